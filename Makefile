@@ -1,0 +1,120 @@
+# The project's commands.  Only Python 3.11 (or newer) and make need to be there;
+# `make run` and `make test` set up what they need in .venv, once.
+
+PYTHON = python3
+HOST = 127.0.0.1
+PORT ?= 8000
+# Batches per mission in the demonstration; empty: its own default.
+BATCHES ?=
+# Further arguments, e.g. make test PYTEST_ARGS="-k quest -x"
+DEMO_ARGS ?=
+PYTEST_ARGS ?=
+BENCH_ARGS ?=
+# From the environment: TEST_POSTGRESQL_URL, a scratch database for the PostgreSQL tests, which
+# are skipped without it, e.g. postgresql+psycopg://user@127.0.0.1:5432/test
+
+VENV = .venv
+BIN = $(VENV)/bin
+PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
+COMPILE = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header
+
+RUNTIME = $(VENV)/.installed-runtime
+DEV = $(VENV)/.installed-dev
+
+.DEFAULT_GOAL = help
+# The steps of `make check` run one after another, also under -j.
+.NOTPARALLEL:
+.PHONY: help run test check format-check lint types floors migrations-check openapi-check \
+	format lock bench openapi clean
+
+help:
+	@echo "make run      set up, serve on http://$(HOST):$(PORT), replay sample telemetry, print a table"
+	@echo "make test     set up and run the tests"
+	@echo "make check    tests, format, lint, types, import floors, migrations, openapi.yaml"
+	@echo "make format   format the code and mend what the linter can"
+	@echo "make bench    run the benchmarks"
+	@echo "make openapi  write openapi.yaml anew"
+	@echo "make lock     resolve the dependencies anew (needs the package index)"
+	@echo "make clean    remove .venv and everything that was built or cached"
+	@echo
+	@echo "Variables: PORT, HOST, BATCHES, PYTHON, TEST_POSTGRESQL_URL,"
+	@echo "           DEMO_ARGS, PYTEST_ARGS, BENCH_ARGS"
+
+run: $(RUNTIME)
+	@exec $(BIN)/acquire demo --host $(HOST) --port $(PORT) $(if $(BATCHES),--batches $(BATCHES)) $(DEMO_ARGS)
+
+test: $(DEV)
+	@echo "== tests"
+	@$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+check: test format-check lint types floors migrations-check openapi-check
+	@echo "== all checks passed"
+
+format-check: $(DEV)
+	@echo "== format"
+	@$(BIN)/ruff format --check --quiet
+
+lint: $(DEV)
+	@echo "== lint"
+	@$(BIN)/ruff check --quiet
+
+types: $(DEV)
+	@echo "== types"
+	@$(BIN)/mypy
+
+floors: $(DEV)
+	@echo "== import floors"
+	@$(BIN)/lint-imports --no-logo
+
+migrations-check: $(DEV)
+	@echo "== migrations"
+	@$(BIN)/acquire database check --fresh
+
+openapi-check: $(DEV)
+	@echo "== openapi.yaml"
+	@$(BIN)/acquire openapi --check
+
+format: $(DEV)
+	@$(BIN)/ruff format
+	@$(BIN)/ruff check --fix
+
+bench: $(DEV)
+	@$(BIN)/python -m benchmarks $(BENCH_ARGS)
+
+# Written beside and then moved: a failure leaves the old file.
+openapi: $(DEV)
+	@$(BIN)/acquire openapi > openapi.yaml.new && mv openapi.yaml.new openapi.yaml || { rm -f openapi.yaml.new; exit 1; }
+
+# The second lock is bound to the first, so that one .venv serves both.
+lock: $(DEV)
+	@$(COMPILE) --upgrade --group build --output-file requirements.lock pyproject.toml
+	@$(COMPILE) --upgrade --group dev --extra postgresql --constraint requirements.lock \
+		--output-file requirements-dev.lock pyproject.toml
+
+clean:
+	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "Python 3.11 or newer is needed; name one with: make PYTHON=/path/to/python3.11"; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || \
+		{ echo "Python's venv module is missing (on Debian: apt-get install python3-venv)"; exit 1; }
+	@echo "Setting up $(VENV)"
+	@$(PYTHON) -m venv $(VENV)
+
+# $(1): lock file.  Every file is checked against its hash; the project itself is linked in place.
+define install
+	@echo "Installing the packages of $(1) into $(VENV) (once; about a minute)"
+	@$(PIP) --require-hashes --requirement $(1)
+	@$(PIP) --no-deps --no-build-isolation --editable .
+endef
+
+$(RUNTIME): requirements.lock pyproject.toml | $(BIN)/python
+	$(call install,requirements.lock)
+	@touch $@
+
+# Holds the runtime packages too, in the same versions.
+$(DEV): requirements-dev.lock requirements.lock pyproject.toml | $(BIN)/python
+	$(call install,requirements-dev.lock)
+	@touch $(RUNTIME) $@
