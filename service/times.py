@@ -1,0 +1,149 @@
+"""UTC text to a two-part Julian date and back.
+
+Calendar (`1996-01-10T12:00:00.000Z`) and day-of-year (`1996-010T12:00:00Z`)
+forms are read; a leap second (`23:59:60`) is a time like any other; digits
+below the microsecond are kept (CCSDS 301.0-B, ASCII codes A and B).
+
+ERFA does the arithmetic.  Its bare ufuncs are called because pyerfa's wrappers
+warn of every year beyond the leap-second table, and silencing a warning is not
+safe between threads; the status they return is read instead.
+"""
+
+import re
+from dataclasses import dataclass
+from datetime import date, timedelta
+from functools import cached_property
+
+import erfa
+from erfa import ufunc
+
+from service.errors import BadInput, Fault, shown_value
+
+FIRST_YEAR, LAST_YEAR = 1972, 2099
+HOUR_S, DAY_S = 3600, 86400
+
+_MJD_ZERO = date(1858, 11, 17).toordinal()
+_J2000_MJD = 51544
+_TEXT = re.compile(
+    r"(?P<year>\d{4})-(?:(?P<month>\d{2})-(?P<day>\d{2})|(?P<doy>\d{3}))"
+    r"T(?P<hour>\d{2}):(?P<minute>\d{2}):(?P<second>\d{2})(?P<fraction>\.\d{1,9})?Z?",
+    re.ASCII,
+)
+_FORMS = "UTC as 1996-01-10T12:00:00.000Z or 1996-010T12:00:00.000Z"
+
+
+@dataclass(frozen=True, order=True)
+class Utc:
+    """A moment in UTC as ERFA's two-part quasi-Julian date."""
+
+    jd1: float
+    jd2: float
+
+    def __str__(self) -> str:
+        return self.text
+
+    @cached_property
+    def _fields(self) -> tuple[date, int, int, int, int]:
+        """Date, hour, minute, second (0 to 60) and nanoseconds."""
+        year, month, day, clock, _ = ufunc.d2dtf(b"UTC", 9, self.jd1, self.jd2)
+        h, m, s, f = (int(clock[name]) for name in ("h", "m", "s", "f"))
+        return date(int(year), int(month), int(day)), h, m, s, f
+
+    @cached_property
+    def text(self) -> str:
+        """Calendar text with at least three and at most nine decimals, ending in Z."""
+        day, hour, minute, second, nanoseconds = self._fields
+        decimals = f"{nanoseconds:09d}".rstrip("0").ljust(3, "0")
+        return f"{day.isoformat()}T{hour:02d}:{minute:02d}:{second:02d}.{decimals}Z"
+
+    @property
+    def day_of_year(self) -> int:
+        """Day of the year, 1 January being 1."""
+        return self._fields[0].timetuple().tm_yday
+
+    @cached_property
+    def tai_ns(self) -> int:
+        """Nanoseconds of TAI since 2000-01-01T12:00:00 TAI, uniform: for sorting and differences."""
+        day, hour, minute, second, nanoseconds = self._fields
+        leap_seconds, _ = ufunc.dat(day.year, day.month, day.day, 0.0)
+        seconds = (day.toordinal() - _MJD_ZERO - _J2000_MJD) * DAY_S - DAY_S // 2
+        seconds += hour * HOUR_S + minute * 60 + second + int(leap_seconds)
+        return seconds * 1_000_000_000 + nanoseconds
+
+    @cached_property
+    def tt(self) -> tuple[float, float]:
+        """The same moment in Terrestrial Time, two-part Julian date."""
+        tai1, tai2, _ = ufunc.utctai(self.jd1, self.jd2)
+        tt1, tt2, _ = ufunc.taitt(tai1, tai2)
+        return float(tt1), float(tt2)
+
+    @property
+    def julian_year(self) -> float:
+        """The moment as a Julian epoch, 2000.0 being J2000."""
+        return float(erfa.epj(*self.tt))
+
+    def bucket(self, width_s: int) -> int:
+        """The number of the UTC hour (3600) or day (86400) that holds the moment, from MJD 0.
+
+        A leap second belongs to the hour and the day that it ends.
+        """
+        day, hour = self._fields[:2]
+        days = day.toordinal() - _MJD_ZERO
+        return days if width_s == DAY_S else days * 24 + hour
+
+
+def bucket_start(number: int, width_s: int) -> Utc:
+    """The moment at which hour or day `number` (see `Utc.bucket`) begins."""
+    days, hour = (number, 0) if width_s == DAY_S else divmod(number, 24)
+    return _from_fields(date.fromordinal(days + _MJD_ZERO), hour, 0, 0.0)
+
+
+def shifted(moment: Utc, seconds: float) -> Utc:
+    """The moment `seconds` of TAI later, leap seconds counted."""
+    tai1, tai2, _ = ufunc.utctai(moment.jd1, moment.jd2)
+    jd1, jd2, _ = ufunc.taiutc(tai1, tai2 + seconds / DAY_S)
+    return Utc(float(jd1), float(jd2))
+
+
+def parse_utc(text: object, field: str = "time") -> Utc:
+    """Read UTC text, calendar or day-of-year.
+
+    Raises `BadInput` naming `field` for another form, a day or second that
+    does not exist, and years outside 1972 to 2099.
+    """
+
+    def refuse(why: str) -> BadInput:
+        return BadInput(Fault(field, why, shown_value(text)))
+
+    match = _TEXT.fullmatch(text) if isinstance(text, str) else None
+    if match is None:
+        raise refuse(f"must be {_FORMS}")
+    year, hour, minute, second = (int(match[n]) for n in ("year", "hour", "minute", "second"))
+    if not FIRST_YEAR <= year <= LAST_YEAR:
+        raise refuse(f"the year must be from {FIRST_YEAR} to {LAST_YEAR}")
+    if hour > 23 or minute > 59 or second > 60:
+        raise refuse("there is no such time of day")
+    try:
+        if match["doy"]:
+            day = date(year, 1, 1) + timedelta(days=int(match["doy"]) - 1)
+        else:
+            day = date(year, int(match["month"]), int(match["day"]))
+    except ValueError:
+        raise refuse("there is no such day") from None
+    if day.year != year:
+        raise refuse("there is no such day of the year")
+    if second == 60 and not ((hour, minute) == (23, 59) and _ends_in_leap_second(day)):
+        raise refuse("there is no leap second at that time")
+    return _from_fields(day, hour, minute, second + float(match["fraction"] or 0.0))
+
+
+def _ends_in_leap_second(day: date) -> bool:
+    following = day + timedelta(days=1)
+    before, _ = ufunc.dat(day.year, day.month, day.day, 0.0)
+    after, _ = ufunc.dat(following.year, following.month, following.day, 0.0)
+    return bool(after > before)
+
+
+def _from_fields(day: date, hour: int, minute: int, second: float) -> Utc:
+    jd1, jd2, _ = ufunc.dtf2d(b"UTC", day.year, day.month, day.day, hour, minute, second)
+    return Utc(float(jd1), float(jd2))

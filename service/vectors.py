@@ -1,0 +1,161 @@
+"""Unit vectors, accurate angles, rotations and quaternions.
+
+Every quaternion of the service is `[q1, q2, q3, qc]`: scalar last, qc >= 0, a
+coordinate transform from inertial to body axes (CCSDS 504.0-B; Shuster's
+A(q)).  A turn of the axes by +30 deg about z is (0, 0, 0.2588, 0.9659).
+
+`matrix_from_quaternion(q) @ r` gives the body components of the inertial
+vector `r`.  scipy's `Rotation.from_matrix(A)` and SPICE's `m2q(A)` describe
+the conjugate turn; the named converters below are the only bridges to them.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Vector = npt.NDArray[np.float64]
+Matrix = npt.NDArray[np.float64]
+
+ARCSEC_PER_RADIAN = math.degrees(1.0) * 3600.0
+
+
+def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """The same array, locked against writing."""
+    array.flags.writeable = False
+    return array
+
+
+def unit(vectors: npt.ArrayLike) -> Vector:
+    """Vectors of shape (..., 3) scaled to length one; a zero vector gives NaN."""
+    v = np.asarray(vectors, dtype=np.float64)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return v / np.sqrt(np.sum(v * v, axis=-1, keepdims=True))
+
+
+def from_ra_dec(ra_deg: npt.ArrayLike, dec_deg: npt.ArrayLike) -> Vector:
+    """Unit vectors (..., 3) of right ascensions and declinations in degrees."""
+    ra, dec = np.radians(ra_deg), np.radians(dec_deg)
+    return np.stack(
+        np.broadcast_arrays(np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)),
+        axis=-1,
+    )
+
+
+def to_ra_dec(vectors: npt.ArrayLike) -> tuple[Vector, Vector]:
+    """Right ascension in [0, 360) and declination, in degrees, of vectors (..., 3)."""
+    v = np.asarray(vectors, dtype=np.float64)
+    ra = np.degrees(np.arctan2(v[..., 1], v[..., 0])) % 360.0
+    dec = np.degrees(np.arctan2(v[..., 2], np.hypot(v[..., 0], v[..., 1])))
+    return np.where(ra >= 360.0, 0.0, ra), dec
+
+
+def angle_between_deg(a: npt.ArrayLike, b: npt.ArrayLike) -> Vector:
+    """Angles in degrees between vectors (..., 3), accurate from zero to 180 degrees.
+
+    The form 2 atan2(|a - b|, |a + b|) of unit vectors keeps full precision at
+    arcseconds, where an arc cosine has lost half its digits.
+    """
+    u, v = unit(a), unit(b)
+    apart = np.sqrt(np.sum((u - v) ** 2, axis=-1))
+    along = np.sqrt(np.sum((u + v) ** 2, axis=-1))
+    return np.asarray(np.degrees(2.0 * np.arctan2(apart, along)))
+
+
+def coordinate_rotation(axis: int, angle_deg: float) -> Matrix:
+    """The matrix that turns the axes by `angle_deg` about axis 0, 1 or 2 (x, y, z)."""
+    c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    matrix = np.eye(3)
+    matrix[i, i] = matrix[j, j] = c
+    matrix[i, j], matrix[j, i] = s, -s
+    return matrix
+
+
+def rotate_about(rotation_vectors_rad: npt.ArrayLike, vectors: npt.ArrayLike) -> Vector:
+    """exp([w x]) v: vectors (..., 3) turned about rotation vectors (..., 3) in radians."""
+    w = np.asarray(rotation_vectors_rad, dtype=np.float64)
+    v = np.asarray(vectors, dtype=np.float64)
+    angle = np.sqrt(np.sum(w * w, axis=-1, keepdims=True))
+    # sin(x)/x and (1 - cos(x))/x^2 as sinc, which is exact at zero.
+    first = np.sinc(angle / np.pi)
+    second = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
+    once = np.cross(w, v)
+    return np.asarray(v + first * once + second * np.cross(w, once))
+
+
+def matrix_from_quaternion(quaternion: npt.ArrayLike) -> Matrix:
+    """The attitude matrix A(q), (..., 3, 3), of quaternions (..., 4): body = A @ inertial."""
+    q1, q2, q3, qc = np.moveaxis(np.asarray(quaternion, dtype=np.float64), -1, 0)
+    rows = [
+        [q1 * q1 - q2 * q2 - q3 * q3 + qc * qc, 2 * (q1 * q2 + q3 * qc), 2 * (q1 * q3 - q2 * qc)],
+        [2 * (q1 * q2 - q3 * qc), -q1 * q1 + q2 * q2 - q3 * q3 + qc * qc, 2 * (q2 * q3 + q1 * qc)],
+        [2 * (q1 * q3 + q2 * qc), 2 * (q2 * q3 - q1 * qc), -q1 * q1 - q2 * q2 + q3 * q3 + qc * qc],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quaternion_from_matrix(matrix: npt.ArrayLike) -> Vector:
+    """The quaternion (4,) of one attitude matrix A (3, 3), with qc >= 0.
+
+    Shepperd's choice of the largest component keeps it accurate at every
+    angle, exact half turns included.
+    """
+    a = np.asarray(matrix, dtype=np.float64)
+    squares = np.array(
+        [
+            1 + a[0, 0] - a[1, 1] - a[2, 2],
+            1 - a[0, 0] + a[1, 1] - a[2, 2],
+            1 - a[0, 0] - a[1, 1] + a[2, 2],
+            1 + a[0, 0] + a[1, 1] + a[2, 2],
+        ]
+    )
+    largest = int(np.argmax(squares))
+    if largest == 3:
+        q = np.array([a[1, 2] - a[2, 1], a[2, 0] - a[0, 2], a[0, 1] - a[1, 0], squares[3]])
+    elif largest == 0:
+        q = np.array([squares[0], a[0, 1] + a[1, 0], a[0, 2] + a[2, 0], a[1, 2] - a[2, 1]])
+    elif largest == 1:
+        q = np.array([a[0, 1] + a[1, 0], squares[1], a[1, 2] + a[2, 1], a[2, 0] - a[0, 2]])
+    else:
+        q = np.array([a[0, 2] + a[2, 0], a[1, 2] + a[2, 1], squares[2], a[0, 1] - a[1, 0]])
+    q /= math.sqrt(float(q @ q))
+    return -q if q[3] < 0 else q
+
+
+def attitude_error_arcsec(attitude: npt.ArrayLike, truth: npt.ArrayLike) -> Vector:
+    """The small rotation, in arcseconds about the body axes, from the true attitude to another.
+
+    Both are attitude matrices (3, 3).  The vector e satisfies
+    A = exp(-[e x]) A_true, so that e^T P^-1 e is chi-square with three degrees
+    of freedom when P is the covariance of a solution in body axes.
+    """
+    q = quaternion_from_matrix(np.asarray(attitude) @ np.asarray(truth).T)
+    sine = math.sqrt(float(q[:3] @ q[:3]))
+    scale = 2.0 if sine == 0.0 else 2.0 * math.atan2(sine, float(q[3])) / sine
+    return np.asarray(q[:3] * scale * ARCSEC_PER_RADIAN)
+
+
+def quaternion_to_scipy(quaternion: npt.ArrayLike) -> Any:
+    """The scipy `Rotation` whose `.apply(body vector)` gives inertial components.
+
+    scipy rotates vectors where the service transforms coordinates: the
+    `Rotation` of A transposed has the service's own components.
+    """
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_quat(np.asarray(quaternion, dtype=np.float64))
+
+
+def quaternion_from_scipy(rotation: Any) -> Vector:
+    """The service's quaternion of a scipy `Rotation` that takes body vectors to inertial."""
+    q = np.asarray(rotation.as_quat(), dtype=np.float64)
+    return -q if q[3] < 0 else q
+
+
+def quaternion_from_spice(spice: npt.ArrayLike) -> Vector:
+    """The service's quaternion of SPICE's `m2q(A)`: scalar first and conjugate, A inertial to body."""
+    s = np.asarray(spice, dtype=np.float64)
+    q = np.array([-s[1], -s[2], -s[3], s[0]])
+    return -q if q[3] < 0 else q
