@@ -1,0 +1,251 @@
+"""A mission: zone, tolerances, tests, run catalog and trackers, read from a TOML file.
+
+Lengths of the field's names: our word first, the paper's symbol in the
+comment of the file and of the field here (Fink & Shoup 1994, Table 1).
+"""
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from service.errors import BadConfiguration, BadInput, Fault, NotFound, shown_value
+from service.vectors import Matrix, Vector, read_only, unit
+
+SHIPPED_FOLDER = Path(__file__).parent
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+Components = tuple[float, float, float]
+Identifier = Literal["starid", "verified", "ptp", "lost_in_space"]
+Solver = Literal["quest", "triad"]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=False)
+
+
+class Cap(_Strict):
+    """A small circle about the tracker's presumed boresight."""
+
+    kind: Literal["cap"]
+    axis_body: Components
+    """The spacecraft's boresight: the axis that an a priori `boresight` names."""
+    radius_deg: float = Field(gt=0, le=180)  # CCAP
+    grid_deg: float = Field(default=0.0, ge=0, le=10)
+    """Step of the grid to which the zone's axis is snapped for the cache; 0: the exact zone."""
+
+
+class Band(_Strict):
+    """A band about a small or great circle around the catalog generation vector, its pole."""
+
+    kind: Literal["band"]
+    axis_body: Components
+    """The body axis that lies along the pole: for SOHO the one pointed at the Sun."""
+    coelevation_deg: float = Field(gt=0, lt=180)  # COEL
+    half_width_deg: float = Field(gt=0, le=90)  # WBAND
+    grid_deg: float = Field(default=0.0, ge=0, le=10)
+
+
+class Tolerances(_Strict):
+    """Every tolerance of the identification, each open to change per request."""
+
+    pair_separation_max_deg: float = Field(gt=0, le=60)  # HMAX
+    separation_deg: float = Field(ge=0, le=5)  # SEPTOL
+    magnitude_mag: float = Field(ge=0, le=30)  # XMTOL
+    magnitude_order_mag: float = Field(ge=0, le=30)  # TMAGMX
+    cross_product_deg: float = Field(ge=0, le=180)  # CAPMAX, in bands BANMAX
+    pole_difference_deg: float = Field(default=0.13, ge=0, le=180)  # BANTOL1
+    pole_angle_deg: float = Field(default=7.2, ge=0, le=180)  # BANTOL2
+
+
+class Tests(_Strict):
+    """The switches of the tests; None for `pole` means: on in a band, off in a cap."""
+
+    magnitude: bool = True
+    cross_product: bool = True
+    pole: bool = True
+    fov_rotation: bool = False
+    match_groups: bool = False
+
+
+class RunCatalogSettings(_Strict):
+    """How the run catalog of the mission is made from the star catalog."""
+
+    magnitude_limit_mag: float = Field(ge=-2, le=15)
+    epoch_step_years: float = Field(default=1.0, gt=0, le=100)
+    """A batch uses the run catalog of its own time rounded to this step."""
+    merge_within_arcsec: float = Field(default=60.0, ge=0, le=3600)
+    reject_neighbour_within_arcsec: float = Field(default=0.0, ge=0, le=3600)
+    reject_neighbour_fainter_by_mag: float = Field(default=2.0, ge=0, le=30)
+    reject_variable_amplitude_mag: float | None = Field(default=None, gt=0, le=30)
+    reject_position_sigma_arcsec: float | None = Field(default=None, gt=0)
+    color_polynomial_mag: tuple[float, ...] = ()
+    """Instrument magnitude = V + c0 + c1 (B-V) + c2 (B-V)^2 + ...; empty: V itself."""
+
+    def epoch_of(self, julian_year: float) -> float:
+        """The epoch, in Julian years, of the run catalog that serves a time."""
+        return round(julian_year / self.epoch_step_years) * self.epoch_step_years
+
+
+class Calibration(_Strict):
+    """Focal-plane calibration: measured angles to true ones.
+
+    With u, v the measured `h_deg`, `v_deg`, each true angle is
+    scale (measured + sum of coefficient u^i v^j) over terms [i, j, coefficient].
+    """
+
+    scale: float = Field(default=1.0, gt=0.5, lt=2)
+    h_terms: tuple[tuple[int, int, float], ...] = ()
+    v_terms: tuple[tuple[int, int, float], ...] = ()
+
+
+class Tracker(_Strict):
+    """One star tracker: where it looks in the body, how far it sees, how well it measures."""
+
+    name: Name
+    x_axis_body: Components
+    y_axis_body: Components
+    z_axis_body: Components
+    """The tracker's axes in body components; +Z is the boresight."""
+    field_of_view_radius_deg: float = Field(gt=0, le=60)  # FOVMAX
+    sigma_arcsec: float = Field(gt=0, le=3600)
+    """One standard deviation per tangent axis: the paper's radial SIGOBS over the root of two."""
+    magnitude_sigma_mag: float = Field(gt=0, le=10)  # SIGMAG
+    coelevation_deg: float | None = Field(default=None, gt=0, lt=180)
+    """In bands: the coelevation of this tracker's boresight, where it is not the mission's."""
+    calibration: Calibration = Calibration()
+
+    @model_validator(mode="after")
+    def _axes_are_right_handed(self) -> Self:
+        axes = np.column_stack([self.x_axis_body, self.y_axis_body, self.z_axis_body])
+        if not np.allclose(axes.T @ axes, np.eye(3), atol=1e-4) or np.linalg.det(axes) < 0:
+            raise ValueError("the three axes must be a right-handed set of unit vectors")
+        return self
+
+    @cached_property
+    def body_from_tracker(self) -> Matrix:
+        """The alignment (3, 3): body components = this @ tracker components."""
+        axes = np.column_stack([self.x_axis_body, self.y_axis_body, self.z_axis_body])
+        u, _, vt = np.linalg.svd(axes)
+        return read_only(u @ vt)
+
+
+class Mission(_Strict):
+    """All that is fixed for a mission."""
+
+    name: Name
+    description: str = ""
+    identifier: Identifier = "starid"
+    solver: Solver = "quest"
+    zone: Annotated[Cap | Band, Field(discriminator="kind")]
+    tolerances: Tolerances
+    tests: Tests = Tests()
+    catalog: RunCatalogSettings
+    trackers: tuple[Tracker, ...] = Field(min_length=1, max_length=16)
+
+    @field_validator("trackers")
+    @classmethod
+    def _names_differ(cls, trackers: tuple[Tracker, ...]) -> tuple[Tracker, ...]:
+        names = [tracker.name for tracker in trackers]
+        if len(set(names)) != len(names):
+            raise ValueError(f"two trackers share a name: {', '.join(names)}")
+        return trackers
+
+    @cached_property
+    def digest(self) -> str:
+        """`sha256:` of the settings, the same for the same settings however the file is laid out."""
+        text = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+        return "sha256:" + hashlib.sha256(text.encode()).hexdigest()
+
+    @cached_property
+    def axis_body(self) -> Vector:
+        """The zone's body axis as a unit vector."""
+        return read_only(unit(self.zone.axis_body))
+
+    def tracker(self, name: str, field: str) -> Tracker:
+        """The tracker of that name; raises `BadInput` naming `field` and the trackers there are."""
+        for tracker in self.trackers:
+            if tracker.name == name:
+                return tracker
+        known = ", ".join(tracker.name for tracker in self.trackers)
+        raise BadInput(Fault(field, f"{self.name} has {known}", shown_value(name)))
+
+
+def parse_mission(text: str, file: str) -> Mission:
+    """Read one mission from TOML; raises `BadConfiguration` naming file, key and allowed values."""
+    try:
+        return Mission.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise BadConfiguration(f"{file}: not TOML: {error}") from None
+    except ValidationError as error:
+        lines = [
+            f"{file}: {_key(e['loc'])}: {_explained(e)} (got {shown_value(e['input'])})"
+            for e in error.errors()
+        ]
+        raise BadConfiguration("\n".join(lines)) from None
+
+
+def _key(location: tuple[str | int, ...]) -> str:
+    return ".".join(str(part) for part in location if part not in ("cap", "band")) or "the file"
+
+
+def _explained(error: Mapping[str, Any]) -> str:
+    if error["type"] != "extra_forbidden":
+        return str(error["msg"])
+    return f"no such key; allowed here: {', '.join(_allowed_keys(error['loc'][:-1]))}"
+
+
+def _allowed_keys(location: tuple[str | int, ...]) -> list[str]:
+    model: Any = Mission
+    tables = {
+        "zone": {"cap": Cap, "band": Band},
+        "tolerances": Tolerances,
+        "tests": Tests,
+        "catalog": RunCatalogSettings,
+        "trackers": Tracker,
+        "calibration": Calibration,
+    }
+    for part in location:
+        found = tables.get(str(part))
+        if isinstance(found, dict):
+            model = found[str(location[1])]
+        elif found is not None:
+            model = found
+    return list(model.model_fields)
+
+
+def load_missions(folder: Path | None = None) -> dict[str, Mission]:
+    """The shipped missions by name, with those of a site's folder added or put in their place."""
+    missions: dict[str, Mission] = {}
+    for place in filter(None, (SHIPPED_FOLDER, folder)):
+        if not place.is_dir():
+            raise BadConfiguration(f"{place}: no such folder of mission files (ACQUIRE_MISSIONS)")
+        origin: dict[str, str] = {}
+        for path in sorted(place.glob("*.toml")):
+            try:
+                text = path.read_text(encoding="utf-8")
+            except (OSError, UnicodeDecodeError) as error:
+                raise BadConfiguration(f"{path}: cannot be read: {error}") from None
+            mission = parse_mission(text, str(path))
+            if mission.name in origin:
+                raise BadConfiguration(
+                    f"{path}: name: {mission.name} is already in {origin[mission.name]}"
+                )
+            origin[mission.name] = str(path)
+            missions[mission.name] = mission
+    return missions
+
+
+def mission_named(missions: Mapping[str, Mission], name: str) -> Mission:
+    """The mission of a spacecraft; raises `NotFound` naming those there are."""
+    try:
+        return missions[name]
+    except KeyError:
+        known = ", ".join(sorted(missions))
+        raise NotFound(f"no spacecraft {shown_value(name)}; there are {known}") from None
