@@ -1,0 +1,287 @@
+"""THE STAIRCASE: batch, corrected, identified, solved.
+
+One way down for every door: single posts, bulk, replay, simulator and what-if.
+Pure: an answer depends on the batch, the mission and the catalog alone.  Not
+finding a star is a result; only bad input raises.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from service import __version__
+from service.attitude.solution import AttitudeSolution, NoAttitude
+from service.attitude.solve import solve_attitude
+from service.errors import BadBatch, Fault
+from service.identify.identification import Identification, Outcome
+from service.identify.presumed import Presumed, aim_of, presumed_attitude
+from service.identify.starid import Sighting, identify_by_votes
+from service.missions.mission import Band, Mission, Solver, Tests, Tolerances
+from service.observe.batch import APriori, BoresightPrior, ObservationBatch
+from service.observe.correct import CorrectedObservations, correct
+from service.sky.ephemeris import apparent, observer_velocity
+from service.sky.run_catalog import RunCatalog
+from service.sky.view import Sky
+from service.sky.zones import Aim, Zone
+from service.times import Utc
+from service.vectors import Vector, matrix_from_quaternion
+
+IDENTIFIERS: Mapping[str, Callable[[Sighting], Identification]] = {"starid": identify_by_votes}
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What holds for one batch: its mission's settings with its own options in their place."""
+
+    identifier: str
+    solver: Solver
+    tolerances: Tolerances
+    tests: Tests
+    zone_grid_deg: float
+
+
+@dataclass(frozen=True)
+class TrackerResult:
+    """One tracker's part: where its stars were looked for, and what was found.
+
+    `residual_arcsec` is NaN for stars that are not unique and where there is
+    no attitude.
+    """
+
+    corrected: CorrectedObservations
+    aim: Aim
+    zone: Zone
+    zone_cached: bool
+    identification: Identification
+    residual_arcsec: Vector
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What an answer was made of."""
+
+    catalog: str
+    run_catalog: str
+    epoch_year: float
+    mission: str
+    version: str
+
+
+@dataclass(frozen=True)
+class Acquisition:
+    """Everything that came of one batch.
+
+    `solution` is None where `reason` says why; never an older attitude.
+    """
+
+    batch: ObservationBatch
+    mission: Mission
+    choices: Choices
+    run_catalog: RunCatalog
+    trackers: tuple[TrackerResult, ...]
+    solution: AttitudeSolution | None
+    reason: NoAttitude | None
+    warnings: tuple[str, ...]
+    timings_us: Mapping[str, int]
+    provenance: Provenance
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Stars observed, and of them unique, ambiguous and unmatched."""
+        found = Counter(int(o) for each in self.trackers for o in each.identification.outcome)
+        counts = {"observed": sum(found.values())}
+        for outcome in (Outcome.UNIQUE, Outcome.AMBIGUOUS, Outcome.UNMATCHED):
+            counts[outcome.word] = found[int(outcome)]
+        return counts
+
+
+def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
+    """Identify a batch's stars and solve for the attitude.
+
+    Raises `BadBatch` for what does not fit the mission: a tracker it has not,
+    a kind of a priori knowledge that its zone cannot use.
+    """
+    choices = choices_of(batch, mission)
+    corrected = correct(batch, mission)
+    presumed = presumed_attitude(batch.a_priori, batch.time, mission)
+
+    clock = [time.perf_counter_ns()]
+    run_catalog = sky.run_catalog(mission, batch.time)
+    places = [
+        _place(each, index, presumed, mission, choices, run_catalog, sky)
+        for index, each in enumerate(corrected)
+    ]
+    clock.append(time.perf_counter_ns())
+    identify = IDENTIFIERS[choices.identifier]
+    identifications = [
+        identify(
+            Sighting(
+                np.dot(each.direction_body, presumed.attitude),
+                each.magnitude_mag,
+                aim,
+                zone,
+                choices.tolerances,
+                choices.tests,
+            )
+        )
+        for each, (aim, zone, _) in zip(corrected, places, strict=True)
+    ]
+    clock.append(time.perf_counter_ns())
+    solved = _solve(batch, choices, corrected, identifications, run_catalog)
+    clock.append(time.perf_counter_ns())
+
+    solution = solved if isinstance(solved, AttitudeSolution) else None
+    trackers = tuple(
+        TrackerResult(each, *place, identification, residual)
+        for each, place, identification, residual in zip(
+            corrected, places, identifications, _residuals(identifications, solution), strict=True
+        )
+    )
+    steps = (round((end - start) / 1000) for start, end in pairwise(clock))
+    return Acquisition(
+        batch=batch,
+        mission=mission,
+        choices=choices,
+        run_catalog=run_catalog,
+        trackers=trackers,
+        solution=solution,
+        reason=solved if isinstance(solved, NoAttitude) else None,
+        warnings=(*presumed.warnings, *_warnings(batch, trackers, presumed, solution)),
+        timings_us=dict(zip(("zone", "identify", "solve"), steps, strict=True)),
+        provenance=Provenance(
+            sky.catalog.digest,
+            run_catalog.digest,
+            run_catalog.epoch_year,
+            mission.digest,
+            __version__,
+        ),
+    )
+
+
+def choices_of(batch: ObservationBatch, mission: Mission) -> Choices:
+    """The settings that hold for a batch; raises `BadBatch` for a pole test in a cap."""
+    options = batch.options
+    is_band = isinstance(mission.zone, Band)
+    if options.tests.get("pole") and not is_band:
+        raise BadBatch(
+            Fault("options.tests.pole", f"{mission.name} has a cap, without a pole", "True")
+        )
+    tests = {"pole": is_band and mission.tests.pole, **options.tests}
+    if isinstance(batch.a_priori, BoresightPrior):
+        # Nothing is known of the roll that the cross products would be compared in.
+        tests["cross_product"] = False
+    grid_deg = options.zone_grid_deg
+    return Choices(
+        identifier=options.identifier or mission.identifier,
+        solver=options.solver or mission.solver,
+        tolerances=mission.tolerances.model_copy(update=options.tolerances),
+        tests=mission.tests.model_copy(update=tests),
+        zone_grid_deg=mission.zone.grid_deg if grid_deg is None else grid_deg,
+    )
+
+
+def warm_zones(sky: Sky, mission: Mission, prior: APriori, time: Utc) -> list[Zone]:
+    """Put the zones on the shelf that a batch of this a priori knowledge will ask for."""
+    presumed = presumed_attitude(prior, time, mission)
+    run_catalog = sky.run_catalog(mission, time)
+    return [
+        sky.zone(
+            mission,
+            run_catalog,
+            aim_of(tracker, presumed, mission, "a_priori"),
+            mission.tolerances.pair_separation_max_deg,
+            mission.zone.grid_deg,
+        )[0]
+        for tracker in mission.trackers
+    ]
+
+
+def _place(
+    corrected: CorrectedObservations,
+    index: int,
+    presumed: Presumed,
+    mission: Mission,
+    choices: Choices,
+    run_catalog: RunCatalog,
+    sky: Sky,
+) -> tuple[Aim, Zone, bool]:
+    aim = aim_of(corrected.tracker, presumed, mission, f"observations.{index}.tracker")
+    zone, cached = sky.zone(
+        mission,
+        run_catalog,
+        aim,
+        choices.tolerances.pair_separation_max_deg,
+        choices.zone_grid_deg,
+    )
+    return aim, zone, cached
+
+
+def _solve(
+    batch: ObservationBatch,
+    choices: Choices,
+    corrected: tuple[CorrectedObservations, ...],
+    identifications: list[Identification],
+    run_catalog: RunCatalog,
+) -> AttitudeSolution | NoAttitude:
+    masks = [identification.unique for identification in identifications]
+    star = np.concatenate([i.star[m] for i, m in zip(identifications, masks, strict=True)])
+    reference = run_catalog.direction[star]
+    if batch.aberration == "to_correct" and len(star):
+        velocity_c = observer_velocity(batch.time, batch.velocity_km_per_s)
+        reference = apparent(reference, velocity_c, batch.time)
+    return solve_attitude(
+        np.concatenate([c.direction_body[m] for c, m in zip(corrected, masks, strict=True)]),
+        reference,
+        np.concatenate([c.sigma_arcsec[m] for c, m in zip(corrected, masks, strict=True)]),
+        np.repeat(np.arange(len(masks)), [int(mask.sum()) for mask in masks]),
+        tuple(each.tracker.name for each in corrected),
+        choices.solver,
+    )
+
+
+def _residuals(
+    identifications: list[Identification], solution: AttitudeSolution | None
+) -> list[Vector]:
+    """The solution's residuals spread over the stars of each tracker, NaN where there is none."""
+    residuals = [np.full(len(each.outcome), np.nan) for each in identifications]
+    if solution is not None:
+        taken = 0
+        for residual, identification in zip(residuals, identifications, strict=True):
+            mask = identification.unique
+            used = int(mask.sum())
+            residual[mask] = solution.residual_arcsec[taken : taken + used]
+            taken += used
+    return residuals
+
+
+def _warnings(
+    batch: ObservationBatch,
+    trackers: tuple[TrackerResult, ...],
+    presumed: Presumed,
+    solution: AttitudeSolution | None,
+) -> list[str]:
+    warnings = []
+    if batch.aberration == "to_correct" and batch.velocity_km_per_s is None:
+        warnings.append(
+            "velocity_of_earth_alone: no velocity_km_per_s was given; "
+            "aberration was corrected for Earth's motion only"
+        )
+    attitude = (
+        presumed.attitude if solution is None else matrix_from_quaternion(solution.quaternion)
+    )
+    for each in trackers:
+        tracker = each.corrected.tracker
+        boresight = attitude.T @ tracker.body_from_tracker[:, 2]
+        if each.aim.reaches_past(boresight, tracker.field_of_view_radius_deg):
+            warnings.append(
+                f"field_of_view_past_zone_edge: the field of view of {tracker.name} reaches past "
+                "the edge of its zone; stars beyond it cannot be identified"
+            )
+        stars = each.identification.star[each.identification.unique]
+        if len(np.unique(stars)) < len(stars):
+            warnings.append(f"same_star_twice: two stars of {tracker.name} have one identity")
+    return warnings

@@ -1,0 +1,1 @@
+"""WHERE WE POINT: matched vectors to an attitude with its covariance."""

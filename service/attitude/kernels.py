@@ -1,0 +1,306 @@
+"""TRIAD, QUEST and the covariance, compiled.
+
+b are observed unit vectors in body axes, r the reference vectors in inertial
+axes, weights are sigma^-2 with sigma in radians.  Quaternions are scalar last,
+inertial to body.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+NEWTON_STEPS = 30
+POLISHING_STEPS = 10
+
+
+@njit(cache=True, nogil=True)
+def widest_pair(b, weights):  # type: ignore[no-untyped-def]
+    """The two rows with the largest sine between them, the one of smaller sigma first, and that sine."""
+    first, second, widest = 0, 1, -1.0
+    for i in range(len(b) - 1):
+        for j in range(i + 1, len(b)):
+            x = b[i, 1] * b[j, 2] - b[i, 2] * b[j, 1]
+            y = b[i, 2] * b[j, 0] - b[i, 0] * b[j, 2]
+            z = b[i, 0] * b[j, 1] - b[i, 1] * b[j, 0]
+            sine = math.sqrt(x * x + y * y + z * z)
+            if sine > widest:
+                first, second, widest = i, j, sine
+    if weights[second] > weights[first]:
+        first, second = second, first
+    return first, second, widest
+
+
+@njit(cache=True, nogil=True)
+def _triad_frame(anchor, other, rows):  # type: ignore[no-untyped-def]
+    x = anchor[1] * other[2] - anchor[2] * other[1]
+    y = anchor[2] * other[0] - anchor[0] * other[2]
+    z = anchor[0] * other[1] - anchor[1] * other[0]
+    norm = math.sqrt(x * x + y * y + z * z)
+    x, y, z = x / norm, y / norm, z / norm
+    rows[0] = anchor
+    rows[1, 0], rows[1, 1], rows[1, 2] = x, y, z
+    rows[2, 0] = anchor[1] * z - anchor[2] * y
+    rows[2, 1] = anchor[2] * x - anchor[0] * z
+    rows[2, 2] = anchor[0] * y - anchor[1] * x
+
+
+@njit(cache=True, nogil=True)
+def triad(b1, b2, r1, r2, attitude):  # type: ignore[no-untyped-def]
+    """The attitude matrix that takes r1 to b1 exactly and r2 into the plane of b1 and b2 (Black 1964)."""
+    body = np.empty((3, 3))
+    inertial = np.empty((3, 3))
+    _triad_frame(b1, b2, body)
+    _triad_frame(r1, r2, inertial)
+    for i in range(3):
+        for j in range(3):
+            attitude[i, j] = (
+                body[0, i] * inertial[0, j]
+                + body[1, i] * inertial[1, j]
+                + body[2, i] * inertial[2, j]
+            )
+
+
+@njit(cache=True, nogil=True)
+def to_matrix(q, a):  # type: ignore[no-untyped-def]
+    """A(q) into a (3, 3)."""
+    q1, q2, q3, qc = q[0], q[1], q[2], q[3]
+    a[0, 0] = q1 * q1 - q2 * q2 - q3 * q3 + qc * qc
+    a[0, 1] = 2 * (q1 * q2 + q3 * qc)
+    a[0, 2] = 2 * (q1 * q3 - q2 * qc)
+    a[1, 0] = 2 * (q1 * q2 - q3 * qc)
+    a[1, 1] = -q1 * q1 + q2 * q2 - q3 * q3 + qc * qc
+    a[1, 2] = 2 * (q2 * q3 + q1 * qc)
+    a[2, 0] = 2 * (q1 * q3 + q2 * qc)
+    a[2, 1] = 2 * (q2 * q3 - q1 * qc)
+    a[2, 2] = -q1 * q1 - q2 * q2 + q3 * q3 + qc * qc
+
+
+@njit(cache=True, nogil=True)
+def to_quaternion(a, q):  # type: ignore[no-untyped-def]
+    """The quaternion of an attitude matrix, qc >= 0, by Shepperd's largest component."""
+    trace = a[0, 0] + a[1, 1] + a[2, 2]
+    if trace >= a[0, 0] and trace >= a[1, 1] and trace >= a[2, 2]:
+        q[0], q[1], q[2] = a[1, 2] - a[2, 1], a[2, 0] - a[0, 2], a[0, 1] - a[1, 0]
+        q[3] = 1.0 + trace
+    elif a[0, 0] >= a[1, 1] and a[0, 0] >= a[2, 2]:
+        q[0], q[1] = 1.0 + a[0, 0] - a[1, 1] - a[2, 2], a[0, 1] + a[1, 0]
+        q[2], q[3] = a[0, 2] + a[2, 0], a[1, 2] - a[2, 1]
+    elif a[1, 1] >= a[2, 2]:
+        q[0], q[1] = a[0, 1] + a[1, 0], 1.0 - a[0, 0] + a[1, 1] - a[2, 2]
+        q[2], q[3] = a[1, 2] + a[2, 1], a[2, 0] - a[0, 2]
+    else:
+        q[0], q[1] = a[0, 2] + a[2, 0], a[1, 2] + a[2, 1]
+        q[2], q[3] = 1.0 - a[0, 0] - a[1, 1] + a[2, 2], a[0, 1] - a[1, 0]
+    _normalise(q)
+
+
+@njit(cache=True, nogil=True)
+def _normalise(q):  # type: ignore[no-untyped-def]
+    norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    if q[3] < 0.0:
+        norm = -norm
+    for i in range(4):
+        q[i] /= norm
+
+
+@njit(cache=True, nogil=True)
+def quest(b, r, weights, start, q):  # type: ignore[no-untyped-def]
+    """Wahba's attitude by QUEST (Shuster & Oh 1981) into q.
+
+    `start` is any rough quaternion (TRIAD's): its largest component tells by
+    which half turn to rotate the reference vectors first, so that the scalar
+    part of what is solved for is never small.  Without it every exact half turn
+    fails.  The characteristic polynomial loses half the digits where the field
+    is narrow, so the answer is polished by Gauss-Newton steps on the residuals.
+    """
+    turn = 3
+    for i in range(3):
+        if abs(start[i]) > abs(start[turn]):
+            turn = i
+    total = 0.0
+    for k in range(len(weights)):
+        total += weights[k]
+    profile = np.zeros((3, 3))  # B = sum of a b r^T
+    for k in range(len(weights)):
+        share = weights[k] / total
+        for j in range(3):
+            reference = r[k, j] if turn == 3 or turn == j else -r[k, j]
+            for i in range(3):
+                profile[i, j] += share * b[k, i] * reference
+    sigma = profile[0, 0] + profile[1, 1] + profile[2, 2]
+    s = profile + profile.T
+    z0 = profile[1, 2] - profile[2, 1]
+    z1 = profile[2, 0] - profile[0, 2]
+    z2 = profile[0, 1] - profile[1, 0]
+    c00 = s[1, 1] * s[2, 2] - s[1, 2] * s[2, 1]
+    c11 = s[0, 0] * s[2, 2] - s[0, 2] * s[2, 0]
+    c22 = s[0, 0] * s[1, 1] - s[0, 1] * s[1, 0]
+    kappa = c00 + c11 + c22
+    det = (
+        s[0, 0] * c00
+        - s[0, 1] * (s[1, 0] * s[2, 2] - s[1, 2] * s[2, 0])
+        + s[0, 2] * (s[1, 0] * s[2, 1] - s[1, 1] * s[2, 0])
+    )
+    sz0 = s[0, 0] * z0 + s[0, 1] * z1 + s[0, 2] * z2
+    sz1 = s[1, 0] * z0 + s[1, 1] * z1 + s[1, 2] * z2
+    sz2 = s[2, 0] * z0 + s[2, 1] * z1 + s[2, 2] * z2
+    zz = z0 * z0 + z1 * z1 + z2 * z2
+    zsz = z0 * sz0 + z1 * sz1 + z2 * sz2
+    zssz = sz0 * sz0 + sz1 * sz1 + sz2 * sz2
+    pa = sigma * sigma - kappa
+    pb = sigma * sigma + zz
+    pc = det + zsz
+    pd = zssz
+    largest = 1.0
+    for _ in range(NEWTON_STEPS):
+        square = largest * largest
+        value = (square - pa) * (square - pb) - pc * largest + (pc * sigma - pd)
+        slope = 2.0 * largest * (2.0 * square - pa - pb) - pc
+        if slope <= 0.0:
+            break
+        step = value / slope
+        largest -= step
+        if abs(step) < 1e-15:
+            break
+    alpha = largest * largest - sigma * sigma + kappa
+    beta = largest - sigma
+    gamma = (largest + sigma) * alpha - det
+    x0 = alpha * z0 + beta * sz0 + s[0, 0] * sz0 + s[0, 1] * sz1 + s[0, 2] * sz2
+    x1 = alpha * z1 + beta * sz1 + s[1, 0] * sz0 + s[1, 1] * sz1 + s[1, 2] * sz2
+    x2 = alpha * z2 + beta * sz2 + s[2, 0] * sz0 + s[2, 1] * sz1 + s[2, 2] * sz2
+    if turn == 0:
+        q[0], q[1], q[2], q[3] = gamma, -x2, x1, -x0
+    elif turn == 1:
+        q[0], q[1], q[2], q[3] = x2, gamma, -x0, -x1
+    elif turn == 2:
+        q[0], q[1], q[2], q[3] = -x1, x0, gamma, -x2
+    else:
+        q[0], q[1], q[2], q[3] = x0, x1, x2, gamma
+    _normalise(q)
+    # In a very narrow field the polynomial has no digits left, and TRIAD is the nearer start.
+    if not _loss(b, r, weights, q) <= _loss(b, r, weights, start):
+        q[:] = start
+    _polish(b, r, weights, q)
+
+
+@njit(cache=True, nogil=True)
+def _loss(b, r, weights, q):  # type: ignore[no-untyped-def]
+    a = np.empty((3, 3))
+    to_matrix(q, a)
+    total = 0.0
+    for k in range(len(weights)):
+        for i in range(3):
+            apart = b[k, i] - a[i, 0] * r[k, 0] - a[i, 1] * r[k, 1] - a[i, 2] * r[k, 2]
+            total += weights[k] * apart * apart
+    return total
+
+
+@njit(cache=True, nogil=True)
+def information(vectors, weights, matrix):  # type: ignore[no-untyped-def]
+    """Sum of sigma^-2 (I - v v^T): the inverse of the covariance, in rad^-2."""
+    matrix[:] = 0.0
+    for k in range(len(weights)):
+        for i in range(3):
+            matrix[i, i] += weights[k]
+            for j in range(3):
+                matrix[i, j] -= weights[k] * vectors[k, i] * vectors[k, j]
+
+
+@njit(cache=True, nogil=True)
+def inverse_symmetric(m, out):  # type: ignore[no-untyped-def]
+    """The inverse of a symmetric (3, 3); False where it has none."""
+    c00 = m[1, 1] * m[2, 2] - m[1, 2] * m[1, 2]
+    c01 = m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2]
+    c02 = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]
+    det = m[0, 0] * c00 + m[0, 1] * c01 + m[0, 2] * c02
+    scale = m[0, 0] + m[1, 1] + m[2, 2]
+    if not det > 1e-15 * scale * scale * scale:
+        return False
+    out[0, 0] = c00 / det
+    out[0, 1] = out[1, 0] = c01 / det
+    out[0, 2] = out[2, 0] = c02 / det
+    out[1, 1] = (m[0, 0] * m[2, 2] - m[0, 2] * m[0, 2]) / det
+    out[1, 2] = out[2, 1] = (m[0, 1] * m[0, 2] - m[0, 0] * m[1, 2]) / det
+    out[2, 2] = (m[0, 0] * m[1, 1] - m[0, 1] * m[0, 1]) / det
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _polish(b, r, weights, q):  # type: ignore[no-untyped-def]
+    a = np.empty((3, 3))
+    p = np.empty_like(r)
+    matrix = np.empty((3, 3))
+    inverse = np.empty((3, 3))
+    for _ in range(POLISHING_STEPS):
+        to_matrix(q, a)
+        g0 = g1 = g2 = 0.0
+        for k in range(len(weights)):
+            for i in range(3):
+                p[k, i] = a[i, 0] * r[k, 0] + a[i, 1] * r[k, 1] + a[i, 2] * r[k, 2]
+            # b x p, written with the residual b - p so that it keeps its digits.
+            d0, d1, d2 = b[k, 0] - p[k, 0], b[k, 1] - p[k, 1], b[k, 2] - p[k, 2]
+            g0 += weights[k] * (d1 * p[k, 2] - d2 * p[k, 1])
+            g1 += weights[k] * (d2 * p[k, 0] - d0 * p[k, 2])
+            g2 += weights[k] * (d0 * p[k, 1] - d1 * p[k, 0])
+        information(p, weights, matrix)
+        if not inverse_symmetric(matrix, inverse):
+            return
+        e0 = 0.5 * (inverse[0, 0] * g0 + inverse[0, 1] * g1 + inverse[0, 2] * g2)
+        e1 = 0.5 * (inverse[1, 0] * g0 + inverse[1, 1] * g1 + inverse[1, 2] * g2)
+        e2 = 0.5 * (inverse[2, 0] * g0 + inverse[2, 1] * g1 + inverse[2, 2] * g2)
+        square = e0 * e0 + e1 * e1 + e2 * e2
+        if square > 0.25:
+            return  # no small correction: the vectors do not agree, and the start stands
+        # (e/2, 1) composed with q: A becomes exp(-[e x]) A.
+        q0, q1, q2, qc = q[0], q[1], q[2], q[3]
+        q[0] = qc * e0 + q0 + q1 * e2 - q2 * e1
+        q[1] = qc * e1 + q1 + q2 * e0 - q0 * e2
+        q[2] = qc * e2 + q2 + q0 * e1 - q1 * e0
+        q[3] = qc - q0 * e0 - q1 * e1 - q2 * e2
+        _normalise(q)
+        if square < 1e-30:
+            return
+
+
+@njit(cache=True, nogil=True)
+def solve(b, r, sigma_rad, worst_rad, quaternions, covariance, squares):  # type: ignore[no-untyped-def]
+    """TRIAD into row 0 of `quaternions` (2, 4) and QUEST into row 1, with the covariance (3, 3), rad^2.
+
+    `squares` (2, n) gets the squared residuals |b - A r|^2 of either.  False
+    where the geometry leaves an axis worse than `worst_rad`.
+    """
+    n = len(b)
+    weights = 1.0 / (sigma_rad * sigma_rad)
+    first, second, sine = widest_pair(b, weights)
+    if sine <= 1e-12:
+        return False
+    matrix = np.empty((3, 3))
+    information(b, weights, matrix)
+    if not inverse_symmetric(matrix, covariance):
+        return False
+    # Every axis is better than the bound where M - I / worst^2 is positive definite.
+    least = 1.0 / (worst_rad * worst_rad)
+    m00, m11, m22 = matrix[0, 0] - least, matrix[1, 1] - least, matrix[2, 2] - least
+    minor = m00 * m11 - matrix[0, 1] * matrix[0, 1]
+    determinant = (
+        m00 * (m11 * m22 - matrix[1, 2] * matrix[1, 2])
+        - matrix[0, 1] * (matrix[0, 1] * m22 - matrix[1, 2] * matrix[0, 2])
+        + matrix[0, 2] * (matrix[0, 1] * matrix[1, 2] - m11 * matrix[0, 2])
+    )
+    if m00 <= 0.0 or minor <= 0.0 or determinant <= 0.0:
+        return False
+    attitude = np.empty((3, 3))
+    triad(b[first], b[second], r[first], r[second], attitude)
+    to_quaternion(attitude, quaternions[0])
+    quest(b, r, weights, quaternions[0], quaternions[1])
+    for method in range(2):
+        to_matrix(quaternions[method], attitude)
+        for k in range(n):
+            squares[method, k] = 0.0
+            for i in range(3):
+                apart = b[k, i] - (
+                    attitude[i, 0] * r[k, 0] + attitude[i, 1] * r[k, 1] + attitude[i, 2] * r[k, 2]
+                )
+                squares[method, k] += apart * apart
+    return True

@@ -1,0 +1,50 @@
+"""The attitude that matched vectors give, with all that tells how far to trust it."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from service.vectors import Matrix, Vector
+
+
+class NoAttitude(StrEnum):
+    """Why there is no attitude."""
+
+    FEWER_THAN_TWO_UNIQUE_STARS = "fewer_than_two_unique_stars"
+    DEGENERATE_GEOMETRY = "degenerate_geometry"
+
+
+@dataclass(frozen=True)
+class TrackerFit:
+    """How one tracker's stars agree with the joint attitude."""
+
+    tracker: str
+    stars: int
+    taste: float
+    outlier: bool
+
+
+@dataclass(frozen=True)
+class AttitudeSolution:
+    """An attitude, inertial to body, from N >= 2 matched vectors.
+
+    `quaternion` is the chosen method's; `triad` and `quest` stand side by side
+    with the angle between them.  `covariance_arcsec2` (3, 3) is of the small
+    rotation about the body axes.  `residual_arcsec` has one row a matched
+    vector, the angle between the observed direction and the predicted one.
+    `taste` is the weighted sum of squares, about chi-square with 2N - 3 degrees
+    of freedom; beyond its 99.9 % point the solution is suspect.
+    """
+
+    quaternion: Vector
+    method: str
+    covariance_arcsec2: Matrix
+    residual_arcsec: Vector
+    residual_rms_arcsec: float
+    predicted_rms_arcsec: float
+    taste: float
+    degrees_of_freedom: int
+    suspect: bool
+    triad: Vector
+    quest: Vector
+    triad_quest_angle_arcsec: float
+    trackers: tuple[TrackerFit, ...]

@@ -1,0 +1,1 @@
+"""WHICH IS WHICH: observed stars to catalog stars."""

@@ -1,0 +1,95 @@
+"""A batch of observed stars as the core sees it: arrays, units in the names."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from service.times import Utc
+from service.vectors import Vector
+
+MAX_STARS_PER_TRACKER = 250
+MAX_TRACKERS = 16
+
+Aberration = Literal["to_correct", "applied_upstream", "ignore"]
+
+
+@dataclass(frozen=True)
+class QuaternionPrior:
+    """An a priori attitude: inertial to body, scalar last, of norm one."""
+
+    quaternion: Vector
+
+
+@dataclass(frozen=True)
+class BoresightPrior:
+    """An a priori direction of the spacecraft's boresight, roll unknown (cap missions)."""
+
+    ra_deg: float
+    dec_deg: float
+
+
+@dataclass(frozen=True)
+class SunPointedPrior:
+    """The pole is on the Sun, roll unknown (band missions).
+
+    `sun_vector` is inertial, spacecraft to Sun; without it the Sun is taken
+    from an ephemeris, seen from `position_km` (geocentric, EME2000) if given.
+    """
+
+    sun_vector: Vector | None
+    position_km: Vector | None
+
+
+APriori = QuaternionPrior | BoresightPrior | SunPointedPrior
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a batch or a what-if asks to be done otherwise than its mission says."""
+
+    identifier: str | None = None
+    solver: str | None = None
+    tests: dict[str, bool] = field(default_factory=dict)
+    tolerances: dict[str, float] = field(default_factory=dict)
+    zone_grid_deg: float | None = None
+
+
+@dataclass(frozen=True)
+class TrackerStars:
+    """The stars of one tracker, in the order observed.
+
+    Angles as measured: `vector` rows are unit vectors in tracker axes, NaN
+    where the star came as `angles_deg` (h, v), which are NaN otherwise.
+    Magnitude is NaN where none was given; sigma is NaN where the mission's holds.
+    """
+
+    tracker: str
+    vector: Vector
+    angles_deg: Vector
+    magnitude_mag: Vector
+    time_offset_s: Vector
+    sigma_arcsec: Vector
+
+    @property
+    def count(self) -> int:
+        """The number of stars."""
+        return len(self.magnitude_mag)
+
+
+@dataclass(frozen=True)
+class ObservationBatch:
+    """One batch: who, when, the a priori attitude, and the stars of each tracker.
+
+    Body rates are of the body relative to inertial, in body axes.  Velocity is
+    geocentric, EME2000, None where it was not given.
+    """
+
+    spacecraft: str
+    batch: str
+    run: str
+    time: Utc
+    a_priori: APriori
+    body_rates_deg_per_s: Vector
+    velocity_km_per_s: Vector | None
+    aberration: Aberration
+    observations: tuple[TrackerStars, ...]
+    options: Options

@@ -1,0 +1,370 @@
+"""A batch as JSON: the object that pipelines send, checked field by field.
+
+Every door reads batches here, so that all refuse the same things with the
+same words.  The pydantic models are also what `openapi.yaml` shows.
+"""
+
+import hashlib
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    model_validator,
+)
+
+from service.errors import BadBatch, BadInput, Fault, NotAvailable, shown_value
+from service.missions.mission import Identifier, Solver
+from service.observe.batch import (
+    MAX_STARS_PER_TRACKER,
+    MAX_TRACKERS,
+    Aberration,
+    APriori,
+    BoresightPrior,
+    ObservationBatch,
+    Options,
+    QuaternionPrior,
+    SunPointedPrior,
+    TrackerStars,
+)
+from service.times import parse_utc
+from service.vectors import Vector, read_only, unit
+
+NORM_TOLERANCE = 1e-3
+MAX_FAULTS_SHOWN = 20
+
+Frame = Literal["EME2000", "ICRF", "GCRF"]
+
+
+def _is_number(value: Any) -> Any:
+    # JSON's true and "5.3" are no numbers, though pydantic would take them for some.
+    if isinstance(value, (bool, str)):
+        raise ValueError("must be a number")
+    return value
+
+
+def _near_unit(components: tuple[float, ...]) -> tuple[float, ...]:
+    norm = math.hypot(*components)
+    if abs(norm - 1.0) > NORM_TOLERANCE:
+        raise ValueError(f"must have norm 1 within {NORM_TOLERANCE}; its norm is {norm:.6g}")
+    return components
+
+
+def _is_time(text: str) -> str:
+    try:
+        parse_utc(text)
+    except BadInput as error:
+        raise ValueError(error.faults[0].message) from None
+    return text
+
+
+Number = Annotated[float, BeforeValidator(_is_number)]
+Components = tuple[Number, Number, Number]
+UnitVector = Annotated[Components, AfterValidator(_near_unit)]
+Quaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_near_unit)]
+Key = Annotated[str, Field(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\x7f]+$")]
+RunName = Annotated[
+    str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.:-]*$")
+]
+Rate = Annotated[Number, Field(ge=-360, le=360)]
+Speed = Annotated[Number, Field(ge=-100, le=100)]
+Distance = Annotated[Number, Field(ge=-1e9, le=1e9)]
+Position = tuple[Distance, Distance, Distance]
+Tolerance = Annotated[Number, Field(ge=0, le=180)]
+
+
+class Wire(BaseModel):
+    """The ground rules of every body: nothing unknown, no NaN, no infinity."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class StarIn(Wire):
+    """One observed star: a unit vector in tracker axes, or the angles h and v of (tan h, tan v, 1)."""
+
+    vector: UnitVector | None = None
+    h_deg: Annotated[Number, Field(gt=-89, lt=89)] | None = None
+    v_deg: Annotated[Number, Field(gt=-89, lt=89)] | None = None
+    magnitude: Annotated[Number, Field(ge=-30, le=30)] | None = None
+    time_offset_s: Annotated[Number, Field(ge=-3600, le=3600)] = 0.0
+    sigma_arcsec: Annotated[Number, Field(ge=1e-3, le=3600)] | None = None
+
+    @model_validator(mode="after")
+    def _one_direction(self) -> Self:
+        angles = (self.h_deg is not None, self.v_deg is not None)
+        if self.vector is None and not all(angles):
+            raise ValueError("needs either vector, or both h_deg and v_deg")
+        if self.vector is not None and any(angles):
+            raise ValueError("takes either vector, or h_deg and v_deg, not both")
+        return self
+
+
+class TrackerIn(Wire):
+    """The stars that one tracker sees."""
+
+    tracker: Key
+    stars: Annotated[list[StarIn], Field(max_length=MAX_STARS_PER_TRACKER)]
+
+
+class QuaternionIn(Wire):
+    """An a priori attitude, inertial to body, scalar last."""
+
+    quaternion: Quaternion
+    frame: Frame = "EME2000"
+
+
+class DirectionIn(Wire):
+    """A direction in right ascension and declination."""
+
+    ra_deg: Annotated[Number, Field(ge=-360, le=360)]
+    dec_deg: Annotated[Number, Field(ge=-90, le=90)]
+
+
+class BoresightIn(Wire):
+    """An a priori boresight with unknown roll (cap missions)."""
+
+    boresight: DirectionIn
+    frame: Frame = "EME2000"
+
+
+class SunPointedIn(Wire):
+    """A pole on the Sun with unknown roll (band missions)."""
+
+    sun_pointed: Literal[True]
+    sun_vector: UnitVector | None = None
+    position_km: Position | None = None
+    frame: Frame = "EME2000"
+
+
+class TestsIn(Wire):
+    """Tests switched on or off."""
+
+    magnitude: bool | None = None
+    cross_product: bool | None = None
+    pole: bool | None = None
+    fov_rotation: bool | None = None
+    match_groups: bool | None = None
+
+
+class TolerancesIn(Wire):
+    """Tolerances by the mission file's names."""
+
+    pair_separation_max_deg: Annotated[Number, Field(gt=0, le=60)] | None = None
+    separation_deg: Annotated[Number, Field(ge=0, le=5)] | None = None
+    magnitude_mag: Annotated[Number, Field(ge=0, le=30)] | None = None
+    magnitude_order_mag: Annotated[Number, Field(ge=0, le=30)] | None = None
+    cross_product_deg: Tolerance | None = None
+    pole_difference_deg: Tolerance | None = None
+    pole_angle_deg: Tolerance | None = None
+
+
+class OptionsIn(Wire):
+    """What to do otherwise than the mission's settings say."""
+
+    identifier: Identifier | None = None
+    solver: Solver | None = None
+    tests: TestsIn = TestsIn()
+    tolerances: TolerancesIn = TolerancesIn()
+    zone_grid_deg: Annotated[Number, Field(ge=0, le=10)] | None = None
+
+    def to_options(self, field: str = "options") -> Options:
+        """The options as the core takes them; raises `NotAvailable` for what is not there yet."""
+        if self.identifier not in (None, "starid"):
+            raise NotAvailable(
+                Fault(
+                    f"{field}.identifier",
+                    "is not there yet; use starid",
+                    shown_value(self.identifier),
+                )
+            )
+        tests = self.tests.model_dump(exclude_none=True)
+        for name in ("fov_rotation", "match_groups"):
+            if tests.get(name):
+                raise NotAvailable(Fault(f"{field}.tests.{name}", "is not there yet", "True"))
+        return Options(
+            identifier=self.identifier,
+            solver=self.solver,
+            tests=tests,
+            tolerances=self.tolerances.model_dump(exclude_none=True),
+            zone_grid_deg=self.zone_grid_deg,
+        )
+
+
+def _kind_of_prior(value: Any) -> str | None:
+    keys = value if isinstance(value, dict) else getattr(value, "model_fields_set", ())
+    return next((kind for kind in ("quaternion", "boresight", "sun_pointed") if kind in keys), None)
+
+
+APrioriIn = Annotated[
+    Annotated[QuaternionIn, Tag("quaternion")]
+    | Annotated[BoresightIn, Tag("boresight")]
+    | Annotated[SunPointedIn, Tag("sun_pointed")],
+    Discriminator(
+        _kind_of_prior,
+        custom_error_type="a_priori_kind",
+        custom_error_message="must hold one of quaternion, boresight, sun_pointed, or be null",
+    ),
+]
+
+
+def _stars_of_different_trackers(observations: list[TrackerIn]) -> list[TrackerIn]:
+    names = [each.tracker for each in observations]
+    if len(set(names)) != len(names):
+        raise ValueError(f"a tracker stands there twice: {', '.join(names)}")
+    if not any(each.stars for each in observations):
+        raise ValueError("there are no stars; at least one tracker must see one")
+    return observations
+
+
+class BatchIn(Wire):
+    """A batch of observed stars."""
+
+    spacecraft: Key
+    batch: Key
+    time: Annotated[str, AfterValidator(_is_time)]
+    run: RunName = "live"
+    a_priori: APrioriIn | None
+    body_rates_deg_per_s: tuple[Rate, Rate, Rate] = (0.0, 0.0, 0.0)
+    velocity_km_per_s: tuple[Speed, Speed, Speed] | None = None
+    sun_vector: UnitVector | None = None
+    position_km: Position | None = None
+    aberration: Aberration = "to_correct"
+    observations: Annotated[
+        list[TrackerIn],
+        Field(min_length=1, max_length=MAX_TRACKERS),
+        AfterValidator(_stars_of_different_trackers),
+    ]
+    options: OptionsIn = OptionsIn()
+
+    def to_batch(self) -> ObservationBatch:
+        """The batch as the core takes it; raises `NotAvailable` for what is not there yet."""
+        return ObservationBatch(
+            spacecraft=self.spacecraft,
+            batch=self.batch,
+            run=self.run,
+            time=parse_utc(self.time),
+            a_priori=self._prior(),
+            body_rates_deg_per_s=_array(self.body_rates_deg_per_s),
+            velocity_km_per_s=_optional_array(self.velocity_km_per_s),
+            aberration=self.aberration,
+            observations=tuple(_tracker_stars(each) for each in self.observations),
+            options=self.options.to_options(),
+        )
+
+    def _prior(self) -> APriori:
+        prior = self.a_priori
+        if prior is None:
+            raise NotAvailable(
+                Fault("a_priori", "lost-in-space identification is not there yet", "null")
+            )
+        if isinstance(prior, QuaternionIn):
+            return QuaternionPrior(read_only(unit(prior.quaternion)))
+        if isinstance(prior, BoresightIn):
+            return BoresightPrior(prior.boresight.ra_deg, prior.boresight.dec_deg)
+        sun = prior.sun_vector or self.sun_vector
+        return SunPointedPrior(
+            None if sun is None else read_only(unit(sun)),
+            _optional_array(prior.position_km or self.position_km),
+        )
+
+
+def _array(values: Iterable[Any]) -> Vector:
+    return read_only(np.array(values, dtype=np.float64))
+
+
+def _optional_array(values: Iterable[float] | None) -> Vector | None:
+    return None if values is None else _array(values)
+
+
+_NO_VECTOR = (math.nan, math.nan, math.nan)
+
+
+def _tracker_stars(tracker: TrackerIn) -> TrackerStars:
+    stars = tracker.stars
+    vector = np.array([star.vector or _NO_VECTOR for star in stars], dtype=np.float64)
+    return TrackerStars(
+        tracker=tracker.tracker,
+        vector=read_only(unit(vector.reshape(-1, 3))),
+        # A number that is absent becomes NaN by numpy's reading of None.
+        angles_deg=_array([(star.h_deg, star.v_deg) for star in stars]).reshape(-1, 2),
+        magnitude_mag=_array([star.magnitude for star in stars]),
+        time_offset_s=_array([star.time_offset_s for star in stars]),
+        sigma_arcsec=_array([star.sigma_arcsec for star in stars]),
+    )
+
+
+@dataclass(frozen=True)
+class Submission:
+    """A batch that passed every check of its form, with the text that identifies it.
+
+    `text` is its canonical JSON, defaults left out: what is recorded and run
+    again.  `fingerprint` is the digest of that text, so that white space and
+    the order of keys do not make another body.
+    """
+
+    batch: ObservationBatch
+    text: str
+    fingerprint: str
+
+
+def submission_from_json(body: bytes | str, run: str | None = None) -> Submission:
+    """Read one batch; `run`, where given, takes the place of the batch's own.
+
+    Raises `BadBatch` with every fault, each naming field and value.
+    """
+    try:
+        model = BatchIn.model_validate_json(body)
+    except ValidationError as error:
+        raise BadBatch(faults_of(error)) from None
+    return submission_from_model(model if run is None else model.model_copy(update={"run": run}))
+
+
+def submission_from_model(model: BatchIn) -> Submission:
+    """The submission of a model that is already checked."""
+    text = model.model_dump_json(exclude_defaults=True)
+    return Submission(model.to_batch(), text, hashlib.sha256(text.encode()).hexdigest())
+
+
+def faults_of(error: ValidationError, prefix: tuple[str, ...] = ()) -> list[Fault]:
+    """What pydantic found, in the service's words: a dotted field, a message, the value."""
+    return [
+        Fault(_field((*prefix, *fault["loc"])), _message(fault), _value(fault))
+        for fault in error.errors(include_url=False)[:MAX_FAULTS_SHOWN]
+    ]
+
+
+def _field(location: tuple[str | int, ...]) -> str:
+    tags = ("quaternion", "boresight", "sun_pointed")
+    parts = [
+        str(part)
+        for index, part in enumerate(location)
+        # The tag of the kind of prior is pydantic's, not a field of the body.
+        if not (
+            part in tags
+            and index
+            and location[index - 1] == "a_priori"
+            and index + 1 < len(location)
+        )
+    ]
+    return ".".join(parts) or "body"
+
+
+def _message(fault: Any) -> str:
+    if fault["type"] == "extra_forbidden":
+        return "there is no such field"
+    return str(fault["msg"]).removeprefix("Value error, ")
+
+
+def _value(fault: Any) -> str | None:
+    # A missing field or a fault of the whole has nothing to show but its surroundings.
+    return None if fault["type"] == "missing" or not fault["loc"] else shown_value(fault["input"])

@@ -1,0 +1,53 @@
+"""The sky as one batch sees it: the run catalog of its epoch and the zones in it."""
+
+from dataclasses import dataclass
+
+from service.missions.mission import Mission
+from service.sky.catalog import Catalog
+from service.sky.run_catalog import RunCatalog, build_run_catalog
+from service.sky.shelf import Shelf
+from service.sky.zones import Aim, Zone, ZoneKey, zone_for
+from service.times import Utc
+
+
+@dataclass(frozen=True)
+class RunCatalogKey:
+    """What a run catalog depends on: the key under which the shelf keeps it."""
+
+    catalog: str
+    settings: str
+    epoch_year: float
+
+
+@dataclass(frozen=True)
+class Sky:
+    """A star catalog with the shelf that caches what is derived from it."""
+
+    catalog: Catalog
+    shelf: Shelf
+
+    def run_catalog(self, mission: Mission, time: Utc) -> RunCatalog:
+        """The run catalog that serves a mission at a time: that of the nearest epoch of its step."""
+        epoch_year = mission.catalog.epoch_of(time.julian_year)
+        key = RunCatalogKey(self.catalog.digest, mission.catalog.model_dump_json(), epoch_year)
+        run_catalog, _ = self.shelf.get(
+            key, lambda: build_run_catalog(self.catalog, mission.catalog, epoch_year)
+        )
+        return run_catalog
+
+    def zone(
+        self,
+        mission: Mission,
+        run_catalog: RunCatalog,
+        aim: Aim,
+        separation_max_deg: float,
+        grid_deg: float,
+    ) -> tuple[Zone, bool]:
+        """The zone that serves an aim, and whether it was on the shelf."""
+        return zone_for(self.shelf, mission.name, run_catalog, aim, separation_max_deg, grid_deg)
+
+    def drop_zones(self, mission: str | None = None) -> int:
+        """Take the zones of a mission, or all, off the shelf; how many there were."""
+        return self.shelf.drop(
+            lambda key: isinstance(key, ZoneKey) and mission in (None, key.mission)
+        )

@@ -1,0 +1,188 @@
+"""Zone catalogs: the stars of a cap or of a band, with their pair index.
+
+A zone is the set of stars whose angle to an axis lies between two bounds: a
+cap from zero to its radius, a band within its half width of the coelevation.
+
+The shelf keeps zones whose axis is snapped to a grid and whose bounds are
+grown by what the snapping may move the axis.  The identifier then keeps only
+the stars within the bounds about the exact axis, so that the answer to a batch
+depends neither on the grid nor on the batches before it.
+"""
+
+import math
+from collections.abc import Hashable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from service.sky.pairs import PairIndex, build_pairs
+from service.sky.run_catalog import RunCatalog
+from service.sky.shelf import Shelf
+from service.vectors import (
+    Vector,
+    angle_between_deg,
+    from_ra_dec,
+    read_only,
+    separation_deg,
+    to_ra_dec,
+)
+
+# Keeps a star that stands on a bound within the grown zone through rounding.
+_ROUNDING_DEG = 1e-9
+
+
+@dataclass(frozen=True)
+class Aim:
+    """Where to look: an exact axis (3,), inertial, and the bounds on the angle to it."""
+
+    kind: str
+    axis: Vector
+    least_deg: float
+    most_deg: float
+
+    def grown(self, by_deg: float) -> "Aim":
+        """The same with both bounds moved outwards."""
+        return Aim(
+            self.kind,
+            self.axis,
+            max(0.0, self.least_deg - by_deg),
+            min(180.0, self.most_deg + by_deg),
+        )
+
+    def reaches_past(self, boresight: Vector, radius_deg: float) -> bool:
+        """Whether a field of view about an inertial boresight goes beyond the bounds."""
+        angle = separation_deg(self.axis, boresight)
+        return angle + radius_deg > self.most_deg or (
+            self.least_deg > 0.0 and angle - radius_deg < self.least_deg
+        )
+
+
+@dataclass(frozen=True)
+class Zone:
+    """The stars of a zone, brightest first, and their pairs.
+
+    `star` holds the rows in the run catalog, ascending; `direction` (n, 3) and
+    `magnitude_mag` belong to them.
+    """
+
+    mission: str
+    run_catalog: str
+    aim: Aim
+    grid_deg: float
+    star: npt.NDArray[np.int32]
+    direction: Vector
+    magnitude_mag: Vector
+    pairs: PairIndex
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held."""
+        return (
+            self.star.nbytes + self.direction.nbytes + self.magnitude_mag.nbytes + self.pairs.nbytes
+        )
+
+    def summary(self) -> dict[str, Any]:
+        """What the zone is, as the interface shows it."""
+        ra_deg, dec_deg = to_ra_dec(self.aim.axis)
+        return {
+            "kind": self.aim.kind,
+            "ra_deg": float(ra_deg),
+            "dec_deg": float(dec_deg),
+            "stars": len(self.star),
+            "pairs": self.pairs.count,
+        }
+
+
+@dataclass(frozen=True)
+class ZoneKey:
+    """What a zone depends on: the key under which the shelf keeps it."""
+
+    mission: str
+    run_catalog: str
+    kind: str
+    axis: tuple[float, float, float]
+    least_deg: float
+    most_deg: float
+    pair_separation_max_deg: float
+
+
+def build_zone(
+    mission: str,
+    run_catalog: RunCatalog,
+    aim: Aim,
+    separation_max_deg: float,
+    grid_deg: float = 0.0,
+) -> Zone:
+    """Select the stars within the aim and index their pairs."""
+    cosine = run_catalog.direction @ aim.axis
+    low = math.cos(math.radians(min(180.0, aim.most_deg + 1e-4)))
+    high = math.cos(math.radians(max(0.0, aim.least_deg - 1e-4)))
+    # The cosine chooses cheaply and generously, the accurate angle decides.
+    near = (
+        np.flatnonzero((cosine >= low) & (cosine <= high))
+        if aim.least_deg > 0
+        else np.flatnonzero(cosine >= low)
+    )
+    angle = angle_between_deg(run_catalog.direction[near], aim.axis)
+    star = near[(angle >= aim.least_deg) & (angle <= aim.most_deg)].astype(np.int32)
+    direction = np.ascontiguousarray(run_catalog.direction[star])
+    return Zone(
+        mission=mission,
+        run_catalog=run_catalog.digest,
+        aim=aim,
+        grid_deg=grid_deg,
+        star=read_only(star),
+        direction=read_only(direction),
+        magnitude_mag=read_only(run_catalog.magnitude_mag[star]),
+        pairs=build_pairs(direction, separation_max_deg),
+    )
+
+
+def zone_for(
+    shelf: Shelf,
+    mission: str,
+    run_catalog: RunCatalog,
+    aim: Aim,
+    separation_max_deg: float,
+    grid_deg: float,
+) -> tuple[Zone, bool]:
+    """The zone that serves an aim, from the shelf or built, and whether it was there.
+
+    With a grid the zone's axis is the nearest grid point and its bounds are
+    grown by half the diagonal of a grid cell; grid 0 is the exact zone.
+    """
+    wide = aim
+    if grid_deg > 0.0:
+        grown = aim.grown(grid_deg / math.sqrt(2.0) + _ROUNDING_DEG)
+        wide = Aim(aim.kind, snapped(aim.axis, grid_deg), grown.least_deg, grown.most_deg)
+    x, y, z = (float(component) for component in wide.axis)
+    key: Hashable = ZoneKey(
+        mission,
+        run_catalog.digest,
+        wide.kind,
+        (x, y, z),
+        wide.least_deg,
+        wide.most_deg,
+        separation_max_deg,
+    )
+    return shelf.get(
+        key, lambda: build_zone(mission, run_catalog, wide, separation_max_deg, grid_deg)
+    )
+
+
+def snapped(axis: Vector, grid_deg: float) -> Vector:
+    """The grid point nearest to a direction: rows of declination, each cut into equal steps.
+
+    A step along a row is at most `grid_deg` of arc, so that no direction lies
+    farther than grid_deg / sqrt(2) from its point.
+    """
+    ra_deg, dec_deg = (float(angle) for angle in to_ra_dec(axis))
+    row_deg = round(dec_deg / grid_deg) * grid_deg
+    # The row's widest circle lies nearest to the equator, half a step from the row.
+    widest = max(0.0, abs(row_deg) - grid_deg / 2.0)
+    steps = max(1, math.ceil(360.0 * math.cos(math.radians(widest)) / grid_deg))
+    if abs(row_deg) >= 90.0:
+        return from_ra_dec(0.0, math.copysign(90.0, row_deg))
+    return from_ra_dec(round(ra_deg * steps / 360.0) % steps * 360.0 / steps, row_deg)
