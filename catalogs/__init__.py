@@ -1,0 +1,1 @@
+"""The embedded star catalog and how it is built."""

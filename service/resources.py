@@ -1,0 +1,19 @@
+"""Where the data that travels with the code is found.
+
+In a checkout the star catalog and the migrations stand beside the package; in
+an installed wheel they lie inside it, in `service/_shipped`.
+"""
+
+from pathlib import Path
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def shipped(*parts: str) -> Path:
+    """The path of a shipped file or folder, e.g. `shipped("catalogs", "stars.npz")`.
+
+    `parts` are the names of the path in the checkout.  Nothing is checked: a
+    file that is missing is reported by whoever opens it.
+    """
+    inside = _PACKAGE / "_shipped"
+    return (inside if inside.is_dir() else _PACKAGE.parent).joinpath(*parts)

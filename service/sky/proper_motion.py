@@ -1,0 +1,34 @@
+"""Where stars stand after some years of proper motion."""
+
+import numpy as np
+import numpy.typing as npt
+
+from service.vectors import ARCSEC_PER_RADIAN, Vector, from_ra_dec, unit
+
+
+def moved(
+    ra_deg: npt.ArrayLike,
+    dec_deg: npt.ArrayLike,
+    pm_ra_mas_per_year: npt.ArrayLike,
+    pm_dec_mas_per_year: npt.ArrayLike,
+    years: float,
+) -> Vector:
+    """Unit vectors (N, 3) of stars after some Julian years, seen from the barycentre.
+
+    Motion in right ascension is times cos(declination).  A star goes along the
+    straight line through space that its proper motion starts, which also holds
+    beside the pole; radial velocities are not known and taken as zero.
+    """
+    ra, dec = np.radians(ra_deg), np.radians(dec_deg)
+    sin_ra, cos_ra, sin_dec, cos_dec = np.sin(ra), np.cos(ra), np.sin(dec), np.cos(dec)
+    east = years / (1000.0 * ARCSEC_PER_RADIAN) * np.asarray(pm_ra_mas_per_year)
+    north = years / (1000.0 * ARCSEC_PER_RADIAN) * np.asarray(pm_dec_mas_per_year)
+    shift = np.stack(
+        [
+            -sin_ra * east - sin_dec * cos_ra * north,
+            cos_ra * east - sin_dec * sin_ra * north,
+            cos_dec * north,
+        ],
+        axis=-1,
+    )
+    return unit(from_ra_dec(ra_deg, dec_deg) + shift)
