@@ -5,7 +5,7 @@ Pure: an answer depends on the batch, the mission and the catalog alone.  Not
 finding a star is a result; only bad input raises.
 """
 
-import time
+from time import perf_counter_ns as clock_ns
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -20,17 +20,35 @@ from service.errors import BadBatch, Fault
 from service.identify.identification import Identification, Outcome
 from service.identify.presumed import Presumed, aim_of, presumed_attitude
 from service.identify.starid import Sighting, identify_by_votes
+from service.identify.verify import identify_verified
 from service.missions.mission import Band, Mission, Solver, Tests, Tolerances
-from service.observe.batch import APriori, BoresightPrior, ObservationBatch
+from service.observe.batch import (
+    APriori,
+    BoresightPrior,
+    ObservationBatch,
+    Options,
+    QuaternionPrior,
+    SunPointedPrior,
+    TrackerStars,
+)
 from service.observe.correct import CorrectedObservations, correct
 from service.sky.ephemeris import apparent, observer_velocity
 from service.sky.run_catalog import RunCatalog
+from service.sky.shelf import Shelf
 from service.sky.view import Sky
 from service.sky.zones import Aim, Zone
-from service.times import Utc
-from service.vectors import Vector, matrix_from_quaternion
+from service.times import Utc, parse_utc
+from service.vectors import (
+    ARCSEC_PER_RADIAN,
+    Vector,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+)
 
-IDENTIFIERS: Mapping[str, Callable[[Sighting], Identification]] = {"starid": identify_by_votes}
+IDENTIFIERS: Mapping[str, Callable[[Sighting], Identification]] = {
+    "starid": identify_by_votes,
+    "verified": identify_verified,
+}
 
 
 @dataclass(frozen=True)
@@ -108,20 +126,26 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
     choices = choices_of(batch, mission)
     corrected = correct(batch, mission)
     presumed = presumed_attitude(batch.a_priori, batch.time, mission)
+    velocity_c = None
+    if batch.aberration == "to_correct":
+        velocity_c = observer_velocity(batch.time, batch.velocity_km_per_s)
 
-    clock = [time.perf_counter_ns()]
+    clock = [clock_ns()]
     run_catalog = sky.run_catalog(mission, batch.time)
     places = [
         _place(each, index, presumed, mission, choices, run_catalog, sky)
         for index, each in enumerate(corrected)
     ]
-    clock.append(time.perf_counter_ns())
+    clock.append(clock_ns())
     identify = IDENTIFIERS[choices.identifier]
     identifications = [
         identify(
             Sighting(
                 np.dot(each.direction_body, presumed.attitude),
                 each.magnitude_mag,
+                each.sigma_arcsec / ARCSEC_PER_RADIAN,
+                presumed.known_axis,
+                np.zeros(3) if velocity_c is None else velocity_c,
                 aim,
                 zone,
                 choices.tolerances,
@@ -130,9 +154,9 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
         )
         for each, (aim, zone, _) in zip(corrected, places, strict=True)
     ]
-    clock.append(time.perf_counter_ns())
-    solved = _solve(batch, choices, corrected, identifications, run_catalog)
-    clock.append(time.perf_counter_ns())
+    clock.append(clock_ns())
+    solved = _solve(batch.time, velocity_c, choices, corrected, identifications, run_catalog)
+    clock.append(clock_ns())
 
     solution = solved if isinstance(solved, AttitudeSolution) else None
     trackers = tuple(
@@ -200,6 +224,54 @@ def warm_zones(sky: Sky, mission: Mission, prior: APriori, time: Utc) -> list[Zo
     ]
 
 
+def warm_up(sky: Sky, missions: Mapping[str, Mission]) -> None:
+    """Compile every kernel by running a batch of real stars of each kind of zone.
+
+    What is built for it goes on a shelf of its own and is forgotten.
+    """
+    moment = parse_utc("2000-01-01T12:00:00Z")
+    apart = Sky(sky.catalog, Shelf(max_bytes=0))
+    kinds = {mission.zone.kind: mission for mission in missions.values()}
+    for mission in kinds.values():
+        tracker = mission.trackers[0]
+        attitude = presumed_attitude(
+            SunPointedPrior(None, None)
+            if mission.zone.kind == "band"
+            else BoresightPrior(0.0, 0.0),
+            moment,
+            mission,
+        ).attitude
+        run_catalog = apart.run_catalog(mission, moment)
+        boresight = attitude.T @ tracker.body_from_tracker[:, 2]
+        stars = np.argsort(-(run_catalog.direction @ boresight))[:5]
+        seen = run_catalog.direction[stars] @ attitude.T @ tracker.body_from_tracker
+        none = np.full(len(stars), np.nan)
+        observed = TrackerStars(
+            tracker=tracker.name,
+            vector=seen,
+            angles_deg=np.full((len(stars), 2), np.nan),
+            magnitude_mag=run_catalog.magnitude_mag[stars],
+            time_offset_s=np.zeros(len(stars)),
+            sigma_arcsec=none,
+        )
+        acquire(
+            ObservationBatch(
+                spacecraft=mission.name,
+                batch="warm-up",
+                run="warm-up",
+                time=moment,
+                a_priori=QuaternionPrior(quaternion_from_matrix(attitude)),
+                body_rates_deg_per_s=np.zeros(3),
+                velocity_km_per_s=None,
+                aberration="to_correct",
+                observations=(observed,),
+                options=Options(zone_grid_deg=0.0),
+            ),
+            mission,
+            apart,
+        )
+
+
 def _place(
     corrected: CorrectedObservations,
     index: int,
@@ -221,7 +293,8 @@ def _place(
 
 
 def _solve(
-    batch: ObservationBatch,
+    time: Utc,
+    velocity_c: Vector | None,
     choices: Choices,
     corrected: tuple[CorrectedObservations, ...],
     identifications: list[Identification],
@@ -230,9 +303,8 @@ def _solve(
     masks = [identification.unique for identification in identifications]
     star = np.concatenate([i.star[m] for i, m in zip(identifications, masks, strict=True)])
     reference = run_catalog.direction[star]
-    if batch.aberration == "to_correct" and len(star):
-        velocity_c = observer_velocity(batch.time, batch.velocity_km_per_s)
-        reference = apparent(reference, velocity_c, batch.time)
+    if velocity_c is not None:
+        reference = apparent(reference, velocity_c, time)
     return solve_attitude(
         np.concatenate([c.direction_body[m] for c, m in zip(corrected, masks, strict=True)]),
         reference,
@@ -280,6 +352,10 @@ def _warnings(
             warnings.append(
                 f"field_of_view_past_zone_edge: the field of view of {tracker.name} reaches past "
                 "the edge of its zone; stars beyond it cannot be identified"
+            )
+        if each.identification.bounded:
+            warnings.append(
+                f"work_bound_hit: the search for the stars of {tracker.name} ended at its bound"
             )
         stars = each.identification.star[each.identification.unique]
         if len(np.unique(stars)) < len(stars):

@@ -31,7 +31,8 @@ class Identification:
     `star` is the row in the run catalog of the unique winner, -1 without one.
     `votes` and `runner_up` are STARID's highest and second-highest tallies,
     equal in a tie.  `rivals` are the tied rows of an ambiguous star, brightest
-    first.  `probability` is NaN where the identifier gives none.
+    first.  `probability` is NaN where the identifier gives none.  `bounded`: the
+    search ended at the most work allowed, and what it did not see may rival.
     """
 
     outcome: Integers
@@ -40,6 +41,7 @@ class Identification:
     runner_up: Integers
     rivals: tuple[tuple[int, ...], ...]
     probability: Vector
+    bounded: bool = False
 
     @property
     def unique(self) -> npt.NDArray[np.bool_]:

@@ -33,10 +33,15 @@ SAME_BORESIGHT_DEG = 0.01
 
 @dataclass(frozen=True)
 class Presumed:
-    """The presumed attitude (3, 3), inertial to body, and what is not known of it."""
+    """The presumed attitude (3, 3), inertial to body, and what is not known of it.
+
+    `known_axis` (inertial) is what alone is known where the roll is not: the
+    boresight, or in a band the pole, about which any rotation may come.
+    """
 
     attitude: Matrix
     roll_known: bool
+    known_axis: Vector | None
     growth_deg: float = 0.0
     warnings: list[str] = field(default_factory=list)
 
@@ -48,7 +53,8 @@ def presumed_attitude(prior: APriori, time: Utc, mission: Mission) -> Presumed:
     """
     if isinstance(prior, QuaternionPrior):
         attitude = matrix_from_quaternion(prior.quaternion)
-        return Presumed(attitude, True, warnings=_pole_warnings(attitude, time, mission))
+        pole = attitude.T @ mission.axis_body if isinstance(mission.zone, Band) else None
+        return Presumed(attitude, True, pole, warnings=_pole_warnings(pole, time))
     if isinstance(prior, BoresightPrior):
         if not isinstance(mission.zone, Cap):
             raise BadBatch(
@@ -59,7 +65,7 @@ def presumed_attitude(prior: APriori, time: Utc, mission: Mission) -> Presumed:
                 )
             )
         boresight = from_ra_dec(prior.ra_deg, prior.dec_deg)
-        return Presumed(_any_roll(mission.axis_body, boresight), False)
+        return Presumed(_any_roll(mission.axis_body, boresight), False, boresight)
     if not isinstance(mission.zone, Band):
         raise BadBatch(
             Fault(
@@ -89,7 +95,7 @@ def _sun_pointed(prior: SunPointedPrior, time: Utc, mission: Mission) -> Presume
         other = np.array([1.0, 0.0, 0.0])
     body = _frame(mission.axis_body, other)
     inertial = _frame(pole, ecliptic_north(time))
-    return Presumed(body.T @ inertial, False, growth_deg, warnings)
+    return Presumed(body.T @ inertial, False, pole, growth_deg, warnings)
 
 
 def _frame(first: Vector, second: Vector) -> Matrix:
@@ -107,10 +113,9 @@ def _any_roll(body_axis: Vector, inertial_axis: Vector) -> Matrix:
     return with_any(body_axis).T @ with_any(inertial_axis)
 
 
-def _pole_warnings(attitude: Matrix, time: Utc, mission: Mission) -> list[str]:
-    if not isinstance(mission.zone, Band):
+def _pole_warnings(pole: Vector | None, time: Utc) -> list[str]:
+    if pole is None:
         return []
-    pole = attitude.T @ mission.axis_body
     off_deg = separation_deg(pole, sun_direction(time, None))
     if off_deg <= POLE_FROM_SUN_WARNING_DEG:
         return []

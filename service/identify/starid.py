@@ -23,11 +23,17 @@ class Sighting:
     """What an identifier is given: one tracker's stars and where to look for them.
 
     `direction` (n, 3) is inertial through the presumed attitude; magnitudes may
-    be NaN.  `zone` holds at least the stars within `aim`.
+    be NaN; sigma is one standard deviation per tangent axis.  `zone` holds at
+    least the stars within `aim`.  Of the presumed attitude the whole rotation
+    is known, or only how it points `known_axis` (inertial).  `velocity_c` of the
+    observer is zero where aberration is not to be corrected.
     """
 
     direction: Vector
     magnitude_mag: Vector
+    sigma_rad: Vector
+    known_axis: Vector | None
+    velocity_c: Vector
     aim: Aim
     zone: Zone
     tolerances: Tolerances

@@ -20,6 +20,7 @@ import numpy.typing as npt
 from service.sky.pairs import PairIndex, build_pairs
 from service.sky.run_catalog import RunCatalog
 from service.sky.shelf import Shelf
+from service.sky.star_grid import StarGrid, build_star_grid
 from service.vectors import (
     Vector,
     angle_between_deg,
@@ -75,13 +76,13 @@ class Zone:
     direction: Vector
     magnitude_mag: Vector
     pairs: PairIndex
+    grid: StarGrid
 
     @property
     def nbytes(self) -> int:
         """Bytes held."""
-        return (
-            self.star.nbytes + self.direction.nbytes + self.magnitude_mag.nbytes + self.pairs.nbytes
-        )
+        parts = (self.star, self.direction, self.magnitude_mag, self.pairs, self.grid)
+        return sum(part.nbytes for part in parts)
 
     def summary(self) -> dict[str, Any]:
         """What the zone is, as the interface shows it."""
@@ -137,6 +138,7 @@ def build_zone(
         direction=read_only(direction),
         magnitude_mag=read_only(run_catalog.magnitude_mag[star]),
         pairs=build_pairs(direction, separation_max_deg),
+        grid=build_star_grid(direction),
     )
 
 
