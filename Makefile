@@ -87,7 +87,7 @@ openapi: $(DEV)
 
 # The second lock is bound to the first, so that one .venv serves both.
 lock: $(DEV)
-	@$(COMPILE) --upgrade --group build --output-file requirements.lock pyproject.toml
+	@$(COMPILE) --upgrade --group build --extra postgresql --output-file requirements.lock pyproject.toml
 	@$(COMPILE) --upgrade --group dev --extra postgresql --constraint requirements.lock \
 		--output-file requirements-dev.lock pyproject.toml
 

@@ -1,0 +1,1 @@
+"""WHAT WE KEEP: batches with their inputs, results, solutions and trends, in SQL."""

@@ -1,0 +1,207 @@
+"""A record in the making: everything of a result but the last number of its answer.
+
+The rows are taken from the answer itself, so that what a list or a trend says
+cannot differ from what the client was told.
+"""
+
+import dataclasses
+import json
+import time
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+
+from service.acquire import Acquisition
+from service.observe.wire import Submission
+from service.records.answer import answer_of, star_rows
+from service.times import DAY_S, HOUR_S, Utc
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Answered:
+    """An answer as it is stored and sent; `replayed` where it was stored before this request."""
+
+    id: str | None
+    """None for a what-if that was not to be recorded."""
+    body: bytes
+    replayed: bool
+
+
+@dataclass(frozen=True)
+class Buckets:
+    """Where in the trends a result counts: spacecraft, run, and the hour and day of its batch."""
+
+    spacecraft: str
+    run: str
+    hour: int
+    day: int
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A result that is computed and not yet recorded.
+
+    `batch` is the row of a first submission and None for a what-if.  `answer`
+    lacks the time that recording took.
+    """
+
+    acquisition: Acquisition
+    answer: Row
+    batch: Row | None
+    result: Row
+    stars: list[Row]
+    solution: Row | None
+    buckets: Buckets
+    key: str | None
+    solved_ns: int
+
+    @property
+    def id(self) -> str:
+        """The result's id."""
+        return str(self.result["id"])
+
+    @property
+    def identity(self) -> tuple[str, str, str]:
+        """(spacecraft, run, batch): what is unique among submissions."""
+        return self.answer["spacecraft"], self.answer["run"], self.answer["batch"]
+
+    def finish(self) -> bytes:
+        """The answer's JSON, `timings_us.record` being the time since the solution was there."""
+        self.answer["timings_us"]["record"] = (time.perf_counter_ns() - self.solved_ns) // 1000
+        return msgspec.json.encode(self.answer)
+
+
+def submission_draft(
+    submission: Submission,
+    acquisition: Acquisition,
+    *,
+    id: str,
+    received: Utc,
+    solved_ns: int,
+    key: str | None = None,
+) -> Draft:
+    """The draft of a batch's first result, which is current and gives the batch its id."""
+    batch = acquisition.batch
+    row = {
+        "id": id,
+        "spacecraft": batch.spacecraft,
+        "run": batch.run,
+        "batch": batch.batch,
+        "time": batch.time.text,
+        "time_ns": batch.time.tai_ns,
+        "received": received.text,
+        "fingerprint": submission.fingerprint,
+        "input": submission.text,
+    }
+    answer = answer_of(acquisition, id=id)
+    result = _result_row(
+        acquisition, answer, batch_id=id, parent=None, current=True, created=received
+    )
+    return _draft(acquisition, answer, row, result, key, solved_ns)
+
+
+def what_if_draft(
+    acquisition: Acquisition,
+    *,
+    id: str,
+    batch_id: str,
+    parent: str,
+    adopt: bool,
+    created: Utc,
+    solved_ns: int,
+) -> Draft:
+    """The draft of a further result of a batch, current if it is to be adopted."""
+    answer = answer_of(acquisition, id=id, parent=parent)
+    answer["recorded"] = True
+    result = _result_row(
+        acquisition, answer, batch_id=batch_id, parent=parent, current=adopt, created=created
+    )
+    return _draft(acquisition, answer, None, result, None, solved_ns)
+
+
+def counts_of(result: Row) -> "Counter[str]":
+    """What one current result adds to the trends."""
+    return Counter(
+        batches=1,
+        observed=result["observed"],
+        unique=result["unique"],
+        ambiguous=result["ambiguous"],
+        unmatched=result["unmatched"],
+        solved=int(result["status"] is not None),
+        suspect=int(result["status"] == "suspect"),
+    )
+
+
+def _draft(
+    acquisition: Acquisition,
+    answer: Row,
+    batch_row: Row | None,
+    result: Row,
+    key: str | None,
+    solved_ns: int,
+) -> Draft:
+    batch = acquisition.batch
+    stars = [{"result_id": result["id"], **vars(row)} for row in star_rows(acquisition)]
+    buckets = Buckets(
+        batch.spacecraft, batch.run, batch.time.bucket(HOUR_S), batch.time.bucket(DAY_S)
+    )
+    solution = _solution_row(acquisition, answer, result["id"])
+    return Draft(acquisition, answer, batch_row, result, stars, solution, buckets, key, solved_ns)
+
+
+def _result_row(
+    acquisition: Acquisition,
+    answer: Row,
+    *,
+    batch_id: str,
+    parent: str | None,
+    current: bool,
+    created: Utc,
+) -> Row:
+    batch = acquisition.batch
+    attitude = answer["attitude"]
+    return {
+        "id": answer["id"],
+        "batch_id": batch_id,
+        "parent_id": parent,
+        "current": current,
+        "created": created.text,
+        "spacecraft": batch.spacecraft,
+        "run": batch.run,
+        "time_ns": batch.time.tai_ns,
+        "identifier": answer["identifier"],
+        "options": options_text(acquisition),
+        "mission_digest": answer["provenance"]["mission"],
+        "catalog_digest": answer["provenance"]["catalog"],
+        **answer["counts"],
+        "status": attitude and attitude["status"],
+        "reason": answer["reason"],
+    }
+
+
+def options_text(acquisition: Acquisition) -> str:
+    """The options that a result was computed with, as JSON, what was not named left out."""
+    named = dataclasses.asdict(acquisition.batch.options)
+    return json.dumps({name: value for name, value in named.items() if value not in (None, {})})
+
+
+def _solution_row(acquisition: Acquisition, answer: Row, result_id: str) -> Row | None:
+    attitude, solution = answer["attitude"], acquisition.solution
+    if attitude is None or solution is None:
+        return None
+    q, p = attitude["quaternion"], attitude["covariance_arcsec2"]
+    return {
+        "result_id": result_id,
+        **dict(zip(("q1", "q2", "q3", "qc"), q, strict=True)),
+        "frame": attitude["frame"],
+        **{f"p{i + 1}{j + 1}": p[i][j] for i in range(3) for j in range(i, 3)},
+        "residual_rms_arcsec": attitude["residual_rms_arcsec"],
+        "predicted_rms_arcsec": solution.predicted_rms_arcsec,
+        "taste": attitude["taste"],
+        "method": attitude["method"],
+        "status": attitude["status"],
+    }

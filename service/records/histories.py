@@ -1,0 +1,122 @@
+"""Histories: attitudes, the state of a spacecraft, its settings, and the runs there are."""
+
+import json
+from typing import Any
+
+from sqlalchemy import Connection, Select, func, select
+
+from service.missions.mission import Mission
+from service.records.draft import Row
+from service.records.pages import PLACE, Page, Stretch, newest_first, oldest_first, page_of
+from service.records.reading import summaries, summary_of
+from service.records.tables import batches, missions, results, rollups_daily, runs, solutions
+from service.times import DAY_S, bucket_start
+
+
+def list_attitudes(
+    connection: Connection, stretch: Stretch, *, limit: int, cursor: str | None
+) -> Page:
+    """The attitudes of current results, oldest batch time first."""
+    chosen = [*stretch.conditions(), results.c.status.is_not(None)]
+    return page_of(connection, oldest_first(attitudes().where(*chosen), cursor), limit, attitude_of)
+
+
+def live_state(connection: Connection, mission: Mission, run: str) -> Row:
+    """How a spacecraft stands in a run: its newest batch and its newest attitude.
+
+    `state` is that of the newest batch: good, suspect, no_attitude, or
+    no_batches.  `attitude` has the time of the batch it belongs to, which may
+    be an older one.
+    """
+    chosen = Stretch(run, mission.name).conditions()
+    newest = newest_first(summaries().where(*chosen)).limit(1)
+    solved = newest_first(attitudes().where(*chosen, results.c.status.is_not(None))).limit(1)
+    batch = connection.execute(newest).mappings().first()
+    attitude = connection.execute(solved).mappings().first()
+    return {
+        "name": mission.name,
+        "description": mission.description,
+        "state": "no_batches" if batch is None else batch["status"] or "no_attitude",
+        "latest_batch": None if batch is None else summary_of(batch),
+        "attitude": None if attitude is None else attitude_of(attitude),
+    }
+
+
+def mission_history(connection: Connection, spacecraft: str) -> list[Row]:
+    """The settings that a spacecraft was served with, oldest first."""
+    query = (
+        select(missions)
+        .where(missions.c.spacecraft == spacecraft)
+        .order_by(missions.c.first_used, missions.c.digest)
+    )
+    return [
+        {
+            "digest": row["digest"],
+            "first_used": row["first_used"],
+            "settings": json.loads(row["settings"]),
+        }
+        for row in connection.execute(query).mappings()
+    ]
+
+
+def list_runs(connection: Connection) -> list[Row]:
+    """Every run with its number of batches, its spacecraft and the days it covers."""
+    daily = rollups_daily.c
+    query = select(
+        daily.spacecraft,
+        daily.run,
+        func.sum(daily.batches).label("batches"),
+        func.min(daily.bucket).label("first"),
+        func.max(daily.bucket).label("last"),
+    ).group_by(daily.run, daily.spacecraft)
+    parts: dict[str, list[Any]] = {}
+    for part in connection.execute(query.order_by(daily.run, daily.spacecraft)).mappings():
+        parts.setdefault(part["run"], []).append(part)
+    return [
+        {
+            "run": row["name"],
+            "created": row["created"],
+            "batches": int(sum(part["batches"] for part in parts[row["name"]])),
+            "spacecraft": [part["spacecraft"] for part in parts[row["name"]]],
+            "first_day": _day(min(part["first"] for part in parts[row["name"]])),
+            "last_day": _day(max(part["last"] for part in parts[row["name"]])),
+        }
+        for row in connection.execute(select(runs).order_by(runs.c.name)).mappings()
+        if row["name"] in parts
+    ]
+
+
+def _day(number: int) -> str:
+    return bucket_start(number, DAY_S).text[:10]
+
+
+def attitudes() -> Select[Any]:
+    """The query for what `attitude_of` shows."""
+    place = [results.c.id, *PLACE, batches.c.batch, batches.c.time]
+    return (
+        select(*place, *(column for column in solutions.c if column.name != "result_id"))
+        .join_from(results, batches, results.c.batch_id == batches.c.id)
+        .join(solutions, solutions.c.result_id == results.c.id)
+    )
+
+
+def attitude_of(row: Any) -> Row:
+    """An attitude in a history: of which batch, at what time, how good."""
+    p = {name: row[name] for name in ("p11", "p12", "p13", "p22", "p23", "p33")}
+    return {
+        "id": row["id"],
+        "batch": row["batch"],
+        "time": row["time"],
+        "quaternion": [row[name] for name in ("q1", "q2", "q3", "qc")],
+        "frame": row["frame"],
+        "covariance_arcsec2": [
+            [p["p11"], p["p12"], p["p13"]],
+            [p["p12"], p["p22"], p["p23"]],
+            [p["p13"], p["p23"], p["p33"]],
+        ],
+        "residual_rms_arcsec": row["residual_rms_arcsec"],
+        "predicted_rms_arcsec": row["predicted_rms_arcsec"],
+        "taste": row["taste"],
+        "method": row["method"],
+        "status": row["status"],
+    }

@@ -1,0 +1,192 @@
+"""From a submission to its stored answer: compute first, then one transaction, then answer."""
+
+import dataclasses
+import json
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
+
+import msgspec
+
+from service.acquire import Acquisition, acquire
+from service.errors import AcquisitionError, BadBatch, Busy, Fault, shown_value
+from service.missions.mission import Mission, mission_named
+from service.observe.wire import OptionsIn, Submission, submission_from_json
+from service.records.answer import answer_of
+from service.records.draft import Answered, Draft, Row, submission_draft, what_if_draft
+from service.records.identity import Identity, Taken, look_up, remember_key, stored_answers
+from service.records.ids import Ulids
+from service.records.reading import one_result
+from service.records.running import Running
+from service.records.store import Store
+from service.sky.view import Sky
+from service.times import Utc, parse_utc
+
+MAX_KEY_LENGTH = 255
+
+log = logging.getLogger(__name__)
+
+Observer = Callable[[Acquisition], None]
+Answers = list[Answered | AcquisitionError]
+
+
+class Intake:
+    """Takes batches in: each is identified, solved and recorded once, however often it is sent."""
+
+    def __init__(self, missions: Mapping[str, Mission], sky: Sky, store: Store) -> None:
+        self._missions = missions
+        self._sky = sky
+        self._store = store
+        self._ids = Ulids()
+        self._running = Running()
+        self.observers: list[Observer] = []
+        """Called with the acquisition of every batch that is new, after its commit."""
+
+    def submit(self, submission: Submission, key: str | None) -> Answered:
+        """Record a batch and answer it; a repeat gets the stored answer, at once or when it is."""
+        if key is not None:
+            _check_key(key)
+        while True:
+            stored = self._stored(submission, key)
+            if stored is not None:
+                return stored
+            with self._running.turn(identity_of(submission)) as mine:
+                if mine:
+                    return _raised(self._write([self._draft(submission, key)])[0])
+
+    def submit_many(self, submissions: Sequence[Submission]) -> Answers:
+        """`submit` of each in one transaction; an error stands in the place of what is refused."""
+        with self._store.reading() as connection:
+            registry = look_up(connection, {identity_of(each) for each in submissions})
+            found: list[Draft | Taken | AcquisitionError] = []
+            for each in submissions:
+                try:
+                    first = registry.first(identity_of(each), None, each.fingerprint)
+                except AcquisitionError as error:
+                    found.append(error)
+                else:
+                    found.append(first or self._draft_or_error(each))
+            repeats = {each.result_id for each in found if isinstance(each, Taken)}
+            stored = stored_answers(connection, repeats)
+        written = iter(self._write([each for each in found if isinstance(each, Draft)]))
+        answers: Answers = []
+        for one in found:
+            if isinstance(one, Draft):
+                answers.append(next(written))
+            elif isinstance(one, Taken):
+                answers.append(Answered(one.result_id, stored[one.result_id], replayed=True))
+            else:
+                answers.append(one)
+        return answers
+
+    def what_if(self, id: str, options: OptionsIn, *, record: bool, adopt: bool) -> Answered:
+        """Run a recorded batch again; `options` replace what they name of the result's own."""
+        with self._store.reading() as connection:
+            parent = one_result(connection, id)
+        batch = submission_from_json(parent["input"]).batch
+        merged = _merged(json.loads(parent["options"]), options)
+        batch = dataclasses.replace(batch, options=merged.to_options())
+        acquisition = acquire(batch, mission_named(self._missions, batch.spacecraft), self._sky)
+        solved_ns = time.perf_counter_ns()
+        if not (record or adopt):
+            answer = answer_of(acquisition, id=None, parent=id) | {"recorded": False}
+            return Answered(None, msgspec.json.encode(answer), replayed=False)
+        draft = what_if_draft(
+            acquisition,
+            id=self._ids.new(),
+            batch_id=parent["batch_id"],
+            parent=id,
+            adopt=adopt,
+            created=now(),
+            solved_ns=solved_ns,
+        )
+        return _raised(self._write([draft])[0])
+
+    def _stored(self, submission: Submission, key: str | None) -> Answered | None:
+        identity = identity_of(submission)
+        with self._store.reading() as connection:
+            registry = look_up(connection, [identity], [] if key is None else [key])
+            first = registry.first(identity, key, submission.fingerprint)
+            if first is None:
+                return None
+            body = stored_answers(connection, [first.result_id])[first.result_id]
+        if key is not None and key not in registry.keys:
+            self._store.writer.change(
+                lambda connection: remember_key(connection, identity, key, first)
+            ).result()
+        return Answered(first.result_id, body, replayed=True)
+
+    def _draft(self, submission: Submission, key: str | None = None) -> Draft:
+        received = now()
+        mission = mission_named(self._missions, submission.batch.spacecraft)
+        acquisition = acquire(submission.batch, mission, self._sky)
+        solved_ns = time.perf_counter_ns()
+        return submission_draft(
+            submission,
+            acquisition,
+            id=self._ids.new(),
+            received=received,
+            solved_ns=solved_ns,
+            key=key,
+        )
+
+    def _draft_or_error(self, submission: Submission) -> Draft | AcquisitionError:
+        try:
+            return self._draft(submission)
+        except AcquisitionError as error:
+            return error
+
+    def _write(self, drafts: Sequence[Draft]) -> Answers:
+        if not drafts:
+            return []
+        outcomes = self._store.writer.record(drafts).result()
+        answers: Answers = []
+        for draft, outcome in zip(drafts, outcomes, strict=True):
+            is_new = isinstance(outcome, Answered) and not outcome.replayed
+            # A what-if looks at the same stars again: there is nothing new to observe.
+            if is_new and draft.batch is not None:
+                self._tell(draft.acquisition)
+            # Neither is an answer to the batch: both say that nothing was decided about it.
+            if isinstance(outcome, Busy) or not isinstance(outcome, Answered | AcquisitionError):
+                raise outcome
+            answers.append(outcome)
+        return answers
+
+    def _tell(self, acquisition: Acquisition) -> None:
+        for observer in self.observers:
+            try:
+                observer(acquisition)
+            except Exception:
+                # The batch is recorded and its answer due, whoever looks on.
+                log.exception("an observer failed")
+
+
+def identity_of(submission: Submission) -> Identity:
+    """What is unique among submissions."""
+    batch = submission.batch
+    return batch.spacecraft, batch.run, batch.batch
+
+
+def now() -> Utc:
+    """This moment."""
+    return parse_utc(datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ"))
+
+
+def _merged(own: Row, options: OptionsIn) -> OptionsIn:
+    merged = dict(own)
+    for name, value in options.model_dump(exclude_none=True).items():
+        merged[name] = merged.get(name, {}) | value if isinstance(value, dict) else value
+    return OptionsIn.model_validate(merged)
+
+
+def _check_key(key: str) -> None:
+    if not (0 < len(key) <= MAX_KEY_LENGTH and key.isprintable()):
+        message = f"must be 1 to {MAX_KEY_LENGTH} printable characters"
+        raise BadBatch(Fault("Idempotency-Key", message, shown_value(key)))
+
+
+def _raised(answer: Answered | AcquisitionError) -> Answered:
+    if isinstance(answer, AcquisitionError):
+        raise answer
+    return answer

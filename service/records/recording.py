@@ -1,0 +1,129 @@
+"""Writing results: every row of a result, its part in the trends included, in one transaction."""
+
+from collections import Counter
+from collections.abc import Sequence
+
+from sqlalchemy import Connection, and_, select, update
+
+from service.errors import AcquisitionError
+from service.records import rollups
+from service.records.draft import Answered, Buckets, Draft, Row, counts_of
+from service.records.identity import Registry, Taken, look_up, stored_answers
+from service.records.statements import insert_all, insert_missing
+from service.records.tables import (
+    batches,
+    catalogs,
+    idempotency_keys,
+    missions,
+    results,
+    runs,
+    solutions,
+    star_results,
+)
+
+Outcome = Answered | AcquisitionError
+Changes = list[tuple[Buckets, "Counter[str]"]]
+
+
+def register(connection: Connection, mission_rows: Sequence[Row], catalog_row: Row) -> None:
+    """Note the settings and the catalog that results will name, unless they are known already."""
+    insert_missing(connection, missions, mission_rows)
+    insert_missing(connection, catalogs, [catalog_row])
+
+
+def record(connection: Connection, drafts: Sequence[Draft]) -> list[Outcome]:
+    """Record what is new among the drafts; one outcome each, in order.
+
+    Look, then insert: a submission that is already there, in the tables or
+    earlier among the drafts, gets the stored answer, and one whose identity or
+    key is taken by another body gets the error.  On PostgreSQL another process
+    may still insert between the two: then an `IntegrityError` is raised, and
+    to call again is to look again.
+    """
+    registry = look_up(
+        connection,
+        {draft.identity for draft in drafts if draft.batch is not None},
+        {draft.key for draft in drafts if draft.key is not None},
+    )
+    keys_before = set(registry.keys)
+    holders: list[Taken | AcquisitionError] = [_holder(draft, registry) for draft in drafts]
+    fresh = [
+        (draft, draft.finish())
+        for draft, holder in zip(drafts, holders, strict=True)
+        if isinstance(holder, Taken) and holder.result_id == draft.id
+    ]
+    _insert(connection, fresh)
+    insert_all(
+        connection,
+        idempotency_keys,
+        [
+            {"key": key, "fingerprint": taken.fingerprint, "result_id": taken.result_id}
+            for key, taken in sorted(registry.keys.items())
+            if key not in keys_before
+        ],
+    )
+    answers = {draft.id: body for draft, body in fresh}
+    missing = {h.result_id for h in holders if isinstance(h, Taken)} - answers.keys()
+    if missing:
+        answers |= stored_answers(connection, missing)
+    return [
+        Answered(holder.result_id, answers[holder.result_id], holder.result_id != draft.id)
+        if isinstance(holder, Taken)
+        else holder
+        for draft, holder in zip(drafts, holders, strict=True)
+    ]
+
+
+def _holder(draft: Draft, registry: Registry) -> Taken | AcquisitionError:
+    """Who holds what the draft asks for: an earlier result, or from now on the draft itself."""
+    if draft.batch is None:
+        return Taken(draft.id, "")
+    try:
+        first = registry.first(draft.identity, draft.key, draft.batch["fingerprint"])
+    except AcquisitionError as error:
+        return error
+    taken = first or Taken(draft.id, draft.batch["fingerprint"])
+    registry.enter(draft.identity, draft.key, taken)
+    return taken
+
+
+def _insert(connection: Connection, fresh: Sequence[tuple[Draft, bytes]]) -> None:
+    # Sorted, so that two processes that insert the same batches do not wait in a circle.
+    firsts = sorted(
+        ((draft, body) for draft, body in fresh if draft.batch is not None),
+        key=lambda each: each[0].identity,
+    )
+    names = {draft.answer["run"]: draft.batch["received"] for draft, _ in firsts if draft.batch}
+    insert_missing(
+        connection, runs, [{"name": name, "created": names[name]} for name in sorted(names)]
+    )
+    insert_all(connection, batches, [draft.batch for draft, _ in firsts if draft.batch])
+    _insert_results(connection, firsts)
+    changes: Changes = [(draft.buckets, counts_of(draft.result)) for draft, _ in firsts]
+    # What-ifs go one by one: of two that are adopted, the second supersedes the first.
+    for draft, body in fresh:
+        if draft.batch is None:
+            if draft.result["current"]:
+                changes.append((draft.buckets, _supersede(connection, draft)))
+            _insert_results(connection, [(draft, body)])
+    rollups.add(connection, changes)
+
+
+def _insert_results(connection: Connection, drafts: Sequence[tuple[Draft, bytes]]) -> None:
+    rows = [draft.result | {"answer": body.decode()} for draft, body in drafts]
+    insert_all(connection, results, rows)
+    insert_all(connection, star_results, [row for draft, _ in drafts for row in draft.stars])
+    insert_all(connection, solutions, [d.solution for d, _ in drafts if d.solution is not None])
+
+
+def _supersede(connection: Connection, draft: Draft) -> "Counter[str]":
+    """Take the place of the current result of a batch; what that changes in the trends."""
+    batch_id = draft.result["batch_id"]
+    # The lock on the batch orders the adoptions of several processes.
+    connection.execute(select(batches.c.id).where(batches.c.id == batch_id).with_for_update())
+    current = and_(results.c.batch_id == batch_id, results.c.current)
+    old = connection.execute(select(results).where(current)).mappings().one()
+    connection.execute(update(results).where(current).values(current=False))
+    change = counts_of(draft.result)
+    change.subtract(counts_of(dict(old)))
+    return change

@@ -1,0 +1,63 @@
+"""The database, open: who writes to it, and how to read from it."""
+
+import logging
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from sqlalchemy import Connection
+
+from service.records.database import bring_up_to_date, require_up_to_date
+from service.records.engines import database_url, reading_engine, writing_engine
+from service.records.writer import Writer
+
+log = logging.getLogger(__name__)
+
+# Two connections that write and checkpoint at the same moment can lose a transaction.
+_WAL_RESET_BUG = (3, 7, 0), (3, 51, 2)
+
+
+class Store:
+    """The one connection that writes, behind its thread, and the readers."""
+
+    def __init__(self, database: str) -> None:
+        """Open a database: SQLite is created and migrated, PostgreSQL must be up to date.
+
+        Raises `BadConfiguration` with what to do.
+        """
+        self.url = database_url(database)
+        self._writing = writing_engine(self.url)
+        try:
+            if self.url.drivername == "sqlite":
+                bring_up_to_date(self._writing)
+                _warn_of_old_sqlite()
+            else:
+                require_up_to_date(self._writing)
+        except BaseException:
+            self._writing.dispose()
+            raise
+        self._readers = reading_engine(self.url)
+        self.writer = Writer(self._writing)
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """A connection that sees one moment of the database and cannot write."""
+        with self._readers.connect() as connection, connection.begin():
+            yield connection
+
+    def close(self) -> None:
+        """Write what is queued, then let go of the database."""
+        self.writer.close()
+        # The writer goes last: the last connection to leave checkpoints the log.
+        self._readers.dispose()
+        self._writing.dispose()
+
+
+def _warn_of_old_sqlite() -> None:
+    first, last = _WAL_RESET_BUG
+    if first <= sqlite3.sqlite_version_info <= last:
+        log.warning(
+            "SQLite %s: let one process at a time write to the database; "
+            "two may lose rows before SQLite 3.51.3",
+            sqlite3.sqlite_version,
+        )

@@ -1,0 +1,96 @@
+"""One transaction of the writer: much work at once, and no failure reaches its neighbours."""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from sqlalchemy import Connection
+from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, ProgrammingError
+
+from service.records.draft import Draft
+from service.records.recording import Outcome, record
+
+Results = list[Outcome | Exception]
+
+MAX_LOOKS = 5
+
+
+@dataclass
+class Job:
+    """Drafts to record, or another change to make; and who waits for it."""
+
+    drafts: Sequence[Draft] = ()
+    change: Callable[[Connection], Any] | None = None
+    done: "Future[Any]" = field(default_factory=Future)
+
+    @property
+    def weight(self) -> int:
+        """How much there is to write."""
+        return len(self.drafts) or 1
+
+
+def transact(connection: Connection, jobs: Sequence[Job]) -> list[Any]:
+    """One outcome for each job: a result, or the error that concerns it alone."""
+    recorded = iter(_record(connection, [draft for job in jobs for draft in job.drafts]))
+    return [
+        [next(recorded) for _ in job.drafts]
+        if job.change is None
+        else _change(connection, job.change)
+        for job in jobs
+    ]
+
+
+def _record(connection: Connection, drafts: Sequence[Draft]) -> Results:
+    """All drafts together; where that fails, each by itself, so that one spoils no other."""
+    if not drafts:
+        return []
+    failure: Exception
+    for _ in range(MAX_LOOKS):
+        try:
+            with _savepoint(connection):
+                return list(record(connection, drafts))
+        except IntegrityError as error:
+            failure = error  # perhaps another process was faster: look again
+        except Exception as error:
+            if is_of_the_database(error):
+                raise
+            failure = error
+            break
+    if len(drafts) == 1:
+        return [failure]
+    return [outcome for draft in drafts for outcome in _record(connection, [draft])]
+
+
+def _change(connection: Connection, change: Callable[[Connection], Any]) -> Any:
+    try:
+        with _savepoint(connection):
+            return change(connection)
+    except Exception as error:
+        if is_of_the_database(error):
+            raise
+        return error
+
+
+@contextmanager
+def _savepoint(connection: Connection) -> Iterator[None]:
+    """Keep what the block does whole, or none of it.
+
+    Trouble of the database itself ends the whole transaction: SQLite, its disk
+    full, may have rolled it back already, and what came before would be lost.
+    """
+    savepoint = connection.begin_nested()
+    try:
+        yield
+    except BaseException as error:
+        if not is_of_the_database(error):
+            savepoint.rollback()
+        raise
+    savepoint.commit()
+
+
+def is_of_the_database(error: BaseException) -> bool:
+    """Whether an error is the database's, its disk's or its connection's, and no single row's."""
+    about_a_row = (IntegrityError, DataError, ProgrammingError)
+    return isinstance(error, DBAPIError) and not isinstance(error, about_a_row)

@@ -1,0 +1,126 @@
+"""The one thread that writes.
+
+It takes whatever is queued, writes it in one transaction, commits, and only
+then answers those who wait: under load a commit is shared by many, alone it is
+waited for by nobody else.  There is no timer.
+"""
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from typing import Any, TypeVar
+
+from sqlalchemy import Connection, Engine
+from sqlalchemy.exc import DBAPIError
+
+from service.errors import Busy
+from service.records.draft import Draft
+from service.records.transaction import Job, Results, is_of_the_database, transact
+
+log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+MAX_QUEUED = 10_000
+"""Drafts that may wait: a matter of seconds."""
+MAX_ATTEMPTS = 5
+RETRY_AFTER_S = 5
+
+# PostgreSQL's words for two writers that crossed; the one it stopped begins again.
+_CROSSED = ("40001", "40P01")
+
+
+class Writer:
+    """Writes what is queued, from one thread over one connection."""
+
+    def __init__(self, engine: Engine, max_queued: int = MAX_QUEUED) -> None:
+        self._engine = engine
+        self._max_queued = max_queued
+        self._queue: deque[Job] = deque()
+        self._queued = 0
+        self._closing = False
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
+        self._thread.start()
+
+    def record(self, drafts: Sequence[Draft]) -> "Future[Results]":
+        """Queue drafts for one transaction; raises `Busy` when too much is waiting.
+
+        The future gives one outcome each, in order: an answer, stored; or the
+        error that kept this draft, and no other, from being recorded.  Where
+        the database itself fails, the future raises `Busy`.
+        """
+        return self._put(Job(drafts=drafts))
+
+    def change(self, change: Callable[[Connection], T]) -> "Future[T]":
+        """Queue another change, which is kept whole or not at all, and may be made twice over."""
+        return self._put(Job(change=change))
+
+    def close(self) -> None:
+        """Refuse new work, write what is queued, and end the thread."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        self._thread.join()
+
+    def _put(self, job: Job) -> "Future[Any]":
+        # A request that is given up does not take its record back.
+        job.done.set_running_or_notify_cancel()
+        with self._changed:
+            if self._closing:
+                raise Busy("the service is stopping")
+            # A job that alone is larger than the queue is still taken by an empty one.
+            if self._queued and self._queued + job.weight > self._max_queued:
+                raise Busy(f"{self._queued} records are waiting to be written")
+            self._queue.append(job)
+            self._queued += job.weight
+            self._changed.notify()
+        return job.done
+
+    def _take(self) -> list[Job]:
+        with self._changed:
+            while not self._queue and not self._closing:
+                self._changed.wait()
+            jobs = list(self._queue)
+            self._queue.clear()
+            self._queued = 0
+        return jobs
+
+    def _run(self) -> None:
+        while jobs := self._take():
+            try:
+                outcomes = self._write(jobs)
+            except Exception as error:
+                log.error("%d pieces of work could not be written: %s", len(jobs), error)
+                for job in jobs:
+                    job.done.set_exception(_told(error))
+                continue
+            for job, outcome in zip(jobs, outcomes, strict=True):
+                if isinstance(outcome, Exception):
+                    job.done.set_exception(outcome)
+                else:
+                    job.done.set_result(outcome)
+
+    def _write(self, jobs: Sequence[Job], attempt: int = 1) -> list[Any]:
+        with self._engine.connect() as connection:
+            try:
+                with connection.begin():
+                    return transact(connection, jobs)
+            except BaseException as error:
+                # The next transaction shall not inherit what this one broke.
+                connection.invalidate()
+                crossed = getattr(getattr(error, "orig", None), "sqlstate", None) in _CROSSED
+                if not crossed or attempt == MAX_ATTEMPTS:
+                    raise
+        return self._write(jobs, attempt + 1)
+
+
+def _told(error: Exception) -> Exception:
+    """The error as those who wait get it: trouble of the database may pass, so it is `Busy`."""
+    if isinstance(error, DBAPIError) and is_of_the_database(error):
+        busy = Busy(f"the database cannot be written now: {error.orig}", RETRY_AFTER_S)
+        busy.__cause__ = error
+        return busy
+    return error

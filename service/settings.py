@@ -1,0 +1,83 @@
+"""The settings of the process, read from the environment once."""
+
+import ipaddress
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from service.errors import BadConfiguration, shown_value
+
+PREFIX = "ACQUIRE_"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What an operator may set; each field is the variable ACQUIRE_<FIELD>.
+
+    `database` is a SQLAlchemy URL.  `missions` is a folder with a site's own
+    mission files, `catalog` a site's own star catalog; None takes the shipped
+    ones alone.  `shelf_mb` bounds the cache of zones and run catalogs.
+    """
+
+    database: str = "sqlite:///acquire.db"
+    missions: Path | None = None
+    catalog: Path | None = None
+    shelf_mb: int = 256
+    host: str = "127.0.0.1"
+    port: int = 8000
+
+    def __post_init__(self) -> None:
+        if not self.database.strip():
+            raise _refusal("database", "must be a URL such as sqlite:///acquire.db", self.database)
+        if not 1 <= self.shelf_mb <= 1_000_000:
+            raise _refusal("shelf_mb", "must be from 1 to 1000000", self.shelf_mb)
+        if not 0 <= self.port <= 65535:
+            raise _refusal("port", "must be from 0 to 65535", self.port)
+        # Nobody is asked who they are, so nobody but this machine may ask.
+        if not _is_loopback(self.host):
+            raise _refusal("host", "must be a loopback address, such as 127.0.0.1", self.host)
+
+    @classmethod
+    def from_environment(cls, environment: Mapping[str, str] = os.environ) -> "Settings":
+        """The settings that the ACQUIRE_ variables ask for; an empty one counts as not set.
+
+        Raises `BadConfiguration` for a value that cannot be, and for a name
+        that is no setting: a misspelt ACQUIRE_DATABASE must not quietly record
+        somewhere else.
+        """
+        known = {PREFIX + field.name.upper(): field.name for field in fields(cls)}
+        given = {
+            name: text for name, text in environment.items() if name.startswith(PREFIX) and text
+        }
+        for name in given:
+            if name not in known:
+                raise BadConfiguration(f"{name}: no such setting; there are {', '.join(known)}")
+        return cls(**{known[name]: _read(known[name], text) for name, text in given.items()})
+
+
+_READERS: dict[str, Callable[[str], Any]] = {
+    "missions": Path,
+    "catalog": Path,
+    "shelf_mb": int,
+    "port": int,
+}
+
+
+def _read(field: str, text: str) -> Any:
+    try:
+        return _READERS.get(field, str)(text)
+    except ValueError:
+        raise _refusal(field, "must be a whole number", text) from None
+
+
+def _refusal(field: str, message: str, value: object) -> BadConfiguration:
+    return BadConfiguration(f"{PREFIX}{field.upper()}: {message} (got {shown_value(value)})")
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

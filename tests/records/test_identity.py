@@ -1,0 +1,179 @@
+"""Who was first: one body, one record, one answer."""
+
+import json
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from sqlalchemy import func, select
+
+from service.errors import BadBatch, BadInput, Conflict, KeyReused, NotFound
+from service.observe.wire import OptionsIn, submission_from_json
+from service.records.tables import batches, idempotency_keys, metadata, results, star_results
+
+REPEATS = 50
+
+
+def count(operations, table):
+    with operations.store.reading() as connection:
+        return connection.scalar(select(func.count()).select_from(table))
+
+
+def everything(operations):
+    with operations.store.reading() as connection:
+        return {
+            table.name: sorted(map(tuple, connection.execute(select(table))), key=repr)
+            for table in metadata.sorted_tables
+        }
+
+
+def outcome_of(function, *arguments):
+    try:
+        return function(*arguments)
+    except Exception as error:
+        return error
+
+
+def all_at_once(operations, sent):
+    """Submit from one thread each, all let go at the same moment."""
+    gate = threading.Barrier(len(sent))
+
+    def submit(each):
+        gate.wait()
+        return outcome_of(operations.submit, *each)
+
+    with ThreadPoolExecutor(len(sent)) as threads:
+        return list(threads.map(submit, sent))
+
+
+def test_the_same_body_gets_the_stored_answer_byte_for_byte(operations, make):
+    first = operations.submit(make())
+    again = operations.submit(make())
+    assert not first.replayed
+    assert again.replayed
+    assert (again.id, again.body) == (first.id, first.body)
+    assert count(operations, batches) == 1
+
+
+def test_white_space_and_the_order_of_keys_make_no_other_body(operations, make):
+    submission = make()
+    first = operations.submit(submission)
+    turned = dict(reversed(json.loads(submission.text).items()))
+    again = operations.submit(submission_from_json(json.dumps(turned, indent=3)))
+    assert again.body == first.body
+
+
+def test_another_body_under_a_batch_id_that_is_taken_is_a_conflict_and_changes_nothing(
+    operations, make
+):
+    operations.submit(make())
+    before = everything(operations)
+    with pytest.raises(Conflict, match="'b1'"):
+        operations.submit(make(stars=4))
+    assert everything(operations) == before
+
+
+def test_a_batch_id_is_taken_within_its_run_and_spacecraft_only(operations, make):
+    sent = [make(), make(run="again"), make(spacecraft="SWAS")]
+    assert len({operations.submit(each).id for each in sent}) == 3
+
+
+def test_a_key_with_another_body_is_refused_before_anything_else_is_looked_at(operations, make):
+    operations.submit(make("b1"), "key")
+    operations.submit(make("b2"))
+    before = everything(operations)
+    with pytest.raises(KeyReused, match="'key'"):
+        operations.submit(make("b3"), "key")
+    with pytest.raises(KeyReused):
+        # Both the key and the batch are taken: the key is what is told.
+        operations.submit(make("b2", stars=4), "key")
+    assert everything(operations) == before
+
+
+def test_a_key_with_the_same_body_gets_the_first_answer_even_after_another_was_adopted(
+    operations, make
+):
+    first = operations.submit(make(), "key")
+    wider = OptionsIn.model_validate({"tolerances": {"separation_deg": 0.01}})
+    operations.what_if(first.id, wider, record=True, adopt=True)
+    assert operations.submit(make(), "key").body == first.body
+    assert operations.submit(make()).body == first.body
+
+
+def test_a_key_that_comes_with_a_repeat_belongs_to_its_body_from_then_on(operations, make):
+    first = operations.submit(make())
+    assert operations.submit(make(), "late").body == first.body
+    with pytest.raises(KeyReused):
+        operations.submit(make("b2"), "late")
+
+
+@pytest.mark.parametrize("key", ["", "x" * 256, "a\nb"])
+def test_a_key_that_cannot_be_one_is_named(operations, make, key):
+    with pytest.raises(BadBatch, match="Idempotency-Key"):
+        operations.submit(make(), key)
+
+
+def test_what_is_refused_leaves_nothing_and_takes_no_identity(operations, make):
+    submission = make()
+    before = everything(operations)
+    wrong = json.loads(submission.text)
+    wrong["observations"][0]["tracker"] = "NO_SUCH"
+    with pytest.raises(BadInput, match="NO_SUCH"):
+        operations.submit(submission_from_json(json.dumps(wrong)), "key")
+    wrong = json.loads(submission.text) | {"spacecraft": "NO_SUCH"}
+    with pytest.raises(NotFound, match="NO_SUCH"):
+        operations.submit(submission_from_json(json.dumps(wrong)), "key")
+    assert everything(operations) == before
+    assert not operations.submit(submission, "key").replayed
+
+
+def test_fifty_concurrent_repeats_are_computed_and_recorded_once(operations, make):
+    submission = make()
+    computed = []
+    operations.observers.append(computed.append)
+    answers = all_at_once(operations, [(submission, "key")] * REPEATS)
+    assert len({(answer.id, answer.body) for answer in answers}) == 1
+    assert sum(not answer.replayed for answer in answers) == 1
+    assert len(computed) == 1
+    assert count(operations, results) == 1
+    assert count(operations, star_results) == 5
+
+
+def test_of_fifty_concurrent_bodies_under_one_batch_id_one_is_recorded(operations, make):
+    bodies = [make(stars=2 + index % 4) for index in range(REPEATS)]
+    outcomes = all_at_once(operations, [(body, None) for body in bodies])
+    recorded = [each for each in outcomes if not isinstance(each, Exception)]
+    assert len({each.body for each in recorded}) == 1
+    assert all(isinstance(each, Conflict) for each in outcomes if isinstance(each, Exception))
+    assert len(recorded) in (12, 13)
+    assert count(operations, results) == 1
+
+
+def test_of_fifty_concurrent_batches_under_one_key_one_is_recorded(operations, make):
+    outcomes = all_at_once(operations, [(make(f"b{i}"), "key") for i in range(REPEATS)])
+    errors = [each for each in outcomes if isinstance(each, Exception)]
+    assert len(errors) == REPEATS - 1
+    assert all(isinstance(error, KeyReused) for error in errors)
+    assert count(operations, results) == count(operations, idempotency_keys) == 1
+
+
+def test_two_services_on_one_database_record_a_batch_once(opened, make):
+    """The unique constraint decides between processes; whoever loses answers with the winner's."""
+    services = [opened(), opened()]
+    sent = [make(f"b{i}", after_s=60.0 * i) for i in range(40)]
+
+    def submit_all(operations):
+        return [operations.submit(each).body for each in sent]
+
+    def submit_chunks(operations):
+        return [
+            answer.body
+            for first in range(0, len(sent), 8)
+            for answer in operations.submit_many(sent[first : first + 8])
+        ]
+
+    work = [(submit_all, 0), (submit_all, 1), (submit_chunks, 0), (submit_chunks, 1)]
+    with ThreadPoolExecutor(len(work)) as threads:
+        bodies = list(threads.map(lambda each: each[0](services[each[1]]), work))
+    assert bodies[0] == bodies[1] == bodies[2] == bodies[3]
+    assert count(services[0], results) == len(sent)

@@ -1,0 +1,98 @@
+"""Whatever was acknowledged is stored, at whatever moment the process is killed."""
+
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from sqlalchemy import func, select
+
+from service.operations import Operations
+from service.records import rollups
+from service.records.tables import batches, results, solutions, star_results
+from service.settings import Settings
+from tests.records import samples
+
+KILLS = int(os.environ.get("TEST_KILLS", "8"))
+BATCHES_A_ROUND = 150
+CHECKOUT = Path(__file__).parents[2]
+
+
+def run_and_kill(database, file, output, after_s):
+    """Kill a worker `after_s` after its first acknowledgement; False: it had finished."""
+    with output.open("wb") as stdout:
+        command = [sys.executable, "-m", "tests.records.worker", database, str(file)]
+        worker = subprocess.Popen(command, stdout=stdout, stderr=subprocess.DEVNULL, cwd=CHECKOUT)
+        give_up = time.monotonic() + 60
+        while not output.stat().st_size and worker.poll() is None and time.monotonic() < give_up:
+            time.sleep(0.005)
+        time.sleep(after_s)
+        worker.kill()
+        return worker.wait() == -signal.SIGKILL
+
+
+def acknowledged_in(output):
+    # A line that the kill cut short was not heard by anybody.
+    return [
+        line.split() for line in output.read_text().splitlines(keepends=True) if line[-1:] == "\n"
+    ]
+
+
+def assert_whole(operations, acknowledged):
+    with operations.store.reading() as connection:
+        stored = {
+            id: hashlib.sha256(answer.encode()).hexdigest()
+            for id, answer in connection.execute(select(results.c.id, results.c.answer))
+        }
+        assert acknowledged.items() <= stored.items()
+        assert connection.scalar(select(func.count()).select_from(batches)) == len(stored)
+        stars = dict(
+            connection.execute(
+                select(star_results.c.result_id, func.count()).group_by(star_results.c.result_id)
+            ).all()
+        )
+        solved = set(connection.scalars(select(solutions.c.result_id)))
+        for row in connection.execute(select(results)).mappings():
+            assert stars[row["id"]] == row["observed"]
+            assert (row["id"] in solved) == (row["status"] is not None)
+        for bucket in ("hour", "day"):
+            assert rollups.stored(connection, bucket) == rollups.recount(connection, bucket)
+        if connection.dialect.name == "sqlite":
+            assert connection.exec_driver_sql("PRAGMA integrity_check").scalar() == "ok"
+            assert connection.exec_driver_sql("PRAGMA foreign_key_check").all() == []
+
+
+def test_nothing_acknowledged_is_lost_torn_or_doubled_by_kills(
+    database, tmp_path, sky, missions, rng
+):
+    """Each round repeats the batches of the one before, as clients do that were left waiting."""
+    acknowledged, killed = {}, 0
+    lines = []
+    for round_number in range(KILLS):
+        fresh = [
+            samples.batch(
+                sky,
+                missions,
+                f"{round_number}-{index}",
+                kind=samples.KINDS[index % len(samples.KINDS)],
+                after_s=60.0 * index,
+            )
+            for index in range(BATCHES_A_ROUND)
+        ]
+        file, output = tmp_path / "batches.ndjson", tmp_path / "acknowledged"
+        file.write_text("\n".join(lines[-BATCHES_A_ROUND:] + fresh))
+        lines += fresh
+        killed += run_and_kill(database, file, output, after_s=float(rng.uniform(0, 0.4)))
+        for id, digest in acknowledged_in(output):
+            assert acknowledged.setdefault(id, digest) == digest
+        operations = Operations.open(Settings(database=database))
+        try:
+            assert_whole(operations, acknowledged)
+        finally:
+            operations.close()
+    assert acknowledged
+    # Had the workers finished, nothing would have been shown.
+    assert killed > KILLS / 2

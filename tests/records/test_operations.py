@@ -1,0 +1,134 @@
+"""The one object that every door holds."""
+
+import json
+
+import pytest
+
+from service.errors import BadConfiguration, BadInput, Busy, Conflict, NotFound
+from service.observe.wire import OptionsIn, QuaternionIn, submission_from_json
+from service.operations import Operations
+from service.settings import Settings
+from service.times import parse_utc
+from tests.records.samples import KINDS, QUATERNION, without_accidents
+
+
+def told(outcome):
+    if isinstance(outcome, Exception):
+        return type(outcome), str(outcome)
+    return outcome.replayed, without_accidents(json.loads(outcome.body))
+
+
+def test_many_at_once_give_what_each_by_itself_gives(operations, make):
+    """The bulk path is the single path repeated: answers, refusals and repeats alike."""
+    wrong = json.loads(make("b4").text)
+    wrong["observations"][0]["tracker"] = "NO_SUCH"
+    unknown = json.loads(make("b5").text) | {"spacecraft": "HST"}
+    one_run = [
+        make("b0"),
+        *(make(f"b{i}", kind=kind, after_s=60.0 * i) for i, kind in enumerate(KINDS, start=1)),
+        submission_from_json(json.dumps(wrong | {"batch": "w"})),
+        submission_from_json(json.dumps(unknown)),
+        make("b0"),
+        make("b0", stars=4),
+        make("b9", spacecraft="SWAS"),
+    ]
+    other_run = [submission_from_json(each.text, run="bulk") for each in one_run]
+    operations.submit(one_run[-1])
+    operations.submit(other_run[-1])
+
+    def single(submission):
+        try:
+            return operations.submit(submission)
+        except Exception as error:
+            return error
+
+    singly = [told(single(each)) for each in one_run]
+    at_once = [told(each) for each in operations.submit_many(other_run)]
+    assert [first for first, _ in singly] == [first for first, _ in at_once]
+    assert [first for first, _ in at_once] == [
+        *[False] * 5,
+        BadInput,
+        NotFound,
+        True,
+        Conflict,
+        True,
+    ]
+    for (_, alone), (_, together) in zip(singly, at_once, strict=True):
+        if isinstance(alone, dict):
+            assert together == alone | {"run": "bulk"}
+        else:
+            assert together == alone.replace("run live", "run bulk")
+    live, bulk = (operations.rates("XTE", run=run) for run in ("live", "bulk"))
+    assert live == bulk
+
+
+def test_nothing_at_once_is_nothing(operations):
+    assert operations.submit_many([]) == []
+
+
+def test_observers_see_every_new_batch_once_and_neither_repeats_nor_what_ifs(operations, make):
+    seen = []
+    operations.observers.append(lambda acquisition: seen.append(acquisition.batch.batch))
+    first = operations.submit(make("b1"))
+    operations.submit(make("b1"))
+    operations.what_if(first.id, OptionsIn(), adopt=True)
+    operations.submit_many([make("b1"), make("b2"), make("b2"), make("b3")])
+    assert seen == ["b1", "b2", "b3"]
+
+
+def test_an_observer_that_fails_takes_no_answer_away(operations, make):
+    operations.observers.append(lambda acquisition: 1 / 0)
+    assert not operations.submit(make()).replayed
+
+
+def test_ready_means_warm_and_in_reach_of_the_database(operations):
+    operations.ready()
+    with operations._warming:
+        # What is warm stays so: nobody has to wait for it again.
+        operations.ready()
+
+
+def test_whoever_asks_while_another_warms_up_is_told_to_wait(operations):
+    with operations._warming, pytest.raises(Busy, match="warming up"):
+        operations.ready()
+
+
+def test_what_is_asked_after_closing_is_busy(opened, make):
+    operations = opened()
+    operations.close()
+    with pytest.raises(Busy, match="stopping"):
+        operations.submit(make())
+
+
+def test_what_was_recorded_is_there_when_opened_again(opened, make):
+    first = opened().submit(make())
+    again = opened().submit(make())
+    assert (again.replayed, again.body) == (True, first.body)
+
+
+def test_zones_show_what_is_cached_and_can_be_warmed_and_dropped(operations, make):
+    time = parse_utc("1996-01-10T12:00:00.000Z")
+    operations.drop_zones()
+    (warmed,) = operations.warm_zones("XTE", [QuaternionIn(quaternion=QUATERNION)], time)
+    assert warmed["kind"] == "cap"
+    answer = json.loads(operations.submit(make()).body)
+    assert answer["observations"][0]["zone"]["cached"]
+    shown = operations.zones()
+    (zone,) = shown["items"]
+    assert (zone["spacecraft"], zone["stars"]) == ("XTE", warmed["stars"])
+    assert zone["bytes"] > 0
+    assert zone["hits"] == 1
+    assert zone["build_us"] > 0
+    assert shown["bytes"] <= shown["max_bytes"]
+    assert operations.drop_zones("SWAS") == 0
+    assert operations.drop_zones("XTE") == 1
+    assert operations.zones()["items"] == []
+    with pytest.raises(NotFound):
+        operations.drop_zones("HST")
+
+
+@pytest.mark.parametrize("name", ["none.csv", "none.npz"])
+def test_a_catalog_that_cannot_be_read_is_a_mistake_in_the_configuration(tmp_path, name):
+    database = f"sqlite:///{tmp_path / 'acquire.db'}"
+    with pytest.raises(BadConfiguration, match=name):
+        Operations.open(Settings(database=database, catalog=tmp_path / name))

@@ -1,0 +1,124 @@
+"""Replays on the server: in the background, a line at a time, into a run of their own."""
+
+import io
+import json
+import time
+
+import pytest
+from sqlalchemy import update
+
+from service.errors import BadBatch
+from service.records.tables import replays
+
+
+def finished(operations, id):
+    give_up = time.monotonic() + 60
+    while (replay := operations.replay(id))["finished"] is None and time.monotonic() < give_up:
+        time.sleep(0.01)
+    return replay
+
+
+@pytest.fixture
+def lines(make):
+    return [make(f"b{index}", after_s=60.0 * index).text.encode() + b"\n" for index in range(10)]
+
+
+def test_every_line_is_recorded_in_the_run_and_none_in_live(operations, lines):
+    replay = finished(operations, operations.start_replay(lines, "pass-1", "pass-1.ndjson"))
+    assert replay["state"] == "done"
+    assert replay["lines"] == {"total": None, "done": 10, "refused": 0}
+    assert (replay["run"], replay["name"], replay["errors"]) == ("pass-1", "pass-1.ndjson", [])
+    assert replay["started"] <= replay["finished"]
+    assert [each["batches"] for each in operations.rates("XTE", run="pass-1")] == [10]
+    assert operations.rates("XTE") == []
+    assert operations.batches().items == []
+
+
+def test_a_bad_line_is_reported_with_its_number_and_the_rest_goes_on(operations, lines, make):
+    lines[3] = b'{"spacecraft": "XTE", "batch": \n'
+    lines[5] = b"\n"
+    lines[7] = make("b0", stars=4).text.encode() + b"\n"
+    replay = finished(operations, operations.start_replay(lines, "pass-1"))
+    assert replay["state"] == "done"
+    assert replay["lines"] == {"total": None, "done": 10, "refused": 2}
+    truncated, conflict = replay["errors"]
+    assert truncated["line"] == 4
+    assert truncated["problem"]["errors"]
+    assert (conflict["line"], "another body" in conflict["problem"]["detail"]) == (8, True)
+    assert len(operations.batches(run="pass-1").items) == 7
+
+
+def test_a_replay_is_safe_to_run_twice(operations, lines):
+    for _ in range(2):
+        replay = finished(operations, operations.start_replay(lines, "pass-1"))
+        assert replay["lines"]["refused"] == 0
+    assert [each["batches"] for each in operations.rates("XTE", run="pass-1")] == [10]
+
+
+def test_a_file_is_counted_and_its_stem_names_the_run(operations, lines, tmp_path):
+    file = tmp_path / "pass-2.ndjson"
+    file.write_bytes(b"".join(lines))
+    replay = finished(operations, operations.start_replay(file, name=file.name))
+    assert (replay["run"], replay["lines"]["total"]) == ("pass-2", 10)
+
+
+def test_lines_that_can_be_closed_are_closed_at_the_end(operations, lines):
+    file = io.BytesIO(b"".join(lines))
+    finished(operations, operations.start_replay(file, "pass-1"))
+    assert file.closed
+
+
+def test_the_first_thousand_errors_are_kept_and_all_are_counted(operations):
+    replay = finished(operations, operations.start_replay([b"{\n"] * 1200, "pass-1"))
+    assert replay["lines"]["refused"] == 1200
+    assert [each["line"] for each in replay["errors"]] == list(range(1, 1001))
+
+
+def test_lines_that_break_off_fail_the_replay_and_keep_what_was_read(operations, lines):
+    def broken():
+        yield from lines
+        raise OSError("the file is gone")
+
+    replay = finished(operations, operations.start_replay(broken(), "pass-1"))
+    assert replay["state"] == "failed"
+    assert "the file is gone" in replay["errors"][0]["problem"]["detail"]
+
+
+@pytest.mark.parametrize("run", ["no spaces", "-", "x" * 65])
+def test_a_run_that_cannot_be_named_so_is_refused(operations, run):
+    with pytest.raises(BadBatch, match="run"):
+        operations.start_replay([], run)
+
+
+def test_closing_interrupts_a_replay_and_keeps_what_it_recorded(opened, make):
+    def endless():
+        index = 0
+        while True:
+            yield make(f"b{index}").text.encode()
+            index += 1
+
+    operations = opened()
+    id = operations.start_replay(endless(), "endless")
+    give_up = time.monotonic() + 60
+    while operations.replay(id)["lines"]["done"] == 0 and time.monotonic() < give_up:
+        time.sleep(0.01)
+    operations.close()
+    later = opened()
+    replay = later.replay(id)
+    assert replay["state"] == "interrupted"
+    (run,) = later.runs()
+    assert run["batches"] == replay["lines"]["done"]
+
+
+def test_what_a_killed_process_left_running_is_marked_interrupted_on_opening(opened, lines):
+    operations = opened()
+    id = operations.start_replay(lines, "pass-1")
+    finished(operations, id)
+    left = update(replays).values(state="running", finished=None)
+    operations.store.writer.change(lambda connection: connection.execute(left)).result()
+    operations.close()
+    assert opened().replay(id)["state"] == "interrupted"
+
+
+def test_progress_is_json_ready(operations, lines):
+    json.dumps(finished(operations, operations.start_replay(lines, "pass-1")))

@@ -1,0 +1,109 @@
+"""Trends are at every moment the sums over the results that are current."""
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from service.observe.wire import OptionsIn
+from service.records import rollups
+from service.times import parse_utc
+from tests.records.samples import KINDS
+
+TIGHT = OptionsIn.model_validate({"tolerances": {"separation_deg": 1e-5}})
+WIDE = OptionsIn.model_validate({"tolerances": {"separation_deg": 0.05}})
+
+BATCH = st.fixed_dictionaries(
+    {
+        "kind": st.sampled_from(KINDS),
+        "run": st.sampled_from(["live", "again"]),
+        "spacecraft": st.sampled_from(["XTE", "SWAS"]),
+        "after_s": st.sampled_from([0.0, 1800.0, 3600.0, 50_000.0]),
+    }
+)
+WHAT_IF = st.tuples(
+    st.integers(0, 1000), st.sampled_from([TIGHT, WIDE]), st.booleans(), st.booleans()
+)
+
+
+def assert_equal_to_a_recount(operations):
+    with operations.store.reading() as connection:
+        for bucket in ("hour", "day"):
+            assert rollups.stored(connection, bucket) == rollups.recount(connection, bucket)
+
+
+@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(steps=st.lists(st.one_of(BATCH, WHAT_IF, st.lists(BATCH, max_size=4)), max_size=10))
+def test_they_equal_a_recount_after_any_sequence_of_batches_and_adoptions(operations, make, steps):
+    ids = []
+    serial = iter(range(len(steps) * 10))
+
+    def named(wanted):
+        # Examples share a database: names tell them apart, and the sums must hold all the same.
+        return make(f"{id(steps)}-{next(serial)}", **wanted)
+
+    for step in steps:
+        if isinstance(step, dict):
+            ids.append(operations.submit(named(step)).id)
+        elif isinstance(step, list):
+            ids += [each.id for each in operations.submit_many([named(each) for each in step])]
+        elif ids:
+            chosen, options, record, adopt = step
+            answered = operations.what_if(ids[chosen % len(ids)], options, record, adopt)
+            ids += [answered.id] if answered.id else []
+    assert_equal_to_a_recount(operations)
+
+
+def test_an_adopted_result_takes_the_place_of_the_old_one(operations, make):
+    first = operations.submit(make(kind="suspect"))
+    (before,) = operations.rates("XTE")
+    assert (before["unique"], before["solved"], before["suspect"]) == (5, 1, 1)
+    operations.what_if(first.id, TIGHT, record=True)
+    assert operations.rates("XTE") == [before]
+    operations.what_if(first.id, TIGHT, adopt=True)
+    (after,) = operations.rates("XTE")
+    assert (after["unique"], after["unmatched"]) == (4, 1)
+    assert (after["batches"], after["solved"], after["suspect"]) == (1, 1, 0)
+    assert_equal_to_a_recount(operations)
+
+
+def test_live_rates_never_include_a_named_run(operations, make):
+    operations.submit(make("b1"))
+    operations.submit(make("b1", run="again"))
+    operations.submit(make("b2", run="again"))
+    assert [each["batches"] for each in operations.rates("XTE")] == [1]
+    assert [each["batches"] for each in operations.rates("XTE", run="again")] == [2]
+
+
+def test_buckets_are_utc_hours_and_days_of_the_batch_time(operations, make):
+    for index, hours in enumerate((0, 0.5, 1, 11.75, 12.25)):
+        operations.submit(make(f"b{index}", after_s=3600 * hours))
+    hourly = operations.rates("XTE", bucket="hour")
+    assert [(each["start"][11:16], each["batches"]) for each in hourly] == [
+        ("12:00", 2),
+        ("13:00", 1),
+        ("23:00", 1),
+        ("00:00", 1),
+    ]
+    daily = operations.rates("XTE", bucket="day")
+    assert [(each["start"], each["batches"]) for each in daily] == [
+        ("1996-01-10T00:00:00.000Z", 4),
+        ("1996-01-11T00:00:00.000Z", 1),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "hours"),
+    [
+        ("1996-01-10T12:30:00Z", None, [12, 13]),
+        ("1996-01-10T13:00:00Z", None, [13]),
+        (None, "1996-01-10T13:00:00Z", [12]),
+        (None, "1996-01-10T13:00:00.001Z", [12, 13]),
+        ("1996-01-10T14:00:00Z", "1996-01-10T15:00:00Z", []),
+    ],
+)
+def test_a_range_takes_the_buckets_it_touches(operations, make, start, end, hours):
+    operations.submit(make("b1"))
+    operations.submit(make("b2", after_s=3600))
+    given_range = {"start": start and parse_utc(start), "end": end and parse_utc(end)}
+    shown = operations.rates("XTE", **given_range)
+    assert [int(each["start"][11:13]) for each in shown] == hours

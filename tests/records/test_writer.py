@@ -1,0 +1,164 @@
+"""The writer: shared commits, and failures that reach those they concern."""
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from sqlalchemy import event, func, insert, select
+from sqlalchemy.exc import IntegrityError, OperationalError
+
+from service.errors import Busy
+from service.records import rollups
+from service.records.store import Store
+from service.records.tables import results, runs
+from service.records.writer import Writer
+
+
+@pytest.fixture
+def store(database):
+    opened = Store(database)
+    yield opened
+    opened.close()
+
+
+def held_up(writer):
+    """Keep the writer busy until the event that is given back is set."""
+    begun, go_on = threading.Event(), threading.Event()
+
+    def wait(_connection):
+        begun.set()
+        go_on.wait(30)
+
+    writer.change(wait)
+    begun.wait(30)
+    return go_on
+
+
+def new_run(name):
+    return lambda connection: connection.execute(insert(runs).values(name=name, created="now"))
+
+
+def names(store):
+    with store.reading() as connection:
+        return sorted(connection.scalars(select(runs.c.name)))
+
+
+def test_what_waits_together_is_committed_together(store):
+    commits = []
+    event.listen(store._writing, "commit", commits.append)
+    go_on = held_up(store.writer)
+    waiting = [store.writer.change(new_run(f"run{i:02d}")) for i in range(20)]
+    go_on.set()
+    for each in waiting:
+        each.result(30)
+    assert len(names(store)) == 20
+    assert len(commits) == 2
+
+
+def test_an_answer_comes_after_its_commit(store):
+    for index in range(20):
+        store.writer.change(new_run(f"run{index:02d}")).result(30)
+        assert len(names(store)) == index + 1
+
+
+def test_one_change_that_fails_spoils_none_of_its_neighbours(store):
+    go_on = held_up(store.writer)
+    waiting = [store.writer.change(new_run(name)) for name in ("a", "b", "a", "c")]
+    go_on.set()
+    assert isinstance(waiting[2].exception(30), IntegrityError)
+    assert names(store) == ["a", "b", "c"]
+
+
+def test_one_draft_that_cannot_be_kept_spoils_none_of_its_neighbours(operations, make):
+    go_on = held_up(operations.store.writer)
+    drafts = [operations._intake._draft(make(name)) for name in ("b1", "b2", "b3")]
+    drafts[1].result["mission_digest"] = "sha256:of nothing that is there"
+    waiting = operations.store.writer.record(drafts)
+    go_on.set()
+    first, second, third = waiting.result(30)
+    assert isinstance(second, IntegrityError)
+    assert [operations.batch(each.id)["answer"]["batch"] for each in (first, third)] == ["b1", "b3"]
+    assert [each["batches"] for each in operations.rates("XTE")] == [2]
+
+
+def test_a_full_queue_is_busy_and_takes_work_again_once_it_is_written(store):
+    writer = Writer(store._writing, max_queued=3)
+    go_on = held_up(writer)
+    waiting = [writer.change(new_run(name)) for name in "abc"]
+    with pytest.raises(Busy, match="3 records are waiting"):
+        writer.change(new_run("d"))
+    go_on.set()
+    for each in waiting:
+        each.result(30)
+    writer.change(new_run("d")).result(30)
+    writer.close()
+    assert names(store) == ["a", "b", "c", "d"]
+
+
+def test_closing_writes_what_is_queued_and_refuses_the_rest(store):
+    go_on = held_up(store.writer)
+    waiting = [store.writer.change(new_run(name)) for name in "abc"]
+    with ThreadPoolExecutor(1) as thread:
+        closing = thread.submit(store.writer.close)
+        while not store.writer._closing:
+            pass
+        with pytest.raises(Busy, match="stopping"):
+            store.writer.change(new_run("d"))
+        go_on.set()
+        closing.result(30)
+    assert all(each.done() for each in waiting)
+    assert names(store) == ["a", "b", "c"]
+
+
+def test_a_commit_that_fails_reaches_everyone_who_waits_and_writing_goes_on(operations, make):
+    """The hook stands for a disk that fails at COMMIT: nothing of the transaction is kept."""
+    operations.submit(make("b0"))
+    engine = operations.store._writing
+
+    def fail(_connection):
+        raise OperationalError("COMMIT", {}, Exception("disk I/O error"))
+
+    event.listen(engine, "commit", fail)
+    with ThreadPoolExecutor(8) as threads:
+        waiting = [threads.submit(operations.submit, make(f"b{i}")) for i in range(8)]
+        errors = [each.exception(30) for each in waiting]
+    assert errors[0] is None  # recorded before: a repeat only reads
+    assert all(isinstance(error, Busy) for error in errors[1:])
+    assert "disk I/O error" in str(errors[1])
+    assert len(operations.batches().items) == 1
+    event.remove(engine, "commit", fail)
+    assert not any(operations.submit(make(f"b{i}")).replayed for i in range(1, 8))
+    assert len(operations.batches().items) == 8
+
+
+@pytest.mark.parametrize("empty_database", ["sqlite"], indirect=True)
+def test_a_full_disk_loses_nothing_acknowledged_and_writing_resumes_with_room(operations, make):
+    """SQLite's own bound on the file gives the error of a full disk, wherever it strikes."""
+    engine = operations.store._writing
+    limit = {"pages": 0}
+
+    def bound(connection, _record):
+        connection.execute(f"PRAGMA max_page_count = {limit['pages']}")
+
+    with operations.store.reading() as connection:
+        used = connection.exec_driver_sql("PRAGMA page_count").scalar()
+    event.listen(engine, "checkout", lambda connection, record, _proxy: bound(connection, record))
+    acknowledged, refused = [], []
+    for index in range(60):
+        limit["pages"] = used + index  # a little more room each time
+        try:
+            acknowledged.append(operations.submit(make(f"b{index}")))
+        except Busy as error:
+            refused.append(str(error))
+    assert acknowledged
+    assert refused
+    assert all("disk is full" in each for each in refused)
+    limit["pages"] = 1_000_000
+    assert not operations.submit(make("at last")).replayed
+    for each in acknowledged:
+        assert operations.batch(each.id)["current"]
+    with operations.store.reading() as connection:
+        stored = connection.scalar(select(func.count()).select_from(results))
+        assert stored == len(acknowledged) + 1
+        assert rollups.stored(connection, "hour") == rollups.recount(connection, "hour")
+        assert connection.exec_driver_sql("PRAGMA integrity_check").scalar() == "ok"

@@ -1,0 +1,62 @@
+"""Settings come from the environment, and a mistake is named."""
+
+from pathlib import Path
+
+import pytest
+
+from service.errors import BadConfiguration
+from service.settings import Settings
+
+
+def test_nothing_set_means_sqlite_here_and_loopback():
+    settings = Settings.from_environment({})
+    assert settings == Settings()
+    assert (settings.database, settings.host, settings.port) == (
+        "sqlite:///acquire.db",
+        "127.0.0.1",
+        8000,
+    )
+
+
+def test_every_setting_has_its_variable():
+    assert Settings.from_environment(
+        {
+            "ACQUIRE_DATABASE": "postgresql://user@host/name",
+            "ACQUIRE_MISSIONS": "/site/missions",
+            "ACQUIRE_CATALOG": "/site/catalog.npz",
+            "ACQUIRE_SHELF_MB": "64",
+            "ACQUIRE_HOST": "::1",
+            "ACQUIRE_PORT": "9000",
+            "HOME": "/root",
+        }
+    ) == Settings(
+        database="postgresql://user@host/name",
+        missions=Path("/site/missions"),
+        catalog=Path("/site/catalog.npz"),
+        shelf_mb=64,
+        host="::1",
+        port=9000,
+    )
+
+
+def test_an_empty_variable_counts_as_not_set():
+    assert Settings.from_environment({"ACQUIRE_PORT": "", "ACQUIRE_CATALOG": ""}) == Settings()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("ACQUIRE_PORT", "http", "whole number"),
+        ("ACQUIRE_PORT", "65536", "from 0 to 65535"),
+        ("ACQUIRE_SHELF_MB", "0", "from 1 to"),
+        ("ACQUIRE_SHELF_MB", "1.5", "whole number"),
+        ("ACQUIRE_DATABASE", "   ", "must be a URL"),
+        ("ACQUIRE_HOST", "0.0.0.0", "loopback"),
+        ("ACQUIRE_HOST", "example.org", "loopback"),
+        ("ACQUIRE_DATABSE", "sqlite:///x.db", "ACQUIRE_DATABASE"),
+    ],
+)
+def test_a_mistake_names_the_variable_and_what_is_allowed(name, value, said):
+    with pytest.raises(BadConfiguration, match=said) as refusal:
+        Settings.from_environment({name: value})
+    assert name in str(refusal.value)
