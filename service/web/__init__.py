@@ -1,0 +1,1 @@
+"""The HTTP door: routes, problems, metrics and the page."""

@@ -1,0 +1,91 @@
+"""The app, put together in one place."""
+
+import logging
+import threading
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import anyio.to_thread
+from fastapi import APIRouter, FastAPI
+from fastapi.routing import APIRoute
+from starlette.staticfiles import StaticFiles
+
+from service import __version__
+from service.operations import Operations
+from service.web.bodies import DEFAULT_LIMITS, Limits
+from service.web.dashboard import page
+from service.web.errors import add_error_handlers
+from service.web.metrics import Metrics
+from service.web.middleware import AroundRequests
+from service.web.reference import add_reference
+from service.web.routes import batches, probes, runs, spacecraft, zones
+
+log = logging.getLogger(__name__)
+
+WORKER_THREADS = 64
+"""Handlers run in threads, and those of concurrent repeats wait there for the first."""
+
+ROUTERS: tuple[APIRouter, ...] = (
+    batches.router,
+    spacecraft.router,
+    zones.router,
+    runs.router,
+    probes.router,
+    page.router,
+)
+
+
+def create_app(operations: Operations, limits: Limits = DEFAULT_LIMITS) -> FastAPI:
+    """The app over open operations, which it closes when it has served its last request."""
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        anyio.to_thread.current_default_thread_limiter().total_tokens = WORKER_THREADS
+        warming = threading.Thread(target=_warm_up, args=(operations,), name="warm-up")
+        warming.start()
+        try:
+            yield
+        finally:
+            await anyio.to_thread.run_sync(warming.join)
+            await anyio.to_thread.run_sync(operations.close)
+
+    app = bare_app()
+    app.router.lifespan_context = lifespan
+    app.state.operations = operations
+    app.state.limits = limits
+    app.state.metrics = Metrics(operations)
+    app.add_middleware(AroundRequests, metrics=app.state.metrics)
+    return app
+
+
+def bare_app() -> FastAPI:
+    """The app without anything behind it: enough to describe it."""
+    app = FastAPI(
+        title="Attitude acquisition",
+        version=__version__,
+        # The framework's own pages load scripts from elsewhere.
+        docs_url=None,
+        redoc_url=None,
+        openapi_url="/api/v1/openapi.json",
+        redirect_slashes=False,
+        generate_unique_id_function=_operation_id,
+    )
+    for router in ROUTERS:
+        app.include_router(router)
+    app.state.routes = [route for router in ROUTERS for route in router.routes]
+    app.mount("/static", StaticFiles(packages=[("service.web.dashboard", "static")]))
+    add_error_handlers(app)
+    add_reference(app)
+    return app
+
+
+def _warm_up(operations: Operations) -> None:
+    try:
+        operations.ready()
+    except Exception as error:
+        # Whoever asks /readyz is told, and the next call tries again.
+        log.warning("not ready yet: %s", error)
+
+
+def _operation_id(route: APIRoute) -> str:
+    return route.name

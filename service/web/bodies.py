@@ -1,0 +1,166 @@
+"""Reading a request's body: its type checked, its size capped while it streams, its time bounded.
+
+The server below has no deadline for a body and the framework would buffer
+one whole, whatever its size.  A body that is too large is refused as soon as
+it passes the bound; what still arrives of it is dropped unread.
+"""
+
+import tempfile
+from collections.abc import AsyncIterator, Iterator
+from dataclasses import dataclass
+from typing import IO, Annotated, TypeVar
+
+import anyio
+from fastapi import Depends
+from pydantic import BaseModel, ValidationError
+from pydantic_core import from_json
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+
+from service.errors import BadBatch, BadInput, Fault
+from service.observe.wire import Submission, faults_of, submission_from_json
+from service.web.errors import NotJson
+
+JSON = "application/json"
+NDJSON = ("application/x-ndjson", "application/ndjson", "application/jsonl")
+
+MAX_JSON_BYTES = 2 << 20
+"""Ten thousand stars still fit, so that their number is what is complained of."""
+
+Body = TypeVar("Body", bound=BaseModel)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How large and how slow a body may be."""
+
+    json_bytes: int = MAX_JSON_BYTES
+    replay_bytes: int = 1 << 30
+    pause_s: float = 20.0
+    """The longest wait for the next piece of a body."""
+    json_s: float = 60.0
+    replay_s: float = 3600.0
+
+
+DEFAULT_LIMITS = Limits()
+
+
+def _limits(request: Request) -> Limits:
+    limits = request.app.state.limits
+    assert isinstance(limits, Limits)
+    return limits
+
+
+def _require_type(request: Request, allowed: tuple[str, ...]) -> None:
+    # Also a guard: a page of another site can only send form types without asking first.
+    sent = request.headers.get("content-type", "")
+    kind, _, parameters = sent.partition(";")
+    kind, parameters = kind.strip().lower(), parameters.strip().lower().replace('"', "")
+    json_like = JSON in allowed and kind.startswith("application/") and kind.endswith("+json")
+    if kind not in allowed and not json_like:
+        raise HTTPException(415, f"Content-Type must be {allowed[0]}, not {sent[:80] or 'absent'}")
+    if parameters.startswith("charset=") and parameters not in ("charset=utf-8", "charset=utf8"):
+        raise HTTPException(415, f"the body must be in UTF-8, not {parameters[:40]}")
+    coding = request.headers.get("content-encoding", "identity")
+    if coding.lower() != "identity":
+        detail = f"Content-Encoding {coding[:40]} is not supported; send the body as it is"
+        raise HTTPException(415, detail, {"Accept-Encoding": "identity"})
+
+
+async def _pieces(
+    request: Request, max_bytes: int, pause_s: float, total_s: float
+) -> AsyncIterator[bytes]:
+    too_large = HTTPException(413, f"the body may have at most {max_bytes} bytes")
+    declared = request.headers.get("content-length", "")
+    if (
+        declared.isascii()
+        and declared.isdigit()
+        and (len(declared) > 15 or int(declared) > max_bytes)
+    ):
+        raise too_large
+    received = 0
+    stream = aiter(request.stream())
+    deadline = anyio.current_time() + total_s
+    while True:
+        left = min(pause_s, deadline - anyio.current_time())
+        try:
+            with anyio.fail_after(left):
+                piece = await anext(stream, None)
+        except TimeoutError:
+            detail = f"the body did not arrive in time ({received} bytes did)"
+            raise HTTPException(408, detail, {"Connection": "close"}) from None
+        if piece is None:
+            return
+        received += len(piece)
+        if received > max_bytes:
+            raise too_large
+        yield piece
+
+
+async def json_body(request: Request) -> bytes:
+    """The bytes of a JSON body."""
+    _require_type(request, (JSON,))
+    limits = _limits(request)
+    pieces = _pieces(request, limits.json_bytes, limits.pause_s, limits.json_s)
+    return b"".join([piece async for piece in pieces])
+
+
+async def ndjson_body(request: Request) -> IO[bytes]:
+    """The file of an NDJSON body, rewound; it has no name and is gone once it is closed."""
+    _require_type(request, NDJSON)
+    limits = _limits(request)
+    file = tempfile.TemporaryFile()  # noqa: SIM115 - whoever reads the lines closes it
+    try:
+        async for piece in _pieces(request, limits.replay_bytes, limits.pause_s, limits.replay_s):
+            file.write(piece)
+    except BaseException:
+        file.close()
+        raise
+    if file.tell() == 0:
+        file.close()
+        raise BadBatch(Fault("body", "there are no lines; it must hold a batch a line"))
+    file.seek(0)
+    return file
+
+
+def lines_of(file: IO[bytes], max_bytes: int) -> Iterator[bytes]:
+    """The lines of a file, which is closed after the last one.
+
+    Of a line longer than `max_bytes` only its beginning is given, which is no
+    JSON and is reported with its number like any other bad line.
+    """
+    with file:
+        while line := file.readline(max_bytes):
+            yield line
+            while len(line) == max_bytes and not line.endswith(b"\n"):
+                line = file.readline(max_bytes)
+
+
+def read_submission(body: bytes) -> Submission:
+    """The batch in a body; raises `NotJson` or `BadBatch`."""
+    try:
+        return submission_from_json(body)
+    except BadInput as error:
+        _require_json(body, error)
+        raise
+
+
+def read_model(model: type[Body], body: bytes) -> Body:
+    """The checked object in a body; an empty body is the object with every default."""
+    try:
+        return model.model_validate_json(body or b"{}")
+    except ValidationError as error:
+        refusal = BadBatch(faults_of(error))
+        _require_json(body, refusal)
+        raise refusal from None
+
+
+def _require_json(body: bytes, refusal: BadInput) -> None:
+    # Only looked at when something is wrong: is it the form of the text, or what it says?
+    try:
+        from_json(body)
+    except ValueError:
+        raise NotJson(refusal.faults) from None
+
+
+JsonBody = Annotated[bytes, Depends(json_body)]

@@ -1,0 +1,1 @@
+"""The page at `/`: how well stars are identified, spacecraft by spacecraft."""

@@ -1,0 +1,171 @@
+"""Every error as a problem (RFC 9457): the one place that knows which error has which status.
+
+A client's mistake names the field and the value.  A mistake of ours is
+logged, and its answer says nothing of what is inside.
+"""
+
+import json
+import logging
+from dataclasses import dataclass
+from http import HTTPStatus
+
+from fastapi import FastAPI
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import Response
+from starlette.routing import Match
+
+from service.errors import (
+    AcquisitionError,
+    BadInput,
+    Busy,
+    Conflict,
+    Fault,
+    KeyReused,
+    NotAvailable,
+    NotFound,
+    shown_value,
+)
+
+MEDIA_TYPE = "application/problem+json"
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What all problems of one kind share; a `slug` makes a type of its own."""
+
+    status: int
+    title: str
+    slug: str | None = None
+
+    @property
+    def type(self) -> str:
+        """The problem's `type`; without a slug the status says all."""
+        return "about:blank" if self.slug is None else f"/problems/{self.slug}"
+
+
+KINDS: dict[type[AcquisitionError], Kind] = {
+    BadInput: Kind(422, "The input is refused", "bad-input"),
+    NotAvailable: Kind(422, "This is not there yet", "not-available"),
+    NotFound: Kind(404, "There is no such thing", "not-found"),
+    Conflict: Kind(409, "The batch is recorded with another body", "conflict"),
+    KeyReused: Kind(422, "The Idempotency-Key is taken by another body", "key-reused"),
+    Busy: Kind(503, "The service cannot take this now", "busy"),
+}
+OUR_FAULT = Kind(500, HTTPStatus(500).phrase)
+
+
+def kind_of(error: AcquisitionError) -> Kind:
+    """The kind of an error: its own, or that of the nearest class above it."""
+    return next((KINDS[each] for each in type(error).__mro__ if each in KINDS), OUR_FAULT)
+
+
+class NotJson(BadInput):
+    """A body that is no JSON at all: truncated, empty, in another encoding."""
+
+
+KINDS[NotJson] = Kind(400, "The body is not JSON", "not-json")
+
+
+def problem(
+    request: Request,
+    kind: Kind,
+    detail: str,
+    faults: tuple[Fault, ...] = (),
+    headers: dict[str, str] | None = None,
+) -> Response:
+    """The answer that tells of a problem."""
+    content: dict[str, object] = {
+        "type": kind.type,
+        "title": kind.title,
+        "status": kind.status,
+        "detail": detail,
+        "instance": request.url.path,
+    }
+    if faults:
+        content["errors"] = [
+            {"field": each.field, "message": each.message, "value": each.value} for each in faults
+        ]
+    # ASCII only: a client's text may hold lone surrogates, which UTF-8 cannot carry.
+    body = json.dumps(content, ensure_ascii=True, separators=(",", ":"))
+    return Response(body, kind.status, headers, media_type=MEDIA_TYPE)
+
+
+async def _on_acquisition_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, AcquisitionError)
+    kind = kind_of(error)
+    if kind.status == 500:
+        return our_fault(request, error)
+    if isinstance(error, BadInput):
+        return problem(request, kind, _summary(error.faults), error.faults)
+    headers = {"Retry-After": str(error.retry_after_s)} if isinstance(error, Busy) else None
+    return problem(request, kind, str(error), headers=headers)
+
+
+def _summary(faults: tuple[Fault, ...]) -> str:
+    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+    return f"{faults[0]}{more}" if faults else "The input is refused."
+
+
+async def _on_query_fault(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    faults = tuple(
+        Fault(
+            ".".join(str(part) for part in each["loc"][1:]) or str(each["loc"][0]),
+            str(each["msg"]).removeprefix("Value error, "),
+            None if each["type"] == "missing" else shown_value(each["input"]),
+        )
+        for each in error.errors()
+    )
+    return problem(request, KINDS[BadInput], _summary(faults), faults)
+
+
+async def _on_http_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    phrase = HTTPStatus(error.status_code).phrase
+    headers = dict(error.headers or {})
+    detail = error.detail
+    if error.status_code == 405:
+        headers["Allow"] = ", ".join(_methods_at(request))
+        detail = f"{request.method} does not work here; {headers['Allow']} do"
+    if error.status_code == 404 and detail == phrase:
+        detail = "There is nothing at this address; the routes are in /api/v1/openapi.json"
+    return problem(request, Kind(error.status_code, phrase), detail, headers=headers)
+
+
+def _methods_at(request: Request) -> list[str]:
+    # The router names the methods of the first route it meets; there may be several on one path.
+    methods: set[str] = set()
+    for route in request.app.state.routes:
+        match, _ = route.matches(request.scope)
+        if match is not Match.NONE:
+            methods |= route.methods
+    if not methods or "GET" in methods:
+        methods |= {"GET", "HEAD"}
+    return sorted(methods)
+
+
+def our_fault(request: Request, error: Exception) -> Response:
+    """Log an error that nobody foresaw, and answer without a word of what is inside."""
+    log.error("%s %s failed", request.method, request.url.path, exc_info=error)
+    return problem(
+        request,
+        OUR_FAULT,
+        "The fault is on the service's side; it is logged.",
+    )
+
+
+async def _on_disconnect(request: Request, error: Exception) -> Response:
+    # Nobody reads this answer.
+    return Response(status_code=400)
+
+
+def add_error_handlers(app: FastAPI) -> None:
+    """Let every error that is raised on purpose answer as a problem."""
+    app.add_exception_handler(AcquisitionError, _on_acquisition_error)
+    app.add_exception_handler(RequestValidationError, _on_query_fault)
+    app.add_exception_handler(HTTPException, _on_http_error)
+    app.add_exception_handler(ClientDisconnect, _on_disconnect)

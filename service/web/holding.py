@@ -1,0 +1,47 @@
+"""What every handler is given: the operations and the metrics that the app holds."""
+
+from typing import Annotated, Any
+
+import msgspec
+from fastapi import Depends
+from starlette.requests import Request
+from starlette.responses import Response
+
+from service.operations import Operations, Page
+from service.web.bodies import JSON
+from service.web.metrics import Metrics
+
+_JSON = msgspec.json.Encoder()
+
+
+def _operations(request: Request) -> Operations:
+    operations = request.app.state.operations
+    assert isinstance(operations, Operations)
+    return operations
+
+
+def _metrics(request: Request) -> Metrics:
+    metrics = request.app.state.metrics
+    assert isinstance(metrics, Metrics)
+    return metrics
+
+
+Held = Annotated[Operations, Depends(_operations)]
+Counted = Annotated[Metrics, Depends(_metrics)]
+
+
+def json_response(
+    content: Any, status: int = 200, headers: dict[str, str] | None = None
+) -> Response:
+    """An answer of plain values."""
+    return Response(_JSON.encode(content), status, headers, media_type=JSON)
+
+
+def page_response(request: Request, page: Page) -> Response:
+    """A page; where there is another, `Link` leads to it with the same filters."""
+    headers = None
+    if page.next_cursor is not None:
+        following = request.url.include_query_params(cursor=page.next_cursor)
+        headers = {"Link": f'<{following.path}?{following.query}>; rel="next"'}
+    content = {"items": page.items, "next_cursor": page.next_cursor}
+    return json_response(content, headers=headers)

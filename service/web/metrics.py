@@ -1,0 +1,97 @@
+"""Counters for Prometheus, in a registry of the app's own: no state is shared between apps."""
+
+from collections.abc import Iterator
+
+from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+from starlette.types import Scope
+
+from service.acquire import Acquisition
+from service.operations import LIVE, Operations
+
+OUTCOMES = ("unique", "ambiguous", "unmatched")
+_METHODS = ("GET", "POST", "DELETE", "PUT", "PATCH", "OPTIONS")
+_SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
+
+
+class _Zones(Collector):
+    """The cache of zones, read when asked."""
+
+    def __init__(self, operations: Operations) -> None:
+        self._operations = operations
+
+    def collect(self) -> Iterator[Metric]:
+        shelf = self._operations.sky.shelf.state()
+        yield CounterMetricFamily(
+            "starid_zone_cache_hits", "Zones that were at hand.", value=shelf.hits
+        )
+        yield CounterMetricFamily(
+            "starid_zone_cache_misses", "Zones that had to be built.", value=shelf.misses
+        )
+        yield CounterMetricFamily(
+            "starid_zone_build_seconds", "Time spent building zones.", value=shelf.build_us / 1e6
+        )
+        yield GaugeMetricFamily(
+            "starid_zone_cache_bytes", "Memory the cached zones hold.", value=shelf.nbytes
+        )
+
+
+class Metrics:
+    """What is counted, and its text form."""
+
+    def __init__(self, operations: Operations) -> None:
+        self.registry = CollectorRegistry()
+        self._stars = Counter(
+            "starid_stars",
+            "Observed stars of live batches by outcome.",
+            ("spacecraft", "outcome"),
+            registry=self.registry,
+        )
+        self._batches = Counter(
+            "starid_batches",
+            "Recorded batches: live or of a named run, with an attitude or without.",
+            ("spacecraft", "run", "result"),
+            registry=self.registry,
+        )
+        self._repeats = Counter(
+            "starid_batches_repeated",
+            "Submissions that were answered with what is recorded already.",
+            registry=self.registry,
+        )
+        self._requests = Histogram(
+            "starid_request_seconds",
+            "Time from a request's first byte to its answer's last.",
+            ("method", "route", "status"),
+            buckets=_SECONDS,
+            registry=self.registry,
+        )
+        self.registry.register(_Zones(operations))
+        operations.observers.append(self.count_batch)
+        for name in operations.missions:
+            # A counter that is there from the start has a first increase.
+            for outcome in OUTCOMES:
+                self._stars.labels(name, outcome)
+
+    def count_batch(self, acquisition: Acquisition) -> None:
+        """Count one newly recorded batch."""
+        batch, live = acquisition.batch, acquisition.batch.run == LIVE
+        result = "no_attitude" if acquisition.solution is None else "attitude"
+        self._batches.labels(batch.spacecraft, LIVE if live else "named", result).inc()
+        if live:
+            for outcome in OUTCOMES:
+                self._stars.labels(batch.spacecraft, outcome).inc(acquisition.counts[outcome])
+
+    def count_repeat(self) -> None:
+        """Count one submission that was recorded before."""
+        self._repeats.inc()
+
+    def count_request(self, scope: Scope, status: int, seconds: float) -> None:
+        """Count one request under its route's template, so that ids make no new series."""
+        method = scope["method"] if scope["method"] in _METHODS else "other"
+        route = getattr(scope.get("route"), "path", "none")
+        self._requests.labels(method, route, str(status)).observe(seconds)
+
+    def text(self) -> bytes:
+        """The exposition text."""
+        return generate_latest(self.registry)

@@ -1,0 +1,59 @@
+"""Runs and replays."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from service.web.schemas.base import Count, FaultOut, Id, Moment, Shape
+
+
+class RunRow(Shape):
+    """A run."""
+
+    run: str
+    created: Moment
+    batches: Count
+    spacecraft: list[str]
+    first_day: str = Field(examples=["1999-03-01"])
+    last_day: str
+
+
+class RunList(Shape):
+    """Every run that holds batches."""
+
+    items: list[RunRow]
+
+
+class ReplayLines(Shape):
+    """The lines of a replay."""
+
+    total: int | None = Field(description="null where nobody counted them beforehand.")
+    done: Count
+    refused: Count
+
+
+class LineProblem(Shape):
+    """What is wrong with a line."""
+
+    detail: str
+    errors: list[FaultOut]
+
+
+class RefusedLine(Shape):
+    """A line that was refused; the others go on."""
+
+    line: int = Field(description="Its number, from 1.")
+    problem: LineProblem
+
+
+class ReplayState(Shape):
+    """A replay and how far it is."""
+
+    id: Id
+    run: str
+    name: str
+    state: Literal["running", "done", "interrupted", "failed"]
+    lines: ReplayLines
+    errors: list[RefusedLine] = Field(description="The first thousand.")
+    started: Moment
+    finished: Moment | None

@@ -1,0 +1,131 @@
+"""A headless Chromium to look at pages with, driven over its DevTools socket."""
+
+import json
+import shutil
+import subprocess
+import time
+from contextlib import ExitStack
+from itertools import count
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import httpx
+from websockets.sync.client import connect
+
+_NAMES = ("chromium", "chromium-browser", "google-chrome")
+CHROMIUM = next(filter(None, map(shutil.which, _NAMES)), None)
+
+_FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--remote-debugging-port=0",
+)
+
+
+class Browser:
+    """One page in a browser of its own; `complaints` holds what its console says."""
+
+    def __init__(self, folder: Path) -> None:
+        self.complaints: list[str] = []
+        self._folder = folder
+        self._numbers = count(1)
+        self._stack = ExitStack()
+
+    def __enter__(self) -> "Browser":
+        try:
+            self._start()
+        except BaseException:
+            self._stack.close()
+            raise
+        return self
+
+    def _start(self) -> None:
+        assert CHROMIUM is not None
+        command = [CHROMIUM, *_FLAGS, f"--user-data-dir={self._folder}", "about:blank"]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        process = self._stack.enter_context(subprocess.Popen(command, **quiet))
+        self._stack.callback(process.terminate)
+        noted = self._folder / "DevToolsActivePort"
+        self.wait(lambda: noted.exists() and noted.read_text().count("\n") >= 1)
+        port = noted.read_text().split("\n")[0]
+        listed = httpx.get(f"http://127.0.0.1:{port}/json").json()
+        (url,) = [each["webSocketDebuggerUrl"] for each in listed if each["type"] == "page"]
+        self._socket = self._stack.enter_context(connect(url, max_size=None))
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            self.call(f"{domain}.enable")
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stack.close()
+
+    def call(self, method: str, **parameters: Any) -> Any:
+        """Ask the browser for something; what it says meanwhile is noted."""
+        number = next(self._numbers)
+        message = {"id": number, "method": method, "params": parameters}
+        self._socket.send(json.dumps(message))
+        while True:
+            heard = json.loads(self._socket.recv(timeout=30))
+            if heard.get("id") == number:
+                assert "error" not in heard, heard
+                return heard["result"]
+            self._note(heard)
+
+    def _note(self, heard: dict[str, Any]) -> None:
+        kind, said = heard.get("method"), heard.get("params", {})
+        if kind == "Runtime.exceptionThrown":
+            self.complaints.append(str(said["exceptionDetails"]))
+        elif kind == "Log.entryAdded" and said["entry"]["level"] in ("error", "warning"):
+            self.complaints.append(f"{said['entry']['text']} {said['entry'].get('url', '')}")
+        elif kind == "Runtime.consoleAPICalled" and said["type"] in ("error", "warning"):
+            self.complaints.append(str(said["args"]))
+
+    def open(self, url: str, width: int = 1440, height: int = 900, dark: bool = False) -> None:
+        """Load a page in a window of that size."""
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=False,
+        )
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.call("Emulation.setEmulatedMedia", features=[scheme])
+        self.call("Page.navigate", url=url)
+        self.wait(
+            lambda: self.run("location.href !== 'about:blank' && document.readyState") == "complete"
+        )
+
+    def run(self, script: str) -> Any:
+        """The value of an expression in the page."""
+        done = self.call(
+            "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
+        )
+        assert "exceptionDetails" not in done, done
+        return done["result"].get("value")
+
+    def press(self, key: str) -> None:
+        """Press and release a key such as Tab."""
+        code = {"Tab": 9, "Enter": 13}[key]
+        text = {"Enter": "\r"}.get(key, "")
+        for type_ in ("keyDown", "keyUp"):
+            self.call(
+                "Input.dispatchKeyEvent", type=type_, key=key, windowsVirtualKeyCode=code, text=text
+            )
+
+    def wait(self, condition: Any, seconds: float = 30.0) -> None:
+        """Return once the condition holds."""
+        end = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < end, "waited in vain"
+            time.sleep(0.05)

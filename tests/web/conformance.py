@@ -1,0 +1,64 @@
+"""Holds every answer against the committed `openapi.yaml`."""
+
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import httpx
+import yaml
+from jsonschema import Draft202012Validator
+from referencing import Registry, Resource
+from referencing.jsonschema import DRAFT202012
+
+FILE = Path(__file__).parents[2] / "openapi.yaml"
+_URI = "urn:openapi"
+
+
+@cache
+def reference() -> dict[str, Any]:
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    return yaml.load(FILE.read_text(encoding="utf-8"), loader)
+
+
+@cache
+def _registry() -> Registry:
+    resource = Resource.from_contents(reference(), default_specification=DRAFT202012)
+    return Registry().with_resource(_URI, resource)
+
+
+@cache
+def validator(*place: str) -> Draft202012Validator:
+    """The validator of the schema that stands at a place of the reference."""
+    pointer = "/".join(each.replace("~", "~0").replace("/", "~1") for each in place)
+    return Draft202012Validator({"$ref": f"{_URI}#/{pointer}"}, registry=_registry())
+
+
+def check(response: httpx.Response) -> None:
+    """Fail where an answer is not as described: its status, its type, its headers, its shape."""
+    request = response.request
+    path = next((each for each in reference()["paths"] if _fits(each, request.url.path)), None)
+    method = "get" if request.method == "HEAD" else request.method.lower()
+    operation = reference()["paths"].get(path, {}).get(method)
+    if operation is None:
+        assert response.status_code in (404, 405) or path is None, request.url
+        return
+    status = str(response.status_code)
+    if status not in operation["responses"]:
+        assert response.status_code >= 400, f"{status} is not described: {request.url}"
+        status = "default"
+    described = operation["responses"][status]
+    kind = response.headers["content-type"].partition(";")[0]
+    assert kind in described["content"], (kind, request.url)
+    for header in set(described.get("headers", {})) - {"Link"}:
+        assert header in response.headers, (header, request.url)
+    response.read()
+    if kind.endswith("json") and request.method != "HEAD":
+        place = ("paths", path, method, "responses", status, "content", kind, "schema")
+        errors = list(validator(*place).iter_errors(response.json()))
+        assert not errors, f"{request.method} {request.url}: {errors[0]}"
+
+
+def _fits(template: str, path: str) -> bool:
+    pattern = re.sub(r"\\\{\w+\\\}", "[^/]+", re.escape(template))
+    return re.fullmatch(pattern, path) is not None

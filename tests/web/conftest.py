@@ -1,0 +1,117 @@
+"""A real server over a real database, and real stars to send to it."""
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import uvicorn
+from fastapi import FastAPI
+
+from service.missions.mission import load_missions
+from service.operations import Operations
+from service.settings import Settings
+from service.simulate.stretches import Pass
+from service.simulate.telemetry import draw_pass
+from service.web.app import create_app
+from tests.web.conformance import check
+
+Json = dict[str, Any]
+
+
+class Server:
+    """The app behind uvicorn on a free port, in a thread of this process."""
+
+    def __init__(self, app: FastAPI) -> None:
+        config = uvicorn.Config(app, port=0, http="httptools", ws="none", log_level="warning")
+        self._server = uvicorn.Server(config)
+        # Signals belong to the main thread, which is pytest's.
+        self._thread = threading.Thread(target=self._server.run, name="server")
+
+    def __enter__(self) -> str:
+        self._thread.start()
+        while not self._server.started:
+            assert self._thread.is_alive(), "the server did not start"
+            time.sleep(0.01)
+        port = self._server.servers[0].sockets[0].getsockname()[1]
+        return f"http://127.0.0.1:{port}"
+
+    def __exit__(self, *_: object) -> None:
+        self._server.should_exit = True
+        self._thread.join()
+
+
+@pytest.fixture(scope="session")
+def operations(tmp_path_factory: pytest.TempPathFactory) -> Operations:
+    """The real operations over a new SQLite file; the server closes them."""
+    path: Path = tmp_path_factory.mktemp("web") / "acquire.db"
+    return Operations.open(Settings(database=f"sqlite:///{path}"))
+
+
+@pytest.fixture(scope="session")
+def address(operations: Operations) -> Iterator[str]:
+    with Server(create_app(operations)) as url:
+        yield url
+
+
+@pytest.fixture(scope="session")
+def client(address: str) -> Iterator[httpx.Client]:
+    """Talks to the server; every answer it gets is held against openapi.yaml."""
+    hooks = {"response": [check]}
+    with httpx.Client(base_url=address, timeout=60, event_hooks=hooks) as client:
+        yield client
+
+
+@pytest.fixture(scope="session")
+def drawn(operations: Operations) -> Callable[..., list[Json]]:
+    """Batches of a pass over the real catalog."""
+
+    def draw(spacecraft: str, batches: int, **wanted: Any) -> list[Json]:
+        mission = load_missions()[spacecraft]
+        wanted_pass = Pass(batches=batches, **wanted)
+        return [each.batch for each in draw_pass(mission, operations.sky, wanted_pass)]
+
+    return draw
+
+
+_numbers = count(1)
+
+
+@pytest.fixture
+def batch(drawn: Callable[..., list[Json]]) -> Json:
+    """A batch of XTE with five real stars, under an id of its own."""
+    return drawn("XTE", 1)[0] | {"batch": f"one-{next(_numbers)}"}
+
+
+@pytest.fixture
+def run() -> str:
+    """The name of a run that nothing else writes to."""
+    return f"run-{next(_numbers)}"
+
+
+@pytest.fixture(scope="session")
+def full_run(client: httpx.Client, drawn: Callable[..., list[Json]]) -> str:
+    """A run with 20 batches of XTE and 20 of SOHO, stretches of trouble included."""
+    for spacecraft in ("XTE", "SOHO"):
+        for each in drawn(spacecraft, 20, seed=4):
+            client.post("/api/v1/batches", json=each | {"run": "full"}).raise_for_status()
+    return "full"
+
+
+@pytest.fixture
+def post(client: httpx.Client) -> Callable[..., httpx.Response]:
+    """Send a batch as the JSON it would be sent as."""
+
+    def send(body: Json | bytes, **headers: str) -> httpx.Response:
+        content = body if isinstance(body, bytes) else json.dumps(body).encode()
+        headers = {"Content-Type": "application/json"} | {
+            name.replace("_", "-"): value for name, value in headers.items()
+        }
+        return client.post("/api/v1/batches", content=content, headers=headers)
+
+    return send

@@ -1,0 +1,112 @@
+"""The committed reference is the app's own, complete, and its examples are what the app answers."""
+
+import json
+
+import pytest
+from jsonschema import Draft202012Validator
+
+from service.observe.wire import submission_from_json
+from service.web.app import bare_app
+from service.web.openapi import openapi_yaml
+from service.web.reference import examples
+from tests.web.conformance import FILE, reference, validator
+from tests.web.examples import fresh_walk
+
+OPERATIONS = [
+    (path, method, operation)
+    for path, methods in reference()["paths"].items()
+    for method, operation in methods.items()
+]
+NAMED = [operation["operationId"] for _, _, operation in OPERATIONS]
+
+
+def test_the_committed_file_is_what_the_app_says_of_itself(client):
+    assert FILE.read_text(encoding="utf-8") == openapi_yaml(), "run: make openapi"
+    assert client.get("/api/v1/openapi.json").json() == reference()
+
+
+def test_it_is_made_the_same_twice():
+    assert openapi_yaml() == openapi_yaml()
+
+
+def test_every_route_is_described():
+    routes = {
+        (route.path, method.lower())
+        for route in bare_app().state.routes
+        for method in route.methods
+        if route.include_in_schema
+    }
+    assert {(path, method) for path, method, _ in OPERATIONS} == routes
+    assert len(set(NAMED)) == len(NAMED) == 17
+
+
+def test_every_reference_leads_somewhere():
+    def walk(node):
+        if isinstance(node, dict):
+            if "$ref" in node:
+                place = reference()
+                for step in node["$ref"].removeprefix("#/").split("/"):
+                    place = place[step]
+            for each in node.values():
+                walk(each)
+        elif isinstance(node, list):
+            for each in node:
+                walk(each)
+
+    walk(reference())
+
+
+@pytest.mark.parametrize("name", reference()["components"]["schemas"])
+def test_every_schema_is_one(name):
+    Draft202012Validator.check_schema(reference()["components"]["schemas"][name])
+
+
+@pytest.mark.parametrize(("path", "method", "operation"), OPERATIONS, ids=NAMED)
+def test_every_answer_is_described_with_a_shape(path, method, operation):
+    assert operation["summary"]
+    assert operation["tags"]
+    assert {"422", "default"} <= set(operation["responses"])
+    for response in operation["responses"].values():
+        assert response["description"]
+        for content in response["content"].values():
+            assert content["schema"]
+    for parameter in operation.get("parameters", []):
+        assert parameter["description"], parameter["name"]
+
+
+@pytest.mark.parametrize(("path", "method", "operation"), OPERATIONS, ids=NAMED)
+def test_every_example_has_the_shape_it_is_an_example_of(path, method, operation):
+    parts = [("requestBody", operation["requestBody"])] if "requestBody" in operation else []
+    parts += [(f"responses {status}", each) for status, each in operation["responses"].items()]
+    for where, part in parts:
+        for kind, content in part["content"].items():
+            check = validator("paths", path, method, *where.split(), "content", kind, "schema")
+            for example in content.get("examples", {}).values():
+                if kind.endswith("json"):
+                    check.validate(example["value"])
+
+
+def test_every_batch_among_the_examples_can_be_sent():
+    for batch in examples()["submit_batch"]["request"].values():
+        assert submission_from_json(json.dumps(batch))
+
+
+def test_every_route_that_answers_json_has_examples_of_its_success():
+    for _, _, operation in OPERATIONS:
+        kinds = {kind for each in operation["responses"].values() for kind in each["content"]}
+        if "application/json" in kinds:
+            assert set(examples()[operation["operationId"]]) & {"200", "201", "202"}
+
+
+def test_the_examples_are_what_the_app_still_answers():
+    """Numbers that differ from run to run aside."""
+    found = fresh_walk()
+    assert shape(found) == shape(examples()), "run: python -m tests.web.examples && make openapi"
+
+
+def shape(value):
+    if isinstance(value, dict):
+        return {key: shape(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [shape(each) for each in value]
+    return value if isinstance(value, bool) else type(value).__name__

@@ -1,0 +1,89 @@
+"""Probes and metrics; the answer to a fault of ours."""
+
+import time
+
+import httpx
+from prometheus_client.parser import text_string_to_metric_families
+
+from service.operations import Operations
+from service.settings import Settings
+from service.web.app import create_app
+from tests.web.conftest import Server
+
+
+def samples(client):
+    text = client.get("/metrics").text
+    return {
+        (sample.name, *sorted(sample.labels.items())): sample.value
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+
+
+def stars(found, outcome):
+    return found["starid_stars_total", ("outcome", outcome), ("spacecraft", "XTE")]
+
+
+def test_it_lives_and_becomes_ready(client):
+    assert client.get("/livez").status_code == 200
+    for _ in range(600):
+        if (answer := client.get("/readyz")).status_code == 200:
+            return
+        assert (answer.status_code, "Retry-After" in answer.headers) == (503, True)
+        time.sleep(0.1)
+    raise AssertionError(answer.text)
+
+
+def test_live_stars_are_counted_once_by_outcome(client, post, batch, run):
+    before = samples(client)
+    post(batch)
+    post(batch)
+    post(batch | {"run": run})
+    after = samples(client)
+    assert stars(after, "unique") - stars(before, "unique") == 5
+    assert stars(after, "unmatched") == stars(before, "unmatched")
+    assert after["starid_batches_repeated_total",] - before["starid_batches_repeated_total",] == 1
+
+
+def test_a_what_if_is_no_new_observation(client, post, batch):
+    id = post(batch).json()["id"]
+    before = samples(client)
+    client.post(
+        f"/api/v1/batches/{id}/what-if", json={"options": {"solver": "triad"}, "adopt": True}
+    )
+    assert stars(samples(client), "unique") == stars(before, "unique")
+
+
+def test_requests_are_counted_under_their_route_and_not_their_address(client, post, batch):
+    client.get(post(batch).headers["Location"])
+    client.get("/nothing/of/the/kind")
+    routes = {dict(key[1:]).get("route") for key in samples(client) if "request" in key[0]}
+    assert {"/api/v1/batches", "/api/v1/batches/{id}", "none"} <= routes
+    assert not any("nothing" in (route or "") for route in routes)
+
+
+def test_the_cache_of_zones_is_counted(client):
+    found = samples(client)
+    for name in ("hits_total", "misses_total", "bytes"):
+        assert (f"starid_zone_cache_{name}",) in found
+
+
+def test_two_apps_share_no_counter(client, tmp_path):
+    operations = Operations.open(Settings(database=f"sqlite:///{tmp_path}/other.db"))
+    with Server(create_app(operations)) as address, httpx.Client(base_url=address) as other:
+        assert stars(samples(other), "unique") == 0
+
+
+def test_a_fault_of_ours_is_logged_and_says_nothing_of_what_is_inside(tmp_path, caplog):
+    operations = Operations.open(Settings(database=f"sqlite:///{tmp_path}/gone.db"))
+    with Server(create_app(operations)) as address:
+        with operations.store.writer._engine.begin() as connection:
+            connection.exec_driver_sql("ALTER TABLE runs RENAME TO elsewhere")
+        with httpx.Client(base_url=address) as client:
+            answer = client.get("/api/v1/runs")
+            assert client.get("/livez").status_code == 200, "on the same connection"
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert answer.status_code in (500, 503)
+    assert "runs" not in answer.json()["detail"]
+    assert "elsewhere" not in answer.text
+    assert "GET /api/v1/runs failed" in caplog.text

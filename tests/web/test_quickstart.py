@@ -1,0 +1,101 @@
+"""The quick start is true: its commands are run as they stand and give the outputs shown."""
+
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import httpx
+import pytest
+
+ROOT = Path(__file__).parents[2]
+TEXT = (ROOT / "docs" / "quickstart.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"^```(sh|text)\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
+
+pytestmark = pytest.mark.skipif(
+    not (shutil.which("curl") and shutil.which("bash")), reason="there is no curl on this machine"
+)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder that looks like the checkout to who follows the quick start."""
+    (tmp_path / "docs").symlink_to(ROOT / "docs")
+    (tmp_path / ".venv").symlink_to(sys.prefix)
+    return tmp_path
+
+
+@pytest.fixture
+def port():
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return str(free.getsockname()[1])
+
+
+@pytest.fixture
+def server(folder, port):
+    """The first block starts it."""
+    kind, start = BLOCKS[0]
+    assert (kind, "acquire serve" in start) == ("sh", True)
+    command = ["bash", "-c", "exec " + start.strip().replace("8000", port)]
+    process = subprocess.Popen(command, cwd=folder)
+    for _ in range(1200):
+        try:
+            httpx.get(f"http://127.0.0.1:{port}/livez")
+            break
+        except httpx.TransportError:
+            assert process.poll() is None, "the server did not start"
+            time.sleep(0.05)
+    yield
+    process.send_signal(signal.SIGTERM)
+    process.wait(timeout=60)
+
+
+@pytest.mark.usefixtures("server")
+def test_every_command_gives_the_output_that_is_shown(folder, port):
+    shell = subprocess.Popen(
+        ["bash", "--norc"],
+        cwd=folder,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    with shell:
+        for index, (kind, text) in enumerate(BLOCKS[1:], start=1):
+            if kind == "sh":
+                said = run(shell, text.replace("8000", port))
+                shown = BLOCKS[index + 1][1] if BLOCKS[index + 1 : index + 2] else ""
+                follows = index + 1 < len(BLOCKS) and BLOCKS[index + 1][0] == "text"
+                assert said == (shown if follows else ""), text
+        shell.stdin.close()
+
+
+def run(shell, commands):
+    """What the commands print, in the shell that all blocks share."""
+    shell.stdin.write(f"{commands}\necho end-of-block\n")
+    shell.stdin.flush()
+    said = ""
+    for line in shell.stdout:
+        if line == "end-of-block\n":
+            return said
+        said += line.replace("\r\n", "\n")
+    raise AssertionError(f"the shell ended after {said}")
+
+
+def test_every_link_leads_to_a_file():
+    for name in ("quickstart.md", "api.md"):
+        text = (ROOT / "docs" / name).read_text(encoding="utf-8")
+        for link in re.findall(r"\]\(([^)#:]+)\)", text):
+            assert (ROOT / "docs" / link).is_file(), (name, link)
+
+
+def test_the_guide_knows_every_kind_of_problem():
+    from service.web.errors import KINDS
+
+    guide = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    for kind in KINDS.values():
+        assert f"| {kind.status} | `{kind.type}` |" in guide

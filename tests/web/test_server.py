@@ -1,0 +1,82 @@
+"""The server as a process of its own: where it listens, how it stops, what it keeps."""
+
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import httpx
+import pytest
+
+from service.errors import BadConfiguration
+from service.settings import Settings
+
+SERVE = """
+import sys
+from service.settings import Settings
+from service.web.server import serve
+serve(Settings(database=sys.argv[1], port=int(sys.argv[2])))
+"""
+
+
+@pytest.fixture
+def process(tmp_path):
+    """Starts the server in a process; gives its address and the process."""
+    begun = []
+
+    def start():
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            port = free.getsockname()[1]
+        database = f"sqlite:///{tmp_path}/acquire.db"
+        command = [sys.executable, "-c", SERVE, database, str(port)]
+        begun.append(subprocess.Popen(command))
+        address = f"http://127.0.0.1:{port}"
+        for _ in range(600):
+            try:
+                httpx.get(f"{address}/livez").raise_for_status()
+                return address, begun[-1]
+            except httpx.TransportError:
+                assert begun[-1].poll() is None
+                time.sleep(0.05)
+        raise AssertionError("the server does not answer")
+
+    yield start
+    for each in begun:
+        each.kill()
+        each.wait()
+
+
+@pytest.mark.parametrize(
+    "host", ["0.0.0.0", "::", "192.168.0.1", "10.1.2.3", "example.com", "", "127.0.0.1.evil.com"]
+)
+def test_it_listens_to_this_machine_alone(host):
+    with pytest.raises(BadConfiguration, match="loopback"):
+        Settings(host=host)
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.9.9.9", "::1", "localhost"])
+def test_every_name_of_this_machine_will_do(host):
+    assert Settings(host=host).host == host
+
+
+@pytest.mark.parametrize("stop", [signal.SIGTERM, signal.SIGINT])
+def test_told_to_stop_it_ends_in_order_and_keeps_what_it_took(process, batch, stop):
+    address, running = process()
+    answer = httpx.post(f"{address}/api/v1/batches", json=batch, timeout=60)
+    assert answer.status_code == 201
+    running.send_signal(stop)
+    assert running.wait(timeout=30) in (0, -stop, 130)
+    address, _ = process()
+    record = httpx.get(address + answer.headers["Location"]).json()
+    assert record["answer"] == answer.json()
+
+
+def test_killed_it_keeps_what_it_acknowledged(process, batch):
+    address, running = process()
+    answer = httpx.post(f"{address}/api/v1/batches", json=batch, timeout=60)
+    running.kill()
+    running.wait()
+    address, _ = process()
+    again = httpx.post(f"{address}/api/v1/batches", json=batch, timeout=60)
+    assert (again.status_code, again.content) == (200, answer.content)
