@@ -5,13 +5,15 @@ Pure: an answer depends on the batch, the mission and the catalog alone.  Not
 finding a star is a result; only bad input raises.
 """
 
-from time import perf_counter_ns as clock_ns
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+from time import perf_counter_ns as clock_ns
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from service import __version__
 from service.attitude.solution import AttitudeSolution, NoAttitude
@@ -44,6 +46,8 @@ from service.vectors import (
     matrix_from_quaternion,
     quaternion_from_matrix,
 )
+
+Array = npt.NDArray[Any]
 
 IDENTIFIERS: Mapping[str, Callable[[Sighting], Identification]] = {
     "starid": identify_by_votes,
@@ -146,6 +150,7 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
                 each.sigma_arcsec / ARCSEC_PER_RADIAN,
                 presumed.known_axis,
                 np.zeros(3) if velocity_c is None else velocity_c,
+                each.tracker.body_from_tracker[:, 2] @ presumed.attitude,
                 aim,
                 zone,
                 choices.tolerances,
@@ -196,8 +201,8 @@ def choices_of(batch: ObservationBatch, mission: Mission) -> Choices:
         )
     tests = {"pole": is_band and mission.tests.pole, **options.tests}
     if isinstance(batch.a_priori, BoresightPrior):
-        # Nothing is known of the roll that the cross products would be compared in.
-        tests["cross_product"] = False
+        # Nothing is known of the roll in which cross products and rotations would be compared.
+        tests["cross_product"] = tests["fov_rotation"] = False
     grid_deg = options.zone_grid_deg
     return Choices(
         identifier=options.identifier or mission.identifier,
@@ -301,18 +306,25 @@ def _solve(
     run_catalog: RunCatalog,
 ) -> AttitudeSolution | NoAttitude:
     masks = [identification.unique for identification in identifications]
-    star = np.concatenate([i.star[m] for i, m in zip(identifications, masks, strict=True)])
+    matched = [int(mask.sum()) for mask in masks]
+    if sum(matched) < 2:
+        return NoAttitude.FEWER_THAN_TWO_UNIQUE_STARS
+    star = _joined([i.star[m] for i, m in zip(identifications, masks, strict=True)])
     reference = run_catalog.direction[star]
     if velocity_c is not None:
         reference = apparent(reference, velocity_c, time)
     return solve_attitude(
-        np.concatenate([c.direction_body[m] for c, m in zip(corrected, masks, strict=True)]),
+        _joined([c.direction_body[m] for c, m in zip(corrected, masks, strict=True)]),
         reference,
-        np.concatenate([c.sigma_arcsec[m] for c, m in zip(corrected, masks, strict=True)]),
-        np.repeat(np.arange(len(masks)), [int(mask.sum()) for mask in masks]),
+        _joined([c.sigma_arcsec[m] for c, m in zip(corrected, masks, strict=True)]),
+        np.repeat(np.arange(len(masks)), matched),
         tuple(each.tracker.name for each in corrected),
         choices.solver,
     )
+
+
+def _joined(parts: list[Array]) -> Array:
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _residuals(

@@ -99,10 +99,14 @@ def bucket_start(number: int, width_s: int) -> Utc:
 
 
 def shifted(moment: Utc, seconds: float) -> Utc:
-    """The moment `seconds` of TAI later, leap seconds counted."""
+    """The moment `seconds` of TAI later, leap seconds counted, to the nanosecond.
+
+    It is read again from its text: moments are equal and in order only where
+    the two parts of the Julian date are split alike.
+    """
     tai1, tai2, _ = ufunc.utctai(moment.jd1, moment.jd2)
     jd1, jd2, _ = ufunc.taiutc(tai1, tai2 + seconds / DAY_S)
-    return Utc(float(jd1), float(jd2))
+    return parse_utc(Utc(float(jd1), float(jd2)).text)
 
 
 def parse_utc(text: object, field: str = "time") -> Utc:

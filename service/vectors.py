@@ -31,7 +31,7 @@ def unit(vectors: npt.ArrayLike) -> Vector:
     """Vectors of shape (..., 3) scaled to length one; a zero vector gives NaN."""
     v = np.asarray(vectors, dtype=np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return v / np.sqrt(np.sum(v * v, axis=-1, keepdims=True))
+        return np.asarray(v / np.sqrt(np.sum(v * v, axis=-1, keepdims=True)))
 
 
 def from_ra_dec(ra_deg: npt.ArrayLike, dec_deg: npt.ArrayLike) -> Vector:
@@ -63,6 +63,14 @@ def angle_between_deg(a: npt.ArrayLike, b: npt.ArrayLike) -> Vector:
     return np.asarray(np.degrees(2.0 * np.arctan2(apart, along)))
 
 
+def separation_deg(a: Vector, b: Vector) -> float:
+    """`angle_between_deg` of two unit vectors (3,), without an array's overhead."""
+    x, y, z = a.tolist()
+    u, v, w = b.tolist()
+    apart = math.hypot(x - u, y - v, z - w)
+    return math.degrees(2.0 * math.atan2(apart, math.hypot(x + u, y + v, z + w)))
+
+
 def coordinate_rotation(axis: int, angle_deg: float) -> Matrix:
     """The matrix that turns the axes by `angle_deg` about axis 0, 1 or 2 (x, y, z)."""
     c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
@@ -86,14 +94,27 @@ def rotate_about(rotation_vectors_rad: npt.ArrayLike, vectors: npt.ArrayLike) ->
 
 
 def matrix_from_quaternion(quaternion: npt.ArrayLike) -> Matrix:
-    """The attitude matrix A(q), (..., 3, 3), of quaternions (..., 4): body = A @ inertial."""
-    q1, q2, q3, qc = np.moveaxis(np.asarray(quaternion, dtype=np.float64), -1, 0)
-    rows = [
-        [q1 * q1 - q2 * q2 - q3 * q3 + qc * qc, 2 * (q1 * q2 + q3 * qc), 2 * (q1 * q3 - q2 * qc)],
-        [2 * (q1 * q2 - q3 * qc), -q1 * q1 + q2 * q2 - q3 * q3 + qc * qc, 2 * (q2 * q3 + q1 * qc)],
-        [2 * (q1 * q3 + q2 * qc), 2 * (q2 * q3 - q1 * qc), -q1 * q1 - q2 * q2 + q3 * q3 + qc * qc],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    """The attitude matrix A(q), (3, 3), of a quaternion (4,): body = A @ inertial."""
+    q1, q2, q3, qc = np.asarray(quaternion, dtype=np.float64).tolist()
+    return np.array(
+        [
+            [
+                q1 * q1 - q2 * q2 - q3 * q3 + qc * qc,
+                2 * (q1 * q2 + q3 * qc),
+                2 * (q1 * q3 - q2 * qc),
+            ],
+            [
+                2 * (q1 * q2 - q3 * qc),
+                -q1 * q1 + q2 * q2 - q3 * q3 + qc * qc,
+                2 * (q2 * q3 + q1 * qc),
+            ],
+            [
+                2 * (q1 * q3 + q2 * qc),
+                2 * (q2 * q3 - q1 * qc),
+                -q1 * q1 - q2 * q2 + q3 * q3 + qc * qc,
+            ],
+        ]
+    )
 
 
 def quaternion_from_matrix(matrix: npt.ArrayLike) -> Vector:
@@ -155,7 +176,7 @@ def quaternion_from_scipy(rotation: Any) -> Vector:
 
 
 def quaternion_from_spice(spice: npt.ArrayLike) -> Vector:
-    """The service's quaternion of SPICE's `m2q(A)`: scalar first and conjugate, A inertial to body."""
+    """The service's quaternion of SPICE's `m2q(A)`, scalar first and conjugate; A inertial to body."""
     s = np.asarray(spice, dtype=np.float64)
     q = np.array([-s[1], -s[2], -s[3], s[0]])
     return -q if q[3] < 0 else q

@@ -12,26 +12,51 @@ from numba import njit
 
 NEWTON_STEPS = 30
 POLISHING_STEPS = 10
+LEAST_SINE = 1e-12
+"""Below this two vectors stand in one line."""
 
 
-@njit(cache=True, nogil=True)
-def widest_pair(b, weights):  # type: ignore[no-untyped-def]
-    """The two rows with the largest sine between them, the one of smaller sigma first, and that sine."""
-    first, second, widest = 0, 1, -1.0
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sine(a, b):  # type: ignore[no-untyped-def]
+    x = a[1] * b[2] - a[2] * b[1]
+    y = a[2] * b[0] - a[0] * b[2]
+    z = a[0] * b[1] - a[1] * b[0]
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def widest_pair(b, r, weights):  # type: ignore[no-untyped-def]
+    """The two rows with the largest sine between them, the smaller sigma first, and that sine.
+
+    Passed over are two stars that were given one identity: their references
+    span no plane.
+    """
+    first, second, widest = 0, 1, 0.0
     for i in range(len(b) - 1):
         for j in range(i + 1, len(b)):
-            x = b[i, 1] * b[j, 2] - b[i, 2] * b[j, 1]
-            y = b[i, 2] * b[j, 0] - b[i, 0] * b[j, 2]
-            z = b[i, 0] * b[j, 1] - b[i, 1] * b[j, 0]
-            sine = math.sqrt(x * x + y * y + z * z)
-            if sine > widest:
+            sine = _sine(b[i], b[j])
+            if sine > widest and _sine(r[i], r[j]) > LEAST_SINE:
                 first, second, widest = i, j, sine
     if weights[second] > weights[first]:
         first, second = second, first
     return first, second, widest
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _firmest_pair(b, r, weights):  # type: ignore[no-untyped-def]
+    """The finest star, and the one that best fixes the turn about it by weight times sine^2."""
+    first, second, firmest = 0, 0, 0.0
+    for i in range(len(b)):
+        if weights[i] > weights[first]:
+            first = i
+    for j in range(len(b)):
+        firmness = weights[j] * _sine(b[first], b[j]) ** 2
+        if firmness > firmest and _sine(r[first], r[j]) > LEAST_SINE:
+            second, firmest = j, firmness
+    return first, second
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _triad_frame(anchor, other, rows):  # type: ignore[no-untyped-def]
     x = anchor[1] * other[2] - anchor[2] * other[1]
     y = anchor[2] * other[0] - anchor[0] * other[2]
@@ -45,9 +70,9 @@ def _triad_frame(anchor, other, rows):  # type: ignore[no-untyped-def]
     rows[2, 2] = anchor[0] * y - anchor[1] * x
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def triad(b1, b2, r1, r2, attitude):  # type: ignore[no-untyped-def]
-    """The attitude matrix that takes r1 to b1 exactly and r2 into the plane of b1 and b2 (Black 1964)."""
+    """The matrix that takes r1 to b1 exactly and r2 into the plane of b1 and b2 (Black 1964)."""
     body = np.empty((3, 3))
     inertial = np.empty((3, 3))
     _triad_frame(b1, b2, body)
@@ -61,7 +86,7 @@ def triad(b1, b2, r1, r2, attitude):  # type: ignore[no-untyped-def]
             )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def to_matrix(q, a):  # type: ignore[no-untyped-def]
     """A(q) into a (3, 3)."""
     q1, q2, q3, qc = q[0], q[1], q[2], q[3]
@@ -76,7 +101,7 @@ def to_matrix(q, a):  # type: ignore[no-untyped-def]
     a[2, 2] = -q1 * q1 - q2 * q2 + q3 * q3 + qc * qc
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def to_quaternion(a, q):  # type: ignore[no-untyped-def]
     """The quaternion of an attitude matrix, qc >= 0, by Shepperd's largest component."""
     trace = a[0, 0] + a[1, 1] + a[2, 2]
@@ -95,7 +120,7 @@ def to_quaternion(a, q):  # type: ignore[no-untyped-def]
     _normalise(q)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _normalise(q):  # type: ignore[no-untyped-def]
     norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     if q[3] < 0.0:
@@ -104,15 +129,16 @@ def _normalise(q):  # type: ignore[no-untyped-def]
         q[i] /= norm
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def quest(b, r, weights, start, q):  # type: ignore[no-untyped-def]
     """Wahba's attitude by QUEST (Shuster & Oh 1981) into q.
 
-    `start` is any rough quaternion (TRIAD's): its largest component tells by
-    which half turn to rotate the reference vectors first, so that the scalar
-    part of what is solved for is never small.  Without it every exact half turn
-    fails.  The characteristic polynomial loses half the digits where the field
-    is narrow, so the answer is polished by Gauss-Newton steps on the residuals.
+    `start` is a rough quaternion: its largest component tells by which half
+    turn to rotate the reference vectors first, so that the scalar part of what
+    is solved for is never small.  Without it every exact half turn fails.  The
+    characteristic polynomial loses its digits where the field is narrow or the
+    weights are far apart: then the start stands in for its root.  Gauss-Newton
+    steps on the residuals polish the answer.
     """
     turn = 3
     for i in range(3):
@@ -178,13 +204,12 @@ def quest(b, r, weights, start, q):  # type: ignore[no-untyped-def]
     else:
         q[0], q[1], q[2], q[3] = x0, x1, x2, gamma
     _normalise(q)
-    # In a very narrow field the polynomial has no digits left, and TRIAD is the nearer start.
     if not _loss(b, r, weights, q) <= _loss(b, r, weights, start):
         q[:] = start
     _polish(b, r, weights, q)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _loss(b, r, weights, q):  # type: ignore[no-untyped-def]
     a = np.empty((3, 3))
     to_matrix(q, a)
@@ -196,7 +221,7 @@ def _loss(b, r, weights, q):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def information(vectors, weights, matrix):  # type: ignore[no-untyped-def]
     """Sum of sigma^-2 (I - v v^T): the inverse of the covariance, in rad^-2."""
     matrix[:] = 0.0
@@ -207,7 +232,7 @@ def information(vectors, weights, matrix):  # type: ignore[no-untyped-def]
                 matrix[i, j] -= weights[k] * vectors[k, i] * vectors[k, j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def inverse_symmetric(m, out):  # type: ignore[no-untyped-def]
     """The inverse of a symmetric (3, 3); False where it has none."""
     c00 = m[1, 1] * m[2, 2] - m[1, 2] * m[1, 2]
@@ -226,7 +251,7 @@ def inverse_symmetric(m, out):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _polish(b, r, weights, q):  # type: ignore[no-untyped-def]
     a = np.empty((3, 3))
     p = np.empty_like(r)
@@ -263,17 +288,18 @@ def _polish(b, r, weights, q):  # type: ignore[no-untyped-def]
             return
 
 
-@njit(cache=True, nogil=True)
-def solve(b, r, sigma_rad, worst_rad, quaternions, covariance, squares):  # type: ignore[no-untyped-def]
-    """TRIAD into row 0 of `quaternions` (2, 4) and QUEST into row 1, with the covariance (3, 3), rad^2.
+@njit(cache=True, nogil=True, error_model="numpy")
+def solve(b, r, sigma_rad, worst_rad, quaternions, covariance, squares, sums):  # type: ignore[no-untyped-def]
+    """TRIAD into row 0 of `quaternions` (2, 4), QUEST into row 1, the covariance (3, 3) in rad^2.
 
-    `squares` (2, n) gets the squared residuals |b - A r|^2 of either.  False
-    where the geometry leaves an axis worse than `worst_rad`.
+    `squares` (2, n) gets the squared residuals |b - A r|^2 of either, `sums`
+    (2, 2) their sum and their sum in units of sigma^2.  False where the geometry
+    leaves an axis worse than `worst_rad`.
     """
     n = len(b)
     weights = 1.0 / (sigma_rad * sigma_rad)
-    first, second, sine = widest_pair(b, weights)
-    if sine <= 1e-12:
+    first, second, sine = widest_pair(b, r, weights)
+    if sine <= LEAST_SINE:
         return False
     matrix = np.empty((3, 3))
     information(b, weights, matrix)
@@ -293,7 +319,13 @@ def solve(b, r, sigma_rad, worst_rad, quaternions, covariance, squares):  # type
     attitude = np.empty((3, 3))
     triad(b[first], b[second], r[first], r[second], attitude)
     to_quaternion(attitude, quaternions[0])
-    quest(b, r, weights, quaternions[0], quaternions[1])
+    # The widest pair may be of coarse stars; TRIAD of the firmest is near the optimum.
+    start = quaternions[0].copy()
+    anchor, other = _firmest_pair(b, r, weights)
+    if anchor != other:
+        triad(b[anchor], b[other], r[anchor], r[other], attitude)
+        to_quaternion(attitude, start)
+    quest(b, r, weights, start, quaternions[1])
     for method in range(2):
         to_matrix(quaternions[method], attitude)
         for k in range(n):
@@ -303,4 +335,6 @@ def solve(b, r, sigma_rad, worst_rad, quaternions, covariance, squares):  # type
                     attitude[i, 0] * r[k, 0] + attitude[i, 1] * r[k, 1] + attitude[i, 2] * r[k, 2]
                 )
                 squares[method, k] += apart * apart
+        sums[method, 0] = squares[method].sum()
+        sums[method, 1] = (squares[method] * weights).sum()
     return True

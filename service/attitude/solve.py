@@ -18,6 +18,8 @@ from service.vectors import ARCSEC_PER_RADIAN, Vector, read_only
 WORST_AXIS_DEG = 1.0
 SUSPECT_TAIL = 0.001
 """A true solution's TASTE passes the bound that makes it suspect with this probability."""
+ODDS_OF_TWO = 100.0
+"""Of two trackers one is named only where the other alone fits so many times likelier."""
 METHODS = ("triad", "quest")
 
 
@@ -40,41 +42,49 @@ def solve_attitude(
     if n < 2:
         return NoAttitude.FEWER_THAN_TWO_UNIQUE_STARS
     sigma_rad = sigma_arcsec / ARCSEC_PER_RADIAN
-    quaternions, covariance, squares = np.empty((2, 4)), np.empty((3, 3)), np.empty((2, n))
-    if not kernels.solve(
-        observed,
-        reference,
-        sigma_rad,
-        math.radians(WORST_AXIS_DEG),
-        quaternions,
-        covariance,
-        squares,
-    ):
+    solved = _solved(observed, reference, sigma_rad)
+    if solved is None:
         return NoAttitude.DEGENERATE_GEOMETRY
+    quaternions, covariance, squares, sums = solved
     chosen = METHODS.index(method)
     square = squares[chosen]
-    weighted = square / sigma_rad**2
-    taste = float(weighted.sum())
+    square_sum, taste = sums[chosen].tolist()
     freedom = 2 * n - 3
     suspect = taste > taste_bound(freedom)
-    residual_arcsec = np.sqrt(square) * ARCSEC_PER_RADIAN
-    between = float(np.linalg.norm(quaternions[0] - quaternions[1]))
-    between = min(between, float(np.linalg.norm(quaternions[0] + quaternions[1])))
+    outlier = _outlier(observed, reference, sigma_rad, tracker_of) if suspect else -1
+    triad, quest = quaternions.tolist()
+    between = min(math.dist(triad, quest), math.dist(triad, [-part for part in quest]))
     return AttitudeSolution(
-        quaternion=read_only(quaternions[chosen].copy()),
+        quaternion=quaternions[chosen],
         method=method,
         covariance_arcsec2=read_only(covariance * ARCSEC_PER_RADIAN**2),
-        residual_arcsec=read_only(residual_arcsec),
-        residual_rms_arcsec=math.sqrt(float(residual_arcsec @ residual_arcsec) / n),
+        residual_arcsec=read_only(np.sqrt(square) * ARCSEC_PER_RADIAN),
+        residual_rms_arcsec=math.sqrt(square_sum / n) * ARCSEC_PER_RADIAN,
         predicted_rms_arcsec=_predicted_rms_arcsec(sigma_arcsec, freedom),
         taste=taste,
         degrees_of_freedom=freedom,
         suspect=suspect,
-        triad=read_only(quaternions[0].copy()),
-        quest=read_only(quaternions[1].copy()),
+        triad=quaternions[0],
+        quest=quaternions[1],
         triad_quest_angle_arcsec=4.0 * math.asin(min(1.0, between / 2.0)) * ARCSEC_PER_RADIAN,
-        trackers=_tracker_fits(weighted, tracker_of, trackers, suspect),
+        trackers=_tracker_fits(square / sigma_rad**2, tracker_of, trackers, outlier)
+        if len(trackers) > 1
+        else (),
     )
+
+
+def _solved(
+    observed: Vector, reference: Vector, sigma_rad: Vector
+) -> tuple[Vector, Vector, Vector, Vector] | None:
+    """The kernel's arrays (see `kernels.solve`), None where the geometry gives no attitude."""
+    quaternions, covariance = np.empty((2, 4)), np.empty((3, 3))
+    squares, sums = np.empty((2, len(observed))), np.empty((2, 2))
+    worst_rad = math.radians(WORST_AXIS_DEG)
+    if not kernels.solve(
+        observed, reference, sigma_rad, worst_rad, quaternions, covariance, squares, sums
+    ):
+        return None
+    return read_only(quaternions), covariance, squares, sums
 
 
 @lru_cache(maxsize=1024)
@@ -93,16 +103,35 @@ def _predicted_rms_arcsec(sigma_arcsec: Vector, freedom: int) -> float:
 
 
 def _tracker_fits(
-    weighted: Vector, tracker_of: npt.NDArray[np.int64], trackers: tuple[str, ...], suspect: bool
+    weighted: Vector, tracker_of: npt.NDArray[np.int64], trackers: tuple[str, ...], outlier: int
 ) -> tuple[TrackerFit, ...]:
-    """Each tracker's share of TASTE; of a suspect joint solution the worst per star is the outlier."""
-    if len(trackers) < 2:
-        return ()
+    """Each tracker's share of TASTE."""
     stars = np.bincount(tracker_of, minlength=len(trackers))
     taste = np.bincount(tracker_of, weights=weighted, minlength=len(trackers))
-    per_star = np.where(stars > 0, taste / np.maximum(stars, 1), -1.0)
-    worst = int(np.argmax(per_star)) if suspect and np.count_nonzero(stars) > 1 else -1
     return tuple(
-        TrackerFit(name, int(stars[i]), float(taste[i]), i == worst)
+        TrackerFit(name, int(stars[i]), float(taste[i]), i == outlier)
         for i, name in enumerate(trackers)
     )
+
+
+def _outlier(
+    observed: Vector, reference: Vector, sigma_rad: Vector, tracker_of: npt.NDArray[np.int64]
+) -> int:
+    """The tracker without which the rest agrees best; -1 where it never agrees, or two are alike.
+
+    The shares of TASTE do not tell: a misaligned tracker with most of the stars
+    pulls the joint attitude to itself, and the others look worse.  Of two
+    trackers that disagree, each in itself sound, neither can be named.
+    """
+    from scipy.special import chdtrc
+
+    tails = []
+    for tracker in np.unique(tracker_of):
+        rest = tracker_of != tracker
+        n = int(rest.sum())
+        solved = _solved(observed[rest], reference[rest], sigma_rad[rest]) if n > 1 else None
+        tail = 0.0 if solved is None else float(chdtrc(2 * n - 3, solved[3][1, 1]))
+        tails.append((tail, int(tracker)))
+    (second, _), (best, outlier) = sorted(tails)[-2:] if len(tails) > 1 else [(0.0, -1)] * 2
+    plain = len(tails) > 2 or best > ODDS_OF_TWO * second
+    return outlier if plain and best > SUSPECT_TAIL else -1

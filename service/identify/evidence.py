@@ -39,13 +39,13 @@ _LOG_2PI = math.log(2.0 * math.pi)
 
 @njit(cache=True, nogil=True)
 def log_beta(a, b):  # type: ignore[no-untyped-def]
-    """ln B(a, b)."""
+    """Logarithm of Euler's beta function."""
     return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
 
 
 @njit(cache=True, nogil=True)
 def log_clutter(clutter, stars):  # type: ignore[no-untyped-def]
-    """ln of the probability that just these are clutter."""
+    """Log probability that just these are clutter."""
     return log_beta(clutter + BETA_CLUTTER, stars + BETA_STAR) - log_beta(BETA_CLUTTER, BETA_STAR)
 
 
@@ -87,7 +87,7 @@ def log_positions(stars, square, log_det, reference_sigma_rad):  # type: ignore[
 
 @njit(cache=True, nogil=True)
 def log_magnitudes(count, total_mag, square_mag2):  # type: ignore[no-untyped-def]
-    """The magnitudes of `count` stars, from the sum and sum of squares of observed minus catalog."""
+    """The magnitudes of `count` stars: sum and sum of squares of observed minus catalog."""
     if count == 0:
         return 0.0
     largest = -math.inf

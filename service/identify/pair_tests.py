@@ -10,7 +10,11 @@ import math
 import numpy as np
 from numba import njit
 
+from service.identify.fov_rotation import rotation_rad
+from service.identify.identification import Outcome
 from service.sky.pairs import separation_rad
+
+UNMATCHED, UNIQUE, AMBIGUOUS = (int(outcome) for outcome in Outcome)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -33,12 +37,18 @@ def cast_votes(  # type: ignore[no-untyped-def]
     cross_tolerance,  # CAPMAX or BANMAX, radians
     pole_tolerance,  # BANTOL1, radians
     angle_tolerance,  # BANTOL2, radians
+    rotation_tolerance,  # of the field of view, radians
+    boresight,  # (3,) inertial through the a priori attitude
+    is_band,
     test_magnitude,
     test_cross,
     test_pole,
+    test_rotation,
     votes,  # (n, m) counted up
+    edges,  # (0, 4), or as many rows as half the votes: each vote's i, a, j, b
 ):
     """Cast the votes of every observed pair's surviving candidate pairs."""
+    kept = 0
     n, m = len(observed), len(direction)
     # A zone star's angle to the axis is worked out when first asked for; -1: not yet.
     polar = np.full(m, -1.0)
@@ -133,12 +143,50 @@ def cast_votes(  # type: ignore[no-untyped-def]
                     elif not (along if order == 1 else against):
                         continue
 
+                if test_rotation:
+                    # Of both orders, where nothing told one, that which turns little stays.
+                    along, against = order >= 0, order <= 0
+                    if along:
+                        turn = rotation_rad(
+                            observed[i],
+                            observed[j],
+                            direction[a],
+                            direction[b],
+                            boresight,
+                            axis,
+                            is_band,
+                        )
+                        along = turn <= rotation_tolerance
+                    if against:
+                        turn = rotation_rad(
+                            observed[i],
+                            observed[j],
+                            direction[b],
+                            direction[a],
+                            boresight,
+                            axis,
+                            is_band,
+                        )
+                        against = turn <= rotation_tolerance
+                    if not (along or against):
+                        continue
+                    if not (along and against):
+                        order = 1 if along else -1
+
                 if order >= 0:
                     votes[i, a] += 1
                     votes[j, b] += 1
+                    if len(edges):
+                        edges[kept, 0], edges[kept, 1] = i, a
+                        edges[kept, 2], edges[kept, 3] = j, b
+                        kept += 1
                 if order <= 0:
                     votes[i, b] += 1
                     votes[j, a] += 1
+                    if len(edges):
+                        edges[kept, 0], edges[kept, 1] = i, b
+                        edges[kept, 2], edges[kept, 3] = j, a
+                        kept += 1
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -155,8 +203,12 @@ def _unit_cross(a, b, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def count_votes(votes, winner, highest, second, tied):  # type: ignore[no-untyped-def]
-    """Per observed star: the first row of most votes, that tally, the next one, how many share it."""
+def count_votes(votes, star_of, outcome, star, highest, second):  # type: ignore[no-untyped-def]
+    """Per observed star: outcome, the winner's row of `star_of` (-1: none), the two highest tallies.
+
+    True where any star is ambiguous.
+    """
+    any_tie = False
     for i in range(votes.shape[0]):
         best = runner = 0
         row = -1
@@ -170,4 +222,8 @@ def count_votes(votes, winner, highest, second, tied):  # type: ignore[no-untype
                 share += 1
             elif count > runner:
                 runner = count
-        winner[i], highest[i], second[i], tied[i] = row, best, runner, share
+        highest[i], second[i] = best, runner
+        star[i] = star_of[row] if share == 1 else -1
+        outcome[i] = UNMATCHED if share == 0 else UNIQUE if share == 1 else AMBIGUOUS
+        any_tie = any_tie or share > 1
+    return any_tie

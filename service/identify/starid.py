@@ -8,14 +8,19 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
-from service.identify.identification import Identification, Outcome
+from service.identify.identification import Identification, Integers, Outcome
+from service.identify.match_groups import MAX_EDGES, keep_largest_groups
 from service.identify.pair_tests import cast_votes, count_votes
 from service.missions.mission import Tests, Tolerances
 from service.sky.zones import Aim, Zone
 from service.vectors import Vector
 
+Tallies = npt.NDArray[np.int32]
+
 MAX_RIVALS = 20
+_NO_EDGES = np.empty((0, 4), np.int32)
 
 
 @dataclass(frozen=True)
@@ -26,7 +31,8 @@ class Sighting:
     be NaN; sigma is one standard deviation per tangent axis.  `zone` holds at
     least the stars within `aim`.  Of the presumed attitude the whole rotation
     is known, or only how it points `known_axis` (inertial).  `velocity_c` of the
-    observer is zero where aberration is not to be corrected.
+    observer is zero where aberration is not to be corrected.  `boresight` is the
+    presumed one, inertial.
     """
 
     direction: Vector
@@ -34,6 +40,7 @@ class Sighting:
     sigma_rad: Vector
     known_axis: Vector | None
     velocity_c: Vector
+    boresight: Vector
     aim: Aim
     zone: Zone
     tolerances: Tolerances
@@ -42,14 +49,32 @@ class Sighting:
 
 def identify_by_votes(sighting: Sighting) -> Identification:
     """Identify the stars of one tracker by the votes of pairs, steps 1 to 10."""
+    zone, tests = sighting.zone, sighting.tests
+    n = len(sighting.direction)
+    votes = np.zeros((n, len(zone.star)), np.int32)
+    _cast(sighting, votes, _NO_EDGES)
+    bounded = tests.match_groups and _keep_groups(sighting, votes)
+    outcome, star, highest, second = np.empty((4, n), np.int64)
+    any_tie = count_votes(votes, zone.star, outcome, star, highest, second)
+    return Identification(
+        outcome=outcome,
+        star=star,
+        votes=highest,
+        runner_up=second,
+        rivals=_tied(votes, outcome, highest, zone) if any_tie else ((),) * n,
+        probability=np.full(n, np.nan),
+        bounded=bounded,
+    )
+
+
+def _cast(sighting: Sighting, votes: Tallies, edges: Tallies) -> None:
+    """Cast the votes of all pairs, and write the pairs to `edges` where it has rows."""
     zone, aim, limits, tests = (
         sighting.zone,
         sighting.aim,
         sighting.tolerances,
         sighting.tests,
     )
-    n = len(sighting.direction)
-    votes = np.zeros((n, len(zone.star)), np.int32)
     cast_votes(
         sighting.direction,
         sighting.magnitude_mag,
@@ -69,28 +94,35 @@ def identify_by_votes(sighting: Sighting) -> Identification:
         math.radians(limits.cross_product_deg),
         math.radians(limits.pole_difference_deg),
         math.radians(limits.pole_angle_deg),
+        math.radians(limits.fov_rotation_deg),
+        sighting.boresight,
+        aim.kind == "band",
         tests.magnitude,
         tests.cross_product,
         tests.pole,
+        tests.fov_rotation,
         votes,
+        edges,
     )
-    counted = np.empty((4, n), np.int64)
-    winner, highest, second, tied = counted
-    count_votes(votes, winner, highest, second, tied)
-    outcome = np.where(tied > 1, int(Outcome.AMBIGUOUS), tied)
-    star = np.full(n, -1)
-    unique = tied == 1
-    star[unique] = zone.star[winner[unique]]
-    return Identification(
-        outcome=outcome,
-        star=star,
-        votes=highest,
-        runner_up=second,
-        rivals=tuple(
-            tuple(zone.star[np.flatnonzero(votes[i] == highest[i])[:MAX_RIVALS]].tolist())
-            if tied[i] > 1
-            else ()
-            for i in range(n)
-        ),
-        probability=np.full(n, np.nan),
+
+
+def _keep_groups(sighting: Sighting, votes: Tallies) -> bool:
+    """Leave only the votes of the largest match groups; whether that search was cut short."""
+    count = int(votes.sum()) // 2
+    if count > MAX_EDGES:
+        return True
+    edges = np.empty((count, 4), np.int32)
+    _cast(sighting, np.zeros_like(votes), edges)
+    return keep_largest_groups(votes, edges)
+
+
+def _tied(
+    votes: Tallies, outcome: Integers, highest: Integers, zone: Zone
+) -> tuple[tuple[int, ...], ...]:
+    """The stars that share the highest tally of each ambiguous star, brightest first."""
+    return tuple(
+        tuple(zone.star[np.flatnonzero(row == most)[:MAX_RIVALS]].tolist())
+        if what == Outcome.AMBIGUOUS
+        else ()
+        for row, what, most in zip(votes, outcome, highest, strict=True)
     )

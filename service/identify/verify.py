@@ -1,7 +1,7 @@
 """The identifier `verified`: a probability for every star, from all that is known of all of them.
 
 Hypotheses are searched for without the tests of steps 1 to 10 and weighed as a
-posterior (`hypotheses`, `evidence`); a star is unique from a probability of
+posterior (`search`, `evidence`); a star is unique from a probability of
 0.999.  STARID's votes are counted beside it and shown.
 """
 
@@ -10,9 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from service.identify import hypotheses as search_for
 from service.identify.evidence import PRIOR_DIRECTION, PRIOR_ROTATION
+from service.identify.hypotheses import MAX_HYPOTHESES, marginals
 from service.identify.identification import Identification, Outcome
+from service.identify.scene import Pairs, Seen, Stars
+from service.identify.search import search
 from service.identify.starid import MAX_RIVALS, Sighting, identify_by_votes
 
 UNIQUE_PROBABILITY = 0.999
@@ -20,41 +22,16 @@ UNIQUE_PROBABILITY = 0.999
 
 def identify_verified(sighting: Sighting) -> Identification:
     """Identify the stars of one tracker by the posterior of hypotheses."""
-    zone, aim = sighting.zone, sighting.aim
+    zone = sighting.zone
     n = len(sighting.direction)
     star, probability, none = np.full(n, -1), np.zeros(n), np.ones(n)
     rivals = np.full((n, MAX_RIVALS), -1)
     bounded = False
     if n >= 2 and len(zone.star) >= 2:
-        found = np.empty((search_for.MAX_HYPOTHESES, n), np.int32)
-        log_weight = np.empty(search_for.MAX_HYPOTHESES)
-        grid, pairs = zone.grid, zone.pairs
-        count, rest, _, bounded = search_for.search(
-            sighting.direction,
-            sighting.magnitude_mag,
-            sighting.sigma_rad,
-            zone.direction,
-            zone.magnitude_mag,
-            pairs.separation_rad,
-            pairs.brighter,
-            pairs.dimmer,
-            pairs.bin_start,
-            pairs.bins_per_rad,
-            grid.box,
-            grid.offset,
-            grid.start,
-            grid.rows,
-            aim.axis,
-            math.radians(aim.least_deg),
-            math.radians(aim.most_deg),
-            sighting.velocity_c,
-            PRIOR_ROTATION if sighting.known_axis is None else PRIOR_DIRECTION,
-            aim.axis if sighting.known_axis is None else sighting.known_axis,
-            False,
-            found,
-            log_weight,
-        )
-        search_for.marginals(found, log_weight, count, rest, star, probability, none, rivals)
+        ledger = np.empty((MAX_HYPOTHESES, n), np.int32)
+        log_weight = np.empty(MAX_HYPOTHESES)
+        count, rest, _, bounded = search(*_scene(sighting), False, ledger, log_weight)
+        marginals(ledger, log_weight, count, rest, star, probability, none, rivals)
     unique = probability >= UNIQUE_PROBABILITY
     unmatched = ~unique & (none >= probability)
     return replace(
@@ -73,4 +50,39 @@ def identify_verified(sighting: Sighting) -> Identification:
         ),
         probability=np.where(unmatched, none, probability),
         bounded=bounded,
+    )
+
+
+def _scene(sighting: Sighting) -> tuple[Seen, Stars, Pairs]:
+    """The sighting as the kernels take it."""
+    zone, aim, pairs = sighting.zone, sighting.aim, sighting.zone.pairs
+    reference_sigma = float(sighting.sigma_rad.min())
+    seen = Seen(
+        observed=sighting.direction,
+        magnitude=sighting.magnitude_mag,
+        sigma_rad=sighting.sigma_rad,
+        weight=(reference_sigma / sighting.sigma_rad) ** 2,
+        reference_sigma=reference_sigma,
+        velocity=sighting.velocity_c,
+        prior_kind=PRIOR_ROTATION if sighting.known_axis is None else PRIOR_DIRECTION,
+        prior_axis=aim.axis if sighting.known_axis is None else sighting.known_axis,
+    )
+    stars = Stars(
+        direction=zone.direction,
+        magnitude=zone.magnitude_mag,
+        box=zone.grid.box,
+        offset=zone.grid.offset,
+        start=zone.grid.start,
+        rows=zone.grid.rows,
+        axis=aim.axis,
+        least=math.radians(aim.least_deg),
+        most=math.radians(aim.most_deg),
+        polar=np.full(len(zone.star), -1.0),
+    )
+    return (
+        seen,
+        stars,
+        Pairs(
+            pairs.separation_rad, pairs.brighter, pairs.dimmer, pairs.bin_start, pairs.bins_per_rad
+        ),
     )

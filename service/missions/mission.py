@@ -62,6 +62,8 @@ class Tolerances(_Strict):
     cross_product_deg: float = Field(ge=0, le=180)  # CAPMAX, in bands BANMAX
     pole_difference_deg: float = Field(default=0.13, ge=0, le=180)  # BANTOL1
     pole_angle_deg: float = Field(default=7.2, ge=0, le=180)  # BANTOL2
+    fov_rotation_deg: float = Field(default=10.0, ge=0, le=180)
+    """Of Van Bezooijen's test, which the paper leaves out and the missions have off."""
 
 
 class Tests(_Strict):

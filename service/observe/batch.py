@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from service.missions.mission import Identifier, Solver
 from service.times import Utc
 from service.vectors import Vector
 
@@ -46,8 +47,8 @@ APriori = QuaternionPrior | BoresightPrior | SunPointedPrior
 class Options:
     """What a batch or a what-if asks to be done otherwise than its mission says."""
 
-    identifier: str | None = None
-    solver: str | None = None
+    identifier: Identifier | None = None
+    solver: Solver | None = None
     tests: dict[str, bool] = field(default_factory=dict)
     tolerances: dict[str, float] = field(default_factory=dict)
     zone_grid_deg: float | None = None

@@ -166,6 +166,7 @@ class TolerancesIn(Wire):
     cross_product_deg: Tolerance | None = None
     pole_difference_deg: Tolerance | None = None
     pole_angle_deg: Tolerance | None = None
+    fov_rotation_deg: Tolerance | None = None
 
 
 class OptionsIn(Wire):
@@ -179,7 +180,7 @@ class OptionsIn(Wire):
 
     def to_options(self, field: str = "options") -> Options:
         """The options as the core takes them; raises `NotAvailable` for what is not there yet."""
-        if self.identifier not in (None, "starid"):
+        if self.identifier not in (None, "starid", "verified"):
             raise NotAvailable(
                 Fault(
                     f"{field}.identifier",
@@ -187,14 +188,10 @@ class OptionsIn(Wire):
                     shown_value(self.identifier),
                 )
             )
-        tests = self.tests.model_dump(exclude_none=True)
-        for name in ("fov_rotation", "match_groups"):
-            if tests.get(name):
-                raise NotAvailable(Fault(f"{field}.tests.{name}", "is not there yet", "True"))
         return Options(
             identifier=self.identifier,
             solver=self.solver,
-            tests=tests,
+            tests=self.tests.model_dump(exclude_none=True),
             tolerances=self.tolerances.model_dump(exclude_none=True),
             zone_grid_deg=self.zone_grid_deg,
         )
@@ -253,7 +250,7 @@ class BatchIn(Wire):
             batch=self.batch,
             run=self.run,
             time=parse_utc(self.time),
-            a_priori=self._prior(),
+            a_priori=prior_of(self.a_priori, self.sun_vector, self.position_km),
             body_rates_deg_per_s=_array(self.body_rates_deg_per_s),
             velocity_km_per_s=_optional_array(self.velocity_km_per_s),
             aberration=self.aberration,
@@ -261,21 +258,29 @@ class BatchIn(Wire):
             options=self.options.to_options(),
         )
 
-    def _prior(self) -> APriori:
-        prior = self.a_priori
-        if prior is None:
-            raise NotAvailable(
-                Fault("a_priori", "lost-in-space identification is not there yet", "null")
-            )
-        if isinstance(prior, QuaternionIn):
-            return QuaternionPrior(read_only(unit(prior.quaternion)))
-        if isinstance(prior, BoresightIn):
-            return BoresightPrior(prior.boresight.ra_deg, prior.boresight.dec_deg)
-        sun = prior.sun_vector or self.sun_vector
-        return SunPointedPrior(
-            None if sun is None else read_only(unit(sun)),
-            _optional_array(prior.position_km or self.position_km),
+
+def prior_of(
+    prior: APrioriIn | None,
+    sun_vector: Iterable[float] | None = None,
+    position_km: Iterable[float] | None = None,
+) -> APriori:
+    """The a priori knowledge as the core takes it; the Sun's direction may stand beside it too.
+
+    Raises `NotAvailable` for none at all.
+    """
+    if prior is None:
+        raise NotAvailable(
+            Fault("a_priori", "lost-in-space identification is not there yet", "null")
         )
+    if isinstance(prior, QuaternionIn):
+        return QuaternionPrior(read_only(unit(prior.quaternion)))
+    if isinstance(prior, BoresightIn):
+        return BoresightPrior(prior.boresight.ra_deg, prior.boresight.dec_deg)
+    sun = prior.sun_vector or sun_vector
+    return SunPointedPrior(
+        None if sun is None else read_only(unit(np.array(sun))),
+        _optional_array(prior.position_km or position_km),
+    )
 
 
 def _array(values: Iterable[Any]) -> Vector:

@@ -1,0 +1,157 @@
+"""Fitting a hypothesis and weighing it.
+
+A hypothesis is `match` (n,): for every observed star the row of a zone star,
+-1 for clutter.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from service.attitude.kernels import inverse_symmetric, triad
+from service.identify import evidence
+from service.identify.evidence import PRIOR_ROTATION
+from service.sky.pairs import separation_rad
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fit(seen, stars, match, t, references):  # type: ignore[no-untyped-def]
+    """Fit T to a hypothesis: TRIAD on the widest pair, then two Gauss-Newton steps.
+
+    Returns the number of stars, the weighted sum of squared residuals and
+    ln det N; the number is 0 where the geometry gives no attitude.
+    `references` gets the apparent directions of the matched stars.
+    """
+    n = len(match)
+    observed = seen.observed
+    count = 0
+    for k in range(n):
+        if match[k] >= 0:
+            count += 1
+            norm = 0.0
+            for i in range(3):
+                references[k, i] = stars.direction[match[k], i] + seen.velocity[i]
+                norm += references[k, i] ** 2
+            norm = math.sqrt(norm)
+            for i in range(3):
+                references[k, i] /= norm
+    first = second = -1
+    widest = 0.0
+    for k in range(n - 1):
+        if match[k] < 0:
+            continue
+        for other in range(k + 1, n):
+            if match[other] >= 0:
+                apart = separation_rad(references[k], references[other])
+                apart = min(apart, math.pi - apart)
+                if apart > widest:
+                    widest, first, second = apart, k, other
+    if widest < 1e-5 or separation_rad(observed[first], observed[second]) < 1e-5:
+        return 0, 0.0, 0.0
+    triad(observed[first], observed[second], references[first], references[second], t)
+    matrix = np.empty((3, 3))
+    inverse = np.empty((3, 3))
+    square = 0.0
+    for step in range(3):
+        matrix[:] = 0.0
+        g0 = g1 = g2 = square = 0.0
+        for k in range(n):
+            if match[k] < 0:
+                continue
+            w = seen.weight[k]
+            r = references[k]
+            p0 = t[0, 0] * r[0] + t[0, 1] * r[1] + t[0, 2] * r[2]
+            p1 = t[1, 0] * r[0] + t[1, 1] * r[1] + t[1, 2] * r[2]
+            p2 = t[2, 0] * r[0] + t[2, 1] * r[1] + t[2, 2] * r[2]
+            d0, d1, d2 = observed[k, 0] - p0, observed[k, 1] - p1, observed[k, 2] - p2
+            square += w * (d0 * d0 + d1 * d1 + d2 * d2)
+            g0 += w * (d1 * p2 - d2 * p1)
+            g1 += w * (d2 * p0 - d0 * p2)
+            g2 += w * (d0 * p1 - d1 * p0)
+            matrix[0, 0] += w * (1.0 - p0 * p0)
+            matrix[1, 1] += w * (1.0 - p1 * p1)
+            matrix[2, 2] += w * (1.0 - p2 * p2)
+            matrix[0, 1] -= w * p0 * p1
+            matrix[0, 2] -= w * p0 * p2
+            matrix[1, 2] -= w * p1 * p2
+        if step == 2:
+            break
+        matrix[1, 0], matrix[2, 0], matrix[2, 1] = matrix[0, 1], matrix[0, 2], matrix[1, 2]
+        if not inverse_symmetric(matrix, inverse):
+            return 0, 0.0, 0.0
+        e0 = inverse[0, 0] * g0 + inverse[0, 1] * g1 + inverse[0, 2] * g2
+        e1 = inverse[1, 0] * g0 + inverse[1, 1] * g1 + inverse[1, 2] * g2
+        e2 = inverse[2, 0] * g0 + inverse[2, 1] * g1 + inverse[2, 2] * g2
+        _turn(t, e0, e1, e2)
+    det = (
+        matrix[0, 0] * (matrix[1, 1] * matrix[2, 2] - matrix[1, 2] ** 2)
+        - matrix[0, 1] * (matrix[0, 1] * matrix[2, 2] - matrix[1, 2] * matrix[0, 2])
+        + matrix[0, 2] * (matrix[0, 1] * matrix[1, 2] - matrix[1, 1] * matrix[0, 2])
+    )
+    if not det > 0.0:
+        return 0, 0.0, 0.0
+    return count, square, math.log(det)
+
+
+@njit(cache=True, nogil=True)
+def _turn(t, e0, e1, e2):  # type: ignore[no-untyped-def]
+    """T becomes exp(-[e x]) T, by the quaternion (e/2, 1) so that it stays orthonormal."""
+    norm = 1.0 / math.sqrt(1.0 + 0.25 * (e0 * e0 + e1 * e1 + e2 * e2))
+    x, y, z, c = 0.5 * e0 * norm, 0.5 * e1 * norm, 0.5 * e2 * norm, norm
+    for j in range(3):
+        a, b, d = t[0, j], t[1, j], t[2, j]
+        t[0, j] = (
+            (x * x - y * y - z * z + c * c) * a + 2 * (x * y + z * c) * b + 2 * (x * z - y * c) * d
+        )
+        t[1, j] = (
+            2 * (x * y - z * c) * a + (-x * x + y * y - z * z + c * c) * b + 2 * (y * z + x * c) * d
+        )
+        t[2, j] = (
+            2 * (x * z + y * c) * a + 2 * (y * z - x * c) * b + (-x * x - y * y + z * z + c * c) * d
+        )
+
+
+@njit(cache=True, nogil=True)
+def prior_angle(t, axis, kind):  # type: ignore[no-untyped-def]
+    """The angle that the prior weighs: T's total rotation, or the tilt that it gives the axis."""
+    if kind == PRIOR_ROTATION:
+        x, y, z = t[2, 1] - t[1, 2], t[0, 2] - t[2, 0], t[1, 0] - t[0, 1]
+        return math.atan2(math.sqrt(x * x + y * y + z * z), t[0, 0] + t[1, 1] + t[2, 2] - 1.0)
+    chord2 = 0.0
+    for j in range(3):
+        carried = axis[0] * t[0, j] + axis[1] * t[1, j] + axis[2] * t[2, j]
+        chord2 += (carried - axis[j]) ** 2
+    return 2.0 * math.asin(min(1.0, 0.5 * math.sqrt(chord2)))
+
+
+@njit(cache=True, nogil=True)
+def weigh(seen, stars, density, match, t, references):  # type: ignore[no-untyped-def]
+    """The log weight of a hypothesis, fitted; T is left in `t`.  `density`: see `log_density`."""
+    count, square, log_det = fit(seen, stars, match, t, references)
+    if count < 2:
+        return -math.inf
+    compared = clutter = 0
+    total = total2 = log_relative = 0.0
+    for k in range(len(match)):
+        if match[k] >= 0:
+            log_relative += math.log(seen.weight[k])
+        if np.isnan(seen.magnitude[k]):
+            continue
+        if match[k] < 0:
+            clutter += 1
+            continue
+        difference = seen.magnitude[k] - stars.magnitude[match[k]]
+        compared += 1
+        total += difference
+        total2 += difference * difference
+    kind = seen.prior_kind
+    return (
+        evidence.log_prior(prior_angle(t, seen.prior_axis, kind), kind)
+        + evidence.log_positions(count, square, log_det, seen.reference_sigma)
+        + log_relative
+        + evidence.log_magnitudes(compared, total, total2)
+        + evidence.log_clutter(len(match) - count, count)
+        - clutter * math.log(evidence.CLUTTER_SPAN_MAG)
+        - count * density
+    )
