@@ -23,33 +23,26 @@ from service.identify.identification import Identification, Outcome
 from service.identify.presumed import Presumed, aim_of, presumed_attitude
 from service.identify.starid import Sighting, identify_by_votes
 from service.identify.verify import identify_verified
-from service.missions.mission import Band, Mission, Solver, Tests, Tolerances
+from service.missions.mission import Band, Identifier, Mission, Solver, Tests, Tolerances
 from service.observe.batch import (
-    APriori,
     BoresightPrior,
     ObservationBatch,
-    Options,
-    QuaternionPrior,
-    SunPointedPrior,
-    TrackerStars,
 )
 from service.observe.correct import CorrectedObservations, correct
 from service.sky.ephemeris import apparent, observer_velocity
 from service.sky.run_catalog import RunCatalog
-from service.sky.shelf import Shelf
 from service.sky.view import Sky
 from service.sky.zones import Aim, Zone
-from service.times import Utc, parse_utc
+from service.times import Utc
 from service.vectors import (
     ARCSEC_PER_RADIAN,
     Vector,
     matrix_from_quaternion,
-    quaternion_from_matrix,
 )
 
 Array = npt.NDArray[Any]
 
-IDENTIFIERS: Mapping[str, Callable[[Sighting], Identification]] = {
+IDENTIFIERS: Mapping[Identifier, Callable[[Sighting], Identification]] = {
     "starid": identify_by_votes,
     "verified": identify_verified,
 }
@@ -59,7 +52,7 @@ IDENTIFIERS: Mapping[str, Callable[[Sighting], Identification]] = {
 class Choices:
     """What holds for one batch: its mission's settings with its own options in their place."""
 
-    identifier: str
+    identifier: Identifier
     solver: Solver
     tolerances: Tolerances
     tests: Tests
@@ -124,7 +117,7 @@ class Acquisition:
 def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
     """Identify a batch's stars and solve for the attitude.
 
-    Raises `BadBatch` for what does not fit the mission: a tracker it has not,
+    Raises `BadInput` for what does not fit the mission: a tracker it has not,
     a kind of a priori knowledge that its zone cannot use.
     """
     choices = choices_of(batch, mission)
@@ -211,70 +204,6 @@ def choices_of(batch: ObservationBatch, mission: Mission) -> Choices:
         tests=mission.tests.model_copy(update=tests),
         zone_grid_deg=mission.zone.grid_deg if grid_deg is None else grid_deg,
     )
-
-
-def warm_zones(sky: Sky, mission: Mission, prior: APriori, time: Utc) -> list[Zone]:
-    """Put the zones on the shelf that a batch of this a priori knowledge will ask for."""
-    presumed = presumed_attitude(prior, time, mission)
-    run_catalog = sky.run_catalog(mission, time)
-    return [
-        sky.zone(
-            mission,
-            run_catalog,
-            aim_of(tracker, presumed, mission, "a_priori"),
-            mission.tolerances.pair_separation_max_deg,
-            mission.zone.grid_deg,
-        )[0]
-        for tracker in mission.trackers
-    ]
-
-
-def warm_up(sky: Sky, missions: Mapping[str, Mission]) -> None:
-    """Compile every kernel by running a batch of real stars of each kind of zone.
-
-    What is built for it goes on a shelf of its own and is forgotten.
-    """
-    moment = parse_utc("2000-01-01T12:00:00Z")
-    apart = Sky(sky.catalog, Shelf(max_bytes=0))
-    kinds = {mission.zone.kind: mission for mission in missions.values()}
-    for mission in kinds.values():
-        tracker = mission.trackers[0]
-        attitude = presumed_attitude(
-            SunPointedPrior(None, None)
-            if mission.zone.kind == "band"
-            else BoresightPrior(0.0, 0.0),
-            moment,
-            mission,
-        ).attitude
-        run_catalog = apart.run_catalog(mission, moment)
-        boresight = attitude.T @ tracker.body_from_tracker[:, 2]
-        stars = np.argsort(-(run_catalog.direction @ boresight))[:5]
-        seen = run_catalog.direction[stars] @ attitude.T @ tracker.body_from_tracker
-        none = np.full(len(stars), np.nan)
-        observed = TrackerStars(
-            tracker=tracker.name,
-            vector=seen,
-            angles_deg=np.full((len(stars), 2), np.nan),
-            magnitude_mag=run_catalog.magnitude_mag[stars],
-            time_offset_s=np.zeros(len(stars)),
-            sigma_arcsec=none,
-        )
-        acquire(
-            ObservationBatch(
-                spacecraft=mission.name,
-                batch="warm-up",
-                run="warm-up",
-                time=moment,
-                a_priori=QuaternionPrior(quaternion_from_matrix(attitude)),
-                body_rates_deg_per_s=np.zeros(3),
-                velocity_km_per_s=None,
-                aberration="to_correct",
-                observations=(observed,),
-                options=Options(zone_grid_deg=0.0),
-            ),
-            mission,
-            apart,
-        )
 
 
 def _place(

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
-from service.acquire import warm_up, warm_zones
 from service.errors import (
     AcquisitionError,
     BadBatch,
@@ -35,6 +34,7 @@ from service.sky.shelf import Shelf
 from service.sky.view import Sky
 from service.sky.zones import Zone
 from service.times import Utc
+from service.warm import warm_up, warm_zones
 
 __all__ = ["LIVE", "Answered", "Operations", "Page"]
 
@@ -70,7 +70,7 @@ class Operations:
         Raises `BadConfiguration` for whatever of these cannot be used.
         """
         missions = load_missions(settings.missions)
-        sky = Sky(_load_catalog(settings.catalog), Shelf(settings.shelf_mb << 20))
+        sky = Sky(load_catalog(settings.catalog), Shelf(settings.shelf_mb << 20))
         operations = cls(settings, missions, sky, Store(settings.database))
         try:
             operations._register()
@@ -317,7 +317,8 @@ def _run_name(text: str) -> str:
         raise BadBatch(Fault("run", message, shown_value(text))) from None
 
 
-def _load_catalog(file: Path | None) -> Catalog:
+def load_catalog(file: Path | None) -> Catalog:
+    """The site's catalog, or the embedded one; raises `BadConfiguration` where it is damaged."""
     if file is None:
         return load_embedded()
     try:

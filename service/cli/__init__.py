@@ -1,0 +1,51 @@
+"""The `acquire` command.
+
+Nothing is imported before it is needed: help answers at once, and each command
+loads its own part of the service alone.
+"""
+
+import os
+import sys
+from collections.abc import Sequence
+
+from service.cli.parser import build_parser
+from service.errors import AcquisitionError, BadInput
+
+USAGE_ERROR = 2
+INTERRUPTED = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code.
+
+    0: done; 1: done, with lines or differences that are reported; 2: refused
+    for its usage, configuration or input, or no service to talk to.
+    """
+    parsed = build_parser().parse_args(arguments)
+    from service.cli import commands
+
+    try:
+        code: int = getattr(commands, parsed.command)(parsed)
+        sys.stdout.flush()
+        return code
+    except BadInput as error:
+        for fault in error.faults:
+            _complain(str(fault))
+    except AcquisitionError as error:
+        _complain(str(error))
+    except KeyboardInterrupt:
+        _complain("interrupted")
+        return INTERRUPTED
+    except BrokenPipeError:
+        # Whoever read the output has seen enough; nothing more may be written to it.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        _complain(f"{where}{error.strerror or error}")
+    return USAGE_ERROR
+
+
+def _complain(text: str) -> None:
+    for line in text.splitlines() or [""]:
+        print(f"acquire: {line}", file=sys.stderr)

@@ -1,0 +1,46 @@
+"""Replay through the operations of this process, without a server."""
+
+import time
+from collections.abc import Iterable
+
+from service.errors import AcquisitionError, Busy
+from service.operations import Operations
+from service.replay.items import Item, Outcome, Pace, Report, problem_of
+
+CHUNK = 500
+"""Batches of one transaction: enough to share its cost, few enough to see progress."""
+
+
+def replay_in_process(
+    operations: Operations, items: Iterable[Item], report: Report, pace: Pace | None = None
+) -> None:
+    """Submit every item and report what became of it, in order."""
+    pace = pace or Pace()
+    chunk: list[Item] = []
+    for item in items:
+        wait_s = pace.wait_s(item, time.monotonic())
+        if chunk and (wait_s > 0 or len(chunk) == CHUNK):
+            _submit(operations, chunk, report)
+            chunk = []
+            wait_s = pace.wait_s(item, time.monotonic())
+        if wait_s > 0:
+            time.sleep(wait_s)
+        chunk.append(item)
+    _submit(operations, chunk, report)
+
+
+def _submit(operations: Operations, chunk: list[Item], report: Report) -> None:
+    answers = iter(
+        operations.submit_many([each.submission for each in chunk if each.submission is not None])
+    )
+    for item in chunk:
+        if item.submission is None:
+            report(Outcome(item, None, problem=item.problem))
+            continue
+        answer = next(answers)
+        if isinstance(answer, Busy):
+            raise answer
+        if isinstance(answer, AcquisitionError):
+            report(Outcome(item, None, problem=problem_of(answer)))
+        else:
+            report(Outcome(item, answer.body, answer.replayed))

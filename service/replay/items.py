@@ -1,0 +1,105 @@
+"""The lines of telemetry files on their way to the service, and what became of each."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from service.errors import AcquisitionError, BadInput, Fault, shown_value
+from service.observe.formats import read_lines
+from service.observe.wire import RunName, Submission, submission_from_json
+from service.times import Utc
+
+Problem = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Item:
+    """One line of a file: the batch in it, or the problem with it."""
+
+    file: Path
+    number: int
+    submission: Submission | None
+    problem: Problem | None = None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a line: the answer's own bytes, or a problem.
+
+    `replayed` tells that the batch was already recorded.
+    """
+
+    item: Item
+    answer: bytes | None
+    replayed: bool = False
+    problem: Problem | None = None
+
+
+Report = Callable[[Outcome], None]
+
+
+def items_of(files: Sequence[Path], run: str) -> Iterator[Item]:
+    """Every line of the files, in order, checked as a batch of that run."""
+    for file in files:
+        for line in read_lines(file):
+            if line.body is None:
+                problem = _problem(() if line.fault is None else (line.fault,))
+                yield Item(file, line.number, None, problem)
+                continue
+            try:
+                yield Item(file, line.number, submission_from_json(line.body, run))
+            except BadInput as error:
+                yield Item(file, line.number, None, problem_of(error))
+
+
+def run_name(files: Sequence[Path], run: str | None) -> str:
+    """The run that takes every batch: the one asked for, else the first file's stem.
+
+    Raises `BadInput` for a name that no run can have.
+    """
+    name = files[0].stem if run is None else run
+    try:
+        return TypeAdapter(RunName).validate_python(name)
+    except ValidationError:
+        where = "--run" if run is not None else f"{files[0].name}, whose stem would name the run"
+        message = "a run has 1 to 64 of A-Z a-z 0-9 _ . : -, a letter or digit first"
+        hint = "" if run is not None else "; give --run NAME"
+        raise BadInput(Fault(where, message + hint, shown_value(name))) from None
+
+
+def problem_of(error: AcquisitionError) -> Problem:
+    """A refusal as it is reported, the same whichever way the batch went."""
+    if isinstance(error, BadInput):
+        return _problem(error.faults)
+    return {"detail": str(error)}
+
+
+def _problem(faults: tuple[Fault, ...]) -> Problem:
+    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+    return {
+        "detail": f"{faults[0]}{more}",
+        "errors": [
+            {"field": each.field, "message": each.message, "value": each.value} for each in faults
+        ],
+    }
+
+
+class Pace:
+    """When each batch is due: at its own time, sped up by a factor, or at once without one."""
+
+    def __init__(self, factor: float | None = None) -> None:
+        self.factor = factor
+        self._first: tuple[int, float] | None = None
+
+    def wait_s(self, item: Item, now_s: float) -> float:
+        """Seconds until the batch is due; the first is due now."""
+        if self.factor is None or item.submission is None:
+            return 0.0
+        time: Utc = item.submission.batch.time
+        if self._first is None:
+            self._first = (time.tai_ns, now_s)
+        first_ns, start_s = self._first
+        return max(0.0, start_s + (time.tai_ns - first_ns) * 1e-9 / self.factor - now_s)

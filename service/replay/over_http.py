@@ -1,0 +1,145 @@
+"""Replay through a running service: a window of posts at a time, results in the order sent.
+
+A post whose answer was lost is sent again: the service knows the batch by its
+identity and records it once.
+"""
+
+import asyncio
+import json
+from collections import deque
+from collections.abc import Iterable
+
+import httpx
+
+from service.errors import BadInput, Busy, Fault, shown_value
+from service.replay.items import Item, Outcome, Pace, Problem, Report
+
+ROUTE = "/api/v1/batches"
+JSON = {"Content-Type": "application/json"}
+AGAIN = frozenset({429, 502, 503, 504})
+TIMEOUT = httpx.Timeout(60.0, connect=5.0)
+FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 5.0
+PATIENCE_S = 30.0
+
+
+def replay_over_http(
+    url: str,
+    items: Iterable[Item],
+    report: Report,
+    pace: Pace | None = None,
+    concurrency: int = 4,
+    patience_s: float = PATIENCE_S,
+) -> None:
+    """Post every item to the service at `url` and report what became of it, in order.
+
+    Raises `BadInput` for an address that is none, `Busy` when no service
+    answers there, or none any more for `patience_s`.
+    """
+    asyncio.run(_replay(_checked(url), items, report, pace or Pace(), concurrency, patience_s))
+
+
+def _checked(url: str) -> str:
+    try:
+        parsed = httpx.URL(url)
+        valid = parsed.scheme in ("http", "https") and bool(parsed.host)
+    except httpx.InvalidURL:
+        valid = False
+    if not valid:
+        message = "must be the address of a service, such as http://127.0.0.1:8000"
+        raise BadInput(Fault("--url", message, shown_value(url)))
+    return url.rstrip("/")
+
+
+async def _replay(
+    url: str,
+    items: Iterable[Item],
+    report: Report,
+    pace: Pace,
+    concurrency: int,
+    patience_s: float,
+) -> None:
+    limits = httpx.Limits(max_connections=concurrency, max_keepalive_connections=concurrency)
+    # The service listens to this machine alone: a proxy of the environment cannot reach it.
+    async with httpx.AsyncClient(
+        base_url=url, timeout=TIMEOUT, limits=limits, trust_env=False
+    ) as client:
+        await _require_service(client, url)
+        clock = asyncio.get_running_loop().time
+        window: deque[asyncio.Task[Outcome]] = deque()
+        try:
+            for item in items:
+                while (wait_s := pace.wait_s(item, clock())) > 0:
+                    while window and window[0].done():
+                        report(await window.popleft())
+                    await asyncio.sleep(min(wait_s, 0.5))
+                if len(window) >= concurrency:
+                    report(await window.popleft())
+                window.append(asyncio.create_task(_outcome(client, url, item, patience_s)))
+            while window:
+                report(await window.popleft())
+        finally:
+            for task in window:
+                task.cancel()
+            await asyncio.gather(*window, return_exceptions=True)
+
+
+async def _require_service(client: httpx.AsyncClient, url: str) -> None:
+    try:
+        response = await client.get("/livez")
+    except httpx.TransportError as error:
+        raise Busy(
+            f"no service answers at {url} ({_shown(error)}); "
+            "start one with `acquire serve`, or replay with --in-process"
+        ) from None
+    if response.status_code != 200:
+        raise Busy(f"{url} is not this service: GET /livez gives {response.status_code}")
+
+
+async def _outcome(client: httpx.AsyncClient, url: str, item: Item, patience_s: float) -> Outcome:
+    if item.submission is None:
+        return Outcome(item, None, problem=item.problem)
+    response = await _post(client, url, item.submission.text, patience_s)
+    if response.status_code in (200, 201):
+        return Outcome(item, response.content, response.headers.get("Replayed") == "true")
+    return Outcome(item, None, problem=_problem(response))
+
+
+async def _post(
+    client: httpx.AsyncClient, url: str, text: str, patience_s: float
+) -> httpx.Response:
+    clock = asyncio.get_running_loop().time
+    give_up, wait_s = clock() + patience_s, FIRST_WAIT_S
+    while True:
+        asked_s = 0.0
+        try:
+            response = await client.post(ROUTE, content=text, headers=JSON)
+            if response.status_code not in AGAIN:
+                return response
+            why = f"HTTP {response.status_code}"
+            asked_s = _seconds(response.headers.get("Retry-After", ""))
+        except httpx.TransportError as error:
+            why = _shown(error)
+        if clock() >= give_up:
+            raise Busy(
+                f"{url} no longer answers ({why}); run the same command again to go on "
+                "from here: nothing is recorded twice"
+            )
+        await asyncio.sleep(min(max(wait_s, asked_s), LONGEST_WAIT_S))
+        wait_s *= 2
+
+
+def _seconds(text: str) -> float:
+    return float(text) if text.isascii() and text.isdigit() else 0.0
+
+
+def _shown(error: Exception) -> str:
+    return str(error) or type(error).__name__
+
+
+def _problem(response: httpx.Response) -> Problem:
+    """The part of a problem that does not depend on how the batch was sent."""
+    try:
+        told = response.json()
+        return {name: told[name] for name in ("detail", "errors") if name in told}
+    except (json.JSONDecodeError, UnicodeDecodeError, TypeError):
+        return {"detail": f"HTTP {response.status_code}: {response.text[:200]}"}

@@ -1,0 +1,67 @@
+"""Telemetry files of drawn passes, and the truth beside them."""
+
+import json
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, TextIO
+
+from service.errors import BadFile, Fault
+from service.observe.formats import form_of
+from service.simulate.telemetry import Drawn
+
+
+def truth_path(telemetry: Path) -> Path:
+    """Where the truth of a telemetry file stands: OUT.truth.ndjson beside OUT.ndjson."""
+    return telemetry.with_name(f"{telemetry.stem}.truth.ndjson")
+
+
+def write_pass(drawn: Iterable[Drawn], telemetry: Path) -> int:
+    """Write batches (NDJSON, or CSV by the name) and their truth; how many there were.
+
+    Both files appear when they are whole: a pass cut short leaves the old ones.
+    """
+    count = 0
+
+    def batches() -> Iterator[dict[str, Any]]:
+        nonlocal count
+        for each in drawn:
+            truth.write(_line(each.truth))
+            count += 1
+            yield each.batch
+
+    with ExitStack() as stack:
+        truth = stack.enter_context(_appearing(truth_path(telemetry)))
+        out = stack.enter_context(_appearing(telemetry))
+        if form_of(telemetry) == "csv":
+            from service.observe.csv_rows import write_csv
+            from service.observe.wire import BatchIn
+
+            write_csv((BatchIn.model_validate_json(json.dumps(each)) for each in batches()), out)
+        else:
+            out.writelines(_line(each) for each in batches())
+    return count
+
+
+def read_objects(path: Path) -> Iterator[dict[str, Any]]:
+    """The JSON objects of a file of the service's own making, one a line."""
+    with path.open("rb") as file:
+        for line in file:
+            yield json.loads(line)
+
+
+def _line(thing: dict[str, Any]) -> str:
+    return json.dumps(thing, separators=(",", ":")) + "\n"
+
+
+@contextmanager
+def _appearing(path: Path) -> Iterator[TextIO]:
+    part = path.with_name(path.name + ".part")
+    try:
+        with part.open("w", encoding="utf-8", newline="") as file:
+            yield file
+        part.replace(path)
+    except OSError as error:
+        raise BadFile(Fault(str(path), f"cannot be written: {error.strerror}")) from None
+    finally:
+        part.unlink(missing_ok=True)

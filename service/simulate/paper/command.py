@@ -1,0 +1,136 @@
+"""`acquire simulate paper`: every table of the paper, theirs beside ours."""
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TextIO
+
+from service.errors import BadInput, Fault
+from service.missions.mission import Identifier
+from service.simulate.paper import tables, time_tables
+from service.simulate.paper.experiments import run_experiments
+from service.simulate.paper.plots import draw
+from service.simulate.paper.printed import the_paper
+from service.simulate.paper.tally import AMBIGUOUS, CORRECT, MISIDENTIFIED, UNMATCHED, Tally
+from service.simulate.paper.timings import measure
+
+PAPER_IDENTIFIER: Identifier = "starid"
+ZONE_IDENTIFIERS: tuple[Identifier, ...] = ("starid", "verified")
+"""The identifiers that look in a zone, as the paper's does."""
+DEFAULT_STARS = 20_000
+TIMES, PROPORTIONS = (11, 12), (13, 14)
+
+
+def run_paper(
+    table: int | None = None,
+    stars: int = DEFAULT_STARS,
+    seeds: Sequence[int] = (1,),
+    json_path: Path | None = None,
+    identifiers: Sequence[Identifier] = ZONE_IDENTIFIERS,
+    processes: int | None = None,
+    plots: Path | None = None,
+    out: TextIO | None = None,
+) -> list[Tally]:
+    """Print one table, or all, with the paper's numbers and ours; the tallies of Tables 2 to 10.
+
+    Each run sees at least `stars` stars for each seed, in whole experiments of
+    the paper's size; several seeds are pooled.  `json_path` takes one row per
+    run and identifier, the folder `plots` the pictures.  Raises `BadInput` for
+    a table that the paper has not.
+    """
+    wanted = _checked(table, stars, seeds, identifiers)
+    out = out or sys.stdout
+    runs = the_paper().runs_of(wanted)
+    tallies = run_experiments(runs, stars, seeds, identifiers, processes) if runs else []
+    if json_path is not None:
+        write_json(tallies, json_path)
+    if plots is not None:
+        draw([tally for tally in tallies if tally.identifier == PAPER_IDENTIFIER], plots)
+    for identifier in identifiers:
+        # What a zone holds is the same whoever identifies in it.
+        asked = [n for n in wanted if n not in PROPORTIONS or identifier == identifiers[0]]
+        if asked:
+            print(report(tallies, identifier, asked, seeds[0]), file=out)
+    return tallies
+
+
+def _checked(
+    table: int | None, stars: int, seeds: Sequence[int], identifiers: Sequence[Identifier]
+) -> Sequence[int]:
+    faults = []
+    if table is not None and table not in tables.TITLES:
+        faults.append(Fault("table", "must be from 2 to 14", str(table)))
+    if stars < 1:
+        faults.append(Fault("stars", "must be at least 1", str(stars)))
+    faults += [Fault("seed", "must not be negative", str(seed)) for seed in seeds if seed < 0]
+    faults += [
+        Fault("identifier", f"must be one of {', '.join(ZONE_IDENTIFIERS)}", name)
+        for name in identifiers
+        if name not in ZONE_IDENTIFIERS
+    ]
+    if faults:
+        raise BadInput(faults)
+    return list(tables.TITLES) if table is None else [table]
+
+
+def report(
+    tallies: Sequence[Tally], identifier: Identifier, wanted: Sequence[int], seed: int
+) -> str:
+    """The tables of one identifier as Markdown."""
+    mine = [tally for tally in tallies if tally.identifier == identifier]
+    parts = [f"## Tables of Fink & Shoup 1994 by the identifier `{identifier}`"]
+    is_paper = identifier == PAPER_IDENTIFIER
+    if mine and is_paper:
+        parts.append(
+            "Not identified: ambiguous or unmatched. A printed run is inside when distance² "
+            "<= 5.99. `!`: other than the reference."
+        )
+    for number in wanted:
+        chosen = [tally for tally in mine if tally.run.number == number]
+        if chosen:
+            shown = tables.rates(chosen) if is_paper else tables.improvements(chosen)
+            parts += [tables.heading(number), shown]
+    if mine:
+        parts.append(tables.summary(mine) if is_paper else tables.improvement_summary(mine))
+    # Tables 13 and 14 are of the zones of 11 and 12, measured once for both.
+    measured = {
+        number: [
+            (case, measure(case, seed, identifier))
+            for case in the_paper().times
+            if case.table == str(number)
+        ]
+        for number, shares in zip(TIMES, PROPORTIONS, strict=True)
+        if {number, shares} & set(wanted)
+    }
+    for number in wanted:
+        if number in TIMES:
+            parts += [tables.heading(number), time_tables.times(measured[number])]
+        elif number in PROPORTIONS:
+            written = time_tables.proportions(measured[number - 2])
+            note = "`!`: the zone holds more pairs than the approximation bounds."
+            parts += [tables.heading(number), written, note]
+    return "\n\n".join(parts) + "\n"
+
+
+def rows_of(tallies: Sequence[Tally]) -> list[dict[str, Any]]:
+    """One row per run and identifier, Tables 2 to 10."""
+    return [
+        {
+            "table": tally.run.table,
+            "run": tally.run.run,
+            "identifier": tally.identifier,
+            "stars": tally.stars,
+            "ambiguous": tally.total(AMBIGUOUS),
+            "unmatched": tally.total(UNMATCHED),
+            "correct": tally.total(CORRECT),
+            "misidentified": tally.total(MISIDENTIFIED),
+        }
+        for tally in tallies
+    ]
+
+
+def write_json(tallies: Sequence[Tally], path: Path) -> None:
+    """Write the rows as a JSON array, one a line."""
+    lines = ",\n".join(json.dumps(row, ensure_ascii=False) for row in rows_of(tallies))
+    path.write_text(f"[\n{lines}\n]\n" if lines else "[]\n", encoding="utf-8")

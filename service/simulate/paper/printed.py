@@ -1,0 +1,156 @@
+"""What the paper prints: its worlds, its runs with their counts, its times and its k_g.
+
+Beside each run stands what an independent implementation of the same reading
+got from 40 experiments of the paper's size: the reference.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+REFERENCE_EXPERIMENTS = 40
+_FILE = Path(__file__).with_name("printed.json")
+
+Angles = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class World:
+    """Where the zones of some tables lie, and how many make one experiment of the paper's size.
+
+    A zone's axis is `axis_deg` (right ascension, declination), or the Sun's
+    direction at one of `sun_dates`, or drawn over the sphere.
+    """
+
+    name: str
+    mission: str
+    off_axis_deg: float  # RCVIEW
+    zones: int
+    views: int
+    axis_deg: tuple[float, float] | None = None
+    sun_dates: tuple[str, ...] = ()
+
+    @property
+    def strata(self) -> int:
+        """How many kinds of zones follow each other in turn."""
+        return max(1, len(self.sun_dates))
+
+
+@dataclass(frozen=True)
+class Counts:
+    """A printed run: stars, of them ambiguous (or unmatched), correct and misidentified."""
+
+    stars: int
+    ambiguous: int
+    correct: int
+    misidentified: int
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The reference's rates in percent; `sd` is that of one experiment of the paper's size."""
+
+    stars: int
+    ambiguous_pct: float
+    unmatched_pct: float
+    misidentified_pct: float
+    sd_unidentified_pct: float
+    sd_misidentified_pct: float
+
+    @property
+    def unidentified_pct(self) -> float:
+        """Ambiguous or unmatched."""
+        return self.ambiguous_pct + self.unmatched_pct
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run: the errors that are put in, whether the tests of geometry are on, what came of it.
+
+    `rotation_arcsec` is the error of the attitude: phi, theta, psi.
+    """
+
+    table: str
+    run: str
+    world: str
+    rotation_arcsec: Angles
+    sigma_arcsec: float  # SIGOBS
+    sigma_mag: float  # SIGMAG
+    bound_mag: float  # RCMAG
+    geometry: bool
+    printed: Counts
+    reference: Reference
+
+    @property
+    def number(self) -> int:
+        """The table's number: 9 for both 9D and 9F."""
+        return int(self.table.rstrip("DF"))
+
+
+@dataclass(frozen=True)
+class Times:
+    """A row of Tables 11 and 12: seconds of 1994, least and greatest, with NCAP and NTOT."""
+
+    table: str
+    world: str
+    zones: int
+    case: str
+    total_s: float
+    generate_s: tuple[float, float]
+    first_s: tuple[float, float]
+    later_s: tuple[float, float]
+    stars: tuple[int, int]
+    pairs: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Proportion:
+    """A row of Tables 13 and 14: k_g from the areas and from NCAP and NTOT."""
+
+    table: str
+    stars: int
+    pairs: int
+    apparent: float
+    geometric: float
+
+
+@dataclass(frozen=True)
+class Paper:
+    """All that is printed."""
+
+    worlds: dict[str, World]
+    runs: tuple[Run, ...]
+    times: tuple[Times, ...]
+    proportions: tuple[Proportion, ...]
+
+    def runs_of(self, tables: Sequence[int]) -> tuple[Run, ...]:
+        """The runs of some tables, in the paper's order."""
+        return tuple(run for run in self.runs if run.number in tables)
+
+
+@cache
+def the_paper() -> Paper:
+    """What the paper prints, read once."""
+    data = json.loads(_FILE.read_text(encoding="utf-8"))
+    return Paper(
+        worlds={name: World(name, **_tuples(world)) for name, world in data["worlds"].items()},
+        runs=tuple(
+            Run(
+                **{
+                    **_tuples(run),
+                    "printed": Counts(**run["printed"]),
+                    "reference": Reference(**run["reference"]),
+                }
+            )
+            for run in data["runs"]
+        ),
+        times=tuple(Times(**_tuples(row)) for row in data["times"]),
+        proportions=tuple(Proportion(**row) for row in data["proportions"]),
+    )
+
+
+def _tuples(row: dict[str, Any]) -> dict[str, Any]:
+    return {key: tuple(v) if isinstance(v, list) else v for key, v in row.items()}

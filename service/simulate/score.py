@@ -1,0 +1,132 @@
+"""How answers compare with the truth: stars right and wrong, attitude errors beside their sigma."""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from service.vectors import attitude_error_arcsec, matrix_from_quaternion
+
+CHI_SQUARE_997 = 14.16
+"""The 99.73 % point of chi-square with three degrees of freedom."""
+GAUSSIAN_MEDIAN = 0.6745
+"""The median of |x| for x of sigma one: a median over this is a sigma that outliers cannot move."""
+
+
+@dataclass
+class Score:
+    """What came of the batches of one kind of stretch."""
+
+    batches: int = 0
+    refused: int = 0
+    stars: Counter[str] = field(default_factory=Counter)
+    """By outcome, `observed` for all, and `wrong`: unique, but not the true star."""
+    worst_axis_arcsec: list[float] = field(default_factory=list)
+    predicted_arcsec: list[float] = field(default_factory=list)
+    chi_square: list[float] = field(default_factory=list)
+    """e^T P^-1 e of each attitude, e being its error and P its covariance."""
+    solving_us: list[float] = field(default_factory=list)
+    whole_us: list[float] = field(default_factory=list)
+
+    def add(self, answer: Mapping[str, Any], truth: Mapping[str, Any]) -> None:
+        """Count one answer; its truth is of the same batch."""
+        self.batches += 1
+        true_of = {each["tracker"]: each["stars"] for each in truth["observations"]}
+        for tracker in answer["observations"]:
+            for star, true in zip(tracker["stars"], true_of[tracker["tracker"]], strict=True):
+                self.stars["observed"] += 1
+                self.stars[star["outcome"]] += 1
+                if star["star"] is not None and star["star"]["id"] != true:
+                    self.stars["wrong"] += 1
+        timings = answer["timings_us"]
+        self.solving_us.append(timings["identify"] + timings["solve"])
+        self.whole_us.append(sum(us for us in timings.values() if us is not None))
+        if answer["attitude"] is not None:
+            self._add_attitude(answer["attitude"], truth["quaternion"])
+
+    def _add_attitude(self, attitude: Mapping[str, Any], true_quaternion: list[float]) -> None:
+        error = attitude_error_arcsec(
+            matrix_from_quaternion(attitude["quaternion"]), matrix_from_quaternion(true_quaternion)
+        )
+        covariance = np.asarray(attitude["covariance_arcsec2"])
+        variances, axes = np.linalg.eigh(covariance)
+        self.worst_axis_arcsec.append(abs(float(error @ axes[:, -1])))
+        self.predicted_arcsec.append(float(np.sqrt(variances[-1])))
+        self.chi_square.append(float(error @ np.linalg.solve(covariance, error)))
+
+    def percent(self, outcome: str) -> float:
+        """The share of all observed stars, NaN where there were none."""
+        observed = self.stars["observed"]
+        return 100.0 * self.stars[outcome] / observed if observed else float("nan")
+
+    @property
+    def attitudes(self) -> int:
+        """Batches that gave an attitude."""
+        return len(self.chi_square)
+
+    @property
+    def seen_sigma_arcsec(self) -> float:
+        """One sigma of the error along each attitude's own worst axis, as it was."""
+        return _median(self.worst_axis_arcsec) / GAUSSIAN_MEDIAN
+
+    @property
+    def predicted_sigma_arcsec(self) -> float:
+        """The same as the covariances predict it."""
+        return _median(self.predicted_arcsec)
+
+    @property
+    def within_percent(self) -> float:
+        """The share of attitudes inside the ellipsoid that should hold 99.73 % of them."""
+        inside = sum(each <= CHI_SQUARE_997 for each in self.chi_square)
+        return 100.0 * inside / self.attitudes if self.attitudes else float("nan")
+
+    @property
+    def median_solving_us(self) -> float:
+        """Identification and solution together."""
+        return _median(self.solving_us)
+
+    @property
+    def median_whole_us(self) -> float:
+        """Every step that the answer tells the time of, recording included."""
+        return _median(self.whole_us)
+
+
+def score(
+    results: Iterable[Mapping[str, Any]], truths: Iterable[Mapping[str, Any]]
+) -> dict[str, Score]:
+    """The scores by stretch, `nominal` among them, of results and truths in the same order.
+
+    A refused batch is counted as such and has no stars.
+    """
+    scores: dict[str, Score] = {}
+    for result, truth in zip(results, truths, strict=True):
+        stretch = scores.setdefault(truth["stretch"], Score())
+        if "problem" in result:
+            stretch.refused += 1
+        else:
+            stretch.add(result, truth)
+    return scores
+
+
+def together(scores: Iterable[Score]) -> Score:
+    """Several scores as one."""
+    whole = Score()
+    for each in scores:
+        whole.batches += each.batches
+        whole.refused += each.refused
+        whole.stars += each.stars
+        for name in (
+            "worst_axis_arcsec",
+            "predicted_arcsec",
+            "chi_square",
+            "solving_us",
+            "whole_us",
+        ):
+            getattr(whole, name).extend(getattr(each, name))
+    return whole
+
+
+def _median(values: list[float]) -> float:
+    return float(np.median(values)) if values else float("nan")

@@ -1,0 +1,142 @@
+"""What the trackers of a turning, moving spacecraft see of the sky, and what they measure.
+
+Each star is where it appears from the moving spacecraft, at its own time,
+while the body turns with constant rates: carried to the batch's epoch, it lies
+where the attitude of the epoch puts it.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from service.missions.mission import Band, Calibration, Mission, Tracker
+from service.observe.batch import Aberration
+from service.simulate.motion import random_axis, turned
+from service.simulate.stretches import Stretch
+from service.sky.ephemeris import apparent
+from service.sky.run_catalog import RunCatalog
+from service.times import Utc
+from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector, rotate_about, unit
+
+TIME_OFFSET_S = 0.5
+MAGNITUDE_CUT_SIGMA = 6.0
+"""0.6 mag for a tracker with 0.1: the paper's RCMAG."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Stars of one tracker: true directions in tracker axes, each at its own time."""
+
+    tracker: Tracker
+    direction: Vector
+    offset_s: Vector
+    magnitude: Vector
+    star: npt.NDArray[np.intp]
+    """Rows of the run catalog, -1 for a spurious star."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The sky about one batch, and what befalls its stars."""
+
+    mission: Mission
+    catalog: RunCatalog
+    time: Utc
+    velocity_c: Vector
+    aberration: Aberration
+    rates_deg_per_s: Vector
+    stretch: Stretch
+    rng: np.random.Generator
+
+    def look(self, attitude: Matrix, most: int) -> tuple[Matrix, list[Seen]]:
+        """Up to `most` stars a tracker; where no tracker sees any, from an attitude nearby.
+
+        A spacecraft that keeps its pole only rolls for it.
+        """
+        keeps_pole = isinstance(self.mission.zone, Band)
+        while True:
+            seen = [self._visible(tracker, attitude, most) for tracker in self.mission.trackers]
+            if any(len(each.star) for each in seen):
+                return attitude, seen
+            axis = self.mission.axis_body if keeps_pole else random_axis(self.rng)
+            attitude = turned(attitude, axis * math.radians(3.0))
+
+    def _visible(self, tracker: Tracker, attitude: Matrix, most: int) -> Seen:
+        alignment = tracker.body_from_tracker
+        radius = math.radians(tracker.field_of_view_radius_deg)
+        # Somewhat wider: aberration and the body's turning may bring a star in.
+        near = math.cos(min(radius + math.radians(0.2), math.pi))
+        row = np.flatnonzero(self.catalog.direction @ (attitude.T @ alignment[:, 2]) >= near)
+        direction = self.catalog.direction[row]
+        if self.aberration != "applied_upstream":
+            direction = apparent(direction, self.velocity_c, self.time)
+        offset_s = np.round(self.rng.uniform(-TIME_OFFSET_S, TIME_OFFSET_S, len(row)), 3)
+        turn = -np.radians(self.rates_deg_per_s) * offset_s[:, None]
+        direction = rotate_about(turn, direction @ attitude.T) @ alignment
+        inside = np.flatnonzero(direction[:, 2] >= math.cos(radius))
+        chosen = self.rng.permutation(inside)[:most]
+        star, direction = row[chosen], direction[chosen]
+        magnitude = self.catalog.magnitude_mag[star]
+        if self.stretch.kind == "spurious":
+            false = self.rng.permutation(len(star))[: int(self.stretch.size)]
+            star[false] = -1
+            direction[false] = anywhere(radius, len(false), self.rng)
+            magnitude[false] = self.rng.choice(self.catalog.magnitude_mag, len(false))
+        return Seen(tracker, direction, offset_s[chosen], magnitude, star)
+
+    def measured(self, seen: Seen, as_angles: bool) -> list[dict[str, Any]]:
+        """The stars as they are sent, with noise."""
+        kind, size = self.stretch.kind, self.stretch.size
+        sigma_arcsec = size if kind == "position_error" else seen.tracker.sigma_arcsec
+        sigma_mag = size if kind == "magnitude_error" else seen.tracker.magnitude_sigma_mag
+        direction = shaken(seen.direction, sigma_arcsec / ARCSEC_PER_RADIAN, self.rng)
+        error = self.rng.normal(size=len(seen.star))
+        while (beyond := np.abs(error) > MAGNITUDE_CUT_SIGMA).any():
+            error[beyond] = self.rng.normal(size=int(beyond.sum()))
+        magnitudes = np.round(seen.magnitude + sigma_mag * error, 3).tolist()
+        if as_angles:
+            angles = np.round(measured_angles_deg(direction, seen.tracker.calibration), 9).tolist()
+            where = [{"h_deg": h, "v_deg": v} for h, v in angles]
+        else:
+            where = [{"vector": vector} for vector in np.round(direction, 10).tolist()]
+        return [
+            {**place, "magnitude": magnitude, "time_offset_s": offset_s}
+            for place, magnitude, offset_s in zip(
+                where, magnitudes, seen.offset_s.tolist(), strict=True
+            )
+        ]
+
+
+def anywhere(radius_rad: float, count: int, rng: np.random.Generator) -> Vector:
+    """Directions (count, 3) drawn evenly over a field of view, in tracker axes."""
+    z = rng.uniform(math.cos(radius_rad), 1.0, count)
+    angle = rng.uniform(0.0, math.tau, count)
+    across = np.sqrt(1.0 - z * z)
+    return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
+
+
+def shaken(direction: Vector, sigma_rad: float, rng: np.random.Generator) -> Vector:
+    """Directions (n, 3) with Gaussian noise of one sigma on each of two tangent axes."""
+    least = np.eye(3)[np.argmin(np.abs(direction), axis=1)]
+    aside = unit(np.cross(direction, least))
+    above = np.cross(direction, aside)
+    noise = rng.normal(0.0, sigma_rad, (len(direction), 2))
+    return unit(direction + noise[:, :1] * aside + noise[:, 1:] * above)
+
+
+def measured_angles_deg(direction: Vector, calibration: Calibration) -> Vector:
+    """The angles (n, 2) that a tracker of this calibration would measure for directions (n, 3)."""
+    true = np.degrees(np.arctan2(direction[:, :2], direction[:, 2:]))
+    measured = true / calibration.scale
+    # The terms are small: a fixed point is reached in a few rounds.
+    for _ in range(20):
+        h, v = measured.T
+        bent = [
+            sum((c * h**i * v**j for i, j, c in terms), np.zeros_like(h))
+            for terms in (calibration.h_terms, calibration.v_terms)
+        ]
+        measured = true / calibration.scale - np.stack(bent, axis=1)
+    return np.asarray(measured)

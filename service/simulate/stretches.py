@@ -1,0 +1,133 @@
+"""What a pass is asked to be: its length, its stars, and the stretches where things go wrong."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Literal, get_args
+
+from service.errors import BadInput, Fault, shown_value
+from service.missions.mission import Band, Mission
+from service.observe.batch import MAX_STARS_PER_TRACKER, Aberration
+
+Prior = Literal["quaternion", "direction", "mixed"]
+Kind = Literal["nominal", "attitude_error", "spurious", "magnitude_error", "position_error"]
+
+DEFAULT_START = "1999-03-01T00:00:00.000Z"
+"""A day on which XTE, SWAS and SOHO were all at work."""
+CAP_CADENCE_S, BAND_CADENCE_S = 30.0, 300.0
+CAP_ATTITUDE_ERROR_DEG, BAND_ATTITUDE_ERROR_DEG = 10.0, 5.0
+
+
+@dataclass(frozen=True)
+class Trouble:
+    """A kind of error: the share of the pass that has it, and its size in the kind's own unit."""
+
+    share: float = 0.0
+    size: float | None = None
+
+
+@dataclass(frozen=True)
+class Troubles:
+    """The stretches of a pass, one of each kind in this order; a share of zero leaves one out.
+
+    `attitude_error` grows through its stretch up to its size: about each axis
+    in a cap, of the pole in a band (degrees).  `spurious` puts that many false
+    stars in the place of real ones.  The sizes of `magnitude_error` (mag) and
+    `position_error` (arcsec per tangent axis) are standard deviations that
+    take the place of the tracker's own.
+    """
+
+    attitude_error: Trouble = Trouble(0.1)
+    spurious: Trouble = Trouble(0.1, 1)
+    magnitude_error: Trouble = Trouble(0.0, 0.5)
+    position_error: Trouble = Trouble(0.0, 12.0)
+
+
+_LARGEST = {
+    "attitude_error": 180.0,
+    "spurious": float(MAX_STARS_PER_TRACKER),
+    "magnitude_error": 5.0,
+    "position_error": 3600.0,
+}
+
+NO_TROUBLES = Troubles(Trouble(), Trouble(), Trouble(), Trouble())
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """What holds for one batch: the kind of trouble, its size, and how far into it (0 to 1)."""
+
+    kind: Kind = "nominal"
+    size: float = 0.0
+    progress: float = 0.0
+
+
+@dataclass(frozen=True)
+class Pass:
+    """Everything that decides what telemetry is drawn; the same pass is always drawn the same."""
+
+    batches: int
+    seed: int = 1
+    start: str = DEFAULT_START
+    cadence_s: float | None = None
+    stars: int = 5
+    prior: Prior = "quaternion"
+    angles_share: float = 0.25
+    """The share of batches whose stars come as `h_deg`, `v_deg`; the others come as vectors."""
+    aberration: Mapping[Aberration, float] = field(default_factory=lambda: {"to_correct": 1.0})
+    troubles: Troubles = Troubles()
+
+    def __post_init__(self) -> None:
+        _require(self.batches >= 1, "batches", "must be at least 1", self.batches)
+        _require(self.seed >= 0, "seed", "must not be negative", self.seed)
+        most = MAX_STARS_PER_TRACKER
+        _require(1 <= self.stars <= most, "stars", f"must be from 1 to {most}", self.stars)
+        cadence_s = 1.0 if self.cadence_s is None else self.cadence_s
+        _require(0 < cadence_s <= 1e6, "cadence", "must be above 0 and at most 1e6 s", cadence_s)
+        _require(0 <= self.angles_share <= 1, "angles", "must be from 0 to 1", self.angles_share)
+        _require(self.prior in get_args(Prior), "prior", f"must be {_any_of(Prior)}", self.prior)
+        for word, share in self.aberration.items():
+            known = word in get_args(Aberration)
+            _require(known, "aberration", f"must be of {_any_of(Aberration)}", word)
+            _require(0 <= share <= 1, f"aberration {word}", "must be from 0 to 1", share)
+        total = sum(self.aberration.values())
+        _require(abs(total - 1) < 1e-9, "aberration", "the shares must add up to 1", total)
+        shares = {each.name: getattr(self.troubles, each.name).share for each in fields(Troubles)}
+        for name, share in shares.items():
+            _require(0 <= share <= 1, f"{name} share", "must be from 0 to 1", share)
+            size, largest = getattr(self.troubles, name).size, _LARGEST[name]
+            within = size is None or 0 < size <= largest
+            _require(within, name, f"must be above 0, to {largest:g}", size)
+        total = sum(shares.values())
+        _require(total <= 1, "shares", "the stretches must not be more than the pass", total)
+
+    def cadence_of(self, mission: Mission) -> float:
+        """Seconds from one batch to the next."""
+        default = BAND_CADENCE_S if isinstance(mission.zone, Band) else CAP_CADENCE_S
+        return default if self.cadence_s is None else self.cadence_s
+
+    def stretches(self, mission: Mission) -> list[Stretch]:
+        """One entry a batch: nominal at both ends and between the stretches, evenly."""
+        in_band = isinstance(mission.zone, Band)
+        default = BAND_ATTITUDE_ERROR_DEG if in_band else CAP_ATTITUDE_ERROR_DEG
+        wanted = [
+            (each.name, round(trouble.share * self.batches), trouble.size)
+            for each in fields(Troubles)
+            if (trouble := getattr(self.troubles, each.name)).share > 0
+        ]
+        free = self.batches - sum(count for _, count, _ in wanted)
+        plan: list[Stretch] = []
+        for place, (kind, count, size) in enumerate(wanted, start=1):
+            before = sum(each.kind == "nominal" for each in plan)
+            plan += [Stretch()] * (free * place // (len(wanted) + 1) - before)
+            value = default if size is None else float(size)
+            plan += [Stretch(kind, value, (k + 1) / count) for k in range(count)]  # type: ignore[arg-type]
+        return (plan + [Stretch()] * self.batches)[: self.batches]
+
+
+def _require(holds: bool, name: str, message: str, value: object) -> None:
+    if not holds:
+        raise BadInput(Fault(name, message, shown_value(value)))
+
+
+def _any_of(words: object) -> str:
+    return ", ".join(get_args(words))

@@ -1,0 +1,194 @@
+"""Sample telemetry: a pass drawn from the real catalog, with its truth.
+
+The stars are those of the run catalog of the batch's epoch, proper motion
+included.  The truth is kept beside the batch and never enters it.
+"""
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+
+from service.missions.mission import Band, Mission
+from service.observe.batch import Aberration
+from service.simulate.motion import (
+    body_rates_deg_per_s,
+    pointed,
+    random_axis,
+    slewing_attitudes,
+    tilted,
+)
+from service.simulate.orbits import orbit_of
+from service.simulate.sightings import Scene, Seen
+from service.simulate.stretches import Pass
+from service.sky.ephemeris import observer_velocity, sun_direction
+from service.sky.view import Sky
+from service.times import Utc, parse_utc, shifted
+from service.vectors import (
+    Matrix,
+    Vector,
+    angle_between_deg,
+    attitude_error_arcsec,
+    coordinate_rotation,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    to_ra_dec,
+    unit,
+)
+
+CAP_A_PRIORI_DEG = 3.0
+BAND_A_PRIORI_DEG = 0.1
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """One batch as it is sent, and what is true of it; both ready for JSON."""
+
+    batch: dict[str, Any]
+    truth: dict[str, Any]
+
+
+def draw_pass(mission: Mission, sky: Sky, wanted: Pass) -> Iterator[Drawn]:
+    """The batches of a pass, in order of time.
+
+    Every batch has a random generator of its own, so that a change of one
+    leaves the others as they were; the mission's name makes its pass another
+    than that of its sister with the same seed.
+    """
+    start, cadence_s = parse_utc(wanted.start, "start"), wanted.cadence_of(mission)
+    root = (wanted.seed, *mission.name.encode())
+    rng = np.random.default_rng([*root, 0])
+    rates = body_rates_deg_per_s(mission, wanted.batches, rng)
+    drift = rng.uniform(-1.0, 1.0, 3)
+    drift /= np.abs(drift).max()
+    states = _motion(mission, rates, cadence_s, rng)
+    words, shares = zip(*wanted.aberration.items(), strict=True)
+    orbit = orbit_of(mission)
+    digits = max(4, len(str(wanted.batches)))
+    for k, (stretch, state) in enumerate(zip(wanted.stretches(mission), states, strict=True)):
+        time = _rounded(shifted(start, k * cadence_s))
+        rng = np.random.default_rng([*root, 1, k])
+        position_km, velocity_km_per_s = (np.round(each, 4) for each in orbit.state(time))
+        scene = Scene(
+            mission=mission,
+            catalog=sky.run_catalog(mission, time),
+            time=time,
+            velocity_c=observer_velocity(time, velocity_km_per_s),
+            aberration=cast(Aberration, str(rng.choice(words, p=shares))),
+            rates_deg_per_s=rates[k],
+            stretch=stretch,
+            rng=rng,
+        )
+        if isinstance(state, float):
+            sun = sun_direction(time, position_km)
+            attitude, presumed, seen = _on_the_sun(scene, sun, state, wanted.stars)
+        else:
+            attitude, presumed, seen = _on_the_sky(scene, state, drift, wanted.stars)
+        by_direction = wanted.prior == "direction" or (
+            wanted.prior == "mixed" and bool(rng.random() < 0.5)
+        )
+        as_angles = bool(rng.random() < wanted.angles_share)
+        batch = {
+            "spacecraft": mission.name,
+            "batch": f"{time.text[:4]}-{time.day_of_year:03d}-{k + 1:0{digits}d}",
+            "time": time.text,
+            "a_priori": _prior(mission, presumed, by_direction),
+            "body_rates_deg_per_s": rates[k].tolist(),
+            "velocity_km_per_s": velocity_km_per_s.tolist(),
+            "position_km": position_km.tolist(),
+            "aberration": scene.aberration,
+            "observations": [
+                {"tracker": each.tracker.name, "stars": scene.measured(each, as_angles)}
+                for each in seen
+            ],
+        }
+        yield Drawn(batch, _truth(batch, scene, attitude, presumed, seen))
+
+
+def _motion(
+    mission: Mission, rates: Vector, cadence_s: float, rng: np.random.Generator
+) -> Iterable[Matrix | float]:
+    """What the rates make of each batch: the attitude, or the roll about a pole on the Sun."""
+    if isinstance(mission.zone, Band):
+        steps_rad = np.radians(rates @ mission.axis_body) * cadence_s
+        rolls_rad: list[float] = (
+            rng.uniform(0.0, math.tau) + np.cumsum(steps_rad) - steps_rad
+        ).tolist()
+        return rolls_rad
+    first = pointed(mission.axis_body, random_axis(rng), rng.uniform(0.0, math.tau))
+    return slewing_attitudes(rates, cadence_s, first)
+
+
+def _on_the_sun(
+    scene: Scene, sun: Vector, roll_rad: float, most: int
+) -> tuple[Matrix, Matrix, list[Seen]]:
+    """A pole close to the Sun; the a priori attitude has it on the Sun, with any roll."""
+    rng, stretch, axis = scene.rng, scene.stretch, scene.mission.axis_body
+    tilt_deg = rng.uniform(0.0, BAND_A_PRIORI_DEG)
+    if stretch.kind == "attitude_error":
+        tilt_deg = BAND_A_PRIORI_DEG + (stretch.size - BAND_A_PRIORI_DEG) * stretch.progress
+    pole = tilted(sun, math.radians(tilt_deg), rng)
+    attitude, seen = scene.look(pointed(axis, pole, roll_rad), most)
+    return attitude, _as_sent(pointed(axis, sun, rng.uniform(0.0, math.tau))), seen
+
+
+def _on_the_sky(
+    scene: Scene, attitude: Matrix, drift: Vector, most: int
+) -> tuple[Matrix, Matrix, list[Seen]]:
+    """Anywhere; the a priori attitude is off: attitude = R1(psi) R2(theta) R3(phi) a priori."""
+    rng, stretch, limit = scene.rng, scene.stretch, CAP_A_PRIORI_DEG
+    attitude, seen = scene.look(attitude, most)
+    angles = rng.uniform(-limit, limit, 3)
+    if stretch.kind == "attitude_error":
+        angles = drift * (limit + (stretch.size - limit) * stretch.progress)
+    psi, theta, phi = angles
+    error = coordinate_rotation(0, psi) @ coordinate_rotation(1, theta)
+    error = error @ coordinate_rotation(2, phi)
+    return attitude, _as_sent(error.T @ attitude), seen
+
+
+def _as_sent(attitude: Matrix) -> Matrix:
+    """The attitude of the quaternion as it is written."""
+    return matrix_from_quaternion(unit(np.round(quaternion_from_matrix(attitude), 10)))
+
+
+def _rounded(time: Utc) -> Utc:
+    """The time to the millisecond, as it is sent."""
+    nanoseconds = round(float(time.text[19:-1]) * 1e3) * 1_000_000
+    whole = parse_utc(time.text[:19])
+    return shifted(whole, nanoseconds * 1e-9) if nanoseconds else whole
+
+
+def _prior(mission: Mission, presumed: Matrix, by_direction: bool) -> dict[str, Any]:
+    if not by_direction:
+        quaternion = np.round(quaternion_from_matrix(presumed), 10)
+        return {"quaternion": quaternion.tolist(), "frame": "EME2000"}
+    if isinstance(mission.zone, Band):
+        return {"sun_pointed": True}
+    ra_deg, dec_deg = to_ra_dec(presumed.T @ mission.axis_body)
+    return {"boresight": {"ra_deg": round(float(ra_deg), 8), "dec_deg": round(float(dec_deg), 8)}}
+
+
+def _truth(
+    batch: dict[str, Any], scene: Scene, attitude: Matrix, presumed: Matrix, seen: list[Seen]
+) -> dict[str, Any]:
+    axis = scene.mission.axis_body
+    error_deg = attitude_error_arcsec(presumed, attitude) / 3600.0
+    return {
+        "spacecraft": batch["spacecraft"],
+        "batch": batch["batch"],
+        "time": batch["time"],
+        "stretch": scene.stretch.kind,
+        "quaternion": quaternion_from_matrix(attitude).tolist(),
+        "a_priori_error_deg": error_deg.tolist() if "quaternion" in batch["a_priori"] else None,
+        "a_priori_axis_error_deg": float(angle_between_deg(presumed.T @ axis, attitude.T @ axis)),
+        "observations": [
+            {
+                "tracker": each.tracker.name,
+                "stars": [None if row < 0 else scene.catalog.star_id[row] for row in each.star],
+            }
+            for each in seen
+        ],
+    }

@@ -1,0 +1,85 @@
+"""Building ahead of need: compiled kernels before the service is ready, zones when asked."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from service.acquire import IDENTIFIERS, acquire
+from service.identify.presumed import aim_of, presumed_attitude
+from service.missions.mission import Band, Mission
+from service.observe.batch import (
+    APriori,
+    BoresightPrior,
+    ObservationBatch,
+    Options,
+    QuaternionPrior,
+    SunPointedPrior,
+    TrackerStars,
+)
+from service.sky.shelf import Shelf
+from service.sky.view import Sky
+from service.sky.zones import Zone
+from service.times import Utc, parse_utc
+from service.vectors import quaternion_from_matrix
+
+
+def warm_zones(sky: Sky, mission: Mission, prior: APriori, time: Utc) -> list[Zone]:
+    """Put the zones on the shelf that a batch of this a priori knowledge will ask for."""
+    presumed = presumed_attitude(prior, time, mission)
+    run_catalog = sky.run_catalog(mission, time)
+    return [
+        sky.zone(
+            mission,
+            run_catalog,
+            aim_of(tracker, presumed, mission, "a_priori"),
+            mission.tolerances.pair_separation_max_deg,
+            mission.zone.grid_deg,
+        )[0]
+        for tracker in mission.trackers
+    ]
+
+
+def warm_up(sky: Sky, missions: Mapping[str, Mission]) -> None:
+    """Compile every kernel by running a batch of real stars of each kind of zone.
+
+    What is built for it goes on a shelf of its own and is forgotten.
+    """
+    moment = parse_utc("2000-01-01T12:00:00Z")
+    apart = Sky(sky.catalog, Shelf(max_bytes=0))
+    kinds = {mission.zone.kind: mission for mission in missions.values()}
+    for mission in kinds.values():
+        tracker = mission.trackers[0]
+        attitude = presumed_attitude(
+            SunPointedPrior(None, None)
+            if isinstance(mission.zone, Band)
+            else BoresightPrior(0.0, 0.0),
+            moment,
+            mission,
+        ).attitude
+        run_catalog = apart.run_catalog(mission, moment)
+        boresight = attitude.T @ tracker.body_from_tracker[:, 2]
+        stars = np.argsort(-(run_catalog.direction @ boresight))[:5]
+        seen = run_catalog.direction[stars] @ attitude.T @ tracker.body_from_tracker
+        none = np.full(len(stars), np.nan)
+        observed = TrackerStars(
+            tracker=tracker.name,
+            vector=seen,
+            angles_deg=np.full((len(stars), 2), np.nan),
+            magnitude_mag=run_catalog.magnitude_mag[stars],
+            time_offset_s=np.zeros(len(stars)),
+            sigma_arcsec=none,
+        )
+        for identifier in IDENTIFIERS:
+            batch = ObservationBatch(
+                spacecraft=mission.name,
+                batch="warm-up",
+                run="warm-up",
+                time=moment,
+                a_priori=QuaternionPrior(quaternion_from_matrix(attitude)),
+                body_rates_deg_per_s=np.zeros(3),
+                velocity_km_per_s=None,
+                aberration="to_correct",
+                observations=(observed,),
+                options=Options(identifier=identifier, zone_grid_deg=0.0),
+            )
+            acquire(batch, mission, apart)

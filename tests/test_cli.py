@@ -1,0 +1,378 @@
+"""The command: help that teaches, one clear line a mistake, exit codes that scripts can use."""
+
+import csv
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import httpx
+import pytest
+import yaml
+
+from service import __version__
+from service.cli import main
+from service.cli.parser import build_parser
+from service.observe.csv_cells import COLUMNS
+from service.simulate.files import read_objects
+from service.times import parse_utc
+
+COMMANDS = [
+    "serve",
+    "replay",
+    "catalog",
+    "catalog build",
+    "catalog import",
+    "catalog export",
+    "catalog rejected",
+    "simulate",
+    "simulate telemetry",
+    "simulate paper",
+    "database",
+    "database upgrade",
+    "database check",
+    "openapi",
+    "demo",
+    "version",
+]
+
+
+@pytest.fixture(autouse=True)
+def _somewhere_else(tmp_path, monkeypatch):
+    """Every command runs in an empty folder, with nothing set."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("DATABASE", "MISSIONS", "CATALOG", "SHELF_MB", "HOST", "PORT"):
+        monkeypatch.delenv(f"ACQUIRE_{name}", raising=False)
+
+
+@pytest.fixture
+def acquire(capsys):
+    """Run a command; its exit code, what it printed and what it complained of."""
+
+    def run(*arguments):
+        try:
+            code = main([str(argument) for argument in arguments])
+        except SystemExit as stop:
+            code = stop.code
+        printed = capsys.readouterr()
+        return code, printed.out, printed.err
+
+    return run
+
+
+def telemetry(acquire, path, spacecraft="XTE", batches=6, *more):
+    code, _, complaint = acquire(
+        "simulate", "telemetry", "--spacecraft", spacecraft, "--batches", batches, path, *more
+    )
+    assert code == 0, complaint
+    return path
+
+
+# ---- help --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS])
+def test_help_tells_what_a_command_does_and_gives_examples(acquire, command):
+    code, out, _ = acquire(*command.split(), "--help")
+    assert code == 0
+    assert out.startswith(f"usage: acquire {command}".rstrip())
+    assert "examples:" in out
+    assert max(len(line) for line in out.splitlines()) <= 100
+
+
+def test_every_example_in_the_help_is_understood(acquire):
+    """What the help shows can be typed."""
+    for command in ["", *COMMANDS]:
+        _, out, _ = acquire(*command.split(), "--help")
+        for line in out.split("examples:\n")[1].split("\n\n")[0].splitlines():
+            words = line.split("  ")[1].split() if line.startswith("  ") else []
+            words = [word for word in words if not word.startswith("ACQUIRE_")]
+            if "COMMAND" not in words and words:
+                assert words[0] == "acquire"
+                assert build_parser().parse_args(words[1:]).command
+
+
+def test_the_help_of_replay_names_every_column_of_a_csv_file(acquire):
+    _, out, _ = acquire("replay", "--help")
+    named = out.split("named after the JSON:\n")[1].split("spacecraft, batch, time")[0].split()
+    assert sorted(named) == sorted(COLUMNS)
+
+
+def test_help_loads_nothing_that_takes_time():
+    code = (
+        "import sys; from service.cli.parser import build_parser; build_parser().format_help();"
+        "heavy = {'numpy', 'pydantic', 'fastapi', 'sqlalchemy', 'httpx', 'erfa', 'numba'};"
+        "print(*(heavy & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "\n", "")
+
+
+def test_the_version_is_the_packages(acquire):
+    assert acquire("version") == acquire("--version") == (0, f"acquire {__version__}\n", "")
+
+
+# ---- mistakes ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ("", "the following arguments are required: COMMAND (see `acquire --help`)"),
+        ("frob", "invalid choice: 'frob'"),
+        ("replay", "required: FILE (see `acquire replay --help`)"),
+        ("replay none.ndjson", "none.ndjson: cannot be opened: No such file or directory"),
+        ("replay . --run x", ".: cannot be opened: Is a directory"),
+        ("replay a --speed 0", "argument --speed: must be a number above 0, or max (got '0')"),
+        ("replay a --speed nan", "must be a number above 0, or max (got 'nan')"),
+        ("replay a --concurrency 0", "must be a whole number of at least 1 (got '0')"),
+        ("replay a --in-process --url http://x", "--url: not allowed with argument --in-process"),
+        ("simulate telemetry --spacecraft XTE --batches 1 --stars 300 o", "stars: must be from 1"),
+        ("simulate telemetry --spacecraft NO --batches 1 o", "no spacecraft 'NO'; there are SOHO"),
+        ("simulate telemetry --spacecraft XTE --batches 1 no/o", "no/o.truth.ndjson: cannot be"),
+        ("simulate telemetry --spacecraft XTE --batches 1 --start x o", "start: must be UTC as"),
+        (
+            "simulate telemetry --spacecraft XTE --batches 1 --aberration ignore=much o",
+            "--aberration: must be a word, or words with shares",
+        ),
+        ("simulate paper --table 1", "table: must be from 2 to 14 (got 1)"),
+        ("catalog export --spacecraft XTE --epoch 96 o", "--epoch: must be from 1972 to 2100"),
+        ("catalog export --spacecraft XTE --epoch nan o", "--epoch: must be from 1972 to 2100"),
+        ("catalog import none.csv", "none.csv: "),
+        ("catalog build .", "missing: download package"),
+        ("openapi --check none.yaml", "none.yaml: No such file or directory"),
+        ("serve --host 0.0.0.0", "must be a loopback address"),
+        ("serve --port 70000", "must be from 0 to 65535"),
+        ("serve --database no://where", "ACQUIRE_DATABASE: "),
+        ("database check --database sqlite:///no/such/folder.db", "ACQUIRE_DATABASE: "),
+        ("demo --seed -1 --once", "seed: must not be negative (got -1)"),
+        ("demo --port 0 --once", "--port: must be a port that can be named"),
+    ],
+)
+def test_a_mistake_is_one_clear_line_and_exit_code_2(acquire, arguments, complaint):
+    code, out, err = acquire(*arguments.split())
+    assert code == 2
+    assert out == ""
+    assert complaint in err
+    lines = [line for line in err.splitlines() if line.startswith("acquire: ")]
+    assert len(lines) == 1
+    assert "Traceback" not in err
+
+
+def test_a_setting_that_is_misspelt_is_refused(acquire, monkeypatch):
+    monkeypatch.setenv("ACQUIRE_DATABSE", "sqlite:///a.db")
+    code, _, err = acquire("database", "check")
+    assert code == 2
+    assert "ACQUIRE_DATABSE: no such setting" in err
+
+
+def test_output_that_nobody_reads_to_its_end_is_no_error():
+    command = f"{sys.executable} -m service.cli openapi | head -1"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, check=False)
+    assert done.stdout.startswith("openapi: 3.1")
+    assert done.stderr == ""
+
+
+# ---- telemetry and replay ----------------------------------------------------------------------
+
+
+def test_telemetry_is_drawn_as_asked_with_its_truth_beside_it(acquire, tmp_path):
+    path = tmp_path / "soho.ndjson"
+    code, out, _ = acquire(
+        *("simulate", "telemetry", "--spacecraft", "SOHO", "--batches", 10, "--seed", 3, path),
+        *("--start", "1996-010T12:00:00Z", "--cadence", 60, "--stars", 3, "--serious"),
+        *("--prior", "direction", "--angles", 1, "--aberration", "to_correct=0.5,ignore=0.5"),
+    )
+    assert code == 0
+    assert "10 batches of SOHO" in out
+    batches, truths = list(read_objects(path)), list(read_objects(tmp_path / "soho.truth.ndjson"))
+    assert [each["batch"] for each in batches] == [each["batch"] for each in truths]
+    assert batches[0]["time"] == "1996-01-10T12:00:00.000Z"
+    assert batches[1]["time"] == "1996-01-10T12:01:00.000Z"
+    assert all(each["a_priori"] == {"sun_pointed": True} for each in batches)
+    stars = [each["observations"][0]["stars"] for each in batches]
+    assert all(len(each) <= 3 and "h_deg" in each[0] for each in stars)
+    assert {each["aberration"] for each in batches} == {"to_correct", "ignore"}
+    assert {each["stretch"] for each in truths} == {
+        "nominal",
+        "attitude_error",
+        "spurious",
+        "magnitude_error",
+        "position_error",
+    }
+
+
+@pytest.mark.parametrize(
+    ("arguments", "stretches"),
+    [
+        ("--nominal", {"nominal"}),
+        ("", {"nominal", "attitude_error", "spurious"}),
+        ("--nominal --magnitude-error-share 0.5", {"nominal", "magnitude_error"}),
+        (
+            "--position-error-arcsec 20 --spurious-share 0",
+            {"nominal", "attitude_error", "position_error"},
+        ),
+    ],
+)
+def test_stretches_come_as_asked(acquire, tmp_path, arguments, stretches):
+    telemetry(acquire, tmp_path / "x.ndjson", "XTE", 20, *arguments.split())
+    truths = read_objects(tmp_path / "x.truth.ndjson")
+    assert {each["stretch"] for each in truths} == stretches
+
+
+def test_replay_in_process_records_answers_and_sums_up(acquire, tmp_path):
+    path = telemetry(acquire, tmp_path / "night.ndjson")
+    code, out, err = acquire("replay", path, "--in-process", "--results", "out.ndjson")
+    assert code == 0, err
+    table = dict(line.strip().split(None, 1) for line in out.splitlines())
+    assert table["run"] == "night"
+    assert table["batches"] == table["new"] == "6"
+    assert table["refused"] == "0"
+    assert len(list(read_objects(tmp_path / "out.ndjson"))) == 6
+    # The default database, made and migrated on the way.
+    assert (tmp_path / "acquire.db").exists()
+    code, out, _ = acquire("replay", path, "--in-process")
+    assert code == 0
+    assert "already recorded  6" in out
+
+
+def test_a_bad_line_in_the_middle_gives_exit_code_1_and_the_rest_goes_on(acquire, tmp_path):
+    path = telemetry(acquire, tmp_path / "night.ndjson")
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:3], '{"spacecraft": ', *lines[3:]]))
+    code, out, err = acquire(
+        "replay", path, "--in-process", "--run", "trial", "--results", "out.ndjson"
+    )
+    assert code == 1
+    assert f"{path}:4: " in err
+    results = list(read_objects(tmp_path / "out.ndjson"))
+    assert [result.get("line") for result in results] == [None, None, None, 4, None, None, None]
+    assert {result.get("run") for result in results} == {"trial", None}
+    assert "refused           1" in out
+
+
+def test_a_csv_file_with_a_wrong_header_is_refused_before_anything_is_sent(acquire, tmp_path):
+    good = telemetry(acquire, tmp_path / "good.ndjson")
+    bad = telemetry(acquire, tmp_path / "bad.csv")
+    bad.write_text(bad.read_text().replace("magnitude", "brightness", 1))
+    code, _, err = acquire("replay", good, bad, "--in-process")
+    assert code == 2
+    assert "column brightness: there is no such column" in err
+    assert not (tmp_path / "acquire.db").exists()
+
+
+def test_results_are_never_written_over_what_is_replayed(acquire, tmp_path):
+    path = telemetry(acquire, tmp_path / "night.ndjson")
+    before = path.read_bytes()
+    code, _, err = acquire("replay", path, "--in-process", "--results", path)
+    assert code == 2
+    assert "--results: must not be a file that is replayed" in err
+    assert path.read_bytes() == before
+
+
+def test_the_server_serves_takes_a_replay_and_stops_when_told(acquire, tmp_path):
+    """The real process: `serve`, then `replay` to it, then SIGTERM."""
+    path = telemetry(acquire, tmp_path / "night.ndjson", "SOHO", 4)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-m", "service.cli", "serve", "--port", str(port)]
+    with (tmp_path / "log").open("wb") as log:
+        server = subprocess.Popen(command, stdout=log, stderr=log)
+    try:
+        url = f"http://127.0.0.1:{port}"
+        for _ in range(600):
+            assert server.poll() is None, (tmp_path / "log").read_text()
+            try:
+                if httpx.get(f"{url}/readyz", trust_env=False, timeout=60).status_code == 200:
+                    break
+            except httpx.TransportError:
+                pass
+            time.sleep(0.1)
+        code, out, err = acquire("replay", path, "--url", url)
+        assert code == 0, err
+        assert "new               4" in out
+    finally:
+        server.send_signal(signal.SIGTERM)
+        assert server.wait(20) in (0, -signal.SIGTERM)
+
+
+# ---- catalogs, database, description -----------------------------------------------------------
+
+
+def test_an_export_holds_exactly_what_the_identifier_uses(acquire, missions, sky, tmp_path):
+    code, out, _ = acquire(
+        "catalog", "export", "--spacecraft", "XTE", "--epoch", "1995.7", tmp_path / "x.csv"
+    )
+    assert code == 0
+    assert "epoch 1996" in out
+    used = sky.run_catalog(missions["XTE"], parse_utc("1996-01-10T12:00:00Z"))
+    with (tmp_path / "x.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["id"] for row in rows] == list(used.star_id)
+    for column in ("ra_deg", "dec_deg", "magnitude"):
+        exact = getattr(used, column if column != "magnitude" else "magnitude_mag").tolist()
+        assert [float(row[column]) for row in rows] == exact
+
+
+def test_rejected_stars_are_listed_with_their_reasons(acquire, tmp_path):
+    code, out, _ = acquire(
+        "catalog", "rejected", "--spacecraft", "SOHO", "--epoch", 1996, tmp_path / "r.csv"
+    )
+    assert code == 0
+    with (tmp_path / "r.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert f"{len(rows)} stars left out" in out
+    assert all(row["reason"].startswith("merged into ") for row in rows)
+
+
+def test_a_site_brings_its_own_catalog(acquire, tmp_path, monkeypatch):
+    lines = ["id,ra_deg,dec_deg,magnitude", "SKYMAP 1,10.5,-20.25,3.5", "SKYMAP 2,11.5,-21,2.5"]
+    (tmp_path / "site.csv").write_text("\n".join(lines))
+    code, out, _ = acquire("catalog", "import", "site.csv")
+    assert code == 0
+    assert "site.npz: 2 stars" in out
+    monkeypatch.setenv("ACQUIRE_CATALOG", "site.npz")
+    acquire("catalog", "export", "--spacecraft", "SWAS", "--epoch", 2000, "out.csv")
+    with (tmp_path / "out.csv").open(newline="") as file:
+        assert [row["id"] for row in csv.DictReader(file)] == ["SKYMAP 2", "SKYMAP 1"]
+
+
+def test_a_damaged_site_catalog_is_refused_with_line_and_column(acquire, tmp_path):
+    (tmp_path / "site.csv").write_text("id,ra_deg,dec_deg,magnitude\nA,10,20,3\nB,10,200,3\n")
+    code, _, err = acquire("catalog", "import", "site.csv")
+    assert code == 2
+    assert "3" in err
+    assert "dec_deg" in err
+    assert not (tmp_path / "site.npz").exists()
+
+
+def test_the_database_is_made_checked_and_its_migrations_are_whole(acquire, tmp_path):
+    url = f"sqlite:///{tmp_path / 'a.db'}"
+    assert acquire("database", "upgrade", "--database", url)[0] == 0
+    assert acquire("database", "check", "--database", url)[0] == 0
+    assert acquire("database", "check", "--fresh")[0] == 0
+    code, out, _ = acquire("database", "check", "--database", "sqlite:///empty.db")
+    assert code == 1
+    assert "add_table" in out
+
+
+def test_the_description_is_printed_written_and_checked(acquire, tmp_path):
+    code, out, _ = acquire("openapi")
+    assert code == 0
+    assert yaml.safe_load(out)["openapi"].startswith("3.1")
+    assert acquire("openapi", "--output", "openapi.yaml")[0] == 0
+    assert (tmp_path / "openapi.yaml").read_text() == out
+    assert acquire("openapi", "--check")[0] == 0
+    (tmp_path / "openapi.yaml").write_text(out.replace("/api/v1/zones", "/api/v1/places"))
+    code, out, _ = acquire("openapi", "--check")
+    assert code == 1
+    assert "run `make openapi`" in out
+
+
+def test_what_is_read_back_is_json_one_object_a_line(acquire, tmp_path):
+    path = telemetry(acquire, tmp_path / "x.ndjson", "SWAS", 3)
+    for line in path.read_text().splitlines():
+        assert json.loads(line)["spacecraft"] == "SWAS"

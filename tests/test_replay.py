@@ -1,0 +1,338 @@
+"""Replay: both ways give equal results, in order, each line once, bad lines by their number."""
+
+import io
+import json
+import re
+import socket
+import threading
+import time
+from itertools import count
+
+import pytest
+
+from service.errors import BadInput, Busy
+from service.observe.csv_rows import write_csv
+from service.observe.wire import BatchIn
+from service.operations import Operations
+from service.replay.in_process import replay_in_process
+from service.replay.items import Pace, items_of, run_name
+from service.replay.over_http import replay_over_http
+from service.replay.tally import Tally
+from service.settings import Settings
+from service.simulate.files import read_objects
+from service.simulate.stretches import Pass, Trouble, Troubles
+from service.simulate.telemetry import draw_pass
+from service.web.app import create_app
+from tests.web.conftest import Server
+
+SERIOUS = Troubles(Trouble(0.2), Trouble(0.2, 2), Trouble(0.2, 0.5), Trouble(0.2, 12.0))
+_names = count(1)
+
+
+def opened(folder, name="acquire.db"):
+    return Operations.open(Settings(database=f"sqlite:///{folder / name}"))
+
+
+@pytest.fixture(scope="module")
+def operations(tmp_path_factory):
+    operations = opened(tmp_path_factory.mktemp("in-process"))
+    yield operations
+    operations.close()
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory):
+    """A real server with a database of its own."""
+    with Server(create_app(opened(tmp_path_factory.mktemp("served")))) as url:
+        yield url
+
+
+@pytest.fixture(scope="module")
+def batches(missions, sky):
+    """Nine batches of each mission, all kinds of trouble among them, and of mixed forms."""
+    wanted = Pass(9, 5, prior="mixed", angles_share=0.5, troubles=SERIOUS)
+    names = ("XTE", "SOHO", "SWAS")
+    passes = [[each.batch for each in draw_pass(missions[name], sky, wanted)] for name in names]
+    return [batch for three in zip(*passes, strict=True) for batch in three]
+
+
+@pytest.fixture
+def run():
+    return f"run-{next(_names)}"
+
+
+def written(path, lines):
+    texts = (line if isinstance(line, str) else json.dumps(line) for line in lines)
+    path.write_text("".join(f"{text}\n" for text in texts), encoding="utf-8")
+    return path
+
+
+def replayed(files, run, results, *, operations=None, url=None, **how):
+    files = files if isinstance(files, list) else [files]
+    with Tally(files, results, progress=False) as tally:
+        if url is None:
+            replay_in_process(operations, items_of(files, run), tally.add, **how)
+        else:
+            replay_over_http(url, items_of(files, run), tally.add, **how)
+    return tally, list(read_objects(results))
+
+
+def without_circumstances(result):
+    """A result without what depends on when and where it was made, not on what was asked."""
+    if "problem" in result:
+        return result
+    result = {key: value for key, value in result.items() if key not in ("id", "timings_us")}
+    for tracker in result["observations"]:
+        del tracker["zone"]["cached"]
+    return result
+
+
+def bad_lines(batch):
+    first = batch["observations"][0]["stars"][0]
+    return [
+        '{"spacecraft": "XTE", "batch": "cut sho',
+        "",
+        "[1, 2]",
+        {**batch, "batch": "far", "spacecraft": "VOYAGER"},
+        {**batch, "batch": "eyes", "observations": [{"tracker": "EYE", "stars": [first]}]},
+        {**batch, "batch": "odd", "time": "1996-02-30T00:00:00Z", "aberration": "maybe"},
+        re.sub('"magnitude": [0-9.]+', '"magnitude": 1e999', json.dumps({**batch, "batch": "inf"})),
+        {**batch, "batch": "lost", "a_priori": None},
+        {**batch, "time": "1999-03-01T12:00:00Z"},
+        batch,
+    ]
+
+
+def test_both_ways_give_equal_results_star_by_star(operations, address, batches, run, tmp_path):
+    """Answers and refusals alike, serious errors and bad lines included."""
+    middle = len(batches) // 2
+    lines = [*batches[:middle], *bad_lines(batches[0]), *batches[middle:]]
+    path = written(tmp_path / "pass.ndjson", lines)
+    inside, here = replayed(path, run, tmp_path / "in.ndjson", operations=operations)
+    outside, there = replayed(path, run, tmp_path / "out.ndjson", url=address)
+    assert [without_circumstances(each) for each in here] == [
+        without_circumstances(each) for each in there
+    ]
+    for tally in (inside, outside):
+        assert (tally.new, tally.replayed, tally.refused) == (len(batches), 1, 8)
+        assert tally.stars["observed"] == sum(
+            len(tracker["stars"])
+            for batch in [*batches, batches[0]]
+            for tracker in batch["observations"]
+        )
+
+
+def test_bad_lines_are_told_by_number_and_field_and_the_rest_goes_on(
+    operations, batches, run, tmp_path, capsys
+):
+    path = written(tmp_path / "pass.ndjson", [batches[0], *bad_lines(batches[0]), batches[1]])
+    tally, results = replayed(path, run, tmp_path / "out.ndjson", operations=operations)
+    problems = {each["line"]: each["problem"] for each in results if "problem" in each}
+    assert list(problems) == [2, 4, 5, 6, 7, 8, 9, 10]
+    assert problems[5]["detail"].startswith("no spacecraft 'VOYAGER'; there are SOHO, SWAS, XTE")
+    assert problems[6]["errors"][0]["field"] == "observations.0.tracker"
+    assert {each["field"] for each in problems[7]["errors"]} == {"time", "aberration"}
+    assert "magnitude" in problems[8]["errors"][0]["field"]
+    assert problems[9]["errors"][0]["field"] == "a_priori"
+    assert results[-1]["batch"] == batches[1]["batch"]
+    told = capsys.readouterr().err
+    assert f"{path}:5: no spacecraft 'VOYAGER'" in told
+    assert tally.refused == 8
+
+
+@pytest.mark.parametrize("concurrency", [1, 16])
+def test_results_stand_in_input_order_exactly_as_answered(
+    address, batches, run, tmp_path, concurrency
+):
+    path = written(tmp_path / "pass.ndjson", batches)
+    _, results = replayed(path, run, tmp_path / "a", url=address, concurrency=concurrency)
+    assert [each["batch"] for each in results] == [each["batch"] for each in batches]
+    assert {each["run"] for each in results} == {run}
+    for result, batch in zip(results, batches, strict=True):
+        assert [len(each["stars"]) for each in result["observations"]] == [
+            len(each["stars"]) for each in batch["observations"]
+        ]
+
+
+@pytest.mark.parametrize("way", ["in process", "http"])
+def test_a_second_time_nothing_is_new_and_every_answer_is_the_same(
+    operations, address, batches, run, tmp_path, way
+):
+    path = written(tmp_path / "pass.ndjson", batches)
+    where = {"url": address} if way == "http" else {"operations": operations}
+    replayed(path, run, tmp_path / "first", **where)
+    tally, _ = replayed(path, run, tmp_path / "second", **where)
+    assert (tally.new, tally.replayed, tally.refused) == (0, len(batches), 0)
+    assert (tmp_path / "first").read_bytes() == (tmp_path / "second").read_bytes()
+    assert "already recorded  27" in tally.table()
+
+
+def test_rows_and_json_are_one_run(operations, batches, run, tmp_path):
+    """A CSV file of batches that were replayed as NDJSON brings nothing new."""
+    json_file = written(tmp_path / "pass.ndjson", batches)
+    csv_file = tmp_path / "pass.csv"
+    with csv_file.open("w", newline="", encoding="utf-8") as file:
+        write_csv((BatchIn.model_validate_json(json.dumps(each)) for each in batches), file)
+    replayed(json_file, run, tmp_path / "a", operations=operations)
+    tally, _ = replayed(csv_file, run, tmp_path / "b", operations=operations)
+    assert (tally.new, tally.replayed) == (0, len(batches))
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_a_bad_row_of_a_csv_file_is_told_by_line_and_column(operations, batches, run, tmp_path):
+    path = tmp_path / "pass.csv"
+    text = io.StringIO(newline="")
+    write_csv((BatchIn.model_validate_json(json.dumps(each)) for each in batches[:3]), text)
+    rows = text.getvalue().splitlines()
+    at = next(
+        k for k, row in enumerate(rows) if batches[1]["batch"] in row and ",SOHO" in f",{row}"
+    )
+    cells = rows[at].split(",")
+    cells[rows[0].split(",").index("magnitude")] = "dim"
+    rows[at] = ",".join(cells)
+    path.write_text("\n".join(rows), encoding="utf-8")
+    tally, results = replayed(path, run, tmp_path / "out", operations=operations)
+    assert (tally.new, tally.refused) == (2, 1)
+    assert results[1] == {
+        "line": at + 1,
+        "problem": {
+            "detail": f"line {at + 1}, column magnitude: must be a number (got 'dim')",
+            "errors": [
+                {
+                    "field": f"line {at + 1}, column magnitude",
+                    "message": "must be a number",
+                    "value": "'dim'",
+                }
+            ],
+        },
+    }
+
+
+def test_several_files_are_one_run_and_a_refusal_names_its_file(operations, batches, run, tmp_path):
+    files = [
+        written(tmp_path / "one.ndjson", batches[:2]),
+        written(tmp_path / "two.ndjson", ["{", batches[2]]),
+    ]
+    tally, results = replayed(files, run, tmp_path / "out", operations=operations)
+    assert (tally.new, tally.refused) == (3, 1)
+    assert results[2]["file"] == str(files[1])
+    assert results[2]["line"] == 1
+
+
+class Unreliable:
+    """The real app on a bad day: every third post is turned away, every fourth answer is lost."""
+
+    def __init__(self, app):
+        self.app, self.posts, self.lock = app, 0, threading.Lock()
+
+    async def __call__(self, scope, receive, send):
+        if scope["type"] != "http" or scope["method"] != "POST":
+            await self.app(scope, receive, send)
+            return
+        with self.lock:
+            self.posts += 1
+            number = self.posts
+        if number % 3 == 0:
+            headers = [(b"retry-after", b"0")]
+            await send({"type": "http.response.start", "status": 503, "headers": headers})
+            await send({"type": "http.response.body", "body": b""})
+        elif number % 4 == 0:
+
+            async def lose(message):
+                body = message.get("body", b"")
+                if message["type"] == "http.response.body":
+                    message = {**message, "body": body[: len(body) // 2]}
+                await send(message)
+
+            # What was done stays done; the client sees the connection close.
+            await self.app(scope, receive, lose)
+        else:
+            await self.app(scope, receive, send)
+
+
+def test_busy_answers_and_lost_ones_are_asked_again_and_nothing_is_doubled(batches, run, tmp_path):
+    path = written(tmp_path / "pass.ndjson", batches)
+    operations = opened(tmp_path)
+    unreliable = Unreliable(create_app(operations))
+    with Server(unreliable) as url:
+        tally, results = replayed(path, run, tmp_path / "out", url=url)
+        stored = operations.batches(
+            spacecraft=None,
+            run=run,
+            start=None,
+            end=None,
+            outcome=None,
+            status=None,
+            limit=100,
+            cursor=None,
+        )
+    assert unreliable.posts > len(batches)
+    assert tally.refused == 0
+    assert tally.new + tally.replayed == len(batches) == len(stored.items)
+    assert tally.replayed > 0
+    assert [each["batch"] for each in results] == [each["batch"] for each in batches]
+
+
+def test_a_replay_that_was_cut_off_goes_on_where_it_stopped(batches, run, tmp_path):
+    path = written(tmp_path / "pass.ndjson", batches)
+    server = Server(create_app(opened(tmp_path)))
+
+    def stopping_after(number, items):
+        for index, item in enumerate(items):
+            if index == number:
+                server.__exit__()
+            yield item
+
+    with Tally([path], None, progress=False) as tally:
+        url = server.__enter__()
+        with pytest.raises(Busy, match="run the same command again to go on"):
+            replay_over_http(
+                url,
+                stopping_after(10, items_of([path], run)),
+                tally.add,
+                concurrency=1,
+                patience_s=0.2,
+            )
+    done = tally.new
+    assert 9 <= done <= 10
+    with Server(create_app(opened(tmp_path))) as url:
+        tally, _ = replayed(path, run, tmp_path / "out", url=url)
+    # The answer of one more may have been on its way.
+    assert done <= tally.replayed <= done + 1
+    assert tally.replayed + tally.new == len(batches)
+
+
+def test_batches_are_sent_at_their_own_times_sped_up(operations, address, missions, sky, tmp_path):
+    """Five batches a second apart, at four times the speed, take a second."""
+    drawn = list(draw_pass(missions["XTE"], sky, Pass(5, 9, cadence_s=1.0)))
+    path = written(tmp_path / "pass.ndjson", [each.batch for each in drawn])
+    for run, where in (("paced-1", {"operations": operations}), ("paced-2", {"url": address})):
+        start = time.monotonic()
+        replayed(path, run, tmp_path / "out", pace=Pace(4.0), **where)
+        assert 1.0 <= time.monotonic() - start < 3.0
+
+
+def test_where_no_service_answers_it_is_said_at_once(tmp_path, batches):
+    path = written(tmp_path / "pass.ndjson", batches)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        url = f"http://127.0.0.1:{free.getsockname()[1]}"
+    with pytest.raises(Busy, match=f"no service answers at {url}") as refusal:
+        replayed(path, "run", tmp_path / "out", url=url)
+    assert "acquire serve" in str(refusal.value)
+
+
+@pytest.mark.parametrize("url", ["", "127.0.0.1:8000", "ftp://127.0.0.1", "http://"])
+def test_an_address_that_is_none_is_refused(url, tmp_path):
+    with pytest.raises(BadInput, match="--url: must be the address of a service"):
+        replay_over_http(url, [], lambda outcome: None)
+
+
+def test_the_run_is_named_or_takes_the_first_files_stem(tmp_path):
+    files = [tmp_path / "night-7.ndjson", tmp_path / "other.csv"]
+    assert run_name(files, None) == "night-7"
+    assert run_name(files, "mine") == "mine"
+    with pytest.raises(BadInput, match="--run: a run has 1 to 64 of"):
+        run_name(files, "no spaces")
+    with pytest.raises(BadInput, match=r"my pass\.ndjson, whose stem would name the run"):
+        run_name([tmp_path / "my pass.ndjson"], None)
