@@ -235,7 +235,7 @@ def _solve(
     run_catalog: RunCatalog,
 ) -> AttitudeSolution | NoAttitude:
     masks = [identification.unique for identification in identifications]
-    matched = [int(mask.sum()) for mask in masks]
+    matched = [np.count_nonzero(mask) for mask in masks]
     if sum(matched) < 2:
         return NoAttitude.FEWER_THAN_TWO_UNIQUE_STARS
     star = _joined([i.star[m] for i, m in zip(identifications, masks, strict=True)])
@@ -246,7 +246,7 @@ def _solve(
         _joined([c.direction_body[m] for c, m in zip(corrected, masks, strict=True)]),
         reference,
         _joined([c.sigma_arcsec[m] for c, m in zip(corrected, masks, strict=True)]),
-        np.repeat(np.arange(len(masks)), matched),
+        _joined([np.full(count, index) for index, count in enumerate(matched)]),
         tuple(each.tracker.name for each in corrected),
         choices.solver,
     )

@@ -63,7 +63,7 @@ class Utc:
 
     @cached_property
     def tai_ns(self) -> int:
-        """Nanoseconds of TAI since 2000-01-01T12:00:00 TAI, uniform: for sorting and differences."""
+        """Nanoseconds of TAI since 2000-01-01T12:00:00 TAI: for sorting and differences."""
         day, hour, minute, second, nanoseconds = self._fields
         leap_seconds, _ = ufunc.dat(day.year, day.month, day.day, 0.0)
         seconds = (day.toordinal() - _MJD_ZERO - _J2000_MJD) * DAY_S - DAY_S // 2

@@ -176,7 +176,7 @@ def quaternion_from_scipy(rotation: Any) -> Vector:
 
 
 def quaternion_from_spice(spice: npt.ArrayLike) -> Vector:
-    """The service's quaternion of SPICE's `m2q(A)`, scalar first and conjugate; A inertial to body."""
+    """The service's quaternion of SPICE's `m2q(A)`: scalar first, conjugate; A inertial to body."""
     s = np.asarray(spice, dtype=np.float64)
     q = np.array([-s[1], -s[2], -s[3], s[0]])
     return -q if q[3] < 0 else q

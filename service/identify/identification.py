@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -43,7 +44,7 @@ class Identification:
     probability: Vector
     bounded: bool = False
 
-    @property
+    @cached_property
     def unique(self) -> npt.NDArray[np.bool_]:
         """Mask of the stars with a unique winner."""
         return np.asarray(self.outcome == Outcome.UNIQUE)

@@ -204,7 +204,7 @@ def _unit_cross(a, b, out):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def count_votes(votes, star_of, outcome, star, highest, second):  # type: ignore[no-untyped-def]
-    """Per observed star: outcome, the winner's row of `star_of` (-1: none), the two highest tallies.
+    """Per observed star: outcome, the winner's `star_of` (-1: none) and the two highest tallies.
 
     True where any star is ambiguous.
     """

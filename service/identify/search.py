@@ -110,7 +110,7 @@ def _scan(  # type: ignore[no-untyped-def]
     found, p = np.empty(2, np.int32), np.empty(3)
     order, parts, gate, others = _predictors(seen, i, j)
     for c in range(first, last):
-        work += 1
+        work += others
         for swap in range(2):
             a, b = pairs.brighter[c], pairs.dimmer[c]
             if swap == 1:
@@ -138,6 +138,7 @@ def _scan(  # type: ignore[no-untyped-def]
             if known(match, ledger, count):
                 continue
             count, rest = consider(seen, stars, density, match, ledger, log_weight, count, rest)
+            work += n * n
         if work >= MAX_WORK:
             break
     return count, rest, work

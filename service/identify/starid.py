@@ -10,16 +10,19 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from service.errors import BadBatch, Fault, shown_value
 from service.identify.identification import Identification, Integers, Outcome
 from service.identify.match_groups import MAX_EDGES, keep_largest_groups
 from service.identify.pair_tests import cast_votes, count_votes
 from service.missions.mission import Tests, Tolerances
 from service.sky.zones import Aim, Zone
-from service.vectors import Vector
+from service.vectors import Vector, angle_between_deg
 
 Tallies = npt.NDArray[np.int32]
 
 MAX_RIVALS = 20
+MAX_COMPARISONS = 30_000_000
+"""Observed with candidate pairs, for one tracker: about half a second."""
 _NO_EDGES = np.empty((0, 4), np.int32)
 
 
@@ -48,9 +51,14 @@ class Sighting:
 
 
 def identify_by_votes(sighting: Sighting) -> Identification:
-    """Identify the stars of one tracker by the votes of pairs, steps 1 to 10."""
+    """Identify the stars of one tracker by the votes of pairs, steps 1 to 10.
+
+    Raises `BadBatch` where tolerances make more comparisons than are allowed.
+    """
     zone, tests = sighting.zone, sighting.tests
     n = len(sighting.direction)
+    if n * (n - 1) // 2 * zone.pairs.count > MAX_COMPARISONS:
+        _refuse_endless(sighting)
     votes = np.zeros((n, len(zone.star)), np.int32)
     _cast(sighting, votes, _NO_EDGES)
     bounded = tests.match_groups and _keep_groups(sighting, votes)
@@ -65,6 +73,25 @@ def identify_by_votes(sighting: Sighting) -> Identification:
         probability=np.full(n, np.nan),
         bounded=bounded,
     )
+
+
+def _refuse_endless(sighting: Sighting) -> None:
+    """Raise `BadBatch` where so many stars at so wide a tolerance would take seconds."""
+    one, other = np.triu_indices(len(sighting.direction), 1)
+    separation = np.radians(angle_between_deg(sighting.direction[one], sighting.direction[other]))
+    tolerance_deg = sighting.tolerances.separation_deg
+    pairs, tolerance = sighting.zone.pairs.separation_rad, math.radians(tolerance_deg)
+    found = np.searchsorted(pairs, separation + tolerance, "right")
+    comparisons = int((found - np.searchsorted(pairs, separation - tolerance)).sum())
+    if comparisons > MAX_COMPARISONS:
+        raise BadBatch(
+            Fault(
+                "options.tolerances.separation_deg",
+                f"with {len(sighting.direction)} stars asks for {comparisons:,} comparisons "
+                f"of pairs; at most {MAX_COMPARISONS:,} are made",
+                shown_value(tolerance_deg),
+            )
+        )
 
 
 def _cast(sighting: Sighting, votes: Tallies, edges: Tallies) -> None:

@@ -12,8 +12,8 @@ from service.identify.hypotheses import NEGLIGIBLE, keep, known, log_sum
 from service.identify.scene import within
 from service.sky.pairs import separation_rad
 
-MAX_WORK = 4_000_000
-"""Candidate pairs looked at, at most, for one batch."""
+MAX_WORK = 20_000_000
+"""Stars looked up and fitted, at most, for one tracker: a second or two."""
 
 
 @njit(cache=True, nogil=True)

@@ -161,7 +161,7 @@ class Mission(_Strict):
 
     @cached_property
     def digest(self) -> str:
-        """`sha256:` of the settings, the same for the same settings however the file is laid out."""
+        """`sha256:` of the settings, the same however the file is laid out."""
         text = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
         return "sha256:" + hashlib.sha256(text.encode()).hexdigest()
 

@@ -68,7 +68,10 @@ def _corrected(
 
 
 def tracker_vectors(angles_deg: Vector, calibration: Calibration) -> Vector:
-    """Unit vectors (n, 3) in tracker axes of measured angles (n, 2): (tan h, tan v, 1) of the true ones."""
+    """Unit vectors (n, 3) in tracker axes of measured angles (n, 2).
+
+    The direction is that of (tan h, tan v, 1), h and v being the true angles.
+    """
     h, v = angles_deg[:, 0], angles_deg[:, 1]
     true_h, true_v = (
         calibration.scale * (measured + sum(c * h**i * v**j for i, j, c in terms))

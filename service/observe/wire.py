@@ -90,7 +90,7 @@ class Wire(BaseModel):
 
 
 class StarIn(Wire):
-    """One observed star: a unit vector in tracker axes, or the angles h and v of (tan h, tan v, 1)."""
+    """One observed star: a unit vector in tracker axes, or the angles of (tan h, tan v, 1)."""
 
     vector: UnitVector | None = None
     h_deg: Annotated[Number, Field(gt=-89, lt=89)] | None = None

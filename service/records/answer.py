@@ -68,23 +68,20 @@ def answer_of(
 
 def star_rows(acquisition: Acquisition) -> list[StarRow]:
     """Every star of every tracker, in the order observed."""
-    rows = []
-    for each in acquisition.trackers:
-        found = each.identification
-        for k in range(len(found.outcome)):
-            rows.append(
-                StarRow(
-                    tracker=each.corrected.tracker.name,
-                    position=k,
-                    outcome=Outcome(found.outcome[k]).word,
-                    star_id=_star_id(acquisition.run_catalog, int(found.star[k])),
-                    votes=int(found.votes[k]),
-                    runner_up=int(found.runner_up[k]),
-                    probability=_number(found.probability[k]),
-                    residual_arcsec=_number(each.residual_arcsec[k]),
-                )
-            )
-    return rows
+    return [
+        StarRow(
+            tracker=each.corrected.tracker.name,
+            position=k,
+            outcome=Outcome(outcome).word,
+            star_id=_star_id(acquisition.run_catalog, int(each.identification.star[k])),
+            votes=int(each.identification.votes[k]),
+            runner_up=int(each.identification.runner_up[k]),
+            probability=_number(each.identification.probability[k]),
+            residual_arcsec=_number(each.residual_arcsec[k]),
+        )
+        for each in acquisition.trackers
+        for k, outcome in enumerate(each.identification.outcome)
+    ]
 
 
 def _tracker_answer(result: TrackerResult, run_catalog: RunCatalog) -> dict[str, Any]:

@@ -11,11 +11,14 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from service.errors import BadInput, Fault
 from service.vectors import Vector, read_only
 
 Indices = npt.NDArray[np.int32]
 
 PAIRS_PER_BIN = 4
+MAX_PAIRS = 8_000_000
+"""In one index, 130 MB: twice those of the whole sky to V 8 within 8 degrees."""
 
 
 @dataclass(frozen=True)
@@ -47,13 +50,25 @@ class PairIndex:
 
 
 def build_pairs(direction: Vector, separation_max_deg: float) -> PairIndex:
-    """Index the pairs of unit vectors (n, 3), rows in order of brightness, up to HMAX."""
+    """Index the pairs of unit vectors (n, 3), rows in order of brightness, up to HMAX.
+
+    Raises `BadInput` where there would be too many to keep.
+    """
     limit = math.radians(separation_max_deg)
     # A sweep along the axis with the widest spread looks at few pairs beyond the limit.
     axis = int(np.argmax(np.ptp(direction, axis=0))) if len(direction) else 0
     sweep = np.argsort(direction[:, axis], kind="stable").astype(np.int32)
     ordered = np.ascontiguousarray(direction[sweep])
     count = _count_pairs(ordered, axis, limit)
+    if count > MAX_PAIRS:
+        raise BadInput(
+            Fault(
+                "options.tolerances.pair_separation_max_deg",
+                f"makes {count:,} pairs of {len(direction):,} stars; "
+                f"at most {MAX_PAIRS:,} are kept",
+                str(separation_max_deg),
+            )
+        )
     separation = np.empty(count)
     brighter, dimmer = np.empty(count, np.int32), np.empty(count, np.int32)
     _fill_pairs(ordered, sweep, axis, limit, separation, brighter, dimmer)

@@ -27,7 +27,7 @@ class Sky:
     shelf: Shelf
 
     def run_catalog(self, mission: Mission, time: Utc) -> RunCatalog:
-        """The run catalog that serves a mission at a time: that of the nearest epoch of its step."""
+        """The run catalog that serves a mission at a time: that of the nearest epoch."""
         epoch_year = mission.catalog.epoch_of(time.julian_year)
         key = RunCatalogKey(self.catalog.digest, mission.catalog.model_dump_json(), epoch_year)
         run_catalog, _ = self.shelf.get(
