@@ -18,7 +18,6 @@ import numpy.typing as npt
 from service import __version__
 from service.attitude.solution import AttitudeSolution, NoAttitude
 from service.attitude.solve import solve_attitude
-from service.errors import BadBatch, Fault
 from service.identify.identification import Identification, Outcome
 from service.identify.presumed import Presumed, aim_of, presumed_attitude
 from service.identify.starid import Sighting, identify_by_votes
@@ -32,12 +31,14 @@ from service.observe.correct import CorrectedObservations, correct
 from service.sky.ephemeris import apparent, observer_velocity
 from service.sky.run_catalog import RunCatalog
 from service.sky.view import Sky
-from service.sky.zones import Aim, Zone
+from service.sky.zones import Aim, Zone, counts_within
 from service.times import Utc
 from service.vectors import (
     ARCSEC_PER_RADIAN,
+    Matrix,
     Vector,
     matrix_from_quaternion,
+    separation_deg,
 )
 
 Array = npt.NDArray[Any]
@@ -63,14 +64,17 @@ class Choices:
 class TrackerResult:
     """One tracker's part: where its stars were looked for, and what was found.
 
-    `residual_arcsec` is NaN for stars that are not unique and where there is
-    no attitude.
+    `stars` and `pairs` are those within the aim, the paper's NCAP and NTOT;
+    `zone`, from the shelf, may hold more.  `residual_arcsec` is NaN for stars
+    that are not unique and where there is no attitude.
     """
 
     corrected: CorrectedObservations
     aim: Aim
     zone: Zone
     zone_cached: bool
+    stars: int
+    pairs: int
     identification: Identification
     residual_arcsec: Vector
 
@@ -122,7 +126,7 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
     """
     choices = choices_of(batch, mission)
     corrected = correct(batch, mission)
-    presumed = presumed_attitude(batch.a_priori, batch.time, mission)
+    presumed = presumed_attitude(batch.a_priori, batch.time, mission, batch.position_km)
     velocity_c = None
     if batch.aberration == "to_correct":
         velocity_c = observer_velocity(batch.time, batch.velocity_km_per_s)
@@ -158,8 +162,8 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
 
     solution = solved if isinstance(solved, AttitudeSolution) else None
     trackers = tuple(
-        TrackerResult(each, *place, identification, residual)
-        for each, place, identification, residual in zip(
+        TrackerResult(each, aim, zone, cached, *counts_within(zone, aim), identification, residual)
+        for each, (aim, zone, cached), identification, residual in zip(
             corrected, places, identifications, _residuals(identifications, solution), strict=True
         )
     )
@@ -172,7 +176,7 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
         trackers=trackers,
         solution=solution,
         reason=solved if isinstance(solved, NoAttitude) else None,
-        warnings=(*presumed.warnings, *_warnings(batch, trackers, presumed, solution)),
+        warnings=(*presumed.warnings, *_warnings(batch, mission, trackers, presumed, solution)),
         timings_us=dict(zip(("zone", "identify", "solve"), steps, strict=True)),
         provenance=Provenance(
             sky.catalog.digest,
@@ -185,17 +189,13 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
 
 
 def choices_of(batch: ObservationBatch, mission: Mission) -> Choices:
-    """The settings that hold for a batch; raises `BadBatch` for a pole test in a cap."""
+    """The settings that hold for a batch.
+
+    A test that cannot be made is off: that of the pole in a cap, and what
+    compares with the presumed roll where an a priori boresight leaves it open.
+    """
     options = batch.options
-    is_band = isinstance(mission.zone, Band)
-    if options.tests.get("pole") and not is_band:
-        raise BadBatch(
-            Fault("options.tests.pole", f"{mission.name} has a cap, without a pole", "True")
-        )
-    tests = {"pole": is_band and mission.tests.pole, **options.tests}
-    if isinstance(batch.a_priori, BoresightPrior):
-        # Nothing is known of the roll in which cross products and rotations would be compared.
-        tests["cross_product"] = tests["fov_rotation"] = False
+    tests = {**options.tests, **dict.fromkeys(_impossible_tests(batch, mission), False)}
     grid_deg = options.zone_grid_deg
     return Choices(
         identifier=options.identifier or mission.identifier,
@@ -204,6 +204,12 @@ def choices_of(batch: ObservationBatch, mission: Mission) -> Choices:
         tests=mission.tests.model_copy(update=tests),
         zone_grid_deg=mission.zone.grid_deg if grid_deg is None else grid_deg,
     )
+
+
+def _impossible_tests(batch: ObservationBatch, mission: Mission) -> tuple[str, ...]:
+    pole = () if isinstance(mission.zone, Band) else ("pole",)
+    roll = ("cross_product", "fov_rotation") if isinstance(batch.a_priori, BoresightPrior) else ()
+    return pole + roll
 
 
 def _place(
@@ -273,11 +279,16 @@ def _residuals(
 
 def _warnings(
     batch: ObservationBatch,
+    mission: Mission,
     trackers: tuple[TrackerResult, ...],
     presumed: Presumed,
     solution: AttitudeSolution | None,
 ) -> list[str]:
-    warnings = []
+    warnings = [
+        f"test_off: {name} was asked for and cannot be made of this a priori knowledge"
+        for name in _impossible_tests(batch, mission)
+        if batch.options.tests.get(name)
+    ]
     if batch.aberration == "to_correct" and batch.velocity_km_per_s is None:
         warnings.append(
             "velocity_of_earth_alone: no velocity_km_per_s was given; "
@@ -286,6 +297,8 @@ def _warnings(
     attitude = (
         presumed.attitude if solution is None else matrix_from_quaternion(solution.quaternion)
     )
+    if solution is not None:
+        warnings += _doubts(solution, attitude, mission, presumed)
     for each in trackers:
         tracker = each.corrected.tracker
         boresight = attitude.T @ tracker.body_from_tracker[:, 2]
@@ -299,6 +312,29 @@ def _warnings(
                 f"work_bound_hit: the search for the stars of {tracker.name} ended at its bound"
             )
         stars = each.identification.star[each.identification.unique]
-        if len(np.unique(stars)) < len(stars):
+        if len(set(stars.tolist())) < len(stars):
             warnings.append(f"same_star_twice: two stars of {tracker.name} have one identity")
     return warnings
+
+
+def _doubts(
+    solution: AttitudeSolution, attitude: Matrix, mission: Mission, presumed: Presumed
+) -> list[str]:
+    """What speaks against an attitude: its own residuals, and the a priori knowledge."""
+    doubts = []
+    if solution.suspect:
+        doubts.append(
+            f"attitude_suspect: residuals of {solution.residual_rms_arcsec:.1f} arcsec rms "
+            f"where {solution.predicted_rms_arcsec:.1f} are expected: a star is misidentified "
+            "or noisier than its sigma"
+        )
+    zone = mission.zone
+    allowed_deg = zone.half_width_deg if isinstance(zone, Band) else zone.radius_deg
+    axis = mission.axis_body
+    off_deg = separation_deg(attitude.T @ axis, presumed.attitude.T @ axis)
+    if off_deg > allowed_deg:
+        doubts.append(
+            f"attitude_off_a_priori: its {'pole' if isinstance(zone, Band) else 'boresight'} lies "
+            f"{off_deg:.1f} deg from where the a priori knowledge has it"
+        )
+    return doubts

@@ -29,6 +29,8 @@ POLE_FROM_SUN_WARNING_DEG = 1.0
 SUN_FROM_EARTH_GROWTH_DEG = 0.3
 """From Earth's centre the Sun is up to 0.26 deg from where a halo orbit about L1 sees it."""
 SAME_BORESIGHT_DEG = 0.01
+ALONG = 0.999999
+"""The cosine beyond which one direction does not fix a plane with another."""
 
 
 @dataclass(frozen=True)
@@ -46,15 +48,17 @@ class Presumed:
     warnings: list[str] = field(default_factory=list)
 
 
-def presumed_attitude(prior: APriori, time: Utc, mission: Mission) -> Presumed:
-    """The presumed attitude of a batch of that time.
+def presumed_attitude(
+    prior: APriori, time: Utc, mission: Mission, position_km: Vector | None = None
+) -> Presumed:
+    """The presumed attitude of a batch of that time, seen from a geocentric position where known.
 
     Raises `BadBatch` where the kind of prior does not fit the mission's zone.
     """
     if isinstance(prior, QuaternionPrior):
         attitude = matrix_from_quaternion(prior.quaternion)
         pole = attitude.T @ mission.axis_body if isinstance(mission.zone, Band) else None
-        return Presumed(attitude, True, pole, warnings=_pole_warnings(pole, time))
+        return Presumed(attitude, True, pole, warnings=_pole_warnings(pole, time, position_km))
     if isinstance(prior, BoresightPrior):
         if not isinstance(mission.zone, Cap):
             raise BadBatch(
@@ -81,42 +85,46 @@ def _sun_pointed(prior: SunPointedPrior, time: Utc, mission: Mission) -> Presume
     warnings: list[str] = []
     growth_deg = 0.0
     pole = prior.sun_vector
-    if pole is None:
+    if pole is not None:
+        warnings += _pole_warnings(pole, time, prior.position_km)
+    else:
         pole = sun_direction(time, prior.position_km)
+        if not np.isfinite(pole).all():
+            raise BadBatch(
+                Fault("position_km", "is that of the Sun itself", shown_value(prior.position_km))
+            )
         if prior.position_km is None:
             growth_deg = SUN_FROM_EARTH_GROWTH_DEG
             warnings.append(
                 "sun_seen_from_earth: neither sun_vector nor position_km was given; "
                 f"the band is {growth_deg} deg wider on either side"
             )
-    # Body Z is presumed along the projection of ecliptic north (or X, where the pole is Z).
-    other = np.array([0.0, 0.0, 1.0])
-    if abs(float(other @ mission.axis_body)) > 0.9:
-        other = np.array([1.0, 0.0, 0.0])
-    body = _frame(mission.axis_body, other)
+    # Body Z is presumed along the projection of ecliptic north.
+    body = _frame(mission.axis_body, np.array([0.0, 0.0, 1.0]))
     inertial = _frame(pole, ecliptic_north(time))
     return Presumed(body.T @ inertial, False, pole, growth_deg, warnings)
 
 
 def _frame(first: Vector, second: Vector) -> Matrix:
-    """Rows: the first direction, the normal to both, and the third of the right-handed set."""
+    """Rows: the first direction, the normal to both, and the third of the right-handed set.
+
+    A second direction along the first gives way to a coordinate axis.
+    """
+    if abs(float(first @ second)) > ALONG:
+        second = np.eye(3)[int(np.argmin(np.abs(first)))]
     normal = unit(np.cross(first, second))
     return np.stack([first, normal, np.cross(first, normal)])
 
 
 def _any_roll(body_axis: Vector, inertial_axis: Vector) -> Matrix:
     """Some attitude that carries an inertial direction to a body axis."""
-
-    def with_any(axis: Vector) -> Matrix:
-        return _frame(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
-
-    return with_any(body_axis).T @ with_any(inertial_axis)
+    return _frame(body_axis, body_axis).T @ _frame(inertial_axis, inertial_axis)
 
 
-def _pole_warnings(pole: Vector | None, time: Utc) -> list[str]:
+def _pole_warnings(pole: Vector | None, time: Utc, position_km: Vector | None) -> list[str]:
     if pole is None:
         return []
-    off_deg = separation_deg(pole, sun_direction(time, None))
+    off_deg = separation_deg(pole, sun_direction(time, position_km))
     if off_deg <= POLE_FROM_SUN_WARNING_DEG:
         return []
     return [f"pole_off_sun: the a priori pole is {off_deg:.2f} deg from the Sun"]

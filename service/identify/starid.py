@@ -22,7 +22,7 @@ Tallies = npt.NDArray[np.int32]
 
 MAX_RIVALS = 20
 MAX_COMPARISONS = 30_000_000
-"""Observed with candidate pairs, for one tracker: about half a second."""
+"""Observed with candidate pairs, for one tracker: a second or two."""
 _NO_EDGES = np.empty((0, 4), np.int32)
 
 

@@ -34,6 +34,8 @@ def identify_verified(sighting: Sighting) -> Identification:
         marginals(ledger, log_weight, count, rest, star, probability, none, rivals)
     unique = probability >= UNIQUE_PROBABILITY
     unmatched = ~unique & (none >= probability)
+    named = np.full(n, -1)
+    named[unique] = zone.star[star[unique]]
     return replace(
         identify_by_votes(sighting),
         outcome=np.where(
@@ -41,7 +43,7 @@ def identify_verified(sighting: Sighting) -> Identification:
             int(Outcome.UNIQUE),
             np.where(unmatched, int(Outcome.UNMATCHED), int(Outcome.AMBIGUOUS)),
         ),
-        star=np.where(unique, zone.star[star], -1),
+        star=named,
         rivals=tuple(
             ()
             if unique[k] or unmatched[k]

@@ -1,7 +1,7 @@
 """A mission: zone, tolerances, tests, run catalog and trackers, read from a TOML file.
 
-Lengths of the field's names: our word first, the paper's symbol in the
-comment of the file and of the field here (Fink & Shoup 1994, Table 1).
+Our word names a setting; the paper's symbol stands in the comment, here and in
+the files (Fink & Shoup 1994, Table 1).
 """
 
 import hashlib
@@ -13,7 +13,16 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from service.errors import BadConfiguration, BadInput, Fault, NotFound, shown_value
 from service.vectors import Matrix, Vector, read_only, unit
@@ -22,7 +31,17 @@ SHIPPED_FOLDER = Path(__file__).parent
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
 Components = tuple[float, float, float]
-Identifier = Literal["starid", "verified", "ptp", "lost_in_space"]
+
+
+def _zero_or_wide(step_deg: float) -> float:
+    if 0.0 < step_deg < LEAST_GRID_DEG:
+        raise ValueError(f"must be 0, for exact zones, or at least {LEAST_GRID_DEG}")
+    return step_deg
+
+
+LEAST_GRID_DEG = 0.01
+GridStep = Annotated[float, Field(ge=0, le=10), AfterValidator(_zero_or_wide)]
+Identifier = Literal["starid", "verified"]
 Solver = Literal["quest", "triad"]
 
 
@@ -37,7 +56,7 @@ class Cap(_Strict):
     axis_body: Components
     """The spacecraft's boresight: the axis that an a priori `boresight` names."""
     radius_deg: float = Field(gt=0, le=180)  # CCAP
-    grid_deg: float = Field(default=0.0, ge=0, le=10)
+    grid_deg: GridStep = 0.0
     """Step of the grid to which the zone's axis is snapped for the cache; 0: the exact zone."""
 
 
@@ -49,13 +68,13 @@ class Band(_Strict):
     """The body axis that lies along the pole: for SOHO the one pointed at the Sun."""
     coelevation_deg: float = Field(gt=0, lt=180)  # COEL
     half_width_deg: float = Field(gt=0, le=90)  # WBAND
-    grid_deg: float = Field(default=0.0, ge=0, le=10)
+    grid_deg: GridStep = 0.0
 
 
 class Tolerances(_Strict):
     """Every tolerance of the identification, each open to change per request."""
 
-    pair_separation_max_deg: float = Field(gt=0, le=60)  # HMAX
+    pair_separation_max_deg: float = Field(ge=0.01, le=60)  # HMAX
     separation_deg: float = Field(ge=0, le=5)  # SEPTOL
     magnitude_mag: float = Field(ge=0, le=30)  # XMTOL
     magnitude_order_mag: float = Field(ge=0, le=30)  # TMAGMX
@@ -67,11 +86,11 @@ class Tolerances(_Strict):
 
 
 class Tests(_Strict):
-    """The switches of the tests; None for `pole` means: on in a band, off in a cap."""
+    """The switches of the tests; unless a file says otherwise, `pole` is on in bands alone."""
 
     magnitude: bool = True
     cross_product: bool = True
-    pole: bool = True
+    pole: bool = False
     fov_rotation: bool = False
     match_groups: bool = False
 
@@ -89,6 +108,11 @@ class RunCatalogSettings(_Strict):
     reject_position_sigma_arcsec: float | None = Field(default=None, gt=0)
     color_polynomial_mag: tuple[float, ...] = ()
     """Instrument magnitude = V + c0 + c1 (B-V) + c2 (B-V)^2 + ...; empty: V itself."""
+
+    @cached_property
+    def digest(self) -> str:
+        """The settings as text: part of the key under which a run catalog is kept."""
+        return self.model_dump_json()
 
     def epoch_of(self, julian_year: float) -> float:
         """The epoch, in Julian years, of the run catalog that serves a time."""
@@ -147,7 +171,7 @@ class Mission(_Strict):
     solver: Solver = "quest"
     zone: Annotated[Cap | Band, Field(discriminator="kind")]
     tolerances: Tolerances
-    tests: Tests = Tests()
+    tests: Tests = Field(default=Tests(), validate_default=True)
     catalog: RunCatalogSettings
     trackers: tuple[Tracker, ...] = Field(min_length=1, max_length=16)
 
@@ -158,6 +182,17 @@ class Mission(_Strict):
         if len(set(names)) != len(names):
             raise ValueError(f"two trackers share a name: {', '.join(names)}")
         return trackers
+
+    @field_validator("tests")
+    @classmethod
+    def _pole_is_a_band_s(cls, tests: Tests, info: ValidationInfo) -> Tests:
+        is_band = isinstance(info.data.get("zone"), Band)
+        if "pole" not in tests.model_fields_set:
+            return tests.model_copy(update={"pole": is_band})
+        # A zone that is itself at fault is not there to be compared with.
+        if tests.pole and not is_band and "zone" in info.data:
+            raise ValueError("pole: a cap has no pole; false is allowed")
+        return tests
 
     @cached_property
     def digest(self) -> str:

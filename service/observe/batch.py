@@ -80,8 +80,8 @@ class TrackerStars:
 class ObservationBatch:
     """One batch: who, when, the a priori attitude, and the stars of each tracker.
 
-    Body rates are of the body relative to inertial, in body axes.  Velocity is
-    geocentric, EME2000, None where it was not given.
+    Body rates are of the body relative to inertial, in body axes.  Velocity and
+    position are geocentric, EME2000, None where they were not given.
     """
 
     spacecraft: str
@@ -94,3 +94,4 @@ class ObservationBatch:
     aberration: Aberration
     observations: tuple[TrackerStars, ...]
     options: Options
+    position_km: Vector | None = None

@@ -49,8 +49,11 @@ def correct(batch: ObservationBatch, mission: Mission) -> tuple[CorrectedObserva
 def _corrected(
     stars: TrackerStars, tracker: Tracker, rates_deg_per_s: Vector
 ) -> CorrectedObservations:
-    from_angles = tracker_vectors(stars.angles_deg, tracker.calibration)
-    direction = np.where(np.isnan(stars.vector), from_angles, stars.vector)
+    direction = stars.vector
+    as_angles = np.isnan(direction[:, 0])
+    if as_angles.any():
+        from_angles = tracker_vectors(stars.angles_deg, tracker.calibration)
+        direction = np.where(as_angles[:, None], from_angles, direction)
     outside = direction[:, 2] < np.cos(np.radians(tracker.field_of_view_radius_deg))
     body = direction @ tracker.body_from_tracker.T
     if rates_deg_per_s.any() and stars.time_offset_s.any():

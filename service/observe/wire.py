@@ -8,13 +8,12 @@ import hashlib
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
 import numpy as np
 from pydantic import (
     AfterValidator,
     BaseModel,
-    BeforeValidator,
     ConfigDict,
     Discriminator,
     Field,
@@ -24,7 +23,7 @@ from pydantic import (
 )
 
 from service.errors import BadBatch, BadInput, Fault, NotAvailable, shown_value
-from service.missions.mission import Identifier, Solver
+from service.missions.mission import GridStep, Identifier, Solver
 from service.observe.batch import (
     MAX_STARS_PER_TRACKER,
     MAX_TRACKERS,
@@ -46,13 +45,6 @@ MAX_FAULTS_SHOWN = 20
 Frame = Literal["EME2000", "ICRF", "GCRF"]
 
 
-def _is_number(value: Any) -> Any:
-    # JSON's true and "5.3" are no numbers, though pydantic would take them for some.
-    if isinstance(value, (bool, str)):
-        raise ValueError("must be a number")
-    return value
-
-
 def _near_unit(components: tuple[float, ...]) -> tuple[float, ...]:
     norm = math.hypot(*components)
     if abs(norm - 1.0) > NORM_TOLERANCE:
@@ -68,7 +60,8 @@ def _is_time(text: str) -> str:
     return text
 
 
-Number = Annotated[float, BeforeValidator(_is_number)]
+Number = Annotated[float, Field(strict=True)]
+"""Strict: JSON's true and "5.3" are no numbers, though pydantic would take them for some."""
 Components = tuple[Number, Number, Number]
 UnitVector = Annotated[Components, AfterValidator(_near_unit)]
 Quaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_near_unit)]
@@ -80,6 +73,8 @@ Rate = Annotated[Number, Field(ge=-360, le=360)]
 Speed = Annotated[Number, Field(ge=-100, le=100)]
 Distance = Annotated[Number, Field(ge=-1e9, le=1e9)]
 Position = tuple[Distance, Distance, Distance]
+NamedIdentifier = Identifier | Literal["ptp", "lost_in_space"]
+"""Every identifier that the interface names; the second two are not there yet."""
 Tolerance = Annotated[Number, Field(ge=0, le=180)]
 
 
@@ -159,7 +154,7 @@ class TestsIn(Wire):
 class TolerancesIn(Wire):
     """Tolerances by the mission file's names."""
 
-    pair_separation_max_deg: Annotated[Number, Field(gt=0, le=60)] | None = None
+    pair_separation_max_deg: Annotated[Number, Field(ge=0.01, le=60)] | None = None
     separation_deg: Annotated[Number, Field(ge=0, le=5)] | None = None
     magnitude_mag: Annotated[Number, Field(ge=0, le=30)] | None = None
     magnitude_order_mag: Annotated[Number, Field(ge=0, le=30)] | None = None
@@ -172,19 +167,19 @@ class TolerancesIn(Wire):
 class OptionsIn(Wire):
     """What to do otherwise than the mission's settings say."""
 
-    identifier: Identifier | None = None
+    identifier: NamedIdentifier | None = None
     solver: Solver | None = None
     tests: TestsIn = TestsIn()
     tolerances: TolerancesIn = TolerancesIn()
-    zone_grid_deg: Annotated[Number, Field(ge=0, le=10)] | None = None
+    zone_grid_deg: Annotated[GridStep, Field(strict=True)] | None = None
 
     def to_options(self, field: str = "options") -> Options:
         """The options as the core takes them; raises `NotAvailable` for what is not there yet."""
-        if self.identifier not in (None, "starid", "verified"):
+        if self.identifier == "ptp" or self.identifier == "lost_in_space":
             raise NotAvailable(
                 Fault(
                     f"{field}.identifier",
-                    "is not there yet; use starid",
+                    f"is not there yet; there are {', '.join(get_args(Identifier))}",
                     shown_value(self.identifier),
                 )
             )
@@ -256,6 +251,7 @@ class BatchIn(Wire):
             aberration=self.aberration,
             observations=tuple(_tracker_stars(each) for each in self.observations),
             options=self.options.to_options(),
+            position_km=_optional_array(self.position_km),
         )
 
 

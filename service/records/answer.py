@@ -9,7 +9,7 @@ from service.acquire import Acquisition, TrackerResult
 from service.attitude.solution import AttitudeSolution
 from service.identify.identification import Outcome
 from service.sky.run_catalog import RunCatalog
-from service.vectors import Vector
+from service.vectors import Vector, to_ra_dec
 
 FRAME = "EME2000"
 
@@ -86,9 +86,17 @@ def star_rows(acquisition: Acquisition) -> list[StarRow]:
 
 def _tracker_answer(result: TrackerResult, run_catalog: RunCatalog) -> dict[str, Any]:
     tracker, found = result.corrected.tracker, result.identification
+    ra_deg, dec_deg = to_ra_dec(result.aim.axis)
     return {
         "tracker": tracker.name,
-        "zone": {**result.zone.summary(), "cached": result.zone_cached},
+        "zone": {
+            "kind": result.aim.kind,
+            "ra_deg": float(ra_deg),
+            "dec_deg": float(dec_deg),
+            "stars": result.stars,
+            "pairs": result.pairs,
+            "cached": result.zone_cached,
+        },
         "stars": [_star(result, k, run_catalog) for k in range(len(found.outcome))],
     }
 
@@ -117,6 +125,9 @@ def _flags(result: TrackerResult, k: int) -> list[str]:
         flags.append("outside_field_of_view")
     if np.isnan(result.corrected.magnitude_mag[k]):
         flags.append("no_magnitude")
+    star = result.identification.star
+    if star[k] >= 0 and np.count_nonzero(star == star[k]) > 1:
+        flags.append("same_star_twice")
     return flags
 
 

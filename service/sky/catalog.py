@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from service.errors import BadFile, Fault, NotFound
+from service.errors import BadConfiguration, BadFile, Fault, NotFound
 from service.resources import shipped
 from service.sky import catalog_csv
 from service.sky.catalog_coding import COLUMNS, LABEL, digest_of, pack, unpack
@@ -132,6 +132,16 @@ def load(path: Path) -> Catalog:
 def load_embedded() -> Catalog:
     """The catalog that travels with the service, read once."""
     return load(shipped("catalogs", "stars.npz"))
+
+
+def open_catalog(file: Path | None) -> Catalog:
+    """The site's catalog, or the embedded one; raises `BadConfiguration` where it is damaged."""
+    if file is None:
+        return load_embedded()
+    try:
+        return import_csv(file) if file.suffix.lower() == ".csv" else load(file)
+    except BadFile as error:
+        raise BadConfiguration(f"ACQUIRE_CATALOG: {error}") from None
 
 
 def import_csv(path: Path) -> Catalog:

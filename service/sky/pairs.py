@@ -17,8 +17,8 @@ from service.vectors import Vector, read_only
 Indices = npt.NDArray[np.int32]
 
 PAIRS_PER_BIN = 4
-MAX_PAIRS = 8_000_000
-"""In one index, 130 MB: twice those of the whole sky to V 8 within 8 degrees."""
+MAX_PAIRS = 5_000_000
+"""In one index, 80 MB: more than those of the whole sky to V 8 within 8 degrees."""
 
 
 @dataclass(frozen=True)

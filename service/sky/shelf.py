@@ -12,6 +12,9 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
+BUILDS_AT_ONCE = 2
+"""A build may take many times the memory of what it leaves on the shelf."""
+
 
 class Sized(Protocol):
     """Anything that knows how many bytes it holds."""
@@ -56,6 +59,9 @@ class Shelf:
     _entries: "OrderedDict[Hashable, Entry[Sized]]" = field(default_factory=OrderedDict)
     _building: "dict[Hashable, Future[Sized]]" = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
+    _building_slots: threading.Semaphore = field(
+        default_factory=lambda: threading.Semaphore(BUILDS_AT_ONCE)
+    )
     _nbytes: int = 0
     _hits: int = 0
     _misses: int = 0
@@ -83,9 +89,10 @@ class Shelf:
                 self._hits += 1
         if not mine:
             return promise.result(), True  # type: ignore[return-value]
-        started = time.perf_counter_ns()
         try:
-            thing = build()
+            with self._building_slots:
+                started = time.perf_counter_ns()
+                thing = build()
         except BaseException as error:
             with self._lock:
                 del self._building[key]

@@ -41,7 +41,7 @@ class StarGrid:
 
 def build_star_grid(direction: Vector) -> StarGrid:
     """Sort unit vectors (n, 3) into cells."""
-    face_of, row_of, cell_u, cell_v = [], [], [], []
+    row_of, cell_u, cell_v = [], [], []
     for face in range(6):
         axis, sign = divmod(face, 2)
         depth = direction[:, axis] * (1.0 - 2.0 * sign)
@@ -49,7 +49,6 @@ def build_star_grid(direction: Vector) -> StarGrid:
         u = direction[front, (axis + 1) % 3] / depth[front]
         v = direction[front, (axis + 2) % 3] / depth[front]
         on = (np.abs(u) <= 1.0 + EDGE) & (np.abs(v) <= 1.0 + EDGE)
-        face_of.append(np.full(int(on.sum()), face))
         row_of.append(front[on])
         cell_u.append(np.floor(u[on] / CELL).astype(np.int64))
         cell_v.append(np.floor(v[on] / CELL).astype(np.int64))

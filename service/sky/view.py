@@ -29,7 +29,7 @@ class Sky:
     def run_catalog(self, mission: Mission, time: Utc) -> RunCatalog:
         """The run catalog that serves a mission at a time: that of the nearest epoch."""
         epoch_year = mission.catalog.epoch_of(time.julian_year)
-        key = RunCatalogKey(self.catalog.digest, mission.catalog.model_dump_json(), epoch_year)
+        key = RunCatalogKey(self.catalog.digest, mission.catalog.digest, epoch_year)
         run_catalog, _ = self.shelf.get(
             key, lambda: build_run_catalog(self.catalog, mission.catalog, epoch_year)
         )

@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
-from service.sky.pairs import PairIndex, build_pairs
+from service.sky.pairs import PairIndex, build_pairs, separation_rad
 from service.sky.run_catalog import RunCatalog
 from service.sky.shelf import Shelf
 from service.sky.star_grid import StarGrid, build_star_grid
@@ -55,7 +56,7 @@ class Aim:
     def reaches_past(self, boresight: Vector, radius_deg: float) -> bool:
         """Whether a field of view about an inertial boresight goes beyond the bounds."""
         angle = separation_deg(self.axis, boresight)
-        return angle + radius_deg > self.most_deg or (
+        return min(angle + radius_deg, 180.0) > self.most_deg or (
             self.least_deg > 0.0 and angle - radius_deg < self.least_deg
         )
 
@@ -142,6 +143,33 @@ def build_zone(
     )
 
 
+def counts_within(zone: Zone, aim: Aim) -> tuple[int, int]:
+    """How many of a zone's stars and pairs lie within an aim that it serves."""
+    if zone.grid_deg == 0.0:
+        return len(zone.star), zone.pairs.count
+    stars, pairs = _counts_within(
+        zone.direction,
+        aim.axis,
+        math.radians(aim.least_deg),
+        math.radians(aim.most_deg),
+        zone.pairs.brighter,
+        zone.pairs.dimmer,
+    )
+    return int(stars), int(pairs)
+
+
+@njit(cache=True, nogil=True)
+def _counts_within(direction, axis, least, most, brighter, dimmer):  # type: ignore[no-untyped-def]
+    inside = np.zeros(len(direction), np.bool_)
+    stars = pairs = 0
+    for row in range(len(direction)):
+        inside[row] = least <= separation_rad(direction[row], axis) <= most
+        stars += inside[row]
+    for k in range(len(brighter)):
+        pairs += inside[brighter[k]] and inside[dimmer[k]]
+    return stars, pairs
+
+
 def zone_for(
     shelf: Shelf,
     mission: str,
@@ -180,7 +208,9 @@ def snapped(axis: Vector, grid_deg: float) -> Vector:
     A step along a row is at most `grid_deg` of arc, so that no direction lies
     farther than grid_deg / sqrt(2) from its point.
     """
-    ra_deg, dec_deg = (float(angle) for angle in to_ra_dec(axis))
+    x, y, z = axis.tolist()
+    ra_deg = math.degrees(math.atan2(y, x)) % 360.0
+    dec_deg = math.degrees(math.atan2(z, math.hypot(x, y)))
     row_deg = round(dec_deg / grid_deg) * grid_deg
     # The row's widest circle lies nearest to the equator, half a step from the row.
     widest = max(0.0, abs(row_deg) - grid_deg / 2.0)

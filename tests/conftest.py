@@ -1,0 +1,81 @@
+"""What every test may ask for: one seed, the embedded sky, the shipped missions.
+
+pytest --seed 7           other random draws, for hypothesis as well
+pytest --batches 2000     batches per mission held against the plain implementation
+"""
+
+import os
+import tomllib
+
+import hypothesis
+import numpy as np
+import pytest
+
+from service.missions.mission import SHIPPED_FOLDER, load_missions
+from service.sky.catalog import load_embedded
+from service.sky.shelf import Shelf
+from service.sky.view import Sky
+
+DEFAULT_SEED = 19941026
+DEFAULT_BATCHES = 240
+
+hypothesis.settings.register_profile(
+    # Two shared cores: a deadline would fail on the machine, not on the code.
+    "repeatable",
+    derandomize=True,
+    deadline=None,
+    database=None,
+)
+hypothesis.settings.register_profile("seeded", deadline=None, database=None)
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--seed", type=int, default=DEFAULT_SEED, help="seed of every random draw in the tests"
+    )
+    parser.addoption(
+        "--batches",
+        type=int,
+        default=int(os.environ.get("TEST_BATCHES", DEFAULT_BATCHES)),
+        help="batches per mission held against the plain implementation",
+    )
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_configure(config):
+    seed = config.getoption("--seed")
+    if seed == DEFAULT_SEED:
+        hypothesis.settings.load_profile("repeatable")
+    else:
+        hypothesis.settings.load_profile("seeded")
+        hypothesis.core.global_force_seed = seed
+
+
+@pytest.fixture
+def seed(request):
+    return request.config.getoption("--seed")
+
+
+@pytest.fixture
+def rng(seed):
+    return np.random.default_rng(seed)
+
+
+@pytest.fixture(scope="session")
+def sky():
+    """The embedded catalog with a shelf, shared by all tests: answers do not depend on it."""
+    return Sky(load_embedded(), Shelf(max_bytes=256 << 20))
+
+
+@pytest.fixture(scope="session")
+def missions():
+    return load_missions()
+
+
+@pytest.fixture(scope="session")
+def mission_files():
+    """The shipped mission files as plain dictionaries."""
+    return {
+        path.stem.upper(): tomllib.loads(path.read_text(encoding="utf-8"))
+        for path in sorted(SHIPPED_FOLDER.glob("*.toml"))
+    }

@@ -1,0 +1,160 @@
+"""Verified identification: what it claims is so, and each part agrees with an outside authority."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from service.acquire import acquire
+from service.identify import evidence
+from service.identify.fitting import fit
+from service.identify.identification import Outcome
+from service.identify.scene import Seen, Stars, nearest
+from service.missions.mission import load_missions
+from service.simulate.paper.printed import the_paper
+from service.simulate.paper.views import EPOCH, batch_of, draw_zone
+from service.sky.star_grid import build_star_grid
+from service.vectors import ARCSEC_PER_RADIAN, from_ra_dec, unit
+
+VIEWS = 60
+
+
+def identified(sky, rng, table, run_name, views=VIEWS, spoil=None):
+    """Views of one run of the paper: per view the identification and the true rows, -1 spurious."""
+    paper = the_paper()
+    run = next(run for run in paper.runs_of([table]) if run.run == run_name)
+    world = paper.worlds[run.world]
+    mission = load_missions()[world.mission]
+    catalog = sky.run_catalog(mission, EPOCH)
+    found, number = [], 0
+    while len(found) < views:
+        for view in draw_zone(world, number, mission, catalog, rng):
+            if len(view.star) < 5:
+                continue
+            batch, truth = batch_of(view, run, mission, "verified"), view.star.copy()
+            if spoil is not None:
+                batch = spoil(batch, truth, mission, rng)
+            found.append((acquire(batch, mission, sky).trackers[0].identification, truth))
+        number += 1
+    return found
+
+
+def tally(found):
+    """Of the real stars the shares right, wrong; of the spurious ones the share named."""
+    right = wrong = real = named = spurious = 0
+    for identification, truth in found:
+        unique = identification.outcome == Outcome.UNIQUE
+        is_real = truth >= 0
+        real += is_real.sum()
+        spurious += (~is_real).sum()
+        right += (unique & is_real & (identification.star == truth)).sum()
+        wrong += (unique & is_real & (identification.star != truth)).sum()
+        named += (unique & ~is_real).sum()
+    return right / real, wrong / real, named / max(spurious, 1)
+
+
+@pytest.mark.parametrize(
+    ("table", "run"),
+    [(2, "psi100"), (3, "5,5,270"), (4, "sm1.0"), (5, "sm1.0"), (7, "so12"), (9, "phi100")],
+)
+def test_where_votes_fail_it_names_the_stars_and_none_wrongly(sky, rng, table, run):
+    right, wrong, _ = tally(identified(sky, rng, table, run))
+    assert wrong == 0
+    assert right > 0.96
+
+
+def spurious(count):
+    """Put `count` of the stars anywhere in the field of view."""
+
+    def spoil(batch, truth, mission, rng):
+        tracker = mission.trackers[0]
+        stars = batch.observations[0]
+        vector = stars.vector.copy()
+        centre = unit(vector.mean(axis=0))
+        radius = math.radians(tracker.field_of_view_radius_deg)
+        for k in rng.choice(len(truth), count, replace=False):
+            away = np.sqrt(rng.uniform()) * radius
+            side = unit(np.cross(centre, rng.normal(size=3)))
+            vector[k] = math.cos(away) * centre + math.sin(away) * side
+            truth[k] = -1
+        return replace(batch, observations=(replace(stars, vector=vector),))
+
+    return spoil
+
+
+@pytest.mark.parametrize("table", [2, 8])
+def test_a_spurious_star_is_named_by_hardly_any_and_spoils_no_other(sky, rng, table):
+    run = the_paper().runs_of([table])[0].run
+    right, wrong, named = tally(identified(sky, rng, table, run, spoil=spurious(1)))
+    assert wrong == 0
+    assert right > 0.96
+    assert named < 0.05
+
+
+def test_the_weight_of_magnitudes_is_that_of_normal_distributions(rng):
+    """The closed form against scipy's multivariate normal, scale by scale."""
+    difference = rng.normal(0.3, 0.4, 5)
+    total = 0.0
+    for t in evidence.MAGNITUDE_SCALES_MAG:
+        for variance in (0.0, evidence.OFFSET_SIGMA_MAG**2):
+            covariance = t * t * np.eye(5) + variance
+            total += multivariate_normal.pdf(difference, np.zeros(5), covariance)
+    total /= 2 * len(evidence.MAGNITUDE_SCALES_MAG)
+    ours = evidence.log_magnitudes(5, difference.sum(), (difference**2).sum())
+    assert ours == pytest.approx(math.log(total), abs=1e-9)
+
+
+def test_the_prior_of_the_attitude_is_a_density():
+    """Over all rotations, and over all directions and rolls, it integrates to one."""
+    angle = np.concatenate([[0.0], np.geomspace(1e-7, math.pi, 200_001)])
+    rotation = [evidence.log_prior(a, evidence.PRIOR_ROTATION) for a in angle[::10]]
+    measure = 8.0 * math.pi * (1.0 - np.cos(angle[::10]))
+    assert np.trapezoid(np.exp(rotation) * measure, angle[::10]) == pytest.approx(1.0, abs=0.05)
+    tilt = [evidence.log_prior(a, evidence.PRIOR_DIRECTION) for a in angle[::10]]
+    measure = 2.0 * math.pi * np.sin(angle[::10]) * 2.0 * math.pi
+    assert np.trapezoid(np.exp(tilt) * measure, angle[::10]) == pytest.approx(1.0, abs=0.05)
+
+
+def scene_of(direction):
+    """Zone stars all over the sky as the kernels take them."""
+    grid = build_star_grid(direction)
+    return Stars(
+        direction, np.zeros(len(direction)), grid.box, grid.offset, grid.start, grid.rows,
+        np.array([0.0, 0.0, 1.0]), 0.0, math.pi, np.full(len(direction), -1.0),
+    )  # fmt: skip
+
+
+def test_the_star_grid_finds_what_looking_at_every_star_finds(rng):
+    """On the whole sphere, edges and corners of the cube's faces included."""
+    direction = unit(rng.normal(size=(20_000, 3)))
+    stars = scene_of(direction)
+    corners = unit(np.array([[1, 1, 1], [1, 1, 0], [-1, 1, 1e-3], [0, -1, 1], [1, 0, 0]]))
+    places = np.concatenate([corners, unit(rng.normal(size=(500, 3)))])
+    found = np.empty(2, np.int32)
+    for place in places:
+        nearest(place, 0.009, stars, np.empty(0, np.int32), found)
+        chord = np.linalg.norm(direction - place, axis=1)
+        order = np.argsort(chord)[:2]
+        expected = [int(k) if chord[k] < 2 * math.sin(0.0045) else -1 for k in order]
+        assert found.tolist() == expected
+
+
+def test_the_fit_is_wahba_s_optimum(rng):
+    """The attitude of a hypothesis against the singular value decomposition."""
+    direction = from_ra_dec(rng.uniform(10, 18, 6), rng.uniform(-4, 4, 6))
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    sigma = rng.uniform(1.0, 4.0, 6) / ARCSEC_PER_RADIAN
+    observed = unit(direction @ turn.T + sigma[:, None] * rng.normal(size=(6, 3)))
+    seen = Seen(
+        observed, np.zeros(6), sigma, (sigma.min() / sigma) ** 2, sigma.min(), np.zeros(3), 0,
+        np.array([1.0, 0.0, 0.0]),
+    )  # fmt: skip
+    t, references = np.empty((3, 3)), np.empty((6, 3))
+    match = np.arange(6, dtype=np.int32)
+    assert fit(seen, scene_of(direction), match, t, references)[0] == 6
+    u, _, vt = np.linalg.svd((seen.weight[:, None] * observed).T @ direction)
+    best = u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
+    assert np.abs(t - best).max() * ARCSEC_PER_RADIAN < 1e-4

@@ -1,0 +1,107 @@
+"""The service's answers beside those of the plain implementation, star by star."""
+
+import json
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from service.acquire import acquire
+from service.identify.starid import MAX_RIVALS
+from service.missions.mission import Mission
+from service.observe.wire import submission_from_json
+from service.records.answer import answer_of
+from service.sky.view import Sky
+from service.times import parse_utc
+from tests.reference import batches
+from tests.reference.plain_starid import PlainCatalog, PlainOutcome, identify
+
+Json = dict[str, Any]
+
+
+@dataclass
+class Comparison:
+    """What was compared, by the outcome that the plain implementation gives, and what differed."""
+
+    outcomes: Counter[str] = field(default_factory=Counter)
+    differences: list[str] = field(default_factory=list)
+
+
+def answered(batch: Json, mission: Mission, sky: Sky) -> Json:
+    """The service's answer, by the way every batch takes: from its JSON text."""
+    submission = submission_from_json(json.dumps(batch))
+    answer = answer_of(acquire(submission.batch, mission, sky), id=None)
+    return dict(json.loads(json.dumps(answer, allow_nan=False)))
+
+
+def plain_view(answer: Json) -> list[list[PlainOutcome]]:
+    """An answer's stars in the words of the plain implementation."""
+    return [
+        [
+            PlainOutcome(
+                star["outcome"],
+                star["star"]["id"] if star["star"] else None,
+                star["votes"],
+                star["runner_up"],
+                tuple(star.get("rivals", ())),
+            )
+            for star in tracker["stars"]
+        ]
+        for tracker in answer["observations"]
+    ]
+
+
+class Judge:
+    """Holds the service against the plain implementation, for one mission; keeps its zones."""
+
+    def __init__(self, toml: Json, sky: Sky) -> None:
+        self.toml, self.sky = toml, sky
+        self.mission = Mission.model_validate(toml)
+        self.comparison = Comparison()
+        self._catalogs: dict[float, PlainCatalog] = {}
+        self._zones: dict[int, dict[Any, Any]] = {}
+
+    def catalog(self, time: str) -> PlainCatalog:
+        """The run catalog of a time, as it would be exported."""
+        run = self.sky.run_catalog(self.mission, parse_utc(time))
+        if run.epoch_year not in self._catalogs:
+            self._catalogs[run.epoch_year] = PlainCatalog(
+                list(run.star_id), run.ra_deg, run.dec_deg, run.magnitude_mag
+            )
+        return self._catalogs[run.epoch_year]
+
+    def hold(self, batch: Json) -> Json:
+        """Compare one batch; what differs is noted.  Gives back the service's answer."""
+        catalog = self.catalog(batch["time"])
+        zones = self._zones.setdefault(id(catalog), {})
+        if len(zones) > 200:
+            zones.clear()
+        expected = identify(batch, self.toml, catalog, zones)
+        answer = answered(batch, self.mission, self.sky)
+        for tracker, (got, right) in enumerate(zip(plain_view(answer), expected, strict=True)):
+            for k, (one, other) in enumerate(zip(got, right, strict=True)):
+                cut = PlainOutcome(
+                    other.outcome,
+                    other.star_id,
+                    other.votes,
+                    other.runner_up,
+                    other.rivals[:MAX_RIVALS],
+                )
+                self.comparison.outcomes[other.outcome] += 1
+                if one != cut:
+                    place = f"{batch['spacecraft']} {batch['batch']} tracker {tracker} star {k}"
+                    self.comparison.differences.append(f"{place}: {one} instead of {cut}")
+        return answer
+
+    def hold_many(self, rng: np.random.Generator, count: int, **fixed: Any) -> Comparison:
+        """Compare random batches; ten share an a priori attitude, so that zones are met again."""
+        attitudes = batches.prior_attitudes(rng, self.toml, max(3, count // 10))
+        for number in range(count):
+            time = fixed.get("time", batches.TIMES[rng.integers(len(batches.TIMES))])
+            attitude = attitudes[rng.integers(len(attitudes))]
+            drawn = {**fixed, "time": time}
+            self.hold(
+                batches.draw_batch(rng, self.toml, self.catalog(time), attitude, number, **drawn)
+            )
+        return self.comparison
