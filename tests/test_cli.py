@@ -354,9 +354,13 @@ def test_the_database_is_made_checked_and_its_migrations_are_whole(acquire, tmp_
     assert acquire("database", "upgrade", "--database", url)[0] == 0
     assert acquire("database", "check", "--database", url)[0] == 0
     assert acquire("database", "check", "--fresh")[0] == 0
+    code, _, complaint = acquire("database", "check", "--database", "sqlite:///none.db")
+    assert (code, "there is no such file" in complaint) == (2, True)
+    assert not (tmp_path / "none.db").exists()
+    (tmp_path / "empty.db").touch()
     code, out, _ = acquire("database", "check", "--database", "sqlite:///empty.db")
     assert code == 1
-    assert "add_table" in out
+    assert "acquire database upgrade" in out
 
 
 def test_the_description_is_printed_written_and_checked(acquire, tmp_path):

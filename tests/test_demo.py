@@ -9,9 +9,11 @@ import sys
 import httpx
 import pytest
 
-from service.demo import MISSIONS, table
+from service import demo as demonstration
+from service.demo import MISSIONS
 from service.simulate.files import read_objects, truth_path
 from service.simulate.score import Score, score
+from service.simulate.score_table import table
 
 
 def free_port():
@@ -55,8 +57,11 @@ def test_nominal_stretches_are_identified_and_the_errors_are_as_predicted(tmp_pa
         assert len(results) == len(truths) == 300
         counted = score(results, truths)["nominal"]
         assert counted.percent("unique") == pytest.approx(found[name, "nominal"][2], abs=0.006)
-    for place in ("/?run=demo-", "docs/quickstart.md", "curl -s 'http://127.0.0.1:"):
-        assert place in done.stdout
+    # Nothing serves any more: the way to the records comes before their address.
+    serve, page = (done.stdout.index(each) for each in ("acquire serve --database", "/?run=demo-"))
+    assert serve < page
+    assert "curl" not in done.stdout
+    assert "docs/quickstart.md" in done.stdout
 
 
 def test_a_second_time_nothing_is_new_and_the_table_is_the_same(tmp_path):
@@ -76,9 +81,10 @@ def test_it_keeps_serving_until_it_is_told_to_stop_and_takes_its_server_with_it(
     command += ["--port", str(port), "--batches", "3"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as running:
         assert running.stdout is not None
-        for line in running.stdout:
-            if line.startswith("Serving on "):
-                break
+        told_so_far = list(
+            iter(running.stdout.readline, f"Serving on http://127.0.0.1:{port} until Ctrl-C.\n")
+        )
+        assert any("curl -s 'http://127.0.0.1:" in line for line in told_so_far)
         url = f"http://127.0.0.1:{port}"
         assert httpx.get(f"{url}/livez", trust_env=False).status_code == 200
         running.send_signal(told)
@@ -86,6 +92,22 @@ def test_it_keeps_serving_until_it_is_told_to_stop_and_takes_its_server_with_it(
         assert running.wait(30) == 0
     with pytest.raises(httpx.ConnectError):
         httpx.get(f"{url}/livez", trust_env=False)
+
+
+def test_a_long_start_is_told_on_a_moving_line_or_now_and_then(monkeypatch, capsys):
+    def said(terminal):
+        monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+        with demonstration._Waiting() as waiting:
+            for waited_s in (0.0, 1.0, 6.0, 7.0, 16.0):
+                waiting.show(waited_s)
+        return capsys.readouterr().err
+
+    assert said(False).count("\n") == 2
+    moving = said(True)
+    assert "\n" not in moving
+    assert moving.count("the server is starting") == 5
+    assert moving.count("first start compiles") == 3
+    assert moving.endswith(" \r")
 
 
 def test_a_port_that_is_taken_is_said_at_once(tmp_path):

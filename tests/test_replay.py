@@ -10,7 +10,7 @@ from itertools import count
 
 import pytest
 
-from service.errors import BadInput, Busy
+from service.errors import BadFile, BadInput, Busy
 from service.observe.csv_rows import write_csv
 from service.observe.wire import BatchIn
 from service.operations import Operations
@@ -129,14 +129,15 @@ def test_bad_lines_are_told_by_number_and_field_and_the_rest_goes_on(
     tally, results = replayed(path, run, tmp_path / "out.ndjson", operations=operations)
     problems = {each["line"]: each["problem"] for each in results if "problem" in each}
     assert list(problems) == [2, 4, 5, 6, 7, 8, 9, 10]
-    assert problems[5]["detail"].startswith("no spacecraft 'VOYAGER'; there are SOHO, SWAS, XTE")
+    assert problems[5]["detail"].startswith("spacecraft: there is no such spacecraft;")
+    assert problems[5]["errors"][0]["value"] == "'VOYAGER'"
     assert problems[6]["errors"][0]["field"] == "observations.0.tracker"
     assert {each["field"] for each in problems[7]["errors"]} == {"time", "aberration"}
     assert "magnitude" in problems[8]["errors"][0]["field"]
     assert problems[9]["errors"][0]["field"] == "a_priori"
     assert results[-1]["batch"] == batches[1]["batch"]
     told = capsys.readouterr().err
-    assert f"{path}:5: no spacecraft 'VOYAGER'" in told
+    assert f"{path}:5: spacecraft: there is no such" in told
     assert tally.refused == 8
 
 
@@ -208,15 +209,18 @@ def test_a_bad_row_of_a_csv_file_is_told_by_line_and_column(operations, batches,
     }
 
 
-def test_several_files_are_one_run_and_a_refusal_names_its_file(operations, batches, run, tmp_path):
+def test_several_files_are_one_run_and_a_refusal_names_its_file(
+    operations, batches, run, tmp_path, capsys
+):
     files = [
         written(tmp_path / "one.ndjson", batches[:2]),
         written(tmp_path / "two.ndjson", ["{", batches[2]]),
     ]
     tally, results = replayed(files, run, tmp_path / "out", operations=operations)
     assert (tally.new, tally.refused) == (3, 1)
-    assert results[2]["file"] == str(files[1])
+    assert set(results[2]) == {"line", "problem"}
     assert results[2]["line"] == 1
+    assert f"{files[1]}:1: " in capsys.readouterr().err
 
 
 class Unreliable:
@@ -317,9 +321,11 @@ def test_where_no_service_answers_it_is_said_at_once(tmp_path, batches):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         url = f"http://127.0.0.1:{free.getsockname()[1]}"
+    (tmp_path / "out").write_text("of an earlier run")
     with pytest.raises(Busy, match=f"no service answers at {url}") as refusal:
         replayed(path, "run", tmp_path / "out", url=url)
     assert "acquire serve" in str(refusal.value)
+    assert (tmp_path / "out").read_text() == "of an earlier run"
 
 
 @pytest.mark.parametrize("url", ["", "127.0.0.1:8000", "ftp://127.0.0.1", "http://"])
@@ -336,3 +342,15 @@ def test_the_run_is_named_or_takes_the_first_files_stem(tmp_path):
         run_name(files, "no spaces")
     with pytest.raises(BadInput, match=r"my pass\.ndjson, whose stem would name the run"):
         run_name([tmp_path / "my pass.ndjson"], None)
+
+
+def test_a_file_without_a_batch_leaves_results_without_a_line(operations, run, tmp_path):
+    (tmp_path / "out").write_text("of an earlier run")
+    replayed(written(tmp_path / "pass", []), run, tmp_path / "out", operations=operations)
+    assert (tmp_path / "out").read_bytes() == b""
+
+
+@pytest.mark.parametrize("place", ["", "none/out"])
+def test_a_place_for_results_that_cannot_be_is_refused_beforehand(tmp_path, place):
+    with pytest.raises(BadFile, match="cannot be written"):
+        Tally([], tmp_path / place)

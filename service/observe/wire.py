@@ -73,7 +73,7 @@ Rate = Annotated[Number, Field(ge=-360, le=360)]
 Speed = Annotated[Number, Field(ge=-100, le=100)]
 Distance = Annotated[Number, Field(ge=-1e9, le=1e9)]
 Position = tuple[Distance, Distance, Distance]
-NamedIdentifier = Identifier | Literal["ptp", "lost_in_space"]
+NamedIdentifier = Literal["starid", "verified", "ptp", "lost_in_space"]
 """Every identifier that the interface names; the second two are not there yet."""
 Tolerance = Annotated[Number, Field(ge=0, le=180)]
 

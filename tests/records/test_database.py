@@ -1,13 +1,14 @@
 """The database: made by migrations, opened with care, refused with a reason."""
 
 import sqlite3
+from pathlib import Path
 
 import pytest
 from alembic import command
-from sqlalchemy import create_engine, inspect, text
-from sqlalchemy.exc import DBAPIError
+from sqlalchemy import create_engine, event, inspect, make_url, text
+from sqlalchemy.exc import DBAPIError, OperationalError
 
-from service.errors import BadConfiguration
+from service.errors import BadConfiguration, Busy
 from service.operations import Operations
 from service.records import database as migrations
 from service.records.engines import database_url, writing_engine
@@ -17,7 +18,9 @@ from service.settings import Settings
 
 
 def test_the_migrations_make_what_the_tables_say(empty_database):
-    assert migrations.check(empty_database) != []
+    if empty_database.startswith("sqlite"):
+        Path(make_url(empty_database).database).touch()
+    assert "acquire database upgrade" in migrations.check(empty_database)[0]
     migrations.upgrade(empty_database)
     assert migrations.check(empty_database) == []
 
@@ -143,3 +146,44 @@ def test_a_reader_sees_one_moment(operations, make):
         assert connection.execute(runs).all() == []
         operations.submit(make())
         assert connection.execute(runs).all() == []
+
+
+def test_checking_what_is_not_there_says_so_and_leaves_nothing_behind(tmp_path):
+    with pytest.raises(BadConfiguration, match="there is no such file"):
+        migrations.check(f"sqlite:///{tmp_path / 'none.db'}")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_checking_tells_every_difference_in_words(database):
+    engine = create_engine(database_url(database))
+    with engine.begin() as connection:
+        connection.execute(text("ALTER TABLE runs ADD COLUMN colour TEXT"))
+        connection.execute(text("DROP TABLE replays"))
+    engine.dispose()
+    told = migrations.check(database)
+    assert any("add table replays" in each for each in told)
+    assert any("remove column runs.colour" in each for each in told)
+    assert not any("Column(" in each or "Table(" in each for each in told)
+
+
+def test_a_database_out_of_reach_is_busy_and_the_reason_is_for_the_log_alone(operations, caplog):
+    """The hook stands for a server that has gone away, in the words of its driver."""
+
+    def gone(*_):
+        raise OperationalError("SELECT", {}, Exception("host db.example, user secret"))
+
+    event.listen(operations.store._readers, "begin", gone)
+    with pytest.raises(Busy, match="cannot be read now") as busy:
+        operations.runs()
+    event.remove(operations.store._readers, "begin", gone)
+    assert "secret" not in str(busy.value)
+    assert "user secret" in caplog.text
+    assert operations.runs() == []
+
+
+@pytest.mark.parametrize("empty_database", ["sqlite"], indirect=True)
+def test_a_table_that_is_missing_is_no_passing_trouble(operations):
+    with operations.store._writing.begin() as connection:
+        connection.execute(text("ALTER TABLE runs RENAME TO elsewhere"))
+    with pytest.raises(DBAPIError, match="no such table"):
+        operations.runs()

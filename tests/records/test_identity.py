@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from sqlalchemy import func, select
 
-from service.errors import BadBatch, BadInput, Conflict, KeyReused, NotFound
+from service.errors import BadBatch, BadInput, Conflict, KeyReused
 from service.observe.wire import OptionsIn, submission_from_json
 from service.records.tables import batches, idempotency_keys, metadata, results, star_results
 
@@ -107,7 +107,7 @@ def test_a_key_that_comes_with_a_repeat_belongs_to_its_body_from_then_on(operati
         operations.submit(make("b2"), "late")
 
 
-@pytest.mark.parametrize("key", ["", "x" * 256, "a\nb"])
+@pytest.mark.parametrize("key", ["", "x" * 256, "a\nb", "clé"])
 def test_a_key_that_cannot_be_one_is_named(operations, make, key):
     with pytest.raises(BadBatch, match="Idempotency-Key"):
         operations.submit(make(), key)
@@ -121,8 +121,11 @@ def test_what_is_refused_leaves_nothing_and_takes_no_identity(operations, make):
     with pytest.raises(BadInput, match="NO_SUCH"):
         operations.submit(submission_from_json(json.dumps(wrong)), "key")
     wrong = json.loads(submission.text) | {"spacecraft": "NO_SUCH"}
-    with pytest.raises(NotFound, match="NO_SUCH"):
+    with pytest.raises(BadBatch, match="NO_SUCH") as refusal:
         operations.submit(submission_from_json(json.dumps(wrong)), "key")
+    (fault,) = refusal.value.faults
+    assert (fault.field, fault.value) == ("spacecraft", "'NO_SUCH'")
+    assert "SOHO, SWAS, XTE" in fault.message
     assert everything(operations) == before
     assert not operations.submit(submission, "key").replayed
 

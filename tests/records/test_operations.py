@@ -1,12 +1,15 @@
 """The one object that every door holds."""
 
 import json
+import threading
+import time
 
 import pytest
 
-from service.errors import BadConfiguration, BadInput, Busy, Conflict, NotFound
+from service.errors import AcquisitionError, BadBatch, BadConfiguration, BadInput, Busy, Conflict
 from service.observe.wire import OptionsIn, QuaternionIn, submission_from_json
 from service.operations import Operations
+from service.records import intake
 from service.settings import Settings
 from service.times import parse_utc
 from tests.records.samples import KINDS, QUATERNION, without_accidents
@@ -48,7 +51,7 @@ def test_many_at_once_give_what_each_by_itself_gives(operations, make):
     assert [first for first, _ in at_once] == [
         *[False] * 5,
         BadInput,
-        NotFound,
+        BadBatch,
         True,
         Conflict,
         True,
@@ -123,8 +126,9 @@ def test_zones_show_what_is_cached_and_can_be_warmed_and_dropped(operations, mak
     assert operations.drop_zones("SWAS") == 0
     assert operations.drop_zones("XTE") == 1
     assert operations.zones()["items"] == []
-    with pytest.raises(NotFound):
-        operations.drop_zones("HST")
+    for ask in (operations.drop_zones, lambda name: operations.warm_zones(name, [], time)):
+        with pytest.raises(BadBatch, match="spacecraft: there is no such .*'HST'"):
+            ask("HST")
 
 
 @pytest.mark.parametrize("name", ["none.csv", "none.npz"])
@@ -132,3 +136,55 @@ def test_a_catalog_that_cannot_be_read_is_a_mistake_in_the_configuration(tmp_pat
     database = f"sqlite:///{tmp_path / 'acquire.db'}"
     with pytest.raises(BadConfiguration, match=name):
         Operations.open(Settings(database=database, catalog=tmp_path / name))
+
+
+def test_no_moment_of_the_database_is_held_while_many_are_worked_on(operations, make):
+    held = []
+    operations._intake._acquire = lambda *asked, own=operations._intake._acquire: (
+        held.append(operations.store._readers.pool.checkedout()),
+        own(*asked),
+    )[1]
+    operations.submit_many([make("b1"), make("b2")])
+    assert held == [0, 0]
+
+
+def test_many_at_once_share_the_time_of_their_recording(operations, make):
+    """The sum over a chunk is what the chunk took, not that times its size."""
+    sent = [make(f"b{i}", after_s=60.0 * i) for i in range(40)]
+    start = time.perf_counter()
+    answers = operations.submit_many(sent)
+    took_us = (time.perf_counter() - start) * 1e6
+    recording = [json.loads(each.body)["timings_us"]["record"] for each in answers]
+    assert all(each > 0 for each in recording)
+    assert sum(recording) < took_us
+
+
+def test_a_fault_of_ours_in_one_batch_keeps_no_other_from_being_recorded(
+    operations, make, monkeypatch, caplog
+):
+    def acquire(batch, *rest):
+        if batch.batch == "b2":
+            raise ZeroDivisionError("inside")
+        return real(batch, *rest)
+
+    real = intake.acquire
+    monkeypatch.setattr(intake, "acquire", acquire)
+    first, second, third = operations.submit_many([make("b1"), make("b2"), make("b3")])
+    assert not first.replayed
+    assert not third.replayed
+    assert isinstance(second, AcquisitionError)
+    assert "inside" not in str(second)
+    assert "batch b2 failed" in caplog.text
+
+
+def test_whoever_finds_every_processor_taken_for_long_is_told_to_come_again(
+    operations, make, monkeypatch
+):
+    monkeypatch.setattr(intake, "PROCESSOR_WAIT_S", 0.01)
+    monkeypatch.setattr(operations._intake, "_processors", threading.BoundedSemaphore(1))
+    with operations._intake._processors:
+        with pytest.raises(Busy, match="processor"):
+            operations.submit(make())
+        with pytest.raises(Busy, match="processor"):
+            operations.submit_many([make()])
+    assert not operations.submit(make()).replayed

@@ -122,6 +122,7 @@ def test_a_record_holds_the_answer_as_sent_and_the_input_that_made_it(operations
     assert record == {
         "answer": json.loads(answered.body),
         "input": json.loads(submission.text),
+        "options": {},
         "current": True,
         "parent": None,
         "what_ifs": [],
@@ -144,11 +145,13 @@ def test_a_spacecraft_shows_its_newest_batch_and_its_newest_attitude(operations,
     operations.submit(make("b9", run="again", kind="suspect", after_s=9 * HOUR))
     state = operations.spacecraft_state("XTE")
     assert (state["state"], state["latest_batch"]["batch"]) == ("good", "b1")
+    assert state["attitude"] == state["last_attitude"]
     operations.submit(make("b2", kind="one_star", after_s=2 * HOUR))
     state = operations.spacecraft_state("XTE")
     assert (state["state"], state["latest_batch"]["batch"]) == ("no_attitude", "b2")
-    # The older attitude is shown as what it is: the one of an older batch, with its time.
-    assert (state["attitude"]["batch"], state["attitude"]["time"][11:13]) == ("b1", "13")
+    # The older attitude is shown as what it is: no attitude of now, and with its time.
+    assert state["attitude"] is None
+    assert (state["last_attitude"]["batch"], state["last_attitude"]["time"][11:13]) == ("b1", "13")
     listed = {each["name"]: each["state"] for each in operations.spacecraft()}
     assert listed == {"SOHO": "no_batches", "SWAS": "no_batches", "XTE": "no_attitude"}
 

@@ -2,13 +2,16 @@
 
 import io
 import json
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from sqlalchemy import update
 
-from service.errors import BadBatch
+from service.errors import BadBatch, Busy, Stopping
 from service.records.tables import replays
+from service.records.writer import Writer
 
 
 def finished(operations, id):
@@ -53,13 +56,6 @@ def test_a_replay_is_safe_to_run_twice(operations, lines):
         replay = finished(operations, operations.start_replay(lines, "pass-1"))
         assert replay["lines"]["refused"] == 0
     assert [each["batches"] for each in operations.rates("XTE", run="pass-1")] == [10]
-
-
-def test_a_file_is_counted_and_its_stem_names_the_run(operations, lines, tmp_path):
-    file = tmp_path / "pass-2.ndjson"
-    file.write_bytes(b"".join(lines))
-    replay = finished(operations, operations.start_replay(file, name=file.name))
-    assert (replay["run"], replay["lines"]["total"]) == ("pass-2", 10)
 
 
 def test_lines_that_can_be_closed_are_closed_at_the_end(operations, lines):
@@ -122,3 +118,57 @@ def test_what_a_killed_process_left_running_is_marked_interrupted_on_opening(ope
 
 def test_progress_is_json_ready(operations, lines):
     json.dumps(finished(operations, operations.start_replay(lines, "pass-1")))
+
+
+def test_replays_that_begin_together_are_all_stopped_by_closing(opened, make):
+    """None is forgotten while its row is on its way to the table."""
+
+    def endless():
+        index = 0
+        while True:
+            yield make(f"b{index % 50}").text.encode()
+            index += 1
+
+    operations = opened()
+    with ThreadPoolExecutor(6) as threads:
+        ids = list(threads.map(lambda n: operations.start_replay(endless(), f"r{n}"), range(6)))
+    assert len(operations._replays) == 6
+    operations.close()
+    assert not [each for each in threading.enumerate() if each.name.startswith("replay-")]
+    later = opened()
+    assert {later.replay(id)["state"] for id in ids} == {"interrupted"}
+
+
+def test_a_replay_does_not_outlive_a_service_that_stops_under_it(operations, lines, monkeypatch):
+    monkeypatch.setattr(Writer, "record", lambda *_: (_ for _ in ()).throw(Stopping("stopping")))
+    replay = finished(operations, operations.start_replay(lines, "pass-1"))
+    assert (replay["state"], replay["lines"]["refused"]) == ("interrupted", 0)
+
+
+def test_none_begins_once_the_service_is_stopping(opened, lines):
+    operations = opened()
+    operations.close()
+    with pytest.raises(Stopping):
+        operations.start_replay(lines, "pass-1")
+
+
+def test_replays_have_a_bound_in_number(operations, lines, monkeypatch):
+    monkeypatch.setattr("service.operations.MAX_REPLAYS", 1)
+    go_on = threading.Event()
+
+    def waiting():
+        go_on.wait(30)
+        yield from lines
+
+    id = operations.start_replay(waiting(), "pass-1")
+    with pytest.raises(Busy, match="1 replays are at work"):
+        operations.start_replay(lines, "pass-2")
+    go_on.set()
+    finished(operations, id)
+
+
+def test_what_is_kept_of_bad_lines_is_bounded(operations):
+    wrong = json.dumps({"k" * 30_000 + str(k): 1 for k in range(20)}).encode()
+    replay = finished(operations, operations.start_replay([wrong] * 100, "pass-1"))
+    assert replay["lines"]["refused"] == 100
+    assert len(json.dumps(replay["errors"])) < 200_000

@@ -97,3 +97,10 @@ def test_what_cannot_be_done_is_refused_and_leaves_nothing(operations, make):
     with pytest.raises(NotFound):
         operations.what_if("0" * 26, TIGHT)
     assert count(operations) == 1
+
+
+def test_a_record_says_what_it_was_asked_to_do_otherwise(operations, make):
+    first = operations.submit(make())
+    second = operations.what_if(first.id, TIGHT, record=True)
+    assert operations.batch(first.id)["options"] == {}
+    assert operations.batch(second.id)["options"] == TIGHT.model_dump(exclude_none=True)

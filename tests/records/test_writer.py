@@ -7,7 +7,7 @@ import pytest
 from sqlalchemy import event, func, insert, select
 from sqlalchemy.exc import IntegrityError, OperationalError
 
-from service.errors import Busy
+from service.errors import Busy, Stopping
 from service.records import rollups
 from service.records.store import Store
 from service.records.tables import results, runs
@@ -110,7 +110,9 @@ def test_closing_writes_what_is_queued_and_refuses_the_rest(store):
     assert names(store) == ["a", "b", "c"]
 
 
-def test_a_commit_that_fails_reaches_everyone_who_waits_and_writing_goes_on(operations, make):
+def test_a_commit_that_fails_reaches_everyone_who_waits_and_writing_goes_on(
+    operations, make, caplog
+):
     """The hook stands for a disk that fails at COMMIT: nothing of the transaction is kept."""
     operations.submit(make("b0"))
     engine = operations.store._writing
@@ -124,7 +126,8 @@ def test_a_commit_that_fails_reaches_everyone_who_waits_and_writing_goes_on(oper
         errors = [each.exception(30) for each in waiting]
     assert errors[0] is None  # recorded before: a repeat only reads
     assert all(isinstance(error, Busy) for error in errors[1:])
-    assert "disk I/O error" in str(errors[1])
+    assert "disk" not in str(errors[1]), "what is inside is for the log alone"
+    assert "disk I/O error" in caplog.text
     assert len(operations.batches().items) == 1
     event.remove(engine, "commit", fail)
     assert not any(operations.submit(make(f"b{i}")).replayed for i in range(1, 8))
@@ -132,7 +135,9 @@ def test_a_commit_that_fails_reaches_everyone_who_waits_and_writing_goes_on(oper
 
 
 @pytest.mark.parametrize("empty_database", ["sqlite"], indirect=True)
-def test_a_full_disk_loses_nothing_acknowledged_and_writing_resumes_with_room(operations, make):
+def test_a_full_disk_loses_nothing_acknowledged_and_writing_resumes_with_room(
+    operations, make, caplog
+):
     """SQLite's own bound on the file gives the error of a full disk, wherever it strikes."""
     engine = operations.store._writing
     limit = {"pages": 0}
@@ -152,7 +157,8 @@ def test_a_full_disk_loses_nothing_acknowledged_and_writing_resumes_with_room(op
             refused.append(str(error))
     assert acknowledged
     assert refused
-    assert all("disk is full" in each for each in refused)
+    assert all("cannot be written now" in each for each in refused)
+    assert "disk is full" in caplog.text
     limit["pages"] = 1_000_000
     assert not operations.submit(make("at last")).replayed
     for each in acknowledged:
@@ -162,3 +168,25 @@ def test_a_full_disk_loses_nothing_acknowledged_and_writing_resumes_with_room(op
         assert stored == len(acknowledged) + 1
         assert rollups.stored(connection, "hour") == rollups.recount(connection, "hour")
         assert connection.exec_driver_sql("PRAGMA integrity_check").scalar() == "ok"
+
+
+def test_a_writer_that_ends_leaves_nobody_waiting_and_is_not_ready(operations):
+    writer = operations.store.writer
+
+    def end(_connection):
+        begun.set()
+        go_on.wait(30)
+        raise SystemExit
+
+    begun, go_on = threading.Event(), threading.Event()
+    ended = writer.change(end)
+    begun.wait(30)
+    later = writer.change(new_run("late"))
+    go_on.set()
+    for each in (ended, later):
+        assert isinstance(each.exception(30), Stopping)
+    with pytest.raises(Stopping):
+        writer.change(new_run("later still"))
+    operations._warm = True
+    with pytest.raises(Busy, match="started again"):
+        operations.ready()

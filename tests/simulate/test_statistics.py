@@ -98,6 +98,9 @@ def test_over_a_nominal_pass_errors_are_what_the_covariance_predicts(missions, s
     low, high = limits(len(right))
     assert low <= right.mean() <= high
     assert np.mean(right > CHI_SQUARE_997) <= 0.006 * max(1.0, np.sqrt(2000 / len(right)))
+    # The wrong ones are few enough to change little.
+    every = np.array([each.chi_square for each in solved(results)])
+    assert np.mean(every > CHI_SQUARE_997) <= 0.01 * max(1.0, np.sqrt(2000 / len(every)))
 
 
 @pytest.mark.parametrize("name", ALL)

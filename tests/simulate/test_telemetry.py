@@ -2,8 +2,10 @@
 
 import json
 from collections import Counter
+from functools import cache
 from itertools import pairwise
 
+import erfa
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ from service.observe.correct import correct, tracker_vectors
 from service.observe.wire import submission_from_json
 from service.simulate.files import read_objects, truth_path, write_pass
 from service.simulate.orbits import HaloOrbit, orbit_of
+from service.simulate.real_sky import real_sky
 from service.simulate.sightings import anywhere, measured_angles_deg, shaken
 from service.simulate.stretches import NO_TROUBLES, Pass, Trouble, Troubles
 from service.simulate.telemetry import draw_pass
@@ -22,6 +25,7 @@ from service.vectors import (
     ARCSEC_PER_RADIAN,
     angle_between_deg,
     matrix_from_quaternion,
+    unit,
 )
 
 SERIOUS = Troubles(Trouble(0.2), Trouble(0.2, 2), Trouble(0.2, 0.5), Trouble(0.2, 12.0))
@@ -40,15 +44,61 @@ def true_stars(each):
     return [star for tracker in each.truth["observations"] for star in tracker["stars"]]
 
 
+def place_by_erfa(catalog, row, time, position_km):
+    """Where one star stands from the spacecraft, by ERFA's own routine: motion and parallax."""
+    dec = np.radians(catalog.dec_deg[row])
+    mas = np.radians(1.0 / 3.6e6)
+    _, barycentric = erfa.epv00(*time.tt)
+    return erfa.pmpx(
+        np.radians(catalog.ra_deg[row]),
+        dec,
+        catalog.pm_ra_mas_per_year[row] * mas / np.cos(dec),
+        catalog.pm_dec_mas_per_year[row] * mas,
+        max(np.nan_to_num(catalog.parallax_mas[row]), 0.0) / 1000.0,
+        0.0,
+        time.julian_year - 2000.0,
+        barycentric["p"] + np.asarray(position_km) / (erfa.DAU / 1000.0),
+    )
+
+
+@cache
+def blend_of(catalog, leader, within_arcsec):
+    """The rows that a tracker sees as one star: the leader with what is close to it and fainter."""
+    apart = angle_between_deg(catalog.direction, catalog.direction[leader]) * 3600.0
+    fainter = np.arange(len(catalog)) > leader
+    taken = np.flatnonzero((apart <= within_arcsec) & fainter & ~catalog.light_elsewhere)
+    return [leader, *taken.tolist()]
+
+
+def motion_mas(catalog, row):
+    return np.hypot(catalog.pm_ra_mas_per_year[row], catalog.pm_dec_mas_per_year[row])
+
+
+def place(catalog, leader, within_arcsec, time, position_km):
+    rows = blend_of(catalog, leader, within_arcsec)
+    light = 10.0 ** (-0.4 * catalog.magnitude_v_mag[rows])
+    seen = [place_by_erfa(catalog, row, time, position_km) for row in rows]
+    return unit(light @ np.array(seen))
+
+
 def misses_arcsec(each, missions, sky):
-    """How far each real star was measured from where its catalog direction belongs, on two axes."""
+    """How far each real star was measured from where it really stands, on two axes."""
     batch, mission = batch_of(each), missions[each.batch["spacecraft"]]
-    catalog = sky.run_catalog(mission, batch.time)
-    row = {star: index for index, star in enumerate(catalog.star_id)}
     attitude = matrix_from_quaternion(each.truth["quaternion"])
     (corrected,) = correct(batch, mission)
     real = [k for k, star in enumerate(true_stars(each)) if star is not None]
-    direction = catalog.direction[[row[true_stars(each)[k]] for k in real]]
+    direction = np.array(
+        [
+            place(
+                sky.catalog,
+                sky.catalog.row_of(true_stars(each)[k]),
+                mission.catalog.merge_within_arcsec,
+                batch.time,
+                each.batch["position_km"],
+            )
+            for k in real
+        ]
+    ).reshape(-1, 3)
     if batch.aberration != "applied_upstream":
         velocity = observer_velocity(batch.time, batch.velocity_km_per_s)
         direction = apparent(direction, velocity, batch.time)
@@ -108,6 +158,40 @@ def test_stars_miss_their_place_by_the_trackers_noise_alone(missions, sky, name,
     # One sigma of the spread of n draws is sigma / sqrt(2 n).
     assert misses.std(axis=0) == pytest.approx([sigma, sigma], rel=4 / np.sqrt(2 * len(misses)))
     assert misses.mean(axis=0) == pytest.approx([0, 0], abs=4 * sigma / np.sqrt(len(misses)))
+
+
+@pytest.mark.parametrize("name", ["XTE", "SOHO"])
+def test_stars_stand_where_erfa_has_them_at_that_very_time(missions, sky, name, rng):
+    mission, time = missions[name], parse_utc("1999-07-15T08:00:00Z")
+    real = real_sky(sky.catalog, mission.catalog, sky.run_catalog(mission, time))
+    position_km = np.array([7000.0, -1.2e6, 3e5])
+    fastest = np.argsort(-motion_mas(sky.catalog, real.run.catalog_row))[:40]
+    blends = np.flatnonzero(np.diff(real.first) > 1)
+    stars = np.concatenate([fastest, rng.choice(blends, 20), rng.integers(0, len(real.run), 40)])
+    seen = real.directions(stars, time, position_km)
+    within = mission.catalog.merge_within_arcsec
+    for star, direction in zip(stars, seen, strict=True):
+        leader = int(real.run.catalog_row[star])
+        expected = place(sky.catalog, leader, within, time, position_km)
+        # ERFA counts the light's way across Earth's orbit, too: 8 minutes of proper motion.
+        assert angle_between_deg(direction, expected) * 3600.0 < 1e-3
+    assert real.magnitude_mag == pytest.approx(real.run.magnitude_mag, abs=1e-12)
+    # The service's own directions are off by half a year of motion and by the parallax.
+    left = angle_between_deg(seen, real.run.direction[stars]) * 3600.0
+    assert 1.5 < left.max() < 6.0
+
+
+def test_a_star_shifts_with_the_year_and_two_that_are_close_are_one(missions, sky):
+    """Alpha Centauri: A and B are one star of V -0.3, with the nearest parallax, 0.742 arcsec."""
+    mission, start = missions["XTE"], parse_utc("1999-02-20T00:00:00Z")
+    real = real_sky(sky.catalog, mission.catalog, sky.run_catalog(mission, start))
+    star = np.array([real.run.star_id.index("HIP 71683")])
+    assert real.magnitude_mag[star] == pytest.approx([-0.28], abs=0.03)
+    halves = [shifted(start, half * 182.625 * 86400.0) for half in range(3)]
+    before, between, after = (real.directions(star, time, np.zeros(3))[0] for time in halves)
+    # Even motion cancels; the Sun stands at right angles to the star at all three times.
+    swing_arcsec = np.linalg.norm(before - 2.0 * between + after) * ARCSEC_PER_RADIAN
+    assert swing_arcsec == pytest.approx(4 * 0.742, rel=0.05)
 
 
 def test_the_turning_of_the_body_is_in_the_measurements(missions, sky, seed):

@@ -107,11 +107,12 @@ def test_a_missing_field_is_named(post, batch, field):
     assert field in {each["field"] for each in answer.json()["errors"]}
 
 
-def test_an_unknown_spacecraft_is_not_found_and_the_known_ones_are_named(post, batch):
+def test_an_unknown_spacecraft_is_a_fault_of_its_field_and_the_known_ones_are_named(post, batch):
     answer = post(batch | {"spacecraft": "NOPE"})
-    assert answer.status_code == 404
-    assert "NOPE" in answer.json()["detail"]
-    assert "XTE" in answer.json()["detail"]
+    assert answer.status_code == 422
+    (fault,) = answer.json()["errors"]
+    assert (fault["field"], fault["value"]) == ("spacecraft", "'NOPE'")
+    assert "XTE" in fault["message"]
 
 
 def test_all_faults_are_told_at_once(post, batch):
@@ -317,14 +318,19 @@ def test_wrong_zones_to_warm_are_named(client, asked, status, field):
     assert any(each["field"].startswith(field) for each in answer.json()["errors"])
 
 
-def test_zones_of_an_unknown_spacecraft_are_not_found(client):
+def test_zones_of_an_unknown_spacecraft_are_a_fault_of_its_field(client):
     asked = {
         "spacecraft": "NOPE",
         "time": "1999-001T00:00:00Z",
         "a_priori": [{"quaternion": [0, 0, 0, 1]}],
     }
-    assert client.post("/api/v1/zones", json=asked).status_code == 404
-    assert client.delete("/api/v1/zones?spacecraft=NOPE").status_code == 404
+    for answer in (
+        client.post("/api/v1/zones", json=asked),
+        client.delete("/api/v1/zones?spacecraft=NOPE"),
+    ):
+        assert answer.status_code == 422
+        assert answer.json()["errors"][0]["field"] == "spacecraft"
+    assert client.get("/api/v1/spacecraft/NOPE").status_code == 404
 
 
 def test_a_problem_can_carry_whatever_the_client_sent(post, batch):
@@ -339,3 +345,43 @@ def test_an_odd_request_line_is_refused_by_the_server(address):
     with httpx.Client(base_url=address) as client:
         answer = client.get("/", headers={"Host": "a b"})
     assert answer.status_code < 500
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", ""])
+def test_a_request_under_a_name_that_is_not_this_machines_is_refused(address, host):
+    """A page whose own name leads here would else be let in as this host."""
+    with httpx.Client(base_url=address) as client:
+        answer = client.get("/api/v1/runs", headers={"Host": host})
+    assert answer.status_code == 421
+    assert answer.headers["content-type"] == "application/problem+json"
+
+
+@pytest.mark.parametrize(
+    "host", ["localhost:8000", "LOCALHOST", "127.0.0.1", "127.9.9.9:1", "[::1]:8"]
+)
+def test_every_name_of_this_machine_is_answered(address, host):
+    with httpx.Client(base_url=address) as client:
+        assert client.get("/livez", headers={"Host": host}).status_code == 200
+
+
+def test_a_what_if_takes_no_key_that_it_would_not_heed(client, post, batch):
+    id = post(batch).json()["id"]
+    answer = client.post(
+        f"/api/v1/batches/{id}/what-if", json={"record": True}, headers={"Idempotency-Key": "k"}
+    )
+    assert answer.status_code == 422
+    assert answer.json()["errors"][0]["field"] == "Idempotency-Key"
+
+
+@pytest.mark.parametrize("name", ["record", "adopt"])
+def test_what_is_kept_is_asked_for_with_true_and_nothing_like_it(client, post, batch, name):
+    id = post(batch).json()["id"]
+    answer = client.post(f"/api/v1/batches/{id}/what-if", json={name: "yes"})
+    assert answer.status_code == 422
+    assert answer.json()["errors"][0]["field"] == name
+
+
+def test_a_missing_run_of_a_replay_is_told_once(client):
+    headers = {"Content-Type": "application/x-ndjson"}
+    answer = client.post("/api/v1/replays", content=b"{}", headers=headers)
+    assert [each["field"] for each in answer.json()["errors"]] == ["run"]

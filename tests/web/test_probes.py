@@ -1,6 +1,8 @@
 """Probes and metrics; the answer to a fault of ours."""
 
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import httpx
 from prometheus_client.parser import text_string_to_metric_families
@@ -87,3 +89,18 @@ def test_a_fault_of_ours_is_logged_and_says_nothing_of_what_is_inside(tmp_path, 
     assert "runs" not in answer.json()["detail"]
     assert "elsewhere" not in answer.text
     assert "GET /api/v1/runs failed" in caplog.text
+
+
+def test_with_every_handler_at_work_it_is_still_ready_and_still_stops(tmp_path, monkeypatch):
+    """Probes and the way out have threads of their own."""
+    operations = Operations.open(Settings(database=f"sqlite:///{tmp_path}/busy.db"))
+    operations.ready()
+    monkeypatch.setattr("service.web.app.WORKER_THREADS", 2)
+    go_on = threading.Event()
+    monkeypatch.setattr(operations, "runs", lambda: go_on.wait(30) and [])
+    with Server(create_app(operations)) as address, ThreadPoolExecutor(2) as threads:
+        for _ in range(2):
+            threads.submit(httpx.get, f"{address}/api/v1/runs", timeout=60)
+        time.sleep(0.3)
+        assert httpx.get(f"{address}/readyz", timeout=10).status_code == 200
+        go_on.set()

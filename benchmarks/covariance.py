@@ -1,0 +1,150 @@
+"""Whether errors scatter as the covariance says, through the whole staircase.
+
+Batches of apparent star directions with two-axis Gaussian noise, seen from a
+spacecraft in orbit; the solved attitude is held against the true one.
+"""
+
+import json
+import math
+import tomllib
+from typing import Any
+
+import erfa
+import numpy as np
+import numpy.typing as npt
+from tqdm import tqdm
+
+from benchmarks.report import Report
+from service.acquire import Acquisition, acquire
+from service.missions.mission import SHIPPED_FOLDER, Mission
+from service.observe.wire import submission_from_json
+from service.sky.catalog import load_embedded
+from service.sky.shelf import Shelf
+from service.sky.view import Sky
+from service.times import parse_utc
+from service.vectors import ARCSEC_PER_RADIAN, attitude_error_arcsec, matrix_from_quaternion
+from tests.reference import batches
+
+Array = npt.NDArray[np.float64]
+
+BATCHES, QUICK_BATCHES = 2000, 200
+PRIORS = 40
+MOMENT = "1996-01-10T12:00:00.000Z"
+VELOCITY_KM_PER_S = (0.0, 6.4, -4.1)
+SQUARE_BOUND = 14.16
+"""Chi-square of three degrees of freedom passes this with probability 0.27 %."""
+
+
+class Passes:
+    """Nominal batches of one mission with their true attitudes."""
+
+    def __init__(self, name: str, sky: Sky) -> None:
+        text = (SHIPPED_FOLDER / f"{name.lower()}.toml").read_text("utf-8")
+        self.toml: dict[str, Any] = tomllib.loads(text)
+        self.mission = Mission.model_validate(self.toml)
+        self.sky = sky
+        run_catalog = sky.run_catalog(self.mission, parse_utc(MOMENT))
+        self.directions, self.magnitudes = run_catalog.direction, run_catalog.magnitude_mag
+        self.velocity_c = self._velocity()
+        self.seen = self._apparent()
+
+    def _velocity(self) -> Array:
+        tai = erfa.utctai(*erfa.dtf2d("UTC", 1996, 1, 10, 12, 0, 0.0))
+        earth = erfa.epv00(*erfa.taitt(*tai))[1]["v"] * erfa.DAU / erfa.DAYSEC
+        return np.asarray((earth + np.array(VELOCITY_KM_PER_S) * 1000.0) / erfa.CMPS)
+
+    def _apparent(self) -> Array:
+        """Lorentz-transformed directions, written out: not the service's own correction."""
+        v = self.velocity_c
+        inverse_gamma = math.sqrt(1.0 - v @ v)
+        along = (self.directions @ v)[:, None]
+        seen = inverse_gamma * self.directions + v + along * v / (1.0 + inverse_gamma)
+        return np.asarray(seen / np.linalg.norm(seen, axis=1, keepdims=True))
+
+    def draw(
+        self, rng: np.random.Generator, prior: Array, directions: Array, aberration: str
+    ) -> tuple[Array, Acquisition]:
+        """One batch about an a priori attitude: its true attitude and what was made of it."""
+        band = self.toml["zone"]["kind"] == "band"
+        error = batches.rotation(rng.normal(size=3), rng.uniform(0, 0.1 if band else 3.0))
+        if band:
+            error = error @ batches.rotation(self.toml["zone"]["axis_body"], rng.uniform(0, 360))
+        truth = error @ prior
+        tracker = self.mission.trackers[0]
+        boresight = truth.T @ tracker.body_from_tracker[:, 2]
+        radius = math.radians(tracker.field_of_view_radius_deg)
+        field = np.flatnonzero(directions @ boresight > math.cos(radius))
+        rows = rng.choice(field, min(5, len(field)), replace=False)
+        exact = directions[rows] @ truth.T @ tracker.body_from_tracker
+        noise = rng.normal(size=exact.shape) * tracker.sigma_arcsec / ARCSEC_PER_RADIAN
+        noise -= np.sum(noise * exact, axis=1, keepdims=True) * exact
+        vectors = exact + noise
+        vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+        magnitudes = self.magnitudes[rows] + 0.1 * rng.normal(size=len(rows))
+        batch = {
+            "spacecraft": self.mission.name,
+            "batch": "1",
+            "time": MOMENT,
+            "a_priori": {"quaternion": batches.matrix_quaternion(prior).tolist()},
+            "velocity_km_per_s": list(VELOCITY_KM_PER_S),
+            "aberration": aberration,
+            "observations": [
+                {
+                    "tracker": tracker.name,
+                    "stars": [
+                        {"vector": v.tolist(), "magnitude": float(m)}
+                        for v, m in zip(vectors, magnitudes, strict=True)
+                    ]
+                    or [{"h_deg": 0.0, "v_deg": 0.0}],
+                }
+            ],
+        }
+        return truth, acquire(submission_from_json(json.dumps(batch)).batch, self.mission, self.sky)
+
+
+def error_of(truth: Array, found: Acquisition) -> Array | None:
+    """The attitude error in arcseconds about the body axes; None without a good attitude."""
+    solution = found.solution
+    if solution is None or solution.suspect:
+        return None
+    return attitude_error_arcsec(matrix_from_quaternion(solution.quaternion), truth)
+
+
+def run(quick: bool, seed: int) -> Report:
+    """The benchmark: XTE and SOHO, errors in units of the covariance and TASTE."""
+    count = QUICK_BATCHES if quick else BATCHES
+    sky = Sky(load_embedded(), Shelf(256 << 20))
+    figures: dict[str, Any] = {}
+    faults: list[str] = []
+    with tqdm(total=3 * count, desc="covariance", unit="batch") as bar:
+        for name in ("XTE", "SWAS", "SOHO"):
+            rng = np.random.default_rng([seed, *name.encode()])
+            passes = Passes(name, sky)
+            priors = batches.prior_attitudes(rng, passes.toml, PRIORS)
+            squares, tastes, suspect = [], [], 0
+            for _ in range(count):
+                prior = priors[rng.integers(PRIORS)]
+                truth, found = passes.draw(rng, prior, passes.seen, "to_correct")
+                bar.update(1)
+                solution, error = found.solution, error_of(truth, found)
+                suspect += solution is not None and solution.suspect
+                if solution is None or error is None:
+                    continue
+                squares.append(float(error @ np.linalg.solve(solution.covariance_arcsec2, error)))
+                tastes.append(solution.taste / solution.degrees_of_freedom)
+            mean = float(np.mean(squares))
+            beyond = float(np.mean(np.array(squares) > SQUARE_BOUND))
+            figures |= {
+                f"{name}: attitudes": len(squares),
+                f"{name}: mean of e^T P^-1 e (3)": mean,
+                f"{name}: share above {SQUARE_BOUND} (0.27 %)": f"{beyond:.2%}",
+                f"{name}: mean TASTE over 2N - 3 (1)": float(np.mean(tastes)),
+                f"{name}: suspect (0.1 %)": f"{suspect / count:.2%}",
+            }
+            # The issue of statistics: five standard errors where the run is short.
+            slack = max(0.2, 5.0 * math.sqrt(6.0 / len(squares)))
+            if abs(mean - 3.0) > slack:
+                faults.append(f"{name}: mean of e^T P^-1 e is {mean:.3f}")
+            if beyond > max(0.006, 0.0027 + 5.0 * math.sqrt(0.0027 / len(squares))):
+                faults.append(f"{name}: {beyond:.2%} above {SQUARE_BOUND}")
+    return Report("covariance", figures, not faults, faults)

@@ -1,0 +1,53 @@
+"""The service held against the plain implementation at full size: batches of every kind.
+
+Priors, switches, tolerances, grids, noise, serious errors, spurious stars,
+missing magnitudes and several trackers are drawn at random; outcome, star,
+votes, runner-up and rivals must be equal for every star.
+"""
+
+import tomllib
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks.report import Report
+from service.missions.mission import SHIPPED_FOLDER
+from service.sky.catalog import load_embedded
+from service.sky.shelf import Shelf
+from service.sky.view import Sky
+from tests.reference.batches import with_trackers
+from tests.reference.compare import Judge
+
+BATCHES, QUICK_BATCHES = 2000, 100
+BLOCK = 50
+
+
+def run(quick: bool, seed: int) -> Report:
+    """The benchmark: every shipped mission, and a tenth as many batches of three trackers."""
+    count = QUICK_BATCHES if quick else BATCHES
+    sky = Sky(load_embedded(), Shelf(256 << 20))
+    shipped = [
+        tomllib.loads(path.read_text("utf-8")) for path in sorted(SHIPPED_FOLDER.glob("*.toml"))
+    ]
+    jobs = [(toml["name"], toml, count) for toml in shipped]
+    jobs += [
+        (f"{toml['name']} with three trackers", with_trackers(toml, 3), count // 10)
+        for toml in shipped
+    ]
+    figures: dict[str, Any] = {}
+    faults: list[str] = []
+    with tqdm(total=sum(job[2] for job in jobs), desc="plain reference", unit="batch") as bar:
+        for name, toml, size in jobs:
+            # Missions of one zone would otherwise be given the same batches.
+            rng = np.random.default_rng([seed, *name.encode()])
+            judge = Judge(toml, sky)
+            for done in range(0, size, BLOCK):
+                part = min(BLOCK, size - done)
+                judge.hold_many(rng, part)
+                bar.update(part)
+            stars, differ = judge.comparison.outcomes, judge.comparison.differences
+            shares = ", ".join(f"{stars[k]:,} {k}" for k in ("unique", "ambiguous", "unmatched"))
+            figures[name] = f"{size:,} batches, {shares}; {len(differ)} differ"
+            faults += differ[:5]
+    return Report("plain_reference", figures, not faults, faults)

@@ -1,0 +1,180 @@
+"""What a batch costs: zones cold and cached, identification and solution, with checked answers.
+
+Times move with the machine, so each is shown as a ratio within this run as
+well: to the call of a compiled function that does nothing with the same
+arrays, and to the plain implementation of the tests, whose answers the
+service's must equal star by star.
+"""
+
+import json
+import statistics
+import time
+import tomllib
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from tqdm import tqdm
+
+from benchmarks.report import Report
+from service.acquire import acquire
+from service.missions.mission import SHIPPED_FOLDER, load_missions
+from service.observe.batch import ObservationBatch
+from service.observe.wire import submission_from_json
+from service.sky.catalog import load_embedded
+from service.sky.shelf import Shelf
+from service.sky.view import Sky
+from service.warm import warm_up
+from tests.reference import batches
+from tests.reference.compare import Judge
+
+BATCHES, QUICK_BATCHES = 300, 30
+DEADLINE_S = {"cap": 4.0, "band": 600.0}
+"""The 1994 requirement for XTE and SWAS, and for SOHO."""
+DEADLINE_FACTOR = 100.0
+CAP_BOUND_US = 100.0
+"""Median of identification and solution together in a cached cap."""
+CONCURRENT = 50
+MEGABYTES_256 = 256 << 20
+
+PLACES = {
+    "random cap": ("XTE", None),
+    "cap forest": ("XTE", "forest"),
+    "random band": ("SOHO", None),
+    "band forest": ("SOHO", "forest"),
+}
+
+
+@njit(cache=True, nogil=True)
+def nothing(direction, magnitude, separation, brighter, dimmer, votes):  # type: ignore[no-untyped-def]
+    """The least that a compiled identification can cost: its call."""
+    return len(votes)
+
+
+@dataclass(frozen=True)
+class Place:
+    """The figures of one kind of zone."""
+
+    figures: dict[str, Any]
+    faults: list[str]
+
+
+def run(quick: bool, seed: int) -> Report:
+    """The benchmark: every place, one after another, on one sky."""
+    sky = Sky(load_embedded(), Shelf(MEGABYTES_256))
+    warm_up(sky, load_missions())
+    figures: dict[str, Any] = {}
+    faults: list[str] = []
+    count = QUICK_BATCHES if quick else BATCHES
+    with tqdm(total=len(PLACES) * count, desc="staircase", unit="batch") as bar:
+        for name in PLACES:
+            place = measured(name, count, np.random.default_rng(seed), sky, bar.update)
+            figures |= {f"{name}: {key}": value for key, value in place.figures.items()}
+            faults += [f"{name}: {fault}" for fault in place.faults]
+    return Report("staircase", figures, not faults, faults)
+
+
+def measured(
+    name: str, count: int, rng: np.random.Generator, sky: Sky, step: Callable[[int], object]
+) -> Place:
+    """One place: nominal batches of five stars about one a priori attitude."""
+    mission_name, place = PLACES[name]
+    toml = tomllib.loads((SHIPPED_FOLDER / f"{mission_name.lower()}.toml").read_text("utf-8"))
+    judge = Judge(toml, sky)
+    kind = toml["zone"]["kind"]
+    attitudes = batches.prior_attitudes(rng, toml, 3)
+    attitude = attitudes[2] if place is None else attitudes[1]
+    moment = batches.TIMES[1]
+    drawn = [
+        batches.draw_batch(
+            rng,
+            toml,
+            judge.catalog(moment),
+            attitude,
+            number,
+            prior="quaternion",
+            error_deg=3.0 if kind == "cap" else 0.1,
+            stars=5,
+            spurious=0,
+            missing=0.0,
+            noise_arcsec=2.1,
+            magnitude_noise=0.1,
+            options={},
+            time=moment,
+        )
+        for number in range(count)
+    ]
+    read = [submission_from_json(json.dumps(batch)).batch for batch in drawn]
+    cold_ms, built = _cold(read[0], judge, sky)
+    step(0)
+    identify: list[int] = []
+    solve: list[int] = []
+    whole: list[float] = []
+    for batch in read:
+        acquire(batch, judge.mission, sky)
+    for batch in read:
+        started = time.perf_counter_ns()
+        found = acquire(batch, judge.mission, sky)
+        whole.append((time.perf_counter_ns() - started) / 1000)
+        identify.append(found.timings_us["identify"])
+        solve.append(found.timings_us["solve"])
+    zone = found.trackers[0].zone
+    empty_us = _empty_call_us(zone)
+    begun = time.perf_counter()
+    for body in drawn:
+        judge.hold(body)
+        step(1)
+    plain_us = (time.perf_counter() - begun) / count * 1e6 - statistics.mean(whole)
+    both = statistics.median(a + b for a, b in zip(identify, solve, strict=True))
+    factor = DEADLINE_S[kind] / (cold_ms / 1000)
+    figures = {
+        "stars and pairs of the zone": f"{len(zone.star):,} and {zone.pairs.count:,}",
+        "cold zone, ms": cold_ms,
+        "1994 deadline over cold zone": factor,
+        f"zones built by {CONCURRENT} first requests at once": built,
+        "identify, median us": statistics.median(identify),
+        "solve, median us": statistics.median(solve),
+        "whole staircase, median us": statistics.median(whole),
+        "identify and solve in empty compiled calls": both / empty_us,
+        "plain implementation over the service": plain_us / statistics.median(whole),
+        "stars held against the plain implementation": sum(judge.comparison.outcomes.values()),
+        "stars that differ": len(judge.comparison.differences),
+    }
+    faults = list(judge.comparison.differences[:5])
+    if factor < DEADLINE_FACTOR:
+        faults.append(f"a cold zone takes {cold_ms:.0f} ms")
+    if built != 1:
+        faults.append(f"{built} zones were built for {CONCURRENT} requests at once")
+    if kind == "cap" and both > CAP_BOUND_US:
+        faults.append(f"identification and solution take {both:.0f} us")
+    return Place(figures, faults)
+
+
+def _cold(batch: ObservationBatch, judge: Judge, sky: Sky) -> tuple[float, int]:
+    """Milliseconds of a first answer without its zone, and zones built by many first requests."""
+    times = []
+    for _ in range(3):
+        fresh = Sky(sky.catalog, Shelf(MEGABYTES_256))
+        fresh.run_catalog(judge.mission, batch.time)
+        started = time.perf_counter()
+        acquire(batch, judge.mission, fresh)
+        times.append((time.perf_counter() - started) * 1000)
+    fresh = Sky(sky.catalog, Shelf(MEGABYTES_256))
+    fresh.run_catalog(judge.mission, batch.time)
+    with ThreadPoolExecutor(CONCURRENT) as pool:
+        list(pool.map(lambda _: acquire(batch, judge.mission, fresh), range(CONCURRENT)))
+    return statistics.median(times), fresh.shelf.state().misses - 1
+
+
+def _empty_call_us(zone: Any) -> float:
+    votes = np.zeros((5, len(zone.star)), np.int32)
+    pairs = zone.pairs
+    arrays = (zone.direction, zone.magnitude_mag, pairs.separation_rad, pairs.brighter)
+    nothing(*arrays, pairs.dimmer, votes)
+    started = time.perf_counter_ns()
+    for _ in range(1000):
+        nothing(*arrays, pairs.dimmer, votes)
+    return (time.perf_counter_ns() - started) / 1e6

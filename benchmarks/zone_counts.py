@@ -1,0 +1,88 @@
+"""Stars and pairs of the paper's own zones, from the shipped catalog, beside the paper's."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.report import Report
+from service.missions.mission import Band, Cap, Mission, load_missions
+from service.sky.catalog import load_embedded
+from service.sky.ephemeris import sun_direction
+from service.sky.shelf import Shelf
+from service.sky.view import Sky
+from service.sky.zones import Aim
+from service.times import Utc, parse_utc
+from service.vectors import Vector, from_ra_dec
+
+PAPER = Path(__file__).parent.parent / "tests" / "against_paper" / "zone_counts.json"
+
+
+@dataclass(frozen=True)
+class Count:
+    """One quantity of one zone, the paper's and ours; `within` is the bound on their ratio."""
+
+    zone: str
+    quantity: str
+    paper: int
+    here: int
+    within: float
+
+    @property
+    def off(self) -> float:
+        return self.here / self.paper - 1.0
+
+    @property
+    def passed(self) -> bool:
+        return abs(self.off) <= self.within
+
+
+def counted(sky: Sky, mission: Mission, axis: Vector, time: Utc) -> tuple[int, int]:
+    """Stars and pairs of the exact zone about an axis."""
+    zone = mission.zone
+    if isinstance(zone, Cap):
+        aim = Aim("cap", axis, 0.0, zone.radius_deg)
+    else:
+        assert isinstance(zone, Band)
+        middle, half = zone.coelevation_deg, zone.half_width_deg
+        aim = Aim("band", axis, middle - half, middle + half)
+    limit = mission.tolerances.pair_separation_max_deg
+    found, _ = sky.zone(mission, sky.run_catalog(mission, time), aim, limit, 0.0)
+    return len(found.star), found.pairs.count
+
+
+def counts(sky: Sky) -> Iterator[Count]:
+    """Every count that the paper prints, beside what is found here."""
+    paper = json.loads(PAPER.read_text(encoding="utf-8"))
+    missions = load_missions()
+    time = parse_utc(paper["time"])
+    for zone in paper["zones"]:
+        axis = from_ra_dec(zone["ra_deg"], zone["dec_deg"])
+        found = counted(sky, missions[zone["mission"]], axis, time)
+        for quantity, here in zip(("stars", "pairs"), found, strict=True):
+            yield Count(zone["name"], quantity, zone[quantity], here, paper["within"][quantity])
+    bands = paper["sun_bands"]
+    mission = missions[bands["mission"]]
+    months = [
+        counted(sky, mission, sun_direction(time, None), time)
+        for time in map(parse_utc, bands["times"])
+    ]
+    for extreme, pick in (("fewest", min), ("most", max)):
+        for k, quantity in enumerate(("stars", "pairs")):
+            yield Count(
+                f"{bands['name']}, {extreme}",
+                quantity,
+                bands[extreme][quantity],
+                pick(month[k] for month in months),
+                paper["within"][quantity],
+            )
+
+
+def run(quick: bool, seed: int) -> Report:
+    """The benchmark's form of it; neither the size nor the seed matters."""
+    found = list(counts(Sky(load_embedded(), Shelf(256 << 20))))
+    figures = {
+        f"{c.zone}, {c.quantity}": f"{c.here:,} (paper {c.paper:,}, {c.off:+.1%})" for c in found
+    }
+    faults = [f"{c.zone}, {c.quantity}: {c.off:+.1%}" for c in found if not c.passed]
+    return Report("zone_counts", figures, not faults, faults)
