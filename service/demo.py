@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Self
 
 import httpx
 
@@ -25,7 +26,8 @@ from service.replay.over_http import replay_over_http
 from service.replay.tally import Tally
 from service.settings import PREFIX, Settings
 from service.simulate.files import read_objects, truth_path, write_pass
-from service.simulate.score import Score, score, together
+from service.simulate.score import score
+from service.simulate.score_table import table
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
 from service.sky.catalog import load_embedded
@@ -33,8 +35,12 @@ from service.sky.shelf import Shelf
 from service.sky.view import Sky
 
 MISSIONS = ("XTE", "SWAS", "SOHO")
-START_S = 120.0
+START_S = 300.0
 """The longest that the server may take to be ready: the first time it compiles."""
+COMPILES_AFTER_S = 5.0
+"""A start that takes longer than this is a first one."""
+SAID_EVERY_S = 10.0
+"""How often a wait is told where there is no terminal to show it moving."""
 STOP_S = 15.0
 TOLD_TO_STOP = (0, 130, 143, -signal.SIGINT, -signal.SIGTERM)
 CONCURRENCY = 2
@@ -61,6 +67,7 @@ def run_demo(folder: Path, settings: Settings, batches: int, seed: int, once: bo
     with _served(settings, folder / "server.log") as server:
         files = _samples(folder, wanted)
         _wait_until_ready(server, url, folder / "server.log")
+        ready_s = time.perf_counter() - started
         run = f"demo-{_digest(files)}"
         scores = {}
         for name, file in zip(MISSIONS, files, strict=True):
@@ -70,8 +77,10 @@ def run_demo(folder: Path, settings: Settings, batches: int, seed: int, once: bo
             scores[name] = score(read_objects(results), read_objects(truth_path(file)))
         print(table(scores))
         print()
-        print(f"That took {time.perf_counter() - started:.1f} s. Where to look next:")
-        for place, what in _where_next(url, run, folder, settings):
+        whole_s = time.perf_counter() - started
+        print(f"That took {whole_s:.1f} s, {ready_s:.1f} s of them until the server was ready.")
+        print("Where to look next:")
+        for place, what in _where_next(url, run, folder, settings, once):
             print(f"  {place}\n      {what}")
         sys.stdout.flush()
         if once:
@@ -85,52 +94,28 @@ def run_demo(folder: Path, settings: Settings, batches: int, seed: int, once: bo
         return 0
 
 
-def table(scores: dict[str, dict[str, Score]]) -> str:
-    """Per mission a line of the nominal stretches and one of the stretches with errors."""
-    head = (
-        f"{'':<15}{'batches':>8}{'stars':>7}{'unique':>9}{'ambig.':>8}{'unmatch.':>9}{'wrong':>8}"
-        f"{'attitudes':>11}{'error':>8}{'sigma':>7}{'within':>8}{'solve':>8}{'whole':>8}"
-    )
-    units = (
-        f"{'':<15}{'':>8}{'':>7}{'%':>9}{'%':>8}{'%':>9}{'%':>8}"
-        f"{'':>11}{'arcsec':>8}{'arcsec':>7}{'%':>8}{'µs':>8}{'µs':>8}"
-    )
-    lines = [head, units]
-    for name, stretches in scores.items():
-        lines.append(_row(f"{name} nominal", stretches.get("nominal", Score())))
-        serious = [each for kind, each in stretches.items() if kind != "nominal"]
-        lines.append(_row(f"{name} serious", together(serious)))
-    notes = (
-        "nominal: the a priori error that the mission allows for; serious: a growing attitude",
-        "error and spurious stars.  wrong: named with certainty, but another star than the true",
-        "one.  error, sigma: one sigma along the attitude's worst axis, as it was and as the",
-        "covariance predicts it.  within: attitudes inside their own 99.7 % region.  solve:",
-        "identification and solution; whole: zone and recording too; medians of a batch.",
-    )
-    return "\n".join([*lines, "", *notes])
-
-
-def _row(title: str, of: Score) -> str:
-    return (
-        f"{title:<15}{of.batches:>8}{of.stars['observed']:>7}{of.percent('unique'):>9.2f}"
-        f"{of.percent('ambiguous'):>8.2f}{of.percent('unmatched'):>9.2f}{of.percent('wrong'):>8.2f}"
-        f"{of.attitudes:>11}{of.seen_sigma_arcsec:>8.2f}{of.predicted_sigma_arcsec:>7.2f}"
-        f"{of.within_percent:>8.2f}{of.median_solving_us:>8.0f}{of.median_whole_us:>8.0f}"
-    )
-
-
-def _where_next(url: str, run: str, folder: Path, settings: Settings) -> Iterator[tuple[str, str]]:
-    yield f"{url}/?run={run}", "the page of this run: ambiguous and unmatched stars over time"
-    yield (
-        f"curl -s '{url}/api/v1/batches?spacecraft=XTE&run={run}&limit=1'",
-        "the latest batch of XTE as the API gives it",
-    )
+def _where_next(
+    url: str, run: str, folder: Path, settings: Settings, once: bool
+) -> Iterator[tuple[str, str]]:
+    serve = f"acquire serve --database {settings.database}"
+    for name in ("host", "port"):
+        if getattr(settings, name) != getattr(Settings(), name):
+            serve += f" --{name} {getattr(settings, name)}"
+    page = f"{url}/?run={run}"
+    if once:
+        # Nothing serves any more: an address alone would lead nowhere.
+        yield serve, "serve these records; the page of this run is then"
+        yield f"  {page}", "  ambiguous and unmatched stars over time"
+    else:
+        yield page, "the page of this run: ambiguous and unmatched stars over time"
+        yield (
+            f"curl -s '{url}/api/v1/batches?spacecraft=XTE&run={run}&limit=1'",
+            "the latest batch of XTE as the API gives it",
+        )
     yield f"{folder}/*.results.ndjson", "every answer; the truth is in *.truth.ndjson beside it"
     yield "docs/quickstart.md", "a walk: post a batch, read the attitude, try other tolerances"
-    yield (
-        f"acquire serve --database {settings.database}",
-        "serve these records again, without the demonstration",
-    )
+    if not once:
+        yield serve, "serve these records again, without the demonstration"
 
 
 def _samples(folder: Path, wanted: Pass) -> list[Path]:
@@ -201,9 +186,9 @@ def _interrupt(number: int, frame: object) -> None:
 
 
 def _wait_until_ready(server: subprocess.Popen[bytes], url: str, log: Path) -> None:
-    give_up = time.monotonic() + START_S
-    with httpx.Client(base_url=url, timeout=START_S, trust_env=False) as client:
-        while time.monotonic() < give_up:
+    start = time.monotonic()
+    with httpx.Client(base_url=url, timeout=START_S, trust_env=False) as client, _Waiting() as wait:
+        while (waited_s := time.monotonic() - start) < START_S:
             if server.poll() is not None:
                 said = log.read_text(encoding="utf-8", errors="replace").strip()
                 raise BadConfiguration(f"the server did not start:\n{said}")
@@ -212,5 +197,34 @@ def _wait_until_ready(server: subprocess.Popen[bytes], url: str, log: Path) -> N
                     return
             except httpx.TransportError:
                 pass
+            wait.show(waited_s)
             time.sleep(0.1)
     raise Busy(f"the server at {url} is not ready after {START_S:.0f} s; see {log}")
+
+
+class _Waiting:
+    """A line that moves while the server starts; without a terminal a line now and then."""
+
+    def __init__(self) -> None:
+        self._moves = sys.stderr.isatty()
+        self._shown = 0
+        self._next_s = COMPILES_AFTER_S
+
+    def show(self, waited_s: float) -> None:
+        """Tell how long it has been."""
+        line = f"the server is starting: {waited_s:.0f} s"
+        if waited_s >= COMPILES_AFTER_S:
+            line += "; a machine's first start compiles for 20 to 70 s, later ones are quick"
+        if self._moves:
+            print(f"\r{line:<{self._shown}}", end="", file=sys.stderr, flush=True)
+            self._shown = len(line)
+        elif waited_s >= self._next_s:
+            print(line, file=sys.stderr, flush=True)
+            self._next_s += SAID_EVERY_S
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._shown:
+            print(f"\r{'':<{self._shown}}\r", end="", file=sys.stderr, flush=True)

@@ -21,7 +21,7 @@ def add_pass_arguments(parser: ArgumentParser) -> None:
     add("--spacecraft", required=True, metavar="NAME", help=MISSION)
     add("--batches", required=True, type=count, metavar="N")
     add("--seed", type=int, default=1, metavar="S", help="default 1")
-    add("--start", metavar="UTC", help="time of the first batch; default 1999-03-01T00:00:00Z")
+    add("--start", metavar="UTC", help="of the first batch; default 1999-03-01, bands 1996-04-16")
     add("--cadence", type=float, metavar="S", help="seconds between batches; default 30, bands 300")
     add("--stars", type=count, default=5, metavar="N", help="most stars a tracker; default 5")
     add(
@@ -68,7 +68,7 @@ _SERIOUS_SHARE = 0.1
 
 def pass_of(parsed: Namespace) -> "Pass":
     """The pass that was asked for; raises `BadInput` for one that cannot be."""
-    from service.simulate.stretches import DEFAULT_START, Pass, Trouble, Troubles
+    from service.simulate.stretches import Pass, Trouble, Troubles
 
     troubles = {}
     for kind, size_name in _SIZES.items():
@@ -82,7 +82,7 @@ def pass_of(parsed: Namespace) -> "Pass":
     return Pass(
         batches=parsed.batches,
         seed=parsed.seed,
-        start=parsed.start or DEFAULT_START,
+        start=parsed.start,
         cadence_s=parsed.cadence,
         stars=parsed.stars,
         prior=parsed.prior,

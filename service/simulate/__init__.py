@@ -1,1 +1,1 @@
-"""SKIES WITH KNOWN TRUTH: sample telemetry drawn from the real catalog, and how answers compare."""
+"""SKIES WITH KNOWN TRUTH: sample telemetry drawn from the real sky, and how answers compare."""

@@ -1,8 +1,8 @@
 """What the trackers of a turning, moving spacecraft see of the sky, and what they measure.
 
-Each star is where it appears from the moving spacecraft, at its own time,
-while the body turns with constant rates: carried to the batch's epoch, it lies
-where the attitude of the epoch puts it.
+Each star is where it appears from the moving spacecraft while the body turns
+with constant rates, measured at its own time: carried to the batch's epoch, it
+lies where the attitude of the epoch puts it.
 """
 
 import math
@@ -14,10 +14,10 @@ import numpy.typing as npt
 
 from service.missions.mission import Band, Calibration, Mission, Tracker
 from service.observe.batch import Aberration
-from service.simulate.motion import random_axis, turned
+from service.simulate.motion import across, random_axis, turned
+from service.simulate.real_sky import RealSky
 from service.simulate.stretches import Stretch
 from service.sky.ephemeris import apparent
-from service.sky.run_catalog import RunCatalog
 from service.times import Utc
 from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector, rotate_about, unit
 
@@ -43,8 +43,9 @@ class Scene:
     """The sky about one batch, and what befalls its stars."""
 
     mission: Mission
-    catalog: RunCatalog
+    sky: RealSky
     time: Utc
+    position_km: Vector
     velocity_c: Vector
     aberration: Aberration
     rates_deg_per_s: Vector
@@ -67,10 +68,10 @@ class Scene:
     def _visible(self, tracker: Tracker, attitude: Matrix, most: int) -> Seen:
         alignment = tracker.body_from_tracker
         radius = math.radians(tracker.field_of_view_radius_deg)
-        # Somewhat wider: aberration and the body's turning may bring a star in.
+        # Somewhat wider: its own motion, aberration and the body's turning may bring a star in.
         near = math.cos(min(radius + math.radians(0.2), math.pi))
-        row = np.flatnonzero(self.catalog.direction @ (attitude.T @ alignment[:, 2]) >= near)
-        direction = self.catalog.direction[row]
+        row = np.flatnonzero(self.sky.run.direction @ (attitude.T @ alignment[:, 2]) >= near)
+        direction = self.sky.directions(row, self.time, self.position_km)
         if self.aberration != "applied_upstream":
             direction = apparent(direction, self.velocity_c, self.time)
         offset_s = np.round(self.rng.uniform(-TIME_OFFSET_S, TIME_OFFSET_S, len(row)), 3)
@@ -79,12 +80,12 @@ class Scene:
         inside = np.flatnonzero(direction[:, 2] >= math.cos(radius))
         chosen = self.rng.permutation(inside)[:most]
         star, direction = row[chosen], direction[chosen]
-        magnitude = self.catalog.magnitude_mag[star]
+        magnitude = self.sky.magnitude_mag[star]
         if self.stretch.kind == "spurious":
             false = self.rng.permutation(len(star))[: int(self.stretch.size)]
             star[false] = -1
             direction[false] = anywhere(radius, len(false), self.rng)
-            magnitude[false] = self.rng.choice(self.catalog.magnitude_mag, len(false))
+            magnitude[false] = self.rng.choice(self.sky.magnitude_mag, len(false))
         return Seen(tracker, direction, offset_s[chosen], magnitude, star)
 
     def measured(self, seen: Seen, as_angles: bool) -> list[dict[str, Any]]:
@@ -120,9 +121,7 @@ def anywhere(radius_rad: float, count: int, rng: np.random.Generator) -> Vector:
 
 def shaken(direction: Vector, sigma_rad: float, rng: np.random.Generator) -> Vector:
     """Directions (n, 3) with Gaussian noise of one sigma on each of two tangent axes."""
-    least = np.eye(3)[np.argmin(np.abs(direction), axis=1)]
-    aside = unit(np.cross(direction, least))
-    above = np.cross(direction, aside)
+    aside, above = across(direction)
     noise = rng.normal(0.0, sigma_rad, (len(direction), 2))
     return unit(direction + noise[:, :1] * aside + noise[:, 1:] * above)
 

@@ -12,7 +12,10 @@ Prior = Literal["quaternion", "direction", "mixed"]
 Kind = Literal["nominal", "attitude_error", "spurious", "magnitude_error", "position_error"]
 
 DEFAULT_START = "1999-03-01T00:00:00.000Z"
-"""A day on which XTE, SWAS and SOHO were all at work."""
+"""A day on which XTE and SWAS were both at work."""
+BAND_START = "1996-04-16T00:00:00.000Z"
+"""The end of SOHO's commissioning.  In mid January and mid July its band crosses Carina, where
+stars stand closest and a few in ten thousand are taken for another."""
 CAP_CADENCE_S, BAND_CADENCE_S = 30.0, 300.0
 CAP_ATTITUDE_ERROR_DEG, BAND_ATTITUDE_ERROR_DEG = 10.0, 5.0
 
@@ -67,7 +70,7 @@ class Pass:
 
     batches: int
     seed: int = 1
-    start: str = DEFAULT_START
+    start: str | None = None
     cadence_s: float | None = None
     stars: int = 5
     prior: Prior = "quaternion"
@@ -99,6 +102,11 @@ class Pass:
             _require(within, name, f"must be above 0, to {largest:g}", size)
         total = sum(shares.values())
         _require(total <= 1, "shares", "the stretches must not be more than the pass", total)
+
+    def start_of(self, mission: Mission) -> str:
+        """The time of the first batch."""
+        default = BAND_START if isinstance(mission.zone, Band) else DEFAULT_START
+        return default if self.start is None else self.start
 
     def cadence_of(self, mission: Mission) -> float:
         """Seconds from one batch to the next."""

@@ -1,7 +1,9 @@
-"""Sample telemetry: a pass drawn from the real catalog, with its truth.
+"""Sample telemetry: a pass drawn from the real sky, with its truth.
 
-The stars are those of the run catalog of the batch's epoch, proper motion
-included.  The truth is kept beside the batch and never enters it.
+The stars stand where they are at the batch's own time, seen from where the
+spacecraft is and with its speed; how the service knows them is another matter,
+and only their names are its own.  The truth is kept beside the batch and never
+enters it.
 """
 
 import math
@@ -21,6 +23,7 @@ from service.simulate.motion import (
     tilted,
 )
 from service.simulate.orbits import orbit_of
+from service.simulate.real_sky import real_sky
 from service.simulate.sightings import Scene, Seen
 from service.simulate.stretches import Pass
 from service.sky.ephemeris import observer_velocity, sun_direction
@@ -57,7 +60,7 @@ def draw_pass(mission: Mission, sky: Sky, wanted: Pass) -> Iterator[Drawn]:
     leaves the others as they were; the mission's name makes its pass another
     than that of its sister with the same seed.
     """
-    start, cadence_s = parse_utc(wanted.start, "start"), wanted.cadence_of(mission)
+    start, cadence_s = parse_utc(wanted.start_of(mission), "start"), wanted.cadence_of(mission)
     root = (wanted.seed, *mission.name.encode())
     rng = np.random.default_rng([*root, 0])
     rates = body_rates_deg_per_s(mission, wanted.batches, rng)
@@ -73,8 +76,9 @@ def draw_pass(mission: Mission, sky: Sky, wanted: Pass) -> Iterator[Drawn]:
         position_km, velocity_km_per_s = (np.round(each, 4) for each in orbit.state(time))
         scene = Scene(
             mission=mission,
-            catalog=sky.run_catalog(mission, time),
+            sky=real_sky(sky.catalog, mission.catalog, sky.run_catalog(mission, time)),
             time=time,
+            position_km=position_km,
             velocity_c=observer_velocity(time, velocity_km_per_s),
             aberration=cast(Aberration, str(rng.choice(words, p=shares))),
             rates_deg_per_s=rates[k],
@@ -187,7 +191,7 @@ def _truth(
         "observations": [
             {
                 "tracker": each.tracker.name,
-                "stars": [None if row < 0 else scene.catalog.star_id[row] for row in each.star],
+                "stars": [None if row < 0 else scene.sky.run.star_id[row] for row in each.star],
             }
             for each in seen
         ],

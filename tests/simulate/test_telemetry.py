@@ -205,6 +205,19 @@ def test_the_turning_of_the_body_is_in_the_measurements(missions, sky, seed):
     assert np.abs(misses_arcsec(slewing, missions, sky)).max() > 15
 
 
+def test_the_rolls_of_a_pass_lead_all_along_the_band(missions, sky, seed):
+    passes = drawn(missions, sky, "SOHO", seed, 300)
+    assert passes[0].batch["time"].startswith("1996-04-16")
+    boresight = missions["SOHO"].trackers[0].body_from_tracker[:, 2]
+    seen = np.array(
+        [matrix_from_quaternion(one.truth["quaternion"]).T @ boresight for one in passes]
+    )
+    # The band is a great circle: the plane of the sightings.
+    _, _, plane = np.linalg.svd(seen)
+    angle = np.degrees(np.arctan2(seen @ plane[1], seen @ plane[0]))
+    assert len(set(np.floor(angle / 30.0))) >= 11
+
+
 @pytest.mark.parametrize("name", ["XTE", "SWAS"])
 def test_attitudes_follow_from_the_rates(missions, sky, name, seed):
     passes = drawn(missions, sky, name, seed, 40, cadence_s=30.0)
