@@ -6,19 +6,18 @@ finding a star is a result; only bad input raises.
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from time import perf_counter_ns as clock_ns
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from service import __version__
 from service.attitude.solution import AttitudeSolution, NoAttitude
 from service.attitude.solve import solve_attitude
 from service.identify.identification import Identification, Outcome
+from service.identify.matched import matched_vectors
 from service.identify.presumed import Presumed, aim_of, presumed_attitude
 from service.identify.starid import Sighting, identify_by_votes
 from service.identify.verify import identify_verified
@@ -28,11 +27,10 @@ from service.observe.batch import (
     ObservationBatch,
 )
 from service.observe.correct import CorrectedObservations, correct
-from service.sky.ephemeris import apparent, observer_velocity
+from service.sky.ephemeris import observer_velocity, sun_distance_au
 from service.sky.run_catalog import RunCatalog
 from service.sky.view import Sky
 from service.sky.zones import Aim, Zone, counts_within
-from service.times import Utc
 from service.vectors import (
     ARCSEC_PER_RADIAN,
     Matrix,
@@ -40,8 +38,6 @@ from service.vectors import (
     matrix_from_quaternion,
     separation_deg,
 )
-
-Array = npt.NDArray[Any]
 
 IDENTIFIERS: Mapping[Identifier, Callable[[Sighting], Identification]] = {
     "starid": identify_by_votes,
@@ -127,9 +123,12 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
     choices = choices_of(batch, mission)
     corrected = correct(batch, mission)
     presumed = presumed_attitude(batch.a_priori, batch.time, mission, batch.position_km)
-    velocity_c = None
+    # At rest, directions stay geometric.
+    velocity_c = np.zeros(3)
     if batch.aberration == "to_correct":
         velocity_c = observer_velocity(batch.time, batch.velocity_km_per_s)
+    seen = [_seen(each, presumed, velocity_c) for each in corrected]
+    sun_au = sun_distance_au(batch.time)
 
     clock = [clock_ns()]
     run_catalog = sky.run_catalog(mission, batch.time)
@@ -137,27 +136,15 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
         _place(each, index, presumed, mission, choices, run_catalog, sky)
         for index, each in enumerate(corrected)
     ]
-    clock.append(clock_ns())
-    identify = IDENTIFIERS[choices.identifier]
-    identifications = [
-        identify(
-            Sighting(
-                np.dot(each.direction_body, presumed.attitude),
-                each.magnitude_mag,
-                each.sigma_arcsec / ARCSEC_PER_RADIAN,
-                presumed.known_axis,
-                np.zeros(3) if velocity_c is None else velocity_c,
-                each.tracker.body_from_tracker[:, 2] @ presumed.attitude,
-                aim,
-                zone,
-                choices.tolerances,
-                choices.tests,
-            )
-        )
-        for each, (aim, zone, _) in zip(corrected, places, strict=True)
+    sightings = [
+        Sighting(*each, aim, zone, choices.tolerances, choices.tests)
+        for each, (aim, zone, _) in zip(seen, places, strict=True)
     ]
     clock.append(clock_ns())
-    solved = _solve(batch.time, velocity_c, choices, corrected, identifications, run_catalog)
+    identify = IDENTIFIERS[choices.identifier]
+    identifications = [identify(sighting) for sighting in sightings]
+    clock.append(clock_ns())
+    solved = _solve(choices, corrected, sightings, identifications, run_catalog, sun_au)
     clock.append(clock_ns())
 
     solution = solved if isinstance(solved, AttitudeSolution) else None
@@ -232,34 +219,52 @@ def _place(
     return aim, zone, cached
 
 
-def _solve(
-    time: Utc,
-    velocity_c: Vector | None,
-    choices: Choices,
-    corrected: tuple[CorrectedObservations, ...],
-    identifications: list[Identification],
-    run_catalog: RunCatalog,
-) -> AttitudeSolution | NoAttitude:
-    masks = [identification.unique for identification in identifications]
-    matched = [np.count_nonzero(mask) for mask in masks]
-    if sum(matched) < 2:
-        return NoAttitude.FEWER_THAN_TWO_UNIQUE_STARS
-    star = _joined([i.star[m] for i, m in zip(identifications, masks, strict=True)])
-    reference = run_catalog.direction[star]
-    if velocity_c is not None:
-        reference = apparent(reference, velocity_c, time)
-    return solve_attitude(
-        _joined([c.direction_body[m] for c, m in zip(corrected, masks, strict=True)]),
-        reference,
-        _joined([c.sigma_arcsec[m] for c, m in zip(corrected, masks, strict=True)]),
-        _joined([np.full(count, index) for index, count in enumerate(matched)]),
-        tuple(each.tracker.name for each in corrected),
-        choices.solver,
+def _seen(
+    corrected: CorrectedObservations, presumed: Presumed, velocity_c: Vector
+) -> tuple[Vector, Vector, Vector, Vector | None, Vector, Vector]:
+    """What a sighting holds of the observation: the first fields of `Sighting`, in order."""
+    return (
+        np.dot(corrected.direction_body, presumed.attitude),
+        corrected.magnitude_mag,
+        corrected.sigma_arcsec / ARCSEC_PER_RADIAN,
+        presumed.known_axis,
+        velocity_c,
+        corrected.tracker.body_from_tracker[:, 2] @ presumed.attitude,
     )
 
 
-def _joined(parts: list[Array]) -> Array:
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+def _solve(
+    choices: Choices,
+    corrected: Sequence[CorrectedObservations],
+    sightings: Sequence[Sighting],
+    identifications: Sequence[Identification],
+    run_catalog: RunCatalog,
+    sun_au: float,
+) -> AttitudeSolution | NoAttitude:
+    parts = [
+        matched_vectors(
+            each.direction_body,
+            sighting.sigma_rad,
+            identification.star,
+            run_catalog.direction,
+            sighting.velocity_c,
+            sun_au,
+        )
+        for each, sighting, identification in zip(
+            corrected, sightings, identifications, strict=True
+        )
+    ]
+    observed, reference, sigma_rad = (
+        parts[0] if len(parts) == 1 else (np.concatenate(each) for each in zip(*parts, strict=True))
+    )
+    return solve_attitude(
+        observed,
+        reference,
+        sigma_rad,
+        np.repeat(np.arange(len(parts)), [len(part[2]) for part in parts]),
+        tuple(each.tracker.name for each in corrected),
+        choices.solver,
+    )
 
 
 def _residuals(

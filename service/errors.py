@@ -9,14 +9,16 @@
     ├── NotFound              no such spacecraft, batch, zone, run or replay
     ├── NotAvailable          asked for something that is not there yet
     ├── BadConfiguration      a mission file, a setting: names file, key and allowed values
-    └── Busy                  the writer's queue is full, or the service is stopping
+    └── Busy                  the writer's queue is full, or the database cannot be reached now
+        └── Stopping          the service is stopping: here, later will not succeed
 
 Not finding a star is a result and raises nothing.  Nothing here knows HTTP;
 the status codes are given in `service.web.errors`.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -84,3 +86,29 @@ class Busy(AcquisitionError):
     def __init__(self, message: str, retry_after_s: int = 1) -> None:
         super().__init__(message)
         self.retry_after_s = retry_after_s
+
+
+class Stopping(Busy):
+    """The service is stopping: the same process will not take the work any more."""
+
+
+def problem_of(error: Exception) -> dict[str, Any]:
+    """What an error says of an input, in one form wherever it is told: `detail`, and its `errors`.
+
+    `detail` is the first fault with the number of the others; `errors` names
+    every field and value, and is absent where the error is about no field.
+    """
+    if not isinstance(error, BadInput):
+        return {"detail": str(error)}
+    return problem_of_faults(error.faults)
+
+
+def problem_of_faults(faults: Sequence[Fault]) -> dict[str, Any]:
+    """The same of faults that no exception carries."""
+    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+    return {
+        "detail": f"{faults[0]}{more}",
+        "errors": [
+            {"field": each.field, "message": each.message, "value": each.value} for each in faults
+        ],
+    }

@@ -2,18 +2,16 @@
 
 import threading
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
 from service.errors import (
     AcquisitionError,
     BadBatch,
-    BadConfiguration,
-    BadFile,
     Busy,
     Fault,
     NotFound,
+    Stopping,
     shown_value,
 )
 from service.missions.mission import Mission, load_missions, mission_named
@@ -21,14 +19,14 @@ from service.observe.wire import APrioriIn, OptionsIn, RunName, Submission, prio
 from service.records import histories, reading, rollups
 from service.records.draft import Answered, Row
 from service.records.ids import Ulids, is_ulid
-from service.records.intake import Intake, Observer, now
+from service.records.intake import Intake, Observer, mission_in_input, now
 from service.records.pages import Page, Stretch
 from service.records.reading import OutcomeName, Status
 from service.records.recording import register
 from service.records.replays import Replay, mark_interrupted, read_replay
 from service.records.store import Store
 from service.settings import Settings
-from service.sky.catalog import Catalog, import_csv, load, load_embedded
+from service.sky.catalog import open_catalog
 from service.sky.run_catalog import RunCatalog
 from service.sky.shelf import Shelf
 from service.sky.view import Sky
@@ -39,6 +37,9 @@ from service.warm import warm_up, warm_zones
 __all__ = ["LIVE", "Answered", "Operations", "Page"]
 
 LIVE = "live"
+MAX_REPLAYS = 8
+"""Each keeps a thread and a file of its own; those that come later may come again."""
+REPLAY_RETRY_S = 30
 
 _RUN_NAME = TypeAdapter(RunName)
 
@@ -60,6 +61,8 @@ class Operations:
         self._intake = Intake(missions, sky, store)
         self._ids = Ulids()
         self._replays: list[Replay] = []
+        self._replays_lock = threading.Lock()
+        self._closing = False
         self._warming = threading.Lock()
         self._warm = False
 
@@ -70,7 +73,7 @@ class Operations:
         Raises `BadConfiguration` for whatever of these cannot be used.
         """
         missions = load_missions(settings.missions)
-        sky = Sky(load_catalog(settings.catalog), Shelf(settings.shelf_mb << 20))
+        sky = Sky(open_catalog(settings.catalog), Shelf(settings.shelf_mb << 20))
         operations = cls(settings, missions, sky, Store(settings.database))
         try:
             operations._register()
@@ -99,6 +102,9 @@ class Operations:
 
     def close(self) -> None:
         """Stop the replays, write what is queued, and let go of the database."""
+        with self._replays_lock:
+            # From here on none is added.
+            self._closing = True
         for replay in self._replays:
             replay.stop()
         self.store.close()
@@ -106,8 +112,8 @@ class Operations:
     def ready(self) -> None:
         """Return once batches can be taken at full speed; the first call compiles and warms.
 
-        Raises `Busy` while another call is at that, and whatever keeps the
-        database from being read.
+        Raises `Busy` while another call is at that, and where the database can
+        be neither read nor written.
         """
         if not self._warm:
             if not self._warming.acquire(blocking=False):
@@ -117,6 +123,7 @@ class Operations:
                 self._warm = True
             finally:
                 self._warming.release()
+        self.store.writer.require()
         with self.store.reading() as connection:
             connection.exec_driver_sql("SELECT 1")
 
@@ -131,8 +138,8 @@ class Operations:
         """Record a batch and answer it; a repeat gets the stored answer.
 
         Raises `KeyReused` and `Conflict` for another body under a key or a
-        batch that is taken, `NotFound` for an unknown spacecraft, `BadBatch`
-        for what does not fit its mission, `Busy` when too much is waiting.
+        batch that is taken, `BadBatch` for an unknown spacecraft and for what
+        does not fit its mission, `Busy` when too much is waiting.
         """
         return self._intake.submit(submission, idempotency_key)
 
@@ -167,12 +174,19 @@ class Operations:
         limit: int = 100,
         cursor: str | None = None,
     ) -> Page:
-        """Current results, newest batch time first; see `reading.list_batches`."""
+        """Current results, newest batch time first; see `reading.list_batches`.
+
+        Raises `BadBatch` for a spacecraft that has neither batches nor a mission.
+        """
         stretch = Stretch(run or LIVE, spacecraft, start, end)
         with self.store.reading() as connection:
-            return reading.list_batches(
+            page = reading.list_batches(
                 connection, stretch, outcome=outcome, status=status, limit=limit, cursor=cursor
             )
+        if spacecraft is not None and not page.items:
+            # A misspelt name must not pass for a spacecraft without data.
+            mission_in_input(self.missions, spacecraft)
+        return page
 
     # ---- spacecraft --------------------------------------------------------------------------
 
@@ -255,7 +269,7 @@ class Operations:
 
     def warm_zones(self, spacecraft: str, a_priori: Sequence[APrioriIn], time: Utc) -> list[Row]:
         """Build the zones that batches of these a priori attitudes will ask for."""
-        mission = mission_named(self.missions, spacecraft)
+        mission = mission_in_input(self.missions, spacecraft)
         return [
             zone.summary()
             for each in a_priori
@@ -265,7 +279,7 @@ class Operations:
     def drop_zones(self, spacecraft: str | None = None) -> int:
         """Drop the cached zones of a spacecraft, or all; how many there were."""
         if spacecraft is not None:
-            mission_named(self.missions, spacecraft)
+            mission_in_input(self.missions, spacecraft)
         return self.sky.drop_zones(spacecraft)
 
     # ---- runs and replays --------------------------------------------------------------------
@@ -276,25 +290,24 @@ class Operations:
             return histories.list_runs(connection)
 
     def start_replay(
-        self, lines: Iterable[bytes] | Path, run: str | None = None, name: str = "replay"
+        self, lines: Iterable[bytes], run: str, name: str = "replay", total: int | None = None
     ) -> str:
         """Work through NDJSON lines in the background; the id under which to ask for progress.
 
-        Every batch goes to `run`, without it to one named as the stem of
-        `name`.  Lines that can be closed are closed at the end.
+        Every batch goes to `run`.  `total` is the number of lines, where it is
+        known.  Lines that can be closed are closed at the end.
         """
-        run = _run_name(run or Path(name).stem)
-        id = self._ids.new()
-        total = None
-        if isinstance(lines, Path):
-            with lines.open("rb") as counted:
-                total = sum(1 for _ in counted)
-            lines = lines.open("rb")
-        row = {"id": id, "run": run, "name": name, "lines_total": total}
+        row = {"id": self._ids.new(), "run": _run_name(run), "name": name, "lines_total": total}
         replay = Replay(self.store, self.submit_many, lambda: now().text, row)
-        self._replays = [each for each in self._replays if each.at_work] + [replay]
+        with self._replays_lock:
+            if self._closing:
+                raise Stopping("the service is stopping")
+            at_work = [each for each in self._replays if not each.is_over]
+            if len(at_work) >= MAX_REPLAYS:
+                raise Busy(f"{len(at_work)} replays are at work", REPLAY_RETRY_S)
+            self._replays = [*at_work, replay]
         replay.start(lines)
-        return id
+        return str(row["id"])
 
     def replay(self, id: str) -> Row:
         """A replay and how far it is, with the lines that were refused."""
@@ -315,13 +328,3 @@ def _run_name(text: str) -> str:
     except ValidationError as error:
         message = str(error.errors()[0]["msg"])
         raise BadBatch(Fault("run", message, shown_value(text))) from None
-
-
-def load_catalog(file: Path | None) -> Catalog:
-    """The site's catalog, or the embedded one; raises `BadConfiguration` where it is damaged."""
-    if file is None:
-        return load_embedded()
-    try:
-        return import_csv(file) if file.suffix.lower() == ".csv" else load(file)
-    except BadFile as error:
-        raise BadConfiguration(f"ACQUIRE_CATALOG: {error}") from None

@@ -36,7 +36,7 @@ class Settings:
         if not 0 <= self.port <= 65535:
             raise _refusal("port", "must be from 0 to 65535", self.port)
         # Nobody is asked who they are, so nobody but this machine may ask.
-        if not _is_loopback(self.host):
+        if not is_loopback(self.host):
             raise _refusal("host", "must be a loopback address, such as 127.0.0.1", self.host)
 
     @classmethod
@@ -76,7 +76,8 @@ def _refusal(field: str, message: str, value: object) -> BadConfiguration:
     return BadConfiguration(f"{PREFIX}{field.upper()}: {message} (got {shown_value(value)})")
 
 
-def _is_loopback(host: str) -> bool:
+def is_loopback(host: str) -> bool:
+    """Whether a name or an address is this machine's own, whoever answers for names."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:

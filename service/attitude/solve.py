@@ -26,7 +26,7 @@ METHODS = ("triad", "quest")
 def solve_attitude(
     observed: Vector,
     reference: Vector,
-    sigma_arcsec: Vector,
+    sigma_rad: Vector,
     tracker_of: npt.NDArray[np.int64],
     trackers: tuple[str, ...],
     method: str = "quest",
@@ -34,14 +34,13 @@ def solve_attitude(
     """The attitude of N matched unit vectors, or the reason for none.
 
     `observed` (N, 3) is in body axes, `reference` (N, 3) inertial, sigma one
-    standard deviation per tangent axis; `tracker_of` (N,) says which of
+    standard deviation per tangent axis in radians; `tracker_of` (N,) says which of
     `trackers` saw each.  `method` (`quest` or `triad`) chooses whose quaternion
     and residuals are the solution's.
     """
     n = len(observed)
     if n < 2:
         return NoAttitude.FEWER_THAN_TWO_UNIQUE_STARS
-    sigma_rad = sigma_arcsec / ARCSEC_PER_RADIAN
     solved = _solved(observed, reference, sigma_rad)
     if solved is None:
         return NoAttitude.DEGENERATE_GEOMETRY
@@ -51,7 +50,9 @@ def solve_attitude(
     square_sum, taste = sums[chosen].tolist()
     freedom = 2 * n - 3
     suspect = taste > taste_bound(freedom)
-    outlier = _outlier(observed, reference, sigma_rad, tracker_of) if suspect else -1
+    outlier = -1
+    if suspect and len(trackers) > 1:
+        outlier = _outlier(observed, reference, sigma_rad, tracker_of)
     triad, quest = quaternions.tolist()
     between = min(math.dist(triad, quest), math.dist(triad, [-part for part in quest]))
     return AttitudeSolution(
@@ -60,7 +61,7 @@ def solve_attitude(
         covariance_arcsec2=read_only(covariance * ARCSEC_PER_RADIAN**2),
         residual_arcsec=read_only(np.sqrt(square) * ARCSEC_PER_RADIAN),
         residual_rms_arcsec=math.sqrt(square_sum / n) * ARCSEC_PER_RADIAN,
-        predicted_rms_arcsec=_predicted_rms_arcsec(sigma_arcsec, freedom),
+        predicted_rms_arcsec=_predicted_rms_arcsec(sigma_rad, freedom),
         taste=taste,
         degrees_of_freedom=freedom,
         suspect=suspect,
@@ -95,11 +96,11 @@ def taste_bound(degrees_of_freedom: int) -> float:
     return float(chdtri(degrees_of_freedom, SUSPECT_TAIL))
 
 
-def _predicted_rms_arcsec(sigma_arcsec: Vector, freedom: int) -> float:
+def _predicted_rms_arcsec(sigma_rad: Vector, freedom: int) -> float:
     # Of the 2 N measured angles the attitude takes up three.
-    n = len(sigma_arcsec)
-    mean_square = float(sigma_arcsec @ sigma_arcsec) / n
-    return math.sqrt(mean_square * freedom / n)
+    n = len(sigma_rad)
+    mean_square = float(sigma_rad @ sigma_rad) / n
+    return math.sqrt(mean_square * freedom / n) * ARCSEC_PER_RADIAN
 
 
 def _tracker_fits(

@@ -208,11 +208,11 @@ def openapi(parsed: Namespace) -> int:
 
 def _mission_and_catalog(name: str) -> "tuple[Mission, Catalog]":
     from service.missions.mission import load_missions, mission_named
-    from service.operations import load_catalog as load_catalog
+    from service.sky.catalog import open_catalog
 
     settings = Settings.from_environment()
     mission = mission_named(load_missions(settings.missions), name)
-    return mission, load_catalog(settings.catalog)
+    return mission, open_catalog(settings.catalog)
 
 
 def _run_catalog(parsed: Namespace) -> "RunCatalog":

@@ -162,10 +162,19 @@ def _catalog(commands: Any) -> None:
         group,
         "build",
         "Build the embedded catalog from its source packages (in a checkout).",
-        "acquire catalog build packages/",
+        """
+        acquire catalog build
+        acquire catalog build downloads/ stars.npz
+        """,
         "catalog_build",
     )
-    build.add_argument("packages", type=Path, help="folder that holds the source packages")
+    build.add_argument(
+        "packages",
+        type=Path,
+        nargs="?",
+        default=Path("packages"),
+        help="folder that holds the source packages; default: ./packages",
+    )
     build.add_argument("output", type=Path, nargs="?", help="default: the checkout's own file")
     load = _command(
         group,
@@ -215,7 +224,7 @@ def _simulate(commands: Any) -> None:
     parser = _command(
         group,
         "telemetry",
-        "Draw a pass from the real catalog: NDJSON (or CSV by the name), the truth in "
+        "Draw a pass from the real sky: NDJSON (or CSV by the name), the truth in "
         "OUT.truth.ndjson beside it.  The same arguments always give the same pass.",
         """
         acquire simulate telemetry --spacecraft XTE --batches 2000 --seed 7 xte.ndjson

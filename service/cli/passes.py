@@ -30,7 +30,13 @@ def add_pass_arguments(parser: ArgumentParser) -> None:
         default="quaternion",
         help="a priori attitude: whole, boresight or sun_pointed only, or either",
     )
-    add("--angles", type=float, default=0.25, metavar="SHARE", help="sent as h_deg, v_deg; 0.25")
+    add(
+        "--angles",
+        type=float,
+        default=0.25,
+        metavar="SHARE",
+        help="sent as h_deg, v_deg; default 0.25",
+    )
     add(
         "--aberration",
         default="to_correct",

@@ -42,6 +42,14 @@ class Buckets:
 
 
 @dataclass(frozen=True)
+class Handed:
+    """When drafts were handed to the writer, and how many together."""
+
+    ns: int
+    drafts: int
+
+
+@dataclass
 class Draft:
     """A result that is computed and not yet recorded.
 
@@ -57,7 +65,7 @@ class Draft:
     solution: Row | None
     buckets: Buckets
     key: str | None
-    solved_ns: int
+    handed: Handed | None = None
 
     @property
     def id(self) -> str:
@@ -70,8 +78,14 @@ class Draft:
         return self.answer["spacecraft"], self.answer["run"], self.answer["batch"]
 
     def finish(self) -> bytes:
-        """The answer's JSON, `timings_us.record` being the time since the solution was there."""
-        self.answer["timings_us"]["record"] = (time.perf_counter_ns() - self.solved_ns) // 1000
+        """The answer's JSON; `timings_us.record` is its share of the time since it was handed on.
+
+        Of many drafts in one transaction none is recorded before the last, so
+        that the whole time would be counted once for each.
+        """
+        if self.handed is not None:
+            waited_ns = time.perf_counter_ns() - self.handed.ns
+            self.answer["timings_us"]["record"] = waited_ns // (1000 * self.handed.drafts)
         return msgspec.json.encode(self.answer)
 
 
@@ -81,7 +95,6 @@ def submission_draft(
     *,
     id: str,
     received: Utc,
-    solved_ns: int,
     key: str | None = None,
 ) -> Draft:
     """The draft of a batch's first result, which is current and gives the batch its id."""
@@ -101,7 +114,7 @@ def submission_draft(
     result = _result_row(
         acquisition, answer, batch_id=id, parent=None, current=True, created=received
     )
-    return _draft(acquisition, answer, row, result, key, solved_ns)
+    return _draft(acquisition, answer, row, result, key)
 
 
 def what_if_draft(
@@ -112,7 +125,6 @@ def what_if_draft(
     parent: str,
     adopt: bool,
     created: Utc,
-    solved_ns: int,
 ) -> Draft:
     """The draft of a further result of a batch, current if it is to be adopted."""
     answer = answer_of(acquisition, id=id, parent=parent)
@@ -120,7 +132,7 @@ def what_if_draft(
     result = _result_row(
         acquisition, answer, batch_id=batch_id, parent=parent, current=adopt, created=created
     )
-    return _draft(acquisition, answer, None, result, None, solved_ns)
+    return _draft(acquisition, answer, None, result, None)
 
 
 def counts_of(result: Row) -> "Counter[str]":
@@ -142,7 +154,6 @@ def _draft(
     batch_row: Row | None,
     result: Row,
     key: str | None,
-    solved_ns: int,
 ) -> Draft:
     batch = acquisition.batch
     stars = [{"result_id": result["id"], **vars(row)} for row in star_rows(acquisition)]
@@ -150,7 +161,7 @@ def _draft(
         batch.spacecraft, batch.run, batch.time.bucket(HOUR_S), batch.time.bucket(DAY_S)
     )
     solution = _solution_row(acquisition, answer, result["id"])
-    return Draft(acquisition, answer, batch_row, result, stars, solution, buckets, key, solved_ns)
+    return Draft(acquisition, answer, batch_row, result, stars, solution, buckets, key)
 
 
 def _result_row(

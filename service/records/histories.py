@@ -25,20 +25,23 @@ def live_state(connection: Connection, mission: Mission, run: str) -> Row:
     """How a spacecraft stands in a run: its newest batch and its newest attitude.
 
     `state` is that of the newest batch: good, suspect, no_attitude, or
-    no_batches.  `attitude` has the time of the batch it belongs to, which may
-    be an older one.
+    no_batches.  `attitude` is that batch's own, or None; `last_attitude` is the
+    newest there is, which may be of an older batch.
     """
     chosen = Stretch(run, mission.name).conditions()
     newest = newest_first(summaries().where(*chosen)).limit(1)
     solved = newest_first(attitudes().where(*chosen, results.c.status.is_not(None))).limit(1)
     batch = connection.execute(newest).mappings().first()
-    attitude = connection.execute(solved).mappings().first()
+    row = connection.execute(solved).mappings().first()
+    last = None if row is None else attitude_of(row)
+    is_latest = batch is not None and last is not None and last["id"] == batch["id"]
     return {
         "name": mission.name,
         "description": mission.description,
         "state": "no_batches" if batch is None else batch["status"] or "no_attitude",
         "latest_batch": None if batch is None else summary_of(batch),
-        "attitude": None if attitude is None else attitude_of(attitude),
+        "attitude": last if is_latest else None,
+        "last_attitude": last,
     }
 
 

@@ -3,6 +3,8 @@
 import dataclasses
 import json
 import logging
+import os
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
@@ -10,20 +12,32 @@ from datetime import UTC, datetime
 import msgspec
 
 from service.acquire import Acquisition, acquire
-from service.errors import AcquisitionError, BadBatch, Busy, Fault, shown_value
+from service.errors import AcquisitionError, BadBatch, Busy, Fault, NotFound, shown_value
 from service.missions.mission import Mission, mission_named
+from service.observe.batch import ObservationBatch
 from service.observe.wire import OptionsIn, Submission, submission_from_json
 from service.records.answer import answer_of
-from service.records.draft import Answered, Draft, Row, submission_draft, what_if_draft
-from service.records.identity import Identity, Taken, look_up, remember_key, stored_answers
+from service.records.draft import Answered, Draft, Handed, Row, submission_draft, what_if_draft
+from service.records.identity import (
+    Identity,
+    Registry,
+    Taken,
+    look_up,
+    remember_key,
+    stored_answers,
+)
 from service.records.ids import Ulids
 from service.records.reading import one_result
 from service.records.running import Running
 from service.records.store import Store
+from service.records.writer import RETRY_AFTER_S
 from service.sky.view import Sky
 from service.times import Utc, parse_utc
 
 MAX_KEY_LENGTH = 255
+
+PROCESSOR_WAIT_S = 5.0
+"""A batch takes a millisecond: whoever waits longer stands behind a pile of the worst ones."""
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +54,7 @@ class Intake:
         self._store = store
         self._ids = Ulids()
         self._running = Running()
+        self._processors = threading.BoundedSemaphore(max(2, os.cpu_count() or 1))
         self.observers: list[Observer] = []
         """Called with the acquisition of every batch that is new, after its commit."""
 
@@ -59,16 +74,15 @@ class Intake:
         """`submit` of each in one transaction; an error stands in the place of what is refused."""
         with self._store.reading() as connection:
             registry = look_up(connection, {identity_of(each) for each in submissions})
-            found: list[Draft | Taken | AcquisitionError] = []
-            for each in submissions:
-                try:
-                    first = registry.first(identity_of(each), None, each.fingerprint)
-                except AcquisitionError as error:
-                    found.append(error)
-                else:
-                    found.append(first or self._draft_or_error(each))
-            repeats = {each.result_id for each in found if isinstance(each, Taken)}
+            holders = [_holder(registry, each) for each in submissions]
+            repeats = {each.result_id for each in holders if isinstance(each, Taken)}
             stored = stored_answers(connection, repeats)
+        # The connection is given back: a moment of the database that is held on to for as long
+        # as five hundred batches take keeps SQLite from ever shortening its log.
+        found = [
+            holder or self._draft_or_error(each)
+            for holder, each in zip(holders, submissions, strict=True)
+        ]
         written = iter(self._write([each for each in found if isinstance(each, Draft)]))
         answers: Answers = []
         for one in found:
@@ -87,8 +101,8 @@ class Intake:
         batch = submission_from_json(parent["input"]).batch
         merged = _merged(json.loads(parent["options"]), options)
         batch = dataclasses.replace(batch, options=merged.to_options())
-        acquisition = acquire(batch, mission_named(self._missions, batch.spacecraft), self._sky)
-        solved_ns = time.perf_counter_ns()
+        mission = mission_named(self._missions, batch.spacecraft)
+        acquisition = self._acquire(batch, mission)
         if not (record or adopt):
             answer = answer_of(acquisition, id=None, parent=id) | {"recorded": False}
             return Answered(None, msgspec.json.encode(answer), replayed=False)
@@ -99,7 +113,6 @@ class Intake:
             parent=id,
             adopt=adopt,
             created=now(),
-            solved_ns=solved_ns,
         )
         return _raised(self._write([draft])[0])
 
@@ -119,27 +132,39 @@ class Intake:
 
     def _draft(self, submission: Submission, key: str | None = None) -> Draft:
         received = now()
-        mission = mission_named(self._missions, submission.batch.spacecraft)
-        acquisition = acquire(submission.batch, mission, self._sky)
-        solved_ns = time.perf_counter_ns()
+        mission = mission_in_input(self._missions, submission.batch.spacecraft)
+        acquisition = self._acquire(submission.batch, mission)
         return submission_draft(
-            submission,
-            acquisition,
-            id=self._ids.new(),
-            received=received,
-            solved_ns=solved_ns,
-            key=key,
+            submission, acquisition, id=self._ids.new(), received=received, key=key
         )
+
+    def _acquire(self, batch: ObservationBatch, mission: Mission) -> Acquisition:
+        if not self._processors.acquire(timeout=PROCESSOR_WAIT_S):
+            raise Busy("every processor is at work on other batches", RETRY_AFTER_S)
+        try:
+            return acquire(batch, mission, self._sky)
+        finally:
+            self._processors.release()
 
     def _draft_or_error(self, submission: Submission) -> Draft | AcquisitionError:
         try:
             return self._draft(submission)
+        except Busy:
+            # Says nothing about the batch: the whole chunk may come again.
+            raise
         except AcquisitionError as error:
             return error
+        except Exception:
+            # A fault of ours in one batch: the others are recorded all the same.
+            log.exception("%s, run %s, batch %s failed", *identity_of(submission))
+            return AcquisitionError("the fault is on the service's side; it is logged")
 
     def _write(self, drafts: Sequence[Draft]) -> Answers:
         if not drafts:
             return []
+        handed = Handed(time.perf_counter_ns(), len(drafts))
+        for draft in drafts:
+            draft.handed = handed
         outcomes = self._store.writer.record(drafts).result()
         answers: Answers = []
         for draft, outcome in zip(drafts, outcomes, strict=True):
@@ -162,6 +187,22 @@ class Intake:
                 log.exception("an observer failed")
 
 
+def mission_in_input(missions: Mapping[str, Mission], name: str) -> Mission:
+    """The mission that an input names; raises `BadBatch` naming the field where there is none."""
+    try:
+        return mission_named(missions, name)
+    except NotFound:
+        there_are = f"there is no such spacecraft; there are {', '.join(sorted(missions))}"
+        raise BadBatch(Fault("spacecraft", there_are, shown_value(name))) from None
+
+
+def _holder(registry: Registry, submission: Submission) -> Taken | AcquisitionError | None:
+    try:
+        return registry.first(identity_of(submission), None, submission.fingerprint)
+    except AcquisitionError as error:
+        return error
+
+
 def identity_of(submission: Submission) -> Identity:
     """What is unique among submissions."""
     batch = submission.batch
@@ -181,8 +222,8 @@ def _merged(own: Row, options: OptionsIn) -> OptionsIn:
 
 
 def _check_key(key: str) -> None:
-    if not (0 < len(key) <= MAX_KEY_LENGTH and key.isprintable()):
-        message = f"must be 1 to {MAX_KEY_LENGTH} printable characters"
+    if not (0 < len(key) <= MAX_KEY_LENGTH and key.isascii() and key.isprintable()):
+        message = f"must be 1 to {MAX_KEY_LENGTH} printable ASCII characters"
         raise BadBatch(Fault("Idempotency-Key", message, shown_value(key)))
 
 

@@ -60,6 +60,7 @@ def whole_record(connection: Connection, id: str) -> Row:
     return {
         "answer": msgspec.json.decode(row["answer"]),
         "input": json.loads(row["input"]),
+        "options": json.loads(row["options"]),
         "current": row["current"],
         "parent": row["parent_id"],
         "what_ifs": [summary_of(each) for each in connection.execute(what_ifs).mappings()],

@@ -6,10 +6,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from sqlalchemy import Connection
+from sqlalchemy.exc import DBAPIError, TimeoutError
 
+from service.errors import Busy
 from service.records.database import bring_up_to_date, require_up_to_date
 from service.records.engines import database_url, reading_engine, writing_engine
-from service.records.writer import Writer
+from service.records.transaction import may_pass
+from service.records.writer import RETRY_AFTER_S, Writer
 
 log = logging.getLogger(__name__)
 
@@ -41,9 +44,20 @@ class Store:
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """A connection that sees one moment of the database and cannot write."""
-        with self._readers.connect() as connection, connection.begin():
-            yield connection
+        """A connection that sees one moment of the database and cannot write.
+
+        Raises `Busy` where the database is out of reach or every reader taken.
+        """
+        try:
+            with self._readers.connect() as connection, connection.begin():
+                yield connection
+        except TimeoutError as error:
+            raise Busy("every connection to the database is in use") from error
+        except DBAPIError as error:
+            if not may_pass(error):
+                raise
+            log.error("the database could not be read: %s", error.orig)
+            raise Busy("the database cannot be read now", RETRY_AFTER_S) from error
 
     def close(self) -> None:
         """Write what is queued, then let go of the database."""
@@ -57,7 +71,7 @@ def _warn_of_old_sqlite() -> None:
     first, last = _WAL_RESET_BUG
     if first <= sqlite3.sqlite_version_info <= last:
         log.warning(
-            "SQLite %s: let one process at a time write to the database; "
-            "two may lose rows before SQLite 3.51.3",
+            "this SQLite (%s) has a known fault when two processes write to one file at the same "
+            "moment, mended in 3.51.3: let one process at a time use the database",
             sqlite3.sqlite_version,
         )

@@ -1,5 +1,6 @@
 """One transaction of the writer: much work at once, and no failure reaches its neighbours."""
 
+import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
@@ -7,7 +8,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from sqlalchemy import Connection
-from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, ProgrammingError
+from sqlalchemy.exc import (
+    DataError,
+    DBAPIError,
+    IntegrityError,
+    InterfaceError,
+    OperationalError,
+    ProgrammingError,
+)
 
 from service.records.draft import Draft
 from service.records.recording import Outcome, record
@@ -94,3 +102,14 @@ def is_of_the_database(error: BaseException) -> bool:
     """Whether an error is the database's, its disk's or its connection's, and no single row's."""
     about_a_row = (IntegrityError, DataError, ProgrammingError)
     return isinstance(error, DBAPIError) and not isinstance(error, about_a_row)
+
+
+def may_pass(error: DBAPIError) -> bool:
+    """Whether the trouble is with the database's disk or connection, and not with what was asked.
+
+    SQLite says of a table that is missing, and of a write through a connection
+    for readers, that they are operational errors too.
+    """
+    code = getattr(error.orig, "sqlite_errorcode", None)
+    ours = code is not None and code & 0xFF in (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_READONLY)
+    return isinstance(error, OperationalError | InterfaceError) and not ours

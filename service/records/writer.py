@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 from sqlalchemy import Connection, Engine
 from sqlalchemy.exc import DBAPIError
 
-from service.errors import Busy
+from service.errors import Busy, Stopping
 from service.records.draft import Draft
 from service.records.transaction import Job, Results, is_of_the_database, transact
 
@@ -58,6 +58,12 @@ class Writer:
         """Queue another change, which is kept whole or not at all, and may be made twice over."""
         return self._put(Job(change=change))
 
+    def require(self) -> None:
+        """Raise `Stopping` unless what is queued will be written."""
+        with self._changed:
+            if self._closing or not self._thread.is_alive():
+                raise Stopping("nothing is written any more: the service must be started again")
+
     def close(self) -> None:
         """Refuse new work, write what is queued, and end the thread."""
         with self._changed:
@@ -70,7 +76,7 @@ class Writer:
         job.done.set_running_or_notify_cancel()
         with self._changed:
             if self._closing:
-                raise Busy("the service is stopping")
+                raise Stopping("the service is stopping")
             # A job that alone is larger than the queue is still taken by an empty one.
             if self._queued and self._queued + job.weight > self._max_queued:
                 raise Busy(f"{self._queued} records are waiting to be written")
@@ -89,19 +95,33 @@ class Writer:
         return jobs
 
     def _run(self) -> None:
-        while jobs := self._take():
-            try:
-                outcomes = self._write(jobs)
-            except Exception as error:
-                log.error("%d pieces of work could not be written: %s", len(jobs), error)
-                for job in jobs:
-                    job.done.set_exception(_told(error))
-                continue
-            for job, outcome in zip(jobs, outcomes, strict=True):
-                if isinstance(outcome, Exception):
-                    job.done.set_exception(outcome)
-                else:
-                    job.done.set_result(outcome)
+        try:
+            while jobs := self._take():
+                self._settle(jobs)
+        finally:
+            # Empty after closing in order; else nobody shall wait for what nobody will write.
+            with self._changed:
+                self._closing = True
+                left = list(self._queue)
+                self._queue.clear()
+            for job in left:
+                job.done.set_exception(Stopping("the writer has ended"))
+
+    def _settle(self, jobs: Sequence[Job]) -> None:
+        try:
+            outcomes = self._write(jobs)
+        except BaseException as error:
+            log.error("%d pieces of work could not be written: %s", len(jobs), _logged(error))
+            for job in jobs:
+                job.done.set_exception(_told(error))
+            if not isinstance(error, Exception):
+                raise
+            return
+        for job, outcome in zip(jobs, outcomes, strict=True):
+            if isinstance(outcome, Exception):
+                job.done.set_exception(outcome)
+            else:
+                job.done.set_result(outcome)
 
     def _write(self, jobs: Sequence[Job], attempt: int = 1) -> list[Any]:
         with self._engine.connect() as connection:
@@ -117,10 +137,21 @@ class Writer:
         return self._write(jobs, attempt + 1)
 
 
-def _told(error: Exception) -> Exception:
-    """The error as those who wait get it: trouble of the database may pass, so it is `Busy`."""
+def _logged(error: BaseException) -> object:
+    """What the log says: of the database's own errors the cause, without the values it was sent."""
+    return error.orig if isinstance(error, DBAPIError) else repr(error)
+
+
+def _told(error: BaseException) -> Exception:
+    """The error as those who wait get it: trouble of the database may pass, so it is `Busy`.
+
+    Its words name files and hosts, which are for the log alone.
+    """
     if isinstance(error, DBAPIError) and is_of_the_database(error):
-        busy = Busy(f"the database cannot be written now: {error.orig}", RETRY_AFTER_S)
-        busy.__cause__ = error
-        return busy
-    return error
+        told: Exception = Busy("the database cannot be written now", RETRY_AFTER_S)
+    elif isinstance(error, Exception):
+        return error
+    else:
+        told = Stopping("the writer has ended")
+    told.__cause__ = error
+    return told

@@ -3,9 +3,9 @@
 import time
 from collections.abc import Iterable
 
-from service.errors import AcquisitionError, Busy
+from service.errors import AcquisitionError, Busy, problem_of
 from service.operations import Operations
-from service.replay.items import Item, Outcome, Pace, Report, problem_of
+from service.replay.items import Item, Outcome, Pace, Report
 
 CHUNK = 500
 """Batches of one transaction: enough to share its cost, few enough to see progress."""

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from service.errors import AcquisitionError, BadInput, Fault, shown_value
+from service.errors import BadInput, Fault, problem_of, problem_of_faults, shown_value
 from service.observe.formats import read_lines
 from service.observe.wire import RunName, Submission, submission_from_json
 from service.times import Utc
@@ -46,8 +46,8 @@ def items_of(files: Sequence[Path], run: str) -> Iterator[Item]:
     for file in files:
         for line in read_lines(file):
             if line.body is None:
-                problem = _problem(() if line.fault is None else (line.fault,))
-                yield Item(file, line.number, None, problem)
+                assert line.fault is not None
+                yield Item(file, line.number, None, problem_of_faults([line.fault]))
                 continue
             try:
                 yield Item(file, line.number, submission_from_json(line.body, run))
@@ -68,23 +68,6 @@ def run_name(files: Sequence[Path], run: str | None) -> str:
         message = "a run has 1 to 64 of A-Z a-z 0-9 _ . : -, a letter or digit first"
         hint = "" if run is not None else "; give --run NAME"
         raise BadInput(Fault(where, message + hint, shown_value(name))) from None
-
-
-def problem_of(error: AcquisitionError) -> Problem:
-    """A refusal as it is reported, the same whichever way the batch went."""
-    if isinstance(error, BadInput):
-        return _problem(error.faults)
-    return {"detail": str(error)}
-
-
-def _problem(faults: tuple[Fault, ...]) -> Problem:
-    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
-    return {
-        "detail": f"{faults[0]}{more}",
-        "errors": [
-            {"field": each.field, "message": each.message, "value": each.value} for each in faults
-        ],
-    }
 
 
 class Pace:

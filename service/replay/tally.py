@@ -1,6 +1,7 @@
 """Keeping count of a replay: results to a file, progress to the terminal, a table at the end."""
 
 import json
+import os
 import sys
 import time
 from collections import Counter
@@ -34,11 +35,13 @@ class Tally:
         progress: bool | None = None,
         title: str | None = None,
     ) -> None:
-        self.several_files = len(files) > 1
         self.new = self.replayed = self.refused = self.attitudes = 0
         self.stars: Counter[str] = Counter()
         self.seconds = 0.0
-        self._results = None if results is None else _opened(results)
+        self._path = results
+        self._results: IO[bytes] | None = None
+        if results is not None:
+            _require_place(results)
         self._bar = tqdm(
             total=_lines_in(files),
             desc=title,
@@ -65,18 +68,23 @@ class Tally:
             self.new += not outcome.replayed
             self._count(msgspec.json.decode(outcome.answer))
             line = outcome.answer
-        if self._results is not None:
-            self._results.write(line + b"\n")
+        self._write(line + b"\n")
         self._bar.update()
+
+    def _write(self, text: bytes) -> None:
+        if self._path is None:
+            return
+        if self._results is None:
+            # Not before there is something to put in its place is an older file given up.
+            self._results = _opened(self._path)
+        self._results.write(text)
 
     def _count(self, answer: dict[str, Any]) -> None:
         self.stars.update(answer["counts"])
         self.attitudes += answer["attitude"] is not None
 
     def _refusal(self, outcome: Outcome) -> dict[str, Any]:
-        # Line numbers alone do not tell which of several files is meant.
-        where: dict[str, Any] = {"file": str(outcome.item.file)} if self.several_files else {}
-        return {**where, "line": outcome.item.number, "problem": outcome.problem}
+        return {"line": outcome.item.number, "problem": outcome.problem}
 
     def _tell(self, outcome: Outcome) -> None:
         if self.refused > MAX_PROBLEMS_SHOWN:
@@ -98,6 +106,8 @@ class Tally:
     ) -> None:
         self.seconds = time.perf_counter() - self._start
         self._bar.close()
+        if error is None:
+            self._write(b"")
         if self._results is not None:
             self._results.close()
 
@@ -118,6 +128,15 @@ class Tally:
 
 def _share(part: int, whole: int) -> str:
     return f"  ({100.0 * part / whole:.2f} %)" if whole else ""
+
+
+def _require_place(path: Path) -> None:
+    """Raise `BadFile` for a place that cannot be written, without touching what is there."""
+    folder = path.absolute().parent
+    place = path if path.exists() else folder
+    if path.is_dir() or not folder.is_dir() or not os.access(place, os.W_OK):
+        why = "is a folder" if path.is_dir() else "the folder is missing or closed to writing"
+        raise BadFile(Fault(str(path), f"cannot be written: {why}"))
 
 
 def _opened(path: Path) -> IO[bytes]:

@@ -41,12 +41,16 @@ def observer_velocity(time: Utc, velocity_km_per_s: npt.ArrayLike | None) -> Vec
     return np.asarray(velocity)
 
 
+def sun_distance_au(time: Utc) -> float:
+    """Distance from Earth to the Sun in astronomical units: near enough for a spacecraft's."""
+    heliocentric, _ = _earth(time)
+    return float(np.linalg.norm(heliocentric["p"]))
+
+
 def apparent(directions: npt.ArrayLike, velocity_c: Vector, time: Utc) -> Vector:
     """Apparent unit vectors of geometric ones (..., 3), aberration applied by `erfa.ab`."""
-    heliocentric, _ = _earth(time)
-    sun_distance_au = float(np.linalg.norm(heliocentric["p"]))
     inverse_lorentz = float(np.sqrt(1.0 - velocity_c @ velocity_c))
-    return np.asarray(ufunc.ab(directions, velocity_c, sun_distance_au, inverse_lorentz))
+    return np.asarray(ufunc.ab(directions, velocity_c, sun_distance_au(time), inverse_lorentz))
 
 
 def sun_direction(time: Utc, position_km: npt.ArrayLike | None) -> Vector:

@@ -46,8 +46,10 @@ def create_app(operations: Operations, limits: Limits = DEFAULT_LIMITS) -> FastA
         try:
             yield
         finally:
-            await anyio.to_thread.run_sync(warming.join)
-            await anyio.to_thread.run_sync(operations.close)
+            # The handlers' own threads may all be at work still.
+            own = anyio.CapacityLimiter(1)
+            await anyio.to_thread.run_sync(warming.join, limiter=own)
+            await anyio.to_thread.run_sync(operations.close, limiter=own)
 
     app = bare_app()
     app.router.lifespan_context = lifespan

@@ -105,14 +105,24 @@ async def json_body(request: Request) -> bytes:
     return b"".join([piece async for piece in pieces])
 
 
-async def ndjson_body(request: Request) -> IO[bytes]:
-    """The file of an NDJSON body, rewound; it has no name and is gone once it is closed."""
+@dataclass(frozen=True)
+class Spooled:
+    """A body in a file, rewound, with its number of lines."""
+
+    file: IO[bytes]
+    lines: int
+
+
+async def ndjson_body(request: Request) -> Spooled:
+    """An NDJSON body; its file has no name and is gone once it is closed."""
     _require_type(request, NDJSON)
     limits = _limits(request)
     file = tempfile.TemporaryFile()  # noqa: SIM115 - whoever reads the lines closes it
+    lines, last = 0, b"\n"
     try:
         async for piece in _pieces(request, limits.replay_bytes, limits.pause_s, limits.replay_s):
             file.write(piece)
+            lines, last = lines + piece.count(b"\n"), piece[-1:] or last
     except BaseException:
         file.close()
         raise
@@ -120,7 +130,8 @@ async def ndjson_body(request: Request) -> IO[bytes]:
         file.close()
         raise BadBatch(Fault("body", "there are no lines; it must hold a batch a line"))
     file.seek(0)
-    return file
+    # A last line without an end is one, too.
+    return Spooled(file, lines + (last != b"\n"))
 
 
 def lines_of(file: IO[bytes], max_bytes: int) -> Iterator[bytes]:

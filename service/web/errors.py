@@ -6,8 +6,10 @@ logged, and its answer says nothing of what is inside.
 
 import json
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
+from typing import Any
 
 from fastapi import FastAPI
 from fastapi.exceptions import RequestValidationError
@@ -25,6 +27,8 @@ from service.errors import (
     KeyReused,
     NotAvailable,
     NotFound,
+    problem_of,
+    problem_of_faults,
     shown_value,
 )
 
@@ -71,24 +75,17 @@ KINDS[NotJson] = Kind(400, "The body is not JSON", "not-json")
 
 
 def problem(
-    request: Request,
-    kind: Kind,
-    detail: str,
-    faults: tuple[Fault, ...] = (),
-    headers: dict[str, str] | None = None,
+    request: Request, kind: Kind, told: Mapping[str, Any], headers: dict[str, str] | None = None
 ) -> Response:
-    """The answer that tells of a problem."""
+    """The answer that tells of a problem: what `told` says, with the kind and the address."""
     content: dict[str, object] = {
         "type": kind.type,
         "title": kind.title,
         "status": kind.status,
-        "detail": detail,
+        "detail": told["detail"],
         "instance": request.url.path,
+        **told,
     }
-    if faults:
-        content["errors"] = [
-            {"field": each.field, "message": each.message, "value": each.value} for each in faults
-        ]
     # ASCII only: a client's text may hold lone surrogates, which UTF-8 cannot carry.
     body = json.dumps(content, ensure_ascii=True, separators=(",", ":"))
     return Response(body, kind.status, headers, media_type=MEDIA_TYPE)
@@ -99,28 +96,21 @@ async def _on_acquisition_error(request: Request, error: Exception) -> Response:
     kind = kind_of(error)
     if kind.status == 500:
         return our_fault(request, error)
-    if isinstance(error, BadInput):
-        return problem(request, kind, _summary(error.faults), error.faults)
     headers = {"Retry-After": str(error.retry_after_s)} if isinstance(error, Busy) else None
-    return problem(request, kind, str(error), headers=headers)
-
-
-def _summary(faults: tuple[Fault, ...]) -> str:
-    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
-    return f"{faults[0]}{more}" if faults else "The input is refused."
+    return problem(request, kind, problem_of(error), headers)
 
 
 async def _on_query_fault(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
-    faults = tuple(
+    faults = [
         Fault(
-            ".".join(str(part) for part in each["loc"][1:]) or str(each["loc"][0]),
+            ".".join(str(part)[:80] for part in each["loc"][1:]) or str(each["loc"][0]),
             str(each["msg"]).removeprefix("Value error, "),
             None if each["type"] == "missing" else shown_value(each["input"]),
         )
         for each in error.errors()
-    )
-    return problem(request, KINDS[BadInput], _summary(faults), faults)
+    ]
+    return problem(request, KINDS[BadInput], problem_of_faults(faults))
 
 
 async def _on_http_error(request: Request, error: Exception) -> Response:
@@ -133,7 +123,7 @@ async def _on_http_error(request: Request, error: Exception) -> Response:
         detail = f"{request.method} does not work here; {headers['Allow']} do"
     if error.status_code == 404 and detail == phrase:
         detail = "There is nothing at this address; the routes are in /api/v1/openapi.json"
-    return problem(request, Kind(error.status_code, phrase), detail, headers=headers)
+    return problem(request, Kind(error.status_code, phrase), {"detail": detail}, headers)
 
 
 def _methods_at(request: Request) -> list[str]:
@@ -152,9 +142,7 @@ def our_fault(request: Request, error: Exception) -> Response:
     """Log an error that nobody foresaw, and answer without a word of what is inside."""
     log.error("%s %s failed", request.method, request.url.path, exc_info=error)
     return problem(
-        request,
-        OUR_FAULT,
-        "The fault is on the service's side; it is logged.",
+        request, OUR_FAULT, {"detail": "The fault is on the service's side; it is logged."}
     )
 
 

@@ -7,20 +7,27 @@ from starlette.requests import Request
 
 from service.errors import BadBatch, Fault, shown_value
 
-MAX_KEY_LENGTH = 255
 
-
-def _idempotency_key(request: Request) -> str | None:
+async def _idempotency_key(request: Request) -> str | None:
     keys = request.headers.getlist("Idempotency-Key")
     if not keys:
         return None
     key = keys[0]
     if len(set(keys)) > 1:
         raise BadBatch(Fault("Idempotency-Key", "must stand there once", shown_value(keys)))
-    if not (1 <= len(key) <= MAX_KEY_LENGTH and key.isascii() and key.isprintable()):
-        message = f"must be 1 to {MAX_KEY_LENGTH} printable ASCII characters"
-        raise BadBatch(Fault("Idempotency-Key", message, shown_value(key)))
     return key
 
 
 IdempotencyKey = Annotated[str | None, Depends(_idempotency_key)]
+
+
+async def _no_idempotency_key(request: Request) -> None:
+    key = request.headers.get("Idempotency-Key")
+    if key is not None:
+        # Taken and not heeded, it would let a client believe that a repeat is harmless.
+        message = "belongs to new batches: a what-if that is recorded twice is there twice"
+        raise BadBatch(Fault("Idempotency-Key", message, shown_value(key)))
+
+
+NO_IDEMPOTENCY_KEY = Depends(_no_idempotency_key)
+"""For a route where a repeat is not the same again."""

@@ -1,4 +1,8 @@
-"""What every handler is given: the operations and the metrics that the app holds."""
+"""What every handler is given: the operations and the metrics that the app holds.
+
+What a handler depends on is asynchronous throughout: it has nothing to wait for
+and need not wait for a thread, which a probe could wait for in vain.
+"""
 
 from typing import Annotated, Any
 
@@ -14,13 +18,13 @@ from service.web.metrics import Metrics
 _JSON = msgspec.json.Encoder()
 
 
-def _operations(request: Request) -> Operations:
+async def _operations(request: Request) -> Operations:
     operations = request.app.state.operations
     assert isinstance(operations, Operations)
     return operations
 
 
-def _metrics(request: Request) -> Metrics:
+async def _metrics(request: Request) -> Metrics:
     metrics = request.app.state.metrics
     assert isinstance(metrics, Metrics)
     return metrics

@@ -16,7 +16,7 @@ _SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5
 
 
 class _Zones(Collector):
-    """The cache of zones, read when asked."""
+    """The cache of zones and run catalogs, read when asked."""
 
     def __init__(self, operations: Operations) -> None:
         self._operations = operations
@@ -24,16 +24,22 @@ class _Zones(Collector):
     def collect(self) -> Iterator[Metric]:
         shelf = self._operations.sky.shelf.state()
         yield CounterMetricFamily(
-            "starid_zone_cache_hits", "Zones that were at hand.", value=shelf.hits
+            "starid_zone_cache_hits", "Zones and run catalogs found in the cache.", value=shelf.hits
         )
         yield CounterMetricFamily(
-            "starid_zone_cache_misses", "Zones that had to be built.", value=shelf.misses
+            "starid_zone_cache_misses",
+            "Zones and run catalogs built.",
+            value=shelf.misses,
         )
         yield CounterMetricFamily(
-            "starid_zone_build_seconds", "Time spent building zones.", value=shelf.build_us / 1e6
+            "starid_zone_build_seconds",
+            "Time spent building them.",
+            value=shelf.build_us / 1e6,
         )
         yield GaugeMetricFamily(
-            "starid_zone_cache_bytes", "Memory the cached zones hold.", value=shelf.nbytes
+            "starid_zone_cache_bytes",
+            "Memory that the cache holds.",
+            value=shelf.nbytes,
         )
 
 

@@ -1,18 +1,24 @@
-"""What happens around every request: HEAD, timing, one header for all, the last resort."""
+"""What happens around every request: whom it is for, HEAD, timing, the last resort."""
 
 import time
 
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.web.errors import our_fault
+from service.settings import is_loopback
+from service.web.errors import Kind, our_fault, problem
 from service.web.metrics import Metrics
+
+NOT_HERE = Kind(421, "This is another host's", "not-this-host")
 
 _NO_SNIFF = (b"x-content-type-options", b"nosniff")
 
 
 class AroundRequests:
     """Times every request, answers HEAD as GET without its body, and forbids type guessing.
+
+    A request for a host of another name is refused: a page elsewhere could let
+    its own name lead to this machine, and would then be let in as this one.
 
     An error that nothing below has answered is answered here; let through, it
     would cost the client its connection.
@@ -43,6 +49,11 @@ class AroundRequests:
         # A scope of its own: the server still sees HEAD and frames the answer accordingly.
         inner = {**scope, "method": "GET"} if is_head else scope
         try:
+            host = _host(inner)
+            if host is not None and not is_loopback(host):
+                told = {"detail": f"the service answers to names of this machine, not to {host!r}"}
+                await problem(Request(inner), NOT_HERE, told)(inner, receive, sent)
+                return
             await self.app(inner, receive, sent)
         except Exception as error:
             if status:
@@ -50,3 +61,14 @@ class AroundRequests:
             await our_fault(Request(inner), error)(inner, receive, sent)
         finally:
             self.metrics.count_request(inner, status, time.perf_counter() - started)
+
+
+def _host(scope: Scope) -> str | None:
+    """The name that a request is for, without its port; None where it names none."""
+    text = next((value for name, value in scope["headers"] if name == b"host"), None)
+    if text is None:
+        return None
+    host: str = text.decode("latin-1")[:255].lower()
+    if host.startswith("["):
+        return host[1:].partition("]")[0]
+    return host.partition(":")[0]

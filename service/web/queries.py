@@ -94,7 +94,7 @@ class RatesQuery(Stretch):
     bucket: Annotated[Bucket, Field(description="The width of a bucket, in UTC.")] = "hour"
 
 
-def _no_query(request: Request) -> None:
+async def _no_query(request: Request) -> None:
     faults = [
         Fault(name[:80], "there is no such parameter here; there is none", shown_value(value))
         for name, value in request.query_params.items()

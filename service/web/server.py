@@ -1,10 +1,14 @@
 """Serving the app with uvicorn, on this machine alone."""
 
+import resource
+
 import uvicorn
 
 from service.operations import Operations
 from service.settings import Settings
 from service.web.app import create_app
+
+MAX_FILES = 4096
 
 GRACE_S = 10
 """How long running requests may still take when the server is told to stop."""
@@ -27,4 +31,19 @@ def serve(settings: Settings) -> None:
         access_log=False,
         server_header=False,
         timeout_graceful_shutdown=GRACE_S,
+        limit_concurrency=_connections(),
     )
+
+
+def _connections() -> int:
+    """How many connections may be open at once; whoever comes beyond that is told 503.
+
+    Without a bound idle connections use up the files that the process may
+    open, and then nobody is told anything.  Half are left to the database.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = MAX_FILES if hard == resource.RLIM_INFINITY else min(hard, MAX_FILES)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+        soft = wanted
+    return max(16, min(MAX_FILES, wanted if soft == resource.RLIM_INFINITY else soft) // 2)

@@ -40,7 +40,7 @@ def solved(observed, reference, sigma_arcsec, trackers=None, method="quest"):
     return solve_attitude(
         np.ascontiguousarray(observed),
         np.ascontiguousarray(reference),
-        sigma,
+        sigma / ARCSEC,
         tracker_of,
         names,
         method,

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import erfa
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
@@ -11,6 +12,7 @@ from service.acquire import acquire
 from service.identify import evidence
 from service.identify.fitting import fit
 from service.identify.identification import Outcome
+from service.identify.matched import aberrate
 from service.identify.scene import Seen, Stars, nearest
 from service.missions.mission import load_missions
 from service.simulate.paper.printed import the_paper
@@ -158,3 +160,14 @@ def test_the_fit_is_wahba_s_optimum(rng):
     u, _, vt = np.linalg.svd((seen.weight[:, None] * observed).T @ direction)
     best = u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
     assert np.abs(t - best).max() * ARCSEC_PER_RADIAN < 1e-4
+
+
+def test_the_compiled_aberration_is_erfa_s(rng):
+    """For any direction and a velocity of Earth's size, to the last digits."""
+    velocity = rng.normal(size=3) * 7e-5
+    directions = unit(rng.normal(size=(200, 3)))
+    expected = erfa.ab(directions, velocity, 0.99, math.sqrt(1.0 - velocity @ velocity))
+    ours = np.empty_like(directions)
+    for direction, apparent in zip(directions, ours, strict=True):
+        aberrate(direction, velocity, 0.99, apparent)
+    assert np.abs(ours - expected).max() < 1e-15

@@ -127,7 +127,7 @@ def test_zones_show_what_is_cached_and_can_be_warmed_and_dropped(operations, mak
     assert operations.drop_zones("XTE") == 1
     assert operations.zones()["items"] == []
     for ask in (operations.drop_zones, lambda name: operations.warm_zones(name, [], time)):
-        with pytest.raises(BadBatch, match="spacecraft: there is no such .*'HST'"):
+        with pytest.raises(BadBatch, match=r"spacecraft: there is no such .*'HST'"):
             ask("HST")
 
 

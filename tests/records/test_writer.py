@@ -170,6 +170,7 @@ def test_a_full_disk_loses_nothing_acknowledged_and_writing_resumes_with_room(
         assert connection.exec_driver_sql("PRAGMA integrity_check").scalar() == "ok"
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_writer_that_ends_leaves_nobody_waiting_and_is_not_ready(operations):
     writer = operations.store.writer
 

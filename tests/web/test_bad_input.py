@@ -75,7 +75,6 @@ WRONG = {
         "options.tolerances.separation_deg",
         "-1",
     ),
-    "a test of bands": ("options", {"tests": {"pole": True}}, "options.tests.pole", "True"),
     "not there yet": ("options", {"identifier": "ptp"}, "options.identifier", "ptp"),
 }
 
@@ -278,7 +277,6 @@ BAD_WHAT_IFS = {
         "options.tolerances.SEPTOL",
     ),
     "not there yet": ({"options": {"identifier": "ptp"}}, "options.identifier"),
-    "a test of bands": ({"options": {"tests": {"pole": True}}}, "options.tests.pole"),
     "a word for a switch": ({"record": "perhaps"}, "record"),
 }
 
@@ -318,7 +316,7 @@ def test_wrong_zones_to_warm_are_named(client, asked, status, field):
     assert any(each["field"].startswith(field) for each in answer.json()["errors"])
 
 
-def test_zones_of_an_unknown_spacecraft_are_a_fault_of_its_field(client):
+def test_zones_and_batches_of_an_unknown_spacecraft_are_a_fault_of_its_field(client):
     asked = {
         "spacecraft": "NOPE",
         "time": "1999-001T00:00:00Z",
@@ -327,6 +325,7 @@ def test_zones_of_an_unknown_spacecraft_are_a_fault_of_its_field(client):
     for answer in (
         client.post("/api/v1/zones", json=asked),
         client.delete("/api/v1/zones?spacecraft=NOPE"),
+        client.get("/api/v1/batches?spacecraft=NOPE"),
     ):
         assert answer.status_code == 422
         assert answer.json()["errors"][0]["field"] == "spacecraft"

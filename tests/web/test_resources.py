@@ -28,7 +28,7 @@ def test_a_spacecraft_shows_its_settings_their_history_and_its_state(client, pos
     assert state["state"] == (state["latest_batch"]["status"] or "no_attitude")
 
 
-def test_a_failed_solve_is_the_present_state_and_the_attitude_keeps_its_own_time(
+def test_a_failed_solve_is_the_present_state_and_no_older_attitude_stands_in_for_it(
     client, post, batch
 ):
     post(batch | {"time": "2020-01-10T12:00:00.000Z"})
@@ -38,7 +38,8 @@ def test_a_failed_solve_is_the_present_state_and_the_attitude_keeps_its_own_time
     state = client.get(f"{API}/spacecraft/XTE").json()
     assert state["state"] == "no_attitude"
     assert state["latest_batch"]["reason"] == "fewer_than_two_unique_stars"
-    assert state["attitude"]["time"] < state["latest_batch"]["time"]
+    assert state["attitude"] is None
+    assert state["last_attitude"]["time"] < state["latest_batch"]["time"]
 
 
 def test_attitudes_come_oldest_first_in_pages(client, full_run):
@@ -163,3 +164,15 @@ def test_a_file_that_is_no_telemetry_is_refused_line_by_line(client, run):
     answer = client.post(f"{API}/replays?run={run}", content=content, headers=NDJSON)
     state = finished(client, answer.headers["Location"])
     assert [each["line"] for each in state["errors"]] == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    ("body", "lines"), [(b"{}\n{}\n", 2), (b"{}\n{}", 2), (b"\n\n{}\n", 3), (b"{}", 1)]
+)
+def test_the_lines_of_a_replay_are_counted_beforehand(client, run, body, lines):
+    headers = {"Content-Type": "application/x-ndjson"}
+    begun = client.post(f"{API}/replays?run={run}", content=body, headers=headers)
+    assert begun.json()["lines"]["total"] == lines
+    while (replay := client.get(begun.headers["Location"]).json())["state"] == "running":
+        time.sleep(0.02)
+    assert replay["lines"]["done"] == lines

@@ -1,5 +1,6 @@
 """The server as a process of its own: where it listens, how it stops, what it keeps."""
 
+import resource
 import signal
 import socket
 import subprocess
@@ -11,6 +12,7 @@ import pytest
 
 from service.errors import BadConfiguration
 from service.settings import Settings
+from service.web.server import _connections
 
 SERVE = """
 import sys
@@ -80,3 +82,11 @@ def test_killed_it_keeps_what_it_acknowledged(process, batch):
     address, _ = process()
     again = httpx.post(f"{address}/api/v1/batches", json=batch, timeout=60)
     assert (again.status_code, again.content) == (200, answer.content)
+
+
+def test_idle_connections_are_bounded_below_the_files_that_may_be_open():
+    """Beyond the bound whoever comes is told so, and is not left without an answer."""
+    soft = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    bound = _connections()
+    assert 16 <= bound <= max(16, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 2)
+    assert resource.getrlimit(resource.RLIMIT_NOFILE)[0] >= soft

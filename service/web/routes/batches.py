@@ -4,7 +4,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path
 from fastapi import Query as InQuery
-from pydantic import Field
+from pydantic import Field, StrictBool
 from starlette.requests import Request
 from starlette.responses import Response
 
@@ -12,7 +12,7 @@ from service.observe.wire import BatchIn, OptionsIn, Wire
 from service.operations import Answered
 from service.web.bodies import JSON, JsonBody, read_model, read_submission
 from service.web.describe import IDEMPOTENCY_KEY, LINK, LOCATION, REPLAYED, Gives, described
-from service.web.headers import IdempotencyKey
+from service.web.headers import NO_IDEMPOTENCY_KEY, IdempotencyKey
 from service.web.holding import Counted, Held, json_response, page_response
 from service.web.queries import NO_QUERY, BatchQuery
 from service.web.schemas.answers import Answer, BatchPage, Record
@@ -28,9 +28,11 @@ class WhatIfIn(Wire):
     options: Annotated[
         OptionsIn, Field(description="In place of what they name of the result's own options.")
     ] = OptionsIn()
-    record: Annotated[bool, Field(description="Keep the result beside the first one.")] = False
+    record: Annotated[StrictBool, Field(description="Keep the result beside the first one.")] = (
+        False
+    )
     adopt: Annotated[
-        bool, Field(description="Keep the result and let it be the current one of its batch.")
+        StrictBool, Field(description="Keep the result and let it be the current one of its batch.")
     ] = False
 
 
@@ -43,7 +45,7 @@ class WhatIfIn(Wire):
             200: Gives("The answer as it was recorded before.", Answer, REPLAYED),
         },
         body=BatchIn,
-        problems=(404, 409, 503),
+        problems=(409, 503),
         parameters=(IDEMPOTENCY_KEY,),
     ),
 )
@@ -77,7 +79,7 @@ def get_batch(id: ResultId, operations: Held) -> Response:
 
 @router.post(
     "/{id}/what-if",
-    dependencies=[NO_QUERY],
+    dependencies=[NO_QUERY, NO_IDEMPOTENCY_KEY],
     **described(
         {
             200: Gives("The answer, which was not recorded.", Answer),

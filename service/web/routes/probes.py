@@ -2,6 +2,7 @@
 
 import logging
 
+import anyio.to_thread
 from fastapi import APIRouter
 from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.responses import PlainTextResponse, Response
@@ -25,10 +26,11 @@ async def livez() -> Response:
 
 
 @router.get("/readyz", **described({200: Gives("Ready.", media_type=TEXT)}, problems=(503,)))
-def readyz(operations: Held) -> Response:
+async def readyz(operations: Held) -> Response:
     """Whether batches can be taken: catalog loaded, database within reach."""
     try:
-        operations.ready()
+        # A thread of its own: those of the handlers may all be at work.
+        await anyio.to_thread.run_sync(operations.ready, limiter=anyio.CapacityLimiter(1))
     except Busy:
         raise
     except Exception as error:

@@ -1,7 +1,8 @@
 """Named runs, and replays of telemetry files into them."""
 
 from contextlib import ExitStack
-from typing import IO, Annotated
+from dataclasses import dataclass
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Path
 from fastapi import Query as InQuery
@@ -10,7 +11,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.observe.wire import BatchIn, RunName
-from service.web.bodies import MAX_JSON_BYTES, lines_of, ndjson_body
+from service.web.bodies import MAX_JSON_BYTES, Spooled, lines_of, ndjson_body
 from service.web.describe import LOCATION, Gives, described
 from service.web.holding import Held, json_response
 from service.web.queries import NO_QUERY, Query
@@ -32,9 +33,17 @@ class _ReplayQuery(Query):
 ReplayQuery = Annotated[_ReplayQuery, InQuery()]
 
 
-async def _telemetry(request: Request, query: ReplayQuery) -> IO[bytes]:
+@dataclass(frozen=True)
+class Sent:
+    """A telemetry file and the run it goes to."""
+
+    run: str
+    body: Spooled
+
+
+async def _telemetry(request: Request, query: ReplayQuery) -> Sent:
     # Asks for the query first, so that no gigabyte is taken in only to refuse its run.
-    return await ndjson_body(request)
+    return Sent(query.run, await ndjson_body(request))
 
 
 @router.get("/runs", dependencies=[NO_QUERY], **described({200: Gives("Every run.", RunList)}))
@@ -51,13 +60,12 @@ def list_runs(operations: Held) -> Response:
         problems=(503,),
     ),
 )
-def start_replay(
-    query: ReplayQuery, file: Annotated[IO[bytes], Depends(_telemetry)], operations: Held
-) -> Response:
+def start_replay(sent: Annotated[Sent, Depends(_telemetry)], operations: Held) -> Response:
     """Take a telemetry file, a batch a line, and work through it in the background."""
     with ExitStack() as on_failure:
-        on_failure.callback(file.close)
-        id = operations.start_replay(lines_of(file, MAX_JSON_BYTES), query.run, name=query.run)
+        on_failure.callback(sent.body.file.close)
+        lines = lines_of(sent.body.file, MAX_JSON_BYTES)
+        id = operations.start_replay(lines, sent.run, name=sent.run, total=sent.body.lines)
         on_failure.pop_all()
     location = {"Location": f"/api/v1/replays/{id}"}
     return json_response(operations.replay(id), 202, location)

@@ -42,7 +42,7 @@ def list_zones(operations: Held) -> Response:
 @router.post(
     "",
     dependencies=[NO_QUERY],
-    **described({200: Gives("The zones, now cached.", ZoneList)}, body=WarmIn, problems=(404,)),
+    **described({200: Gives("The zones, now cached.", ZoneList)}, body=WarmIn),
 )
 def warm_zones(body: JsonBody, operations: Held) -> Response:
     """Build the zones that batches with these a priori attitudes will use."""
@@ -51,7 +51,7 @@ def warm_zones(body: JsonBody, operations: Held) -> Response:
     return json_response({"items": warmed})
 
 
-@router.delete("", **described({200: Gives("How many were dropped.", Dropped)}, problems=(404,)))
+@router.delete("", **described({200: Gives("How many were dropped.", Dropped)}))
 def drop_zones(query: Annotated[DropQuery, InQuery()], operations: Held) -> Response:
     """Drop cached zones; the next batch builds what it needs anew."""
     return json_response({"dropped": operations.drop_zones(query.spacecraft)})

@@ -137,7 +137,9 @@ class Answer(Shape):
     warnings: list[str]
     timings_us: TimingsOut
     provenance: ProvenanceOut
-    parent: Id = Field(default="", description="Of a what-if: the result it was made from.")
+    parent: Id | None = Field(
+        default=None, description="Of a what-if, and only there: the result it was made from."
+    )
     recorded: bool = Field(default=True, description="Of a what-if: whether it was kept.")
 
 
@@ -172,6 +174,10 @@ class Record(Shape):
 
     answer: Answer
     input: BatchIn = Field(description="The batch as it was sent, defaults left out.")
+    options: Settings = Field(
+        description="What this result was asked to do otherwise than its mission; the mission's "
+        "own settings are those of `provenance.mission`."
+    )
     current: bool
     parent: Id | None
     what_ifs: list[Summary]

@@ -36,7 +36,7 @@ class LineProblem(Shape):
     """What is wrong with a line."""
 
     detail: str
-    errors: list[FaultOut]
+    errors: list[FaultOut] = Field(default=[], description="Every fault, field by field.")
 
 
 class RefusedLine(Shape):

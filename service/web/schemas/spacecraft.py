@@ -51,7 +51,10 @@ class SpacecraftRow(Shape):
     )
     latest_batch: Summary | None
     attitude: AttitudeRow | None = Field(
-        description="The latest there is: compare its time with that of the latest batch."
+        description="Of the latest batch; null where that has none, whatever came before."
+    )
+    last_attitude: AttitudeRow | None = Field(
+        description="The latest there is: it may be older than the latest batch, see its time."
     )
 
 

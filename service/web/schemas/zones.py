@@ -29,7 +29,11 @@ class CachedRunCatalog(CacheUse):
 
 
 class ZoneCache(Shape):
-    """The cache: what it holds, least recently used first, and its counters."""
+    """The cache: what it holds, least recently used first, and its counters.
+
+    Every batch asks for its run catalog and for the zone of each tracker; the
+    counters are of both together, those of each thing stand with it.
+    """
 
     items: list[CachedZone]
     run_catalogs: list[CachedRunCatalog]
