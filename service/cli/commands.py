@@ -166,6 +166,7 @@ def simulate_paper(parsed: Namespace) -> int:
         parsed.json,
         processes=parsed.processes,
         plots=parsed.plots,
+        report_path=parsed.report,
     )
     return 0
 

@@ -242,6 +242,7 @@ def _simulate(commands: Any) -> None:
         """
         acquire simulate paper --table 3 --stars 2000
         acquire simulate paper --json rates.json
+        acquire simulate paper --seed 1 2 3 --plots docs/plots --report docs/paper.md
         """,
         "simulate_paper",
     )
@@ -250,6 +251,9 @@ def _simulate(commands: Any) -> None:
     paper.add_argument("--seed", type=int, nargs="+", default=[1], metavar="S", help="default 1")
     paper.add_argument("--json", type=Path, metavar="OUT", help="rates of Tables 2 to 10")
     paper.add_argument("--plots", type=Path, metavar="FOLDER", help="the figures")
+    paper.add_argument(
+        "--report", type=Path, metavar="FILE", help="all of it as a page, instead of printing it"
+    )
     paper.add_argument("--processes", type=count, metavar="N", help="default: one a core")
 
 

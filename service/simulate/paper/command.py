@@ -30,14 +30,16 @@ def run_paper(
     identifiers: Sequence[Identifier] = ZONE_IDENTIFIERS,
     processes: int | None = None,
     plots: Path | None = None,
+    report_path: Path | None = None,
     out: TextIO | None = None,
 ) -> list[Tally]:
     """Print one table, or all, with the paper's numbers and ours; the tallies of Tables 2 to 10.
 
     Each run sees at least `stars` stars for each seed, in whole experiments of
     the paper's size; several seeds are pooled.  `json_path` takes one row per
-    run and identifier, the folder `plots` the pictures.  Raises `BadInput` for
-    a table that the paper has not.
+    run and identifier, the folder `plots` the pictures, `report_path` the
+    document that shows them with every table, instead of printing the tables.
+    Raises `BadInput` for a table that the paper has not.
     """
     wanted = _checked(table, stars, seeds, identifiers)
     out = out or sys.stdout
@@ -47,6 +49,13 @@ def run_paper(
         write_json(tallies, json_path)
     if plots is not None:
         draw([tally for tally in tallies if tally.identifier == PAPER_IDENTIFIER], plots)
+    if report_path is not None:
+        from service.simulate.paper.document import document
+
+        text = document(tallies, seeds, plots or report_path.parent, report_path)
+        report_path.write_text(text, encoding="utf-8")
+        print(report_path, file=out)
+        return tallies
     for identifier in identifiers:
         # What a zone holds is the same whoever identifies in it.
         asked = [n for n in wanted if n not in PROPORTIONS or identifier == identifiers[0]]

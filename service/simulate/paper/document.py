@@ -1,5 +1,6 @@
-"""The part of `docs/verification.md` that holds the service against the paper."""
+"""The document that holds the service against the paper."""
 
+import os.path
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,13 +10,14 @@ from service.simulate.paper.region import differences, is_inside
 from service.simulate.paper.tables import TITLES
 from service.simulate.paper.tally import Tally
 
-_INTRODUCTION = """\
-## Fink & Shoup 1994, side by side
+_RATE_TABLES = range(2, 11)
 
+_INTRODUCTION = """\
 The simulator of the paper, made anew, sends its views through the same code as any batch: a view
 is a batch whose a priori attitude has its boresight (cap) or its pole (band) on the zone's axis.
 Every run of a table sees the same zones, stars and draws, as in the paper; only the errors differ.
-`acquire simulate paper` makes these tables again, with `--seed` and `--stars` of your choice.
+`acquire simulate paper --plots docs/plots --report docs/paper.md` makes this page again, with
+`--seed` and `--stars` of your choice.
 
 How the paper was read, where it leaves a choice:
 
@@ -58,23 +60,34 @@ reference, which we therefore think was made so. A tracker sees the light of bot
 }
 
 
-def section(tallies: Sequence[Tally], seed: int, plots: Path, beside: Path) -> str:
+def document(tallies: Sequence[Tally], seeds: Sequence[int], plots: Path, file: Path) -> str:
     """Markdown: how the paper was read, pictures, Tables 2 to 14, and what differs.
 
     The pictures are those that `plots.draw` made in the folder `plots`, linked
-    as seen from the folder `beside`.  Tables 11 to 14 are measured here and now.
+    as seen from the document's own `file`.  Tables 11 to 14 are measured here
+    and now.  Of the identifiers beyond the paper's, Tables 2 to 10 follow.
     """
     mine = [tally for tally in tallies if tally.identifier == PAPER_IDENTIFIER]
     # The report's own heading would stand where the section's does.
-    tables = report(mine, PAPER_IDENTIFIER, list(TITLES), seed).split("\n", 2)[2]
+    tables = report(mine, PAPER_IDENTIFIER, list(TITLES), seeds[0]).split("\n", 2)[2]
     links = [
-        f"![Rates against errors]({path.relative_to(beside).as_posix()})"
+        f"![Rates against errors]({os.path.relpath(path, file.parent)})"
         for path in (plots / f"{name}.svg" for name in (*PICTURES, PLACES))
         if path.exists()
     ]
-    parts = [_INTRODUCTION, *links, tables]
+    written = (
+        f"Seeds {', '.join(map(str, seeds))}, {len(mine)} runs, from {_least(mine):,} stars each."
+    )
+    parts = ["# The tables of Fink & Shoup 1994", written, _INTRODUCTION, *links, tables]
     if not all(map(is_inside, mine)):
         parts.append(_OUTSIDE)
     differing = {t.run.table for t in mine if not all(rate.agrees for rate in differences(t))}
     parts += [text for table, text in _OTHER_THAN_THE_REFERENCE.items() if table in differing]
+    for identifier in dict.fromkeys(tally.identifier for tally in tallies):
+        if identifier != PAPER_IDENTIFIER:
+            parts.append(report(tallies, identifier, _RATE_TABLES, seeds[0]))
     return "\n\n".join(part.strip() for part in parts) + "\n"
+
+
+def _least(tallies: Sequence[Tally]) -> int:
+    return min((tally.stars for tally in tallies), default=0)
