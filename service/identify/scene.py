@@ -90,6 +90,8 @@ def nearest(p, gate, stars, used, found):  # type: ignore[no-untyped-def]
     face = cells[0]
     found[0] = found[1] = -1
     best = second = 4.0 * math.sin(0.5 * gate) ** 2
+    if cells[4] < cells[3]:
+        return  # beside everything that the face holds
     for u in range(cells[1], cells[2] + 1):
         base = (
             stars.offset[face] + (u - stars.box[face, 0]) * stars.box[face, 3] - stars.box[face, 1]

@@ -171,3 +171,14 @@ def test_the_compiled_aberration_is_erfa_s(rng):
     for direction, apparent in zip(directions, ours, strict=True):
         aberrate(direction, velocity, 0.99, apparent)
     assert np.abs(ours - expected).max() < 1e-15
+
+
+def test_a_look_beside_all_stars_of_a_face_finds_nothing(rng):
+    """A cap's stars span a corner of a face; looks all over the sky stay within the arrays."""
+    direction = from_ra_dec(rng.uniform(20, 25, 40), rng.uniform(30, 35, 40))
+    stars, found = scene_of(direction), np.empty(2, np.int32)
+    for place in unit(rng.normal(size=(3000, 3))):
+        nearest(place, 0.009, stars, np.empty(0, np.int32), found)
+        chord = np.linalg.norm(direction - place, axis=1)
+        expected = int(np.argmin(chord)) if chord.min() < 2 * math.sin(0.0045) else -1
+        assert found[0] == expected
