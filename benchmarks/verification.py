@@ -41,7 +41,8 @@ Written by `python -m benchmarks.verification`; its figures are not edited by ha
 Version {__version__}, Python {platform.python_version()}, seed {seed}{sample}. {verdict}
 
 Every section is also a test: `make test` runs the same comparisons on smaller samples, and
-`make bench` prints them with the timings.
+`make bench` prints them with the timings. The tables of the paper itself, theirs beside ours, are
+in [paper.md](paper.md).
 
 ## The sky
 
