@@ -41,6 +41,7 @@ from service.vectors import Vector, read_only, unit
 
 NORM_TOLERANCE = 1e-3
 MAX_FAULTS_SHOWN = 20
+MAX_NAME_SHOWN = 80
 
 Frame = Literal["EME2000", "ICRF", "GCRF"]
 
@@ -347,7 +348,8 @@ def faults_of(error: ValidationError, prefix: tuple[str, ...] = ()) -> list[Faul
 def _field(location: tuple[str | int, ...]) -> str:
     tags = ("quaternion", "boresight", "sun_pointed")
     parts = [
-        str(part)
+        # A client's own key may be of any length.
+        str(part)[:MAX_NAME_SHOWN]
         for index, part in enumerate(location)
         # The tag of the kind of prior is pydantic's, not a field of the body.
         if not (

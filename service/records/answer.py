@@ -33,9 +33,11 @@ def answer_of(
     *,
     id: str | None,
     parent: str | None = None,
-    record_us: int | None = None,
 ) -> dict[str, Any]:
-    """The answer, ready for JSON; `id` and `record_us` are None for what is not recorded."""
+    """The answer, ready for JSON; `id` is None for what is not recorded.
+
+    The time of recording stays None: it is known when the rows are handed over.
+    """
     batch, provenance = acquisition.batch, acquisition.provenance
     answer: dict[str, Any] = {
         "id": id,
@@ -52,7 +54,7 @@ def answer_of(
         "attitude": None if acquisition.solution is None else _attitude(acquisition.solution),
         "reason": None if acquisition.reason is None else str(acquisition.reason),
         "warnings": list(acquisition.warnings),
-        "timings_us": {**acquisition.timings_us, "record": record_us},
+        "timings_us": {**acquisition.timings_us, "record": None},
         "provenance": {
             "catalog": provenance.catalog,
             "run_catalog": provenance.run_catalog,

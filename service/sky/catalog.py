@@ -22,9 +22,6 @@ from service.sky.catalog_coding import COLUMNS, LABEL, digest_of, pack, unpack
 from service.sky.neighbours import nearest_neighbours
 from service.vectors import Vector, from_ra_dec, read_only
 
-EMBEDDED_LIMIT_MAG = 9.0
-"""The embedded catalog holds the stars of V up to this."""
-
 
 @dataclass(frozen=True, eq=False)
 class Catalog:

@@ -276,3 +276,12 @@ def test_what_is_not_there_yet_says_so():
     assert isinstance(refusal.value, BadInput)
     with pytest.raises(NotAvailable, match=r"options\.identifier"):
         read(changed("options.identifier", "ptp"))
+
+
+def test_a_key_of_any_length_gets_a_message_of_a_few_words():
+    body = {**BATCH, "x" * 1_000_000: 1}
+    with pytest.raises(BadBatch) as refusal:
+        submission_from_json(json.dumps(body))
+    fault = refusal.value.faults[0]
+    assert fault.field == "x" * 80
+    assert len(str(refusal.value)) < 500
