@@ -11,6 +11,12 @@ class NoAttitude(StrEnum):
 
     FEWER_THAN_TWO_UNIQUE_STARS = "fewer_than_two_unique_stars"
     DEGENERATE_GEOMETRY = "degenerate_geometry"
+    FEWER_THAN_THREE_STARS = "fewer_than_three_stars"
+    """Without a prior two stars say nothing."""
+    NO_MATCH = "no_match"
+    """No attitude of the whole sky explains three of the stars."""
+    DOUBTFUL_MATCH = "doubtful_match"
+    """An attitude explains some, but chance or another attitude may as well."""
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,15 @@ TILT_SCALES_DEG = np.array([0.05, 0.2, 1.0, 4.0, 15.0])
 PRIOR_ROTATION, PRIOR_DIRECTION = 0, 1
 
 _LOG_2PI = math.log(2.0 * math.pi)
+LOG_CLUTTER_SPAN = math.log(CLUTTER_SPAN_MAG)
+_LOG_POSITION_SCALES = np.log(POSITION_SCALES)
+_LOG_MAGNITUDE_SCALES = np.log(MAGNITUDE_SCALES_MAG)
+_FEW = 32
+_LOG_JOINT = np.log(MAGNITUDE_SCALES_MAG**2 + np.arange(_FEW + 1)[:, None] * OFFSET_SIGMA_MAG**2)
+"""For up to so many stars the logarithm of t^2 + count sigma^2, worked out once."""
+_LOG_BETA_OF_NONE = (
+    math.lgamma(BETA_CLUTTER) + math.lgamma(BETA_STAR) - math.lgamma(BETA_CLUTTER + BETA_STAR)
+)
 
 
 @njit(cache=True, nogil=True)
@@ -46,7 +55,7 @@ def log_beta(a, b):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def log_clutter(clutter, stars):  # type: ignore[no-untyped-def]
     """Log probability that just these are clutter."""
-    return log_beta(clutter + BETA_CLUTTER, stars + BETA_STAR) - log_beta(BETA_CLUTTER, BETA_STAR)
+    return log_beta(clutter + BETA_CLUTTER, stars + BETA_STAR) - _LOG_BETA_OF_NONE
 
 
 @njit(cache=True, nogil=True)
@@ -74,9 +83,11 @@ def log_positions(stars, square, log_det, reference_sigma_rad):  # type: ignore[
     """The attitude and the positions: Laplace's integral, averaged over the scales of noise."""
     largest = -math.inf
     total = 0.0
-    for factor in POSITION_SCALES:
-        s = factor * reference_sigma_rad
-        term = -stars * (_LOG_2PI + 2.0 * math.log(s)) + 3.0 * math.log(s) - 0.5 * square / (s * s)
+    log_reference = math.log(reference_sigma_rad)
+    for i in range(len(POSITION_SCALES)):
+        s = POSITION_SCALES[i] * reference_sigma_rad
+        log_s = log_reference + _LOG_POSITION_SCALES[i]
+        term = (3 - 2 * stars) * log_s - stars * _LOG_2PI - 0.5 * square / (s * s)
         if term > largest:
             total = total * math.exp(largest - term) + 1.0
             largest = term
@@ -92,17 +103,20 @@ def log_magnitudes(count, total_mag, square_mag2):  # type: ignore[no-untyped-de
         return 0.0
     largest = -math.inf
     total = 0.0
-    for t in MAGNITUDE_SCALES_MAG:
-        for variance in (0.0, OFFSET_SIGMA_MAG**2):
-            joint = t * t + count * variance
-            term = -0.5 * (square_mag2 - variance * total_mag**2 / joint) / (t * t)
-            term += -0.5 * count * _LOG_2PI - (count - 1) * math.log(t) - 0.5 * math.log(joint)
+    for i in range(len(MAGNITUDE_SCALES_MAG)):
+        t, log_t = MAGNITUDE_SCALES_MAG[i], _LOG_MAGNITUDE_SCALES[i]
+        joint = t * t + count * OFFSET_SIGMA_MAG**2
+        log_joint = _LOG_JOINT[count, i] if count <= _FEW else math.log(joint)
+        pull = OFFSET_SIGMA_MAG**2 * total_mag**2 / joint
+        plain = -0.5 * square_mag2 / (t * t) - count * log_t
+        for term in (plain, plain + 0.5 * pull / (t * t) + log_t - 0.5 * log_joint):
             if term > largest:
                 total = total * math.exp(largest - term) + 1.0
                 largest = term
             else:
                 total += math.exp(term - largest)
-    return largest + math.log(total / (2 * len(MAGNITUDE_SCALES_MAG)))
+    shared = -0.5 * count * _LOG_2PI
+    return shared + largest + math.log(total / (2 * len(MAGNITUDE_SCALES_MAG)))
 
 
 @njit(cache=True, nogil=True)
@@ -116,4 +130,4 @@ def log_null(count, with_magnitude):  # type: ignore[no-untyped-def]
     one = log_clutter(count - 1, 1) + math.log(count)
     top = max(none, one)
     both = top + math.log(math.exp(none - top) + math.exp(one - top))
-    return both - with_magnitude * math.log(CLUTTER_SPAN_MAG)
+    return both - with_magnitude * LOG_CLUTTER_SPAN

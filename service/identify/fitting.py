@@ -14,15 +14,20 @@ from service.identify import evidence
 from service.identify.evidence import PRIOR_ROTATION
 from service.sky.pairs import separation_rad
 
+LEAST_SINE2 = 4e-10
+"""Of the angle between the widest pair, four times its squared sine: 2 arcsec."""
+
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fit(seen, stars, match, t, references):  # type: ignore[no-untyped-def]
-    """Fit T to a hypothesis: TRIAD on the widest pair, then two Gauss-Newton steps.
+def fit(seen, stars, match, scratch, steps):  # type: ignore[no-untyped-def]
+    """Fit T to a hypothesis: TRIAD on the widest pair, then Gauss-Newton steps.
 
     Returns the number of stars, the weighted sum of squared residuals and
     ln det N; the number is 0 where the geometry gives no attitude.
-    `references` gets the apparent directions of the matched stars.
+    In `scratch`, `t` gets T, `matrix` N and `references` the apparent directions
+    of the matched stars.
     """
+    t, matrix, inverse, references = scratch.t, scratch.matrix, scratch.inverse, scratch.references
     n = len(match)
     observed = seen.observed
     count = 0
@@ -43,17 +48,18 @@ def fit(seen, stars, match, t, references):  # type: ignore[no-untyped-def]
             continue
         for other in range(k + 1, n):
             if match[other] >= 0:
-                apart = separation_rad(references[k], references[other])
-                apart = min(apart, math.pi - apart)
+                chord2 = 0.0
+                for i in range(3):
+                    chord2 += (references[k, i] - references[other, i]) ** 2
+                # Four times the squared sine: near zero and near a half turn alike.
+                apart = chord2 * (4.0 - chord2)
                 if apart > widest:
                     widest, first, second = apart, k, other
-    if widest < 1e-5 or separation_rad(observed[first], observed[second]) < 1e-5:
+    if widest < LEAST_SINE2 or separation_rad(observed[first], observed[second]) < 1e-5:
         return 0, 0.0, 0.0
     triad(observed[first], observed[second], references[first], references[second], t)
-    matrix = np.empty((3, 3))
-    inverse = np.empty((3, 3))
     square = 0.0
-    for step in range(3):
+    for step in range(steps + 1):
         matrix[:] = 0.0
         g0 = g1 = g2 = square = 0.0
         for k in range(n):
@@ -75,27 +81,33 @@ def fit(seen, stars, match, t, references):  # type: ignore[no-untyped-def]
             matrix[0, 1] -= w * p0 * p1
             matrix[0, 2] -= w * p0 * p2
             matrix[1, 2] -= w * p1 * p2
-        if step == 2:
-            break
         matrix[1, 0], matrix[2, 0], matrix[2, 1] = matrix[0, 1], matrix[0, 2], matrix[1, 2]
+        if step == steps:
+            break
         if not inverse_symmetric(matrix, inverse):
             return 0, 0.0, 0.0
         e0 = inverse[0, 0] * g0 + inverse[0, 1] * g1 + inverse[0, 2] * g2
         e1 = inverse[1, 0] * g0 + inverse[1, 1] * g1 + inverse[1, 2] * g2
         e2 = inverse[2, 0] * g0 + inverse[2, 1] * g1 + inverse[2, 2] * g2
-        _turn(t, e0, e1, e2)
-    det = (
-        matrix[0, 0] * (matrix[1, 1] * matrix[2, 2] - matrix[1, 2] ** 2)
-        - matrix[0, 1] * (matrix[0, 1] * matrix[2, 2] - matrix[1, 2] * matrix[0, 2])
-        + matrix[0, 2] * (matrix[0, 1] * matrix[1, 2] - matrix[1, 1] * matrix[0, 2])
-    )
+        turn(t, e0, e1, e2)
+    det = _determinant(matrix)
     if not det > 0.0:
         return 0, 0.0, 0.0
     return count, square, math.log(det)
 
 
 @njit(cache=True, nogil=True)
-def _turn(t, e0, e1, e2):  # type: ignore[no-untyped-def]
+def _determinant(m):  # type: ignore[no-untyped-def]
+    """Of a symmetric (3, 3)."""
+    return (
+        m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] ** 2)
+        - m[0, 1] * (m[0, 1] * m[2, 2] - m[1, 2] * m[0, 2])
+        + m[0, 2] * (m[0, 1] * m[1, 2] - m[1, 1] * m[0, 2])
+    )
+
+
+@njit(cache=True, nogil=True)
+def turn(t, e0, e1, e2):  # type: ignore[no-untyped-def]
     """T becomes exp(-[e x]) T, by the quaternion (e/2, 1) so that it stays orthonormal."""
     norm = 1.0 / math.sqrt(1.0 + 0.25 * (e0 * e0 + e1 * e1 + e2 * e2))
     x, y, z, c = 0.5 * e0 * norm, 0.5 * e1 * norm, 0.5 * e2 * norm, norm
@@ -125,16 +137,68 @@ def prior_angle(t, axis, kind):  # type: ignore[no-untyped-def]
     return 2.0 * math.asin(min(1.0, 0.5 * math.sqrt(chord2)))
 
 
-@njit(cache=True, nogil=True)
-def weigh(seen, stars, density, match, t, references):  # type: ignore[no-untyped-def]
-    """The log weight of a hypothesis, fitted; T is left in `t`.  `density`: see `log_density`."""
-    count, square, log_det = fit(seen, stars, match, t, references)
+@njit(cache=True, nogil=True, error_model="numpy")
+def weigh(seen, stars, match, scratch):  # type: ignore[no-untyped-def]
+    """The log weight of a hypothesis, fitted; see `fit`."""
+    count, square, log_det = fit(seen, stars, match, scratch, 1)
     if count < 2:
         return -math.inf
+    return log_weight_of(seen, stars, match, scratch.t, count, square, log_det)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def weigh_without(seen, stars, match, k, square, scratch):  # type: ignore[no-untyped-def]
+    """The log weight of a hypothesis, already fitted in `scratch`, when star k of it is clutter.
+
+    The fit is linear within its residuals: what star k brought to N, to the
+    sum of squares and to the gradient, which is zero, is taken away again.
+    `match` has -1 for star k already.
+    """
+    t, matrix, smaller, inverse, turned = (
+        scratch.t,
+        scratch.matrix,
+        scratch.smaller,
+        scratch.inverse,
+        scratch.turned,
+    )
+    w, v, r = seen.weight[k], seen.observed[k], scratch.references[k]
+    count = 0
+    for other in match:
+        if other >= 0:
+            count += 1
+    if count < 2:
+        return -math.inf
+    p0 = t[0, 0] * r[0] + t[0, 1] * r[1] + t[0, 2] * r[2]
+    p1 = t[1, 0] * r[0] + t[1, 1] * r[1] + t[1, 2] * r[2]
+    p2 = t[2, 0] * r[0] + t[2, 1] * r[1] + t[2, 2] * r[2]
+    d0, d1, d2 = v[0] - p0, v[1] - p1, v[2] - p2
+    smaller[0, 0] = matrix[0, 0] - w * (1.0 - p0 * p0)
+    smaller[1, 1] = matrix[1, 1] - w * (1.0 - p1 * p1)
+    smaller[2, 2] = matrix[2, 2] - w * (1.0 - p2 * p2)
+    smaller[0, 1] = smaller[1, 0] = matrix[0, 1] + w * p0 * p1
+    smaller[0, 2] = smaller[2, 0] = matrix[0, 2] + w * p0 * p2
+    smaller[1, 2] = smaller[2, 1] = matrix[1, 2] + w * p1 * p2
+    det = _determinant(smaller)
+    if not det > 0.0 or not inverse_symmetric(smaller, inverse):
+        return -math.inf
+    g0, g1, g2 = w * (d1 * p2 - d2 * p1), w * (d2 * p0 - d0 * p2), w * (d0 * p1 - d1 * p0)
+    e0 = inverse[0, 0] * g0 + inverse[0, 1] * g1 + inverse[0, 2] * g2
+    e1 = inverse[1, 0] * g0 + inverse[1, 1] * g1 + inverse[1, 2] * g2
+    e2 = inverse[2, 0] * g0 + inverse[2, 1] * g1 + inverse[2, 2] * g2
+    left = square - w * (d0 * d0 + d1 * d1 + d2 * d2) - (g0 * e0 + g1 * e1 + g2 * e2)
+    turned[:] = t
+    turn(turned, -e0, -e1, -e2)
+    return log_weight_of(seen, stars, match, turned, count, max(left, 0.0), math.log(det))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def log_weight_of(seen, stars, match, t, count, square, log_det):  # type: ignore[no-untyped-def]
+    """The log weight of a hypothesis of `count` stars from its fit."""
     compared = clutter = 0
-    total = total2 = log_relative = 0.0
+    total = total2 = 0.0
+    log_relative = 0.0
     for k in range(len(match)):
-        if match[k] >= 0:
+        if match[k] >= 0 and seen.weight[k] != 1.0:
             log_relative += math.log(seen.weight[k])
         if np.isnan(seen.magnitude[k]):
             continue
@@ -152,6 +216,26 @@ def weigh(seen, stars, density, match, t, references):  # type: ignore[no-untype
         + log_relative
         + evidence.log_magnitudes(compared, total, total2)
         + evidence.log_clutter(len(match) - count, count)
-        - clutter * math.log(evidence.CLUTTER_SPAN_MAG)
-        - count * density
+        - clutter * evidence.LOG_CLUTTER_SPAN
+        - count * stars.log_density
+    )
+
+
+@njit(cache=True, nogil=True)
+def most_log(seen, stars, count, compared, shift):  # type: ignore[no-untyped-def]
+    """What a hypothesis of `count` stars can weigh at most, but for det N.
+
+    That is without residual, at equal magnitudes; `compared` of its stars have
+    one.  The prior is that of an attitude off by `shift`.  With theta the angle
+    between any two of its stars, det N is at least sin^2 theta.
+    """
+    n = len(seen.observed)
+    clutter = n - np.isnan(seen.magnitude).sum() - compared
+    return (
+        evidence.log_prior(shift, seen.prior_kind)
+        + evidence.log_positions(count, 0.0, 0.0, seen.reference_sigma)
+        + evidence.log_magnitudes(compared, 0.0, 0.0)
+        + evidence.log_clutter(n - count, count)
+        - clutter * evidence.LOG_CLUTTER_SPAN
+        - count * stars.log_density
     )

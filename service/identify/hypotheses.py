@@ -9,8 +9,10 @@ import math
 import numpy as np
 from numba import njit
 
-from service.identify.fitting import fit, weigh
-from service.identify.scene import nearest, within
+from service.identify import evidence
+from service.identify.fitting import fit, log_weight_of, weigh, weigh_without
+from service.identify.scene import within
+from service.sky.star_buckets import nearest
 
 MAX_HYPOTHESES = 2048
 MATCH_GATE = 34.0
@@ -18,8 +20,10 @@ MATCH_GATE = 34.0
 LARGEST_GATE_RAD = 0.009
 NEGLIGIBLE = 18.0
 """A hypothesis lighter than the best by this, in logarithms, is only counted, not kept."""
+NEAR_SIGMAS, NEAR_MAG, RARE = 3.0, 0.5, -6.0
+"""How near a matched star lies that is not tried as clutter, where chance neighbours are rare."""
 RIVAL_PROBABILITY = 1e-3
-"""A star at least this likely is named among the rivals of an ambiguous one."""
+"""A star at least this likely is named among the rivals of one that is not unique."""
 
 
 @njit(cache=True, nogil=True)
@@ -34,6 +38,15 @@ def known(match, ledger, count):  # type: ignore[no-untyped-def]
         if same:
             return True
     return False
+
+
+@njit(cache=True, nogil=True)
+def part_of(match, whole):  # type: ignore[no-untyped-def]
+    """Whether every star of a match is the same in another."""
+    apart = 0
+    for k in range(len(match)):
+        apart += match[k] >= 0 and match[k] != whole[k]
+    return apart == 0
 
 
 @njit(cache=True, nogil=True)
@@ -62,89 +75,141 @@ def keep(match, value, ledger, log_weight, count, rest):  # type: ignore[no-unty
 
 
 @njit(cache=True, nogil=True)
-def consider(seen, stars, density, match, ledger, log_weight, count, rest):  # type: ignore[no-untyped-def]
+def consider(seen, stars, match, scratch, ledger, log_weight, count, rest, best):  # type: ignore[no-untyped-def]
     """Fit a hypothesis, match all stars anew at its attitude, weigh it and what stands next to it.
 
-    Next to it stand the hypotheses without one of its stars, and with a star's
-    second-nearest neighbour in its place.
+    Next to it stand the hypotheses without one of its stars, unless that one
+    sits well, and with a star's second-nearest neighbour in its place.  Returns
+    the number of hypotheses, the rest, the heaviest and the work, in stars
+    looked up or fitted.
     """
     n = len(match)
-    t, references = np.empty((3, 3)), np.empty((n, 3))
-    if fit(seen, stars, match, t, references)[0] == 0:
-        return count, rest
-    p, found = np.empty(3), np.empty(2, np.int32)
-    second = np.full(n, -1, np.int32)
-    fresh = np.full(n, -1, np.int32)
+    matched, square, log_det = fit(seen, stars, match, scratch, 1)
+    if matched == 0:
+        return count, rest, best, n
+    fresh, second = scratch.fresh, scratch.second
+    _match_at(seen, stars, scratch.t, fresh, second)
+    if known(fresh, ledger, count):
+        return count, rest, best, 2 * n
+    if not (part_of(fresh, match) and part_of(match, fresh)):
+        matched, square, log_det = fit(seen, stars, fresh, scratch, 1)
+        if matched < 2:
+            return count, rest, best, 3 * n
+    base = log_weight_of(seen, stars, fresh, scratch.t, matched, square, log_det)
+    count, rest = keep(fresh, base, ledger, log_weight, count, rest)
+    best = max(best, base)
+    work = 3 * n
+    if base < max(best, rest) - NEGLIGIBLE:
+        return count, rest, best, work
     for k in range(n):
+        if fresh[k] < 0 or _sits_well(seen, stars, fresh, k, scratch):
+            continue
+        mine = fresh[k]
+        fresh[k] = -1
+        if not known(fresh, ledger, count):
+            value = weigh_without(seen, stars, fresh, k, square, scratch)
+            count, rest = keep(fresh, value, ledger, log_weight, count, rest)
+            best = max(best, value)
+            work += 1
+        fresh[k] = mine
+    for k in range(n):
+        if fresh[k] < 0 or second[k] < 0 or np.any(fresh == second[k]):
+            continue
+        mine = fresh[k]
+        fresh[k] = second[k]
+        if not known(fresh, ledger, count):
+            # This fits anew: nothing below may need the fit of the hypothesis itself.
+            value = weigh(seen, stars, fresh, scratch)
+            count, rest = keep(fresh, value, ledger, log_weight, count, rest)
+            best = max(best, value)
+            work += n
+        fresh[k] = mine
+    return count, rest, best, work
+
+
+@njit(cache=True, nogil=True)
+def _sits_well(seen, stars, match, k, scratch):  # type: ignore[no-untyped-def]
+    """Whether a star fits so well, in place and magnitude, that it can hardly be clutter.
+
+    Chance puts a star of the zone within the widest scale of noise with the
+    probability rho 2 pi s^2; where that is as rare as e^-6, the hypothesis
+    without this star weighs less than about e^-8 of the one with it.
+    """
+    widest = evidence.POSITION_SCALES[-1] * seen.reference_sigma
+    if stars.log_density + math.log(2.0 * math.pi * widest * widest) > RARE:
+        return False
+    # False where there is no magnitude, as with any comparison with NaN.
+    if abs(seen.magnitude[k] - stars.magnitude[match[k]]) > NEAR_MAG:
+        return False
+    t, r, v = scratch.t, scratch.references[k], seen.observed[k]
+    square = 0.0
+    for i in range(3):
+        square += (v[i] - t[i, 0] * r[0] - t[i, 1] * r[1] - t[i, 2] * r[2]) ** 2
+    return square < (NEAR_SIGMAS * seen.sigma_rad[k]) ** 2
+
+
+@njit(cache=True, nogil=True)
+def _match_at(seen, stars, t, first, second):  # type: ignore[no-untyped-def]
+    """Match every observed star at an attitude: its nearest zone star, and the second-nearest."""
+    n = len(seen.observed)
+    p = np.empty(3)
+    first[:] = -1
+    second[:] = -1
+    for k in range(n):
+        norm = 0.0
         for j in range(3):
             p[j] = (
                 t[0, j] * seen.observed[k, 0]
                 + t[1, j] * seen.observed[k, 1]
                 + t[2, j] * seen.observed[k, 2]
+                - seen.velocity[j]
             )
-        norm = 0.0
-        for j in range(3):
-            p[j] -= seen.velocity[j]
             norm += p[j] * p[j]
         norm = math.sqrt(norm)
-        for j in range(3):
-            p[j] /= norm
         gate = min(MATCH_GATE * seen.sigma_rad[k], LARGEST_GATE_RAD)
-        nearest(p, gate, stars, fresh[:k], found)
-        if found[0] >= 0 and within(found[0], stars):
-            fresh[k] = found[0]
-        if found[1] >= 0 and within(found[1], stars):
-            second[k] = found[1]
-    if known(fresh, ledger, count):
-        return count, rest
-    base = weigh(seen, stars, density, fresh, t, references)
-    count, rest = keep(fresh, base, ledger, log_weight, count, rest)
-    if base < rest - NEGLIGIBLE:
-        return count, rest
-    for k in range(n):
-        if fresh[k] < 0:
-            continue
-        mine = fresh[k]
-        for other in (np.int32(-1), second[k]):
-            taken = False
-            for x in range(n):
-                if other >= 0 and fresh[x] == other:
-                    taken = True
-            if taken:
-                continue
-            fresh[k] = other
-            if not known(fresh, ledger, count):
-                value = weigh(seen, stars, density, fresh, t, references)
-                count, rest = keep(fresh, value, ledger, log_weight, count, rest)
-            if second[k] == -1:
-                break
-        fresh[k] = mine
-    return count, rest
+        one, other = nearest(
+            p[0] / norm,
+            p[1] / norm,
+            p[2] / norm,
+            gate,
+            stars.grid_start,
+            stars.grid_rows,
+            stars.grid_direction,
+            first,
+            k,
+        )
+        if one >= 0 and within(one, stars):
+            first[k] = one
+        if other >= 0 and within(other, stars):
+            second[k] = other
 
 
 @njit(cache=True, nogil=True)
-def marginals(ledger, log_weight, count, rest, star, probability, none, rivals):  # type: ignore[no-untyped-def]
+def marginals(ledger, log_weight, count, rest, star, probability, none, rivals, likely):  # type: ignore[no-untyped-def]
     """Per star: the likeliest zone row, its probability, that of no star, and all rows in question.
 
-    `rivals` (n, R) gets the rows by falling probability, -1 beyond the last.
+    `rivals` (n, R) gets the rows by falling probability, -1 beyond the last,
+    `likely` (n, R) their probabilities.
     """
     n, room = rivals.shape
     top = rest
     for h in range(count):
         top = max(top, log_weight[h])
-    total = math.exp(rest - top)
+    weight = np.empty(count)
+    unknown = math.exp(rest - top)
+    total = unknown
     for h in range(count):
-        total += math.exp(log_weight[h] - top)
+        weight[h] = math.exp(log_weight[h] - top)
+        total += weight[h]
     rows = np.empty(count + 1, np.int64)
     share = np.empty(count + 1)
     for k in range(n):
         different = 0
-        nothing = math.exp(rest - top)
+        nothing = unknown
         for h in range(count):
-            w = math.exp(log_weight[h] - top)
             row = ledger[h, k]
             if row < 0:
-                nothing += w
+                nothing += weight[h]
                 continue
             at = 0
             while at < different and rows[at] != row:
@@ -152,14 +217,22 @@ def marginals(ledger, log_weight, count, rest, star, probability, none, rivals):
             if at == different:
                 rows[at], share[at] = row, 0.0
                 different += 1
-            share[at] += w
+            share[at] += weight[h]
         none[k] = nothing / total
         star[k], probability[k] = -1, 0.0
-        ranked = np.argsort(-share[:different])
-        for at in range(room):
-            rivals[k, at] = -1
-            if at < different and share[ranked[at]] / total >= RIVAL_PROBABILITY:
-                rivals[k, at] = rows[ranked[at]]
-        if different:
-            star[k] = rows[ranked[0]]
-            probability[k] = share[ranked[0]] / total
+        for rank in range(room):
+            rivals[k, rank], likely[k, rank] = -1, 0.0
+            best = -1
+            for at in range(different):
+                if share[at] >= 0.0 and (best < 0 or share[at] > share[best]):
+                    best = at
+            if best < 0:
+                continue
+            chance = share[best] / total
+            if rank == 0:
+                star[k], probability[k] = rows[best], chance
+            if chance >= RIVAL_PROBABILITY:
+                rivals[k, rank], likely[k, rank] = rows[best], chance
+                share[best] = -1.0
+            else:
+                different = 0

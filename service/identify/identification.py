@@ -31,9 +31,13 @@ class Identification:
 
     `star` is the row in the run catalog of the unique winner, -1 without one.
     `votes` and `runner_up` are STARID's highest and second-highest tallies,
-    equal in a tie.  `rivals` are the tied rows of an ambiguous star, brightest
-    first.  `probability` is NaN where the identifier gives none.  `bounded`: the
-    search ended at the most work allowed, and what it did not see may rival.
+    equal in a tie.  `rivals` are the rows that a star without a winner may be:
+    the tied ones, brightest first, or where the identifier gives probabilities
+    all that are likely enough, by falling `rival_probability`.  `probability`,
+    NaN where the identifier gives none, is that of the winner, of an ambiguous
+    star's first rival, or that an unmatched star is none of the catalog's.
+    `bounded`: the search ended at the most work allowed, and what it did not
+    see may rival.
     """
 
     outcome: Integers
@@ -42,9 +46,22 @@ class Identification:
     runner_up: Integers
     rivals: tuple[tuple[int, ...], ...]
     probability: Vector
+    rival_probability: tuple[tuple[float, ...], ...] = ()
     bounded: bool = False
 
     @cached_property
     def unique(self) -> npt.NDArray[np.bool_]:
         """Mask of the stars with a unique winner."""
         return np.asarray(self.outcome == Outcome.UNIQUE)
+
+
+def nothing_known(n: int) -> Identification:
+    """The identification of n stars for which there was nowhere to look: all unmatched."""
+    return Identification(
+        outcome=np.full(n, int(Outcome.UNMATCHED)),
+        star=np.full(n, -1),
+        votes=np.zeros(n, np.int64),
+        runner_up=np.zeros(n, np.int64),
+        rivals=((),) * n,
+        probability=np.full(n, np.nan),
+    )

@@ -12,7 +12,6 @@ import numpy as np
 from numba import njit
 
 from service.sky.pairs import separation_rad
-from service.sky.star_grid import cells_about
 
 
 class Seen(NamedTuple):
@@ -36,18 +35,19 @@ class Stars(NamedTuple):
     """The zone's stars (m) with their grid, and the exact bounds on the angle to its axis.
 
     `polar` (m,) keeps that angle once it was worked out; -1: not yet.
+    `log_density` is the logarithm of the stars within the bounds per steradian.
     """
 
     direction: Any
     magnitude: Any
-    box: Any
-    offset: Any
-    start: Any
-    rows: Any
+    grid_start: Any
+    grid_rows: Any
+    grid_direction: Any
     axis: Any
     least: Any
     most: Any
     polar: Any
+    log_density: Any
 
 
 class Pairs(NamedTuple):
@@ -60,6 +60,50 @@ class Pairs(NamedTuple):
     bins_per_rad: Any
 
 
+class Scratch(NamedTuple):
+    """Arrays that a search of n stars writes to again and again, so as to allocate them once."""
+
+    match: Any
+    used: Any
+    fresh: Any
+    second: Any
+    order: Any
+    parts: Any
+    gate: Any
+    references: Any
+    t: Any
+    turned: Any
+    matrix: Any
+    smaller: Any
+    inverse: Any
+    most: Any
+    light: Any
+
+
+@njit(cache=True, nogil=True)
+def scratch_for(n):  # type: ignore[no-untyped-def]
+    """The arrays for n stars; `most` is not worked out yet (NaN)."""
+    rows = np.full((4, n), -1, np.int32)
+    squares = np.empty((5, 3, 3))
+    return Scratch(
+        rows[0],
+        rows[1],
+        rows[2],
+        rows[3],
+        np.empty(n, np.int64),
+        np.empty((n, 3)),
+        np.empty(n),
+        np.empty((n, 3)),
+        squares[0],
+        squares[1],
+        squares[2],
+        squares[3],
+        squares[4],
+        np.full(n + 1, np.nan),
+        np.empty(n + 1, np.int64),
+    )
+
+
 @njit(cache=True, nogil=True)
 def within(row, stars):  # type: ignore[no-untyped-def]
     """Whether a zone star lies within the exact bounds."""
@@ -69,49 +113,14 @@ def within(row, stars):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def log_density(stars):  # type: ignore[no-untyped-def]
-    """Logarithm of the zone's stars per steradian."""
+def log_density(direction, axis, least, most):  # type: ignore[no-untyped-def]
+    """Logarithm of the stars per steradian between two angles from an axis."""
     inside = 0
-    inner, outer = math.cos(stars.least), math.cos(stars.most)
-    for row in range(len(stars.direction)):
-        r = stars.direction[row]
-        cosine = r[0] * stars.axis[0] + r[1] * stars.axis[1] + r[2] * stars.axis[2]
+    inner, outer = math.cos(least), math.cos(most)
+    for row in range(len(direction)):
+        r = direction[row]
+        cosine = r[0] * axis[0] + r[1] * axis[1] + r[2] * axis[2]
         if outer <= cosine <= inner:
             inside += 1
     area = 2.0 * math.pi * (inner - outer)
     return math.log(max(inside, 1) / area)
-
-
-@njit(cache=True, nogil=True)
-def nearest(p, gate, stars, used, found):  # type: ignore[no-untyped-def]
-    """The two unused stars nearest to a direction within `gate`; -1 where there is none."""
-    cells = np.empty(5, np.int64)
-    cells_about(p, gate, stars.box, cells)
-    face = cells[0]
-    found[0] = found[1] = -1
-    best = second = 4.0 * math.sin(0.5 * gate) ** 2
-    if cells[4] < cells[3]:
-        return  # beside everything that the face holds
-    for u in range(cells[1], cells[2] + 1):
-        base = (
-            stars.offset[face] + (u - stars.box[face, 0]) * stars.box[face, 3] - stars.box[face, 1]
-        )
-        for at in range(stars.start[base + cells[3]], stars.start[base + cells[4] + 1]):
-            row = stars.rows[at]
-            x = stars.direction[row, 0] - p[0]
-            y = stars.direction[row, 1] - p[1]
-            z = stars.direction[row, 2] - p[2]
-            chord2 = x * x + y * y + z * z
-            if chord2 >= second:
-                continue
-            taken = False
-            for other in used:
-                if other == row:
-                    taken = True
-            if taken:
-                continue
-            if chord2 < best:
-                second, found[1] = best, found[0]
-                best, found[0] = chord2, row
-            else:
-                second, found[1] = chord2, row

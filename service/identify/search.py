@@ -6,8 +6,10 @@ not gated by steps 1 to 10: the prior and the magnitudes weigh, they do not
 reject.
 
 Pairs are scanned so that single stars grow into groups, the cheapest cross
-pairs first.  With g groups left, a hypothesis that was not seen matches at most
-one star of each, g in all: at two groups all those of three stars are seen.
+pairs first.  A hypothesis with two stars of one group has been seen when the
+group grew together.  So a scan looks only for stars of other groups, and with
+g groups left what was not seen matches at most one star of each, g in all: at
+two groups all those of three stars are seen.
 """
 
 import math
@@ -16,15 +18,14 @@ import numpy as np
 from numba import njit
 
 from service.identify import evidence
-from service.identify.hypotheses import LARGEST_GATE_RAD, consider, known
-from service.identify.scene import log_density, nearest, within
+from service.identify.hypotheses import log_sum
+from service.identify.scan import PREDICTION_GATE, most_of, scan
+from service.identify.scene import scratch_for
 from service.identify.two_stars import MAX_WORK, two_stars
 from service.sky.pairs import separation_rad
 
 MAX_SEEDS = 12
 """Pairs of at most so many stars, the brightest, are scanned; all are matched."""
-PREDICTION_GATE = 20.0
-"""In sigmas: how far a star may lie from where a pair of others puts it."""
 SHORT_PAIR_RAD = math.radians(0.35)
 CHANCE_PER_STAR, CHANCE_MARGIN = math.log(3.0), 12.0
 """Stop early once a hypothesis of three stars or more outweighs the null by 3^n e^12.
@@ -32,13 +33,14 @@ CHANCE_PER_STAR, CHANCE_MARGIN = math.log(3.0), 12.0
 Only after a whole observed pair: the stars of an empty sky may stand so evenly
 that a half turn matches four of them, and it is found first as often as not.
 """
+SETTLED = 10.0
+"""Exhaustive, stop once all that was not seen is lighter than the best by this, in logarithms."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def search(seen, stars, pairs, exhaustive, ledger, log_weight):  # type: ignore[no-untyped-def]
     """Search and weigh: the number of hypotheses, the rest, the work, whether it was bounded."""
     n = len(seen.observed)
-    density = log_density(stars)
     with_magnitude = n - np.isnan(seen.magnitude).sum()
     rest = evidence.log_null(n, with_magnitude)
     enough = rest + n * CHANCE_PER_STAR + CHANCE_MARGIN
@@ -46,9 +48,13 @@ def search(seen, stars, pairs, exhaustive, ledger, log_weight):  # type: ignore[
     count = work = 0
     seeds = _seeds(seen.magnitude)
     s = len(seeds)
+    scratch = scratch_for(n)
     first_pair, last_pair, separation = _candidates(seen, seeds, pairs)
     group = np.arange(s)
-    for _ in range(s - 2):
+    # By observed star; those that are no seeds are each by themselves.
+    group_of = np.arange(s, s + n)
+    group_of[seeds] = group
+    for groups in range(s, 2, -1):
         left, right = _cheapest(group, first_pair, last_pair, separation)
         for x in range(s):
             for y in range(x + 1, s):
@@ -57,23 +63,24 @@ def search(seen, stars, pairs, exhaustive, ledger, log_weight):  # type: ignore[
                 )
                 if not joins or first_pair[x, y] >= last_pair[x, y]:
                     continue
-                before = count
-                count, rest, work = _scan(
+                count, rest, best, work = scan(
                     seen,
                     stars,
                     pairs,
-                    density,
+                    group_of,
                     seeds[x],
                     seeds[y],
                     first_pair[x, y],
                     last_pair[x, y],
+                    math.inf if exhaustive else enough,
+                    scratch,
                     ledger,
                     log_weight,
                     count,
                     rest,
+                    best,
                     work,
                 )
-                best = max(best, log_weight[before:count].max() if count > before else best)
                 if best > enough and not exhaustive:
                     return count, rest, work, False
                 if work >= MAX_WORK:
@@ -81,13 +88,20 @@ def search(seen, stars, pairs, exhaustive, ledger, log_weight):  # type: ignore[
         for x in range(s):
             if group[x] == right:
                 group[x] = left
+        group_of[seeds] = group
+        if best > enough:
+            unseen = _most_unseen(
+                seen, stars, groups - 1, group, first_pair, last_pair, separation, scratch
+            )
+            if unseen < best - SETTLED:
+                return count, log_sum(rest, unseen), work, False
     if best > enough:
         return count, rest, work, False
     return two_stars(
         seen,
         stars,
         pairs,
-        density,
+        scratch,
         seeds,
         first_pair,
         last_pair,
@@ -99,54 +113,35 @@ def search(seen, stars, pairs, exhaustive, ledger, log_weight):  # type: ignore[
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _scan(  # type: ignore[no-untyped-def]
-    seen, stars, pairs, density, i, j, first, last, ledger, log_weight, count, rest, work
+@njit(cache=True, nogil=True)
+def _most_unseen(  # type: ignore[no-untyped-def]
+    seen, stars, groups, group, first_pair, last_pair, separation, scratch
 ):
-    """Try every candidate pair in the place of observed stars i and j, either way round."""
-    n = len(seen.observed)
-    match = np.full(n, -1, np.int32)
-    used = np.full(n, -1, np.int32)
-    found, p = np.empty(2, np.int32), np.empty(3)
-    order, parts, gate, others = _predictors(seen, i, j)
-    for c in range(first, last):
-        work += others
-        for swap in range(2):
-            a, b = pairs.brighter[c], pairs.dimmer[c]
-            if swap == 1:
-                a, b = b, a
-            u, v = stars.direction[a], stars.direction[b]
-            w0 = u[1] * v[2] - u[2] * v[1]
-            w1 = u[2] * v[0] - u[0] * v[2]
-            w2 = u[0] * v[1] - u[1] * v[0]
-            match[:] = -1
-            match[i], match[j] = a, b
-            used[0], used[1] = a, b
-            matched = 2
-            for k in order[:others]:
-                alpha, beta, gamma = parts[k]
-                p[0] = alpha * u[0] + beta * v[0] + gamma * w0
-                p[1] = alpha * u[1] + beta * v[1] + gamma * w1
-                p[2] = alpha * u[2] + beta * v[2] + gamma * w2
-                nearest(p, gate[k], stars, used[:matched], found)
-                if found[0] >= 0 and within(found[0], stars):
-                    match[k] = found[0]
-                    used[matched] = found[0]
-                    matched += 1
-            if matched < 3 or not (within(a, stars) and within(b, stars)):
-                continue
-            if known(match, ledger, count):
-                continue
-            count, rest = consider(seen, stars, density, match, ledger, log_weight, count, rest)
-            work += n * n
-        if work >= MAX_WORK:
-            break
-    return count, rest, work
+    """What all hypotheses can weigh that have at most one star of each group.
+
+    Each holds a candidate of a pair across groups, either way round; a third
+    star that it predicts is rarely more than one.
+    """
+    s = len(group)
+    candidates = 0
+    least = math.pi
+    for x in range(s):
+        for y in range(x + 1, s):
+            if group[x] != group[y]:
+                candidates += 2 * (last_pair[x, y] - first_pair[x, y])
+                least = min(least, separation[x, y])
+    sine = math.sin(least)
+    if sine <= 0.0:
+        return math.inf
+    count = groups + len(seen.observed) - s
+    return most_of(count, seen, stars, scratch.most) - math.log(sine) + math.log(max(candidates, 1))
 
 
 @njit(cache=True, nogil=True)
 def _seeds(magnitude):  # type: ignore[no-untyped-def]
     """The stars whose pairs are scanned: all, or the brightest; those without a magnitude last."""
+    if len(magnitude) <= MAX_SEEDS:
+        return np.arange(len(magnitude))
     ranked = np.argsort(np.where(np.isnan(magnitude), 99.0, magnitude), kind="mergesort")
     return np.sort(ranked[:MAX_SEEDS])
 
@@ -205,47 +200,3 @@ def _cheapest(group, first, last, separation):  # type: ignore[no-untyped-def]
             if 0.0 <= cost[low, high] < least:
                 least, left, right = cost[low, high], low, high
     return left, right
-
-
-@njit(cache=True, nogil=True)
-def _predictors(seen, i, j):  # type: ignore[no-untyped-def]
-    """Write every other star as alpha V_i + beta V_j + gamma V_i x V_j, the best fixed first.
-
-    A catalog pair (a, b) in the place of (i, j) then puts it at
-    alpha a + beta b + gamma a x b, without an attitude.
-    """
-    observed, sigma_rad = seen.observed, seen.sigma_rad
-    n = len(observed)
-    order, parts, gate = np.empty(n, np.int64), np.empty((n, 3)), np.empty(n)
-    vi, vj = observed[i], observed[j]
-    cosine = vi[0] * vj[0] + vi[1] * vj[1] + vi[2] * vj[2]
-    c0 = vi[1] * vj[2] - vi[2] * vj[1]
-    c1 = vi[2] * vj[0] - vi[0] * vj[2]
-    c2 = vi[0] * vj[1] - vi[1] * vj[0]
-    sine2 = c0 * c0 + c1 * c1 + c2 * c2
-    others = 0
-    if sine2 <= 0.0:
-        return order, parts, gate, others
-    for k in range(n):
-        if k in (i, j):
-            continue
-        v = observed[k]
-        di = v[0] * vi[0] + v[1] * vi[1] + v[2] * vi[2]
-        dj = v[0] * vj[0] + v[1] * vj[1] + v[2] * vj[2]
-        alpha = (di - cosine * dj) / sine2
-        beta = (dj - cosine * di) / sine2
-        gamma = (v[0] * c0 + v[1] * c1 + v[2] * c2) / sine2
-        parts[k] = alpha, beta, gamma
-        spread = (
-            sigma_rad[k] ** 2
-            + (alpha**2 + gamma**2) * sigma_rad[i] ** 2
-            + (beta**2 + gamma**2) * sigma_rad[j] ** 2
-        )
-        gate[k] = min(PREDICTION_GATE * math.sqrt(spread), LARGEST_GATE_RAD)
-        at = others
-        while at > 0 and gate[order[at - 1]] > gate[k]:
-            order[at] = order[at - 1]
-            at -= 1
-        order[at] = k
-        others += 1
-    return order, parts, gate, others

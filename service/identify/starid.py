@@ -15,6 +15,7 @@ from service.identify.identification import Identification, Integers, Outcome
 from service.identify.match_groups import MAX_EDGES, keep_largest_groups
 from service.identify.pair_tests import cast_votes, count_votes
 from service.missions.mission import Tests, Tolerances
+from service.sky.guide import Guide
 from service.sky.zones import Aim, Zone
 from service.vectors import Vector, angle_between_deg
 
@@ -35,7 +36,8 @@ class Sighting:
     least the stars within `aim`.  Of the presumed attitude the whole rotation
     is known, or only how it points `known_axis` (inertial).  `velocity_c` of the
     observer is zero where aberration is not to be corrected.  `boresight` is the
-    presumed one, inertial.
+    presumed one, inertial.  `guide` is there for identifiers that ask for no
+    prior, and None for the others.
     """
 
     direction: Vector
@@ -48,6 +50,7 @@ class Sighting:
     zone: Zone
     tolerances: Tolerances
     tests: Tests
+    guide: Guide | None = None
 
 
 def identify_by_votes(sighting: Sighting) -> Identification:

@@ -7,7 +7,7 @@ from numba import njit
 
 from service.identify import evidence
 from service.identify.evidence import PRIOR_ROTATION
-from service.identify.fitting import weigh
+from service.identify.fitting import most_log, weigh
 from service.identify.hypotheses import NEGLIGIBLE, keep, known, log_sum
 from service.identify.scene import within
 from service.sky.pairs import separation_rad
@@ -18,13 +18,23 @@ MAX_WORK = 20_000_000
 
 @njit(cache=True, nogil=True)
 def two_stars(  # type: ignore[no-untyped-def]
-    seen, stars, pairs, density, seeds, first_pair, last_pair, ledger, log_weight, count, rest, work
+    seen,
+    stars,
+    pairs,
+    scratch,
+    seeds,
+    first_pair,
+    last_pair,
+    ledger,
+    log_weight,
+    count,
+    rest,
+    work,
 ):
     """The hypotheses of two stars alone, where no larger one outweighs what chance can do."""
     observed, axis = seen.observed, seen.prior_axis
-    n, s = len(observed), len(seeds)
-    match = np.full(n, -1, np.int32)
-    t, references = np.empty((3, 3)), np.empty((n, 3))
+    s = len(seeds)
+    match = scratch.match
     top = rest
     for h in range(count):
         top = max(top, log_weight[h])
@@ -34,21 +44,15 @@ def two_stars(  # type: ignore[no-untyped-def]
             sine = math.sin(separation_rad(observed[i], observed[j]))
             if sine <= 0.0:
                 continue
-            # The most that any candidate can weigh: no residual, equal magnitudes.
             compared = 0
             for k in (i, j):
                 if not np.isnan(seen.magnitude[k]):
                     compared += 1
-            clutter = 0
-            for k in range(n):
-                if k != i and k != j and not np.isnan(seen.magnitude[k]):
-                    clutter += 1
-            most_log = (
-                evidence.log_positions(2, 0.0, math.log(sine * sine), seen.reference_sigma)
-                + evidence.log_magnitudes(compared, 0.0, 0.0)
-                + evidence.log_clutter(n - 2, 2)
-                - clutter * math.log(evidence.CLUTTER_SPAN_MAG)
-                - 2 * density
+            # At no shift; that of a candidate takes the prior's place.
+            most = (
+                most_log(seen, stars, 2, compared, 0.0)
+                - evidence.log_prior(0.0, seen.prior_kind)
+                - math.log(sine)
             )
             for c in range(first_pair[x, y], last_pair[x, y]):
                 work += 1
@@ -75,7 +79,7 @@ def two_stars(  # type: ignore[no-untyped-def]
                                 - separation_rad(stars.direction[b], axis)
                             ),
                         )
-                    if most_log + evidence.log_prior(shift, seen.prior_kind) < top - NEGLIGIBLE:
+                    if most + evidence.log_prior(shift, seen.prior_kind) < top - NEGLIGIBLE:
                         continue
                     if not within(a, stars) or not within(b, stars):
                         continue
@@ -83,7 +87,7 @@ def two_stars(  # type: ignore[no-untyped-def]
                     match[i], match[j] = a, b
                     if known(match, ledger, count):
                         continue
-                    value = weigh(seen, stars, density, match, t, references)
+                    value = weigh(seen, stars, match, scratch)
                     if value < top - NEGLIGIBLE:
                         rest = log_sum(rest, value)
                     else:

@@ -6,36 +6,64 @@ posterior (`search`, `evidence`); a star is unique from a probability of
 """
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from service.identify.evidence import PRIOR_DIRECTION, PRIOR_ROTATION
 from service.identify.hypotheses import MAX_HYPOTHESES, marginals
-from service.identify.identification import Identification, Outcome
-from service.identify.scene import Pairs, Seen, Stars
+from service.identify.identification import Identification, Integers, Outcome
+from service.identify.scene import Pairs, Seen, Stars, log_density
 from service.identify.search import search
 from service.identify.starid import MAX_RIVALS, Sighting, identify_by_votes
+from service.vectors import Vector
 
 UNIQUE_PROBABILITY = 0.999
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """What the hypotheses say of each of n stars.
+
+    `star` is the likeliest zone row, -1 where there is none, and `probability`
+    its share; `none` that of no star of the zone.  `rivals` (n, R) are zone rows
+    by falling probability, `rival_probability` (n, R), -1 beyond the last.
+    """
+
+    star: Integers
+    probability: Vector
+    none: Vector
+    rivals: Integers
+    rival_probability: npt.NDArray[np.float64]
+    bounded: bool
+
+
+def posterior_of(sighting: Sighting, exhaustive: bool = False) -> Posterior:
+    """Weigh the hypotheses of a sighting; `exhaustive`: go on after one that outweighs chance."""
+    n = len(sighting.direction)
+    star, probability, none = np.full(n, -1), np.zeros(n), np.ones(n)
+    rivals, likely = np.full((n, MAX_RIVALS), -1), np.zeros((n, MAX_RIVALS))
+    bounded = False
+    if n >= 2 and len(sighting.zone.star) >= 2:
+        ledger = np.empty((MAX_HYPOTHESES, n), np.int32)
+        log_weight = np.empty(MAX_HYPOTHESES)
+        count, rest, _, bounded = search(*scene_of(sighting), exhaustive, ledger, log_weight)
+        marginals(ledger, log_weight, count, rest, star, probability, none, rivals, likely)
+    return Posterior(star, probability, none, rivals, likely, bool(bounded))
 
 
 def identify_verified(sighting: Sighting) -> Identification:
     """Identify the stars of one tracker by the posterior of hypotheses."""
     zone = sighting.zone
-    n = len(sighting.direction)
-    star, probability, none = np.full(n, -1), np.zeros(n), np.ones(n)
-    rivals = np.full((n, MAX_RIVALS), -1)
-    bounded = False
-    if n >= 2 and len(zone.star) >= 2:
-        ledger = np.empty((MAX_HYPOTHESES, n), np.int32)
-        log_weight = np.empty(MAX_HYPOTHESES)
-        count, rest, _, bounded = search(*_scene(sighting), False, ledger, log_weight)
-        marginals(ledger, log_weight, count, rest, star, probability, none, rivals)
+    found = posterior_of(sighting)
+    probability, none = found.probability, found.none
     unique = probability >= UNIQUE_PROBABILITY
     unmatched = ~unique & (none >= probability)
-    named = np.full(n, -1)
-    named[unique] = zone.star[star[unique]]
+    named = np.full(len(unique), -1)
+    named[unique] = zone.star[found.star[unique]]
+    # Of a unique star the others are too unlikely to matter.
+    in_question = (found.rivals >= 0) & ~unique[:, None]
     return replace(
         identify_by_votes(sighting),
         outcome=np.where(
@@ -45,17 +73,19 @@ def identify_verified(sighting: Sighting) -> Identification:
         ),
         star=named,
         rivals=tuple(
-            ()
-            if unique[k] or unmatched[k]
-            else tuple(zone.star[rivals[k][rivals[k] >= 0]].tolist())
-            for k in range(n)
+            tuple(zone.star[row[mask]].tolist())
+            for row, mask in zip(found.rivals, in_question, strict=True)
+        ),
+        rival_probability=tuple(
+            tuple(row[mask].tolist())
+            for row, mask in zip(found.rival_probability, in_question, strict=True)
         ),
         probability=np.where(unmatched, none, probability),
-        bounded=bounded,
+        bounded=found.bounded,
     )
 
 
-def _scene(sighting: Sighting) -> tuple[Seen, Stars, Pairs]:
+def scene_of(sighting: Sighting) -> tuple[Seen, Stars, Pairs]:
     """The sighting as the kernels take it."""
     zone, aim, pairs = sighting.zone, sighting.aim, sighting.zone.pairs
     reference_sigma = float(sighting.sigma_rad.min())
@@ -69,17 +99,18 @@ def _scene(sighting: Sighting) -> tuple[Seen, Stars, Pairs]:
         prior_kind=PRIOR_ROTATION if sighting.known_axis is None else PRIOR_DIRECTION,
         prior_axis=aim.axis if sighting.known_axis is None else sighting.known_axis,
     )
+    least, most = math.radians(aim.least_deg), math.radians(aim.most_deg)
     stars = Stars(
         direction=zone.direction,
         magnitude=zone.magnitude_mag,
-        box=zone.grid.box,
-        offset=zone.grid.offset,
-        start=zone.grid.start,
-        rows=zone.grid.rows,
+        grid_start=zone.grid.start,
+        grid_rows=zone.grid.rows,
+        grid_direction=zone.grid.direction,
         axis=aim.axis,
-        least=math.radians(aim.least_deg),
-        most=math.radians(aim.most_deg),
+        least=least,
+        most=most,
         polar=np.full(len(zone.star), -1.0),
+        log_density=log_density(zone.direction, aim.axis, least, most),
     )
     return (
         seen,

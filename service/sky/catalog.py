@@ -6,21 +6,23 @@ known; what a mission's identifier uses is made from it in
 `service.sky.run_catalog`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from service.errors import BadConfiguration, BadFile, Fault, NotFound
 from service.resources import shipped
-from service.sky import catalog_csv
+from service.sky import catalog_csv, sky2000
 from service.sky.catalog_coding import COLUMNS, LABEL, digest_of, pack, unpack
 from service.sky.neighbours import nearest_neighbours
 from service.vectors import Vector, from_ra_dec, read_only
+
+Form = Literal["csv", "sky2000"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +152,36 @@ def import_csv(path: Path) -> Catalog:
     within the catalog itself.  Raises BadFile naming line, column and value of
     up to twenty faults.
     """
-    columns = catalog_csv.read(path)
+    return _of_a_site(path, catalog_csv.read(path))
+
+
+def import_sky2000(
+    path: Path, step: Callable[[], object] = lambda: None
+) -> tuple[Catalog, tuple[str, ...]]:
+    """SKYMAP's SKY2000 catalog from its fixed-width records, and the stars without a magnitude.
+
+    Every star is known by its Skymap number, "SKYMAP 1234".  `step` is called
+    after each record.  Raises BadFile naming line, bytes and value of up to
+    twenty faults.
+    """
+    found = sky2000.read(path, step)
+    return _of_a_site(path, found.columns), found.without_magnitude
+
+
+def import_catalog(path: Path, form: Form | None = None) -> Catalog:
+    """A site's own catalog in either form; without one named, the file's beginning tells."""
+    if (form or form_of(path)) == "sky2000":
+        return import_sky2000(path)[0]
+    return import_csv(path)
+
+
+def form_of(path: Path) -> Form:
+    """The form of a site's file: SKY2000 where it begins as those records do, else CSV."""
+    return "sky2000" if sky2000.is_sky2000(path) else "csv"
+
+
+def _of_a_site(path: Path, columns: Mapping[str, npt.NDArray[Any]]) -> Catalog:
+    """The catalog of a site's columns: sorted by magnitude, neighbours found within itself."""
     order = np.argsort(columns["magnitude_v_mag"], kind="stable")
     columns = {key: column[order] for key, column in columns.items()}
     direction = from_ra_dec(columns["ra_deg"], columns["dec_deg"])

@@ -91,6 +91,9 @@ def build_run_catalog(
         epoch_year - J2000_YEAR,
     )
     leader = merge(start, alone, catalog.light_elsewhere, settings.merge_within_arcsec)
+    if settings.merge_limit_mag is not None:
+        apart = alone > settings.merge_limit_mag
+        leader[apart] = np.flatnonzero(apart)
     direction, magnitude = combined(start, alone, catalog.light_elsewhere, leader)
     bright = magnitude <= settings.magnitude_limit_mag
     leads = leader == np.arange(len(catalog))

@@ -4,8 +4,11 @@ from dataclasses import dataclass
 
 from service.missions.mission import Mission
 from service.sky.catalog import Catalog
+from service.sky.guide import Guide, GuideKey, build_guide
 from service.sky.run_catalog import RunCatalog, build_run_catalog
 from service.sky.shelf import Shelf
+from service.sky.sky_index import SkyIndex, sky_index_for
+from service.sky.triangles import SLAVES
 from service.sky.zones import Aim, Zone, ZoneKey, zone_for
 from service.times import Utc
 
@@ -45,6 +48,17 @@ class Sky:
     ) -> tuple[Zone, bool]:
         """The zone that serves an aim, and whether it was on the shelf."""
         return zone_for(self.shelf, mission.name, run_catalog, aim, separation_max_deg, grid_deg)
+
+    def guide(self, run_catalog: RunCatalog, reach_deg: float) -> Guide:
+        """The guide database of PTP for trackers that see so far from their boresight."""
+        key = GuideKey(run_catalog.digest, reach_deg, SLAVES)
+        guide, _ = self.shelf.get(key, lambda: build_guide(run_catalog, reach_deg))
+        return guide
+
+    def index(self, run_catalog: RunCatalog, limit_mag: float, radius_deg: float) -> SkyIndex:
+        """The whole sky to a limit, for fields of view of a radius."""
+        index, _ = sky_index_for(self.shelf, run_catalog, limit_mag, radius_deg)
+        return index
 
     def drop_zones(self, mission: str | None = None) -> int:
         """Take the zones of a mission, or all, off the shelf; how many there were."""

@@ -21,7 +21,7 @@ from numba import njit
 from service.sky.pairs import PairIndex, build_pairs, separation_rad
 from service.sky.run_catalog import RunCatalog
 from service.sky.shelf import Shelf
-from service.sky.star_grid import StarGrid, build_star_grid
+from service.sky.star_buckets import StarBuckets, build_star_buckets
 from service.vectors import (
     Vector,
     angle_between_deg,
@@ -77,7 +77,7 @@ class Zone:
     direction: Vector
     magnitude_mag: Vector
     pairs: PairIndex
-    grid: StarGrid
+    grid: StarBuckets
 
     @property
     def nbytes(self) -> int:
@@ -139,7 +139,7 @@ def build_zone(
         direction=read_only(direction),
         magnitude_mag=read_only(run_catalog.magnitude_mag[star]),
         pairs=build_pairs(direction, separation_max_deg),
-        grid=build_star_grid(direction),
+        grid=build_star_buckets(direction),
     )
 
 

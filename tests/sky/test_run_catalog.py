@@ -120,6 +120,17 @@ def test_zone_counts_without_stars_that_have_a_listed_neighbour(catalog, build, 
     assert pairs == pytest.approx(expected[1], rel=0.002)
 
 
+def test_a_star_below_the_limit_of_merging_adds_no_light(tmp_path):
+    """By light A at 8.2 is lifted over the limit of 8 by B; where B may not add, A is left out."""
+    rows = ("A,10,0,8.2", "B,10.005,0,8.4", "C,20,0,7.0", "D,20.005,0,8.5", "E,30,0,7.5")
+    catalog = site_catalog(tmp_path, *rows)
+    lifted = run_of(catalog, limit=8.0, merge_within_arcsec=60)
+    assert set(lifted.star_id) == set("ACE")
+    alone = run_of(catalog, limit=8.0, merge_within_arcsec=60, merge_limit_mag=8.0)
+    assert dict(zip(alone.star_id, alone.magnitude_mag, strict=True)) == {"C": 7.0, "E": 7.5}
+    assert alone.rejected == ()
+
+
 def test_index_order_is_brightness_then_catalog_row(build):
     """Magnitudes never fall; equal ones keep the order of the catalog; arrays are locked."""
     for run in build().values():

@@ -1,0 +1,252 @@
+"""The production solver for points of which nothing is known: from vectors to an attitude.
+
+`LostInSpace(index, field).solve(direction, magnitude_mag, sigma_rad)` is all
+there is to call.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from service.attitude.solution import NoAttitude
+from service.identify.lost_in_space import verdict
+from service.identify.lost_in_space.matching import match_at, settle
+from service.identify.lost_in_space.pair_order import magnitude_gate
+from service.identify.lost_in_space.search import LEDGER, search
+from service.identify.lost_in_space.seen import Field, Points
+from service.sky.sky_index import SkyIndex
+from service.vectors import Matrix, Vector
+
+Rows = npt.NDArray[np.int64]
+_STILL = np.zeros(3)
+FEWEST_POINTS = 3
+"""Two stars alone tell no attitude from another."""
+
+
+_REFUSALS = {
+    verdict.FOUND: None,
+    verdict.TOO_FEW: NoAttitude.FEWER_THAN_THREE_STARS,
+    verdict.NOTHING: NoAttitude.NO_MATCH,
+    verdict.DOUBTFUL: NoAttitude.DOUBTFUL_MATCH,
+    verdict.DEGENERATE: NoAttitude.DEGENERATE_GEOMETRY,
+}
+
+
+@dataclass(frozen=True)
+class FieldOfView:
+    """What the tracker sees of the sky: a circle or a square about +Z, its limit, its photometry.
+
+    `limit_mag` is NaN where the faintest star it shows is not known.
+    """
+
+    radius_deg: float
+    half_width_deg: float | None = None
+    """Of a square field; `radius_deg` is then that of its corners."""
+    limit_mag: float = math.nan
+    magnitude_sigma_mag: float = 0.5
+
+    @classmethod
+    def square(
+        cls, side_deg: float, limit_mag: float = math.nan, magnitude_sigma_mag: float = 0.5
+    ) -> "FieldOfView":
+        """A square field, edges `side_deg` apart."""
+        tangent = math.tan(math.radians(0.5 * side_deg))
+        corner_deg = math.degrees(math.atan(tangent * math.sqrt(2.0)))
+        return cls(corner_deg, 0.5 * side_deg, limit_mag, magnitude_sigma_mag)
+
+    def as_field(self) -> Field:
+        """The same as the kernels take it."""
+        cosine = math.cos(math.radians(self.radius_deg))
+        if self.half_width_deg is None:
+            return Field(
+                *(cosine, math.inf, math.inf, 2.0 * math.pi * (1.0 - cosine)),
+                *(self.limit_mag, self.magnitude_sigma_mag),
+            )
+        tangent = math.tan(math.radians(self.half_width_deg))
+        # The solid angle of a pyramid over a square.
+        area = 4.0 * math.asin(tangent * tangent / (1.0 + tangent * tangent))
+        return Field(cosine, tangent, tangent, area, self.limit_mag, self.magnitude_sigma_mag)
+
+
+class LostInSpaceResult(NamedTuple):
+    """What became of a field of points, rows in the order given.
+
+    A tuple, because making one must cost nothing beside a solution of ten
+    microseconds.  Where `refusal` says why there is no attitude, the arrays
+    tell of the best that was found, if anything.
+    """
+
+    refusal: NoAttitude | None
+    matrices: npt.NDArray[np.float64]
+    """(2, 3, 3): see `attitude` and `covariance_rad2`."""
+    star: Rows
+    """(n,) rows of the index, -1 for a point that no star explains."""
+    log_odds: float
+    """Of the attitude against all other explanations."""
+    matched: int
+    work: int
+    """Candidates looked at."""
+    bounded: bool
+    """The search ended at the most work allowed."""
+
+    @property
+    def attitude(self) -> Matrix | None:
+        """(3, 3): tracker components = this @ inertial; None where it was refused."""
+        return None if self.refusal is not None else np.asarray(self.matrices[0])
+
+    @property
+    def covariance_rad2(self) -> Matrix:
+        """(3, 3) of the small rotation about the tracker's axes."""
+        return np.asarray(self.matrices[1])
+
+
+class StarChances(NamedTuple):
+    """Of every point the likeliest star (-1: none), its probability, that of none, the next."""
+
+    star: Rows
+    probability: Vector
+    none: Vector
+    rival: Rows
+
+
+class LostInSpace:
+    """The solver of one field of view and one index; calls do not depend on one another."""
+
+    def __init__(self, index: SkyIndex, field: FieldOfView) -> None:
+        self.index = index
+        self.field = field
+        self._arrays = index.arrays
+        self._field = field.as_field()
+
+    def solve(
+        self,
+        direction: Vector,
+        magnitude_mag: Vector,
+        sigma_rad: Vector,
+        velocity_c: Vector = _STILL,
+    ) -> LostInSpaceResult:
+        """The attitude of points (n, 3) in tracker axes; magnitudes may be NaN.
+
+        `sigma_rad` (n,) is one standard deviation per tangent axis.
+        `velocity_c` of the observer, inertial, in units of c, makes the stars
+        apparent; zero leaves them geometric.
+        """
+        code, *rest = _solve(
+            direction, magnitude_mag, sigma_rad, velocity_c, self._arrays, self._field
+        )
+        return LostInSpaceResult(_REFUSALS[code], *rest)
+
+    def solve_near(
+        self,
+        attitude: Matrix,
+        covariance_rad2: Matrix,
+        direction: Vector,
+        magnitude_mag: Vector,
+        sigma_rad: Vector,
+        velocity_c: Vector = _STILL,
+    ) -> LostInSpaceResult:
+        """The same at an attitude that is known to a covariance: no search, the same judgement."""
+        code, *rest = _solve_near(
+            *(direction, magnitude_mag, sigma_rad, velocity_c, self._arrays, self._field),
+            *(attitude, covariance_rad2),
+        )
+        return LostInSpaceResult(_REFUSALS[code], *rest)
+
+    def chances(
+        self,
+        result: LostInSpaceResult,
+        direction: Vector,
+        magnitude_mag: Vector,
+        sigma_rad: Vector,
+        velocity_c: Vector = _STILL,
+    ) -> StarChances:
+        """How sure the star of every point is, at the attitude that was found."""
+        points = Points(direction, magnitude_mag, sigma_rad, velocity_c)
+        doubt = 1.0 / (1.0 + math.exp(min(result.log_odds, 700.0)))
+        gate = magnitude_gate(self.field.magnitude_sigma_mag)
+        return StarChances(
+            *verdict.star_probabilities(
+                *(points, self._arrays, self._field, gate, *result.matrices, result.star, doubt)
+            )
+        )
+
+
+@njit(cache=True, nogil=True)
+def _sorted(direction, magnitude, sigma, velocity):  # type: ignore[no-untyped-def]
+    """The points brightest first, those of unknown magnitude last, each in the order given."""
+    n = len(direction)
+    order = np.empty(n, np.int64)
+    for k in range(n):
+        at = k
+        while at > 0 and (
+            magnitude[order[at - 1]] > magnitude[k]
+            or (np.isnan(magnitude[order[at - 1]]) and not np.isnan(magnitude[k]))
+        ):
+            order[at] = order[at - 1]
+            at -= 1
+        order[at] = k
+    observed, magnitudes, sigmas = np.empty((n, 3)), np.empty(n), np.empty(n)
+    for k in range(n):
+        for i in range(3):
+            observed[k, i] = direction[order[k], i]
+        magnitudes[k], sigmas[k] = magnitude[order[k]], sigma[order[k]]
+    return order, Points(observed, magnitudes, sigmas, velocity)
+
+
+@njit(cache=True, nogil=True)
+def _ledger(n):  # type: ignore[no-untyped-def]
+    return (
+        np.empty((LEDGER, n), np.int64),
+        np.empty(LEDGER),
+        np.empty((LEDGER, 3, 3)),
+        np.empty((LEDGER, 3, 3)),
+    )
+
+
+@njit(cache=True, nogil=True)
+def _judged(order, ledger, weights, attitudes, covariances, count, work, bounded):  # type: ignore[no-untyped-def]
+    """The verdict, rows back in the order given: see `LostInSpaceResult`."""
+    n = len(order)
+    star = np.full(n, -1, np.int64)
+    matrices = np.zeros((2, 3, 3))
+    best, log_odds, code = verdict.judge(ledger, weights, attitudes, covariances, count)
+    matched = 0
+    if best >= 0:
+        matrices[0], matrices[1] = attitudes[best], covariances[best]
+        for k in range(n):
+            star[order[k]] = ledger[best, k]
+            matched += ledger[best, k] >= 0
+    if n < FEWEST_POINTS:
+        code = verdict.TOO_FEW
+    return code, matrices, star, log_odds, matched, work, bounded
+
+
+@njit(cache=True, nogil=True)
+def _solve(direction, magnitude, sigma, velocity, index, field):  # type: ignore[no-untyped-def]
+    order, points = _sorted(direction, magnitude, sigma, velocity)
+    ledger, weights, attitudes, covariances = _ledger(len(direction))
+    count, work, bounded = search(points, index, field, ledger, weights, attitudes, covariances)
+    return _judged(order, ledger, weights, attitudes, covariances, count, work, bounded)
+
+
+@njit(cache=True, nogil=True)
+def _solve_near(  # type: ignore[no-untyped-def]
+    direction, magnitude, sigma, velocity, index, field, attitude, covariance
+):
+    order, points = _sorted(direction, magnitude, sigma, velocity)
+    ledger, weights, attitudes, covariances = _ledger(len(direction))
+    ledger[0] = -1
+    attitudes[0], covariances[0] = attitude, covariance
+    gate = magnitude_gate(field.magnitude_sigma)
+    matched, _ = match_at(points, index, gate, attitudes[0], covariances[0], ledger[0])
+    count = 0
+    if matched >= 3:
+        matched, weights[0] = settle(
+            points, index, field, gate, attitudes[0], covariances[0], ledger[0]
+        )
+        count = int(matched >= 3 and weights[0] > 0.0)
+    return _judged(order, ledger, weights, attitudes, covariances, count, len(order), False)

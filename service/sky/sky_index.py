@@ -1,0 +1,181 @@
+"""The whole sky made ready for a search without a prior.
+
+Pairs of stars lie in classes of the fainter star's magnitude, in each by
+separation, so that an observed pair finds its candidates without looking at
+stars too faint for it; bitmaps say where no star can be; and every patch of the
+sky has a list of the stars that a field of view about it may hold.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from service.sky.pairs import build_pairs
+from service.sky.run_catalog import RunCatalog
+from service.sky.shelf import Shelf
+from service.sky.sky_bitmap import build_sky_bitmap
+from service.sky.star_grid import build_star_grid
+from service.vectors import ARCSEC_PER_RADIAN, Vector, read_only
+
+BUCKET_RAD = 4.0 / ARCSEC_PER_RADIAN
+"""Separations are found to this much."""
+MAX_PAIR_DEG = 8.0
+CLASSES_BELOW_LIMIT_MAG = (2.5, 2.0, 1.5, 1.25, 1.0, 0.75, 0.5, 0.25)
+BITMAP_RADII_RAD = tuple(arcsec / ARCSEC_PER_RADIAN for arcsec in (60.0, 250.0, 600.0, 1500.0))
+PATCHES = 12
+"""Along an edge of a face of the cube."""
+PATCH_RADIUS_RAD = math.sqrt(2.0) / PATCHES
+"""From the middle of a patch to its corners, at most: that of the largest, at a face's middle."""
+MAX_STARS = 60_000
+"""Rows are kept in 16 bits."""
+MAX_PAIRS = 1_500_000
+"""6 MB.  Of a deeper catalog only its brightest stars are looked for."""
+
+
+class Index(NamedTuple):
+    """The index as the kernels take it: every array fewer makes a call cheaper.
+
+    `stars` (n, 4) holds x, y, z and the magnitude; `pairs` (p, 2) the brighter
+    and the dimmer row; `class_edge` (c, 2) the faintest magnitude of a class
+    and the share of all pairs in it and those before; `face` (6, 5) the grid's
+    box and offset.
+    """
+
+    stars: Any
+    pairs: Any
+    offset: Any
+    class_edge: Any
+    bits: Any
+    face: Any
+    cell_start: Any
+    cell_rows: Any
+    patch_start: Any
+    patch_rows: Any
+
+
+@dataclass(frozen=True, eq=False)
+class SkyIndex:
+    """The stars of a run catalog, brightest first, for fields of view up to a radius.
+
+    `offset` (classes, buckets + 1) tells where in `arrays.pairs` the pairs of a
+    class and of a bucket of separation begin; `patch_start` and `patch_rows`
+    list the stars within a field of view's reach of each patch, brightest
+    first.  Everything is in `arrays`, locked against writing.
+    """
+
+    run_catalog: str
+    limit_mag: float
+    radius_deg: float
+    arrays: Index
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held."""
+        return sum(array.nbytes for array in self.arrays)
+
+    @property
+    def stars(self) -> int:
+        """The number of stars."""
+        return len(self.arrays.stars)
+
+    @property
+    def pairs(self) -> int:
+        """The number of pairs."""
+        return len(self.arrays.pairs)
+
+
+@dataclass(frozen=True)
+class SkyIndexKey:
+    """What an index depends on: the key under which the shelf keeps it."""
+
+    run_catalog: str
+    limit_mag: float
+    radius_deg: float
+
+
+def sky_index_for(
+    shelf: Shelf, run_catalog: RunCatalog, limit_mag: float, radius_deg: float
+) -> tuple[SkyIndex, bool]:
+    """The index from the shelf or built, and whether it was there."""
+    key = SkyIndexKey(run_catalog.digest, limit_mag, radius_deg)
+    return shelf.get(key, lambda: build_sky_index(run_catalog, limit_mag, radius_deg))
+
+
+def build_sky_index(run_catalog: RunCatalog, limit_mag: float, radius_deg: float) -> SkyIndex:
+    """Index the stars to a limit for fields of view whose farthest corner is at `radius_deg`.
+
+    Where there are more stars than fit, the faintest are left out.
+    """
+    magnitude = run_catalog.magnitude_mag
+    separation_max_deg = min(MAX_PAIR_DEG, 2.0 * radius_deg)
+    # Evenly spread stars make n^2 (1 - cos(separation)) / 4 pairs, real ones somewhat more.
+    within = 1.0 - math.cos(math.radians(separation_max_deg))
+    most = min(MAX_STARS, int(math.sqrt(3.0 * MAX_PAIRS / within)))
+    count = min(int(np.searchsorted(magnitude, limit_mag, "right")), most)
+    direction = np.ascontiguousarray(run_catalog.direction[:count])
+    pairs = build_pairs(direction, separation_max_deg)
+    edge = limit_mag - np.array([*CLASSES_BELOW_LIMIT_MAG, -math.inf])
+    pair_class = np.searchsorted(edge, magnitude[pairs.dimmer])
+    bucket = (pairs.separation_rad / BUCKET_RAD).astype(np.int64)
+    buckets = int(math.radians(separation_max_deg) / BUCKET_RAD) + 1
+    # Bucket by bucket, not by separation within one, so that near stars lie together.
+    order = np.lexsort((pairs.dimmer, bucket, pair_class))
+    key = (pair_class * buckets + bucket)[order]
+    start = np.searchsorted(key, np.arange(len(edge) * buckets + 1))
+    rows = np.arange(len(edge))[:, None] * buckets + np.arange(buckets + 1)[None, :]
+    share = np.cumsum(np.bincount(pair_class, minlength=len(edge))) / max(pairs.count, 1)
+    patch_start, patch_rows = _patches(direction, radius_deg)
+    grid = build_star_grid(direction)
+    arrays = Index(
+        stars=np.column_stack([direction, magnitude[:count]]),
+        pairs=np.column_stack([pairs.brighter, pairs.dimmer])[order].astype(np.uint16),
+        offset=start[rows].astype(np.int32),
+        class_edge=np.column_stack([edge, share]),
+        bits=np.stack([build_sky_bitmap(direction, r) for r in BITMAP_RADII_RAD]),
+        face=np.column_stack([grid.box, grid.offset]).astype(np.int32),
+        cell_start=grid.start,
+        cell_rows=grid.rows.astype(np.uint16),
+        patch_start=patch_start,
+        patch_rows=patch_rows,
+    )
+    for array in arrays:
+        read_only(array)
+    return SkyIndex(run_catalog.digest, limit_mag, radius_deg, arrays)
+
+
+def _patches(
+    direction: Vector, radius_deg: float
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.uint16]]:
+    """Of every patch of the sky the stars that a field of view with its boresight there holds."""
+    least = math.cos(min(math.radians(radius_deg) + PATCH_RADIUS_RAD, math.pi))
+    middle = (np.arange(PATCHES) + 0.5) * 2.0 / PATCHES - 1.0
+    start, rows = [0], []
+    for face in range(6):
+        axis, side = divmod(face, 2)
+        for u in middle:
+            for v in middle:
+                p = np.empty(3)
+                p[axis], p[(axis + 1) % 3], p[(axis + 2) % 3] = 1.0 - 2.0 * side, u, v
+                found = np.flatnonzero(direction @ (p / math.sqrt(p @ p)) >= least)
+                start.append(start[-1] + len(found))
+                rows.append(found)
+    return np.array(start, np.int32), np.concatenate(rows).astype(np.uint16)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def patch_of(p):  # type: ignore[no-untyped-def]
+    """The patch of a direction (3,)."""
+    axis = 0
+    if abs(p[1]) > abs(p[axis]):
+        axis = 1
+    if abs(p[2]) > abs(p[axis]):
+        axis = 2
+    face = 2 * axis + (1 if p[axis] < 0.0 else 0)
+    scale = 0.5 * PATCHES / abs(p[axis])
+    u = min(int(p[(axis + 1) % 3] * scale + 0.5 * PATCHES), PATCHES - 1)
+    v = min(int(p[(axis + 2) % 3] * scale + 0.5 * PATCHES), PATCHES - 1)
+    return (face * PATCHES + u) * PATCHES + v

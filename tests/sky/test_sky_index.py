@@ -1,0 +1,102 @@
+"""The whole sky made ready: what is looked up is what brute force finds."""
+
+import math
+
+import numpy as np
+import pytest
+
+from service.missions.mission import RunCatalogSettings
+from service.sky.catalog import load_embedded
+from service.sky.run_catalog import build_run_catalog
+from service.sky.shelf import Shelf
+from service.sky.sky_bitmap import build_sky_bitmap, star_near
+from service.sky.sky_index import (
+    BUCKET_RAD,
+    MAX_PAIR_DEG,
+    build_sky_index,
+    patch_of,
+    sky_index_for,
+)
+from service.vectors import angle_between_deg, unit
+
+LIMIT_MAG = 6.5
+
+
+@pytest.fixture(scope="module")
+def run_catalog():
+    return build_run_catalog(load_embedded(), RunCatalogSettings(magnitude_limit_mag=7.0), 2000.0)
+
+
+@pytest.fixture(scope="module")
+def index(run_catalog):
+    return build_sky_index(run_catalog, LIMIT_MAG, 7.1)
+
+
+def test_every_pair_of_its_stars_stands_in_its_class_and_bucket(index):
+    """Against all separations of a sample of stars, worked out one by one."""
+    stars, pairs, offset = index.arrays.stars, index.arrays.pairs, index.arrays.offset
+    held = {}
+    for c in range(offset.shape[0]):
+        for b in np.flatnonzero(np.diff(offset[c])):
+            for at in range(offset[c, b], offset[c, b + 1]):
+                held[tuple(pairs[at].tolist())] = (c, b)
+    assert len(held) == index.pairs
+    for row in range(0, index.stars, 97):
+        apart = np.radians(angle_between_deg(stars[:, :3], stars[row, :3]))
+        near = np.flatnonzero(apart <= math.radians(MAX_PAIR_DEG))
+        for other in near[near > row]:
+            c, b = held[(row, int(other))]
+            assert b == int(apart[other] / BUCKET_RAD)
+            assert stars[other, 3] <= index.arrays.class_edge[c, 0]
+            assert c == 0 or stars[other, 3] > index.arrays.class_edge[c - 1, 0]
+
+
+def test_it_holds_the_brightest_stars_to_the_limit(index, run_catalog):
+    assert index.stars == np.searchsorted(run_catalog.magnitude_mag, LIMIT_MAG, "right")
+    assert np.array_equal(index.arrays.stars[:, :3], run_catalog.direction[: index.stars])
+
+
+def test_a_bitmap_never_denies_a_star(rng):
+    direction = unit(rng.normal(size=(200, 3)))
+    # Edges and corners of the unfolding.
+    direction = np.concatenate([direction, np.eye(3), -np.eye(3), unit([[1, -1, 0], [0, 1, -1]])])
+    for radius in (1e-4, 2e-3, 7e-3):
+        bits = build_sky_bitmap(direction, radius)
+        for star in direction:
+            for _ in range(20):
+                away = np.cross(star, unit(rng.normal(size=3)))
+                angle = radius * rng.uniform(0.0, 0.999)
+                p = star * math.cos(angle) + unit(away) * math.sin(angle)
+                assert star_near(bits, *(p * rng.uniform(0.5, 2.0)))
+        share = np.unpackbits(bits).mean()
+        widened = len(direction) * math.pi * (radius + 4e-3) ** 2 / (4.0 * math.pi)
+        assert share < widened
+
+
+def test_a_patch_lists_every_star_of_a_field_about_it_brightest_first(index, rng):
+    start, rows = index.arrays.patch_start, index.arrays.patch_rows
+    for _ in range(40):
+        boresight = unit(rng.normal(size=3))
+        patch = patch_of(boresight)
+        listed = rows[start[patch] : start[patch + 1]]
+        assert (np.diff(listed.astype(int)) > 0).all()
+        inside = angle_between_deg(index.arrays.stars[:, :3], boresight) <= index.radius_deg
+        assert set(np.flatnonzero(inside)) <= set(listed.tolist())
+
+
+def test_it_is_small_and_kept_by_what_it_is_made_of(run_catalog):
+    shelf = Shelf(1 << 26)
+    first, cached = sky_index_for(shelf, run_catalog, LIMIT_MAG, 7.1)
+    assert not cached
+    assert first.nbytes <= 15e6
+    again, cached = sky_index_for(shelf, run_catalog, LIMIT_MAG, 7.1)
+    assert cached
+    assert again is first
+    assert sky_index_for(shelf, run_catalog, 6.0, 7.1)[0] is not first
+
+
+def test_of_a_deep_catalog_the_brightest_are_kept():
+    settings = RunCatalogSettings(magnitude_limit_mag=9.0)
+    deep = build_sky_index(build_run_catalog(load_embedded(), settings, 2000.0), 9.0, 4.0)
+    assert deep.stars < 40_000
+    assert deep.nbytes <= 20e6
