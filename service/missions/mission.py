@@ -15,8 +15,6 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import (
     AfterValidator,
-    BaseModel,
-    ConfigDict,
     Field,
     ValidationError,
     ValidationInfo,
@@ -25,6 +23,8 @@ from pydantic import (
 )
 
 from service.errors import BadConfiguration, BadInput, Fault, NotFound, shown_value
+from service.missions.camera import Camera
+from service.missions.strict import Strict
 from service.vectors import Matrix, Vector, read_only, unit
 
 SHIPPED_FOLDER = Path(__file__).parent
@@ -41,15 +41,11 @@ def _zero_or_wide(step_deg: float) -> float:
 
 LEAST_GRID_DEG = 0.01
 GridStep = Annotated[float, Field(ge=0, le=10), AfterValidator(_zero_or_wide)]
-Identifier = Literal["starid", "verified"]
+Identifier = Literal["starid", "verified", "ptp", "lost_in_space"]
 Solver = Literal["quest", "triad"]
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=False)
-
-
-class Cap(_Strict):
+class Cap(Strict):
     """A small circle about the tracker's presumed boresight."""
 
     kind: Literal["cap"]
@@ -60,7 +56,7 @@ class Cap(_Strict):
     """Step of the grid to which the zone's axis is snapped for the cache; 0: the exact zone."""
 
 
-class Band(_Strict):
+class Band(Strict):
     """A band about a small or great circle around the catalog generation vector, its pole."""
 
     kind: Literal["band"]
@@ -71,7 +67,7 @@ class Band(_Strict):
     grid_deg: GridStep = 0.0
 
 
-class Tolerances(_Strict):
+class Tolerances(Strict):
     """Every tolerance of the identification, each open to change per request."""
 
     pair_separation_max_deg: float = Field(ge=0.01, le=60)  # HMAX
@@ -85,7 +81,7 @@ class Tolerances(_Strict):
     """Of Van Bezooijen's test, which the paper leaves out and the missions have off."""
 
 
-class Tests(_Strict):
+class Tests(Strict):
     """The switches of the tests; unless a file says otherwise, `pole` is on in bands alone."""
 
     magnitude: bool = True
@@ -95,13 +91,15 @@ class Tests(_Strict):
     match_groups: bool = False
 
 
-class RunCatalogSettings(_Strict):
+class RunCatalogSettings(Strict):
     """How the run catalog of the mission is made from the star catalog."""
 
     magnitude_limit_mag: float = Field(ge=-2, le=15)
     epoch_step_years: float = Field(default=1.0, gt=0, le=100)
     """A batch uses the run catalog of its own time rounded to this step."""
     merge_within_arcsec: float = Field(default=60.0, ge=0, le=3600)
+    merge_limit_mag: float | None = Field(default=None, ge=-2, le=15)
+    """A star fainter than this adds no light to a brighter one; None: every one adds its own."""
     reject_neighbour_within_arcsec: float = Field(default=0.0, ge=0, le=3600)
     reject_neighbour_fainter_by_mag: float = Field(default=2.0, ge=0, le=30)
     reject_variable_amplitude_mag: float | None = Field(default=None, gt=0, le=30)
@@ -119,7 +117,7 @@ class RunCatalogSettings(_Strict):
         return round(julian_year / self.epoch_step_years) * self.epoch_step_years
 
 
-class Calibration(_Strict):
+class Calibration(Strict):
     """Focal-plane calibration: measured angles to true ones.
 
     With u, v the measured `h_deg`, `v_deg`, each true angle is
@@ -131,7 +129,7 @@ class Calibration(_Strict):
     v_terms: tuple[tuple[int, int, float], ...] = ()
 
 
-class Tracker(_Strict):
+class Tracker(Strict):
     """One star tracker: where it looks in the body, how far it sees, how well it measures."""
 
     name: Name
@@ -146,6 +144,8 @@ class Tracker(_Strict):
     coelevation_deg: float | None = Field(default=None, gt=0, lt=180)
     """In bands: the coelevation of this tracker's boresight, where it is not the mission's."""
     calibration: Calibration = Calibration()
+    camera: Camera | None = None
+    """Of a tracker that sends frames; the field of view reaches to its farthest corner."""
 
     @model_validator(mode="after")
     def _axes_are_right_handed(self) -> Self:
@@ -162,13 +162,15 @@ class Tracker(_Strict):
         return read_only(u @ vt)
 
 
-class Mission(_Strict):
+class Mission(Strict):
     """All that is fixed for a mission."""
 
     name: Name
     description: str = ""
-    identifier: Identifier = "starid"
+    identifier: Identifier = "verified"
     solver: Solver = "quest"
+    lost_in_space_fallback: bool = True
+    """Look in the whole sky where `verified` finds no good attitude about the a priori one."""
     zone: Annotated[Cap | Band, Field(discriminator="kind")]
     tolerances: Tolerances
     tests: Tests = Field(default=Tests(), validate_default=True)
@@ -201,6 +203,12 @@ class Mission(_Strict):
         return "sha256:" + hashlib.sha256(text.encode()).hexdigest()
 
     @cached_property
+    def within_zones(self) -> "Mission":
+        """The mission with no look at the whole sky where a zone gave nothing good."""
+        # Validated anew: a plain copy would keep the digest.
+        return Mission.model_validate(self.model_dump() | {"lost_in_space_fallback": False})
+
+    @cached_property
     def axis_body(self) -> Vector:
         """The zone's body axis as a unit vector."""
         return read_only(unit(self.zone.axis_body))
@@ -212,6 +220,18 @@ class Mission(_Strict):
                 return tracker
         known = ", ".join(tracker.name for tracker in self.trackers)
         raise BadInput(Fault(field, f"{self.name} has {known}", shown_value(name)))
+
+    def camera_tracker(self, name: str | None, field: str) -> tuple[Tracker, Camera]:
+        """The tracker of that name with its camera; by default the first that has one.
+
+        Raises `BadInput` naming `field` where there is none.
+        """
+        trackers = self.trackers if name is None else (self.tracker(name, field),)
+        for tracker in trackers:
+            if tracker.camera is not None:
+                return tracker, tracker.camera
+        message = f"the mission file of {self.name} describes no camera of it"
+        raise BadInput(Fault(field, message, shown_value(name or trackers[0].name)))
 
 
 def parse_mission(text: str, file: str) -> Mission:
@@ -226,6 +246,15 @@ def parse_mission(text: str, file: str) -> Mission:
             for e in error.errors()
         ]
         raise BadConfiguration("\n".join(lines)) from None
+
+
+def read_mission(path: Path) -> Mission:
+    """The mission of a file; raises `BadConfiguration` naming the file and what is wrong."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise BadConfiguration(f"{path}: cannot be read: {error}") from None
+    return parse_mission(text, str(path))
 
 
 def _key(location: tuple[str | int, ...]) -> str:
@@ -247,6 +276,7 @@ def _allowed_keys(location: tuple[str | int, ...]) -> list[str]:
         "catalog": RunCatalogSettings,
         "trackers": Tracker,
         "calibration": Calibration,
+        "camera": Camera,
     }
     for part in location:
         found = tables.get(str(part))
@@ -265,11 +295,7 @@ def load_missions(folder: Path | None = None) -> dict[str, Mission]:
             raise BadConfiguration(f"{place}: no such folder of mission files (ACQUIRE_MISSIONS)")
         origin: dict[str, str] = {}
         for path in sorted(place.glob("*.toml")):
-            try:
-                text = path.read_text(encoding="utf-8")
-            except (OSError, UnicodeDecodeError) as error:
-                raise BadConfiguration(f"{path}: cannot be read: {error}") from None
-            mission = parse_mission(text, str(path))
+            mission = read_mission(path)
             if mission.name in origin:
                 raise BadConfiguration(
                     f"{path}: name: {mission.name} is already in {origin[mission.name]}"

@@ -80,6 +80,7 @@ class TrackerStars:
 class ObservationBatch:
     """One batch: who, when, the a priori attitude, and the stars of each tracker.
 
+    Without `a_priori` it is lost in space.
     Body rates are of the body relative to inertial, in body axes.  Velocity and
     position are geocentric, EME2000, None where they were not given.
     """
@@ -88,7 +89,7 @@ class ObservationBatch:
     batch: str
     run: str
     time: Utc
-    a_priori: APriori
+    a_priori: APriori | None
     body_rates_deg_per_s: Vector
     velocity_km_per_s: Vector | None
     aberration: Aberration

@@ -8,7 +8,7 @@ import hashlib
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import (
@@ -22,7 +22,7 @@ from pydantic import (
     model_validator,
 )
 
-from service.errors import BadBatch, BadInput, Fault, NotAvailable, shown_value
+from service.errors import BadBatch, BadInput, Fault, shown_value
 from service.missions.mission import GridStep, Identifier, Solver
 from service.observe.batch import (
     MAX_STARS_PER_TRACKER,
@@ -36,6 +36,7 @@ from service.observe.batch import (
     SunPointedPrior,
     TrackerStars,
 )
+from service.observe.frame_record import FrameRecord
 from service.times import parse_utc
 from service.vectors import Vector, read_only, unit
 
@@ -53,7 +54,8 @@ def _near_unit(components: tuple[float, ...]) -> tuple[float, ...]:
     return components
 
 
-def _is_time(text: str) -> str:
+def is_time(text: str) -> str:
+    """The text, if it is a time in UTC; pydantic reports the error that it raises otherwise."""
     try:
         parse_utc(text)
     except BadInput as error:
@@ -74,8 +76,6 @@ Rate = Annotated[Number, Field(ge=-360, le=360)]
 Speed = Annotated[Number, Field(ge=-100, le=100)]
 Distance = Annotated[Number, Field(ge=-1e9, le=1e9)]
 Position = tuple[Distance, Distance, Distance]
-NamedIdentifier = Literal["starid", "verified", "ptp", "lost_in_space"]
-"""Every identifier that the interface names; the second two are not there yet."""
 Tolerance = Annotated[Number, Field(ge=0, le=180)]
 
 
@@ -168,22 +168,14 @@ class TolerancesIn(Wire):
 class OptionsIn(Wire):
     """What to do otherwise than the mission's settings say."""
 
-    identifier: NamedIdentifier | None = None
+    identifier: Identifier | None = None
     solver: Solver | None = None
     tests: TestsIn = TestsIn()
     tolerances: TolerancesIn = TolerancesIn()
     zone_grid_deg: Annotated[GridStep, Field(strict=True)] | None = None
 
-    def to_options(self, field: str = "options") -> Options:
-        """The options as the core takes them; raises `NotAvailable` for what is not there yet."""
-        if self.identifier == "ptp" or self.identifier == "lost_in_space":
-            raise NotAvailable(
-                Fault(
-                    f"{field}.identifier",
-                    f"is not there yet; there are {', '.join(get_args(Identifier))}",
-                    shown_value(self.identifier),
-                )
-            )
+    def to_options(self) -> Options:
+        """The options as the core takes them."""
         return Options(
             identifier=self.identifier,
             solver=self.solver,
@@ -224,7 +216,7 @@ class BatchIn(Wire):
 
     spacecraft: Key
     batch: Key
-    time: Annotated[str, AfterValidator(_is_time)]
+    time: Annotated[str, AfterValidator(is_time)]
     run: RunName = "live"
     a_priori: APrioriIn | None
     body_rates_deg_per_s: tuple[Rate, Rate, Rate] = (0.0, 0.0, 0.0)
@@ -240,13 +232,17 @@ class BatchIn(Wire):
     options: OptionsIn = OptionsIn()
 
     def to_batch(self) -> ObservationBatch:
-        """The batch as the core takes it; raises `NotAvailable` for what is not there yet."""
+        """The batch as the core takes it."""
         return ObservationBatch(
             spacecraft=self.spacecraft,
             batch=self.batch,
             run=self.run,
             time=parse_utc(self.time),
-            a_priori=prior_of(self.a_priori, self.sun_vector, self.position_km),
+            a_priori=(
+                None
+                if self.a_priori is None
+                else prior_of(self.a_priori, self.sun_vector, self.position_km)
+            ),
             body_rates_deg_per_s=_array(self.body_rates_deg_per_s),
             velocity_km_per_s=_optional_array(self.velocity_km_per_s),
             aberration=self.aberration,
@@ -257,18 +253,11 @@ class BatchIn(Wire):
 
 
 def prior_of(
-    prior: APrioriIn | None,
+    prior: APrioriIn,
     sun_vector: Iterable[float] | None = None,
     position_km: Iterable[float] | None = None,
 ) -> APriori:
-    """The a priori knowledge as the core takes it; the Sun's direction may stand beside it too.
-
-    Raises `NotAvailable` for none at all.
-    """
-    if prior is None:
-        raise NotAvailable(
-            Fault("a_priori", "lost-in-space identification is not there yet", "null")
-        )
+    """The a priori knowledge as the core takes it; the Sun's direction may stand beside it too."""
     if isinstance(prior, QuaternionIn):
         return QuaternionPrior(read_only(unit(prior.quaternion)))
     if isinstance(prior, BoresightIn):
@@ -311,12 +300,14 @@ class Submission:
 
     `text` is its canonical JSON, defaults left out: what is recorded and run
     again.  `fingerprint` is the digest of that text, so that white space and
-    the order of keys do not make another body.
+    the order of keys do not make another body.  A batch that was made of a frame
+    has the fingerprint of the frame and of what was told with it.
     """
 
     batch: ObservationBatch
     text: str
     fingerprint: str
+    frame: FrameRecord | None = None
 
 
 def submission_from_json(body: bytes | str, run: str | None = None) -> Submission:
@@ -335,6 +326,25 @@ def submission_from_model(model: BatchIn) -> Submission:
     """The submission of a model that is already checked."""
     text = model.model_dump_json(exclude_defaults=True)
     return Submission(model.to_batch(), text, hashlib.sha256(text.encode()).hexdigest())
+
+
+def tolerances_from_text(texts: Iterable[str], field: str) -> TolerancesIn:
+    """Tolerances written as NAME=VALUE; raises `BadBatch` naming `field`, the name and the value.
+
+    Of a name that comes twice the last one counts, as in JSON.
+    """
+    values: dict[str, float] = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            values[name.strip()] = float(value)
+        except ValueError:
+            message = "must be NAME=VALUE, such as separation_deg=0.01"
+            raise BadBatch(Fault(field, message, shown_value(text))) from None
+    try:
+        return TolerancesIn.model_validate(values)
+    except ValidationError as error:
+        raise BadBatch(faults_of(error, (field,))) from None
 
 
 def faults_of(error: ValidationError, prefix: tuple[str, ...] = ()) -> list[Fault]:

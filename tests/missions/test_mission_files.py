@@ -19,8 +19,8 @@ XTE = (SHIPPED_FOLDER / "xte.toml").read_text(encoding="utf-8")
 SOHO = (SHIPPED_FOLDER / "soho.toml").read_text(encoding="utf-8")
 
 
-def test_the_three_missions_are_shipped(missions):
-    assert sorted(missions) == ["SOHO", "SWAS", "XTE"]
+def test_the_paper_s_three_missions_and_one_with_a_camera_are_shipped(missions):
+    assert sorted(missions) == ["IMAGER", "SOHO", "SWAS", "XTE"]
     for name, mission in missions.items():
         assert mission.name == name
         assert mission.trackers[0].name == "STARTRACKER_1"
@@ -125,7 +125,7 @@ def test_a_site_s_folder_adds_missions_and_replaces_shipped_ones(tmp_path):
     (tmp_path / "hubble.toml").write_text(XTE.replace('name = "XTE"', 'name = "HUBBLE"'))
     (tmp_path / "xte.toml").write_text(XTE.replace("radius_deg = 10.66", "radius_deg = 12"))
     missions = load_missions(tmp_path)
-    assert sorted(missions) == ["HUBBLE", "SOHO", "SWAS", "XTE"]
+    assert sorted(missions) == ["HUBBLE", "IMAGER", "SOHO", "SWAS", "XTE"]
     assert missions["XTE"].zone.radius_deg == 12
 
 
@@ -153,7 +153,7 @@ def test_the_digest_is_of_the_settings_and_not_of_their_layout(missions):
 
 def test_an_unknown_spacecraft_is_named_with_those_there_are(missions):
     assert mission_named(missions, "XTE") is missions["XTE"]
-    with pytest.raises(NotFound, match="SOHO, SWAS, XTE"):
+    with pytest.raises(NotFound, match="IMAGER, SOHO, SWAS, XTE"):
         mission_named(missions, "VOYAGER")
 
 

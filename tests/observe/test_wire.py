@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from service.errors import BadBatch, BadInput, NotAvailable
+from service.errors import BadBatch
 from service.observe.batch import (
     MAX_STARS_PER_TRACKER,
     BoresightPrior,
@@ -269,13 +269,11 @@ def test_a_deeply_nested_body_is_refused():
         submission_from_json('{"a_priori": ' + "[" * 5000 + "]" * 5000 + "}")
 
 
-def test_what_is_not_there_yet_says_so():
-    with pytest.raises(NotAvailable) as refusal:
-        read(changed("a_priori", None))
-    assert refusal.value.faults[0].field == "a_priori"
-    assert isinstance(refusal.value, BadInput)
-    with pytest.raises(NotAvailable, match=r"options\.identifier"):
-        read(changed("options.identifier", "ptp"))
+def test_without_a_prior_and_with_any_identifier_a_batch_is_read():
+    assert read(changed("a_priori", None)).batch.a_priori is None
+    for identifier in ("starid", "verified", "ptp", "lost_in_space"):
+        options = read(changed("options.identifier", identifier)).batch.options
+        assert options.identifier == identifier
 
 
 def test_a_key_of_any_length_gets_a_message_of_a_few_words():

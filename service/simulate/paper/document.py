@@ -4,6 +4,7 @@ import os.path
 from collections.abc import Sequence
 from pathlib import Path
 
+from service.missions.mission import Identifier
 from service.simulate.paper.command import PAPER_IDENTIFIER, report
 from service.simulate.paper.plots import PICTURES, PLACES
 from service.simulate.paper.region import differences, is_inside
@@ -16,8 +17,8 @@ _INTRODUCTION = """\
 The simulator of the paper, made anew, sends its views through the same code as any batch: a view
 is a batch whose a priori attitude has its boresight (cap) or its pole (band) on the zone's axis.
 Every run of a table sees the same zones, stars and draws, as in the paper; only the errors differ.
-`acquire simulate paper --plots docs/plots --report docs/paper.md` makes this page again, with
-`--seed` and `--stars` of your choice.
+`acquire simulate paper --identifier starid --plots docs/plots --report docs/paper.md` makes this
+page again, with `--seed` and `--stars` of your choice.
 
 How the paper was read, where it leaves a choice:
 
@@ -26,7 +27,10 @@ How the paper was read, where it leaves a choice:
   cap body X is the tracker's boresight, in a band it is the pole and Z the boresight;
 - where the magnitudes of a pair do not tell its order, no magnitude is compared at all;
 - where the angles to the pole tell the order, no cross product follows;
-- one vote is enough; the paper's "ambiguous" counts stars without any vote.
+- one vote is enough; the paper's "ambiguous" counts stars without any vote;
+- the prototype read "all stars down to" a magnitude: of a double only components that bright are
+  merged. The service lets fainter ones add their light, as a tracker sees it
+  ([decision 5](decisions/0005-the-papers-run-catalogs.md)).
 
 Misprints taken as such: the angles of Table 2 that are not varied are 40, 40 and 60 arcsec, not
 degrees; in Table 9 the desert at 12 arcsec has 1820 stars right, not 1803; runs 3 and 4 of Table 7
@@ -51,12 +55,6 @@ _OTHER_THAN_THE_REFERENCE = {
 Table 7 at 12 and 15 arcsec: the reference is higher, while at 12 arcsec the bands of Tables 8 and
 10 agree with it on more stars. We take it for a draw of the reference; no other cause was found.
 """,
-    "10F": """\
-Table 10, forest: our run catalogs merge close stars before they are cut at the magnitude limit, so
-that a companion fainter than the limit may lift a star over it. Cut first and merged then, the
-forest has 3164 stars and 113586 pairs instead of 3195 and 116118, and its rates agree with the
-reference, which we therefore think was made so. A tracker sees the light of both stars.
-""",
 }
 
 
@@ -68,6 +66,8 @@ def document(tallies: Sequence[Tally], seeds: Sequence[int], plots: Path, file: 
     and now.  Of the identifiers beyond the paper's, Tables 2 to 10 follow.
     """
     mine = [tally for tally in tallies if tally.identifier == PAPER_IDENTIFIER]
+    if not mine:
+        return _beyond(tallies, seeds)
     # The report's own heading would stand where the section's does.
     tables = report(mine, PAPER_IDENTIFIER, list(TITLES), seeds[0]).split("\n", 2)[2]
     links = [
@@ -83,10 +83,29 @@ def document(tallies: Sequence[Tally], seeds: Sequence[int], plots: Path, file: 
         parts.append(_OUTSIDE)
     differing = {t.run.table for t in mine if not all(rate.agrees for rate in differences(t))}
     parts += [text for table, text in _OTHER_THAN_THE_REFERENCE.items() if table in differing]
-    for identifier in dict.fromkeys(tally.identifier for tally in tallies):
-        if identifier != PAPER_IDENTIFIER:
-            parts.append(report(tallies, identifier, _RATE_TABLES, seeds[0]))
+    parts += [report(tallies, name, _RATE_TABLES, seeds[0]) for name in _others(tallies)]
     return "\n\n".join(part.strip() for part in parts) + "\n"
+
+
+def _beyond(tallies: Sequence[Tally], seeds: Sequence[int]) -> str:
+    """The page of identifiers that the paper has not."""
+    names = _others(tallies)
+    command = f"acquire simulate paper --identifier {' '.join(names)}"
+    parts = [
+        "# The runs of Fink & Shoup 1994, verified",
+        (
+            f"Seeds {', '.join(map(str, seeds))}, from {_least(tallies):,} stars a run: the views "
+            "that [paper.md](paper.md) shows for the votes, and what the paper printed for them. "
+            f"`{command} --report FILE` makes this page."
+        ),
+        *(report(tallies, name, _RATE_TABLES, seeds[0]) for name in names),
+    ]
+    return "\n\n".join(part.strip() for part in parts) + "\n"
+
+
+def _others(tallies: Sequence[Tally]) -> list[Identifier]:
+    names = dict.fromkeys(tally.identifier for tally in tallies)
+    return [name for name in names if name != PAPER_IDENTIFIER]
 
 
 def _least(tallies: Sequence[Tally]) -> int:

@@ -17,10 +17,10 @@ from tqdm import tqdm
 
 from service.acquire import acquire
 from service.identify.identification import Outcome
-from service.missions.mission import Identifier, load_missions
+from service.missions.mission import Identifier
 from service.simulate.paper.printed import Run, World, the_paper
 from service.simulate.paper.tally import Integers, Tally
-from service.simulate.paper.views import EPOCH, batch_of, draw_zone
+from service.simulate.paper.views import EPOCH, batch_of, draw_zone, paper_mission
 from service.sky.catalog import load_embedded
 from service.sky.shelf import Shelf
 from service.sky.view import Sky
@@ -101,7 +101,7 @@ def perform(task: Task, sky: Sky) -> Integers:
     world = the_paper().worlds[task.world]
     worlds = list(the_paper().worlds)
     rng = np.random.default_rng([task.seed, worlds.index(task.world), task.number])
-    mission = load_missions()[world.mission]
+    mission = paper_mission(world.mission)
     catalog = sky.run_catalog(mission, EPOCH)
     counts = np.zeros((len(task.identifiers), len(task.runs), world.zones, 4), np.int64)
     for zone in range(world.zones):

@@ -4,10 +4,11 @@ import math
 import statistics
 from collections.abc import Iterable, Sequence
 
-from service.missions.mission import Band, Mission, load_missions
+from service.missions.mission import Band, Mission
 from service.simulate.paper.printed import Times, the_paper
 from service.simulate.paper.tables import markdown
 from service.simulate.paper.timings import ZoneTime, proportion
+from service.simulate.paper.views import paper_mission
 from service.sky.pairs import PAIRS_PER_BIN
 
 BYTES_PER_PAIR = 8 + 4 + 4 + 4 / PAIRS_PER_BIN
@@ -85,7 +86,7 @@ def proportions(measured: Sequence[tuple[Times, Sequence[ZoneTime]]]) -> str:
     rows: list[tuple[str, ...]] = []
     for case, zones in measured:
         ordered = sorted(zones, key=lambda zone: (zone.stars, zone.pairs))
-        mission = load_missions()[the_paper().worlds[case.world].mission]
+        mission = paper_mission(the_paper().worlds[case.world].mission)
         share = geometric_share(mission)
         # One zone where they are all the same, else the one with fewest stars and that with most.
         for k in sorted({0, -1} if case.stars[0] != case.stars[1] else {0}, reverse=True):

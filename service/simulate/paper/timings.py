@@ -7,10 +7,10 @@ import numpy as np
 
 from service.acquire import acquire
 from service.identify.presumed import aim_of, presumed_attitude
-from service.missions.mission import Identifier, load_missions
+from service.missions.mission import Identifier
 from service.simulate.paper.experiments import open_sky
 from service.simulate.paper.printed import Times, World, the_paper
-from service.simulate.paper.views import EPOCH, View, batch_of, draw_zone
+from service.simulate.paper.views import EPOCH, View, batch_of, draw_zone, paper_mission
 from service.sky.pairs import build_pairs
 from service.sky.view import Sky
 from service.sky.zones import build_zone
@@ -42,7 +42,7 @@ def measure(case: Times, seed: int, identifier: Identifier = "starid") -> list[Z
     """The times of a row's zones, ten views each, nominal errors, in this process."""
     world = the_paper().worlds[case.world]
     sky = open_sky()
-    mission = load_missions()[world.mission]
+    mission = paper_mission(world.mission)
     warm_up(sky, {mission.name: mission})
     catalog = sky.run_catalog(mission, EPOCH)
     rng = np.random.default_rng([seed, int(case.table)])
@@ -53,11 +53,13 @@ def measure(case: Times, seed: int, identifier: Identifier = "starid") -> list[Z
 
 
 def _measure_zone(world: World, views: list[View], sky: Sky, identifier: Identifier) -> ZoneTime:
-    mission = load_missions()[world.mission]
+    mission = paper_mission(world.mission)
     catalog = sky.run_catalog(mission, EPOCH)
     nominal = next(run for run in the_paper().runs if run.world == world.name)
     batches = [batch_of(view, nominal, mission, identifier) for view in views if len(view.star)]
-    presumed = presumed_attitude(batches[0].a_priori, EPOCH, mission)
+    prior = batches[0].a_priori
+    assert prior is not None
+    presumed = presumed_attitude(prior, EPOCH, mission)
     aim = aim_of(mission.trackers[0], presumed, mission, "a_priori")
 
     clock = [time.perf_counter()]

@@ -7,12 +7,13 @@ began every run with the same seed; only the sizes of the errors differ.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr, ndtri
 
-from service.missions.mission import Band, Identifier, Mission
+from service.missions.mission import Band, Identifier, Mission, load_missions
 from service.observe.batch import ObservationBatch, Options, QuaternionPrior, TrackerStars
 from service.simulate.motion import pointed, random_axis
 from service.simulate.paper.printed import Run, World
@@ -32,6 +33,18 @@ from service.vectors import (
 MOST_STARS = 5
 EPOCH = parse_utc("2000-01-01T12:00:00Z")
 """Every view uses the run catalogs of 2000, also where the Sun stands as it did in 1995."""
+
+
+@cache
+def paper_mission(name: str) -> Mission:
+    """A shipped mission as the prototype flew it.
+
+    It read "all stars down to" a magnitude from a catalog of stars: one fainter
+    than that was not there, and lifted no brighter one by its light.
+    """
+    settings = load_missions()[name].model_dump()
+    settings["catalog"]["merge_limit_mag"] = settings["catalog"]["magnitude_limit_mag"]
+    return Mission.model_validate(settings)
 
 
 @dataclass(frozen=True)
@@ -77,12 +90,17 @@ def rotation(run: Run) -> Matrix:
 
 
 def draw_zone(
-    world: World, number: int, mission: Mission, catalog: RunCatalog, rng: np.random.Generator
+    world: World,
+    number: int,
+    mission: Mission,
+    catalog: RunCatalog,
+    rng: np.random.Generator,
+    most_stars: int = MOST_STARS,
 ) -> Iterator[View]:
     """The views of one zone; `number` chooses among the Sun's dates where the world has them."""
     axis = _axis(world, number, rng)
     for _ in range(world.views):
-        yield _view(world, axis, mission, catalog, rng)
+        yield _view(world, axis, mission, catalog, rng, most_stars)
 
 
 def _axis(world: World, number: int, rng: np.random.Generator) -> Vector:
@@ -95,7 +113,12 @@ def _axis(world: World, number: int, rng: np.random.Generator) -> Vector:
 
 
 def _view(
-    world: World, axis: Vector, mission: Mission, catalog: RunCatalog, rng: np.random.Generator
+    world: World,
+    axis: Vector,
+    mission: Mission,
+    catalog: RunCatalog,
+    rng: np.random.Generator,
+    most_stars: int,
 ) -> View:
     tracker = mission.trackers[0]
     near = _within(axis, math.radians(world.off_axis_deg), rng)
@@ -103,7 +126,7 @@ def _view(
     attitude = pointed(mission.axis_body, near, rng.uniform(0.0, math.tau))
     boresight = attitude.T @ tracker.body_from_tracker[:, 2]
     edge = math.cos(math.radians(tracker.field_of_view_radius_deg))
-    star = rng.permutation(np.flatnonzero(catalog.direction @ boresight >= edge))[:MOST_STARS]
+    star = rng.permutation(np.flatnonzero(catalog.direction @ boresight >= edge))[:most_stars]
     count = len(star)
     return View(
         axis=axis,

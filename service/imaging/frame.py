@@ -1,0 +1,83 @@
+"""A frame: the counts of one exposure, and what its file says of itself."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from service.errors import BadFile, Fault
+
+Counts = npt.NDArray[Any]
+"""(rows, columns), float32 or float64; NaN where a pixel holds no number."""
+
+LEAST_KNOWN, MOST_FULL = 0.5, 0.5
+"""Shares of a frame: of pixels with a number in them, and of full ones."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Counts with the digest of their file.
+
+    `full_scale` is the largest count that the file's numbers can hold, infinite for
+    floating ones.  `time` is the UTC of mid exposure as text and `exposure_s` the
+    exposure, each None where the file does not tell.
+    """
+
+    counts: Counts
+    file_format: str
+    digest: str
+    full_scale: float = math.inf
+    time: str | None = None
+    exposure_s: float | None = None
+
+    @property
+    def width_px(self) -> int:
+        """Columns."""
+        return int(self.counts.shape[1])
+
+    @property
+    def height_px(self) -> int:
+        """Rows."""
+        return int(self.counts.shape[0])
+
+
+@dataclass(frozen=True)
+class FrameLimits:
+    """What a file may unfold into: `max_pixels`, and the (rows, columns) that it must have."""
+
+    max_pixels: int
+    shape: tuple[int, int] | None = None
+    whose: str = "the tracker"
+
+    def require(self, width_px: int, height_px: int) -> None:
+        """Raise `BadFile` for a size that is not to be decoded; asked before anything is."""
+        size = f"{width_px} x {height_px} px"
+        if width_px < 1 or height_px < 1:
+            raise refused("has no pixels", size)
+        if self.shape is not None and (height_px, width_px) != self.shape:
+            rows, columns = self.shape
+            raise refused(f"must have the {columns} x {rows} px of {self.whose}", size)
+        if width_px * height_px > self.max_pixels:
+            raise refused(f"may have at most {self.max_pixels:,} pixels", size)
+
+
+def refused(message: str, value: str | None = None) -> BadFile:
+    """The refusal of a frame as a whole."""
+    return BadFile(Fault("frame", message, value))
+
+
+def require_light(frame: Frame, saturation_counts: float) -> None:
+    """Raise `BadFile` for counts in which no star can be: no numbers, no contrast, all full."""
+    known = np.isfinite(frame.counts)
+    share = float(known.mean())
+    if share < LEAST_KNOWN:
+        raise refused("has no number in most of its pixels", f"NaN in {1.0 - share:.0%}")
+    least = float(np.min(frame.counts, where=known, initial=np.inf))
+    most = float(np.max(frame.counts, where=known, initial=-np.inf))
+    if least == most:
+        raise refused("has no contrast: every pixel holds the same count", f"{least:g}")
+    full = float((frame.counts >= min(saturation_counts, frame.full_scale)).mean())
+    if full > MOST_FULL:
+        raise refused("is saturated", f"{full:.0%} of its pixels are full")

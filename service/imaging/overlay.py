@@ -1,0 +1,120 @@
+"""The picture of a frame with what was made of it: stars, names, residual arrows."""
+
+import io
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from service.imaging.marks import Mark
+
+if TYPE_CHECKING:
+    from PIL.ImageDraw import ImageDraw
+
+LEAST_SIDE_PX = 768
+ARROW_PX = 28.0
+"""The length of the median residual's arrow; all are drawn longer by the same factor."""
+MOST_ENLARGED = 5000.0
+RADIUS_PX, SMALL_RADIUS_PX = 9, 5
+LINE_PX = 18
+FOOT_PX = 2 * LINE_PX + 8
+
+Color = tuple[int, int, int]
+COLORS: Mapping[str, Color] = {
+    "unique": (90, 220, 120),
+    "ambiguous": (240, 200, 60),
+    "unmatched": (255, 90, 90),
+    "left_out": (120, 150, 190),
+    "sharp": (200, 110, 220),
+}
+_ARROW: Color = (110, 200, 255)
+_TEXT: Color = (225, 225, 225)
+_WORDS = {"left_out": "not in the batch", "sharp": "hot pixel or cosmic ray"}
+
+
+def draw_overlay(preview: bytes, step: int, marks: Sequence[Mark], title: str) -> bytes:
+    """A PNG: the preview, of which one pixel is `step` of the frame's, under its marks."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    with Image.open(io.BytesIO(preview), formats=("PNG",)) as stored:
+        picture = stored.convert("RGB")
+    enlarged = max(1, -(-LEAST_SIDE_PX // max(picture.size)))
+    picture = picture.resize((picture.width * enlarged, picture.height * enlarged), 0)
+    canvas = Image.new("RGB", (picture.width, picture.height + FOOT_PX))
+    canvas.paste(picture)
+    draw = ImageDraw.Draw(canvas)
+    font = ImageFont.load_default(12)
+    scale = enlarged / step
+    factor = _arrow_factor(marks)
+    # The stars of the batch last, so that nothing hides them.
+    for mark in sorted(marks, key=lambda each: each.kind not in _WORDS):
+        _draw_mark(draw, mark, scale, factor, font, canvas.width)
+    _draw_foot(draw, marks, title, factor, font, picture.height)
+    file = io.BytesIO()
+    canvas.save(file, "PNG")
+    return file.getvalue()
+
+
+def _draw_mark(
+    draw: "ImageDraw", mark: Mark, scale: float, factor: float, font: object, width: int
+) -> None:
+    # The centre of the first pixel is (0, 0) on the frame and (0.5, 0.5) in the picture.
+    x, y = (mark.u_px + 0.5) * scale, (mark.v_px + 0.5) * scale
+    color = COLORS[mark.kind]
+    if mark.kind == "sharp":
+        r = SMALL_RADIUS_PX - 2
+        draw.line((x - r, y - r, x + r, y + r), color)
+        draw.line((x - r, y + r, x + r, y - r), color)
+        return
+    r = SMALL_RADIUS_PX if mark.kind == "left_out" else RADIUS_PX
+    box = (x - r, y - r, x + r, y + r)
+    if mark.kind == "unmatched":
+        draw.rectangle(box, outline=color, width=2)
+    else:
+        draw.ellipse(box, outline=color, width=1 if mark.kind == "left_out" else 2)
+    if mark.predicted_px is not None:
+        du, dv = mark.predicted_px[0] - mark.u_px, mark.predicted_px[1] - mark.v_px
+        _draw_arrow(draw, x, y, du * factor, dv * factor)
+    if mark.label or mark.kind == "unmatched":
+        text = mark.label or "?"
+        length = draw.textlength(text, font=font)  # type: ignore[arg-type]
+        left = x + r + 3 if x + r + 3 + length < width else x - r - 3 - length
+        draw.text((left, y - r - 6), text, color, font=font)  # type: ignore[arg-type]
+
+
+def _draw_arrow(draw: "ImageDraw", x: float, y: float, along_x: float, along_y: float) -> None:
+    end_x, end_y = x + along_x, y + along_y
+    draw.line((x, y, end_x, end_y), _ARROW, 2)
+    angle = math.atan2(along_y, along_x)
+    for turn in (2.6, -2.6):
+        tip = (end_x + 6 * math.cos(angle + turn), end_y + 6 * math.sin(angle + turn))
+        draw.line((end_x, end_y, *tip), _ARROW, 2)
+
+
+def _arrow_factor(marks: Sequence[Mark]) -> float:
+    """How much longer than true the arrows are: one digit, so that it can be said."""
+    lengths = [
+        math.hypot(mark.predicted_px[0] - mark.u_px, mark.predicted_px[1] - mark.v_px)
+        for mark in marks
+        if mark.predicted_px is not None
+    ]
+    if not lengths:
+        return 0.0
+    factor = min(ARROW_PX / max(float(np.median(lengths)), 1e-9), MOST_ENLARGED)
+    digit = 10.0 ** math.floor(math.log10(factor))
+    return max(1.0, round(factor / digit) * digit)
+
+
+def _draw_foot(
+    draw: "ImageDraw", marks: Sequence[Mark], title: str, factor: float, font: object, top: int
+) -> None:
+    draw.text((6, top + 4), title, _TEXT, font=font)  # type: ignore[arg-type]
+    x = 6.0
+    for kind, color in COLORS.items():
+        text = f"{sum(mark.kind == kind for mark in marks)} {_WORDS.get(kind, kind)}"
+        draw.text((x, top + 4 + LINE_PX), text, color, font=font)  # type: ignore[arg-type]
+        x += draw.textlength(text, font=font) + 16  # type: ignore[arg-type]
+    if factor:
+        text = f"arrows: to the predicted place, {factor:,.0f} times enlarged"
+        draw.text((x, top + 4 + LINE_PX), text, _ARROW, font=font)  # type: ignore[arg-type]

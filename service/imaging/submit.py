@@ -1,0 +1,239 @@
+"""From a frame and what is known of it to the batch that goes down the staircase.
+
+The batch holds all that the answer follows from, so that a what-if needs no frame.
+"""
+
+import hashlib
+import json
+import math
+from itertools import pairwise
+from time import perf_counter_ns as clock_ns
+from typing import IO, Annotated, Any
+
+import numpy as np
+from pydantic import AfterValidator, Field, ValidationError
+
+from service.errors import BadBatch, Fault
+from service.imaging.detect import Detections, detect
+from service.imaging.files import read_frame
+from service.imaging.frame import Frame, FrameLimits, refused, require_light
+from service.imaging.measure import MeasuredStar, measure
+from service.imaging.preview import preview_of
+from service.imaging.record import Flag
+from service.missions.camera import Camera, CentroidMethod
+from service.missions.mission import Mission, Tracker
+from service.observe.batch import Aberration
+from service.observe.frame_record import FrameRecord
+from service.observe.wire import (
+    APrioriIn,
+    BatchIn,
+    Key,
+    Number,
+    OptionsIn,
+    Position,
+    Rate,
+    RunName,
+    Speed,
+    Submission,
+    UnitVector,
+    Wire,
+    faults_of,
+    is_time,
+    submission_from_model,
+)
+from service.vectors import Vector
+
+LEAST_SIGMA_ARCSEC = 1e-3
+BLENDED_SHARE = 0.1
+"""Of the image's sigma: what the light of an unseen companion may move a blended star."""
+MAX_SHARP_KEPT = 500
+
+
+class FrameIn(Wire):
+    """What is told of a frame: the fields of a batch but its stars."""
+
+    batch: Key | None = None
+    time: Annotated[str, AfterValidator(is_time)] | None = None
+    run: RunName = "live"
+    tracker: Key | None = None
+    a_priori: APrioriIn | None = None
+    body_rates_deg_per_s: tuple[Rate, Rate, Rate] = (0.0, 0.0, 0.0)
+    velocity_km_per_s: tuple[Speed, Speed, Speed] | None = None
+    sun_vector: UnitVector | None = None
+    position_km: Position | None = None
+    aberration: Aberration = "to_correct"
+    exposure_s: Annotated[Number, Field(gt=0, le=3600)] | None = None
+    centroid: CentroidMethod | None = None
+    options: OptionsIn = OptionsIn()
+
+    def batch_of(self, digest: str) -> str:
+        """The batch id: the one given, else a name made from the frame's digest."""
+        return self.batch or f"frame-{digest.removeprefix('sha256:')[:16]}"
+
+    def fingerprint(self, spacecraft: str, digest: str) -> str:
+        """The digest of the frame and of all that is told of it."""
+        told = f"{spacecraft}\n{digest}\n{self.model_dump_json(exclude_defaults=True)}"
+        return hashlib.sha256(told.encode()).hexdigest()
+
+
+def read_known(values: dict[str, Any]) -> FrameIn:
+    """What is told of a frame, checked; raises `BadBatch` with every fault."""
+    try:
+        # Through JSON: a list there is a tuple here.
+        return FrameIn.model_validate_json(json.dumps(values))
+    except ValidationError as error:
+        raise BadBatch(faults_of(error)) from None
+
+
+def submission_of_frame(
+    file: IO[bytes], digest: str, known: FrameIn, mission: Mission, max_pixels: int
+) -> Submission:
+    """The batch of the stars on a frame, with the record of how they were found.
+
+    Raises `BadFile` for a file that is no frame of the tracker's and for a frame
+    without a star, `BadInput` for what does not fit the mission.
+    """
+    clock = [clock_ns()]
+    tracker, camera = mission.camera_tracker(known.tracker, "tracker")
+    frame = read_frame(file, FrameLimits(max_pixels, camera.shape, tracker.name), digest)
+    require_light(frame, camera.saturation_counts)
+    time = known.time or frame.time
+    if time is None:
+        raise BadBatch(Fault("time", "must be given: the file does not tell when it was exposed"))
+    if known.exposure_s is not None:
+        frame = _exposed(frame, known.exposure_s)
+    clock.append(clock_ns())
+    found = detect(frame, camera)
+    clock.append(clock_ns())
+    faintest_mag = camera.faintest_mag
+    stars = measure(
+        frame,
+        found,
+        tracker,
+        camera,
+        np.array(known.body_rates_deg_per_s),
+        known.centroid or camera.centroid,
+        mission.catalog.magnitude_limit_mag if faintest_mag is None else faintest_mag,
+    )
+    clock.append(clock_ns())
+    used = [star for star in stars if star.left_out is None]
+    if not used:
+        raise refused("shows no star that could be used", f"{found.count} candidates")
+    model = _batch(mission.name, known, digest, time, tracker, _observed(used, camera))
+    steps = dict(
+        zip(
+            ("read", "detect", "centroid"),
+            ((end - start) // 1000 for start, end in pairwise(clock)),
+            strict=True,
+        )
+    )
+    record = _record(frame, found, stars, tracker, camera, known, steps)
+    submission = submission_from_model(model)
+    fingerprint = known.fingerprint(mission.name, digest)
+    return Submission(submission.batch, submission.text, fingerprint, record)
+
+
+def _exposed(frame: Frame, exposure_s: float) -> Frame:
+    return Frame(
+        frame.counts, frame.file_format, frame.digest, frame.full_scale, frame.time, exposure_s
+    )
+
+
+def _batch(
+    spacecraft: str,
+    known: FrameIn,
+    digest: str,
+    time: str,
+    tracker: Tracker,
+    stars: list[dict[str, Any]],
+) -> BatchIn:
+    told = json.loads(known.model_dump_json(exclude_defaults=True))
+    for name in ("tracker", "exposure_s", "centroid"):
+        told.pop(name, None)
+    whole = {
+        "spacecraft": spacecraft,
+        "a_priori": None,
+        **told,
+        "batch": known.batch_of(digest),
+        "time": time,
+        "observations": [{"tracker": tracker.name, "stars": stars}],
+    }
+    return BatchIn.model_validate_json(json.dumps(whole))
+
+
+def _observed(stars: list[MeasuredStar], camera: Camera) -> list[dict[str, Any]]:
+    """The stars as a batch has them: direction, sigma and magnitude."""
+    u, v = (np.array([getattr(star.record, name) for star in stars]) for name in ("u_px", "v_px"))
+    sigma_u, sigma_v = (
+        np.array([_sigma_px(star, name, camera) for star in stars])
+        for name in ("sigma_u_px", "sigma_v_px")
+    )
+    sigma = camera.tangent_sigmas_arcsec(u, v, sigma_u, sigma_v)
+    directions: Vector = camera.directions(u, v)
+    return [
+        {
+            "vector": vector,
+            "magnitude": round(star.magnitude_mag, 3),
+            "sigma_arcsec": round(max(sigma_arcsec, LEAST_SIGMA_ARCSEC), 4),
+        }
+        for star, vector, sigma_arcsec in zip(
+            stars, np.round(directions, 10).tolist(), sigma.tolist(), strict=True
+        )
+    ]
+
+
+def _sigma_px(star: MeasuredStar, name: str, camera: Camera) -> float:
+    """The predicted error, what the calibration leaves, and for a blend what it may hide."""
+    hidden = BLENDED_SHARE * camera.psf_sigma_px if Flag.BLENDED in star.record.flags else 0.0
+    return math.hypot(getattr(star.record, name), camera.sigma_floor_px, hidden)
+
+
+def _record(
+    frame: Frame,
+    found: Detections,
+    stars: list[MeasuredStar],
+    tracker: Tracker,
+    camera: Camera,
+    known: FrameIn,
+    timings_us: dict[str, int],
+) -> FrameRecord:
+    preview, step = preview_of(found)
+    sharp = zip(found.sharp_u_px.tolist(), found.sharp_v_px.tolist(), strict=True)
+    return FrameRecord(
+        digest=frame.digest,
+        file_format=frame.file_format,
+        tracker=tracker.name,
+        width_px=frame.width_px,
+        height_px=frame.height_px,
+        exposure_s=frame.exposure_s or camera.exposure_s,
+        centroid=known.centroid or camera.centroid,
+        background_counts=round(float(np.median(found.background_counts)), 3),
+        noise_counts=round(found.noise_counts, 3),
+        candidates=found.count,
+        sharp=[(round(u, 1), round(v, 1)) for u, v in sharp][:MAX_SHARP_KEPT],
+        stars=[_told(star) for star in stars],
+        timings_us=timings_us,
+        preview=preview,
+        preview_step=step,
+    )
+
+
+def _told(star: MeasuredStar) -> dict[str, Any]:
+    """A measured candidate, ready for JSON."""
+    record = star.record
+    return {
+        "u_px": _rounded(record.u_px, 4),
+        "v_px": _rounded(record.v_px, 4),
+        "sigma_u_px": _rounded(record.sigma_u_px, 5),
+        "sigma_v_px": _rounded(record.sigma_v_px, 5),
+        "flux_counts": _rounded(record.flux_counts, 1),
+        "magnitude": _rounded(star.magnitude_mag, 3),
+        "signal_ratio": _rounded(record.signal_ratio, 1),
+        "flags": [str(flag) for flag in record.flags],
+        "used": star.left_out is None,
+        "left_out": star.left_out,
+    }
+
+
+def _rounded(value: float, digits: int) -> float | None:
+    return round(value, digits) if math.isfinite(value) else None

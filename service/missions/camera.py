@@ -1,0 +1,153 @@
+"""A tracker's camera: what turns a direction into a place on the sensor and light into counts."""
+
+import math
+from functools import cached_property
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from service.missions.strict import Strict
+from service.vectors import ARCSEC_PER_RADIAN, Vector, unit
+
+CentroidMethod = Literal["window", "scan", "matched", "recursive"]
+Power = Annotated[int, Field(ge=0, le=12)]
+Terms = tuple[tuple[Power, Power, float], ...]
+
+MAX_SIDE_PX = 20_000
+MOST_STARS = 250
+
+_ROUNDS = 50
+_NEAR_ENOUGH = 1e-12
+
+
+class Camera(Strict):
+    """Geometry and light of one tracker's frames.
+
+    u counts along columns and v along rows, in pixels; the centre of the first
+    pixel is (0, 0).  Tracker X lies along +u, Y along +v and the boresight Z
+    points to the sky.  With x = (u - center_u_px) / focal_length_px and y likewise,
+    a star stands in the direction of (x + sum of c x^i y^j over `u_terms`,
+    y + the same over `v_terms`, 1).
+    """
+
+    width_px: int = Field(ge=16, le=MAX_SIDE_PX)
+    height_px: int = Field(ge=16, le=MAX_SIDE_PX)
+    focal_length_px: float = Field(ge=10, le=1e7)
+    center_u_px: float = Field(ge=-MAX_SIDE_PX, le=MAX_SIDE_PX)
+    center_v_px: float = Field(ge=-MAX_SIDE_PX, le=MAX_SIDE_PX)
+    """Where the boresight meets the sensor."""
+    u_terms: Terms = ()
+    v_terms: Terms = ()
+    """Distortion, [i, j, c]: from the plane as measured to the true one."""
+    bias_counts: float = Field(default=0.0, ge=-1e6, le=1e6)
+    """The level of a pixel that has seen nothing."""
+    gain_e_per_count: float = Field(gt=0, le=1e6)
+    read_noise_e: float = Field(ge=0, le=1e6)
+    dark_e_per_s: float = Field(default=0.0, ge=0, le=1e9)
+    saturation_counts: float = Field(gt=0, le=1e9)
+    """A pixel at or above this is full."""
+    exposure_s: float = Field(gt=0, le=3600)
+    """Of a frame that does not say otherwise."""
+    psf_sigma_px: float = Field(ge=0.3, le=20)
+    """Of a star's image along each axis, before the pixel integrates it."""
+    zero_point_mag: float = Field(ge=-10, le=40)
+    """Instrument magnitude of a star that gives one count a second."""
+    sigma_floor_px: float = Field(default=0.0, ge=0, le=10)
+    """What the calibration leaves in a position, per axis, however bright the star."""
+    threshold_sigma: float = Field(default=5.0, ge=3, le=100)
+    """Detection: light, through a filter of the image's shape, over its noise."""
+    centroid: CentroidMethod = "matched"
+    centroid_half_width_px: int = Field(default=4, ge=2, le=25)
+    most_stars: int = Field(default=60, ge=2, le=MOST_STARS)
+    """The brightest so many go into a batch."""
+    faintest_mag: float | None = Field(default=None, ge=-10, le=30)
+    """Stars measured fainter are left out of a batch; by default the run catalog's limit."""
+
+    @model_validator(mode="after")
+    def _bias_lies_below_saturation(self) -> Self:
+        if self.bias_counts >= self.saturation_counts:
+            raise ValueError("bias_counts must be below saturation_counts")
+        return self
+
+    @property
+    def pixel_arcsec(self) -> float:
+        """What a pixel spans at the centre."""
+        return ARCSEC_PER_RADIAN / self.focal_length_px
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns) of a frame."""
+        return self.height_px, self.width_px
+
+    @cached_property
+    def corner_radius_deg(self) -> float:
+        """The angle from the boresight to the farthest corner of the sensor."""
+        u = np.array([-0.5, self.width_px - 0.5, -0.5, self.width_px - 0.5])
+        v = np.array([-0.5, -0.5, self.height_px - 0.5, self.height_px - 0.5])
+        return float(np.degrees(np.arccos(self.directions(u, v)[:, 2].min())))
+
+    def directions(self, u_px: Vector, v_px: Vector) -> Vector:
+        """Unit vectors (n, 3) in tracker axes of places (n,) on the sensor."""
+        x, y = self._plane(u_px, v_px)
+        bent_x, bent_y = self._bent(x, y)
+        return unit(np.stack([x + bent_x, y + bent_y, np.ones_like(x)], axis=-1))
+
+    def places(self, directions: Vector) -> tuple[Vector, Vector]:
+        """Where (u, v) directions (n, 3) fall; NaN for what the sensor cannot see by far."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ahead = directions[..., 2] > 0.0
+            true_x = np.where(ahead, directions[..., 0] / directions[..., 2], np.nan)
+            true_y = np.where(ahead, directions[..., 1] / directions[..., 2], np.nan)
+        # A polynomial says nothing of what lies far outside the field it was fitted in.
+        far = np.hypot(true_x, true_y) > 2.0 * math.tan(math.radians(self.corner_radius_deg))
+        true_x, true_y = np.where(far, np.nan, true_x), np.where(far, np.nan, true_y)
+        x, y = true_x, true_y
+        # Distortion is small: a fixed point is reached in a few rounds.
+        for _ in range(_ROUNDS):
+            bent_x, bent_y = self._bent(x, y)
+            moved = np.nanmax(np.abs([true_x - bent_x - x, true_y - bent_y - y]), initial=0.0)
+            x, y = true_x - bent_x, true_y - bent_y
+            if moved < _NEAR_ENOUGH:
+                break
+        return (
+            x * self.focal_length_px + self.center_u_px,
+            y * self.focal_length_px + self.center_v_px,
+        )
+
+    def tangent_sigmas_arcsec(
+        self, u_px: Vector, v_px: Vector, sigma_u_px: Vector, sigma_v_px: Vector
+    ) -> Vector:
+        """One standard deviation per tangent axis (n,) of places with errors along u and v.
+
+        The root of the mean of the variances along two tangent axes: half the trace.
+        """
+        here = self.directions(u_px, v_px)
+        along_u = self.directions(u_px + 1.0, v_px) - here
+        along_v = self.directions(u_px, v_px + 1.0) - here
+        variance = np.sum(along_u**2, axis=1) * sigma_u_px**2
+        variance += np.sum(along_v**2, axis=1) * sigma_v_px**2
+        return np.asarray(np.sqrt(variance / 2.0) * ARCSEC_PER_RADIAN)
+
+    def magnitude(self, flux_counts: Vector, exposure_s: float) -> Vector:
+        """Instrument magnitudes of light summed over an exposure; NaN where there is none."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            light = np.where(flux_counts > 0.0, flux_counts, np.nan) / exposure_s
+        return np.asarray(self.zero_point_mag - 2.5 * np.log10(light))
+
+    def flux_counts(self, magnitude_mag: Vector, exposure_s: float) -> Vector:
+        """The light, in counts, of a star of an instrument magnitude over an exposure."""
+        return np.asarray(exposure_s * 10.0 ** (0.4 * (self.zero_point_mag - magnitude_mag)))
+
+    def _plane(self, u_px: Vector, v_px: Vector) -> tuple[Vector, Vector]:
+        return (
+            (np.asarray(u_px) - self.center_u_px) / self.focal_length_px,
+            (np.asarray(v_px) - self.center_v_px) / self.focal_length_px,
+        )
+
+    def _bent(self, x: Vector, y: Vector) -> tuple[Vector, Vector]:
+        zero = np.zeros_like(x)
+        return (
+            sum((c * x**i * y**j for i, j, c in self.u_terms), zero),
+            sum((c * x**i * y**j for i, j, c in self.v_terms), zero),
+        )

@@ -1,0 +1,314 @@
+"""Frames of a star tracker with known truth: the real sky through a camera, with all its noise.
+
+Every star of the catalog shines, not only those that a run catalog keeps, each at its
+own place and time, so that blends and faint neighbours are in the frames.  In the
+order of nature: light through the image of a point, drawn out by the body's rates;
+the response of each pixel; photon noise of light, sky and dark current; hot pixels and
+cosmic rays; the noise of reading; full pixels; whole counts.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from service.errors import BadInput, Fault, shown_value
+from service.imaging.frame import Counts
+from service.imaging.psf import GaussianPsf, Psf
+from service.imaging.sampled_psf import airy_psf, cross_psf
+from service.imaging.trail import TrailPsf, trails_px
+from service.missions.camera import Camera
+from service.missions.mission import Mission, RunCatalogSettings, Tracker
+from service.simulate.motion import pointed, random_axis, turned
+from service.simulate.orbits import orbit_of
+from service.simulate.real_sky import RealSky, real_sky
+from service.sky.ephemeris import apparent, observer_velocity
+from service.sky.run_catalog import build_run_catalog
+from service.sky.view import Sky
+from service.times import Utc, parse_utc, shifted
+from service.vectors import Matrix, Vector, quaternion_from_matrix
+
+PsfKind = Literal["gaussian", "airy", "cross"]
+
+DEFAULT_START = "2026-03-01T00:00:00.000Z"
+CADENCE_S = 60.0
+FAINTEST_RENDERED_MAG = 9.0
+"""As deep as the embedded catalog is."""
+FAINTEST_TOLD_MAG = 8.0
+STAMP_HALF_PX = {"gaussian": 8, "airy": 24, "cross": 48}
+FULL_SCALE = 65535
+LIGHT_M = 600e-9
+AIRY_OVER_SIGMA = 2.29
+"""lambda f / D over the sigma of the Gaussian that is as wide at half of its height."""
+WIRE_SHARE = 0.1
+"""Of a wire of the cross, in the aperture's diameter."""
+
+
+@dataclass(frozen=True)
+class FrameSettings:
+    """What decides the frames that are drawn; the same settings always give the same frames."""
+
+    frames: int
+    seed: int = 1
+    tracker: str | None = None
+    start: str = DEFAULT_START
+    psf: PsfKind = "gaussian"
+    a_priori_error_deg: float | None = 1.0
+    """The largest error of the a priori attitude; None: there is none, lost in space."""
+    rates_deg_per_s: float = 0.02
+    """The largest rate about any axis."""
+    response_sigma: float = 0.005
+    """Scatter of the pixels' response to light, one standard deviation."""
+    sky_e_per_s: float = 100.0
+    hot_pixels: int = 200
+    cosmic_rays: int = 5
+
+    def __post_init__(self) -> None:
+        _require(self.frames >= 1, "frames", "must be at least 1", self.frames)
+        _require(self.seed >= 0, "seed", "must not be negative", self.seed)
+        _require(self.psf in get_args(PsfKind), "psf", "must be gaussian, airy or cross", self.psf)
+        error_deg = self.a_priori_error_deg
+        sane = error_deg is None or 0.0 <= error_deg <= 180.0
+        _require(sane, "prior-error", "must be from 0 to 180 deg", error_deg)
+        sane = 0.0 <= self.rates_deg_per_s <= 10.0
+        _require(sane, "rates", "must be from 0 to 10 deg/s", self.rates_deg_per_s)
+        sane = 0.0 <= self.response_sigma <= 0.3
+        _require(sane, "response", "must be from 0 to 0.3", self.response_sigma)
+        sane = 0.0 <= self.sky_e_per_s <= 1e6
+        _require(sane, "sky", "must be from 0 to 1e6 electrons a second", self.sky_e_per_s)
+        for name, count in (("hot-pixels", self.hot_pixels), ("cosmic-rays", self.cosmic_rays)):
+            _require(0 <= count <= 100_000, name, "must be from 0 to 100000", count)
+
+
+@dataclass(frozen=True)
+class DrawnFrame:
+    """One frame, what a client would know of it, and what is true of it.
+
+    `known` is what goes with the frame to the service; `truth` never does.
+    """
+
+    counts: Counts
+    exposure_s: float
+    time: Utc
+    known: dict[str, Any]
+    truth: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _Chip:
+    """What stays the same from frame to frame: the pixels' response, and which are hot."""
+
+    response: Counts
+    hot: Counts
+    hot_e_per_s: Vector
+
+
+@dataclass(frozen=True)
+class _Stars:
+    """The stars on one frame, brightest first, at mid exposure."""
+
+    row: Any
+    u_px: Vector
+    v_px: Vector
+    magnitude_mag: Vector
+    trail_u_px: Vector
+    trail_v_px: Vector = field(default_factory=lambda: np.zeros(0))
+
+
+def draw_frames(
+    mission: Mission, sky: Sky, wanted: FrameSettings, numbers: Iterable[int] | None = None
+) -> Iterator[DrawnFrame]:
+    """The frames of one tracker, or some of them by number; each with a generator of its own."""
+    tracker, camera = mission.camera_tracker(wanted.tracker, "tracker")
+    start = parse_utc(wanted.start, "start")
+    root = (wanted.seed, *mission.name.encode(), *tracker.name.encode())
+    chip = _chip(camera, wanted, np.random.default_rng([*root, 0]))
+    psf = PSFS[wanted.psf](camera)
+    digits = max(4, len(str(wanted.frames)))
+    for k in range(wanted.frames) if numbers is None else numbers:
+        rng = np.random.default_rng([*root, 1, k])
+        time = shifted(start, k * CADENCE_S)
+        attitude = pointed(tracker.body_from_tracker[:, 2], random_axis(rng), rng.uniform(0, 7))
+        limit = wanted.rates_deg_per_s
+        rates = np.round(rng.uniform(-limit, limit, 3), 7)
+        position_km, velocity_km_per_s = (
+            np.round(each, 4) for each in orbit_of(mission).state(time)
+        )
+        everything = whole_sky(sky, mission, time)
+        stars = _stars(
+            everything, tracker, camera, attitude, rates, time, position_km, velocity_km_per_s
+        )
+        counts, hits = _exposed(camera, psf, stars, chip, wanted, rng)
+        known: dict[str, Any] = {
+            "batch": f"{time.text[:10]}-{k + 1:0{digits}d}",
+            "time": time.text,
+            "tracker": tracker.name,
+            "a_priori": _a_priori(attitude, wanted.a_priori_error_deg, rng),
+            "body_rates_deg_per_s": rates.tolist(),
+            "velocity_km_per_s": velocity_km_per_s.tolist(),
+            "position_km": position_km.tolist(),
+        }
+        truth = {
+            "batch": known["batch"],
+            "quaternion": quaternion_from_matrix(attitude).tolist(),
+            "cosmic_rays": hits,
+            "stars": [
+                {
+                    "id": everything.run.star_id[row],
+                    "u_px": round(float(u), 4),
+                    "v_px": round(float(v), 4),
+                    "magnitude": round(float(magnitude), 4),
+                }
+                for row, u, v, magnitude in zip(
+                    stars.row, stars.u_px, stars.v_px, stars.magnitude_mag, strict=True
+                )
+                if magnitude <= FAINTEST_TOLD_MAG
+            ],
+        }
+        yield DrawnFrame(counts, camera.exposure_s, time, known, truth)
+
+
+def whole_sky(sky: Sky, mission: Mission, time: Utc) -> RealSky:
+    """Every star of the catalog as it shines by itself, in the mission's instrument."""
+    settings = RunCatalogSettings(
+        magnitude_limit_mag=FAINTEST_RENDERED_MAG,
+        epoch_step_years=mission.catalog.epoch_step_years,
+        merge_within_arcsec=0.0,
+        color_polynomial_mag=mission.catalog.color_polynomial_mag,
+    )
+    epoch_year = settings.epoch_of(time.julian_year)
+    run, _ = sky.shelf.get(
+        ("whole sky", sky.catalog.digest, settings.digest, epoch_year),
+        lambda: build_run_catalog(sky.catalog, settings, epoch_year),
+    )
+    return real_sky(sky.catalog, settings, run)
+
+
+def _stars(
+    everything: RealSky,
+    tracker: Tracker,
+    camera: Camera,
+    attitude: Matrix,
+    rates_deg_per_s: Vector,
+    time: Utc,
+    position_km: Vector,
+    velocity_km_per_s: Vector,
+) -> _Stars:
+    run = everything.run
+    boresight = attitude.T @ tracker.body_from_tracker[:, 2]
+    near = math.cos(math.radians(min(camera.corner_radius_deg + 0.5, 89.0)))
+    row = np.flatnonzero(run.direction @ boresight >= near)
+    # The light of these is that of another row already.
+    row = row[~everything.catalog.light_elsewhere[run.catalog_row[row]]]
+    direction = everything.directions(row, time, position_km)
+    direction = apparent(direction, observer_velocity(time, velocity_km_per_s), time)
+    u, v = camera.places(direction @ attitude.T @ tracker.body_from_tracker)
+    rows, columns = camera.shape
+    margin = 10.0
+    inside = (u > -margin) & (u < columns + margin) & (v > -margin) & (v < rows + margin)
+    row, u, v = row[inside], u[inside], v[inside]
+    trails = trails_px(camera, tracker.body_from_tracker, rates_deg_per_s, u, v, camera.exposure_s)
+    return _Stars(row, u, v, everything.magnitude_mag[row], *trails)
+
+
+def _exposed(
+    camera: Camera,
+    psf: Psf,
+    stars: _Stars,
+    chip: _Chip,
+    wanted: FrameSettings,
+    rng: np.random.Generator,
+) -> tuple[Counts, int]:
+    """The counts of one exposure, and how many cosmic rays hit."""
+    light_e = np.full(camera.shape, wanted.sky_e_per_s * camera.exposure_s)
+    flux_e = camera.flux_counts(stars.magnitude_mag, camera.exposure_s) * camera.gain_e_per_count
+    half = STAMP_HALF_PX[wanted.psf]
+    for u, v, along_u, along_v, flux in zip(
+        stars.u_px, stars.v_px, stars.trail_u_px, stars.trail_v_px, flux_e, strict=True
+    ):
+        add_star(light_e, TrailPsf(psf, along_u, along_v), u, v, flux, half)
+    light_e *= chip.response
+    light_e += camera.dark_e_per_s * camera.exposure_s
+    light_e.reshape(-1)[chip.hot] += chip.hot_e_per_s * camera.exposure_s
+    electrons = rng.poisson(light_e).astype(np.float64)
+    hits = int(rng.poisson(wanted.cosmic_rays))
+    for _ in range(hits):
+        _add_cosmic_ray(electrons, rng)
+    electrons += rng.normal(0.0, camera.read_noise_e, electrons.shape)
+    counts = np.round(electrons / camera.gain_e_per_count + camera.bias_counts)
+    return np.clip(counts, 0, min(camera.saturation_counts, FULL_SCALE)).astype(np.uint16), hits
+
+
+def add_star(
+    light: Counts, psf: TrailPsf, u_px: float, v_px: float, flux: float, half_px: int
+) -> None:
+    """Add a star's image to an array of light, where it falls on it."""
+    rows, columns = light.shape
+    half_u = half_px + math.ceil(abs(psf.trail_u_px) / 2.0)
+    half_v = half_px + math.ceil(abs(psf.trail_v_px) / 2.0)
+    left, right = max(round(u_px) - half_u, 0), min(round(u_px) + half_u + 1, columns)
+    top, bottom = max(round(v_px) - half_v, 0), min(round(v_px) + half_v + 1, rows)
+    if left < right and top < bottom:
+        du = np.arange(left, right)[None, :] - u_px
+        dv = np.arange(top, bottom)[:, None] - v_px
+        light[top:bottom, left:right] += flux * psf.pixel(du, dv)
+
+
+def _add_cosmic_ray(electrons: Counts, rng: np.random.Generator) -> None:
+    """A straight track of uneven charge: most are a few pixels long."""
+    rows, columns = electrons.shape
+    length, angle = rng.exponential(4.0), rng.uniform(0.0, math.tau)
+    along = np.arange(0.0, max(length, 0.5), 0.25)
+    u = np.round(rng.uniform(0, columns) + along * math.cos(angle)).astype(int)
+    v = np.round(rng.uniform(0, rows) + along * math.sin(angle)).astype(int)
+    inside = (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
+    charge = rng.lognormal(math.log(400.0), 0.8, len(along))
+    np.add.at(electrons, (v[inside], u[inside]), charge[inside])
+
+
+def _chip(camera: Camera, wanted: FrameSettings, rng: np.random.Generator) -> _Chip:
+    response = rng.normal(1.0, wanted.response_sigma, camera.shape).clip(0.0)
+    hot = rng.choice(response.size, min(wanted.hot_pixels, response.size), replace=False)
+    hot_e = rng.lognormal(math.log(1500.0), 1.0, len(hot))
+    return _Chip(response, hot, hot_e / camera.exposure_s)
+
+
+def _a_priori(
+    attitude: Matrix, error_deg: float | None, rng: np.random.Generator
+) -> dict[str, Any] | None:
+    if error_deg is None:
+        return None
+    error = random_axis(rng) * math.radians(rng.uniform(0.0, error_deg))
+    quaternion = np.round(quaternion_from_matrix(turned(attitude, error)), 10)
+    return {"quaternion": quaternion.tolist(), "frame": "EME2000"}
+
+
+def _gaussian(camera: Camera) -> Psf:
+    return GaussianPsf(camera.psf_sigma_px)
+
+
+def _airy(camera: Camera) -> Psf:
+    return airy_psf(AIRY_OVER_SIGMA * camera.psf_sigma_px, reach_px=STAMP_HALF_PX["airy"])
+
+
+def _cross(camera: Camera) -> Psf:
+    # An aperture as wide as the camera's images say, with two wires each way before it.
+    pixel_rad = 1.0 / camera.focal_length_px
+    diameter_m = LIGHT_M / (AIRY_OVER_SIGMA * camera.psf_sigma_px * pixel_rad)
+    wires = [(place * diameter_m, WIRE_SHARE * diameter_m) for place in (-0.25, 0.25)]
+    return cross_psf(diameter_m, wires, wires, pixel_rad, LIGHT_M, reach_px=STAMP_HALF_PX["cross"])
+
+
+PSFS: Mapping[PsfKind, Callable[[Camera], Psf]] = {
+    "gaussian": _gaussian,
+    "airy": _airy,
+    "cross": _cross,
+}
+"""How each kind is made to measure for a camera."""
+
+
+def _require(holds: bool, name: str, message: str, value: object) -> None:
+    if not holds:
+        raise BadInput(Fault(name, message, shown_value(value)))

@@ -1,0 +1,180 @@
+"""Files that are made to harm a reader of frames, by name, with a word of the refusal."""
+
+import io
+import struct
+import zlib
+
+import numpy as np
+from PIL import Image
+
+from service.imaging.fits import write_fits
+
+SIDE = 1024
+
+
+def hostile_files(rng):
+    """(name, bytes, word that the refusal must hold)."""
+    sky = rng.normal(207.0, 6.0, (SIDE, SIDE)).astype(np.uint16)
+    whole = _fits(sky)
+    yield "empty", b"", "empty"
+    yield "text", b"hello, this is no frame", "is not FITS"
+    yield "bigtiff", b"II+\0\x08\0\0\0", "BigTIFF"
+    yield "fits cut off in its header", whole[:2000], "cut off"
+    yield "fits cut off in its data", whole[:100_000], "cut off"
+    yield "fits without end", b"SIMPLE  =                    T".ljust(2880 * 200), "without END"
+    for key, value in (
+        ("NAXIS1", 10**13),
+        ("NAXIS1", -5),
+        ("NAXIS2", 10**400),
+        ("NAXIS", 10**6),
+        ("BITPIX", 7),
+        ("NAXIS1", "'many'"),
+        ("BSCALE", "NaN"),
+        ("BZERO", "1E999"),
+        ("BSCALE", 0),
+    ):
+        yield f"fits {key} {str(value)[:12]}", _fits_with(whole, key, value), key
+    yield (
+        "fits of tables alone",
+        _header(NAXIS=0) + _header(XTENSION="'BINTABLE'", NAXIS=0),
+        "no image",
+    )
+    yield "fits tiles", _header(NAXIS=0, ZIMAGE="T"), "compressed by tiles"
+    yield "one pixel", _fits(sky[:1, :1]), "1 x 1 px"
+    yield "twenty thousand wide", _fits(np.zeros((2, 20_000), np.uint16)), "20000 x 2 px"
+    yield "png bomb", _png(20_000, 20_000, 0), "400000000 pixels"
+    yield "png of more than it says", _png(SIDE, SIDE, 0, bytes(200 << 20)), "no contrast"
+    yield "png text bomb", _png(SIDE, SIDE, 0, chunk=_text_bomb()), "PNG"
+    yield "png profile bomb", _png(SIDE, SIDE, 0, chunk=_profile_bomb()), "PNG"
+    yield "png cut off", _picture(sky, "PNG")[:50_000], "PNG"
+    yield "colour", _picture(np.zeros((SIDE, SIDE, 3), np.uint8), "PNG"), "in colour"
+    yield "colour tiff", _picture(np.zeros((SIDE, SIDE, 3), np.uint8), "TIFF"), "in colour"
+    yield "tiff bomb", _tiff_bomb(20_000, 20_000), "400000000 pixels"
+    yield "tiff of more than it says", _tiff_bomb(SIDE, SIDE), "no contrast"
+    yield "tiff with great tags", _tiff_tags(200), "TIFF tag"
+    yield "tiff with many tags", _tiff_tags(60_000), "tags"
+    yield "tiff cut off", _picture(sky, "TIFF")[:100_000], "TIFF"
+    yield "tiff whose directory is elsewhere", b"II*\0" + struct.pack("<L", 1 << 31), "cut off"
+    yield "npy beyond any memory", _npy((10**9, 10**9), "<f8"), "1000000000 x 1000000000 px"
+    yield "npy of objects", _npy((SIDE, SIDE), "|O"), "numbers"
+    yield "npy of three dimensions", _npy((SIDE, SIDE, 3), "<u2"), "two dimensions"
+    yield "npy with less than it says", _npy((SIDE, SIDE), "<f8"), "cut off"
+    yield "npy with a long header", b"\x93NUMPY\x02\0" + struct.pack("<L", 1 << 30), "header"
+    yield "npy negative", _npy((-SIDE, -SIDE), "<u2"), "px"
+    yield "all NaN", _array(np.full((SIDE, SIDE), np.nan)), "no number"
+    yield "all infinite", _array(np.full((SIDE, SIDE), np.inf, np.float32)), "no number"
+    yield "all black", _fits(np.zeros((SIDE, SIDE), np.uint16)), "no contrast"
+    yield "8 bit saturated", _picture(np.full((SIDE, SIDE), 255, np.uint8), "PNG"), "no contrast"
+    mostly = np.where(rng.random((SIDE, SIDE)) < 0.9, 255, 100).astype(np.uint8)
+    yield "8 bit mostly saturated", _picture(mostly, "PNG"), "saturated"
+    yield "nothing but noise", _array(rng.integers(0, 39_000, (SIDE, SIDE))), ""
+    squares = np.indices((SIDE, SIDE)).sum(axis=0) % 2 * 30_000
+    yield "a chess board", _array(squares), ""
+    yield "no star", whole, "no star"
+
+
+def _fits(counts):
+    file = io.BytesIO()
+    write_fits(file, counts, {})
+    return file.getvalue()
+
+
+def _card(key, value):
+    return f"{key:<8}= {value:>20}".ljust(80)
+
+
+def _header(**cards):
+    first = () if "XTENSION" in cards else (("SIMPLE", "T"),)
+    lines = [_card(key, value) for key, value in (*first, ("BITPIX", 8), *cards.items())]
+    text = "".join(lines) + "END".ljust(80)
+    return text.ljust(-(-len(text) // 2880) * 2880).encode()
+
+
+def _fits_with(whole, key, value):
+    """The file with one card of its header replaced."""
+    cards = [whole[at : at + 80] for at in range(0, 2880, 80)]
+    wanted = f"{key:<8}=".encode()
+    cards = [_card(key, value)[:80].encode() if card.startswith(wanted) else card for card in cards]
+    if not any(card.startswith(wanted) for card in cards):
+        cards[cards.index(b"END".ljust(80))] = _card(key, value).encode()
+    return b"".join(cards) + whole[2880:]
+
+
+def _picture(values, file_format):
+    file = io.BytesIO()
+    Image.fromarray(values).save(file, file_format)
+    return file.getvalue()
+
+
+def _chunk(kind, data):
+    return struct.pack(">L", len(data)) + kind + data + struct.pack(">L", zlib.crc32(kind + data))
+
+
+def _png(width, height, grey, more=b"", chunk=b""):
+    """A PNG of one grey, rows deflated as they are made; `more` data behind its rows."""
+    squeeze = zlib.compressobj(1)
+    row = b"\0" + bytes([grey]) * width
+    data = b"".join(squeeze.compress(row) for _ in range(height))
+    data += squeeze.compress(more) + squeeze.flush()
+    head = struct.pack(">LLBBBBB", width, height, 8, 0, 0, 0, 0)
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + _chunk(b"IHDR", head)
+        + chunk
+        + _chunk(b"IDAT", data)
+        + _chunk(b"IEND", b"")
+    )
+
+
+def _text_bomb():
+    return _chunk(b"zTXt", b"Comment\0\0" + zlib.compress(bytes(256 << 20), 1))
+
+
+def _profile_bomb():
+    return _chunk(b"iCCP", b"profile\0\0" + zlib.compress(bytes(256 << 20), 1))
+
+
+def _tiff(entries, behind=b""):
+    """A little-endian TIFF with one directory of (tag, type, count, value) at its start."""
+    directory = struct.pack("<H", len(entries))
+    directory += b"".join(struct.pack("<HHLL", *entry) for entry in entries) + bytes(4)
+    return b"II*\0" + struct.pack("<L", 8) + directory + behind
+
+
+def _tiff_bomb(width, height):
+    """Deflated data of 256 MB in one strip."""
+    data = zlib.compress(bytes(256 << 20), 1)
+    at = 8 + 2 + 12 * 9 + 4
+    return _tiff(
+        [
+            (256, 4, 1, width),
+            (257, 4, 1, height),
+            (258, 3, 1, 8),
+            (259, 3, 1, 8),
+            (262, 3, 1, 1),
+            (273, 4, 1, at),
+            (277, 3, 1, 1),
+            (278, 4, 1, height),
+            (279, 4, 1, len(data)),
+        ],
+        data,
+    )
+
+
+def _tiff_tags(count):
+    """Tags that all point to the same ten megabytes."""
+    behind = bytes(10 << 20)
+    tags = [(256, 4, 1, SIDE), (257, 4, 1, SIDE)]
+    tags += [(1000 + k, 1, len(behind), 8) for k in range(count)]
+    return _tiff(tags, behind)
+
+
+def _npy(shape, descr):
+    text = str({"descr": descr, "fortran_order": False, "shape": shape}).encode()
+    return b"\x93NUMPY\x01\0" + struct.pack("<H", len(text)) + text + bytes(1000)
+
+
+def _array(values):
+    file = io.BytesIO()
+    np.save(file, values)
+    return file.getvalue()

@@ -1,0 +1,120 @@
+"""What is found on a frame: every star to the limit, nothing else; placed as well as it says."""
+
+import numpy as np
+import pytest
+
+from service.imaging.detect import detect
+from service.imaging.frame import Frame
+from service.imaging.measure import measure
+from service.imaging.shapes import is_sharp
+from service.simulate.frames import FrameSettings, draw_frames
+
+
+@pytest.fixture(scope="module")
+def frames(sky, missions):
+    """Frames with ten times the usual cosmic rays."""
+    settings = FrameSettings(frames=4, seed=8, cosmic_rays=50)
+    return list(draw_frames(missions["IMAGER"], sky, settings))
+
+
+@pytest.fixture
+def camera(missions):
+    return missions["IMAGER"].trackers[0].camera
+
+
+def found_on(drawn, camera):
+    frame = Frame(drawn.counts.astype(np.float32), "FITS", "sha256:0", 65535.0)
+    return frame, detect(frame, camera)
+
+
+def truth_of(drawn):
+    return (
+        np.array([star[name] for star in drawn.truth["stars"]])
+        for name in ("u_px", "v_px", "magnitude")
+    )
+
+
+def away(found, u, v):
+    return np.hypot(found.u_px - u[:, None], found.v_px - v[:, None])
+
+
+def test_every_star_to_the_limit_is_found(frames, camera):
+    for drawn in frames:
+        _, found = found_on(drawn, camera)
+        u, v, magnitude = truth_of(drawn)
+        inside = (u > 0) & (u < 1023) & (v > 0) & (v < 1023) & (magnitude <= 6.5)
+        # A star within three pixels of a brighter one is part of its image.
+        near = np.hypot(u - u[:, None], v - v[:, None]) < 3.0
+        alone = ~(near & (magnitude[None, :] < magnitude[:, None])).any(axis=1)
+        assert (away(found, u, v).min(axis=1)[inside & alone] < 2.0).all()
+
+
+def test_nothing_bright_is_found_that_is_no_star(frames, camera):
+    for drawn in frames:
+        _, found = found_on(drawn, camera)
+        u, v, _ = truth_of(drawn)
+        bright = found.flux_counts > 0.5 * camera.flux_counts(np.array(6.5), 0.1)
+        nearest = away(found, u, v).min(axis=0)
+        assert (nearest[bright] < 2.0).all()
+        assert len(found.sharp_u_px) > 100
+
+
+def test_places_scatter_as_they_say(frames, camera, missions):
+    """Stars that stand alone, errors over predicted sigmas: a variance of one."""
+    normalised = []
+    for drawn in frames:
+        frame, found = found_on(drawn, camera)
+        rates = np.array(drawn.known["body_rates_deg_per_s"])
+        tracker = missions["IMAGER"].trackers[0]
+        u, v, _ = truth_of(drawn)
+        for star in measure(frame, found, tracker, camera, rates, "matched", 6.5):
+            if star.left_out is None and not star.record.flags:
+                apart = np.hypot(u - star.record.u_px, v - star.record.v_px)
+                if np.count_nonzero(apart < 6.0) == 1:
+                    k = int(apart.argmin())
+                    normalised.append((star.record.u_px - u[k]) / star.record.sigma_u_px)
+                    normalised.append((star.record.v_px - v[k]) / star.record.sigma_v_px)
+    assert len(normalised) > 60
+    # Four standard deviations of the mean of so many squares.
+    slack = 4.0 * np.sqrt(2.0 / len(normalised))
+    assert np.mean(np.square(normalised)) == pytest.approx(1.0, abs=slack)
+
+
+@pytest.mark.parametrize("sigma_px", [0.7, 0.9, 1.5])
+def test_points_of_light_are_stars_wherever_they_fall_on_a_pixel(rng, sigma_px):
+    from service.imaging.psf import GaussianPsf
+
+    light = np.zeros((41, 41))
+    steps = np.arange(41)
+    for _ in range(50):
+        u, v = rng.uniform(15, 25, 2)
+        image = GaussianPsf(sigma_px).pixel(steps[None, :] - u, steps[:, None] - v)
+        light = 1000.0 * image + rng.normal(0.0, 3.0, image.shape)
+        assert not is_sharp(light, np.array([u]), np.array([v]), sigma_px)[0]
+
+
+def test_single_pixels_and_tracks_are_none(rng):
+    for _ in range(50):
+        light = rng.normal(0.0, 3.0, (41, 41))
+        light[20, 20] += 500.0
+        assert is_sharp(light, np.array([20.2]), np.array([19.9]), 0.9)[0]
+        for step in range(8):
+            light[20 + step, 20 + step // 2] += rng.uniform(300, 600)
+        assert is_sharp(light, np.array([21.5]), np.array([23.5]), 0.9)[0]
+
+
+def test_a_star_on_a_trail_is_found_and_placed_at_mid_exposure(sky, missions, camera):
+    settings = FrameSettings(frames=1, seed=3, rates_deg_per_s=0.4)
+    (drawn,) = draw_frames(missions["IMAGER"], sky, settings)
+    frame, found = found_on(drawn, camera)
+    tracker, rates = missions["IMAGER"].trackers[0], np.array(drawn.known["body_rates_deg_per_s"])
+    u, v, magnitude = truth_of(drawn)
+    offsets = []
+    for star in measure(frame, found, tracker, camera, rates, "matched", 6.0):
+        if star.left_out is None and not star.record.flags:
+            apart = np.hypot(u - star.record.u_px, v - star.record.v_px)
+            k = int(apart.argmin())
+            offsets.append((star.record.u_px - u[k], star.record.v_px - v[k]))
+            assert star.magnitude_mag == pytest.approx(magnitude[k], abs=0.2)
+    assert len(offsets) >= 4
+    assert np.abs(offsets).max() < 0.3

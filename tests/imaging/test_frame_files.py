@@ -1,0 +1,107 @@
+"""Frames are read as other readers read them, whatever the file's kind; truth is kept exactly."""
+
+import io
+import math
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from PIL import Image
+
+from service.imaging.files import read_frame
+from service.imaging.fits import write_fits
+from service.imaging.frame import FrameLimits
+
+LIMITS = FrameLimits(max_pixels=1_000_000)
+
+
+@pytest.fixture
+def counts(rng):
+    return rng.integers(0, 65536, (31, 47)).astype(np.uint16)
+
+
+def read(data, limits=LIMITS):
+    return read_frame(io.BytesIO(data), limits)
+
+
+def astropy_file(values, **cards):
+    file = io.BytesIO()
+    unit = fits.PrimaryHDU(values)
+    unit.header.update(cards)
+    unit.writeto(file)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("kind", ["u1", "i2", "u2", "i4", "i8", "f4", "f8"])
+def test_a_fits_file_of_astropy_is_read_as_astropy_reads_it(rng, kind):
+    values = rng.uniform(0, 200, (12, 20)).astype(kind)
+    frame = read(astropy_file(values))
+    assert frame.file_format == "FITS"
+    assert np.array_equal(frame.counts, values.astype(np.float64))
+    full = math.inf if kind[0] == "f" else float(np.iinfo(kind).max)
+    assert frame.full_scale == full
+
+
+def test_what_is_written_astropy_reads(counts):
+    file = io.BytesIO()
+    write_fits(file, counts, {"EXPTIME": 0.1, "OBSERVER": "D'Arcy", "GUIDED": True})
+    with fits.open(io.BytesIO(file.getvalue())) as opened:
+        opened.verify("exception")
+        assert np.array_equal(opened[0].data, counts)
+        assert opened[0].header["OBSERVER"] == "D'Arcy"
+        assert opened[0].header["EXPTIME"] == 0.1
+    assert np.array_equal(read(file.getvalue()).counts, counts)
+
+
+def test_scales_blanks_and_images_behind_an_empty_unit_are_understood():
+    values = np.array([[1, 2], [-32768, 4]], dtype=np.int16)
+    header = {"BSCALE": 2.0, "BZERO": 10.0, "BLANK": -32768}
+    file = io.BytesIO()
+    image = fits.ImageHDU(values)
+    image.header.update(header)
+    fits.HDUList([fits.PrimaryHDU(), image]).writeto(file)
+    assert np.array_equal(
+        read(file.getvalue()).counts, [[12.0, 14.0], [np.nan, 18.0]], equal_nan=True
+    )
+
+
+@pytest.mark.parametrize(
+    ("cards", "time"),
+    [
+        ({"DATE-AVG": "2026-03-01T00:00:00.5"}, "2026-03-01T00:00:00.500Z"),
+        ({"DATE-OBS": "2026-03-01T00:00:00", "EXPTIME": 0.5}, "2026-03-01T00:00:00.250Z"),
+        ({"DATE-OBS": "2026-03-01T00:00:00"}, None),
+        ({"DATE-AVG": "2026-03-01T00:00:00", "TIMESYS": "TT"}, None),
+        ({"DATE-AVG": "noon"}, None),
+    ],
+)
+def test_the_time_of_mid_exposure_is_taken_from_a_header_that_tells_it(cards, time):
+    frame = read(astropy_file(np.zeros((3, 3), np.uint8), **cards))
+    assert frame.time == time
+
+
+def test_pictures_and_arrays_hold_the_same_counts(counts):
+    for file_format in ("PNG", "TIFF"):
+        file = io.BytesIO()
+        Image.fromarray(counts).save(file, file_format)
+        frame = read(file.getvalue())
+        assert (frame.file_format, frame.full_scale) == (file_format, 65535.0)
+        assert np.array_equal(frame.counts, counts)
+    squeezed = io.BytesIO()
+    Image.fromarray(counts).save(squeezed, "TIFF", compression="tiff_adobe_deflate")
+    assert np.array_equal(read(squeezed.getvalue()).counts, counts)
+    small = io.BytesIO()
+    Image.fromarray((counts >> 8).astype(np.uint8)).save(small, "PNG")
+    assert read(small.getvalue()).full_scale == 255.0
+    for array in (counts, np.asfortranarray(counts), counts.astype(">f8")):
+        file = io.BytesIO()
+        np.save(file, array)
+        assert np.array_equal(read(file.getvalue()).counts, counts)
+
+
+def test_the_digest_is_that_of_the_file(counts):
+    import hashlib
+
+    file = io.BytesIO()
+    np.save(file, counts)
+    assert read(file.getvalue()).digest == ("sha256:" + hashlib.sha256(file.getvalue()).hexdigest())
