@@ -9,6 +9,7 @@ from service.acquire import Acquisition, TrackerResult
 from service.attitude.solution import AttitudeSolution
 from service.identify.identification import Outcome
 from service.sky.run_catalog import RunCatalog
+from service.sky.zones import Aim
 from service.vectors import Vector, to_ra_dec
 
 FRAME = "EME2000"
@@ -46,7 +47,7 @@ def answer_of(
         "run": batch.run,
         "time": batch.time.text,
         "identifier": acquisition.choices.identifier,
-        "path": "zone",
+        "path": str(acquisition.path),
         "observations": [
             _tracker_answer(each, acquisition.run_catalog) for each in acquisition.trackers
         ],
@@ -88,18 +89,22 @@ def star_rows(acquisition: Acquisition) -> list[StarRow]:
 
 def _tracker_answer(result: TrackerResult, run_catalog: RunCatalog) -> dict[str, Any]:
     tracker, found = result.corrected.tracker, result.identification
-    ra_deg, dec_deg = to_ra_dec(result.aim.axis)
     return {
         "tracker": tracker.name,
-        "zone": {
-            "kind": result.aim.kind,
-            "ra_deg": float(ra_deg),
-            "dec_deg": float(dec_deg),
-            "stars": result.stars,
-            "pairs": result.pairs,
-            "cached": result.zone_cached,
-        },
+        "zone": None if result.aim is None else _zone(result, result.aim),
         "stars": [_star(result, k, run_catalog) for k in range(len(found.outcome))],
+    }
+
+
+def _zone(result: TrackerResult, aim: Aim) -> dict[str, Any]:
+    ra_deg, dec_deg = to_ra_dec(aim.axis)
+    return {
+        "kind": aim.kind,
+        "ra_deg": float(ra_deg),
+        "dec_deg": float(dec_deg),
+        "stars": result.stars,
+        "pairs": result.pairs,
+        "cached": result.zone_cached,
     }
 
 
@@ -113,8 +118,10 @@ def _star(result: TrackerResult, k: int, run_catalog: RunCatalog) -> dict[str, A
         "votes": int(found.votes[k]),
         "runner_up": int(found.runner_up[k]),
     }
-    if outcome is Outcome.AMBIGUOUS:
+    if outcome is Outcome.AMBIGUOUS or found.rivals[k]:
         star["rivals"] = [_star_id(run_catalog, rival) for rival in found.rivals[k]]
+        if found.rival_probability:
+            star["rival_probabilities"] = list(found.rival_probability[k])
     star["probability"] = _number(found.probability[k])
     star["residual_arcsec"] = _number(result.residual_arcsec[k])
     star["flags"] = _flags(result, k)

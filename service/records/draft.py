@@ -7,15 +7,17 @@ cannot differ from what the client was told.
 import dataclasses
 import json
 import time
-from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 
 from service.acquire import Acquisition
+from service.observe.frame_record import FrameRecord
 from service.observe.wire import Submission
+from service.records.ahead import AHEAD_NS, LIVE
 from service.records.answer import answer_of, star_rows
+from service.records.measures import measures_of
 from service.times import DAY_S, HOUR_S, Utc
 
 Row = dict[str, Any]
@@ -54,10 +56,11 @@ class Draft:
     """A result that is computed and not yet recorded.
 
     `batch` is the row of a first submission and None for a what-if.  `answer`
-    lacks the time that recording took.
+    lacks the time that recording took.  `acquisition` is None where another
+    process made it.
     """
 
-    acquisition: Acquisition
+    acquisition: Acquisition | None
     answer: Row
     batch: Row | None
     result: Row
@@ -65,6 +68,7 @@ class Draft:
     solution: Row | None
     buckets: Buckets
     key: str | None
+    frame: Row | None = None
     handed: Handed | None = None
 
     @property
@@ -111,10 +115,20 @@ def submission_draft(
         "input": submission.text,
     }
     answer = answer_of(acquisition, id=id)
+    if submission.frame is not None:
+        answer["frame"] = submission.frame.summary()
+    if batch.run == LIVE and batch.time.tai_ns > received.tai_ns + AHEAD_NS:
+        answer["warnings"].append(
+            f"dated_ahead: the batch is dated {batch.time.text} and came at {received.text}; it is "
+            "not shown as the latest"
+        )
     result = _result_row(
         acquisition, answer, batch_id=id, parent=None, current=True, created=received
     )
-    return _draft(acquisition, answer, row, result, key)
+    draft = _draft(acquisition, answer, row, result, key)
+    if submission.frame is not None:
+        draft.frame = _frame_row(submission.frame, id)
+    return draft
 
 
 def what_if_draft(
@@ -135,19 +149,6 @@ def what_if_draft(
     return _draft(acquisition, answer, None, result, None)
 
 
-def counts_of(result: Row) -> "Counter[str]":
-    """What one current result adds to the trends."""
-    return Counter(
-        batches=1,
-        observed=result["observed"],
-        unique=result["unique"],
-        ambiguous=result["ambiguous"],
-        unmatched=result["unmatched"],
-        solved=int(result["status"] is not None),
-        suspect=int(result["status"] == "suspect"),
-    )
-
-
 def _draft(
     acquisition: Acquisition,
     answer: Row,
@@ -162,6 +163,17 @@ def _draft(
     )
     solution = _solution_row(acquisition, answer, result["id"])
     return Draft(acquisition, answer, batch_row, result, stars, solution, buckets, key)
+
+
+def _frame_row(frame: FrameRecord, batch_id: str) -> Row:
+    return {
+        "batch_id": batch_id,
+        "digest": frame.digest,
+        "summary": json.dumps(frame.summary()),
+        "detections": json.dumps({"stars": list(frame.stars), "hot_or_cosmic_px": frame.sharp}),
+        "preview": frame.preview,
+        "preview_step": frame.preview_step,
+    }
 
 
 def _result_row(
@@ -191,6 +203,7 @@ def _result_row(
         **answer["counts"],
         "status": attitude and attitude["status"],
         "reason": answer["reason"],
+        **measures_of(acquisition),
     }
 
 

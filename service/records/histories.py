@@ -1,16 +1,26 @@
 """Histories: attitudes, the state of a spacecraft, its settings, and the runs there are."""
 
 import json
+from itertools import groupby
 from typing import Any
 
 from sqlalchemy import Connection, Select, func, select
 
 from service.missions.mission import Mission
+from service.records.ahead import LIVE
 from service.records.draft import Row
-from service.records.pages import PLACE, Page, Stretch, newest_first, oldest_first, page_of
+from service.records.pages import PLACE, Page, Stretch, newest, oldest_first, page_of
 from service.records.reading import summaries, summary_of
-from service.records.tables import batches, missions, results, rollups_daily, runs, solutions
-from service.times import DAY_S, bucket_start
+from service.records.tables import (
+    batches,
+    mission_uses,
+    missions,
+    results,
+    rollups_daily,
+    runs,
+    solutions,
+)
+from service.times import DAY_S, Utc, bucket_start
 
 
 def list_attitudes(
@@ -21,18 +31,17 @@ def list_attitudes(
     return page_of(connection, oldest_first(attitudes().where(*chosen), cursor), limit, attitude_of)
 
 
-def live_state(connection: Connection, mission: Mission, run: str) -> Row:
+def live_state(connection: Connection, mission: Mission, run: str, now: Utc) -> Row:
     """How a spacecraft stands in a run: its newest batch and its newest attitude.
 
     `state` is that of the newest batch: good, suspect, no_attitude, or
     no_batches.  `attitude` is that batch's own, or None; `last_attitude` is the
     newest there is, which may be of an older batch.
     """
-    chosen = Stretch(run, mission.name).conditions()
-    newest = newest_first(summaries().where(*chosen)).limit(1)
-    solved = newest_first(attitudes().where(*chosen, results.c.status.is_not(None))).limit(1)
-    batch = connection.execute(newest).mappings().first()
-    row = connection.execute(solved).mappings().first()
+    stretch = Stretch(run, mission.name)
+    batch = newest(connection, summaries(), stretch, now)
+    solved = attitudes().where(results.c.status.is_not(None))
+    row = newest(connection, solved, stretch, now)
     last = None if row is None else attitude_of(row)
     is_latest = batch is not None and last is not None and last["id"] == batch["id"]
     return {
@@ -46,19 +55,21 @@ def live_state(connection: Connection, mission: Mission, run: str) -> Row:
 
 
 def mission_history(connection: Connection, spacecraft: str) -> list[Row]:
-    """The settings that a spacecraft was served with, oldest first."""
+    """The settings that a spacecraft was served with, oldest first.
+
+    Who goes back to earlier settings uses them anew.
+    """
     query = (
-        select(missions)
-        .where(missions.c.spacecraft == spacecraft)
-        .order_by(missions.c.first_used, missions.c.digest)
+        select(missions.c.digest, missions.c.settings, mission_uses.c.since)
+        .join_from(mission_uses, missions, mission_uses.c.digest == missions.c.digest)
+        .where(mission_uses.c.spacecraft == spacecraft)
+        .order_by(mission_uses.c.id)
     )
+    # Two processes that begin together may both have noted one change.
+    uses = groupby(connection.execute(query).mappings(), key=lambda row: row["digest"])
     return [
-        {
-            "digest": row["digest"],
-            "first_used": row["first_used"],
-            "settings": json.loads(row["settings"]),
-        }
-        for row in connection.execute(query).mappings()
+        {"digest": digest, "since": row["since"], "settings": json.loads(row["settings"])}
+        for digest, (row, *_) in ((digest, list(rows)) for digest, rows in uses)
     ]
 
 
@@ -79,6 +90,7 @@ def list_runs(connection: Connection) -> list[Row]:
         {
             "run": row["name"],
             "created": row["created"],
+            "alarms": row["alarms"] or row["name"] == LIVE,
             "batches": int(sum(part["batches"] for part in parts[row["name"]])),
             "spacecraft": [part["spacecraft"] for part in parts[row["name"]]],
             "first_day": _day(min(part["first"] for part in parts[row["name"]])),

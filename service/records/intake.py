@@ -1,13 +1,10 @@
 """From a submission to its stored answer: compute first, then one transaction, then answer."""
 
-import dataclasses
-import json
 import logging
 import os
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from datetime import UTC, datetime
 
 import msgspec
 
@@ -15,9 +12,10 @@ from service.acquire import Acquisition, acquire
 from service.errors import AcquisitionError, BadBatch, Busy, Fault, NotFound, shown_value
 from service.missions.mission import Mission, mission_named
 from service.observe.batch import ObservationBatch
-from service.observe.wire import OptionsIn, Submission, submission_from_json
+from service.observe.wire import OptionsIn, Submission
+from service.records.again import batch_again
 from service.records.answer import answer_of
-from service.records.draft import Answered, Draft, Handed, Row, submission_draft, what_if_draft
+from service.records.draft import Answered, Draft, Handed, submission_draft, what_if_draft
 from service.records.identity import (
     Identity,
     Registry,
@@ -32,7 +30,7 @@ from service.records.running import Running
 from service.records.store import Store
 from service.records.writer import RETRY_AFTER_S
 from service.sky.view import Sky
-from service.times import Utc, parse_utc
+from service.times import utc_now
 
 MAX_KEY_LENGTH = 255
 
@@ -60,15 +58,26 @@ class Intake:
 
     def submit(self, submission: Submission, key: str | None) -> Answered:
         """Record a batch and answer it; a repeat gets the stored answer, at once or when it is."""
+        identity = identity_of(submission)
+        return self.submit_made(identity, submission.fingerprint, lambda: submission, key)
+
+    def submit_made(
+        self,
+        identity: Identity,
+        fingerprint: str,
+        make: Callable[[], Submission],
+        key: str | None,
+    ) -> Answered:
+        """The same of a batch that is still to be made, and is not where it is recorded."""
         if key is not None:
             _check_key(key)
         while True:
-            stored = self._stored(submission, key)
+            stored = self._stored(identity, fingerprint, key)
             if stored is not None:
                 return stored
-            with self._running.turn(identity_of(submission)) as mine:
+            with self._running.turn(identity) as mine:
                 if mine:
-                    return _raised(self._write([self._draft(submission, key)])[0])
+                    return _raised(self._write([self._draft(make(), key)])[0])
 
     def submit_many(self, submissions: Sequence[Submission]) -> Answers:
         """`submit` of each in one transaction; an error stands in the place of what is refused."""
@@ -98,11 +107,8 @@ class Intake:
         """Run a recorded batch again; `options` replace what they name of the result's own."""
         with self._store.reading() as connection:
             parent = one_result(connection, id)
-        batch = submission_from_json(parent["input"]).batch
-        merged = _merged(json.loads(parent["options"]), options)
-        batch = dataclasses.replace(batch, options=merged.to_options())
-        mission = mission_named(self._missions, batch.spacecraft)
-        acquisition = self._acquire(batch, mission)
+        batch = batch_again(parent["input"], parent["options"], options)
+        acquisition = self.run_again(batch)
         if not (record or adopt):
             answer = answer_of(acquisition, id=None, parent=id) | {"recorded": False}
             return Answered(None, msgspec.json.encode(answer), replayed=False)
@@ -112,15 +118,21 @@ class Intake:
             batch_id=parent["batch_id"],
             parent=id,
             adopt=adopt,
-            created=now(),
+            created=utc_now(),
         )
         return _raised(self._write([draft])[0])
 
-    def _stored(self, submission: Submission, key: str | None) -> Answered | None:
-        identity = identity_of(submission)
+    def run_again(self, batch: ObservationBatch, mission: Mission | None = None) -> Acquisition:
+        """A recorded batch down the staircase once more; nothing is kept.
+
+        Other settings than those of the batch's mission may be given.
+        """
+        return self._acquire(batch, mission or mission_named(self._missions, batch.spacecraft))
+
+    def _stored(self, identity: Identity, fingerprint: str, key: str | None) -> Answered | None:
         with self._store.reading() as connection:
             registry = look_up(connection, [identity], [] if key is None else [key])
-            first = registry.first(identity, key, submission.fingerprint)
+            first = registry.first(identity, key, fingerprint)
             if first is None:
                 return None
             body = stored_answers(connection, [first.result_id])[first.result_id]
@@ -131,7 +143,7 @@ class Intake:
         return Answered(first.result_id, body, replayed=True)
 
     def _draft(self, submission: Submission, key: str | None = None) -> Draft:
-        received = now()
+        received = utc_now()
         mission = mission_in_input(self._missions, submission.batch.spacecraft)
         acquisition = self._acquire(submission.batch, mission)
         return submission_draft(
@@ -170,7 +182,7 @@ class Intake:
         for draft, outcome in zip(drafts, outcomes, strict=True):
             is_new = isinstance(outcome, Answered) and not outcome.replayed
             # A what-if looks at the same stars again: there is nothing new to observe.
-            if is_new and draft.batch is not None:
+            if is_new and draft.batch is not None and draft.acquisition is not None:
                 self._tell(draft.acquisition)
             # Neither is an answer to the batch: both say that nothing was decided about it.
             if isinstance(outcome, Busy) or not isinstance(outcome, Answered | AcquisitionError):
@@ -207,18 +219,6 @@ def identity_of(submission: Submission) -> Identity:
     """What is unique among submissions."""
     batch = submission.batch
     return batch.spacecraft, batch.run, batch.batch
-
-
-def now() -> Utc:
-    """This moment."""
-    return parse_utc(datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ"))
-
-
-def _merged(own: Row, options: OptionsIn) -> OptionsIn:
-    merged = dict(own)
-    for name, value in options.model_dump(exclude_none=True).items():
-        merged[name] = merged.get(name, {}) | value if isinstance(value, dict) else value
-    return OptionsIn.model_validate(merged)
 
 
 def _check_key(key: str) -> None:

@@ -5,9 +5,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Select, tuple_
+from sqlalchemy import ColumnElement, Connection, RowMapping, Select, tuple_
 
 from service.errors import BadBatch, Fault, shown_value
+from service.records.ahead import AHEAD_NS, LIVE
 from service.records.draft import Row
 from service.records.ids import is_ulid
 from service.records.tables import results
@@ -27,16 +28,21 @@ class Page:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Which current results: of a run and perhaps a spacecraft, from `start` to before `end`."""
+    """Which current results: of a run and perhaps a spacecraft, from `start` to before `end`.
 
-    run: str
+    Without a run they are of every run.
+    """
+
+    run: str | None
     spacecraft: str | None = None
     start: Utc | None = None
     end: Utc | None = None
 
     def conditions(self) -> list[ColumnElement[bool]]:
         """The stretch as SQL over `results`."""
-        chosen = [results.c.current, results.c.run == self.run]
+        chosen: list[ColumnElement[bool]] = [results.c.current]
+        if self.run is not None:
+            chosen.append(results.c.run == self.run)
         if self.spacecraft is not None:
             chosen.append(results.c.spacecraft == self.spacecraft)
         if self.start is not None:
@@ -44,6 +50,24 @@ class Stretch:
         if self.end is not None:
             chosen.append(results.c.time_ns < self.end.tai_ns)
         return chosen
+
+
+def newest(
+    connection: Connection, query: Select[Any], stretch: Stretch, now: Utc
+) -> RowMapping | None:
+    """The newest row of a query over current results.
+
+    A live batch that is dated far ahead of now is passed by, unless there are
+    no others: one wrong date must not hide all that comes after it.  What the
+    time of another run means is that run's own business.
+    """
+    chosen = query.where(*stretch.conditions())
+    if stretch.run == LIVE:
+        near = chosen.where(results.c.time_ns <= now.tai_ns + AHEAD_NS)
+        row = connection.execute(newest_first(near).limit(1)).mappings().first()
+        if row is not None:
+            return row
+    return connection.execute(newest_first(chosen).limit(1)).mappings().first()
 
 
 def newest_first(query: Select[Any], cursor: str | None = None) -> Select[Any]:

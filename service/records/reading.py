@@ -8,8 +8,9 @@ from sqlalchemy import Connection, Select, select
 
 from service.errors import NotFound, shown_value
 from service.records.draft import Row
+from service.records.measures import residual_ratio
 from service.records.pages import Page, Stretch, newest_first, page_of
-from service.records.tables import batches, results
+from service.records.tables import batches, frames, missions, results
 
 OutcomeName = Literal["unique", "ambiguous", "unmatched"]
 Status = Literal["good", "suspect", "none"]
@@ -49,6 +50,12 @@ def one_result(connection: Connection, id: str) -> Row:
     return dict(row)
 
 
+def spacecraft_of(connection: Connection, id: str) -> str | None:
+    """The spacecraft of a result; None where there is none of that id."""
+    found = connection.execute(select(results.c.spacecraft).where(results.c.id == id)).scalar()
+    return None if found is None else str(found)
+
+
 def whole_record(connection: Connection, id: str) -> Row:
     """A result as the interface shows it, with input, standing, and the what-ifs of its batch."""
     row = one_result(connection, id)
@@ -57,14 +64,51 @@ def whole_record(connection: Connection, id: str) -> Row:
         .where(results.c.batch_id == row["batch_id"], results.c.parent_id.is_not(None))
         .order_by(results.c.id)
     )
-    return {
+    record = {
         "answer": msgspec.json.decode(row["answer"]),
         "input": json.loads(row["input"]),
         "options": json.loads(row["options"]),
+        "measures": measured(row),
         "current": row["current"],
         "parent": row["parent_id"],
         "what_ifs": [summary_of(each) for each in connection.execute(what_ifs).mappings()],
     }
+    of_frame = select(frames.c.summary, frames.c.detections).where(
+        frames.c.batch_id == row["batch_id"]
+    )
+    frame = connection.execute(of_frame).mappings().first()
+    if frame is not None:
+        record["frame"] = json.loads(frame["summary"]) | json.loads(frame["detections"])
+    return record
+
+
+def frame_behind(connection: Connection, id: str) -> Row:
+    """What an overlay of a result is drawn from; raises `NotFound`, also where there is no frame.
+
+    The `settings` are those of the mission as they were for that result.
+    """
+    one_result(connection, id)
+    query = (
+        select(
+            results.c.answer,
+            results.c.catalog_digest,
+            batches.c.input,
+            frames.c.detections,
+            frames.c.preview,
+            frames.c.preview_step,
+            missions.c.settings,
+        )
+        .select_from(
+            results.join(batches, results.c.batch_id == batches.c.id)
+            .join(frames, frames.c.batch_id == batches.c.id)
+            .join(missions, missions.c.digest == results.c.mission_digest)
+        )
+        .where(results.c.id == id)
+    )
+    row = connection.execute(query).mappings().first()
+    if row is None:
+        raise NotFound(f"batch {shown_value(id)} was not made of a frame")
+    return dict(row)
 
 
 def summaries() -> Select[Any]:
@@ -83,6 +127,18 @@ def summary_of(row: Any) -> Row:
         "counts": {name: row[name] for name in _COUNTS},
         "status": row["status"],
         "reason": row["reason"],
+        "measures": measured(row),
         "parent": row["parent_id"],
         "current": row["current"],
+    }
+
+
+def measured(row: Any) -> Row:
+    """What is measured of a result, as the interface shows it."""
+    return {
+        "residual_rms_arcsec": row["residual_rms_arcsec"],
+        "predicted_rms_arcsec": row["predicted_rms_arcsec"],
+        "residual_ratio": residual_ratio(row),
+        "magnitude_offset_mag": row["magnitude_offset_mag"],
+        "a_priori_angle_deg": row["a_priori_angle_deg"],
     }

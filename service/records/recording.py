@@ -1,34 +1,51 @@
 """Writing results: every row of a result, its part in the trends included, in one transaction."""
 
-from collections import Counter
 from collections.abc import Sequence
 
-from sqlalchemy import Connection, and_, select, update
+from sqlalchemy import Connection, and_, insert, select, update
 
 from service.errors import AcquisitionError
-from service.records import rollups
-from service.records.draft import Answered, Buckets, Draft, Row, counts_of
+from service.records import events, rollups
+from service.records.draft import Answered, Draft, Row
 from service.records.identity import Registry, Taken, look_up, stored_answers
 from service.records.statements import insert_all, insert_missing
 from service.records.tables import (
     batches,
     catalogs,
+    frames,
     idempotency_keys,
+    mission_uses,
     missions,
     results,
     runs,
     solutions,
     star_results,
 )
+from service.records.watching import watch
 
 Outcome = Answered | AcquisitionError
-Changes = list[tuple[Buckets, "Counter[str]"]]
 
 
 def register(connection: Connection, mission_rows: Sequence[Row], catalog_row: Row) -> None:
     """Note the settings and the catalog that results will name, unless they are known already."""
     insert_missing(connection, missions, mission_rows)
     insert_missing(connection, catalogs, [catalog_row])
+    for row in mission_rows:
+        latest = (
+            select(mission_uses.c.digest)
+            .where(mission_uses.c.spacecraft == row["spacecraft"])
+            .order_by(mission_uses.c.id.desc())
+            .limit(1)
+        )
+        if connection.execute(latest).scalar() != row["digest"]:
+            use = {"spacecraft": row["spacecraft"], "digest": row["digest"]}
+            connection.execute(insert(mission_uses), use | {"since": row["first_used"]})
+
+
+def watch_run(connection: Connection, run: str, watched: bool, now: str) -> None:
+    """Let limits be held against a run, or no longer; the run is made where there is none."""
+    insert_missing(connection, runs, [{"name": run, "created": now, "alarms": watched}])
+    connection.execute(update(runs).where(runs.c.name == run).values(alarms=watched))
 
 
 def record(connection: Connection, drafts: Sequence[Draft]) -> list[Outcome]:
@@ -95,18 +112,46 @@ def _insert(connection: Connection, fresh: Sequence[tuple[Draft, bytes]]) -> Non
     )
     names = {draft.answer["run"]: draft.batch["received"] for draft, _ in firsts if draft.batch}
     insert_missing(
-        connection, runs, [{"name": name, "created": names[name]} for name in sorted(names)]
+        connection,
+        runs,
+        [{"name": name, "created": names[name], "alarms": False} for name in sorted(names)],
     )
     insert_all(connection, batches, [draft.batch for draft, _ in firsts if draft.batch])
+    insert_all(connection, frames, [draft.frame for draft, _ in firsts if draft.frame])
     _insert_results(connection, firsts)
-    changes: Changes = [(draft.buckets, counts_of(draft.result)) for draft, _ in firsts]
+    rollups.add(connection, ((draft.buckets, draft.result) for draft, _ in firsts))
     # What-ifs go one by one: of two that are adopted, the second supersedes the first.
+    adopted = []
     for draft, body in fresh:
         if draft.batch is None:
             if draft.result["current"]:
-                changes.append((draft.buckets, _supersede(connection, draft)))
+                _supersede(connection, draft)
+                adopted.append(draft.buckets)
             _insert_results(connection, [(draft, body)])
-    rollups.add(connection, changes)
+    rollups.renew(connection, adopted)
+    watch(connection, [draft for draft, _ in firsts])
+    _tell(connection, [draft for draft, _ in fresh])
+
+
+def _tell(connection: Connection, fresh: Sequence[Draft]) -> None:
+    """Note what came: new batches once for each spacecraft and run, adopted results each."""
+    new: dict[tuple[str, str], list[Draft]] = {}
+    for draft in fresh:
+        spacecraft, run, _ = draft.identity
+        if draft.batch is not None:
+            new.setdefault((run, spacecraft), []).append(draft)
+        elif draft.result["current"]:
+            about = {"spacecraft": spacecraft, "run": run, "id": draft.id}
+            about["batch_id"] = draft.result["batch_id"]
+            events.note(connection, "adopted", about, run=run, spacecraft=spacecraft)
+    for (run, spacecraft), drafts in new.items():
+        latest = max(drafts, key=lambda draft: int(draft.result["time_ns"]))
+        shown = ("id", "batch", "time", "reason", "counts")
+        newest = {name: latest.answer[name] for name in shown}
+        newest["status"] = latest.result["status"]
+        note: Row = {"spacecraft": spacecraft, "run": run, "batches": len(drafts)}
+        note["latest"] = newest
+        events.note(connection, "batches", note, run=run, spacecraft=spacecraft)
 
 
 def _insert_results(connection: Connection, drafts: Sequence[tuple[Draft, bytes]]) -> None:
@@ -116,14 +161,10 @@ def _insert_results(connection: Connection, drafts: Sequence[tuple[Draft, bytes]
     insert_all(connection, solutions, [d.solution for d, _ in drafts if d.solution is not None])
 
 
-def _supersede(connection: Connection, draft: Draft) -> "Counter[str]":
-    """Take the place of the current result of a batch; what that changes in the trends."""
+def _supersede(connection: Connection, draft: Draft) -> None:
+    """Let the current result of a batch stand no longer, so that the draft can take its place."""
     batch_id = draft.result["batch_id"]
     # The lock on the batch orders the adoptions of several processes.
     connection.execute(select(batches.c.id).where(batches.c.id == batch_id).with_for_update())
     current = and_(results.c.batch_id == batch_id, results.c.current)
-    old = connection.execute(select(results).where(current)).mappings().one()
     connection.execute(update(results).where(current).values(current=False))
-    change = counts_of(draft.result)
-    change.subtract(counts_of(dict(old)))
-    return change

@@ -3,10 +3,11 @@
 import json
 import logging
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from itertools import islice
 from typing import Any
 
+import msgspec
 from sqlalchemy import Connection, insert, select, update
 
 from service.errors import (
@@ -19,6 +20,7 @@ from service.errors import (
     shown_value,
 )
 from service.observe.wire import Submission, submission_from_json
+from service.records import events
 from service.records.draft import Answered, Row
 from service.records.store import Store
 from service.records.tables import replays
@@ -26,10 +28,14 @@ from service.records.tables import replays
 CHUNK_LINES = 250
 """Few enough that a single post, which waits for one chunk at most, is not kept waiting."""
 MAX_ERRORS_KEPT = 1_000
+MAX_LISTED = 100
 MAX_FAULTS_KEPT = 3
 """Of one line: they are written anew with every chunk that adds to them, and read as a whole."""
 MAX_TEXT_KEPT = 300
 BUSY_PAUSE_S = 0.5
+
+COUNTED = ("new", "repeated", "observed", "unique", "ambiguous", "unmatched", "attitudes")
+"""What a replay counts: batches by whether they were recorded before, their stars, attitudes."""
 
 log = logging.getLogger(__name__)
 
@@ -42,6 +48,21 @@ def read_replay(connection: Connection, id: str) -> Row:
     row = connection.execute(select(replays).where(replays.c.id == id)).mappings().first()
     if row is None:
         raise NotFound(f"there is no replay with the id {shown_value(id)}")
+    return _whole(row)
+
+
+def list_replays(connection: Connection) -> list[Row]:
+    """The latest replays and their progress, newest first."""
+    query = select(replays).order_by(replays.c.id.desc()).limit(MAX_LISTED)
+    return [_whole(row) for row in connection.execute(query).mappings()]
+
+
+def _whole(row: Any) -> Row:
+    return replay_state(row) | {"errors": json.loads(row["errors"])}
+
+
+def replay_state(row: Any) -> Row:
+    """How far a replay is, without its errors."""
     return {
         "id": row["id"],
         "run": row["run"],
@@ -52,7 +73,7 @@ def read_replay(connection: Connection, id: str) -> Row:
             "done": row["lines_done"],
             "refused": row["lines_refused"],
         },
-        "errors": json.loads(row["errors"]),
+        "counts": dict.fromkeys(COUNTED, 0) | json.loads(row["counts"] or "{}"),
         "started": row["started"],
         "finished": row["finished"],
     }
@@ -71,16 +92,33 @@ def mark_interrupted(connection: Connection, now: str) -> None:
     )
 
 
+class _Counted(msgspec.Struct):
+    """The part of an answer that is counted."""
+
+    counts: dict[str, int]
+    attitude: msgspec.Raw
+
+
+_COUNTED = msgspec.json.Decoder(_Counted)
+
+
 class Replay:
     """One replay at work; its progress is in the table after every chunk."""
 
     def __init__(
-        self, store: Store, submit_many: SubmitMany, now: Callable[[], str], row: Row
+        self,
+        store: Store,
+        submit_many: SubmitMany,
+        now: Callable[[], str],
+        row: Row,
+        check: Callable[[Submission], None],
     ) -> None:
         self._store = store
         self._submit_many = submit_many
         self._now = now
         self._row = row
+        self._check = check
+        self._counts: Counter[str] = Counter()
         self._errors: list[Row] = []
         self._errors_changed = False
         self._stopping = threading.Event()
@@ -97,18 +135,26 @@ class Replay:
             self._over.set()
             raise
 
+    def abandon(self) -> None:
+        """Be over before it has begun."""
+        self._over.set()
+
     def _note(self) -> None:
         row = self._row | {
             "state": "running",
             "lines_done": 0,
             "lines_refused": 0,
             "errors": "[]",
+            "counts": "{}",
             "started": self._now(),
         }
         self._row = row
-        self._store.writer.change(
-            lambda connection: connection.execute(insert(replays), row)
-        ).result()
+
+        def begin(connection: Connection) -> None:
+            connection.execute(insert(replays), row)
+            self._tell(connection)
+
+        self._store.writer.change(begin).result()
 
     @property
     def is_over(self) -> bool:
@@ -132,6 +178,9 @@ class Replay:
             state = "done"
         except Busy:
             state = "interrupted"
+        except BadInput as error:
+            # The file itself, from here on: its lines before are recorded.
+            self._refuse(self._row["lines_done"] + 1, error)
         except Exception as error:
             log.exception("replay %s failed", self._row["id"])
             self._refuse(self._row["lines_done"] + 1, error)
@@ -149,13 +198,17 @@ class Replay:
         for number, line in chunk:
             if line.strip():
                 try:
-                    submissions.append(submission_from_json(line, run=self._row["run"]))
+                    submission = submission_from_json(line.rstrip(b"\r\n"), run=self._row["run"])
+                    self._check(submission)
+                    submissions.append(submission)
                     numbers.append(number)
-                except BadInput as error:
+                except AcquisitionError as error:
                     self._refuse(number, error)
         for number, outcome in zip(numbers, self._submit(submissions), strict=True):
             if isinstance(outcome, AcquisitionError):
                 self._refuse(number, outcome)
+            else:
+                self._count(outcome)
         self._row["lines_done"] = chunk[-1][0]
 
     def _submit(self, submissions: Sequence[Submission]) -> list[Answered | AcquisitionError]:
@@ -169,6 +222,16 @@ class Replay:
                 if self._stopping.wait(BUSY_PAUSE_S):
                     raise
 
+    def _count(self, outcome: Answered) -> None:
+        answer = _COUNTED.decode(outcome.body)
+        self._counts["repeated" if outcome.replayed else "new"] += 1
+        self._counts["attitudes"] += bytes(answer.attitude) != b"null"
+        self._counts.update(answer.counts)
+
+    def _tell(self, connection: Connection) -> None:
+        state = replay_state({"finished": None} | self._row)
+        events.note(connection, "replay", state, run=self._row["run"])
+
     def _refuse(self, number: int, error: Exception) -> None:
         self._row["lines_refused"] += 1
         if len(self._errors) < MAX_ERRORS_KEPT:
@@ -178,11 +241,18 @@ class Replay:
     def _save(self, **changed: Any) -> None:
         names = ("lines_done", "lines_refused")
         values = {n: self._row[n] for n in names} | changed
+        values["counts"] = json.dumps(self._counts)
         if self._errors_changed:
             values["errors"] = json.dumps(self._errors)
         change = update(replays).where(replays.c.id == self._row["id"]).values(values)
+        self._row |= values
+
+        def save(connection: Connection) -> None:
+            connection.execute(change)
+            self._tell(connection)
+
         try:
-            self._store.writer.change(lambda connection: connection.execute(change)).result()
+            self._store.writer.change(save).result()
             self._errors_changed = False
         except Exception as error:
             # The next chunk says how far it is; the batches themselves are recorded.
@@ -205,5 +275,17 @@ def _cut(text: str) -> str:
 
 
 def _chunks(lines: Iterator[Numbered]) -> Iterator[list[Numbered]]:
-    while chunk := list(islice(lines, CHUNK_LINES)):
+    chunk: list[Numbered] = []
+    try:
+        for each in lines:
+            chunk.append(each)
+            if len(chunk) == CHUNK_LINES:
+                yield chunk
+                chunk = []
+    except BadInput:
+        # Damage ends the file; the lines before it are whole.
+        if chunk:
+            yield chunk
+        raise
+    if chunk:
         yield chunk

@@ -1,24 +1,26 @@
-"""Trends: outcomes per spacecraft, run and UTC hour or day, by the time of the batch.
+"""Trends: sums and extremes per spacecraft, run and UTC hour or day, by the time of the batch.
 
 They are changed in the transaction that records a result or adopts one, and so
-are at every moment the sums over the results that are current.
+are at every moment what a count of the current results would give.
 """
 
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-from sqlalchemy import Connection, Table, select
+from sqlalchemy import ColumnElement, Connection, Table, and_, delete, select, update
 
-from service.records.draft import Buckets, Row, counts_of
-from service.records.statements import add_counts
+from service.records.draft import Buckets, Row
+from service.records.measures import COUNTED, contribution, merge
+from service.records.statements import add_rollups
 from service.records.tables import COUNTS, batches, results, rollups_daily, rollups_hourly
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, parse_utc
 
 Bucket = Literal["hour", "day"]
-Changes = Iterable[tuple[Buckets, "Counter[str]"]]
-Sums = dict[tuple[str, str, int], "Counter[str]"]
+Key = tuple[str, str, int]
+"""(spacecraft, run, bucket)."""
+Rollups = dict[Key, Row]
+_KEY = ("spacecraft", "run", "bucket")
 
 
 @dataclass(frozen=True)
@@ -34,22 +36,100 @@ _TRENDS: dict[Bucket, _Trend] = {
 }
 
 
-def add(connection: Connection, changes: Changes) -> None:
-    """Add counts, which may be negative, to the hours and days that they belong to."""
-    listed = list(changes)
+def add(connection: Connection, new: Iterable[tuple[Buckets, Row]]) -> None:
+    """Add new current results (rows of `results`) to the hours and days that they belong to."""
+    hourly: Rollups = {}
+    daily: Rollups = {}
+    for buckets, result in new:
+        _put(hourly, (buckets.spacecraft, buckets.run, buckets.hour), contribution(result))
+    for (spacecraft, run, hour), row in hourly.items():
+        _put(daily, (spacecraft, run, hour // 24), dict(row))
+    for table, found in ((rollups_hourly, hourly), (rollups_daily, daily)):
+        # In one order everywhere, so that two writers wait for each other but never cross.
+        add_rollups(connection, table, [_keyed(key, found[key]) for key in sorted(found)])
+
+
+def renew(connection: Connection, changed: Iterable[Buckets]) -> None:
+    """Count anew the hours and days in which a current result was replaced by another.
+
+    An extreme that is gone cannot be subtracted.  The row is locked before the
+    results are read: what another process adds is then either in both or comes
+    after.
+    """
+    buckets = list(changed)
     for trend in _TRENDS.values():
-        sums: Sums = defaultdict(Counter)
-        for buckets, counts in listed:
-            sums[buckets.spacecraft, buckets.run, getattr(buckets, trend.field)].update(counts)
-        if sums:
-            add_counts(connection, trend.table, list(_rows(sums)))
+        for spacecraft, run, number in sorted(
+            {(each.spacecraft, each.run, getattr(each, trend.field)) for each in buckets}
+        ):
+            place = _place(trend.table, (spacecraft, run, number))
+            connection.execute(select(trend.table.c.bucket).where(place).with_for_update())
+            row = _counted(connection, trend, (spacecraft, run, number))
+            connection.execute(update(trend.table).where(place).values(row or {}))
 
 
-def _rows(sums: Sums) -> Iterator[Row]:
-    # In one order everywhere, so that two writers wait for each other but never cross.
-    for (spacecraft, run, bucket), counts in sorted(sums.items()):
-        key = {"spacecraft": spacecraft, "run": run, "bucket": bucket}
-        yield key | {name: counts[name] for name in COUNTS}
+def renew_hour(connection: Connection, key: Key) -> None:
+    """Count an hour anew from which results were taken out, and its day from its hours.
+
+    Where nothing is left of either, its row goes too.  The rows are locked
+    before anything is read, the hour before the day, as everywhere.
+    """
+    spacecraft, run, hour = key
+    counted = _counted(connection, _TRENDS["hour"], _locked(connection, rollups_hourly, key))
+    _put_back(connection, rollups_hourly, key, counted)
+    day = _locked(connection, rollups_daily, (spacecraft, run, hour // 24))
+    hours = select(rollups_hourly).where(
+        rollups_hourly.c.spacecraft == spacecraft,
+        rollups_hourly.c.run == run,
+        rollups_hourly.c.bucket >= 24 * day[2],
+        rollups_hourly.c.bucket < 24 * (day[2] + 1),
+    )
+    found: Rollups = {}
+    for row in connection.execute(hours.order_by(rollups_hourly.c.bucket)).mappings():
+        _put(found, day, {name: row[name] for name in row if name not in _KEY})
+    _put_back(connection, rollups_daily, day, found.get(day))
+
+
+def _locked(connection: Connection, table: Table, key: Key) -> Key:
+    connection.execute(select(table.c.bucket).where(_place(table, key)).with_for_update())
+    return key
+
+
+def _put_back(connection: Connection, table: Table, key: Key, row: Row | None) -> None:
+    place = _place(table, key)
+    connection.execute(
+        delete(table).where(place) if row is None else update(table).where(place).values(row)
+    )
+
+
+def _counted(connection: Connection, trend: _Trend, key: Key) -> Row | None:
+    start, end = (bucket_start(key[2] + ahead, trend.width_s).tai_ns for ahead in (0, 1))
+    query = select(*(results.c[name] for name in COUNTED)).where(
+        results.c.current,
+        results.c.spacecraft == key[0],
+        results.c.run == key[1],
+        results.c.time_ns >= start,
+        results.c.time_ns < end,
+    )
+    found: Rollups = {}
+    for result in connection.execute(query).mappings():
+        _put(found, key, contribution(dict(result)))
+    return found.get(key)
+
+
+def _put(found: Rollups, key: Key, row: Row) -> None:
+    if key in found:
+        merge(found[key], row)
+    else:
+        found[key] = row
+
+
+def _place(table: Table, key: Key) -> ColumnElement[bool]:
+    spacecraft, run, number = key
+    return and_(table.c.spacecraft == spacecraft, table.c.run == run, table.c.bucket == number)
+
+
+def _keyed(key: Key, row: Row) -> Row:
+    return {"spacecraft": key[0], "run": key[1], "bucket": key[2], **row}
 
 
 def rates(
@@ -82,21 +162,22 @@ def rates(
     ]
 
 
-def stored(connection: Connection, bucket: Bucket) -> Sums:
-    """The trends as they are kept, buckets without a batch left out."""
-    table = _TRENDS[bucket].table
+def stored(connection: Connection, bucket: Bucket) -> Rollups:
+    """The trends as they are kept."""
     return {
-        (row["spacecraft"], row["run"], row["bucket"]): Counter({n: row[n] for n in COUNTS})
-        for row in connection.execute(select(table)).mappings()
+        (row["spacecraft"], row["run"], row["bucket"]): {
+            name: row[name] for name in row if name not in _KEY
+        }
+        for row in connection.execute(select(_TRENDS[bucket].table)).mappings()
     }
 
 
-def recount(connection: Connection, bucket: Bucket) -> Sums:
+def recount(connection: Connection, bucket: Bucket) -> Rollups:
     """The trends counted anew from the current results: what `stored` must equal."""
     width_s = _TRENDS[bucket].width_s
-    sums: Sums = defaultdict(Counter)
+    found: Rollups = {}
     query = select(results, batches.c.time).join_from(results, batches).where(results.c.current)
     for row in connection.execute(query).mappings():
-        number = parse_utc(row["time"]).bucket(width_s)
-        sums[row["spacecraft"], row["run"], number].update(counts_of(dict(row)))
-    return dict(sums)
+        key = row["spacecraft"], row["run"], parse_utc(row["time"]).bucket(width_s)
+        _put(found, key, contribution(dict(row)))
+    return found

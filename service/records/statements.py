@@ -4,15 +4,16 @@ SQLAlchemy works out the SQL of a statement at every execution.  With a dozen
 inserts for each result that takes longer than running them.
 """
 
+import operator
 from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
-from sqlalchemy import Connection, Insert, Table
+from sqlalchemy import Connection, Insert, Table, case, or_
 from sqlalchemy.dialects import postgresql, sqlite
 
 from service.records.draft import Row
-from service.records.tables import COUNTS
+from service.records.tables import COUNTS, MAXIMA, MINIMA, SUMS
 
 
 def insert_all(connection: Connection, table: Table, rows: Sequence[Row]) -> None:
@@ -25,9 +26,9 @@ def insert_missing(connection: Connection, table: Table, rows: Sequence[Row]) ->
     _run(connection, _insert_missing(table, connection.dialect.name), rows)
 
 
-def add_counts(connection: Connection, table: Table, rows: Sequence[Row]) -> None:
-    """Add the counts of each row to those of its key, which begin at zero."""
-    _run(connection, _add_counts(table, connection.dialect.name), rows)
+def add_rollups(connection: Connection, table: Table, rows: Sequence[Row]) -> None:
+    """Merge each row of a rollup into that of its key: sums add up, outer extremes stay."""
+    _run(connection, _add_rollups(table, connection.dialect.name), rows)
 
 
 def _run(connection: Connection, sql: str, rows: Sequence[Row]) -> None:
@@ -46,13 +47,18 @@ def _insert_missing(table: Table, dialect: str) -> str:
 
 
 @cache
-def _add_counts(table: Table, dialect: str) -> str:
+def _add_rollups(table: Table, dialect: str) -> str:
     statement = _kind(dialect).insert(table)
+    new = statement.excluded
+    merged = {name: table.c[name] + new[name] for name in (*COUNTS, *SUMS)}
+    # By CASE: of a null SQLite's MIN is null, PostgreSQL's LEAST the other one.
+    for names, is_outer in ((MINIMA, operator.lt), (MAXIMA, operator.gt)):
+        for name in names:
+            old = table.c[name]
+            takes_over = or_(old.is_(None), is_outer(new[name], old))
+            merged[name] = case((takes_over, new[name]), else_=old)
     return _compiled(
-        statement.on_conflict_do_update(
-            index_elements=list(table.primary_key),
-            set_={name: table.c[name] + statement.excluded[name] for name in COUNTS},
-        ),
+        statement.on_conflict_do_update(index_elements=list(table.primary_key), set_=merged),
         dialect,
     )
 

@@ -1,16 +1,25 @@
 """The tables, the same on SQLite and PostgreSQL.
 
+    frames ──┐
     runs ── batches ── results ── star_results
                          │    └── solutions        no attitude, no row
     missions, catalogs ──┘
     idempotency_keys ── results
+    mission_uses ── missions                       from when each settings were in use
     rollups_hourly, rollups_daily                  of current results, by batch time
+    limits                                         every setting there was; one a quantity is open
+    watches, alarms ── alarm_actions               what is watched, what was raised, who did what
+    events, event_counter                          what happened lately, in order of commit
     replays
+    access_tokens ── access_sessions               who may ask; audit: who changed what
 
 A batch is what was sent; a result is what was made of it.  The first result of
 a batch has the batch's own id; recorded what-ifs add others, and exactly one
 result of a batch is current.  Results repeat the spacecraft, run and time of
 their batch, so that one index answers a list, a history or a trend.
+
+A batch that was made of a frame has a row in `frames`: what was found on it, and a
+small picture.  The frame itself is not kept.
 
 A batch's time is kept as the text of its UTC and as `time_ns`, nanoseconds of
 TAI from 2000-01-01T12:00:00 TAI, for order and ranges.
@@ -26,12 +35,14 @@ from sqlalchemy import (
     ForeignKey,
     Index,
     Integer,
+    LargeBinary,
     MetaData,
     SmallInteger,
     String,
     Table,
     Text,
     UniqueConstraint,
+    false,
     text,
 )
 
@@ -55,6 +66,8 @@ runs = Table(
     metadata,
     Column("name", RunName, primary_key=True),
     Column("created", Moment, nullable=False),
+    # Whether limits are held against the run; live batches are watched in any case.
+    Column("alarms", Boolean, nullable=False, server_default=false()),
 )
 
 missions = Table(
@@ -64,6 +77,15 @@ missions = Table(
     Column("spacecraft", Name, nullable=False, index=True),
     Column("settings", Text, nullable=False),
     Column("first_used", Moment, nullable=False),
+)
+
+mission_uses = Table(
+    "mission_uses",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("spacecraft", Name, nullable=False, index=True),
+    Column("digest", Digest, ForeignKey(missions.c.digest), nullable=False),
+    Column("since", Moment, nullable=False),
 )
 
 catalogs = Table(
@@ -89,6 +111,19 @@ batches = Table(
     UniqueConstraint("spacecraft", "run", "batch"),
 )
 
+frames = Table(
+    "frames",
+    metadata,
+    Column("batch_id", Id, ForeignKey(batches.c.id), primary_key=True),
+    Column("digest", Digest, nullable=False, index=True),
+    # JSON: what the answer says of the frame, and what was found on it.
+    Column("summary", Text, nullable=False),
+    Column("detections", Text, nullable=False),
+    # PNG; so many pixels a side of the frame make one of it.
+    Column("preview", LargeBinary, nullable=False),
+    Column("preview_step", Integer, nullable=False),
+)
+
 results = Table(
     "results",
     metadata,
@@ -111,6 +146,11 @@ results = Table(
     # Of the attitude: good or suspect; null where there is none, and then a reason.
     Column("status", String(16)),
     Column("reason", String(64)),
+    # What trends and limits are about (see `measures`); null where it is not known.
+    Column("residual_rms_arcsec", Double),
+    Column("predicted_rms_arcsec", Double),
+    Column("magnitude_offset_mag", Double),
+    Column("a_priori_angle_deg", Double),
     # The answer's JSON, byte for byte as it was sent.
     Column("answer", Text, nullable=False),
 )
@@ -118,6 +158,12 @@ results = Table(
 # Lists, histories and trends look at current results alone, newest or oldest first; what they
 # filter by stands in the index, so that a page touches the table only for the rows it shows.
 _FILTERS = [results.c[name] for name in ("status", "unique", "ambiguous", "unmatched")]
+MEASURED = (
+    "residual_rms_arcsec",
+    "predicted_rms_arcsec",
+    "magnitude_offset_mag",
+    "a_priori_angle_deg",
+)
 # SQLite uses a partial index only where the query repeats its words.
 _CURRENT: dict[str, Any] = {
     "sqlite_where": text("current = 1"),
@@ -130,6 +176,8 @@ Index(
     results.c.time_ns,
     results.c.batch_id,
     *_FILTERS,
+    # A trend over batches is drawn from the index alone.
+    *(results.c[name] for name in MEASURED),
     **_CURRENT,
 )
 Index(
@@ -140,10 +188,26 @@ Index(
     *_FILTERS,
     **_CURRENT,
 )
+Index(
+    "ix_results_current_by_time",
+    results.c.time_ns,
+    results.c.batch_id,
+    results.c.spacecraft,
+    *_FILTERS,
+    **_CURRENT,
+)
 Index("uq_results_current", results.c.batch_id, unique=True, **_CURRENT)
 Index(
     "ix_results_what_ifs",
     results.c.batch_id,
+    sqlite_where=results.c.parent_id.is_not(None),
+    postgresql_where=results.c.parent_id.is_not(None),
+)
+
+# Whoever deletes a result is asked who refers to it.
+Index(
+    "ix_results_parent",
+    results.c.parent_id,
     sqlite_where=results.c.parent_id.is_not(None),
     postgresql_where=results.c.parent_id.is_not(None),
 )
@@ -180,10 +244,26 @@ solutions = Table(
 )
 
 COUNTS = ("batches", "observed", "unique", "ambiguous", "unmatched", "solved", "suspect")
+SHARES = ("ambiguous_share", "unmatched_share")
+"""Of a batch's stars; their means follow from the counts."""
+VALUES = (
+    "residual_rms_arcsec",
+    "predicted_rms_arcsec",
+    "residual_ratio",
+    "magnitude_offset_mag",
+    "a_priori_angle_deg",
+)
+SUMS = tuple(f"{name}_{part}" for name in VALUES for part in ("n", "sum"))
+MINIMA = tuple(f"{name}_min" for name in (*SHARES, *VALUES))
+MAXIMA = tuple(f"{name}_max" for name in (*SHARES, *VALUES))
 
 
 def _rollup(name: str) -> Table:
-    """Sums over the current results of each spacecraft, run and bucket (see `Utc.bucket`)."""
+    """Sums and extremes over the current results of each spacecraft, run and bucket.
+
+    A bucket is a UTC hour or day (see `Utc.bucket`).  `_n` batches have the
+    value whose `_sum` stands beside it; an extreme of none is null.
+    """
     return Table(
         name,
         metadata,
@@ -191,8 +271,14 @@ def _rollup(name: str) -> Table:
         Column("run", RunName, primary_key=True),
         Column("bucket", Integer, primary_key=True, autoincrement=False),
         *(Column(count, BigInteger, nullable=False) for count in COUNTS),
+        *(Column(each, _type_of(each), nullable=False, server_default=text("0")) for each in SUMS),
+        *(Column(each, Double) for each in (*MINIMA, *MAXIMA)),
         sqlite_with_rowid=False,
     )
+
+
+def _type_of(sum_name: str) -> type[BigInteger] | type[Double[float]]:
+    return BigInteger if sum_name.endswith("_n") else Double
 
 
 rollups_hourly = _rollup("rollups_hourly")
@@ -203,7 +289,7 @@ idempotency_keys = Table(
     metadata,
     Column("key", String(255), primary_key=True),
     Column("fingerprint", String(64), nullable=False),
-    Column("result_id", Id, ForeignKey(results.c.id), nullable=False),
+    Column("result_id", Id, ForeignKey(results.c.id), nullable=False, index=True),
 )
 
 replays = Table(
@@ -217,6 +303,148 @@ replays = Table(
     Column("lines_done", BigInteger, nullable=False),
     Column("lines_refused", BigInteger, nullable=False),
     Column("errors", Text, nullable=False),
+    Column("counts", Text),
     Column("started", Moment, nullable=False),
     Column("finished", Moment),
+)
+
+access_tokens = Table(
+    "access_tokens",
+    metadata,
+    Column("id", Id, primary_key=True),
+    Column("name", String(64), nullable=False, unique=True),
+    # Of the token the digest alone is kept: whoever reads the database cannot use it.
+    Column("digest", String(64), nullable=False, unique=True),
+    Column("scopes", Text, nullable=False),
+    Column("spacecraft", Text),
+    Column("rate_per_s", Double),
+    Column("created", Moment, nullable=False),
+    Column("expires", Moment, nullable=False),
+    Column("revoked", Moment),
+)
+
+access_sessions = Table(
+    "access_sessions",
+    metadata,
+    Column("digest", String(64), primary_key=True),
+    Column("token_id", Id, ForeignKey(access_tokens.c.id), nullable=False),
+    Column("created", Moment, nullable=False),
+    Column("expires", Moment, nullable=False),
+)
+
+audit = Table(
+    "audit",
+    metadata,
+    Column("id", Id, primary_key=True),
+    Column("moment", Moment, nullable=False),
+    Column("who", String(80), nullable=False),
+    Column("action", String(64), nullable=False),
+    Column("about", Text, nullable=False),
+    Column("body", Text),
+    Column("status", SmallInteger),
+)
+
+limits = Table(
+    "limits",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("spacecraft", Name, nullable=False),
+    Column("quantity", String(32), nullable=False),
+    # JSON; null: the shipped ones hold again.
+    Column("settings", Text),
+    Column("who", String(64), nullable=False),
+    Column("comment", Text),
+    Column("since", Moment, nullable=False),
+    Column("until", Moment),
+)
+_OPEN_LIMIT: dict[str, Any] = {
+    "sqlite_where": limits.c.until.is_(None),
+    "postgresql_where": limits.c.until.is_(None),
+}
+Index("uq_limits_open", limits.c.spacecraft, limits.c.quantity, unique=True, **_OPEN_LIMIT)
+Index("ix_limits_history", limits.c.spacecraft, limits.c.quantity, limits.c.id)
+
+watches = Table(
+    "watches",
+    metadata,
+    Column("spacecraft", Name, primary_key=True),
+    Column("run", RunName, primary_key=True),
+    # The latest batch looked at: its time, its id, and when it came.
+    Column("time", Moment, nullable=False),
+    Column("time_ns", BigInteger, nullable=False),
+    Column("batch_id", Id, nullable=False),
+    Column("received", Moment, nullable=False),
+    # The latest batches' values, and since when each quantity is out of its limits.
+    Column("state", Text, nullable=False),
+)
+
+alarms = Table(
+    "alarms",
+    metadata,
+    Column("id", Id, primary_key=True),
+    Column("spacecraft", Name, nullable=False),
+    Column("run", RunName, nullable=False),
+    Column("quantity", String(32), nullable=False),
+    # The worst so far, and that of now: null is back in limits.
+    Column("severity", String(16), nullable=False),
+    Column("current_severity", String(16)),
+    Column("raised_at", Moment, nullable=False),
+    Column("bound", Double, nullable=False),
+    *(
+        Column(f"{which}_{name}", kind, nullable=name == "batch_id")
+        for which in ("raised", "worst", "latest")
+        for name, kind in (("value", Double), ("time", Moment), ("batch_id", Id))
+    ),
+    Column("returned_at", Moment),
+    Column("acknowledged_at", Moment),
+    Column("acknowledged_by", String(64)),
+    Column("shelved_at", Moment),
+    Column("shelved_by", String(64)),
+    Column("shelved_until", Moment),
+    Column("cleared_at", Moment),
+)
+_ACTIVE: dict[str, Any] = {
+    "sqlite_where": alarms.c.cleared_at.is_(None),
+    "postgresql_where": alarms.c.cleared_at.is_(None),
+}
+Index(
+    "uq_alarms_active",
+    alarms.c.run,
+    alarms.c.spacecraft,
+    alarms.c.quantity,
+    unique=True,
+    **_ACTIVE,
+)
+Index("ix_alarms_run", alarms.c.run, alarms.c.id)
+
+alarm_actions = Table(
+    "alarm_actions",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("alarm_id", Id, ForeignKey(alarms.c.id), nullable=False, index=True),
+    Column("at", Moment, nullable=False),
+    Column("action", String(16), nullable=False),
+    Column("who", String(64)),
+    Column("comment", Text),
+    Column("severity", String(16)),
+    Column("value", Double),
+    Column("time", Moment),
+)
+
+events = Table(
+    "events",
+    metadata,
+    Column("id", BigInteger, primary_key=True, autoincrement=False),
+    Column("kind", String(16), nullable=False),
+    Column("run", RunName),
+    Column("spacecraft", Name),
+    Column("data", Text, nullable=False),
+)
+
+event_counter = Table(
+    "event_counter",
+    metadata,
+    # One row, whose lock orders the events of several processes as they are committed.
+    Column("id", SmallInteger, primary_key=True, autoincrement=False),
+    Column("last", BigInteger, nullable=False),
 )

@@ -17,6 +17,7 @@ from sqlalchemy.exc import (
     ProgrammingError,
 )
 
+from service.records import events
 from service.records.draft import Draft
 from service.records.recording import Outcome, record
 
@@ -41,13 +42,14 @@ class Job:
 
 def transact(connection: Connection, jobs: Sequence[Job]) -> list[Any]:
     """One outcome for each job: a result, or the error that concerns it alone."""
-    recorded = iter(_record(connection, [draft for job in jobs for draft in job.drafts]))
-    return [
-        [next(recorded) for _ in job.drafts]
-        if job.change is None
-        else _change(connection, job.change)
-        for job in jobs
-    ]
+    with events.numbered(connection):
+        recorded = iter(_record(connection, [draft for job in jobs for draft in job.drafts]))
+        return [
+            [next(recorded) for _ in job.drafts]
+            if job.change is None
+            else _change(connection, job.change)
+            for job in jobs
+        ]
 
 
 def _record(connection: Connection, drafts: Sequence[Draft]) -> Results:
@@ -88,10 +90,11 @@ def _savepoint(connection: Connection) -> Iterator[None]:
     Trouble of the database itself ends the whole transaction: SQLite, its disk
     full, may have rolled it back already, and what came before would be lost.
     """
-    savepoint = connection.begin_nested()
+    savepoint, noted = connection.begin_nested(), events.noted(connection)
     try:
         yield
     except BaseException as error:
+        events.undone(connection, noted)
         if not is_of_the_database(error):
             savepoint.rollback()
         raise

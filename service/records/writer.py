@@ -42,6 +42,8 @@ class Writer:
         self._queued = 0
         self._closing = False
         self._changed = threading.Condition()
+        self.after_commit: list[Callable[[], object]] = []
+        """Called, without being waited for long, when something was written."""
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
         self._thread.start()
 
@@ -122,6 +124,12 @@ class Writer:
                 job.done.set_exception(outcome)
             else:
                 job.done.set_result(outcome)
+        for told in self.after_commit:
+            try:
+                told()
+            except Exception:
+                # What is written is written, whoever listens.
+                log.exception("nobody could be told of a commit")
 
     def _write(self, jobs: Sequence[Job], attempt: int = 1) -> list[Any]:
         with self._engine.connect() as connection:

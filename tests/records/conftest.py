@@ -50,8 +50,8 @@ def opened(database):
     """Opens operations on the test's database, as often as asked; all are closed at the end."""
     held = []
 
-    def open_operations(**settings):
-        held.append(Operations.open(Settings(database=database, **settings)))
+    def open_operations(mission=None, **settings):
+        held.append(Operations.open(Settings(database=database, **settings), mission))
         return held[-1]
 
     yield open_operations

@@ -1,22 +1,20 @@
 """Whatever was acknowledged is stored, at whatever moment the process is killed."""
 
-import hashlib
-import os
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
-from sqlalchemy import func, select
+import pytest
 
 from service.operations import Operations
-from service.records import rollups
-from service.records.tables import batches, results, solutions, star_results
 from service.settings import Settings
 from tests.records import samples
+from tests.records.whole import assert_whole
+from tests.scale import size
 
-KILLS = int(os.environ.get("TEST_KILLS", "8"))
+KILLS = {"sqlite": 500, "postgresql": 100}
 BATCHES_A_ROUND = 150
 CHECKOUT = Path(__file__).parents[2]
 
@@ -41,37 +39,15 @@ def acknowledged_in(output):
     ]
 
 
-def assert_whole(operations, acknowledged):
-    with operations.store.reading() as connection:
-        stored = {
-            id: hashlib.sha256(answer.encode()).hexdigest()
-            for id, answer in connection.execute(select(results.c.id, results.c.answer))
-        }
-        assert acknowledged.items() <= stored.items()
-        assert connection.scalar(select(func.count()).select_from(batches)) == len(stored)
-        stars = dict(
-            connection.execute(
-                select(star_results.c.result_id, func.count()).group_by(star_results.c.result_id)
-            ).all()
-        )
-        solved = set(connection.scalars(select(solutions.c.result_id)))
-        for row in connection.execute(select(results)).mappings():
-            assert stars[row["id"]] == row["observed"]
-            assert (row["id"] in solved) == (row["status"] is not None)
-        for bucket in ("hour", "day"):
-            assert rollups.stored(connection, bucket) == rollups.recount(connection, bucket)
-        if connection.dialect.name == "sqlite":
-            assert connection.exec_driver_sql("PRAGMA integrity_check").scalar() == "ok"
-            assert connection.exec_driver_sql("PRAGMA foreign_key_check").all() == []
-
-
+@pytest.mark.torture
 def test_nothing_acknowledged_is_lost_torn_or_doubled_by_kills(
     database, tmp_path, sky, missions, rng
 ):
     """Each round repeats the batches of the one before, as clients do that were left waiting."""
     acknowledged, killed = {}, 0
+    kills = size(KILLS[database.partition(":")[0].partition("+")[0]])
     lines = []
-    for round_number in range(KILLS):
+    for round_number in range(kills):
         fresh = [
             samples.batch(
                 sky,
@@ -95,4 +71,4 @@ def test_nothing_acknowledged_is_lost_torn_or_doubled_by_kills(
             operations.close()
     assert acknowledged
     # Had the workers finished, nothing would have been shown.
-    assert killed > KILLS / 2
+    assert killed > kills / 2

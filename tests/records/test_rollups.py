@@ -5,11 +5,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from service.observe.wire import OptionsIn
-from service.records import rollups
 from service.times import parse_utc
+from tests.records.recount import assert_equal_to_a_recount
 from tests.records.samples import KINDS
 
-TIGHT = OptionsIn.model_validate({"tolerances": {"separation_deg": 1e-5}})
+TIGHT = OptionsIn.model_validate({"identifier": "starid", "tolerances": {"separation_deg": 1e-5}})
 WIDE = OptionsIn.model_validate({"tolerances": {"separation_deg": 0.05}})
 
 BATCH = st.fixed_dictionaries(
@@ -25,10 +25,9 @@ WHAT_IF = st.tuples(
 )
 
 
-def assert_equal_to_a_recount(operations):
+def assert_trends_whole(operations):
     with operations.store.reading() as connection:
-        for bucket in ("hour", "day"):
-            assert rollups.stored(connection, bucket) == rollups.recount(connection, bucket)
+        assert_equal_to_a_recount(connection)
 
 
 @settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -50,7 +49,7 @@ def test_they_equal_a_recount_after_any_sequence_of_batches_and_adoptions(operat
             chosen, options, record, adopt = step
             answered = operations.what_if(ids[chosen % len(ids)], options, record, adopt)
             ids += [answered.id] if answered.id else []
-    assert_equal_to_a_recount(operations)
+    assert_trends_whole(operations)
 
 
 def test_an_adopted_result_takes_the_place_of_the_old_one(operations, make):
@@ -63,7 +62,7 @@ def test_an_adopted_result_takes_the_place_of_the_old_one(operations, make):
     (after,) = operations.rates("XTE")
     assert (after["unique"], after["unmatched"]) == (4, 1)
     assert (after["batches"], after["solved"], after["suspect"]) == (1, 1, 0)
-    assert_equal_to_a_recount(operations)
+    assert_trends_whole(operations)
 
 
 def test_live_rates_never_include_a_named_run(operations, make):

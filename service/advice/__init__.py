@@ -1,0 +1,1 @@
+"""WHAT TO CHANGE: what stored batches say of a mission's settings."""

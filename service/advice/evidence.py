@@ -1,0 +1,208 @@
+"""What identified stars say of the settings: differences between what was seen and the catalog.
+
+The stars are those that verified identification names.  It does not look at
+the tolerances, so that what lies beyond one is seen as well as what lies
+within; the pairs that the votes accept would only ever confirm the tolerance
+that they were accepted by.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from service.acquire import Acquisition, Path, TrackerResult, velocity_to_correct
+from service.attitude.solution import AttitudeSolution
+from service.attitude.solve import solve_attitude
+from service.identify.matched import matched_vectors
+from service.missions.mission import Band
+from service.observe.batch import BoresightPrior
+from service.sky.ephemeris import sun_distance_au
+from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector, angle_between_deg, unit
+
+
+@dataclass(frozen=True)
+class Stars:
+    """Of identified stars (n): which batch and tracker, observed and catalog magnitude.
+
+    `pole_angle_deg` is the difference between the observed angle to the pole,
+    through the a priori attitude, and the catalog's; NaN in caps.
+    """
+
+    batch: npt.NDArray[np.int64]
+    tracker: npt.NDArray[np.int64]
+    observed_mag: Vector
+    catalog_mag: Vector
+    pole_angle_deg: Vector
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Of pairs (n) of identified stars of one tracker, no farther apart than the pair index goes.
+
+    `separation_deg` is observed minus catalog.  `pole_difference_deg` is that
+    between the observed and the catalog difference of the angles to the pole
+    (GTODIF and GTRDIF).  `cross_product_deg` is the angle between the observed
+    and the catalog cross product (CRSSEP), NaN where the votes do not ask for it.
+    """
+
+    batch: npt.NDArray[np.int64]
+    separation_deg: Vector
+    pole_difference_deg: Vector
+    cross_product_deg: Vector
+
+
+_Columns = TypeVar("_Columns", Stars, Pairs)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One tracker's own attitude in one batch: its quaternion, covariance, and how well it fits."""
+
+    batch: int
+    tracker: int
+    quaternion: Vector
+    covariance_arcsec2: Matrix
+    taste: float
+    degrees_of_freedom: int
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """All that the identified stars of some batches say."""
+
+    stars: Stars
+    pairs: Pairs
+    fits: tuple[Fit, ...]
+
+    @property
+    def batches(self) -> int:
+        """Batches with at least one identified star."""
+        return len(np.unique(self.stars.batch))
+
+
+def evidence_of(batch: int, acquisition: Acquisition) -> Evidence:
+    """What one acquisition, by verified identification, gives; `batch` numbers it.
+
+    Tests and zones are judged by what was presumed: where the whole sky had to
+    give the attitude, nothing is said.
+    """
+    mission = acquisition.mission
+    names = [tracker.name for tracker in mission.trackers]
+    stars, pairs, fits = [], [], []
+    for result in acquisition.trackers:
+        used = _used(result)
+        if not used.any() or acquisition.presumed is None or result.aim is None:
+            continue
+        if acquisition.path is not Path.ZONE:
+            continue
+        presumed = acquisition.presumed.attitude
+        tracker = names.index(result.corrected.tracker.name)
+        row = result.identification.star[used]
+        observed = result.corrected.direction_body[used] @ presumed
+        catalog = acquisition.run_catalog.direction[row]
+        polar = [np.full(len(row), np.nan)] * 2
+        if isinstance(mission.zone, Band):
+            polar = [angle_between_deg(each, result.aim.axis) for each in (observed, catalog)]
+        stars.append(
+            Stars(
+                np.full(len(row), batch),
+                np.full(len(row), tracker),
+                result.corrected.magnitude_mag[used],
+                acquisition.run_catalog.magnitude_mag[row],
+                polar[0] - polar[1],
+            )
+        )
+        pairs.append(_pairs(batch, acquisition, observed, catalog, polar))
+        solution = _alone(acquisition, result, used)
+        if solution is not None:
+            fits.append(
+                Fit(
+                    batch,
+                    tracker,
+                    solution.quaternion,
+                    solution.covariance_arcsec2,
+                    solution.taste,
+                    solution.degrees_of_freedom,
+                )
+            )
+    return Evidence(_joined(Stars, stars), _joined(Pairs, pairs), tuple(fits))
+
+
+def gathered(parts: Iterable[Evidence]) -> Evidence:
+    """The evidence of many batches as one."""
+    parts = list(parts)
+    return Evidence(
+        _joined(Stars, [part.stars for part in parts]),
+        _joined(Pairs, [part.pairs for part in parts]),
+        tuple(fit for part in parts for fit in part.fits),
+    )
+
+
+def _used(result: TrackerResult) -> npt.NDArray[np.bool_]:
+    """The unique stars; of those that share an identity one is wrong, so neither counts."""
+    star = result.identification.star
+    names, count = np.unique(star, return_counts=True)
+    return result.identification.unique & ~np.isin(star, names[count > 1])
+
+
+def _pairs(
+    batch: int,
+    acquisition: Acquisition,
+    observed: Vector,
+    catalog: Vector,
+    polar: Sequence[Vector],
+) -> Pairs:
+    tolerances = acquisition.choices.tolerances
+    i, j = np.triu_indices(len(observed), 1)
+    between = angle_between_deg(catalog[i], catalog[j])
+    near = between <= tolerances.pair_separation_max_deg
+    i, j, between = i[near], j[near], between[near]
+    apart = [np.abs(each[i] - each[j]) for each in polar]
+    crossing = angle_between_deg(
+        unit(np.cross(observed[i], observed[j])), unit(np.cross(catalog[i], catalog[j]))
+    )
+    # Where both differences tell the order, the votes order by the pole and ask no further.
+    crossing[np.minimum(*apart) > tolerances.pole_difference_deg] = np.nan
+    if isinstance(acquisition.batch.a_priori, BoresightPrior):
+        crossing[:] = np.nan
+    return Pairs(
+        np.full(len(i), batch),
+        angle_between_deg(observed[i], observed[j]) - between,
+        np.abs(apart[0] - apart[1]),
+        crossing,
+    )
+
+
+def _alone(
+    acquisition: Acquisition, result: TrackerResult, used: npt.NDArray[np.bool_]
+) -> AttitudeSolution | None:
+    """The attitude of one tracker's stars alone, whatever the other trackers say."""
+    observed, reference, sigma_rad = matched_vectors(
+        result.corrected.direction_body,
+        result.corrected.sigma_arcsec / ARCSEC_PER_RADIAN,
+        np.where(used, result.identification.star, -1),
+        acquisition.run_catalog.direction,
+        velocity_to_correct(acquisition.batch),
+        sun_distance_au(acquisition.batch.time),
+    )
+    solved = solve_attitude(
+        observed,
+        reference,
+        sigma_rad,
+        np.zeros(len(observed), np.int64),
+        (result.corrected.tracker.name,),
+    )
+    return solved if isinstance(solved, AttitudeSolution) else None
+
+
+def _joined(kind: type[_Columns], parts: Sequence[_Columns]) -> _Columns:
+    """The columns of many parts one after another; those of no part are empty."""
+    return kind(**{each.name: _column(each.name, parts) for each in fields(kind)})
+
+
+def _column(name: str, parts: Sequence[Stars] | Sequence[Pairs]) -> npt.NDArray[Any]:
+    kind = np.int64 if name in ("batch", "tracker") else np.float64
+    return np.concatenate([np.empty(0, kind), *(vars(part)[name] for part in parts)])

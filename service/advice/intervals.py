@@ -1,0 +1,140 @@
+"""Estimates with their 95 % intervals, of values that come in clusters.
+
+The stars of a batch share its attitude, its time and its luck, so a thousand
+pairs of a hundred batches are not a thousand independent ones.  Every interval
+here counts batches: it is made wider by what the values of one batch have in
+common (Kish's design effect, or a sandwich covariance summed over batches).
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from service.vectors import Vector
+
+Z95 = 1.959963984540054
+"""The standard normal's 97.5 % point: both tails beyond it hold 5 %."""
+HUBER = 1.345
+"""Huber's bound in sigmas: 95 % efficient for Gaussian errors."""
+ROUNDS = 50
+
+Clusters = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An estimate with the bounds between which the true value lies with 95 % confidence."""
+
+    value: float
+    low: float
+    high: float
+
+    def scaled(self, factor: float) -> "Interval":
+        """The same of a positive multiple."""
+        return Interval(self.value * factor, self.low * factor, self.high * factor)
+
+    def holds(self, value: float) -> bool:
+        """Whether a value lies between the bounds."""
+        return self.low <= value <= self.high
+
+
+def wilson(share: float, count: float) -> Interval:
+    """A share of `count` independent trials, by Wilson's score interval."""
+    z2 = Z95 * Z95 / count
+    centre = (share + z2 / 2.0) / (1.0 + z2)
+    half = Z95 * math.sqrt(share * (1.0 - share) / count + z2 / (4.0 * count)) / (1.0 + z2)
+    return Interval(share, max(0.0, centre - half), min(1.0, centre + half))
+
+
+def effective_count(marks: npt.NDArray[np.bool_], cluster: Clusters) -> float:
+    """How many independent trials tell as much as these marks (n,) of clusters (n,) do."""
+    n, share = len(marks), float(marks.mean())
+    if share in (0.0, 1.0):
+        return float(n)
+    excess = np.bincount(cluster, weights=marks - share)
+    clusters = len(np.unique(cluster))
+    if clusters < 2:
+        return 1.0
+    variance = float(excess @ excess) * clusters / (clusters - 1) / n**2
+    # Never more than there are: that the marks of a batch shun each other is chance.
+    return min(float(n), share * (1.0 - share) / variance) if variance > 0 else float(n)
+
+
+def share_of(marks: npt.NDArray[np.bool_], cluster: Clusters) -> Interval:
+    """The share of marks (n,) that are true; clusters (n,) number the batches."""
+    return wilson(float(marks.mean()), effective_count(marks, cluster))
+
+
+def quantile(values: Vector, cluster: Clusters, share: float) -> Interval:
+    """The value below which a share of all lies, with Woodruff's interval.
+
+    The bounds are the quantiles at the bounds of the share.  `high` is infinite
+    where the sample is too small to bound it.
+    """
+    at = float(np.quantile(values, share))
+    bounds = wilson(share, effective_count(values <= at, cluster))
+    # Beyond the last but one value nothing is known of the distribution.
+    bounded = bounds.high * len(values) <= len(values) - 1
+    return Interval(
+        at,
+        float(np.quantile(values, bounds.low)),
+        float(np.quantile(values, bounds.high)) if bounded else math.inf,
+    )
+
+
+def median(values: Vector) -> Interval:
+    """The median of independent values (n,), by the sign test: exact whatever they are drawn from.
+
+    Infinite bounds below six values, of which no two bound it with 95 %.
+    """
+    from scipy.stats import binom
+
+    n = len(values)
+    ordered = np.sort(values)
+    at = float(np.median(values))
+    if n < 6:
+        return Interval(at, -math.inf, math.inf)
+    # The true median lies outside the k-th values from either end with at most 5 %.
+    k = int(binom.ppf(0.025, n, 0.5))
+    return Interval(at, float(ordered[k - 1]), float(ordered[n - k]))
+
+
+def fitted(design: Vector, values: Vector, cluster: Clusters) -> tuple[Vector, Vector]:
+    """Coefficients (p,) of a robust linear fit and their covariance (p, p).
+
+    Huber's M-estimate of values (n,) on the design (n, p) by reweighted least
+    squares; the covariance is the sandwich summed over clusters (n,).
+    """
+    beta = _least_squares(design, values)
+    weight = np.ones(len(values))
+    for _ in range(ROUNDS):
+        residual = values - design @ beta
+        sigma = max(1.4826 * float(np.median(np.abs(residual))), 1e-300)
+        weight = np.minimum(1.0, HUBER / np.maximum(np.abs(residual) / sigma, 1e-300))
+        before, root = beta, np.sqrt(weight)[:, None]
+        beta = _least_squares(design * root, values * root[:, 0])
+        if np.allclose(beta, before, rtol=1e-10, atol=1e-12 * sigma):
+            break
+    residual = values - design @ beta
+    sigma = max(1.4826 * float(np.median(np.abs(residual))), 1e-300)
+    inside = np.abs(residual) <= HUBER * sigma
+    bread = np.linalg.inv(design[inside].T @ design[inside])
+    scores = design * (weight * residual)[:, None]
+    groups = int(cluster.max()) + 1
+    sums = np.stack(
+        [np.bincount(cluster, weights=column, minlength=groups) for column in scores.T], axis=1
+    )
+    used = max(len(np.unique(cluster)), 2)
+    return beta, np.asarray(bread @ (sums.T @ sums) @ bread * used / (used - 1))
+
+
+def _least_squares(design: Vector, values: Vector) -> Vector:
+    return np.asarray(np.linalg.lstsq(design, values, rcond=None)[0], dtype=np.float64)
+
+
+def intervals(beta: Vector, covariance: Vector) -> list[Interval]:
+    """Each coefficient of a fit with its bounds."""
+    half = Z95 * np.sqrt(np.diag(covariance))
+    return [Interval(float(b), float(b - h), float(b + h)) for b, h in zip(beta, half, strict=True)]

@@ -1,0 +1,202 @@
+"""The advice as it is sent and printed: plain values for JSON, and a text for a terminal."""
+
+import math
+import textwrap
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from service.advice.advice import Advice
+from service.advice.intervals import Interval
+from service.advice.tried import Tried
+from service.advice.words import (
+    Said,
+    said_of_alignment,
+    said_of_magnitudes,
+    said_of_noise,
+    said_of_tolerance,
+)
+
+Row = dict[str, Any]
+WIDTH = 96
+
+
+def as_row(advice: Advice) -> Row:
+    """The advice ready for JSON: findings with figures and words, what was tried, the changes."""
+    tolerances = [(each, said_of_tolerance(each, advice)) for each in advice.tolerances]
+    noise = [(each, said_of_noise(each)) for each in advice.noise]
+    magnitudes = [(each, said_of_magnitudes(each, advice)) for each in advice.magnitudes]
+    alignment = [(each, said_of_alignment(each)) for each in advice.alignment]
+    said = [each for pairs in (tolerances, noise, magnitudes, alignment) for _, each in pairs]
+    return {
+        "mission": advice.mission.digest,
+        "identifier": advice.mission.identifier,
+        "batches_sampled": advice.sampled,
+        "batches_identified": advice.identified,
+        "batches_refused": advice.refused,
+        "refusal": advice.refusal,
+        "tolerances": [
+            {
+                "tolerance": each.tolerance.name,
+                "symbol": each.symbol,
+                "unit": each.tolerance.unit,
+                "now": each.now,
+                "verdict": each.verdict,
+                "confidence": each.confidence,
+                "differences": each.differences,
+                "batches": each.batches,
+                "needed": _interval(each.needed),
+                "share_beyond": _interval(each.beyond),
+                "recommended": each.recommended,
+                **_words(words),
+            }
+            for each, words in tolerances
+        ],
+        "noise": [
+            {
+                "tracker": each.tracker,
+                "now_arcsec": each.now_arcsec,
+                "sigma_arcsec": _interval(each.sigma_arcsec),
+                "batches": each.batches,
+                "verdict": each.verdict,
+                **_words(words),
+            }
+            for each, words in noise
+        ],
+        "magnitudes": [
+            {
+                "tracker": each.tracker,
+                "pivot_mag": None if math.isnan(each.pivot_mag) else each.pivot_mag,
+                "offset_mag": _interval(each.offset_mag),
+                "scale": _interval(each.scale),
+                "now_sigma_mag": each.now_sigma_mag,
+                "scatter_mag": _interval(each.scatter_mag),
+                "stars": each.stars,
+                "verdict": each.verdict,
+                "scatter_verdict": each.scatter_verdict,
+                **_words(words),
+            }
+            for each, words in magnitudes
+        ],
+        "alignment": [
+            {
+                "tracker": each.tracker,
+                "reference": each.reference,
+                "rotation_arcsec": each.rotation_arcsec
+                and [_interval(part) for part in each.rotation_arcsec],
+                "axes_body": each.axes_body,
+                "batches": each.batches,
+                "verdict": each.verdict,
+                **_words(words),
+            }
+            for each, words in alignment
+        ],
+        "tried": [_tried(each) for each in advice.tried],
+        "changes": [
+            {"table": change.table, "tracker": change.tracker, "line": change.line}
+            for each in said
+            for change in each.changes
+        ],
+    }
+
+
+def _words(said: Said) -> Row:
+    return {"action": said.action, "text": said.text}
+
+
+def _interval(found: Interval | None) -> Row | None:
+    """The bounds, null where the sample does not bound it."""
+    if found is None:
+        return None
+    parts = {"value": found.value, "low": found.low, "high": found.high}
+    return {name: part if math.isfinite(part) else None for name, part in parts.items()}
+
+
+def _tried(each: Tried) -> Row:
+    return {
+        "name": each.variant.name,
+        "identifier": each.variant.identifier,
+        "tolerances": dict(each.variant.tolerances),
+        "batches": each.batches,
+        "observed": each.observed,
+        "unique": each.unique,
+        "ambiguous": each.ambiguous,
+        "unmatched": each.unmatched,
+        "named_otherwise": each.otherwise,
+        "change_points": _interval(each.change),
+    }
+
+
+# ---- for a terminal --------------------------------------------------------------------------
+
+
+def as_text(row: Mapping[str, Any]) -> str:
+    """The advice for people: sentences, a table of what was tried, the lines to change."""
+    lines = [*_heading(row), ""]
+    for title, kind in (
+        ("Tolerances", "tolerances"),
+        ("Noise", "noise"),
+        ("Magnitudes", "magnitudes"),
+        ("Alignment", "alignment"),
+    ):
+        if row[kind]:
+            lines += [title, *_sentences(row[kind]), ""]
+    lines += [*_table(row["tried"]), "", *changes_text(row)]
+    return "\n".join(lines)
+
+
+def _heading(row: Mapping[str, Any]) -> list[str]:
+    span = f"{row['first']} to {row['last']}" if row["first"] else "no batches"
+    lines = [f"Advice for {row['spacecraft']}, run {row['run']}: {span}"]
+    sampled = f"{row['batches_sampled']} of {row['batches_in_range']} batches were looked at"
+    if row["batches_refused"]:
+        sampled += f"; {row['batches_refused']} could not be run again: {row['refusal']}"
+    return [*lines, *textwrap.wrap(sampled + ".", WIDTH)]
+
+
+def _sentences(findings: Iterable[Mapping[str, Any]]) -> list[str]:
+    marks = {"keep": "  ok  ", "wait": "  ?   "}
+    return [
+        line
+        for each in findings
+        for line in textwrap.wrap(
+            each["text"],
+            WIDTH,
+            initial_indent=marks.get(each["action"], "  !!  "),
+            subsequent_indent="      ",
+        )
+    ]
+
+
+def _table(tried: Iterable[Mapping[str, Any]]) -> list[str]:
+    wide = max(28, *(len(each["name"]) for each in tried))
+    heads = "  ".join(("batches", "stars", "ambig. %", "unmat. %", "other"))
+    lines = [
+        "What the stars would have come to with other settings",
+        f"  {'':<{wide}}  {'':<8}  {heads}",
+    ]
+    for each in tried:
+        observed = each["observed"] or 1
+        lines.append(
+            f"  {each['name']:<{wide}}  {each['identifier']:<8}  {each['batches']:>7}"
+            f"  {each['observed']:>5}  {100 * each['ambiguous'] / observed:>8.2f}"
+            f"  {100 * each['unmatched'] / observed:>8.2f}  {each['named_otherwise']:>5}"
+        )
+    return [*lines, "  other: stars named otherwise than by verified identification"]
+
+
+def changes_text(row: Mapping[str, Any]) -> list[str]:
+    """The lines for the mission file, under the tables that they belong to."""
+    if not row["changes"]:
+        return ["Nothing in the mission file needs to change."]
+    lines = [f"To change in the mission file of {row['spacecraft']}:"]
+    place = None
+    for each in sorted(row["changes"], key=lambda c: (c["table"], c["tracker"] or "")):
+        if (each["table"], each["tracker"]) != place:
+            place = each["table"], each["tracker"]
+            lines.append(
+                f"  [[trackers]]   of {each['tracker']}"
+                if each["tracker"]
+                else f"  [{each['table']}]"
+            )
+        lines.append(f"  {each['line']}")
+    return lines

@@ -1,0 +1,218 @@
+"""How well each tracker measures: its noise, its magnitudes, and how it stands to the others."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from service.advice.evidence import Evidence, Fit, Stars
+from service.advice.intervals import Interval, fitted, intervals, median, quantile
+from service.missions.mission import Mission, Tracker
+from service.vectors import (
+    ARCSEC_PER_RADIAN,
+    Vector,
+    attitude_error_arcsec,
+    matrix_from_quaternion,
+    rotate_about,
+)
+
+LEAST_BATCHES = 20
+LEAST_STARS = 50
+CERTAIN_CHI2 = 16.266
+"""The 99.9 % point of chi-square with three degrees of freedom."""
+CLOSE = 0.2
+"""A sigma that is right within a fifth needs no change."""
+
+Verdict = Literal["too_small", "fits", "too_large", "no_verdict"]
+
+
+@dataclass(frozen=True)
+class NoiseFinding:
+    """A tracker's noise: one standard deviation per tangent axis, beside the mission's."""
+
+    tracker: str
+    now_arcsec: float
+    sigma_arcsec: Interval | None
+    batches: int
+    verdict: Verdict
+
+
+@dataclass(frozen=True)
+class MagnitudeFinding:
+    """observed = catalog + offset + (scale - 1) (catalog - pivot), and the scatter about that.
+
+    The offset is that at the pivot, the median of the catalog magnitudes.  The
+    scatter is one standard deviation.
+    """
+
+    tracker: str
+    now_sigma_mag: float
+    pivot_mag: float
+    offset_mag: Interval | None
+    scale: Interval | None
+    scatter_mag: Interval | None
+    stars: int
+    verdict: Literal["off", "fits", "no_verdict"]
+    scatter_verdict: Verdict
+
+
+@dataclass(frozen=True)
+class AlignmentFinding:
+    """How a tracker is turned from where the mission has it, as seen by another one.
+
+    The rotation vector is in body axes; `axes_body` are the tracker's axes
+    turned by it, where it is certainly not zero.
+    """
+
+    tracker: str
+    reference: str
+    rotation_arcsec: tuple[Interval, Interval, Interval] | None
+    batches: int
+    verdict: Literal["off", "fits", "no_verdict"]
+    axes_body: tuple[tuple[float, ...], ...] | None
+
+
+def noise_findings(mission: Mission, evidence: Evidence) -> list[NoiseFinding]:
+    """The noise of each tracker, from how well its own stars agree with one attitude.
+
+    TASTE over the square of the true noise is chi-square with 2N - 3 degrees of
+    freedom, so that TASTE over the median of that distribution has the square of
+    the noise, in units of the sigmas, for its own median, batch by batch.  The
+    median over batches does not mind a few bad ones.
+    """
+    return [_noise(tracker, index, evidence) for index, tracker in enumerate(mission.trackers)]
+
+
+def _noise(tracker: Tracker, index: int, evidence: Evidence) -> NoiseFinding:
+    fits = [fit for fit in evidence.fits if fit.tracker == index]
+    if len(fits) < LEAST_BATCHES:
+        return NoiseFinding(tracker.name, tracker.sigma_arcsec, None, len(fits), "no_verdict")
+    ratio = median(_squared_noise(fits))
+    sigma = Interval(*(math.sqrt(x) for x in (ratio.value, ratio.low, ratio.high)))
+    sigma = sigma.scaled(tracker.sigma_arcsec)
+    return NoiseFinding(
+        tracker.name,
+        tracker.sigma_arcsec,
+        sigma,
+        len(fits),
+        _size_verdict(tracker.sigma_arcsec, sigma),
+    )
+
+
+def _squared_noise(fits: list[Fit]) -> Vector:
+    """One estimate a fit of the squared noise, in units of the stars' sigmas."""
+    from scipy.stats import chi2
+
+    freedom = np.array([fit.degrees_of_freedom for fit in fits])
+    return np.asarray(np.array([fit.taste for fit in fits]) / chi2.median(freedom))
+
+
+def _size_verdict(now: float, found: Interval) -> Verdict:
+    """Whether a sigma is certainly, and by more than CLOSE, below or above what was found."""
+    if found.low > now and found.value > (1.0 + CLOSE) * now:
+        return "too_small"
+    if found.high < now and found.value < (1.0 - CLOSE) * now:
+        return "too_large"
+    return "fits"
+
+
+def magnitude_findings(mission: Mission, evidence: Evidence) -> list[MagnitudeFinding]:
+    """Offset, scale and scatter of each tracker's magnitudes, by a robust line."""
+    return [
+        _magnitudes(tracker, index, evidence.stars)
+        for index, tracker in enumerate(mission.trackers)
+    ]
+
+
+def _magnitudes(tracker: Tracker, index: int, stars: Stars) -> MagnitudeFinding:
+    own = (stars.tracker == index) & np.isfinite(stars.observed_mag)
+    observed, catalog, batch = stars.observed_mag[own], stars.catalog_mag[own], stars.batch[own]
+    count = int(own.sum())
+    spread = float(np.ptp(catalog)) if count else 0.0
+    if count < LEAST_STARS or len(np.unique(batch)) < LEAST_BATCHES or spread == 0.0:
+        return MagnitudeFinding(
+            tracker.name,
+            tracker.magnitude_sigma_mag,
+            float(np.median(catalog)) if count else math.nan,
+            None,
+            None,
+            None,
+            count,
+            "no_verdict",
+            "no_verdict",
+        )
+    pivot = float(np.median(catalog))
+    design = np.stack([np.ones(count), catalog - pivot], axis=1)
+    beta, covariance = fitted(design, observed - catalog, batch)
+    offset, slope = intervals(beta, covariance)
+    residual = np.abs(observed - catalog - design @ beta)
+    # Half of a Gaussian's values lie within 0.6745 sigma.
+    scatter = quantile(residual, batch, 0.5).scaled(1.0 / 0.674489750196)
+    off = not (offset.holds(0.0) and slope.holds(0.0))
+    matters = (
+        max(abs(offset.value), abs(slope.value) * spread / 2) > tracker.magnitude_sigma_mag / 4
+    )
+    return MagnitudeFinding(
+        tracker.name,
+        tracker.magnitude_sigma_mag,
+        pivot,
+        offset,
+        Interval(1.0 + slope.value, 1.0 + slope.low, 1.0 + slope.high),
+        scatter,
+        count,
+        "off" if off and matters else "fits",
+        _size_verdict(tracker.magnitude_sigma_mag, scatter),
+    )
+
+
+def alignment_findings(mission: Mission, evidence: Evidence) -> list[AlignmentFinding]:
+    """How each further tracker stands to the mission's first, over batches in which both solve."""
+    first, *others = mission.trackers
+    by_batch = {fit.batch: fit for fit in evidence.fits if fit.tracker == 0}
+    return [
+        _alignment(
+            first,
+            tracker,
+            [
+                (by_batch[fit.batch], fit)
+                for fit in evidence.fits
+                if fit.tracker == index and fit.batch in by_batch
+            ],
+        )
+        for index, tracker in enumerate(others, start=1)
+    ]
+
+
+def _alignment(first: Tracker, tracker: Tracker, both: list[tuple[Fit, Fit]]) -> AlignmentFinding:
+    """The rotation e of tracker B's attitude from A's, A_B = exp(-[e x]) A_A, weighed by both.
+
+    A tracker whose axes lie turned by e from the mission's gives, through the
+    mission's alignment, an attitude that is off by just that.
+    """
+    if len(both) < LEAST_BATCHES:
+        return AlignmentFinding(tracker.name, first.name, None, len(both), "no_verdict", None)
+    turned, whiten = [], []
+    for a, b in both:
+        turned.append(
+            attitude_error_arcsec(
+                matrix_from_quaternion(b.quaternion), matrix_from_quaternion(a.quaternion)
+            )
+        )
+        covariance = a.covariance_arcsec2 + b.covariance_arcsec2
+        whiten.append(np.linalg.inv(np.linalg.cholesky(covariance)))
+    root, errors = np.stack(whiten), np.stack(turned)
+    cluster = np.repeat(np.arange(len(both)), 3)
+    values = np.einsum("nij,nj->ni", root, errors).ravel()
+    beta, covariance = fitted(root.reshape(-1, 3), values, cluster)
+    certain = float(beta @ np.linalg.solve(covariance, beta)) > CERTAIN_CHI2
+    x, y, z = intervals(beta, covariance)
+    axes = rotate_about(beta / ARCSEC_PER_RADIAN, tracker.body_from_tracker.T)
+    return AlignmentFinding(
+        tracker.name,
+        first.name,
+        (x, y, z),
+        len(both),
+        "off" if certain else "fits",
+        tuple(tuple(round(float(part), 9) for part in axis) for axis in axes) if certain else None,
+    )

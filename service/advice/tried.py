@@ -1,0 +1,145 @@
+"""What the stars of a sample would have come to with other settings.
+
+Every batch of the sample goes down the same staircase again, once for each
+variant.  A change is that of the share of stars left ambiguous or unmatched,
+batch by batch beside the same identifier with the present settings.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from service.acquire import Acquisition
+from service.advice.intervals import Z95, Interval
+from service.advice.tolerances import ToleranceFinding
+from service.identify.identification import Identification
+from service.missions.mission import Identifier, Mission
+from service.observe.batch import ObservationBatch
+
+PRESENT = "present settings"
+OUTCOMES = ("observed", "unique", "ambiguous", "unmatched")
+ALL_RECOMMENDED = "all that is recommended"
+
+
+@dataclass(frozen=True, eq=False)
+class Variant:
+    """Other settings: an identifier, and tolerances in place of the mission's."""
+
+    name: str
+    identifier: Identifier
+    tolerances: Mapping[str, float] = field(default_factory=dict)
+
+    def of(self, batch: ObservationBatch) -> ObservationBatch:
+        """The batch with these settings in place of its own."""
+        options = batch.options
+        tolerances = {**options.tolerances, **self.tolerances}
+        return dataclasses.replace(
+            batch,
+            options=dataclasses.replace(options, identifier=self.identifier, tolerances=tolerances),
+        )
+
+
+@dataclass(frozen=True)
+class Counts:
+    """What became of the stars of one batch under a variant.
+
+    `otherwise` counts the stars that are unique here and under verified
+    identification, but not the same star.
+    """
+
+    observed: int
+    unique: int
+    ambiguous: int
+    unmatched: int
+    otherwise: int = 0
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A variant with the sums over the sample, and the change from the present settings.
+
+    `change` is that of the share of stars not unique, in percentage points;
+    None for the present settings themselves.
+    """
+
+    variant: Variant
+    batches: int
+    observed: int
+    unique: int
+    ambiguous: int
+    unmatched: int
+    otherwise: int
+    change: Interval | None
+
+    @property
+    def not_unique_percent(self) -> float:
+        """Stars ambiguous or unmatched, in percent of the observed."""
+        return 100.0 * (self.ambiguous + self.unmatched) / self.observed if self.observed else 0.0
+
+
+def variants(
+    mission: Mission, findings: Sequence[ToleranceFinding], own: Mapping[str, float]
+) -> Iterator[Variant]:
+    """What is tried: both identifiers, each tolerance halved, doubled and as recommended.
+
+    `own` are values that were asked for, tried together.  The tolerances belong
+    to the votes: verified identification is tried once, with the present ones.
+    """
+    yield Variant(PRESENT, "starid")
+    yield Variant(PRESENT, "verified")
+    for finding in findings:
+        name = finding.tolerance.name
+        if finding.verdict == "not_used":
+            continue
+        for factor in (0.5, 2.0):
+            value = min(finding.now * factor, finding.tolerance.most)
+            if value != finding.now:
+                yield Variant(f"{name} = {value:.4g}", "starid", {name: value})
+        if finding.recommended is not None:
+            value = finding.recommended
+            yield Variant(f"{name} = {value:.4g}, recommended", "starid", {name: value})
+    recommended = {
+        each.tolerance.name: each.recommended for each in findings if each.recommended is not None
+    }
+    if len(recommended) > 1:
+        yield Variant(ALL_RECOMMENDED, "starid", recommended)
+    if own:
+        shown = ", ".join(f"{name} = {value:g}" for name, value in own.items())
+        yield Variant(f"{shown}, asked for", "starid", own)
+
+
+def counts_of(acquisition: Acquisition, verified: Sequence[Identification]) -> Counts:
+    """The outcomes of one batch, held against those of verified identification by tracker."""
+    otherwise = 0
+    for each, sure in zip(acquisition.trackers, verified, strict=True):
+        mine = each.identification
+        both = mine.unique & sure.unique
+        otherwise += int(np.count_nonzero(both & (mine.star != sure.star)))
+    counts = acquisition.counts
+    return Counts(**{name: counts[name] for name in OUTCOMES}, otherwise=otherwise)
+
+
+def summed(variant: Variant, counts: Sequence[Counts], present: Sequence[Counts] | None) -> Tried:
+    """The sums over a sample, and the change from the same batches under the present settings."""
+    sums = {name: sum(getattr(each, name) for each in counts) for name in (*OUTCOMES, "otherwise")}
+    change = None if present is None else _change(counts, present)
+    return Tried(variant, len(counts), **sums, change=change)
+
+
+def _change(counts: Sequence[Counts], present: Sequence[Counts]) -> Interval | None:
+    """The ratio of sums over batches, with the linearised variance of a ratio."""
+    stars = np.array([each.observed for each in counts], float)
+    lost = np.array(
+        [before.unique - after.unique for after, before in zip(counts, present, strict=True)],
+        float,
+    )
+    n, total = len(stars), float(stars.sum())
+    if n < 2 or total == 0.0:
+        return None
+    change = float(lost.sum()) / total
+    spread = lost - change * stars
+    half = Z95 * math.sqrt(float(spread @ spread) * n / (n - 1)) / total
+    return Interval(100.0 * change, 100.0 * (change - half), 100.0 * (change + half))

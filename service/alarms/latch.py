@@ -1,0 +1,162 @@
+"""How an alarm lives: raised, latched, acknowledged, shelved, cleared.
+
+        out of limits                 acknowledged and back in limits
+    ───────────────────► ACTIVE ─────────────────────────────────────► CLEARED
+                           │  open ◄──── worse than it was ──┐
+                           │    └── acknowledge ──► acknowledged
+                           └  shelved for a while: either of them, put aside
+
+An alarm stays until both are true, in either order: somebody acknowledged it,
+and the quantity is back in limits.  What becomes worse than it ever was is open
+again.  A shelf has an end, and does not keep an alarm from clearing.
+
+Each function gives what changes of an alarm, as columns, and what is to be
+noted of it; nothing is changed in place.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from service.alarms.limits import Severity
+from service.errors import NotNow
+
+State = Literal["open", "acknowledged", "shelved", "cleared"]
+Action = Literal[
+    "raised",
+    "escalated",
+    "eased",
+    "returned",
+    "left_again",
+    "acknowledged",
+    "shelved",
+    "unshelved",
+    "shelf_expired",
+    "commented",
+    "cleared",
+]
+Alarm = Mapping[str, Any]
+Changes = dict[str, Any]
+Step = tuple[Changes, list[Action]]
+
+
+@dataclass(frozen=True)
+class Point:
+    """A judged value, with the batch and the time that it is of."""
+
+    value: float
+    time: str
+    batch_id: str | None
+
+
+def state_of(alarm: Alarm, now: str) -> State:
+    """The state of an alarm at a moment; moments are UTC texts of one form."""
+    if alarm["cleared_at"] is not None:
+        return "cleared"
+    if alarm["shelved_until"] is not None and alarm["shelved_until"] > now:
+        return "shelved"
+    return "open" if alarm["acknowledged_at"] is None else "acknowledged"
+
+
+def raised(severity: Severity, bound: float, point: Point, now: str) -> Step:
+    """A new alarm."""
+    columns = {
+        "severity": severity.word,
+        "current_severity": severity.word,
+        "raised_at": now,
+        "bound": bound,
+        **_at("raised", point),
+        **_at("worst", point),
+        **_at("latest", point),
+        "returned_at": None,
+        "acknowledged_at": None,
+        "acknowledged_by": None,
+        "shelved_at": None,
+        "shelved_by": None,
+        "shelved_until": None,
+        "cleared_at": None,
+    }
+    return columns, ["raised"]
+
+
+def observed(
+    alarm: Alarm, severity: Severity | None, bound: float | None, point: Point, now: str
+) -> Step:
+    """An active alarm meets a new value, which is out of limits by a severity or back in them."""
+    was = _severity(alarm["current_severity"])
+    worst = Severity[alarm["severity"].upper()]
+    changes: Changes = _at("latest", point)
+    if severity is None:
+        if was is None:
+            return changes, []
+        changes |= {"current_severity": None, "returned_at": now}
+        return _cleared(alarm, changes, ["returned"], now)
+    changes |= {"current_severity": severity.word, "returned_at": None}
+    # Beyond the bound on the side that the alarm was raised on.
+    outward = 1.0 if alarm["worst_value"] >= alarm["bound"] else -1.0
+    if outward * (point.value - alarm["worst_value"]) > 0:
+        changes |= _at("worst", point)
+    actions: list[Action] = []
+    if severity > worst:
+        changes |= {"severity": severity.word, "bound": bound} | _at("worst", point)
+        changes |= {"acknowledged_at": None, "acknowledged_by": None}
+        actions = ["escalated"]
+    elif was is None:
+        actions = ["left_again"]
+    elif severity < was:
+        actions = ["eased"]
+    return changes, actions
+
+
+def acknowledged(alarm: Alarm, who: str, now: str) -> Step:
+    """Somebody has seen it; raises `NotNow` where somebody had, or there is nothing any more."""
+    _require_active(alarm)
+    if alarm["acknowledged_at"] is not None:
+        raise NotNow(f"it was acknowledged by {alarm['acknowledged_by']}")
+    changes = {"acknowledged_at": now, "acknowledged_by": who}
+    return _cleared({**alarm, **changes}, changes, ["acknowledged"], now)
+
+
+def shelved(alarm: Alarm, who: str, until: str, now: str) -> Step:
+    """Put aside until a moment; who shelves it again moves that moment."""
+    _require_active(alarm)
+    return {"shelved_at": now, "shelved_by": who, "shelved_until": until}, ["shelved"]
+
+
+def unshelved(alarm: Alarm) -> Step:
+    """Taken from the shelf; raises `NotNow` where it stands on none."""
+    _require_active(alarm)
+    if alarm["shelved_until"] is None:
+        raise NotNow("it is not shelved")
+    return {"shelved_at": None, "shelved_by": None, "shelved_until": None}, ["unshelved"]
+
+
+def expired(alarm: Alarm, now: str) -> Step:
+    """Off the shelf where its time there is over."""
+    over = alarm["cleared_at"] is None and (alarm["shelved_until"] or "~") <= now
+    changes: Changes = {"shelved_at": None, "shelved_by": None, "shelved_until": None}
+    return (changes, ["shelf_expired"]) if over else ({}, [])
+
+
+def _cleared(alarm: Alarm, changes: Changes, actions: list[Action], now: str) -> Step:
+    whole = {**alarm, **changes}
+    if whole["acknowledged_at"] is not None and whole["current_severity"] is None:
+        return changes | {"cleared_at": now}, [*actions, "cleared"]
+    return changes, actions
+
+
+def _require_active(alarm: Alarm) -> None:
+    if alarm["cleared_at"] is not None:
+        raise NotNow(f"it was cleared at {alarm['cleared_at']}")
+
+
+def _at(which: str, point: Point) -> Changes:
+    return {
+        f"{which}_value": point.value,
+        f"{which}_time": point.time,
+        f"{which}_batch_id": point.batch_id,
+    }
+
+
+def _severity(word: str | None) -> Severity | None:
+    return None if word is None else Severity[word.upper()]

@@ -1,0 +1,147 @@
+"""Limits: the bounds of a quantity by severity, and how a value is held against them.
+
+The judged value is taken over the latest `minimum_count` batches together.  It
+is out of a bound when it lies beyond it, and stays out until it has come back
+by `hysteresis`.  Only what has been out for `duration_s` of batch time counts.
+"""
+
+from collections.abc import Mapping
+from enum import IntEnum
+from typing import Annotated, Self
+
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, model_validator
+
+from service.alarms.quantities import QUANTITIES, QuantityName
+from service.missions.mission import Band, Mission
+
+MAX_COUNT = 200
+"""Batches that a value is taken over: each is kept with the watch, and written with every batch."""
+LONGEST_S = 7 * 86400.0
+
+
+class Severity(IntEnum):
+    """How bad it is; the worst is the greatest."""
+
+    WATCH = 1
+    WARNING = 2
+    CRITICAL = 3
+
+    @property
+    def word(self) -> str:
+        """The severity as the interface writes it."""
+        return self.name.lower()
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Bounds(_Strict):
+    """Below `low` or above `high` is out; null is no bound."""
+
+    low: float | None = None
+    high: float | None = None
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if self.low is not None and self.high is not None and self.low >= self.high:
+            raise ValueError(f"low {self.low:g} must be less than high {self.high:g}")
+        return self
+
+
+class LimitSettings(_Strict):
+    """The limits of one quantity."""
+
+    enabled: StrictBool = True
+    watch: Bounds = Bounds()
+    warning: Bounds = Bounds()
+    critical: Bounds = Bounds()
+    hysteresis: Annotated[
+        float, Field(ge=0, description="How far inside a bound the value must come to be back.")
+    ] = 0.0
+    minimum_count: Annotated[
+        int,
+        Field(ge=1, le=MAX_COUNT, description="Batches that are judged together; before, none is."),
+    ] = 20
+    duration_s: Annotated[
+        float,
+        Field(ge=0, le=LONGEST_S, description="Of batch time, for which it must have been out."),
+    ] = 60.0
+
+    @model_validator(mode="after")
+    def _worse_is_further_out(self) -> Self:
+        levels = [self.bounds(severity) for severity in Severity]
+        highs = [each.high for each in levels if each.high is not None]
+        lows = [each.low for each in levels if each.low is not None]
+        if highs != sorted(highs) or lows != sorted(lows, reverse=True):
+            raise ValueError("a worse severity must not have the narrower bound")
+        return self
+
+    def bounds(self, severity: Severity) -> Bounds:
+        """The bounds of a severity."""
+        found: Bounds = getattr(self, severity.word)
+        return found
+
+    def out(self, severity: Severity, value: float, was_out: bool) -> bool:
+        """Whether a value is out of the bounds of a severity, or not yet back in them."""
+        bounds, within = self.bounds(severity), self.hysteresis if was_out else 0.0
+        above = bounds.high is not None and value > bounds.high - within
+        below = bounds.low is not None and value < bounds.low + within
+        return self.enabled and (above or below)
+
+    def bound(self, severity: Severity, value: float) -> float:
+        """The bound that a value is out of."""
+        bounds = self.bounds(severity)
+        middle = [each for each in (bounds.low, bounds.high) if each is not None]
+        return min(middle, key=lambda each: abs(value - each))
+
+
+LIMITED: tuple[QuantityName, ...] = tuple(
+    name
+    for name, each in QUANTITIES.items()
+    if each.of != "rate" and name != "predicted_rms_arcsec"
+)
+"""Quantities that limits can be set for."""
+
+
+def default_limits(mission: Mission) -> Mapping[QuantityName, LimitSettings]:
+    """The limits that hold for a mission until others are set (docs/alarms.md gives reasons)."""
+    margin_deg = a_priori_margin_deg(mission)
+    return {
+        "ambiguous_share": _above(0.15, 0.25, 0.5, hysteresis=0.03),
+        "unmatched_share": _above(0.15, 0.25, 0.5, hysteresis=0.03),
+        "no_attitude_share": _above(0.1, 0.25, 0.5, hysteresis=0.03),
+        "suspect_share": _above(0.1, 0.25, 0.5, hysteresis=0.03),
+        # What is normal depends on the tracker; the ratio below knows it.
+        "residual_rms_arcsec": LimitSettings(),
+        "residual_ratio": _above(1.5, 2.0, 3.0, hysteresis=0.1),
+        "magnitude_offset_mag": _about_zero(0.2, 0.35, 0.6, hysteresis=0.03),
+        "a_priori_angle_deg": _above(
+            0.8 * margin_deg,
+            1.0 * margin_deg,
+            1.3 * margin_deg,
+            hysteresis=0.03 * margin_deg,
+            minimum_count=5,
+        ),
+        "silence_s": _above(None, 3600.0, 6 * 3600.0, minimum_count=1, duration_s=0.0),
+    }
+
+
+def a_priori_margin_deg(mission: Mission) -> float:
+    """How far the a priori attitude may be off before the field of view leaves the zone."""
+    zone = mission.zone
+    half_width_deg = zone.half_width_deg if isinstance(zone, Band) else zone.radius_deg
+    widest_deg = max(each.field_of_view_radius_deg for each in mission.trackers)
+    return max(half_width_deg - widest_deg, 0.1 * half_width_deg)
+
+
+def _above(watch: float | None, warning: float, critical: float, **others: float) -> LimitSettings:
+    highs = {"watch": watch, "warning": warning, "critical": critical}
+    bounds = {name: {"high": high} for name, high in highs.items()}
+    return LimitSettings.model_validate(bounds | others)
+
+
+def _about_zero(watch: float, warning: float, critical: float, hysteresis: float) -> LimitSettings:
+    sizes = {"watch": watch, "warning": warning, "critical": critical}
+    bounds = {name: {"low": -size, "high": size} for name, size in sizes.items()}
+    return LimitSettings.model_validate(bounds | {"hysteresis": hysteresis})

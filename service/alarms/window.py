@@ -1,0 +1,62 @@
+"""The latest values of one quantity, judged together: out of limits, for how long, how badly.
+
+The latest are those of the latest batch times, whatever the order they came in:
+a batch that comes late takes its place among them, or none if it is older.
+"""
+
+from bisect import insort
+from dataclasses import dataclass, field
+from typing import Any
+
+from service.alarms.limits import LimitSettings, Severity
+
+Sample = tuple[int, float, float]
+"""(time_ns, part, whole): a share of counts, or a value over one."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What the latest values amount to: the value, and how bad it is, None: in limits."""
+
+    value: float
+    severity: Severity | None
+
+
+@dataclass
+class Window:
+    """The latest values of a quantity, and since when they are out of which limit."""
+
+    samples: list[Sample] = field(default_factory=list)
+    since_ns: dict[Severity, int] = field(default_factory=dict)
+
+    def add(self, sample: Sample, limits: LimitSettings) -> Judged | None:
+        """Take one batch's part and judge the latest; None while there are too few of them."""
+        insort(self.samples, sample)
+        del self.samples[: -limits.minimum_count]
+        if len(self.samples) < limits.minimum_count:
+            return None
+        whole = sum(each[2] for each in self.samples)
+        value = sum(each[1] for each in self.samples) / whole
+        return Judged(value, self.judge(value, self.samples[-1][0], limits))
+
+    def judge(self, value: float, time_ns: int, limits: LimitSettings) -> Severity | None:
+        """The worst severity whose bound the value has been out of for long enough."""
+        worst = None
+        for severity in Severity:
+            if not limits.out(severity, value, severity in self.since_ns):
+                self.since_ns.pop(severity, None)
+                continue
+            since_ns = self.since_ns.setdefault(severity, time_ns)
+            if time_ns - since_ns >= limits.duration_s * 1e9:
+                worst = severity
+        return worst
+
+    def to_json(self) -> Any:
+        """The window as plain values."""
+        return {"samples": self.samples, "since_ns": {s.word: t for s, t in self.since_ns.items()}}
+
+    @classmethod
+    def from_json(cls, kept: Any) -> "Window":
+        """A window as it was kept."""
+        since_ns = {Severity[word.upper()]: time_ns for word, time_ns in kept["since_ns"].items()}
+        return cls([tuple(each) for each in kept["samples"]], since_ns)

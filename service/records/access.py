@@ -1,0 +1,161 @@
+"""Who asks: callers by token or session, how often they may, and the list of what they changed.
+
+As long as no token was ever made, access on this machine is open.  What is
+known of a token is looked up anew every second, so that a revocation holds in
+every process a second later at most.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from service.errors import NotAdmitted, TooOften
+from service.records import audit, tokens
+from service.records.ids import Ulids
+from service.records.store import Store
+from service.records.tokens import SCOPES, Caller
+from service.times import Utc, shifted
+
+OPEN_CALLER = Caller("local", frozenset(SCOPES))
+"""Whoever asks while access is open."""
+
+KNOWN_FOR_S = 1.0
+MAX_KNOWN = 10_000
+LEAST_BURST = 5.0
+
+Now = Callable[[], Utc]
+
+
+@dataclass
+class _Bucket:
+    """What is left of a token's rate: it fills with time, up to a burst."""
+
+    left: float
+    filled_s: float
+
+
+class Access:
+    """The one place that knows who a caller is."""
+
+    def __init__(self, store: Store, loopback: bool, now: Now) -> None:
+        """`loopback`: whether the service listens to this machine alone."""
+        self._store = store
+        self._loopback = loopback
+        self._now = now
+        self._ids = Ulids()
+        self._lock = threading.Lock()
+        self._known: dict[tuple[str, str], tuple[Caller, float]] = {}
+        self._open_until_s = 0.0
+        self._closed = False
+        self._buckets: dict[str, _Bucket] = {}
+
+    @property
+    def is_open(self) -> bool:
+        """Whether nobody needs a token: on loopback, as long as none was ever made."""
+        if self._closed or not self._loopback:
+            return False
+        clock_s = time.monotonic()
+        if clock_s >= self._open_until_s:
+            # A token once made is never forgotten: what is closed stays closed.
+            self._closed = self.has_tokens()
+            self._open_until_s = clock_s + KNOWN_FOR_S
+        return not self._closed
+
+    def has_tokens(self) -> bool:
+        """Whether a token was ever made."""
+        with self._store.reading() as connection:
+            return tokens.any_token(connection)
+
+    def known(self, token: str | None, session: str | None) -> Caller | None:
+        """What `caller` gives, where that is known without a look into the database."""
+        clock_s = time.monotonic()
+        if not self._closed and self._loopback:
+            return OPEN_CALLER if clock_s < self._open_until_s else None
+        kind, secret = ("session", session) if token is None else ("token", token)
+        known = None if secret is None else self._known.get((kind, tokens.digest_of(secret)))
+        return known[0] if known is not None and clock_s < known[1] else None
+
+    def caller(self, token: str | None, session: str | None) -> Caller:
+        """Whoever a bearer token or a session belongs to; raises `NotAdmitted`."""
+        if self.is_open:
+            return OPEN_CALLER
+        for kind, secret in (("token", token), ("session", session)):
+            if secret is not None:
+                return self._holder(kind, tokens.digest_of(secret))
+        raise NotAdmitted("a token is needed: Authorization: Bearer acq_...")
+
+    def _holder(self, kind: str, digest: str) -> Caller:
+        key, clock_s = (kind, digest), time.monotonic()
+        known = self._known.get(key)
+        if known is not None and clock_s < known[1]:
+            return known[0]
+        look_up = tokens.holder_of if kind == "token" else tokens.session_holder
+        with self._store.reading() as connection:
+            caller = look_up(connection, digest, self._now().text)
+        with self._lock:
+            self._known.pop(key, None)
+            if caller is None:
+                raise NotAdmitted("the token is not known here, has expired or was revoked")
+            if len(self._known) >= MAX_KNOWN:
+                self._known.clear()
+            self._known[key] = (caller, clock_s + KNOWN_FOR_S)
+        return caller
+
+    def take_turn(self, caller: Caller) -> None:
+        """Count a request against its token's rate; raises `TooOften`."""
+        rate = caller.rate_per_s
+        if rate is None or caller.token_id is None:
+            return
+        clock_s, burst = time.monotonic(), max(rate, LEAST_BURST)
+        with self._lock:
+            bucket = self._buckets.setdefault(caller.token_id, _Bucket(burst, clock_s))
+            bucket.left = min(burst, bucket.left + rate * (clock_s - bucket.filled_s))
+            bucket.filled_s = clock_s
+            if bucket.left < 1:
+                wait_s = max(1, round((1 - bucket.left) / rate + 0.5))
+                raise TooOften(f"{caller.name} may ask {rate:g} times a second", wait_s)
+            bucket.left -= 1
+
+    def sign_in(self, token: str) -> tuple[str, Caller]:
+        """Begin a browser's session; the secret that its cookie holds, and whose it is."""
+        caller = self._holder("token", tokens.digest_of(token))
+        if caller.token_id is None:
+            raise NotAdmitted("there is nothing to sign in to")
+        token_id, secret, begun = caller.token_id, tokens.new_secret(), self._now()
+        expires = shifted(begun, tokens.SESSION_H * 3600)
+        self._store.writer.change(
+            lambda connection: tokens.add_session(
+                connection,
+                secret=secret,
+                token_id=token_id,
+                created=begun.text,
+                expires=expires.text,
+            )
+        ).result()
+        return secret, caller
+
+    def sign_out(self, session: str) -> None:
+        """End a browser's session."""
+        digest = tokens.digest_of(session)
+        self._store.writer.change(
+            lambda connection: tokens.end_session(connection, digest)
+        ).result()
+        with self._lock:
+            self._known.pop(("session", digest), None)
+
+    def note(self, who: str, action: str, about: str, body: str | None, status: int) -> None:
+        """Add to the list of what was changed; returns once that is stored."""
+        id, moment = self._ids.new(), self._now().text
+        self._store.writer.change(
+            lambda connection: audit.note(
+                connection,
+                id=id,
+                moment=moment,
+                who=who,
+                action=action,
+                about=about,
+                body=body,
+                status=status,
+            )
+        ).result()

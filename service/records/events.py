@@ -1,0 +1,100 @@
+"""What happened lately, in order of commit, so that whoever was away can be told of it.
+
+Events are noted in the transaction that makes them true.  Their numbers come
+from one row whose lock is held until the commit: no event becomes visible after
+one with a higher number, in whichever process, and none is missing between.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+from sqlalchemy import Connection, delete, select
+
+from service.records.draft import Row
+from service.records.statements import insert_all
+from service.records.tables import event_counter, events
+
+KEPT = 20_000
+"""Events; whoever was away for longer begins anew."""
+PRUNED_EVERY = 500
+
+_OUTBOX = "events"
+_TAKE = "UPDATE event_counter SET last = last + {0} WHERE id = 1 RETURNING last"
+
+
+@dataclass(frozen=True)
+class Event:
+    """One event: its number, what kind of thing happened, to whom, and its JSON."""
+
+    id: int
+    kind: str
+    run: str | None
+    spacecraft: str | None
+    data: str
+
+
+def note(
+    connection: Connection,
+    kind: str,
+    data: Row,
+    *,
+    run: str | None = None,
+    spacecraft: str | None = None,
+) -> None:
+    """Let an event become part of the transaction; it gets its number at the end of it."""
+    text = msgspec.json.encode(data).decode()
+    row = {"kind": kind, "run": run, "spacecraft": spacecraft, "data": text}
+    connection.info.setdefault(_OUTBOX, []).append(row)
+
+
+@contextmanager
+def numbered(connection: Connection) -> Iterator[None]:
+    """Give the events of a transaction their numbers when all else of it is done.
+
+    The later the lock on the numbers is taken, the shorter others wait for it.
+    """
+    outbox: list[Row] = []
+    connection.info[_OUTBOX] = outbox
+    yield
+    if not outbox:
+        return
+    last: int = connection.exec_driver_sql(_TAKE.format(len(outbox))).scalar_one()
+    first = last - len(outbox) + 1
+    rows = [{"id": first + place} | row for place, row in enumerate(outbox)]
+    insert_all(connection, events, rows)
+    if first // PRUNED_EVERY != (last + 1) // PRUNED_EVERY:
+        connection.execute(delete(events).where(events.c.id <= last - KEPT))
+
+
+def undone(connection: Connection, length: int) -> None:
+    """Forget the events noted since the outbox had that length: what they tell was taken back."""
+    del connection.info.get(_OUTBOX, [])[length:]
+
+
+def noted(connection: Connection) -> int:
+    """How many events wait for their numbers."""
+    return len(connection.info.get(_OUTBOX, []))
+
+
+def last_event(connection: Connection) -> int:
+    """The number of the latest event; zero before the first."""
+    return int(connection.execute(select(event_counter.c.last)).scalar_one())
+
+
+def events_after(connection: Connection, last: int, limit: int) -> Sequence[Event] | None:
+    """The events after a number, oldest first; None where some of them are kept no more.
+
+    None too for a number that was never given out: it is another database's.
+    """
+    query = select(events).where(events.c.id > last).order_by(events.c.id).limit(limit)
+    found = [_event(row) for row in connection.execute(query).mappings()]
+    if found:
+        return found if found[0].id == last + 1 else None
+    return [] if last_event(connection) == last else None
+
+
+def _event(row: Any) -> Event:
+    return Event(row["id"], row["kind"], row["run"], row["spacecraft"], row["data"])

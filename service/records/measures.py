@@ -1,0 +1,111 @@
+"""What is measured of one result: what trends are drawn of and limits are held against."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from service.acquire import Acquisition
+from service.records.tables import COUNTS, MAXIMA, MEASURED, MINIMA, SUMS
+from service.vectors import (
+    attitude_error_arcsec,
+    matrix_from_quaternion,
+    separation_deg,
+)
+
+Row = dict[str, Any]
+
+COUNTED = ("observed", "unique", "ambiguous", "unmatched", "status", *MEASURED)
+"""The columns of a result that `contribution` looks at."""
+
+
+def measures_of(acquisition: Acquisition) -> Row:
+    """The values of an acquisition by the names of their columns, None where there is none."""
+    solution = acquisition.solution
+    return {
+        "residual_rms_arcsec": None if solution is None else solution.residual_rms_arcsec,
+        "predicted_rms_arcsec": None if solution is None else solution.predicted_rms_arcsec,
+        "magnitude_offset_mag": magnitude_offset_mag(acquisition),
+        "a_priori_angle_deg": a_priori_angle_deg(acquisition),
+    }
+
+
+def magnitude_offset_mag(acquisition: Acquisition) -> float | None:
+    """How much fainter the unique stars are than the catalog says, on average.
+
+    None where no unique star has a magnitude.
+    """
+    catalog_mag = acquisition.run_catalog.magnitude_mag
+    offsets = [
+        each.corrected.magnitude_mag[unique] - catalog_mag[each.identification.star[unique]]
+        for each in acquisition.trackers
+        if (unique := each.identification.unique).any()
+    ]
+    offset = np.concatenate(offsets) if offsets else np.empty(0)
+    offset = offset[~np.isnan(offset)]
+    return float(offset.mean()) if len(offset) else None
+
+
+def a_priori_angle_deg(acquisition: Acquisition) -> float | None:
+    """The angle from the a priori attitude to the one found; None without either.
+
+    Where only an axis is taken for known, in a band its pole and in a cap an a
+    priori boresight, the angle between it and where that axis was found to be.
+    """
+    if acquisition.solution is None or acquisition.presumed is None:
+        return None
+    presumed = acquisition.presumed
+    attitude = matrix_from_quaternion(acquisition.solution.quaternion)
+    if presumed.known_axis is not None:
+        axis = acquisition.mission.axis_body
+        return float(separation_deg(attitude.T @ axis, presumed.known_axis))
+    error_arcsec = attitude_error_arcsec(attitude, presumed.attitude)
+    return math.hypot(*error_arcsec.tolist()) / 3600.0
+
+
+def residual_ratio(row: Row) -> float | None:
+    """The residual rms of an attitude over what its covariance predicts."""
+    rms, predicted = row["residual_rms_arcsec"], row["predicted_rms_arcsec"]
+    return None if rms is None or not predicted else float(rms / predicted)
+
+
+def contribution(result: Row) -> Row:
+    """What one current result is to the trends: the columns of a rollup of it alone."""
+    observed, status = result["observed"], result["status"]
+    values = {
+        "residual_rms_arcsec": result["residual_rms_arcsec"],
+        "predicted_rms_arcsec": result["predicted_rms_arcsec"],
+        "residual_ratio": residual_ratio(result),
+        "magnitude_offset_mag": result["magnitude_offset_mag"],
+        "a_priori_angle_deg": result["a_priori_angle_deg"],
+    }
+    shares = {
+        "ambiguous_share": result["ambiguous"] / observed if observed else None,
+        "unmatched_share": result["unmatched"] / observed if observed else None,
+    }
+    row: Row = {
+        "batches": 1,
+        "observed": observed,
+        "unique": result["unique"],
+        "ambiguous": result["ambiguous"],
+        "unmatched": result["unmatched"],
+        "solved": int(status is not None),
+        "suspect": int(status == "suspect"),
+    }
+    for name, value in values.items():
+        row[f"{name}_n"], row[f"{name}_sum"] = int(value is not None), value or 0.0
+    for name, value in (shares | values).items():
+        row[f"{name}_min"] = row[f"{name}_max"] = value
+    return row
+
+
+def merge(into: Row, row: Row) -> None:
+    """Add one rollup to another: sums add up, of the extremes the outer ones stay."""
+    for name in (*COUNTS, *SUMS):
+        into[name] += row[name]
+    for name in MINIMA:
+        if into[name] is None or (row[name] is not None and row[name] < into[name]):
+            into[name] = row[name]
+    for name in MAXIMA:
+        if into[name] is None or (row[name] is not None and row[name] > into[name]):
+            into[name] = row[name]

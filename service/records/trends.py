@@ -1,0 +1,249 @@
+"""Histories of quantities: thinned out to as many points as can be drawn, no extreme lost."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from sqlalchemy import Connection, select
+
+from service.alarms.quantities import QUANTITIES, QuantityName
+from service.records.cells import Columns, Level, Span, read_cells, totals
+from service.records.draft import Row
+from service.records.measures import contribution
+from service.records.pages import Stretch, newest, newest_first
+from service.records.tables import batches, results
+from service.times import DAY_S, HOUR_S, Utc, parse_utc, shifted, unix_seconds, utc_now
+from service.vectors import Vector
+
+Integers = npt.NDArray[np.intp]
+
+Strategy = Literal["minmax", "latest"]
+MAX_SIZE = 1_500
+MAX_BATCHES_READ = 5_000
+"""Of one answer; a stretch with more is drawn from rollups, hours at the finest."""
+MAX_HOURS_READ = 1_500
+"""Of one answer; a stretch with more is drawn from days at the finest."""
+
+WIDTHS_S = (
+    *(1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800),
+    *(HOUR_S * hours for hours in (1, 2, 3, 6, 12)),
+    *(DAY_S * days for days in (1, 2, 5, 10, 30)),
+)
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Which history: the quantities, how they are thinned out, and to how many points."""
+
+    quantities: Sequence[QuantityName]
+    strategy: Strategy
+    size: int
+
+
+def history(
+    connection: Connection,
+    spacecraft: str,
+    *,
+    run: str,
+    start: Utc | None,
+    end: Utc | None,
+    asked: Asked,
+) -> Row:
+    """A history, its buckets or batches in columns, oldest first.
+
+    Without an end it ends just after the latest batch, without a start it
+    begins a day before its end.
+    """
+    span = _span(connection, spacecraft, run, start, end)
+    about = {"spacecraft": spacecraft, "run": run, "strategy": asked.strategy}
+    if span is None:
+        return about | {
+            "start": None if start is None else start.text,
+            "end": None if end is None else end.text,
+            **_empty(asked),
+        }
+    about |= {"start": span.start.text, "end": span.end.text}
+    if asked.strategy == "latest":
+        return about | _latest(connection, span, asked)
+    width_s, level = _resolution(connection, span, asked.size)
+    cells = read_cells(connection, span, level)
+    return about | {"bucket_s": width_s, "source": level, **_thinned(cells, span, width_s, asked)}
+
+
+def latest_time(
+    connection: Connection, run: str, spacecraft: str | None = None, *, now: Utc
+) -> Utc | None:
+    """The time of the latest batch of a run, or of one spacecraft in it (see `pages.newest`)."""
+    query = select(batches.c.time).join_from(results, batches, results.c.batch_id == batches.c.id)
+    row = newest(connection, query, Stretch(run, spacecraft), now)
+    return None if row is None else parse_utc(row["time"])
+
+
+def _span(
+    connection: Connection, spacecraft: str, run: str, start: Utc | None, end: Utc | None
+) -> Span | None:
+    if end is None:
+        latest = latest_time(connection, run, spacecraft, now=utc_now())
+        if latest is None:
+            return None
+        end = shifted(latest, 1e-6)
+    span = Span(spacecraft, run, shifted(end, -DAY_S) if start is None else start, end)
+    return span if span.start.tai_ns <= end.tai_ns else replace(span, end=span.start)
+
+
+def _resolution(connection: Connection, span: Span, size: int) -> tuple[int, Level]:
+    """The narrowest buckets that are not more than asked for, and what they are read from."""
+    first_s, end_s = unix_seconds([span.start.tai_ns, span.end.tai_ns]).tolist()
+    width_s = next((w for w in WIDTHS_S if _buckets(first_s, end_s, w) <= size), 0)
+    if not width_s:
+        # Longer than the widest of them: as many months of thirty days as it takes.
+        width_s = WIDTHS_S[-1] * (1 + int((end_s - first_s) / (WIDTHS_S[-1] * max(size - 1, 0.5))))
+    if width_s < HOUR_S:
+        cells = read_cells(connection, span, "hour") if end_s - first_s > HOUR_S else None
+        if cells is None or totals(cells)["batches"] <= MAX_BATCHES_READ:
+            return width_s, "batch"
+        width_s = HOUR_S
+    if width_s < DAY_S and end_s - first_s > MAX_HOURS_READ * HOUR_S:
+        width_s = DAY_S
+    return width_s, "day" if width_s >= DAY_S else "hour"
+
+
+def _buckets(first_s: float, end_s: float, width_s: int) -> int:
+    return int(np.ceil(end_s / width_s) - first_s // width_s)
+
+
+def _thinned(cells: Columns, span: Span, width_s: int, asked: Asked) -> Row:
+    number = np.floor(cells["unix_s"] / width_s)
+    _, first = np.unique(number, return_index=True)
+    unix_s = number[first] * width_s
+    reduced = _Reduced(cells, first, _covered_h(unix_s, width_s, span))
+    return {
+        "unix_s": unix_s.tolist(),
+        "batches": reduced.sum("batches").astype(int).tolist(),
+        "series": {name: reduced.series(name) for name in asked.quantities},
+    }
+
+
+def _covered_h(unix_s: Vector, width_s: int, span: Span) -> Vector:
+    """The hours of each bucket that lie within the span."""
+    begin_s, end_s = unix_seconds([span.start.tai_ns, span.end.tai_ns])
+    return np.asarray(np.minimum(unix_s + width_s, end_s) - np.maximum(unix_s, begin_s)) / HOUR_S
+
+
+class _Reduced:
+    """Cells drawn together into buckets, of which each begins at a row of `first`."""
+
+    def __init__(self, cells: Columns, first: Integers, covered_h: Vector) -> None:
+        self._cells, self._first, self._covered_h = cells, first, covered_h
+
+    def sum(self, name: str) -> Vector:
+        return self._reduce(np.add, self._cells[name])
+
+    def series(self, name: QuantityName) -> Row:
+        """One quantity: unit, how many batches have it, mean, least and greatest of a batch."""
+        cells, kind = self._cells, QUANTITIES[name].of
+        count = self.sum("batches")
+        if kind == "value":
+            count = self.sum(f"{name}_n")
+            mean = _over(self.sum(f"{name}_sum"), count)
+            low, high = cells[f"{name}_min"], cells[f"{name}_max"]
+        elif kind == "stars":
+            mean = _over(self.sum(name.removesuffix("_share")), self.sum("observed"))
+            low, high = cells[f"{name}_min"], cells[f"{name}_max"]
+        elif kind == "batches":
+            hit = cells["suspect"]
+            if name == "no_attitude_share":
+                hit = cells["batches"] - cells["solved"]
+            mean = _over(self._reduce(np.add, hit), count)
+            # A batch is one or is none: all of a cell's, some, or none at all.
+            low, high = (hit == cells["batches"]).astype(float), (hit > 0).astype(float)
+        else:
+            mean = _over(count, self._covered_h)
+            return _series(name, count, mean, mean, mean)
+        return _series(name, count, mean, self._reduce(np.fmin, low), self._reduce(np.fmax, high))
+
+    def _reduce(self, ufunc: np.ufunc, values: Vector) -> Vector:
+        if len(self._first) == len(values):
+            return values
+        return np.asarray(ufunc.reduceat(values, self._first))
+
+
+def _over(part: Vector, whole: Vector) -> Vector:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.where(whole > 0, part / whole, np.nan))
+
+
+def _series(name: QuantityName, count: Vector, mean: Vector, low: Vector, high: Vector) -> Row:
+    return {
+        "unit": QUANTITIES[name].unit,
+        "count": count.astype(int).tolist(),
+        "mean": _listed(mean),
+        "min": _listed(low),
+        "max": _listed(high),
+    }
+
+
+def _listed(values: Vector) -> list[float | None]:
+    unknown = np.isnan(values)
+    if unknown.any():
+        values = values.astype(object)
+        values[unknown] = None
+    return list(values.tolist())
+
+
+_OF_BATCHES = select(results, batches.c.batch, batches.c.time).join_from(
+    results, batches, results.c.batch_id == batches.c.id
+)
+
+
+def _latest(connection: Connection, span: Span, asked: Asked) -> Row:
+    chosen = Stretch(span.run, span.spacecraft, span.start, span.end).conditions()
+    query = newest_first(_OF_BATCHES.where(*chosen)).limit(asked.size)
+    rows = list(connection.execute(query).mappings())[::-1]
+    return _of_batches(rows, asked)
+
+
+def _of_batches(rows: Sequence[Any], asked: Asked) -> Row:
+    return {
+        "bucket_s": None,
+        "source": "batch",
+        "unix_s": unix_seconds([row["time_ns"] for row in rows]).tolist(),
+        **{name: [row[name] for row in rows] for name in ("time", "id", "batch")},
+        "series": {
+            name: {"unit": QUANTITIES[name].unit, "value": [value_of(row, name) for row in rows]}
+            for name in asked.quantities
+        },
+    }
+
+
+def value_of(result: Any, name: QuantityName) -> float | None:
+    """What one batch's current result has of a quantity."""
+    row = contribution(result)
+    match QUANTITIES[name].of:
+        case "batches" if name == "no_attitude_share":
+            return float(1 - row["solved"])
+        case "batches":
+            return float(row["suspect"])
+        case "stars" | "value":
+            value: float | None = row[f"{name}_min"]
+            return value
+        case _:
+            return None
+
+
+def _empty(asked: Asked) -> Row:
+    if asked.strategy == "latest":
+        return _of_batches([], asked)
+    columns = ("count", "mean", "min", "max")
+    return {
+        "bucket_s": None,
+        "source": "batch",
+        "unix_s": [],
+        "batches": [],
+        "series": {
+            name: {"unit": QUANTITIES[name].unit} | {column: [] for column in columns}
+            for name in asked.quantities
+        },
+    }

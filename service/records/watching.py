@@ -1,0 +1,315 @@
+"""Holding limits against batches as they are recorded, each exactly once.
+
+It is part of the transaction that records them: a batch that is sent again is
+not new and is not looked at again, and after a crash either both are there or
+neither.  The row of a watch is locked, so that of several processes one after
+the other looks.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import msgspec
+from sqlalchemy import Connection, insert, select, update
+
+from service.alarms import latch
+from service.alarms.latch import Point
+from service.alarms.limits import LimitSettings, Severity
+from service.alarms.quantities import QUANTITIES, QuantityName
+from service.alarms.window import Sample, Window
+from service.missions.mission import Mission
+from service.records.ahead import AHEAD_NS, LIVE
+from service.records.alarms import change, note
+from service.records.draft import Draft, Row
+from service.records.ids import Ulids
+from service.records.limits import limits_of
+from service.records.measures import contribution
+from service.records.statements import insert_missing
+from service.records.tables import alarms, missions, runs, watches
+from service.times import Utc, parse_utc, shifted
+
+_IDS = Ulids()
+SILENCE: QuantityName = "silence_s"
+
+
+def watch(connection: Connection, new: Sequence[Draft]) -> None:
+    """Hold the limits against new batches of live and of the runs that ask for it."""
+    groups: dict[tuple[str, str], list[Draft]] = {}
+    for draft in new:
+        spacecraft, run, _ = draft.identity
+        if draft.batch is not None and not _is_ahead(draft):
+            groups.setdefault((run, spacecraft), []).append(draft)
+    watched = _watched(connection, {run for run, _ in groups})
+    for run, spacecraft in sorted(groups):
+        if run in watched:
+            drafts = sorted(groups[run, spacecraft], key=lambda each: each.result["time_ns"])
+            _Watch(connection, spacecraft, run, drafts).look()
+
+
+def _is_ahead(draft: Draft) -> bool:
+    """Whether a live batch is dated so far ahead that its time cannot be believed."""
+    assert draft.batch is not None
+    received = parse_utc(draft.batch["received"])
+    return bool(draft.batch["run"] == LIVE and draft.batch["time_ns"] > received.tai_ns + AHEAD_NS)
+
+
+def _watched(connection: Connection, names: set[str]) -> set[str]:
+    asked = names - {LIVE}
+    if not asked:
+        return names
+    query = select(runs.c.name).where(runs.c.name.in_(sorted(asked)), runs.c.alarms)
+    return set(connection.scalars(query)) | (names & {LIVE})
+
+
+class _Watch:
+    """What is watched of one spacecraft in one run, its row locked."""
+
+    def __init__(
+        self, connection: Connection, spacecraft: str, run: str, drafts: Sequence[Draft]
+    ) -> None:
+        self._connection = connection
+        self._run = run
+        self._drafts = drafts
+        self._limits = limits_of(connection, _mission(connection, drafts[0]))
+        first = drafts[0]
+        assert first.batch is not None
+        fresh = {
+            "spacecraft": spacecraft,
+            "run": run,
+            **_latest_of(first.batch),
+            "state": "{}",
+        }
+        self._row = _locked(connection, spacecraft, run)
+        if self._row is None:
+            insert_missing(connection, watches, [fresh])
+            self._row = _locked(connection, spacecraft, run)
+        assert self._row is not None
+        kept = msgspec.json.decode(self._row["state"])
+        self._windows = {name: Window.from_json(each) for name, each in kept.items()}
+        self._board = Board(connection, spacecraft, run)
+
+    def look(self) -> None:
+        """Look at every batch in order of time, and keep what was found."""
+        assert self._row is not None
+        latest = dict(self._row)
+        for draft in self._drafts:
+            assert draft.batch is not None
+            self._mind_the_gap(latest, draft.batch)
+            self._judge(draft)
+            if draft.batch["time_ns"] >= latest["time_ns"]:
+                latest |= _latest_of(draft.batch)
+            latest["received"] = max(latest["received"], draft.batch["received"])
+        kept = {name: window.to_json() for name, window in self._windows.items()}
+        values = {name: latest[name] for name in ("time", "time_ns", "batch_id", "received")}
+        values["state"] = msgspec.json.encode(kept).decode()
+        self._connection.execute(
+            update(watches)
+            .where(watches.c.spacecraft == latest["spacecraft"], watches.c.run == self._run)
+            .values(values)
+        )
+        self._board.save()
+
+    def _mind_the_gap(self, latest: Row, batch: Row) -> None:
+        """Silence: live by the clock, elsewhere by the batches' own time; over with this batch."""
+        gap_s = (batch["time_ns"] - latest["time_ns"]) * 1e-9
+        if self._run == LIVE:
+            gap_s = _seconds(latest["received"], batch["received"])
+        point = Point(gap_s, batch["time"], batch["id"])
+        severity, bound = silence(self._limits, gap_s)
+        now = batch["received"]
+        if severity is not None:
+            self._board.observe(SILENCE, severity, bound, point, now)
+        if self._board.has(SILENCE):
+            self._board.observe(SILENCE, None, None, Point(0.0, *_moment(batch)), now)
+
+    def _judge(self, draft: Draft) -> None:
+        assert draft.batch is not None
+        parts = contribution(draft.result)
+        for name, limits in self._limits.items():
+            sample = _sample(name, parts, draft.result["time_ns"])
+            if sample is None:
+                continue
+            window = self._windows.setdefault(name, Window())
+            judged = window.add(sample, limits)
+            if judged is None:
+                continue
+            point = Point(judged.value, *_moment(draft.batch))
+            bound = judged.severity and limits.bound(judged.severity, judged.value)
+            if judged.severity is not None or self._board.has(name):
+                now = draft.batch["received"]
+                self._board.observe(name, judged.severity, bound, point, now)
+
+
+def _mission(connection: Connection, draft: Draft) -> Mission:
+    """The mission that a draft was made with; one from another process brings its digest alone."""
+    if draft.acquisition is not None:
+        return draft.acquisition.mission
+    query = select(missions.c.settings).where(missions.c.digest == draft.result["mission_digest"])
+    return Mission.model_validate_json(connection.execute(query).scalar_one())
+
+
+class Board:
+    """The active alarms of one spacecraft in one run, as they change in a transaction."""
+
+    def __init__(self, connection: Connection, spacecraft: str, run: str) -> None:
+        self._connection = connection
+        self._place = {"spacecraft": spacecraft, "run": run}
+        query = (
+            select(alarms)
+            .where(
+                alarms.c.run == run,
+                alarms.c.spacecraft == spacecraft,
+                alarms.c.cleared_at.is_(None),
+            )
+            .order_by(alarms.c.id)
+            .with_for_update()
+        )
+        rows = [dict(row) for row in connection.execute(query).mappings()]
+        self._alarms: dict[str, Row] = {row["quantity"]: row for row in rows}
+        self._latest: dict[str, Row] = {}
+
+    def has(self, quantity: str) -> bool:
+        """Whether a quantity has an active alarm."""
+        return quantity in self._alarms
+
+    def observe(
+        self,
+        quantity: str,
+        severity: Severity | None,
+        bound: float | None,
+        point: Point,
+        now: str,
+    ) -> None:
+        """Let a quantity's alarm meet a new value, or raise one."""
+        alarm = self._alarms.get(quantity)
+        if alarm is None:
+            if severity is not None and bound is not None:
+                columns, actions = latch.raised(severity, bound, point, now)
+                alarm = {"id": _IDS.new(), "quantity": quantity, **self._place, **columns}
+                self._connection.execute(insert(alarms), alarm)
+                note(self._connection, alarm, actions, now)
+                self._alarms[quantity] = alarm
+            return
+        changes, actions = latch.observed(alarm, severity, bound, point, now)
+        if actions:
+            pending = self._latest.pop(quantity, {})
+            alarm = change(self._connection, alarm, pending | changes, actions, now)
+        else:
+            # Values alone are written once, at the end.
+            self._latest[quantity] = self._latest.get(quantity, {}) | changes
+            alarm = alarm | changes
+        self._alarms[quantity] = alarm
+        if alarm["cleared_at"] is not None:
+            del self._alarms[quantity]
+
+    def save(self) -> None:
+        """Write the latest values of the alarms that did not change otherwise."""
+        for quantity, changes in self._latest.items():
+            id = self._alarms[quantity]["id"]
+            self._connection.execute(update(alarms).where(alarms.c.id == id).values(changes))
+        self._latest.clear()
+
+
+def silence(
+    limits: Mapping[QuantityName, LimitSettings], gap_s: float
+) -> tuple[Severity | None, float | None]:
+    """How bad a silence is, and the bound that it is beyond."""
+    settings = limits[SILENCE]
+    worst = max((s for s in Severity if settings.out(s, gap_s, False)), default=None)
+    return worst, None if worst is None else settings.bound(worst, gap_s)
+
+
+def sweep(connection: Connection, missions: Mapping[str, Mission], now: Utc) -> None:
+    """What no batch tells of: live spacecraft that are silent, shelves whose time is over."""
+    for spacecraft in sorted(_silent(connection, missions, now)):
+        row = _locked(connection, spacecraft, LIVE)
+        if row is None:
+            continue
+        board = Board(connection, spacecraft, LIVE)
+        gap_s = _seconds(row["received"], now.text)
+        severity, bound = silence(limits_of(connection, missions[spacecraft]), gap_s)
+        if severity is not None:
+            point = Point(gap_s, row["time"], row["batch_id"])
+            board.observe(SILENCE, severity, bound, point, now.text)
+            board.save()
+    over = connection.execute(_shelved_until(now).with_for_update()).mappings().all()
+    for alarm in map(dict, over):
+        changes, actions = latch.expired(alarm, now.text)
+        change(connection, alarm, changes, actions, now.text)
+
+
+def is_due(connection: Connection, missions: Mapping[str, Mission], now: Utc) -> bool:
+    """Whether `sweep` would find something to do; it only reads."""
+    if connection.execute(_shelved_until(now).limit(1)).first() is not None:
+        return True
+    return bool(_silent(connection, missions, now))
+
+
+def _silent(connection: Connection, missions: Mapping[str, Mission], now: Utc) -> set[str]:
+    """The live spacecraft whose silence is worse than their alarm says so far."""
+    found = set()
+    query = select(watches.c.spacecraft, watches.c.received).where(watches.c.run == LIVE)
+    for spacecraft, received in connection.execute(query):
+        mission = missions.get(spacecraft)
+        if mission is None:
+            continue
+        gap_s = _seconds(received, now.text)
+        severity, _ = silence(limits_of(connection, mission), gap_s)
+        if severity is None:
+            continue
+        noted = select(alarms.c.current_severity).where(
+            alarms.c.run == LIVE,
+            alarms.c.spacecraft == spacecraft,
+            alarms.c.quantity == SILENCE,
+            alarms.c.cleared_at.is_(None),
+        )
+        if connection.execute(noted).scalar() != severity.word:
+            found.add(spacecraft)
+    return found
+
+
+def shelf_end(now: Utc, minutes: int) -> str:
+    """The moment some minutes from now, as its text."""
+    return shifted(now, 60.0 * minutes).text
+
+
+def _shelved_until(now: Utc) -> Any:
+    return (
+        select(alarms)
+        .where(alarms.c.cleared_at.is_(None), alarms.c.shelved_until <= now.text)
+        .order_by(alarms.c.id)
+    )
+
+
+def _sample(name: QuantityName, parts: Row, time_ns: int) -> Sample | None:
+    """What one batch adds to the window of a quantity; None where it has none of it."""
+    match QUANTITIES[name].of:
+        case "stars":
+            whole = parts["observed"]
+            return (time_ns, parts[name.removesuffix("_share")], whole) if whole else None
+        case "batches":
+            hit = parts["suspect"] if name == "suspect_share" else 1 - parts["solved"]
+            return time_ns, hit, 1
+        case "value":
+            return (time_ns, parts[f"{name}_sum"], 1) if parts[f"{name}_n"] else None
+        case _:
+            return None
+
+
+def _locked(connection: Connection, spacecraft: str, run: str) -> Row | None:
+    query = select(watches).where(watches.c.spacecraft == spacecraft, watches.c.run == run)
+    row = connection.execute(query.with_for_update()).mappings().first()
+    return None if row is None else dict(row)
+
+
+def _latest_of(batch: Row) -> Row:
+    names = {"time": "time", "time_ns": "time_ns", "batch_id": "id", "received": "received"}
+    return {name: batch[column] for name, column in names.items()}
+
+
+def _moment(batch: Row) -> tuple[str, str]:
+    return batch["time"], batch["id"]
+
+
+def _seconds(earlier: str, later: str) -> float:
+    return (parse_utc(later).tai_ns - parse_utc(earlier).tai_ns) * 1e-9

@@ -1,0 +1,284 @@
+"""Telemetry with known faults is flown, and the advice finds just these."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from service.acquire import acquire
+from service.advice.advice import Pace
+from service.advice.report import as_row, as_text
+from service.advice.tolerances import rounded_up, tolerance_findings
+from service.advice.trackers import alignment_findings, magnitude_findings, noise_findings
+from service.advice.words import said_of_alignment, said_of_noise
+from service.missions.mission import Mission
+from service.simulate.stretches import NO_TROUBLES, Trouble, Troubles
+from service.vectors import (
+    ARCSEC_PER_RADIAN,
+    angle_between_deg,
+    matrix_from_quaternion,
+    rotate_about,
+)
+from tests.advice.passes import (
+    advice_from,
+    evidence_from,
+    flown,
+    mission_like,
+    near,
+    percentile_99,
+    stars_of,
+)
+
+BATCHES = 150
+
+
+def finding(mission, evidence, name):
+    (found,) = [f for f in tolerance_findings(mission, evidence) if f.tolerance.name == name]
+    return found
+
+
+# ---- the trackers ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("factor", "verdict"), [(1.0, "fits"), (2.0, "too_small")])
+def test_the_noise_of_a_tracker_is_found(sky, missions, seed, factor, verdict):
+    """Noise of the mission's sigma fits; twice as much is named, with the line to write."""
+    mission = missions["XTE"]
+    sigma_arcsec = factor * mission.trackers[0].sigma_arcsec
+    troubles = Troubles(Trouble(), Trouble(), Trouble(), Trouble(1.0, sigma_arcsec))
+    pass_ = flown(mission, sky, BATCHES, seed, troubles=troubles)
+    (noise,) = noise_findings(mission, evidence_from(mission, sky, pass_.batches))
+    assert near(noise.sigma_arcsec, sigma_arcsec)
+    assert noise.sigma_arcsec.high - noise.sigma_arcsec.low < 0.4 * sigma_arcsec
+    assert noise.verdict == verdict
+    lines = [change.line for change in said_of_noise(noise).changes]
+    assert [line.split(" = ")[0] for line in lines] == ["sigma_arcsec"] * (verdict != "fits")
+
+
+def test_an_offset_and_a_scale_of_the_magnitudes_are_found(sky, missions, seed):
+    """Magnitudes 0.4 fainter at 5 mag, a magnitude measured as 1.15."""
+
+    def fainter(body):
+        for star in stars_of(body):
+            star["magnitude"] += 0.4 + 0.15 * (star["magnitude"] - 5.0)
+
+    mission = missions["XTE"]
+    pass_ = flown(mission, sky, BATCHES, seed, change=fainter)
+    (found,) = magnitude_findings(mission, evidence_from(mission, sky, pass_.batches))
+    assert near(found.offset_mag, 0.4 + 0.15 * (found.pivot_mag - 5.0))
+    assert near(found.scale, 1.15)
+    assert near(found.scatter_mag, 1.15 * 0.1)
+    assert found.verdict == "off"
+
+
+def test_the_line_for_the_magnitudes_undoes_their_offset(sky, missions, seed):
+    """With the colour polynomial that is advised, the same stars have no offset left."""
+
+    def fainter(body):
+        for star in stars_of(body):
+            star["magnitude"] += 0.35
+
+    mission = missions["XTE"]
+    pass_ = flown(mission, sky, BATCHES, seed, change=fainter)
+    row = as_row(advice_from(mission, sky, pass_.batches[:60]))
+    (line,) = [c["line"] for c in row["changes"] if c["table"] == "catalog"]
+    key, value = line.partition("#")[0].split(" = ")
+    polynomial = tuple(float(part) for part in value.strip(" []").split(","))
+    better = mission.model_dump()
+    better["catalog"][key.strip()] = polynomial
+    mended = Mission.model_validate(better)
+    (found,) = magnitude_findings(mended, evidence_from(mended, sky, pass_.batches))
+    assert found.verdict == "fits"
+    assert abs(found.offset_mag.value) < 0.03
+
+
+def test_a_misaligned_tracker_is_found_and_the_lines_put_it_right(sky, seed):
+    """The second tracker is turned by minutes of arc; with the advised axes nothing is left."""
+    turn_arcsec = np.array([130.0, -80.0, 210.0])
+    mission = mission_like(second_tracker={})
+    true_axes = rotate_about(
+        turn_arcsec / ARCSEC_PER_RADIAN, mission.trackers[1].body_from_tracker.T
+    )
+    names = ("x_axis_body", "y_axis_body", "z_axis_body")
+    truly = mission_like(
+        second_tracker={n: a.tolist() for n, a in zip(names, true_axes, strict=True)}
+    )
+    pass_ = flown(truly, sky, 60, seed)
+    (found,) = alignment_findings(mission, evidence_from(mission, sky, pass_.batches))
+    assert found.verdict == "off"
+    for part, truth in zip(found.rotation_arcsec, turn_arcsec, strict=True):
+        assert near(part, truth)
+        assert part.high - part.low < 20.0
+    advised = {
+        change.line.split(" = ")[0]: [float(x) for x in change.line.split("[")[1][:-1].split(",")]
+        for change in said_of_alignment(found).changes
+    }
+    mended = mission_like(second_tracker=advised)
+    (left,) = alignment_findings(mended, evidence_from(mended, sky, pass_.batches))
+    assert left.verdict == "fits"
+    assert max(abs(part.value) for part in left.rotation_arcsec) < 0.5
+
+
+def test_trackers_that_are_aligned_are_left_alone(sky, seed):
+    mission = mission_like(second_tracker={})
+    pass_ = flown(mission, sky, 60, seed)
+    (found,) = alignment_findings(mission, evidence_from(mission, sky, pass_.batches))
+    assert found.verdict == "fits"
+    assert all(near(part, 0.0) for part in found.rotation_arcsec)
+
+
+# ---- the tolerances ----------------------------------------------------------------------------
+
+
+def test_a_separation_tolerance_that_is_too_tight_is_found(sky, seed):
+    """Of two Gaussian stars of 2.12 arcsec an axis, 99 % of separations lie within 7.73 arcsec."""
+    mission = mission_like(tolerances={"separation_deg": 0.001})
+    pass_ = flown(mission, sky, BATCHES, seed)
+    found = finding(mission, evidence_from(mission, sky, pass_.batches), "separation_deg")
+    sigma_deg = mission.trackers[0].sigma_arcsec * np.sqrt(2.0) / 3600.0
+    assert found.verdict == "too_tight"
+    assert near(found.needed, sigma_deg * stats.norm.ppf(0.995))
+    assert near(found.beyond, 2 * stats.norm.sf(0.001 / sigma_deg))
+    assert found.needed.high < found.recommended < 2 * found.needed.value
+
+
+def test_the_tolerance_that_is_advised_is_no_longer_too_tight(sky, seed):
+    mission = mission_like(tolerances={"separation_deg": 0.001})
+    evidence = evidence_from(mission, sky, flown(mission, sky, BATCHES, seed).batches)
+    advised = finding(mission, evidence, "separation_deg").recommended
+    mended = mission_like(tolerances={"separation_deg": advised})
+    assert finding(mended, evidence, "separation_deg").verdict == "fits"
+
+
+def test_a_magnitude_tolerance_that_is_too_tight_is_found(sky, seed):
+    mission = mission_like(tolerances={"magnitude_mag": 0.12})
+    evidence = evidence_from(mission, sky, flown(mission, sky, BATCHES, seed).batches)
+    found = finding(mission, evidence, "magnitude_mag")
+    assert found.verdict == "too_tight"
+    assert near(found.needed, 0.1 * stats.norm.ppf(0.995))
+
+
+def test_a_cross_product_tolerance_near_the_attitude_errors_is_too_tight(sky, seed):
+    """The a priori attitude is degrees off: the true angles follow from the truth of the pass."""
+    mission = mission_like(tolerances={"cross_product_deg": 2.0})
+    pass_ = flown(mission, sky, BATCHES, seed, angles_share=0.0)
+    found = finding(mission, evidence_from(mission, sky, pass_.batches), "cross_product_deg")
+    true_angles = []
+    for body, truth in zip(pass_.sent, pass_.truth, strict=True):
+        tracker = mission.trackers[0]
+        seen = np.array([s["vector"] for s in stars_of(body)]) @ tracker.body_from_tracker.T
+        i, j = np.triu_indices(len(seen), 1)
+        normal = np.cross(seen[i], seen[j])
+        presumed = matrix_from_quaternion(body["a_priori"]["quaternion"])
+        true = matrix_from_quaternion(truth["quaternion"])
+        true_angles += angle_between_deg(normal @ presumed, normal @ true).tolist()
+    assert found.verdict == "too_tight"
+    assert near(found.needed, percentile_99(true_angles))
+    assert near(found.beyond, np.mean(np.array(true_angles) > 2.0))
+
+
+def test_a_pole_tolerance_far_above_what_is_seen_is_wide(sky, missions, seed):
+    """SOHO's pole is known to 0.1 degrees, and BANTOL1 is 0.13."""
+    mission = missions["SOHO"]
+    evidence = evidence_from(mission, sky, flown(mission, sky, BATCHES, seed).batches)
+    assert finding(mission, evidence, "pole_difference_deg").verdict == "too_wide"
+    # A degree off about the pole turns angles to it by no more than a tilt of that size does.
+    assert finding(mission, evidence, "pole_angle_deg").needed.value < 0.12
+
+
+def test_a_tolerance_whose_test_is_off_is_not_judged(sky, seed):
+    mission = mission_like(tests={"cross_product": False}, tolerances={"cross_product_deg": 0.1})
+    evidence = evidence_from(mission, sky, flown(mission, sky, 30, seed).batches)
+    assert finding(mission, evidence, "cross_product_deg").verdict == "not_used"
+
+
+def test_of_a_few_batches_nothing_is_said(sky, missions, seed):
+    mission = missions["XTE"]
+    row = as_row(advice_from(mission, sky, flown(mission, sky, 6, seed).batches))
+    assert row["changes"] == []
+    findings = row["tolerances"] + row["noise"] + row["magnitudes"]
+    assert {each["action"] for each in findings} == {"wait"}
+    assert all("too little was seen" in each["text"] for each in findings)
+
+
+def test_of_no_batches_nothing_is_said(sky, missions):
+    row = as_row(advice_from(missions["SOHO"], sky, []))
+    assert row["changes"] == []
+    assert row["batches_sampled"] == 0
+
+
+def test_a_pass_as_the_mission_expects_it_needs_no_tighter_or_wider_separation(sky, missions, seed):
+    mission = missions["XTE"]
+    evidence = evidence_from(mission, sky, flown(mission, sky, BATCHES, seed).batches)
+    assert finding(mission, evidence, "separation_deg").verdict == "fits"
+    assert finding(mission, evidence, "magnitude_mag").verdict == "fits"
+    assert [f.verdict for f in noise_findings(mission, evidence)] == ["fits"]
+    assert [f.verdict for f in magnitude_findings(mission, evidence)] == ["fits"]
+
+
+@pytest.mark.parametrize(
+    ("value", "rounded"), [(0.001234, 0.0013), (0.012, 0.012), (5.21, 5.3), (0.0, 0.0), (99.1, 100)]
+)
+def test_a_recommended_value_is_one_a_person_would_write(value, rounded):
+    assert rounded_up(value) == rounded
+
+
+# ---- other settings ----------------------------------------------------------------------------
+
+
+def test_what_was_tried_is_what_the_staircase_gives(sky, seed):
+    """Each row's counts are those of the batches run one by one with these settings."""
+    mission = mission_like(tolerances={"separation_deg": 0.002})
+    pass_ = flown(mission, sky, 25, seed, troubles=Troubles())
+    advice = advice_from(mission, sky, pass_.batches, own={"separation_deg": 0.015})
+    rows = {(t.variant.name, t.variant.identifier): t for t in advice.tried}
+    for (_, identifier), row in rows.items():
+        changed = dict(row.variant.tolerances)
+        again = mission_like(
+            tolerances={"separation_deg": 0.002} | changed,
+        ).model_copy(update={"identifier": identifier})
+        counts = [acquire(batch, again.within_zones, sky).counts for batch in pass_.batches]
+        for name in ("observed", "unique", "ambiguous", "unmatched"):
+            assert getattr(row, name) == sum(each[name] for each in counts)
+    present = rows["present settings", "starid"]
+    asked = rows["separation_deg = 0.015, asked for", "starid"]
+    assert present.change is None
+    lost = 100 * (present.unique - asked.unique) / present.observed
+    assert asked.change.value == pytest.approx(lost)
+    assert rows["present settings", "verified"].otherwise == 0
+
+
+def test_a_batch_that_no_longer_fits_is_counted_and_passed_by(sky, missions, seed):
+    mission = missions["XTE"]
+    batches = flown(mission, sky, 5, seed).batches
+    foreign = flown(missions["SOHO"], sky, 1, seed, prior="direction").batches
+    advice = advice_from(mission, sky, [*batches, *foreign])
+    assert (advice.sampled, advice.refused) == (5, 1)
+    assert "sun_pointed" in advice.refusal
+
+
+def test_where_time_runs_out_fewer_batches_are_looked_at_and_the_answer_says_so(
+    sky, missions, seed
+):
+    steps = []
+    pace = Pace(lambda share: len(steps) < 20 * share, lambda: steps.append(1))
+    mission = missions["XTE"]
+    advice = advice_from(mission, sky, flown(mission, sky, 40, seed).batches, pace=pace)
+    assert advice.sampled == 8
+    assert {t.batches for t in advice.tried if t.variant.identifier == "starid"} == {8}
+
+
+def test_the_text_can_be_acted_upon(sky, seed):
+    """Every change stands under its table, as TOML that a mission file takes."""
+    mission = mission_like(tolerances={"separation_deg": 0.001})
+    pass_ = flown(mission, sky, 60, seed, troubles=NO_TROUBLES)
+    advice = advice_from(mission, sky, pass_.batches)
+    about = {"spacecraft": "XTE", "run": "r", "first": "a", "last": "b", "batches_in_range": 99}
+    text = as_text(about | as_row(advice))
+    assert "60 of 99 batches were looked at." in text
+    assert "SEPTOL (separation_deg) is too tight" in text
+    changes = text.partition("To change in the mission file of XTE:")[2].splitlines()
+    assert "  [tolerances]" in changes
+    (line,) = [each.strip() for each in changes if each.strip().startswith("separation_deg")]
+    value = float(line.partition("#")[0].partition("=")[2])
+    assert 0.002 < value < 0.005
+    assert max(len(each) for each in text.splitlines()) <= 100

@@ -1,0 +1,112 @@
+"""Limits and alarms over HTTP: what people do, who they are, and what is refused."""
+
+import pytest
+
+from tests.web.conftest import (
+    address,
+    batch,
+    client,
+    drawn,
+    operations,
+)
+
+__all__ = ["address", "batch", "client", "drawn", "operations"]
+
+LIMITS = "/api/v1/spacecraft/XTE/limits"
+TIGHT = {"warning": {"high": 0.5}, "minimum_count": 1, "duration_s": 0}
+
+
+@pytest.fixture(scope="module")
+def alarm(client, drawn):
+    """An open alarm of a run of its own."""
+    asked = {"settings": TIGHT, "who": "jb"}
+    assert client.put(f"{LIMITS}/no_attitude_share", json=asked).status_code == 200
+    assert client.put("/api/v1/runs/watched", json={"alarms": True}).status_code == 200
+    (lone,) = drawn("XTE", 1, stars=1)
+    client.post("/api/v1/batches", json=lone | {"run": "watched"}).raise_for_status()
+    (found,) = client.get("/api/v1/alarms?run=watched").json()["items"]
+    return found
+
+
+def test_an_alarm_leads_to_the_batch_that_raised_it(client, alarm):
+    record = client.get(f"/api/v1/batches/{alarm['raised']['batch_id']}").json()
+    assert record["answer"]["time"] == alarm["raised"]["time"]
+    shown = client.get("/api/v1/overview?run=watched").json()
+    assert shown["alarms"]["open"] == 1
+    xte = next(each for each in shown["items"] if each["name"] == "XTE")
+    assert [each["id"] for each in xte["alarms"]] == [alarm["id"]]
+
+
+def test_who_does_something_must_say_who_they_are(client, alarm):
+    answer = client.post(f"/api/v1/alarms/{alarm['id']}/acknowledge", json={})
+    assert answer.status_code == 422
+    assert answer.json()["errors"][0]["field"] == "who"
+
+
+def test_what_is_done_twice_is_told_of_and_changes_nothing(client, alarm):
+    here = f"/api/v1/alarms/{alarm['id']}"
+    assert client.post(f"{here}/acknowledge", json={"who": "jb"}).json()["state"] == "acknowledged"
+    again = client.post(f"{here}/acknowledge", json={"who": "mk"})
+    assert (again.status_code, again.json()["type"]) == (409, "/problems/not-now")
+    assert client.get(here).json()["acknowledged"]["who"] == "jb"
+
+
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [
+        ("shelve", {"who": "jb"}),
+        ("shelve", {"who": "jb", "minutes": 0}),
+        ("shelve", {"who": "jb", "minutes": 100_000}),
+        ("comment", {"who": "jb"}),
+        ("comment", {"who": "jb", "comment": "x" * 3000}),
+        ("acknowledge", {"who": ""}),
+        ("acknowledge", {"who": "jb", "colour": "red"}),
+    ],
+)
+def test_what_makes_no_sense_is_refused_with_its_field(client, alarm, path, body):
+    answer = client.post(f"/api/v1/alarms/{alarm['id']}/{path}", json=body)
+    assert answer.status_code == 422
+    assert answer.json()["errors"]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"warning": {"high": 2}, "critical": {"high": 1}},
+        {"warning": {"high": "much"}},
+        {"minimum_count": 0},
+        {"colour": "red"},
+        {"hysteresis": "1e999"},
+    ],
+)
+def test_limits_that_make_no_sense_are_refused_with_their_field(client, settings):
+    asked = {"settings": settings, "who": "jb"}
+    answer = client.put(f"{LIMITS}/ambiguous_share", json=asked)
+    assert answer.status_code == 422
+    assert answer.json()["errors"][0]["field"].startswith("settings")
+
+
+def test_what_is_not_there_is_not_found(client):
+    assert client.get(f"{LIMITS}/colour").status_code == 404
+    assert client.get(f"{LIMITS}/batches_per_hour").status_code == 404
+    assert client.get("/api/v1/spacecraft/NOPE/limits").status_code == 404
+    assert client.get("/api/v1/alarms/01JD0000000000000000000001").status_code == 404
+    assert (
+        client.post("/api/v1/alarms/x/comment", json={"who": "a", "comment": "b"}).status_code
+        == 404
+    )
+
+
+def test_a_limit_goes_back_to_what_was_shipped(client):
+    place = f"{LIMITS}/suspect_share"
+    asked = {"settings": TIGHT, "who": "jb", "comment": "try"}
+    assert not client.put(place, json=asked).json()["is_default"]
+    assert client.delete(place, params={"who": "mk"}).json()["is_default"]
+    found = client.get(place).json()
+    assert [each["who"] for each in found["history"]] == ["mk", "jb"]
+    assert found["limit"]["settings"] == found["default"]
+
+
+def test_live_batches_are_always_watched(client):
+    answer = client.put("/api/v1/runs/live", json={"alarms": False})
+    assert answer.status_code == 422

@@ -1,0 +1,52 @@
+"""`acquire replay --alarms`: the sample raises an alarm, whichever way the file goes."""
+
+import pytest
+
+from service.cli import main
+from service.operations import Operations
+from service.settings import Settings
+from service.web.app import create_app
+from tests.web.serving import Server
+
+SAMPLE = ["simulate", "telemetry", "--spacecraft", "XTE", "--batches", "160", "--seed"]
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("sample") / "sample.ndjson"
+    assert main([*SAMPLE, "3", str(path)]) == 0
+    return path
+
+
+@pytest.fixture
+def operations(tmp_path):
+    return Operations.open(Settings(database=f"sqlite:///{tmp_path / 'acquire.db'}"))
+
+
+def raised(operations, run):
+    return {each["quantity"] for each in operations.alarms(run=run, state="all").items}
+
+
+@pytest.mark.parametrize("way", [(), ("--concurrency", "4")], ids=["as a file", "batch by batch"])
+def test_through_a_server(operations, file, way):
+    with Server(create_app(operations)) as url:
+        for run, alarms in (("quiet", ()), ("loud", ("--alarms",))):
+            assert main(["replay", str(file), "--url", url, "--run", run, *way, *alarms]) == 0
+        assert raised(operations, "quiet") == set()
+        assert "a_priori_angle_deg" in raised(operations, "loud")
+
+
+def test_in_process(operations, file, tmp_path):
+    operations.close()
+    database = f"sqlite:///{tmp_path / 'acquire.db'}"
+    asked = ["replay", str(file), "--in-process", "--database", database, "--run", "loud"]
+    assert main([*asked, "--alarms"]) == 0
+    again = Operations.open(Settings(database=database))
+    before = again.alarms(run="loud", state="all").items
+    again.close()
+    assert "a_priori_angle_deg" in {each["quantity"] for each in before}
+    # A second time adds nothing, and raises nothing anew.
+    assert main([*asked, "--alarms"]) == 0
+    again = Operations.open(Settings(database=database))
+    assert again.alarms(run="loud", state="all").items == before
+    again.close()

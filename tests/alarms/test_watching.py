@@ -1,0 +1,300 @@
+"""Limits held against batches as they are recorded: once each, on every database."""
+
+import json
+
+import pytest
+
+from service.alarms.limits import LimitSettings
+from service.errors import NotFound, NotNow
+from service.observe.wire import OptionsIn, submission_from_json
+from service.simulate.stretches import NO_TROUBLES, Pass
+from service.simulate.telemetry import draw_pass
+from service.times import shifted, utc_now
+
+TIGHT = LimitSettings.model_validate(
+    {
+        "warning": {"high": 0.1},
+        "critical": {"high": 0.9},
+        "minimum_count": 2,
+        "duration_s": 0,
+        "hysteresis": 0.0,
+    }
+)
+"""Of the unmatched share: one star of five in two batches is out, none is in."""
+
+
+@pytest.fixture
+def tight(operations):
+    operations.set_limit("XTE", "unmatched_share", TIGHT, who="jb", comment="for the test")
+    return operations
+
+
+def send(operations, make, kinds, start=0, **wanted):
+    for k, kind in enumerate(kinds, start=start):
+        operations.submit(make(f"b{k}", kind=kind, after_s=30.0 * k, **wanted))
+
+
+def only(operations, state="active", **wanted):
+    (alarm,) = operations.alarms(state=state, **wanted).items
+    return alarm
+
+
+def actions(operations, alarm):
+    return [each["action"] for each in operations.alarm(alarm["id"])["actions"]]
+
+
+def test_an_alarm_stays_until_it_is_acknowledged_and_back_in_limits(tight, make):
+    send(tight, make, ["good", "spurious", "spurious"])
+    alarm = only(tight)
+    assert (alarm["state"], alarm["severity"], alarm["quantity"]) == (
+        "open",
+        "warning",
+        "unmatched_share",
+    )
+    assert alarm["raised"]["bound"] == 0.1
+    assert alarm["raised"]["time"] == make(after_s=60).batch.time.text
+    assert tight.batch(alarm["raised"]["batch_id"])["answer"]["batch"] == "b2"
+    send(tight, make, ["good", "good"], start=3)
+    back = only(tight)
+    assert (back["state"], back["in_limits"], back["current_severity"]) == ("open", True, None)
+    cleared = tight.acknowledge(alarm["id"], "jb", "dust")
+    assert cleared["state"] == "cleared"
+    assert [each["action"] for each in cleared["actions"]] == [
+        "raised",
+        "returned",
+        "acknowledged",
+        "cleared",
+    ]
+    said = cleared["actions"][2]
+    assert (said["who"], said["comment"]) == ("jb", "dust")
+    assert tight.alarms().items == []
+    assert only(tight, "cleared")["id"] == alarm["id"]
+
+
+def test_acknowledged_first_it_clears_by_itself_when_it_is_back(tight, make):
+    send(tight, make, ["spurious"] * 3)
+    alarm = tight.acknowledge(only(tight)["id"], "jb")
+    assert alarm["state"] == "acknowledged"
+    send(tight, make, ["good"] * 2, start=3)
+    assert only(tight, "cleared")["id"] == alarm["id"]
+    # What goes out again is another alarm.
+    send(tight, make, ["spurious"] * 2, start=5)
+    assert only(tight)["id"] != alarm["id"]
+
+
+def test_what_gets_worse_than_it_was_is_open_again(tight, make):
+    send(tight, make, ["spurious"] * 2)
+    alarm = tight.acknowledge(only(tight)["id"], "jb")
+    worse = TIGHT.model_copy(update={"critical": TIGHT.critical.model_copy(update={"high": 0.15})})
+    tight.set_limit("XTE", "unmatched_share", worse, who="jb")
+    send(tight, make, ["spurious"], start=2)
+    found = only(tight)
+    assert (found["id"], found["state"], found["severity"]) == (alarm["id"], "open", "critical")
+    assert actions(tight, found) == ["raised", "acknowledged", "escalated"]
+
+
+def test_a_batch_is_looked_at_once_however_often_it_comes(tight, make):
+    for _ in range(4):
+        send(tight, make, ["spurious"])
+    assert tight.alarms().items == []
+    send(tight, make, ["spurious"], start=1)
+    assert actions(tight, only(tight)) == ["raised"]
+
+
+def test_many_at_once_raise_what_they_would_raise_one_by_one(opened, tight, make):
+    kinds = ["good", "spurious", "spurious", "good", "good", "spurious", "spurious"]
+    tight.watch_run("bulk")
+    tight.watch_run("single")
+    send(tight, make, kinds, run="single")
+    tight.submit_many(
+        [make(f"b{k}", kind=kind, after_s=30.0 * k, run="bulk") for k, kind in enumerate(kinds)]
+    )
+    one, many = (only(tight, run=run) for run in ("single", "bulk"))
+    different = ("id", "run", "raised", "worst", "latest", "returned_at")
+    assert {k: v for k, v in one.items() if k not in different} == {
+        k: v for k, v in many.items() if k not in different
+    }
+    assert actions(tight, one) == actions(tight, many) == ["raised", "returned", "left_again"]
+    for which in ("raised", "worst", "latest"):
+        assert one[which]["time"] == many[which]["time"]
+        assert one[which]["value"] == many[which]["value"]
+
+
+def test_alarms_watch_live_batches_and_a_run_when_asked(tight, make):
+    send(tight, make, ["spurious"] * 3, run="quiet")
+    assert tight.alarms(run="*").items == []
+    tight.watch_run("loud")
+    send(tight, make, ["spurious"] * 3, run="loud")
+    assert only(tight, run="loud")["run"] == "loud"
+    assert tight.alarms().items == []
+    assert {each["run"]: each["alarms"] for each in tight.runs()} == {"loud": True, "quiet": False}
+
+
+def test_alarms_and_limits_outlive_the_process(opened, make):
+    first = opened()
+    first.set_limit("XTE", "unmatched_share", TIGHT, who="jb", comment="kept")
+    send(first, make, ["spurious"])
+    first.close()
+    second = opened()
+    # The batch before the restart counts: one more makes two.
+    send(second, make, ["spurious"], start=1)
+    alarm = second.shelve(only(second)["id"], "jb", 60)
+    second.close()
+    third = opened()
+    assert only(third, "shelved")["id"] == alarm["id"]
+    assert third.limits("XTE")[1]["comment"] == "kept"
+
+
+def test_two_processes_look_at_one_spacecraft_in_turn(opened, make):
+    one, two = opened(), opened()
+    one.set_limit("XTE", "unmatched_share", TIGHT, who="jb")
+    for k in range(6):
+        (one, two)[k % 2].submit(make(f"b{k}", kind="spurious", after_s=30.0 * k))
+    alarm = only(one)
+    assert only(two) == alarm
+    assert actions(two, alarm) == ["raised"]
+    assert alarm["latest"]["time"] == make(after_s=150).batch.time.text
+
+
+def test_a_shelf_has_an_end(tight, make, monkeypatch):
+    send(tight, make, ["spurious"] * 2)
+    alarm = tight.shelve(only(tight)["id"], "jb", 30, "until the pass is over")
+    assert alarm["state"] == "shelved"
+    assert tight.alarms(state="open").items == []
+    assert tight.overview()["alarms"] == {
+        "open": 0,
+        "acknowledged": 0,
+        "shelved": 1,
+        "worst": None,
+    }
+    assert not tight.sweep()
+    later = shifted(utc_now(), 31 * 60)
+    monkeypatch.setattr("service.operations.utc_now", lambda: later)
+    assert only(tight, "open")["id"] == alarm["id"]
+    assert tight.sweep()
+    assert actions(tight, alarm)[-1] == "shelf_expired"
+    assert not tight.sweep()
+
+
+def test_who_comes_late_to_an_alarm_is_told_so(tight, make):
+    send(tight, make, ["spurious"] * 2)
+    id = only(tight)["id"]
+    with pytest.raises(NotNow, match="not shelved"):
+        tight.unshelve(id, "jb")
+    tight.acknowledge(id, "jb")
+    with pytest.raises(NotNow, match="acknowledged by jb"):
+        tight.acknowledge(id, "mk")
+    tight.comment(id, "mk", "looked at it")
+    send(tight, make, ["good"] * 2, start=2)
+    for act in (tight.acknowledge, tight.unshelve):
+        with pytest.raises(NotNow, match="cleared"):
+            act(id, "mk")
+    with pytest.raises(NotFound, match="no alarm"):
+        tight.alarm("01JD0000000000000000000001")
+
+
+def test_live_silence_is_an_alarm_that_the_next_batch_ends(operations, make, monkeypatch):
+    send(operations, make, ["good"])
+    assert not operations.sweep()
+    began = utc_now()
+    for hours, severity in ((2, "warning"), (7, "critical")):
+        monkeypatch.setattr("service.operations.utc_now", lambda h=hours: shifted(began, h * 3600))
+        assert operations.sweep()
+        assert not operations.sweep()
+        assert only(operations)["severity"] == severity
+    silent = only(operations)
+    assert (silent["quantity"], silent["spacecraft"]) == ("silence_s", "XTE")
+    assert silent["raised"]["time"] == make().batch.time.text
+    monkeypatch.undo()
+    send(operations, make, ["good"], start=1)
+    assert only(operations)["in_limits"]
+    assert actions(operations, silent) == ["raised", "escalated", "returned"]
+
+
+def test_in_a_run_silence_is_a_gap_in_the_batches_own_time(operations, make):
+    operations.watch_run("r")
+    operations.submit(make("b1", run="r"))
+    operations.submit(make("b2", run="r", after_s=30))
+    assert operations.alarms(run="r").items == []
+    operations.submit(make("b3", run="r", after_s=5000))
+    gap = only(operations, run="r")
+    assert (gap["quantity"], gap["raised"]["value"]) == ("silence_s", 4970.0)
+    assert gap["in_limits"]
+
+
+def test_a_batch_dated_far_ahead_is_not_judged(tight, make):
+    for name in ("b1", "b2", "b3"):
+        text = make(name, kind="spurious").text.replace("1996-01-10T", "2098-01-10T")
+        tight.submit(submission_from_json(text.encode()))
+    assert tight.alarms().items == []
+
+
+def test_a_what_if_that_is_adopted_raises_nothing(tight, make):
+    send(tight, make, ["good"] * 3)
+    options = OptionsIn.model_validate({"tolerances": {"separation_deg": 1e-5}})
+    for each in tight.batches().items:
+        tight.what_if(each["id"], options, adopt=True)
+    assert tight.alarms().items == []
+
+
+def test_every_limit_that_was_set_stays_in_the_history(operations):
+    shipped = operations.limit("XTE", "unmatched_share")
+    assert shipped["limit"]["is_default"]
+    assert shipped["history"] == []
+    operations.set_limit("XTE", "unmatched_share", TIGHT, who="jb", comment="one")
+    operations.set_limit("XTE", "unmatched_share", None, who="mk", comment="two")
+    found = operations.limit("XTE", "unmatched_share")
+    assert [(each["who"], each["comment"]) for each in found["history"]] == [
+        ("mk", "two"),
+        ("jb", "one"),
+    ]
+    assert found["history"][1]["settings"] == TIGHT.model_dump(mode="json")
+    assert found["limit"]["settings"] == found["default"]
+    assert operations.limit("SWAS", "unmatched_share")["history"] == []
+
+
+def test_what_happens_to_alarms_and_limits_is_told(tight, make):
+    send(tight, make, ["spurious"] * 2)
+    tight.acknowledge(only(tight)["id"], "jb")
+    told = [(each.kind, json.loads(each.data).get("state")) for each in tight.events_after(0, 100)]
+    assert [each for each in told if each[0] != "batches"] == [
+        ("limit", None),
+        ("alarm", "open"),
+        ("alarm", "acknowledged"),
+    ]
+
+
+# ---- the sample telemetry ------------------------------------------------------------------------
+
+
+def submitted(operations, spacecraft, run, wanted):
+    operations.watch_run(run)
+    mission = operations.missions[spacecraft]
+    drawn = draw_pass(mission, operations.sky, wanted)
+    operations.submit_many(
+        [submission_from_json(json.dumps(each.batch).encode(), run=run) for each in drawn]
+    )
+    stretches = dict(
+        zip(
+            [each["time"] for each in operations.batches(run=run, limit=500).items][::-1],
+            [each.kind for each in wanted.stretches(mission)],
+            strict=True,
+        )
+    )
+    found = operations.alarms(run=run, state="all").items
+    return [(each, stretches[each["raised"]["time"]]) for each in found]
+
+
+@pytest.mark.parametrize("spacecraft", ["XTE", "SWAS", "SOHO"])
+@pytest.mark.parametrize("empty_database", ["sqlite"], indirect=True)
+def test_the_sample_raises_an_alarm_in_its_growing_attitude_error(opened, spacecraft, seed):
+    """And none in what comes before, nor for good."""
+    operations = opened()
+    found = submitted(operations, spacecraft, "sample", Pass(batches=160, seed=seed % 1000))
+    angle = [each for each in found if each[0]["quantity"] == "a_priori_angle_deg"]
+    ((alarm, stretch),) = angle
+    assert stretch == "attitude_error"
+    assert alarm["in_limits"], "after the stretch it is back"
+    assert operations.acknowledge(alarm["id"], "jb", "seen")["state"] == "cleared"
+    nominal = Pass(batches=120, seed=seed % 1000 + 1, troubles=NO_TROUBLES)
+    assert submitted(operations, spacecraft, "nominal", nominal) == []

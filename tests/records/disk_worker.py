@@ -1,0 +1,70 @@
+"""A process whose disk fails now and then: sends every batch until it is acknowledged.
+
+    python -m tests.records.disk_worker DATABASE BATCHES.ndjson FAULTS SEED
+
+Started with `faulty_disk.c` preloaded.  Prints one JSON line: what was
+acknowledged (id to the digest of the answer), how many faults struck, how often
+it was told to come again, and how many reads failed meanwhile.
+"""
+
+import ctypes
+import errno
+import hashlib
+import json
+import random
+import sys
+import time
+from itertools import islice
+from pathlib import Path
+
+from service.errors import Busy
+from service.observe.wire import submission_from_json
+from service.operations import Operations
+from service.settings import Settings
+
+PATIENCE_S = 60.0
+
+
+def main(database, file, faults, seed):
+    disk, draw = ctypes.CDLL(None), random.Random(int(seed))
+    operations = Operations.open(Settings(database=database))
+    lines = Path(file).read_bytes().splitlines()
+    acknowledged, told_busy, struck, reads_failed = {}, 0, 0, 0
+    waiting = iter(lines)
+    for _ in range(int(faults)):
+        before = disk.faulty_failed()
+        # A single write or a disk that stays full for a while, at any write of a commit.
+        disk.faulty_fail(draw.randrange(12), draw.choice((1, 1, 3, 25)), _error(draw))
+        while disk.faulty_failed() == before:
+            chunk = [submission_from_json(line) for line in islice(waiting, 3)]
+            assert chunk, "the batches ended before the disk failed"
+            give_up = time.monotonic() + PATIENCE_S
+            while True:
+                try:
+                    answers = operations.submit_many(chunk)
+                    break
+                except Busy:
+                    told_busy += 1
+                    try:
+                        operations.batches(limit=1)
+                    except Busy:
+                        reads_failed += 1
+                    assert time.monotonic() < give_up, "writing did not resume"
+            for each in answers:
+                acknowledged[each.id] = hashlib.sha256(each.body).hexdigest()
+        struck += 1
+    disk.faulty_fail(0, 0, 0)
+    rest = [submission_from_json(line) for line in waiting]
+    for each in operations.submit_many(rest):
+        acknowledged[each.id] = hashlib.sha256(each.body).hexdigest()
+    operations.close()
+    told = {"acknowledged": acknowledged, "struck": struck, "told_busy": told_busy}
+    print(json.dumps(told | {"reads_failed": reads_failed}))
+
+
+def _error(draw):
+    return draw.choice((errno.ENOSPC, errno.EIO))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,80 @@
+/* Lets writes to one folder fail on demand: preloaded, it stands before the C library.
+ *
+ * FAULTY_FOLDER names the folder, absolute.  From Python:
+ *   ctypes.CDLL(None).faulty_fail(after, count, errno)   the write after `after` more, and the
+ *                                                        following ones, `count` in all
+ *   ctypes.CDLL(None).faulty_calls()                     writes so far
+ *   ctypes.CDLL(None).faulty_failed()                    of these, how many were made to fail
+ */
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <errno.h>
+#include <stdatomic.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/types.h>
+#include <unistd.h>
+
+static atomic_long calls, failed, first = -1, last = -1;
+static atomic_int error;
+
+long faulty_calls(void) { return calls; }
+long faulty_failed(void) { return failed; }
+
+void faulty_fail(long after, long count, int number) {
+    error = number;
+    last = calls + after + count;
+    first = calls + after + 1;
+}
+
+static int fails(int fd) {
+    static const char *folder;
+    char link[64], path[4096];
+    if (!folder && !(folder = getenv("FAULTY_FOLDER"))) return 0;
+    snprintf(link, sizeof link, "/proc/self/fd/%d", fd);
+    ssize_t length = readlink(link, path, sizeof path - 1);
+    if (length < 0 || strncmp(path, folder, strlen(folder)) != 0) return 0;
+    long number = ++calls;
+    if (number < first || number > last) return 0;
+    ++failed;
+    errno = error;
+    return 1;
+}
+
+#define REAL(name) __typeof__(&name) real = (__typeof__(&name))dlsym(RTLD_NEXT, #name)
+
+ssize_t write(int fd, const void *data, size_t size) {
+    REAL(write);
+    return fails(fd) ? -1 : real(fd, data, size);
+}
+
+ssize_t pwrite(int fd, const void *data, size_t size, off_t at) {
+    REAL(pwrite);
+    return fails(fd) ? -1 : real(fd, data, size, at);
+}
+
+ssize_t pwrite64(int fd, const void *data, size_t size, off64_t at) {
+    REAL(pwrite64);
+    return fails(fd) ? -1 : real(fd, data, size, at);
+}
+
+int fsync(int fd) {
+    REAL(fsync);
+    return fails(fd) ? -1 : real(fd);
+}
+
+int fdatasync(int fd) {
+    REAL(fdatasync);
+    return fails(fd) ? -1 : real(fd);
+}
+
+int ftruncate(int fd, off_t size) {
+    REAL(ftruncate);
+    return fails(fd) ? -1 : real(fd, size);
+}
+
+int ftruncate64(int fd, off64_t size) {
+    REAL(ftruncate64);
+    return fails(fd) ? -1 : real(fd, size);
+}

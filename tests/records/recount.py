@@ -1,0 +1,18 @@
+"""Holds the trends as they are kept against a count of the current results."""
+
+import pytest
+
+from service.records import rollups
+
+
+def assert_equal_to_a_recount(connection):
+    for bucket in ("hour", "day"):
+        stored = rollups.stored(connection, bucket)
+        counted = rollups.recount(connection, bucket)
+        assert stored.keys() == counted.keys()
+        for key, row in stored.items():
+            # Sums of floats depend on their order; counts and extremes are exact.
+            assert row == {
+                name: pytest.approx(value, rel=1e-12) if name.endswith("_sum") else value
+                for name, value in counted[key].items()
+            }

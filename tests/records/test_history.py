@@ -1,0 +1,219 @@
+"""Histories: thinned out on the server, exact at both ends, no extreme lost."""
+
+import math
+from datetime import datetime
+from itertools import count
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from service.alarms.quantities import QUANTITIES, TRENDS
+from service.records import cells, trends
+from service.times import parse_utc, shifted, unix_seconds, utc_of_unix
+from tests.records.bulk import put, result_row
+
+# Examples share a database: each has a run of its own.
+RUNS = count()
+START = parse_utc("2016-12-31T20:30:00Z")
+"""A leap second lies three and a half hours ahead."""
+
+RESULT = st.tuples(
+    st.integers(0, 6 * 3600 * 1000),
+    st.integers(0, 5),
+    st.integers(0, 5),
+    st.sampled_from(["good", "suspect", None]),
+    st.floats(0.01, 50),
+    st.one_of(st.none(), st.floats(-2, 2)),
+)
+
+
+def rows_of(operations, drawn, run):
+    rows = []
+    for after_ms, ambiguous, unmatched, status, rms, offset in drawn:
+        unmatched = min(unmatched, 5 - ambiguous)
+        solved = status is not None
+        values = {
+            "ambiguous": ambiguous,
+            "unmatched": unmatched,
+            "unique": 5 - ambiguous - unmatched,
+            "status": status,
+            "reason": None if solved else "fewer_than_two_unique_stars",
+            "residual_rms_arcsec": rms if solved else None,
+            "predicted_rms_arcsec": 2.5 if solved else None,
+            "magnitude_offset_mag": offset,
+            "a_priori_angle_deg": rms / 10 if solved else None,
+        }
+        time = shifted(START, after_ms / 1000)
+        rows.append(result_row(operations, time, run=run, **values))
+    return rows
+
+
+def expected(rows, start, end, width_s, name):
+    """Every bucket's batches, mean, least and greatest, from the rows themselves."""
+    found = {}
+    for _, row in rows:
+        if start.tai_ns <= row["time_ns"] < end.tai_ns:
+            (unix_s,) = unix_seconds([row["time_ns"]])
+            found.setdefault(math.floor(unix_s / width_s) * width_s, []).append(row)
+    for bucket, inside in sorted(found.items()):
+        values = [v for row in inside if (v := trends.value_of(row, name)) is not None]
+        mean = sum(values) / len(values) if values else None
+        yield bucket, len(inside), mean, min(values, default=None), max(values, default=None)
+
+
+@settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    drawn=st.lists(RESULT, min_size=1, max_size=40),
+    begin_s=st.integers(-100, 8000),
+    length_s=st.integers(1, 6 * 3600),
+    size=st.sampled_from([1, 2, 5, 30, 300]),
+    at_most=st.sampled_from([1, 5000]),
+)
+def test_thinning_out_keeps_the_least_and_greatest_of_every_bucket(
+    operations, drawn, begin_s, length_s, size, at_most
+):
+    """Read from batches and from rollups alike, whatever hour the ends cut through."""
+    run = f"r{next(RUNS)}"
+    rows = rows_of(operations, drawn, run)
+    put(operations, rows)
+    start = shifted(START, begin_s)
+    end = shifted(start, length_s)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trends, "MAX_BATCHES_READ", at_most)
+        shown = operations.history("XTE", run=run, start=start, end=end, size=size)
+    assert len(shown["unix_s"]) <= size or shown["bucket_s"] == 3600
+    for name in TRENDS:
+        if QUANTITIES[name].of == "rate":
+            continue
+        series = shown["series"][name]
+        found = list(
+            zip(
+                *(shown["unix_s"], shown["batches"]),
+                *(series["mean"], series["min"], series["max"]),
+                strict=True,
+            )
+        )
+        wanted = list(expected(rows, start, end, shown["bucket_s"], name))
+        assert [(f[0], f[1], f[3], f[4]) for f in found] == [(w[0], w[1], *w[3:]) for w in wanted]
+        for (*_, mean, _, _), (*_, correct, _, _) in zip(found, wanted, strict=True):
+            assert mean == (None if correct is None else pytest.approx(correct))
+
+
+def test_days_hours_and_batches_make_up_the_same_sums(operations):
+    rows = [
+        result_row(operations, shifted(START, 3000 * k), ambiguous=k % 3, unique=5 - k % 3)
+        for k in range(150)
+    ]
+    put(operations, rows)
+    span = cells.Span("XTE", "live", shifted(START, 2500), shifted(START, 360_000))
+    with operations.store.reading() as connection:
+        found = [
+            cells.totals(cells.read_cells(connection, span, each))
+            for each in ("batch", "hour", "day")
+        ]
+    assert found[0] == found[1] == found[2]
+    assert found[0]["batches"] == 119
+
+
+def test_a_year_is_read_from_days_and_a_month_from_hours(operations):
+    put(operations, [result_row(operations, shifted(START, 43200.0 * k)) for k in range(720)])
+    end = shifted(START, 365 * 86400)
+    year = operations.history("XTE", start=START, end=end, size=400)
+    assert (year["source"], year["bucket_s"]) == ("day", 86400)
+    assert sum(year["batches"]) == 720
+    month = operations.history("XTE", start=START, end=shifted(START, 30 * 86400), size=1000)
+    assert month["bucket_s"] == 3600 or month["source"] == "batch"
+    assert sum(month["batches"]) == 60
+
+
+def test_without_a_range_it_is_the_day_up_to_the_latest_batch(operations):
+    put(operations, [result_row(operations, shifted(START, 3600.0 * k)) for k in range(60)])
+    shown = operations.history("XTE")
+    assert sum(shown["batches"]) == 24
+    assert shown["end"].startswith(shifted(START, 59 * 3600).text[:19])
+
+
+def test_of_a_spacecraft_without_a_batch_it_is_empty(operations):
+    for strategy in ("minmax", "latest"):
+        shown = operations.history("SWAS", strategy=strategy)
+        assert shown["unix_s"] == []
+        assert shown["start"] is None
+
+
+def test_the_latest_are_single_batches_with_their_times(operations):
+    rows = [result_row(operations, shifted(START, 60.0 * k), ambiguous=k % 5) for k in range(10)]
+    put(operations, rows)
+    shown = operations.history("XTE", strategy="latest", size=4, quantities=["ambiguous_share"])
+    assert shown["time"] == [batch["time"] for batch, _ in rows[-4:]]
+    assert shown["id"] == [batch["id"] for batch, _ in rows[-4:]]
+    assert list(shown["series"]) == ["ambiguous_share"]
+    assert len(shown["series"]["ambiguous_share"]["value"]) == 4
+
+
+def test_the_rate_of_batches_counts_the_hours_that_are_shown_of_a_bucket(operations):
+    put(operations, [result_row(operations, shifted(START, 30.0 * k)) for k in range(240)])
+    shown = operations.history("XTE", start=START, end=shifted(START, 7200), size=3)
+    rate = shown["series"]["batches_per_hour"]["mean"]
+    assert rate == [pytest.approx(120.0)] * len(rate)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "2016-12-31T23:59:59.500Z",
+        "2017-01-01T00:00:00.000Z",
+        "1972-07-01T00:00:00Z",
+        "2099-12-31T11:22:33.250Z",
+    ],
+)
+def test_posix_times_are_those_of_the_library(text):
+    correct = datetime.fromisoformat(text).timestamp()
+    (found,) = unix_seconds([parse_utc(text).tai_ns])
+    assert found == pytest.approx(correct, abs=1e-6)
+    assert utc_of_unix(correct).tai_ns == parse_utc(text).tai_ns
+
+
+def test_a_leap_second_belongs_to_the_hour_that_it_ends():
+    (found,) = unix_seconds([parse_utc("2016-12-31T23:59:60.500Z").tai_ns])
+    (midnight,) = unix_seconds([parse_utc("2017-01-01T00:00:00Z").tai_ns])
+    assert midnight - 1e-3 < found < midnight
+
+
+# ---- the worst batches -------------------------------------------------------------------------
+
+BY = ["ambiguous_share", "residual_ratio", "magnitude_offset_mag", "a_priori_angle_deg"]
+
+
+@settings(max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    drawn=st.lists(RESULT, min_size=1, max_size=40),
+    by=st.sampled_from(BY),
+    limit=st.integers(1, 8),
+    bounds=st.tuples(st.integers(0, 20000), st.integers(1, 20000)),
+)
+def test_the_worst_are_those_of_sorting_everything(operations, drawn, by, limit, bounds):
+    run = f"r{next(RUNS)}"
+    rows = rows_of(operations, drawn, run)
+    put(operations, rows)
+    start, end = shifted(START, bounds[0]), shifted(START, sum(bounds))
+    found = operations.worst_batches("XTE", by=by, run=run, start=start, end=end, limit=limit)
+    inside = [
+        (abs(value), row["time_ns"], row["id"])
+        for _, row in rows
+        if (value := trends.value_of(row, by)) is not None
+        and start.tai_ns <= row["time_ns"] < end.tai_ns
+    ]
+    assert [each["id"] for each in found] == [id for *_, id in sorted(inside, reverse=True)[:limit]]
+    for each in found:
+        assert abs(each["value"]) in {value for value, *_ in inside}
+
+
+def test_across_runs_batches_are_listed_in_order_of_time(operations):
+    for k, run in enumerate(["live", "a", "b", "live"]):
+        put(operations, [result_row(operations, shifted(START, k), run=run)])
+    shown = operations.batches(run="*").items
+    assert [each["run"] for each in shown] == ["live", "b", "a", "live"]
+    first = operations.batches(run="*", spacecraft="XTE", limit=3)
+    rest = operations.batches(run="*", spacecraft="XTE", limit=3, cursor=first.next_cursor)
+    assert [each["run"] for each in rest.items] == ["live"]
