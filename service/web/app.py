@@ -6,19 +6,34 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 import anyio.to_thread
-from fastapi import APIRouter, FastAPI
+from fastapi import APIRouter, Depends, FastAPI
 from fastapi.routing import APIRoute
 from starlette.staticfiles import StaticFiles
 
 from service import __version__
 from service.operations import Operations
+from service.web.access import guard
 from service.web.bodies import DEFAULT_LIMITS, Limits
-from service.web.dashboard import page
+from service.web.dashboard import PAGES
 from service.web.errors import add_error_handlers
+from service.web.live import Live
 from service.web.metrics import Metrics
 from service.web.middleware import AroundRequests
 from service.web.reference import add_reference
-from service.web.routes import batches, probes, runs, spacecraft, zones
+from service.web.routes import (
+    access,
+    advice,
+    alarms,
+    batches,
+    compare,
+    events,
+    frames,
+    overview,
+    probes,
+    runs,
+    spacecraft,
+    zones,
+)
 
 log = logging.getLogger(__name__)
 
@@ -27,11 +42,18 @@ WORKER_THREADS = 64
 
 ROUTERS: tuple[APIRouter, ...] = (
     batches.router,
+    frames.router,
     spacecraft.router,
+    advice.router,
+    compare.router,
     zones.router,
     runs.router,
+    overview.router,
+    alarms.router,
+    events.router,
+    access.router,
     probes.router,
-    page.router,
+    *PAGES,
 )
 
 
@@ -43,9 +65,11 @@ def create_app(operations: Operations, limits: Limits = DEFAULT_LIMITS) -> FastA
         anyio.to_thread.current_default_thread_limiter().total_tokens = WORKER_THREADS
         warming = threading.Thread(target=_warm_up, args=(operations,), name="warm-up")
         warming.start()
+        await app.state.live.start()
         try:
             yield
         finally:
+            await app.state.live.close()
             # The handlers' own threads may all be at work still.
             own = anyio.CapacityLimiter(1)
             await anyio.to_thread.run_sync(warming.join, limiter=own)
@@ -56,7 +80,8 @@ def create_app(operations: Operations, limits: Limits = DEFAULT_LIMITS) -> FastA
     app.state.operations = operations
     app.state.limits = limits
     app.state.metrics = Metrics(operations)
-    app.add_middleware(AroundRequests, metrics=app.state.metrics)
+    app.state.live = Live(operations)
+    app.add_middleware(AroundRequests, metrics=app.state.metrics, access=operations.access)
     return app
 
 
@@ -73,7 +98,7 @@ def bare_app() -> FastAPI:
         generate_unique_id_function=_operation_id,
     )
     for router in ROUTERS:
-        app.include_router(router)
+        app.include_router(router, dependencies=[Depends(guard)])
     app.state.routes = [route for router in ROUTERS for route in router.routes]
     app.mount("/static", StaticFiles(packages=[("service.web.dashboard", "static")]))
     add_error_handlers(app)

@@ -6,7 +6,7 @@ it passes the bound; what still arrives of it is dropped unread.
 """
 
 import tempfile
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from typing import IO, Annotated, TypeVar
 
@@ -19,9 +19,19 @@ from starlette.requests import Request
 
 from service.errors import BadBatch, BadInput, Fault
 from service.observe.wire import Submission, faults_of, submission_from_json
+from service.web.compressed import Coding
 from service.web.errors import NotJson
 
 JSON = "application/json"
+FRAMES = (
+    "application/fits",
+    "image/fits",
+    "image/tiff",
+    "image/png",
+    "application/x-npy",
+    "application/octet-stream",
+)
+"""A frame's file; what it is, its first bytes say."""
 NDJSON = ("application/x-ndjson", "application/ndjson", "application/jsonl")
 
 MAX_JSON_BYTES = 2 << 20
@@ -40,6 +50,7 @@ class Limits:
     """The longest wait for the next piece of a body."""
     json_s: float = 60.0
     replay_s: float = 3600.0
+    frame_s: float = 120.0
 
 
 DEFAULT_LIMITS = Limits()
@@ -61,10 +72,16 @@ def _require_type(request: Request, allowed: tuple[str, ...]) -> None:
         raise HTTPException(415, f"Content-Type must be {allowed[0]}, not {sent[:80] or 'absent'}")
     if parameters.startswith("charset=") and parameters not in ("charset=utf-8", "charset=utf8"):
         raise HTTPException(415, f"the body must be in UTF-8, not {parameters[:40]}")
-    coding = request.headers.get("content-encoding", "identity")
-    if coding.lower() != "identity":
-        detail = f"Content-Encoding {coding[:40]} is not supported; send the body as it is"
-        raise HTTPException(415, detail, {"Accept-Encoding": "identity"})
+
+
+def _coding(request: Request, allowed: tuple[Coding, ...]) -> Coding:
+    sent = request.headers.get("content-encoding", "identity").strip().lower()
+    for coding in allowed:
+        if sent == coding:
+            return coding
+    known = ", ".join(allowed)
+    detail = f"Content-Encoding {sent[:40]} is not supported here; there is {known}"
+    raise HTTPException(415, detail, {"Accept-Encoding": known})
 
 
 async def _pieces(
@@ -100,22 +117,26 @@ async def _pieces(
 async def json_body(request: Request) -> bytes:
     """The bytes of a JSON body."""
     _require_type(request, (JSON,))
+    _coding(request, ("identity",))
     limits = _limits(request)
     pieces = _pieces(request, limits.json_bytes, limits.pause_s, limits.json_s)
-    return b"".join([piece async for piece in pieces])
+    request.state.body = body = b"".join([piece async for piece in pieces])
+    return body
 
 
 @dataclass(frozen=True)
 class Spooled:
-    """A body in a file, rewound, with its number of lines."""
+    """A body in a file, rewound, with its number of lines where it is not packed."""
 
     file: IO[bytes]
-    lines: int
+    coding: Coding
+    lines: int | None
 
 
 async def ndjson_body(request: Request) -> Spooled:
-    """An NDJSON body; its file has no name and is gone once it is closed."""
+    """An NDJSON body, perhaps packed; its file has no name and is gone once it is closed."""
     _require_type(request, NDJSON)
+    coding = _coding(request, ("identity", "gzip", "zstd"))
     limits = _limits(request)
     file = tempfile.TemporaryFile()  # noqa: SIM115 - whoever reads the lines closes it
     lines, last = 0, b"\n"
@@ -131,20 +152,23 @@ async def ndjson_body(request: Request) -> Spooled:
         raise BadBatch(Fault("body", "there are no lines; it must hold a batch a line"))
     file.seek(0)
     # A last line without an end is one, too.
-    return Spooled(file, lines + (last != b"\n"))
+    return Spooled(file, coding, lines + (last != b"\n") if coding == "identity" else None)
 
 
-def lines_of(file: IO[bytes], max_bytes: int) -> Iterator[bytes]:
-    """The lines of a file, which is closed after the last one.
-
-    Of a line longer than `max_bytes` only its beginning is given, which is no
-    JSON and is reported with its number like any other bad line.
-    """
-    with file:
-        while line := file.readline(max_bytes):
-            yield line
-            while len(line) == max_bytes and not line.endswith(b"\n"):
-                line = file.readline(max_bytes)
+async def frame_body(request: Request, max_bytes: int) -> IO[bytes]:
+    """A frame's file, rewound; it has no name and is gone once it is closed."""
+    _require_type(request, FRAMES)
+    _coding(request, ("identity",))
+    limits = _limits(request)
+    file = tempfile.TemporaryFile()  # noqa: SIM115 - whoever reads it closes it
+    try:
+        async for piece in _pieces(request, max_bytes, limits.pause_s, limits.frame_s):
+            file.write(piece)
+    except BaseException:
+        file.close()
+        raise
+    file.seek(0)
+    return file
 
 
 def read_submission(body: bytes) -> Submission:

@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import BaseModel
 from starlette.responses import Response
 
-from service.web.bodies import JSON, NDJSON
+from service.web.bodies import FRAMES, JSON, NDJSON
 from service.web.errors import MEDIA_TYPE as PROBLEM_JSON
 
 SCHEMAS = "#/components/schemas/"
@@ -38,20 +38,40 @@ IDEMPOTENCY_KEY = {
     ),
     "schema": {"type": "string", "minLength": 1, "maxLength": 255, "pattern": "^[\\x20-\\x7e]+$"},
 }
+LAST_EVENT_ID = {
+    "name": "Last-Event-ID",
+    "in": "header",
+    "description": (
+        "The number of the last event that was received; those after it come first. A browser's "
+        "EventSource sends it by itself when it comes again."
+    ),
+    "schema": {"type": "string", "maxLength": 18},
+}
 
 _PROBLEMS = {
     400: "The body is not JSON: truncated, empty, or in another encoding.",
+    401: "No token, or one that nobody is known by.",
+    403: "The token does not cover this: its scopes, its spacecraft.",
     404: "There is no such thing.",
     408: "The body did not arrive in time.",
     409: "The batch is recorded already, with another body.",
     413: "The body is too large.",
     415: "The body has another type or coding than this route reads.",
     422: "Something in the request is wrong; `errors` names every field and value.",
+    429: "More requests than the token's rate; `Retry-After` says when to try again.",
     503: "The service cannot take this now; `Retry-After` says when to try again.",
 }
 READING_JSON = (400, 408, 413, 415)
-READING_NDJSON = (408, 413, 415)
+READING_NDJSON = READING_FRAME = (408, 413, 415)
 _RETRY_AFTER = {"Retry-After": {"description": "Seconds.", "schema": {"type": "string"}}}
+_WHO = {"WWW-Authenticate": {"description": "Bearer.", "schema": {"type": "string"}}}
+_HEADERS: Mapping[int, Any] = {
+    401: {"headers": _WHO},
+    429: {"headers": _RETRY_AFTER},
+    503: {"headers": _RETRY_AFTER},
+}
+GUARDED = (401, 403, 429)
+"""What every route answers that asks for a token."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +82,8 @@ class Gives:
     shape: type[BaseModel] | None = None
     headers: Mapping[str, Any] = field(default_factory=dict)
     media_type: str = JSON
+    also: str | None = None
+    """Another media type that it can be asked for in, as plain text."""
 
 
 def described(
@@ -69,6 +91,7 @@ def described(
     *,
     body: type[BaseModel] | None = None,
     lines_of: type[BaseModel] | None = None,
+    frame: bool = False,
     problems: Sequence[int] = (),
     parameters: Sequence[Mapping[str, Any]] = (),
 ) -> dict[str, Any]:
@@ -82,6 +105,10 @@ def described(
         content = {NDJSON[0]: {"schema": {"type": "string", "description": description}}}
         extra["requestBody"] = {"required": True, "content": content}
         problems = (*problems, *READING_NDJSON)
+    if frame:
+        file = {"schema": {"type": "string", "format": "binary"}}
+        extra["requestBody"] = {"required": True, "content": dict.fromkeys(FRAMES, file)}
+        problems = (*problems, *READING_FRAME)
     if parameters:
         extra["parameters"] = list(parameters)
     responses: dict[int | str, Any] = {
@@ -89,8 +116,7 @@ def described(
     }
     for status in sorted({*problems, 422}):
         responses[status] = _problem(_PROBLEMS[status])
-        if status == 503:
-            responses[status]["headers"] = _RETRY_AFTER
+        responses[status] |= _HEADERS.get(status, {})
     responses["default"] = _problem("Any other problem: a wrong method, a fault of the service.")
     return {
         "status_code": min(answers, key=lambda status: (status != 201, status)),
@@ -99,6 +125,11 @@ def described(
         "response_class": Response,
         "response_description": answers[min(answers)].description,
     }
+
+
+def guarded_responses() -> dict[str, Any]:
+    """The answers of `GUARDED`, as they stand in the description."""
+    return {str(each): _problem(_PROBLEMS[each]) | _HEADERS.get(each, {}) for each in GUARDED}
 
 
 def _ref(shape: type[BaseModel]) -> dict[str, str]:
@@ -111,6 +142,8 @@ def _answer(gives: Gives) -> dict[str, Any]:
     if gives.headers:
         answer["headers"] = dict(gives.headers)
     answer["content"] = {gives.media_type: {"schema": schema}}
+    if gives.also is not None:
+        answer["content"][gives.also] = {"schema": {"type": "string"}}
     return answer
 
 

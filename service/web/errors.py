@@ -25,8 +25,12 @@ from service.errors import (
     Conflict,
     Fault,
     KeyReused,
+    NotAdmitted,
+    NotAllowed,
     NotAvailable,
     NotFound,
+    NotNow,
+    TooOften,
     problem_of,
     problem_of_faults,
     shown_value,
@@ -54,8 +58,12 @@ class Kind:
 KINDS: dict[type[AcquisitionError], Kind] = {
     BadInput: Kind(422, "The input is refused", "bad-input"),
     NotAvailable: Kind(422, "This is not there yet", "not-available"),
+    NotAdmitted: Kind(401, "Nobody is known by this", "not-admitted"),
+    NotAllowed: Kind(403, "This is not yours to ask", "not-allowed"),
+    TooOften: Kind(429, "Too many requests", "too-often"),
     NotFound: Kind(404, "There is no such thing", "not-found"),
     Conflict: Kind(409, "The batch is recorded with another body", "conflict"),
+    NotNow: Kind(409, "It is not in a state for this", "not-now"),
     KeyReused: Kind(422, "The Idempotency-Key is taken by another body", "key-reused"),
     Busy: Kind(503, "The service cannot take this now", "busy"),
 }
@@ -96,21 +104,33 @@ async def _on_acquisition_error(request: Request, error: Exception) -> Response:
     kind = kind_of(error)
     if kind.status == 500:
         return our_fault(request, error)
-    headers = {"Retry-After": str(error.retry_after_s)} if isinstance(error, Busy) else None
-    return problem(request, kind, problem_of(error), headers)
+    return problem(request, kind, problem_of(error), _headers_of(error))
 
 
-async def _on_query_fault(request: Request, error: Exception) -> Response:
-    assert isinstance(error, RequestValidationError)
-    faults = [
+def _headers_of(error: AcquisitionError) -> dict[str, str] | None:
+    if isinstance(error, Busy | TooOften):
+        return {"Retry-After": str(error.retry_after_s)}
+    if isinstance(error, NotAdmitted):
+        return {"WWW-Authenticate": 'Bearer realm="attitude acquisition"'}
+    return None
+
+
+def query_faults(error: RequestValidationError) -> list[Fault]:
+    """What is wrong with a query, parameter by parameter."""
+    return [
         Fault(
-            ".".join(str(part)[:80] for part in each["loc"][1:]) or str(each["loc"][0]),
+            # What lies below a parameter is which of its forms was tried.
+            str(each["loc"][min(1, len(each["loc"]) - 1)])[:80],
             str(each["msg"]).removeprefix("Value error, "),
             None if each["type"] == "missing" else shown_value(each["input"]),
         )
         for each in error.errors()
     ]
-    return problem(request, KINDS[BadInput], problem_of_faults(faults))
+
+
+async def _on_query_fault(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    return problem(request, KINDS[BadInput], problem_of_faults(query_faults(error)))
 
 
 async def _on_http_error(request: Request, error: Exception) -> Response:

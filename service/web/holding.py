@@ -11,7 +11,7 @@ from fastapi import Depends
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.operations import Operations, Page
+from service.operations import Answered, Operations, Page
 from service.web.bodies import JSON
 from service.web.metrics import Metrics
 
@@ -39,6 +39,15 @@ def json_response(
 ) -> Response:
     """An answer of plain values."""
     return Response(_JSON.encode(content), status, headers, media_type=JSON)
+
+
+def answer_response(answered: Answered, recorded: bool = True) -> Response:
+    """An answer to a batch: new and recorded, recorded before, or not recorded at all."""
+    if not recorded:
+        return Response(answered.body, media_type=JSON)
+    if answered.replayed:
+        return Response(answered.body, 200, {"Replayed": "true"}, JSON)
+    return Response(answered.body, 201, {"Location": f"/api/v1/batches/{answered.id}"}, JSON)
 
 
 def page_response(request: Request, page: Page) -> Response:

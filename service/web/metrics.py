@@ -94,6 +94,8 @@ class Metrics:
 
     def count_request(self, scope: Scope, status: int, seconds: float) -> None:
         """Count one request under its route's template, so that ids make no new series."""
+        if getattr(scope.get("route"), "name", None) == "events":
+            return  # a stream lasts as long as somebody listens
         method = scope["method"] if scope["method"] in _METHODS else "other"
         route = getattr(scope.get("route"), "path", "none")
         self._requests.labels(method, route, str(status)).observe(seconds)

@@ -1,32 +1,44 @@
 """What happens around every request: whom it is for, HEAD, timing, the last resort."""
 
+import logging
 import time
 
+from anyio import CapacityLimiter
+from anyio.to_thread import run_sync
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service.records.access import Access
 from service.settings import is_loopback
 from service.web.errors import Kind, our_fault, problem
 from service.web.metrics import Metrics
 
 NOT_HERE = Kind(421, "This is another host's", "not-this-host")
 
+log = logging.getLogger(__name__)
+
+_NOTES = CapacityLimiter(8)
 _NO_SNIFF = (b"x-content-type-options", b"nosniff")
 
 
 class AroundRequests:
     """Times every request, answers HEAD as GET without its body, and forbids type guessing.
 
-    A request for a host of another name is refused: a page elsewhere could let
-    its own name lead to this machine, and would then be let in as this one.
+    While access is open, a request for a host of another name is refused: a
+    page elsewhere could let its own name lead to this machine, and would then
+    be let in as this one.
+
+    What a caller changed is noted before the answer goes out
+    (`service.web.access`).
 
     An error that nothing below has answered is answered here; let through, it
     would cost the client its connection.
     """
 
-    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+    def __init__(self, app: ASGIApp, metrics: Metrics, access: Access) -> None:
         self.app = app
         self.metrics = metrics
+        self.access = access
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request, or pass on what is none."""
@@ -41,6 +53,7 @@ class AroundRequests:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
+                await self._note(inner, status)
                 message = {**message, "headers": [*message["headers"], _NO_SNIFF]}
             elif is_head:
                 message = {**message, "body": b""}
@@ -50,7 +63,7 @@ class AroundRequests:
         inner = {**scope, "method": "GET"} if is_head else scope
         try:
             host = _host(inner)
-            if host is not None and not is_loopback(host):
+            if host is not None and not is_loopback(host) and self.access.is_open:
                 told = {"detail": f"the service answers to names of this machine, not to {host!r}"}
                 await problem(Request(inner), NOT_HERE, told)(inner, receive, sent)
                 return
@@ -61,6 +74,23 @@ class AroundRequests:
             await our_fault(Request(inner), error)(inner, receive, sent)
         finally:
             self.metrics.count_request(inner, status, time.perf_counter() - started)
+
+    async def _note(self, scope: Scope, status: int) -> None:
+        state = scope.get("state", {})
+        action = state.get("changes")
+        if action is None:
+            return
+        query = scope["query_string"].decode("latin-1")
+        about = scope["path"] + (f"?{query}" if query else "")
+        body = state.get("body")
+        text = None if not body else body.decode("utf-8", "replace")
+        try:
+            await run_sync(
+                self.access.note, state["caller"].name, action, about, text, status, limiter=_NOTES
+            )
+        except Exception as error:
+            # The change itself is made: its answer must not be lost to this.
+            log.error("%s by %s was not noted: %s", action, state["caller"].name, error)
 
 
 def _host(scope: Scope) -> str | None:

@@ -1,6 +1,6 @@
 """What may stand behind the question mark: each parameter checked, unknown ones refused."""
 
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 from fastapi import Depends
 from pydantic import (
@@ -9,14 +9,18 @@ from pydantic import (
     Field,
     PlainValidator,
     WithJsonSchema,
+    field_validator,
     model_validator,
 )
 from starlette.requests import Request
 
+from service.alarms.quantities import TRENDS, QuantityName
 from service.errors import BadBatch, BadInput, Fault, shown_value
 from service.observe.wire import Key, RunName
+from service.records.alarms import StateFilter
 from service.records.reading import OutcomeName, Status
 from service.records.rollups import Bucket
+from service.records.trends import MAX_SIZE, Strategy
 from service.times import Utc, parse_utc
 
 MAX_LIMIT = 500
@@ -75,9 +79,20 @@ class StretchPage(Stretch):
     cursor: Cursor = None
 
 
+class AuditQuery(Query):
+    """A page of changes."""
+
+    limit: Limit = 100
+    cursor: Cursor = None
+
+
 class BatchQuery(StretchPage):
     """Which of the recorded batches."""
 
+    run: Annotated[
+        RunName | Literal["*"],
+        Field(description="The run; `live` is what pipelines send, `*` stands for every run."),
+    ] = "live"
     spacecraft: Spacecraft = None
     outcome: Annotated[
         OutcomeName | None, Field(description="Only those with at least one star of it.")
@@ -88,10 +103,93 @@ class BatchQuery(StretchPage):
     ] = None
 
 
+class RunQuery(Query):
+    """A run."""
+
+    run: Annotated[RunName, Field(description="The run; `live` is what pipelines send.")] = "live"
+
+
 class RatesQuery(Stretch):
     """Star rates of a stretch of time, in buckets."""
 
     bucket: Annotated[Bucket, Field(description="The width of a bucket, in UTC.")] = "hour"
+
+
+class HistoryQuery(Stretch):
+    """A history of quantities, thinned out."""
+
+    quantity: Annotated[
+        list[QuantityName],
+        Field(description="One or, repeated, several; without any, all that have a history."),
+    ] = []
+    strategy: Annotated[
+        Strategy,
+        Field(
+            description="`minmax`: buckets with mean, least and greatest of a batch; "
+            "`latest`: the newest batches one by one."
+        ),
+    ] = "minmax"
+    size: Annotated[int, Field(ge=1, le=MAX_SIZE, description="The most points.")] = 500
+    format: Annotated[Literal["json", "csv"], Field(description="Columns, or a table.")] = "json"
+
+    @field_validator("quantity")
+    @classmethod
+    def _with_history(cls, names: list[QuantityName]) -> list[QuantityName]:
+        for name in names:
+            if name not in TRENDS:
+                raise ValueError(f"{name} has no history; {', '.join(TRENDS)} have")
+        return list(dict.fromkeys(names))
+
+
+class WorstQuery(Stretch):
+    """Which batches are worst, by what."""
+
+    by: Annotated[
+        Literal[
+            "ambiguous_share",
+            "unmatched_share",
+            "residual_rms_arcsec",
+            "predicted_rms_arcsec",
+            "residual_ratio",
+            "magnitude_offset_mag",
+            "a_priori_angle_deg",
+        ],
+        Field(description="The quantity; of `magnitude_offset_mag` the size counts."),
+    ] = "ambiguous_share"
+    limit: Annotated[int, Field(ge=1, le=100, description="The most items.")] = 20
+
+
+class AlarmQuery(Query):
+    """Which alarms."""
+
+    run: Annotated[
+        RunName | Literal["*"],
+        Field(description="The run; `live` is what pipelines send, `*` stands for every run."),
+    ] = "live"
+    spacecraft: Spacecraft = None
+    state: Annotated[StateFilter, Field(description="`active` are those that are not cleared.")] = (
+        "active"
+    )
+    limit: Limit = 100
+    cursor: Cursor = None
+
+
+Who = Annotated[
+    str | None,
+    Field(
+        min_length=1,
+        max_length=64,
+        description="Who does this; with a token its name is taken, else this must be there.",
+    ),
+]
+Comment = Annotated[str | None, Field(max_length=2_000, description="What they say of it.")]
+
+
+class SaidQuery(Query):
+    """Who does something, and what they say of it."""
+
+    who: Who = None
+    comment: Comment = None
 
 
 async def _no_query(request: Request) -> None:

@@ -12,10 +12,27 @@ from pydantic.json_schema import GenerateJsonSchema, models_json_schema
 
 from service import __version__
 from service.observe.wire import BatchIn
-from service.web.describe import SCHEMAS
+from service.web.access import POLICIES
+from service.web.describe import SCHEMAS, guarded_responses
+from service.web.routes.access import SignIn
+from service.web.routes.alarms import CommentIn, LimitIn, Said, ShelveIn
 from service.web.routes.batches import WhatIfIn
+from service.web.routes.compare import CompareIn
+from service.web.routes.runs import RunIn
 from service.web.routes.zones import WarmIn
-from service.web.schemas import answers, base, runs, spacecraft, zones
+from service.web.schemas import (
+    access,
+    advice,
+    alarms,
+    answers,
+    base,
+    compare,
+    overview,
+    runs,
+    spacecraft,
+    trends,
+    zones,
+)
 
 DESCRIPTION = """\
 Stars that a star tracker observed go in; their identities and the spacecraft's
@@ -29,10 +46,24 @@ leads to the next. Parameters and fields that are not described here are refused
 
 TAGS = {
     "batches": "Observed stars and what was made of them.",
+    "frames": "Frames of star trackers, from which stars are taken.",
     "spacecraft": "Settings, state, attitude history and star rates.",
     "zones": "The cached parts of the sky in which stars are looked for.",
     "runs and replays": "Named runs, apart from live batches, and the files replayed into them.",
+    "access": "Who asks, a browser's session, and the list of who changed what.",
+    "alarms": "Limits, what is out of them, and who does what about it.",
+    "events": "What happens, as it happens.",
     "probes": "For whoever keeps the service running.",
+}
+
+
+SECURITY = {
+    "token": {
+        "type": "http",
+        "scheme": "bearer",
+        "description": "From `acquire token create`; not needed on loopback until one was made.",
+    },
+    "session": {"type": "apiKey", "in": "cookie", "name": "acquire_session"},
 }
 
 
@@ -67,7 +98,7 @@ def reference_of(app: FastAPI) -> dict[str, Any]:
         tags=[{"name": name, "description": text} for name, text in TAGS.items()],
         routes=app.routes,
     )
-    described["components"] = {"schemas": _schemas()}
+    described["components"] = {"schemas": _schemas(), "securitySchemes": SECURITY}
     for path in described["paths"].values():
         for operation in path.values():
             _finish(operation)
@@ -75,7 +106,19 @@ def reference_of(app: FastAPI) -> dict[str, Any]:
 
 
 def _schemas() -> dict[str, Any]:
-    shapes: list[type[BaseModel]] = [BatchIn, WhatIfIn, WarmIn, *_shapes()]
+    shapes: list[type[BaseModel]] = [
+        BatchIn,
+        WhatIfIn,
+        WarmIn,
+        RunIn,
+        CompareIn,
+        Said,
+        ShelveIn,
+        CommentIn,
+        LimitIn,
+        SignIn,
+        *_shapes(),
+    ]
     _, found = models_json_schema(
         [(shape, "validation") for shape in shapes],
         ref_template=SCHEMAS + "{model}",
@@ -88,7 +131,19 @@ def _schemas() -> dict[str, Any]:
 def _shapes() -> list[type[BaseModel]]:
     return [
         each
-        for module in (base, answers, spacecraft, zones, runs)
+        for module in (
+            base,
+            answers,
+            spacecraft,
+            overview,
+            advice,
+            compare,
+            alarms,
+            trends,
+            zones,
+            runs,
+            access,
+        )
         for each in vars(module).values()
         if isinstance(each, type) and issubclass(each, base.Shape) and each is not base.Shape
     ]
@@ -96,6 +151,13 @@ def _shapes() -> list[type[BaseModel]]:
 
 def _finish(operation: dict[str, Any]) -> None:
     operation["summary"] = operation.pop("description").rstrip(".")
+    policy = POLICIES[operation["operationId"]]
+    if not policy.open:
+        operation["security"] = [{"token": []}, {"session": []}, {}]
+        operation["x-scope"] = policy.scope
+        operation["responses"] = dict(
+            sorted({**guarded_responses(), **operation["responses"]}.items())
+        )
     known = examples().get(operation["operationId"], {})
     for parameter in operation.get("parameters", []):
         for repeated in ("title", "description"):
@@ -107,6 +169,6 @@ def _finish(operation: dict[str, Any]) -> None:
 
 
 def _put_examples(part: dict[str, Any], known: dict[str, Any] | None) -> None:
-    for content in part.get("content", {}).values():
-        if known:
+    for kind, content in part.get("content", {}).items():
+        if known and kind.endswith("json"):
             content["examples"] = {name: {"value": value} for name, value in known.items()}

@@ -1,15 +1,20 @@
-"""Serving the app with uvicorn, on this machine alone."""
+"""Serving the app with uvicorn: on this machine alone, until there are tokens."""
 
 import resource
+import socket
+from collections.abc import Callable
+from contextlib import suppress
 
 import uvicorn
 
+from service.errors import BadConfiguration
 from service.operations import Operations
-from service.settings import Settings
+from service.settings import Settings, is_loopback
 from service.web.app import create_app
 
 MAX_FILES = 4096
 
+START_FAILED = 3
 GRACE_S = 10
 """How long running requests may still take when the server is told to stop."""
 
@@ -17,11 +22,18 @@ GRACE_S = 10
 def serve(settings: Settings) -> None:
     """Open the operations and serve until told to stop (SIGINT, SIGTERM).
 
-    The settings have made sure that the host is a loopback address: nobody is
-    asked who they are yet, so nobody but this machine may ask.
+    Raises `BadConfiguration` for a host beyond this machine while there are no
+    tokens: nobody would be asked who they are.
     """
-    app = create_app(Operations.open(settings))
-    uvicorn.run(
+    operations = Operations.open(settings)
+    if not is_loopback(settings.host) and not operations.access.has_tokens():
+        operations.close()
+        raise BadConfiguration(
+            f"ACQUIRE_HOST: {settings.host} is beyond this machine, and anybody there could ask "
+            "and submit: make a token first with `acquire token create`"
+        )
+    app = create_app(operations)
+    config = uvicorn.Config(
         app,
         host=settings.host,
         port=settings.port,
@@ -33,6 +45,24 @@ def serve(settings: Settings) -> None:
         timeout_graceful_shutdown=GRACE_S,
         limit_concurrency=_connections(),
     )
+    server = Server(config, app.state.live.stop)
+    with suppress(KeyboardInterrupt):
+        server.run()
+    if not server.started:
+        raise SystemExit(START_FAILED)
+
+
+class Server(uvicorn.Server):
+    """uvicorn's server, which tells those who listen for events before it waits for them to go."""
+
+    def __init__(self, config: uvicorn.Config, stop_streams: Callable[[], None]) -> None:
+        super().__init__(config)
+        self._stop_streams = stop_streams
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End the streams, then everything else."""
+        self._stop_streams()
+        await super().shutdown(sockets)
 
 
 def _connections() -> int:

@@ -1,5 +1,6 @@
 """A headless Chromium to look at pages with, driven over its DevTools socket."""
 
+import base64
 import json
 import shutil
 import subprocess
@@ -106,6 +107,14 @@ class Browser:
             lambda: self.run("location.href !== 'about:blank' && document.readyState") == "complete"
         )
 
+    def picture(self, width: int, height: int) -> bytes:
+        """The page from its top as PNG."""
+        clip = {"x": 0, "y": 0, "width": width, "height": height, "scale": 1}
+        taken = self.call(
+            "Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=clip
+        )
+        return base64.b64decode(taken["data"])
+
     def run(self, script: str) -> Any:
         """The value of an expression in the page."""
         done = self.call(
@@ -116,12 +125,25 @@ class Browser:
 
     def press(self, key: str) -> None:
         """Press and release a key such as Tab."""
-        code = {"Tab": 9, "Enter": 13}[key]
+        code = {"Tab": 9, "Enter": 13, "ArrowLeft": 37, "ArrowRight": 39}[key]
         text = {"Enter": "\r"}.get(key, "")
         for type_ in ("keyDown", "keyUp"):
             self.call(
                 "Input.dispatchKeyEvent", type=type_, key=key, windowsVirtualKeyCode=code, text=text
             )
+
+    def drag(self, selector: str, start: float, end: float) -> None:
+        """Drag the mouse across an element, from one part of its width to another."""
+        script = (
+            f"(e => {{ e.scrollIntoView({{block: 'center'}}); const b = e.getBoundingClientRect();"
+            f"return [b.left, b.top + b.height / 2, b.width]; }})"
+            f"(document.querySelector({json.dumps(selector)}))"
+        )
+        left, y, width = self.run(script)
+        places = [left + width * (start + (end - start) * part / 4) for part in range(5)]
+        kinds = ["mousePressed", *["mouseMoved"] * 4, "mouseReleased"]
+        for kind, x in zip(kinds, [places[0], *places[1:], places[-1]], strict=True):
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
     def wait(self, condition: Any, seconds: float = 30.0) -> None:
         """Return once the condition holds."""

@@ -14,11 +14,14 @@ import httpx
 
 from service.missions.mission import load_missions
 from service.operations import Operations
+from service.records.tokens import add_token, new_secret
 from service.settings import Settings
+from service.simulate.frame_files import frame_bytes
+from service.simulate.frames import FrameSettings, draw_frames
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
 from service.web.app import create_app
-from tests.web.conftest import Server
+from tests.web.serving import Server
 
 FILE = Path(__file__).parents[2] / "service" / "web" / "examples.json"
 API = "/api/v1"
@@ -57,6 +60,12 @@ def walk(client: httpx.Client, operations: Operations) -> Json:
     take("submit_batch", truncated, "truncated")
     take("submit_batch", client.post(f"{API}/batches", content=b"{}"), "no_content_type")
 
+    frame, file = _frame(operations)
+    take("submit_frame", _send(client, "IMAGER", frame, file), "attitude")
+    cut_off = frame | {"batch": "cut-off"}
+    take("submit_frame", _send(client, "IMAGER", cut_off, file[:5760]), "cut_off")
+    take("submit_frame", _send(client, "XTE", frame, file), "no_camera")
+
     here = f"{API}/batches/{first['id']}"
     asked = {"options": {"tolerances": {"separation_deg": 0.02}}}
     take("what_if", client.post(f"{here}/what-if", json=asked), "not_recorded", asked)
@@ -69,8 +78,26 @@ def walk(client: httpx.Client, operations: Operations) -> Json:
     take("list_spacecraft", client.get(f"{API}/spacecraft"), "all")
     take("get_spacecraft", client.get(f"{API}/spacecraft/SOHO"), "soho")
     take("get_spacecraft", client.get(f"{API}/spacecraft/NOPE"), "unknown")
+    take("get_overview", client.get(f"{API}/overview"), "live")
+    take("get_about", client.get(f"{API}/about"), "here")
+    asked = {
+        "spacecraft": "XTE",
+        "sample": 5,
+        "b": {"tolerances": {"separation_deg": 1e-5}},
+    }
+    take("compare", client.post(f"{API}/compare", json=asked), "tighter", asked)
+    _alarm(client, operations, take)
     take("list_attitudes", client.get(f"{API}/spacecraft/SWAS/attitudes"), "one")
     take("list_rates", client.get(f"{API}/spacecraft/XTE/rates"), "one_hour")
+
+    history = f"{API}/spacecraft/XTE/history"
+    take("get_history", client.get(f"{history}?quantity=residual_ratio&size=10"), "one_bucket")
+    latest = client.get(f"{history}?strategy=latest&quantity=ambiguous_share&size=1")
+    take("get_history", latest, "latest_batch")
+    take("list_worst", client.get(f"{API}/spacecraft/XTE/worst?limit=1"), "by_ambiguous_share")
+    advice = f"{API}/spacecraft/XTE/advice"
+    take("get_advice", client.get(f"{advice}?tolerance=separation_deg=0.01"), "of_two_batches")
+    take("get_advice", client.get(f"{advice}?tolerance=septol=1"), "tolerance")
 
     asked = {"spacecraft": "XTE", "time": xte["time"], "a_priori": [xte["a_priori"]]}
     take("warm_zones", client.post(f"{API}/zones", json=asked), "one", asked)
@@ -85,7 +112,82 @@ def walk(client: httpx.Client, operations: Operations) -> Json:
         time.sleep(0.05)
     take("get_replay", client.get(begun.headers["Location"]), "done_with_a_bad_line")
     take("list_runs", client.get(f"{API}/runs"), "two")
+    take("list_replays", client.get(f"{API}/replays"), "one")
+    asked = {"alarms": True}
+    take("watch_run", client.put(f"{API}/runs/pass-7", json=asked), "watched", asked)
+
+    take("list_audit", client.get(f"{API}/audit"), "two_changes")
+    take("session", client.get(f"{API}/session"), "open_access")
+    _sign_in(client, operations, take)
     return found
+
+
+def _alarm(client: httpx.Client, operations: Operations, take: Any) -> None:
+    here = f"{API}/spacecraft/SWAS/limits"
+    settings = {"warning": {"high": 0.5}, "minimum_count": 2, "duration_s": 0}
+    asked = {"settings": settings, "who": "J. Operator", "comment": "for the next pass"}
+    limit = f"{here}/no_attitude_share"
+    take("set_limit", client.put(limit, json=asked), "changed", asked)
+    take("get_limit", client.get(limit), "with_history")
+    take("list_limits", client.get(here), "of_swas")
+    client.put(f"{API}/runs/pass-8", json={"alarms": True})
+    lone = _drawn(operations, "SWAS", stars=1)
+    for name in ("1999-060-0001", "1999-060-0002"):
+        client.post(f"{API}/batches", json=lone | {"batch": name, "run": "pass-8"})
+    found = take("list_alarms", client.get(f"{API}/alarms?run=pass-8"), "open")
+    alarm = f"{API}/alarms/{found['items'][0]['id']}"
+    said = {"who": "J. Operator", "comment": "one star in view"}
+    shelved = {**said, "minutes": 60}
+    take("shelve_alarm", client.post(f"{alarm}/shelve", json=shelved), "an_hour", shelved)
+    take("unshelve_alarm", client.post(f"{alarm}/unshelve", json=said), "back", said)
+    take("comment_alarm", client.post(f"{alarm}/comment", json=said), "said", said)
+    acknowledge = f"{alarm}/acknowledge"
+    take("acknowledge_alarm", client.post(acknowledge, json=said), "seen", said)
+    take("acknowledge_alarm", client.post(acknowledge, json=said), "seen_before")
+    take("get_alarm", client.get(alarm), "with_what_was_done")
+    take("reset_limit", client.delete(f"{limit}?who=J.%20Operator"), "shipped_again")
+
+
+def _sign_in(client: httpx.Client, operations: Operations, take: Any) -> None:
+    secret = new_secret()
+    operations.store.writer.change(
+        lambda connection: add_token(
+            connection,
+            id="01JD0000000000000000000001",
+            name="J. Operator",
+            secret=secret,
+            scopes=("read", "operate"),
+            spacecraft=None,
+            rate_per_s=None,
+            created="1999-03-01T12:00:00.000Z",
+            expires="2099-03-01T12:00:00.000Z",
+        )
+    ).result()
+    # What is known of tokens is believed for a second.
+    time.sleep(1.2)
+    asked = {"token": "acq_the-secret-that-was-printed-once"}
+    take("list_runs", client.get(f"{API}/runs"), "no_token")
+    take("sign_in", client.post(f"{API}/session", json=asked), "unknown", asked)
+    take("sign_in", client.post(f"{API}/session", json={"token": secret}), "operator")
+    same = {"Sec-Fetch-Site": "same-origin"}
+    take("sign_out", client.delete(f"{API}/session", headers=same), "signed_out")
+
+
+def _frame(operations: Operations) -> tuple[Json, bytes]:
+    """What is told of a frame, as a query, and its file."""
+    mission = operations.missions["IMAGER"]
+    (drawn,) = draw_frames(mission, operations.sky, FrameSettings(frames=1))
+    query = {
+        name: value if isinstance(value, str) else json.dumps(value)
+        for name, value in drawn.known.items()
+    }
+    return query, frame_bytes(drawn)
+
+
+def _send(client: httpx.Client, spacecraft: str, query: Json, file: bytes) -> httpx.Response:
+    headers = {"Content-Type": "application/fits"}
+    url = f"{API}/spacecraft/{spacecraft}/frames"
+    return client.post(url, params=query, content=file, headers=headers)
 
 
 def _drawn(operations: Operations, spacecraft: str, **wanted: Any) -> Json:
@@ -98,9 +200,11 @@ def fresh_walk() -> Json:
     """The walk through a server of its own with an empty database."""
     with tempfile.TemporaryDirectory() as folder:
         operations = Operations.open(Settings(database=f"sqlite:///{folder}/acquire.db"))
+        # Where nothing is compiled yet, that takes longer than a client waits.
+        operations.ready()
         with (
             Server(create_app(operations)) as address,
-            httpx.Client(base_url=address, timeout=60) as client,
+            httpx.Client(base_url=address, timeout=300) as client,
         ):
             return walk(client, operations)
 

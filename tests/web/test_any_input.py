@@ -89,11 +89,13 @@ def test_any_body_of_any_route_that_takes_one(client, body):
             assert client.post(url, content=body, headers=JSON).status_code < 500
 
 
+STREAM = "/api/v1/events"
+"""Its answer has no end; `test_events` asks it."""
 QUERIED = [
     (path, parameter["name"])
     for path, methods in reference()["paths"].items()
     for parameter in methods.get("get", {}).get("parameters", [])
-    if parameter["in"] == "query"
+    if parameter["in"] == "query" and path != STREAM
 ]
 
 

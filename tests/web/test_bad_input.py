@@ -75,7 +75,6 @@ WRONG = {
         "options.tolerances.separation_deg",
         "-1",
     ),
-    "not there yet": ("options", {"identifier": "ptp"}, "options.identifier", "ptp"),
 }
 
 
@@ -206,7 +205,6 @@ BAD_QUERIES = {
     "/api/v1/spacecraft?name=XTE": "name",
     "/api/v1/runs?a=1": "a",
     "/api/v1/zones?spacecraft=XTE": "spacecraft",
-    "/?run=%3Cscript%3E": "run",
     "/livez?a=1": "a",
 }
 
@@ -276,7 +274,7 @@ BAD_WHAT_IFS = {
         {"options": {"tolerances": {"SEPTOL": 1}}},
         "options.tolerances.SEPTOL",
     ),
-    "not there yet": ({"options": {"identifier": "ptp"}}, "options.identifier"),
+    "an unknown identifier": ({"options": {"identifier": "guess"}}, "options.identifier"),
     "a word for a switch": ({"record": "perhaps"}, "record"),
 }
 

@@ -11,7 +11,7 @@ from service.operations import Operations
 from service.settings import Settings
 from service.web.app import create_app
 from service.web.bodies import MAX_JSON_BYTES, Limits
-from tests.web.conftest import Server
+from tests.web.serving import Server
 
 URL = "/api/v1/batches"
 HEADERS = {"Content-Type": "application/json"}

@@ -10,7 +10,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from service.operations import Operations
 from service.settings import Settings
 from service.web.app import create_app
-from tests.web.conftest import Server
+from tests.web.serving import Server
 
 
 def samples(client):

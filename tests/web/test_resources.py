@@ -150,7 +150,7 @@ def test_a_line_without_end_is_one_bad_line(client, drawn, run):
         ("?run=a&speed=2", b"{}", NDJSON, 422, "speed"),
         ("?run=a", b"", NDJSON, 422, "body"),
         ("?run=a", b"{}", {"Content-Type": "text/csv"}, 415, None),
-        ("?run=a", b"{}", NDJSON | {"Content-Encoding": "gzip"}, 415, None),
+        ("?run=a", b"{}", NDJSON | {"Content-Encoding": "br"}, 415, None),
     ],
 )
 def test_a_replay_that_cannot_begin_is_refused(client, query, content, headers, status, field):

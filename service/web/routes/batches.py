@@ -9,11 +9,11 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.observe.wire import BatchIn, OptionsIn, Wire
-from service.operations import Answered
-from service.web.bodies import JSON, JsonBody, read_model, read_submission
+from service.web.access import Asking, require_scope, require_spacecraft
+from service.web.bodies import JsonBody, read_model, read_submission
 from service.web.describe import IDEMPOTENCY_KEY, LINK, LOCATION, REPLAYED, Gives, described
 from service.web.headers import NO_IDEMPOTENCY_KEY, IdempotencyKey
-from service.web.holding import Counted, Held, json_response, page_response
+from service.web.holding import Counted, Held, answer_response, json_response, page_response
 from service.web.queries import NO_QUERY, BatchQuery
 from service.web.schemas.answers import Answer, BatchPage, Record
 
@@ -50,13 +50,15 @@ class WhatIfIn(Wire):
     ),
 )
 def submit_batch(
-    body: JsonBody, key: IdempotencyKey, operations: Held, metrics: Counted
+    body: JsonBody, key: IdempotencyKey, operations: Held, metrics: Counted, caller: Asking
 ) -> Response:
     """Identify the stars of a batch, solve for the attitude, and record both."""
-    answered = operations.submit(read_submission(body), key)
+    submission = read_submission(body)
+    require_spacecraft(caller, submission.batch.spacecraft)
+    answered = operations.submit(submission, key)
     if answered.replayed:
         metrics.count_repeat()
-    return _answer(answered)
+    return answer_response(answered)
 
 
 @router.get("", **described({200: Gives("A page of results.", BatchPage, LINK)}))
@@ -77,6 +79,19 @@ def get_batch(id: ResultId, operations: Held) -> Response:
     return json_response(operations.batch(id))
 
 
+@router.get(
+    "/{id}/overlay",
+    dependencies=[NO_QUERY],
+    **described(
+        {200: Gives("The picture.", media_type="image/png")},
+        problems=(404,),
+    ),
+)
+def get_overlay(id: ResultId, operations: Held) -> Response:
+    """The frame that a result was made of: its stars, their names, and residual arrows."""
+    return Response(operations.overlay(id), media_type="image/png")
+
+
 @router.post(
     "/{id}/what-if",
     dependencies=[NO_QUERY, NO_IDEMPOTENCY_KEY],
@@ -89,18 +104,15 @@ def get_batch(id: ResultId, operations: Held) -> Response:
         problems=(404, 503),
     ),
 )
-def what_if(id: ResultId, body: JsonBody, operations: Held) -> Response:
-    """Run a recorded batch again with other options."""
+def what_if(
+    request: Request, id: ResultId, body: JsonBody, operations: Held, caller: Asking
+) -> Response:
+    """Run a recorded batch again with other options; to keep the result needs `operate`."""
     asked = read_model(WhatIfIn, body)
+    if asked.record or asked.adopt:
+        require_scope(caller, "operate")
+        request.state.changes = "what_if"
     answered = operations.what_if(
         id, asked.options, record=asked.record or asked.adopt, adopt=asked.adopt
     )
-    return _answer(answered, recorded=asked.record or asked.adopt)
-
-
-def _answer(answered: Answered, recorded: bool = True) -> Response:
-    if not recorded:
-        return Response(answered.body, media_type=JSON)
-    if answered.replayed:
-        return Response(answered.body, 200, {"Replayed": "true"}, JSON)
-    return Response(answered.body, 201, {"Location": f"/api/v1/batches/{answered.id}"}, JSON)
+    return answer_response(answered, recorded=asked.record or asked.adopt)

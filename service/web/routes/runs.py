@@ -6,20 +6,38 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Path
 from fastapi import Query as InQuery
-from pydantic import Field
+from pydantic import Field, StrictBool
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.observe.wire import BatchIn, RunName
-from service.web.bodies import MAX_JSON_BYTES, Spooled, lines_of, ndjson_body
+from service.observe.wire import BatchIn, RunName, Wire
+from service.web.access import Asking, require_spacecraft
+from service.web.bodies import (
+    MAX_JSON_BYTES,
+    JsonBody,
+    Spooled,
+    ndjson_body,
+    read_model,
+)
+from service.web.compressed import unpacked_lines
 from service.web.describe import LOCATION, Gives, described
 from service.web.holding import Held, json_response
 from service.web.queries import NO_QUERY, Query
-from service.web.schemas.runs import ReplayState, RunList
+from service.web.schemas.runs import ReplayList, ReplayState, RunList, RunState
 
 router = APIRouter(prefix="/api/v1", tags=["runs and replays"])
 
+Run = Annotated[str, Path(description="The run's name.")]
 ReplayId = Annotated[str, Path(description="The `id` of a replay.")]
+
+
+class RunIn(Wire):
+    """What holds for a run."""
+
+    alarms: Annotated[
+        StrictBool,
+        Field(description="Hold limits against its batches from now on; live ones always are."),
+    ]
 
 
 class _ReplayQuery(Query):
@@ -28,6 +46,7 @@ class _ReplayQuery(Query):
     run: Annotated[
         RunName, Field(description="The run that takes every batch, in place of its own.")
     ]
+    alarms: Annotated[bool, Field(description="Hold limits against the run.")] = False
 
 
 ReplayQuery = Annotated[_ReplayQuery, InQuery()]
@@ -38,18 +57,39 @@ class Sent:
     """A telemetry file and the run it goes to."""
 
     run: str
+    alarms: bool
     body: Spooled
 
 
 async def _telemetry(request: Request, query: ReplayQuery) -> Sent:
     # Asks for the query first, so that no gigabyte is taken in only to refuse its run.
-    return Sent(query.run, await ndjson_body(request))
+    return Sent(query.run, query.alarms, await ndjson_body(request))
 
 
 @router.get("/runs", dependencies=[NO_QUERY], **described({200: Gives("Every run.", RunList)}))
 def list_runs(operations: Held) -> Response:
     """Every run that holds batches."""
     return json_response({"items": operations.runs()})
+
+
+@router.put(
+    "/runs/{run}",
+    dependencies=[NO_QUERY],
+    **described({200: Gives("The run.", RunState)}, body=RunIn),
+)
+def watch_run(run: Run, body: JsonBody, operations: Held) -> Response:
+    """Say whether limits are held against a run; it is made where there is none."""
+    return json_response(operations.watch_run(run, read_model(RunIn, body).alarms))
+
+
+@router.get(
+    "/replays",
+    dependencies=[NO_QUERY],
+    **described({200: Gives("The latest hundred.", ReplayList)}),
+)
+def list_replays(operations: Held) -> Response:
+    """The latest replays and how far they are, newest first."""
+    return json_response({"items": operations.replays()})
 
 
 @router.post(
@@ -60,12 +100,21 @@ def list_runs(operations: Held) -> Response:
         problems=(503,),
     ),
 )
-def start_replay(sent: Annotated[Sent, Depends(_telemetry)], operations: Held) -> Response:
+def start_replay(
+    sent: Annotated[Sent, Depends(_telemetry)], operations: Held, caller: Asking
+) -> Response:
     """Take a telemetry file, a batch a line, and work through it in the background."""
     with ExitStack() as on_failure:
         on_failure.callback(sent.body.file.close)
-        lines = lines_of(sent.body.file, MAX_JSON_BYTES)
-        id = operations.start_replay(lines, sent.run, name=sent.run, total=sent.body.lines)
+        lines = unpacked_lines(sent.body.file, sent.body.coding, MAX_JSON_BYTES)
+        id = operations.start_replay(
+            lines,
+            sent.run,
+            name=sent.run,
+            total=sent.body.lines,
+            check=lambda submission: require_spacecraft(caller, submission.batch.spacecraft),
+            alarms=sent.alarms,
+        )
         on_failure.pop_all()
     location = {"Location": f"/api/v1/replays/{id}"}
     return json_response(operations.replay(id), 202, location)

@@ -7,32 +7,40 @@ from fastapi import Query as InQuery
 from starlette.requests import Request
 from starlette.responses import Response
 
+from service.web.access import Asking
 from service.web.describe import LINK, Gives, described
 from service.web.holding import Held, json_response, page_response
-from service.web.queries import NO_QUERY, RatesQuery, StretchPage
-from service.web.schemas.spacecraft import AttitudePage, RateList, SpacecraftList, SpacecraftState
+from service.web.queries import HistoryQuery, RatesQuery, RunQuery, StretchPage, WorstQuery
+from service.web.schemas.spacecraft import (
+    AttitudePage,
+    RateList,
+    SpacecraftList,
+    SpacecraftState,
+)
+from service.web.schemas.trends import History, WorstList
+from service.web.tables import CSV, history_csv
 
 router = APIRouter(prefix="/api/v1/spacecraft", tags=["spacecraft"])
 
 Name = Annotated[str, Path(description="The spacecraft's name, such as `XTE`.")]
 
 
-@router.get(
-    "", dependencies=[NO_QUERY], **described({200: Gives("Every spacecraft.", SpacecraftList)})
-)
-def list_spacecraft(operations: Held) -> Response:
-    """Every spacecraft there is a mission file for, with its state."""
-    return json_response({"items": operations.spacecraft()})
+@router.get("", **described({200: Gives("Every spacecraft.", SpacecraftList)}))
+def list_spacecraft(
+    query: Annotated[RunQuery, InQuery()], operations: Held, caller: Asking
+) -> Response:
+    """Every spacecraft there is a mission file for, with its state in a run."""
+    theirs = [each for each in operations.spacecraft(query.run) if caller.may_see(each["name"])]
+    return json_response({"items": theirs})
 
 
 @router.get(
     "/{name}",
-    dependencies=[NO_QUERY],
     **described({200: Gives("The spacecraft.", SpacecraftState)}, problems=(404,)),
 )
-def get_spacecraft(name: Name, operations: Held) -> Response:
-    """One spacecraft: state, mission settings and their history."""
-    return json_response(operations.spacecraft_state(name))
+def get_spacecraft(name: Name, query: Annotated[RunQuery, InQuery()], operations: Held) -> Response:
+    """One spacecraft: state in a run, mission settings and their history."""
+    return json_response(operations.spacecraft_state(name, query.run))
 
 
 @router.get(
@@ -53,3 +61,29 @@ def list_attitudes(
 def list_rates(name: Name, query: Annotated[RatesQuery, InQuery()], operations: Held) -> Response:
     """Stars by outcome over all observed stars, in buckets by batch time."""
     return json_response({"items": operations.rates(name, **query.asked())})
+
+
+@router.get(
+    "/{name}/history",
+    **described(
+        {200: Gives("The history; as CSV where that was asked for.", History, also=CSV)},
+        problems=(404,),
+    ),
+)
+def get_history(
+    name: Name, query: Annotated[HistoryQuery, InQuery()], operations: Held
+) -> Response:
+    """How quantities went over a stretch of time, thinned out to as many points as can be drawn."""
+    asked = query.asked()
+    as_csv = asked.pop("format") == "csv"
+    history = operations.history(name, quantities=asked.pop("quantity"), **asked)
+    return history_csv(history) if as_csv else json_response(history)
+
+
+@router.get(
+    "/{name}/worst",
+    **described({200: Gives("The worst batches.", WorstList)}, problems=(404,)),
+)
+def list_worst(name: Name, query: Annotated[WorstQuery, InQuery()], operations: Held) -> Response:
+    """The batches of a stretch that are worst by a quantity, the worst first."""
+    return json_response({"by": query.by, "items": operations.worst_batches(name, **query.asked())})

@@ -18,7 +18,13 @@ Count = Annotated[int, Field(ge=0)]
 
 Settings = Annotated[dict[str, Any], Field(description="By the names of the mission's file.")]
 Status = Literal["good", "suspect"]
-Reason = Literal["fewer_than_two_unique_stars", "degenerate_geometry"]
+Reason = Literal[
+    "fewer_than_two_unique_stars",
+    "degenerate_geometry",
+    "fewer_than_three_stars",
+    "no_match",
+    "doubtful_match",
+]
 Covariance = Annotated[
     list[Components],
     Field(min_length=3, max_length=3, description="Of the small rotation about the body axes."),

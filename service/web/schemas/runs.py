@@ -12,6 +12,7 @@ class RunRow(Shape):
 
     run: str
     created: Moment
+    alarms: bool = Field(description="Whether limits are held against it.")
     batches: Count
     spacecraft: list[str]
     first_day: str = Field(examples=["1999-03-01"])
@@ -30,6 +31,18 @@ class ReplayLines(Shape):
     total: int | None = Field(description="null where nobody counted them beforehand.")
     done: Count
     refused: Count
+
+
+class ReplayCounts(Shape):
+    """What came of the lines so far."""
+
+    new: Count = Field(description="Batches that were recorded.")
+    repeated: Count = Field(description="Batches that were recorded before.")
+    observed: Count = Field(description="Their stars; then these by outcome.")
+    unique: Count
+    ambiguous: Count
+    unmatched: Count
+    attitudes: Count = Field(description="Batches that have one.")
 
 
 class LineProblem(Shape):
@@ -54,6 +67,20 @@ class ReplayState(Shape):
     name: str
     state: Literal["running", "done", "interrupted", "failed"]
     lines: ReplayLines
+    counts: ReplayCounts
     errors: list[RefusedLine] = Field(description="The first thousand.")
     started: Moment
     finished: Moment | None
+
+
+class ReplayList(Shape):
+    """The latest replays, newest first."""
+
+    items: list[ReplayState]
+
+
+class RunState(Shape):
+    """A run, and whether limits are held against it."""
+
+    run: str
+    alarms: bool

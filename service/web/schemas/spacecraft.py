@@ -42,7 +42,7 @@ class AttitudePage(Shape):
 
 
 class SpacecraftRow(Shape):
-    """How a spacecraft stands, by its live batches."""
+    """How a spacecraft stands in a run."""
 
     name: str
     description: str
@@ -74,14 +74,16 @@ class MissionNow(Shape):
 class MissionThen(MissionNow):
     """A mission's settings as they were at some time."""
 
-    first_used: Moment
+    since: Moment
 
 
 class SpacecraftState(SpacecraftRow):
     """How a spacecraft stands, and its mission's settings with their history."""
 
     mission: MissionNow
-    history: list[MissionThen] = Field(description="Oldest first.")
+    history: list[MissionThen] = Field(
+        description="Oldest first; who goes back to earlier settings uses them anew."
+    )
 
 
 class Rates(Shape):

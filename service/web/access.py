@@ -1,0 +1,224 @@
+"""Who may use which route.
+
+Every route stands in `POLICIES` under its name: the scope it needs, and where
+it says which spacecraft it is about.  A route that does not stand there is
+refused to everybody, so a new one cannot be forgotten.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Literal
+from urllib.parse import quote
+
+from anyio import CapacityLimiter
+from anyio.to_thread import run_sync
+from fastapi import Depends
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+
+from service.errors import NotAdmitted, NotAllowed, NotFound
+from service.operations import Operations
+from service.records.tokens import Caller, Scope
+
+COOKIE = "acquire_session"
+SIGN_IN = "/sign-in"
+SAFE_METHODS = ("GET", "HEAD")
+
+About = Literal["nothing", "path", "query", "result", "body", "every"]
+
+
+@dataclass(frozen=True)
+class Policy:
+    """What a route asks of its caller.
+
+    `about` says where the spacecraft stands, for a token that is bound to some:
+    in the `path`, in the `query` (which must then name it), in the recorded
+    `result` of the path, or in the `body`, which the handler itself checks
+    with `require_spacecraft`; `every` is for tokens that are bound to none, and
+    `nothing` for what is about no spacecraft, or where the handler shows a
+    caller no other's.  `open` asks for no token.
+    """
+
+    scope: Scope
+    about: About = "every"
+    open: bool = False
+
+
+READ, SUBMIT, OPERATE = Policy("read"), Policy("submit"), Policy("operate")
+OPEN = Policy("read", "nothing", open=True)
+
+POLICIES: Mapping[str, Policy] = {
+    "livez": OPEN,
+    "readyz": OPEN,
+    "metrics": READ,
+    "sign_in_page": OPEN,
+    "sign_in": OPEN,
+    "sign_out": OPEN,
+    "session": Policy("read", "nothing"),
+    "submit_batch": Policy("submit", "body"),
+    "list_batches": Policy("read", "query"),
+    "get_batch": Policy("read", "result"),
+    "what_if": Policy("read", "result"),
+    "list_spacecraft": Policy("read", "nothing"),
+    "get_spacecraft": Policy("read", "path"),
+    "submit_frame": Policy("submit", "path"),
+    "get_overlay": Policy("read", "result"),
+    "list_attitudes": Policy("read", "path"),
+    "list_rates": Policy("read", "path"),
+    "get_history": Policy("read", "path"),
+    "list_worst": Policy("read", "path"),
+    "get_advice": Policy("read", "path"),
+    "advice_page": Policy("read", "path"),
+    "list_zones": READ,
+    "warm_zones": Policy("operate", "body"),
+    "drop_zones": Policy("operate", "query"),
+    "list_runs": READ,
+    "start_replay": Policy("submit", "body"),
+    "list_replays": READ,
+    "get_replay": READ,
+    "watch_run": Policy("submit", "nothing"),
+    "compare": Policy("read", "body"),
+    "list_limits": Policy("read", "path"),
+    "get_limit": Policy("read", "path"),
+    "set_limit": Policy("operate", "path"),
+    "reset_limit": Policy("operate", "path"),
+    "list_alarms": Policy("read", "query"),
+    "get_alarm": Policy("read", "nothing"),
+    "acknowledge_alarm": Policy("operate", "nothing"),
+    "shelve_alarm": Policy("operate", "nothing"),
+    "unshelve_alarm": Policy("operate", "nothing"),
+    "comment_alarm": Policy("operate", "nothing"),
+    "get_about": Policy("read", "nothing"),
+    "get_overview": Policy("read", "nothing"),
+    "events": Policy("read", "query"),
+    "list_audit": OPERATE,
+    "overview_page": Policy("read", "nothing"),
+    "spacecraft_page": Policy("read", "path"),
+    "latest_batch": Policy("read", "path"),
+    "batches_page": Policy("read", "nothing"),
+    "batch_page": Policy("read", "result"),
+    "alarms_page": Policy("read", "nothing"),
+    "alarm_page": Policy("read", "nothing"),
+    "limits_page": Policy("read", "path"),
+    "compare_page": Policy("read", "nothing"),
+    "zones_page": READ,
+    "missions_page": Policy("read", "nothing"),
+    "runs_page": READ,
+    "replay_page": READ,
+    "about_page": Policy("read", "nothing"),
+}
+
+_THREADS = CapacityLimiter(8)
+"""Their own: a handler may wait for a commit, and who asks shall not wait for that."""
+
+
+async def guard(request: Request) -> None:
+    """Let a request through to its handler, or raise what it lacks.
+
+    What a caller with the scope `operate` changes is noted once it is answered
+    (`service.web.middleware`).
+    """
+    route = request.scope["route"]
+    policy = POLICIES.get(route.name)
+    if policy is None:
+        raise NotAllowed(f"no policy is known for {route.name}")
+    operations: Operations = request.app.state.operations
+    if policy.open:
+        request.state.caller = None
+        return
+    token, session = _shown(request)
+    caller = operations.access.known(token, session)
+    try:
+        if caller is None:
+            caller = await run_sync(operations.access.caller, token, session, limiter=_THREADS)
+    except NotAdmitted:
+        if _is_page(request):
+            wanted = quote(
+                request.url.path + (f"?{request.url.query}" if request.url.query else "")
+            )
+            raise HTTPException(
+                303, "sign in first", {"Location": f"{SIGN_IN}?next={wanted}"}
+            ) from None
+        raise
+    if token is None and session is not None:
+        _refuse_other_sites(request)
+    request.state.caller = caller
+    operations.access.take_turn(caller)
+    require_scope(caller, policy.scope)
+    if caller.spacecraft is not None:
+        await _require_own(request, operations, caller, policy.about)
+    if policy.scope == "operate" and request.method not in SAFE_METHODS:
+        request.state.changes = route.name
+
+
+async def _caller(request: Request) -> Caller:
+    caller = request.state.caller
+    assert isinstance(caller, Caller)
+    return caller
+
+
+Asking = Annotated[Caller, Depends(_caller)]
+
+
+def require_scope(caller: Caller, scope: Scope) -> None:
+    """Raise `NotAllowed` unless a caller has a scope."""
+    if scope not in caller.scopes:
+        raise NotAllowed(
+            f"{caller.name} may {', '.join(sorted(caller.scopes))}; this needs the scope {scope}"
+        )
+
+
+def require_spacecraft(caller: Caller, spacecraft: str) -> None:
+    """Raise `NotAllowed` unless a spacecraft is one of the caller's."""
+    if not caller.may_see(spacecraft):
+        theirs = ", ".join(sorted(caller.spacecraft or ()))
+        raise NotAllowed(f"{caller.name} may ask about {theirs}, not about {spacecraft[:128]}")
+
+
+def bearer(request: Request) -> str | None:
+    """The token in the header, if there is one."""
+    kind, _, token = request.headers.get("authorization", "").partition(" ")
+    return token.strip() if kind.lower() == "bearer" else None
+
+
+def _shown(request: Request) -> tuple[str | None, str | None]:
+    return bearer(request), request.cookies.get(COOKIE)
+
+
+def _is_page(request: Request) -> bool:
+    route = request.scope["route"]
+    return not route.include_in_schema and request.method in SAFE_METHODS
+
+
+def _refuse_other_sites(request: Request) -> None:
+    """A browser sends its cookie by itself: a page elsewhere must not have things changed by it."""
+    if request.method in SAFE_METHODS:
+        return
+    site = request.headers.get("sec-fetch-site")
+    if site is None:
+        origin = request.headers.get("origin", "")
+        site = "same-origin" if origin.partition("://")[2] == request.headers["host"] else "other"
+    if site != "same-origin":
+        raise NotAllowed("a session changes things from the service's own pages alone")
+
+
+async def _require_own(
+    request: Request, operations: Operations, caller: Caller, about: About
+) -> None:
+    if about == "path":
+        require_spacecraft(caller, request.path_params["name"])
+    elif about == "query":
+        named = request.query_params.getlist("spacecraft")
+        for each in named:
+            require_spacecraft(caller, each)
+        if not named:
+            theirs = " or ".join(f"?spacecraft={each}" for each in sorted(caller.spacecraft or ()))
+            raise NotAllowed(f"{caller.name} must say which spacecraft: {theirs}")
+    elif about == "result":
+        id = request.path_params["id"]
+        owner = await run_sync(operations.spacecraft_of, id, limiter=_THREADS)
+        if owner is None or not caller.may_see(owner):
+            # As if it were not there: ids of others are not to be tried out.
+            raise NotFound(f"there is no batch with the id {id[:80]!r}")
+    elif about == "every":
+        raise NotAllowed(f"{caller.name} is bound to spacecraft, and this is about all of them")

@@ -1,0 +1,102 @@
+"""Turning a page into HTML: one environment, one set of headers, errors as pages of their own."""
+
+import dataclasses
+import json
+from collections.abc import Callable, Coroutine, Mapping
+from typing import Any
+from urllib.parse import quote, urlencode
+
+from fastapi.exceptions import RequestValidationError
+from fastapi.routing import APIRoute
+from jinja2 import Environment, PackageLoader, StrictUndefined, pass_context
+from jinja2.runtime import Context
+from markupsafe import Markup
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, Response
+
+from service import __version__
+from service.errors import AcquisitionError, BadInput, Busy, problem_of, problem_of_faults
+from service.web.dashboard.shell import BARE, LIVE, Shell
+from service.web.dashboard.words import FILTERS, present
+from service.web.errors import KINDS, OUR_FAULT, Kind, kind_of, query_faults
+
+HEADERS: Mapping[str, str] = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+        "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+    ),
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+
+
+@pass_context
+def _to(context: Context, path: str, /, **query: object) -> str:
+    """An address of the console that stays in the run that is shown."""
+    run = query.pop("run", context["shell"].run)
+    asked = {} if run == LIVE else {"run": run}
+    asked |= {name: value for name, value in query.items() if value is not None}
+    return f"{quote(path)}?{urlencode(asked)}" if asked else quote(path)
+
+
+def _data(value: object) -> Markup:
+    """Values for a script, in an element that is no script: escaped like any text."""
+    return Markup("<template data-json>{}</template>").format(
+        json.dumps(value, ensure_ascii=False, separators=(",", ":"))
+    )
+
+
+def _environment() -> Environment:
+    # Whatever came from a client is escaped; a misspelt name is an error and no empty string.
+    environment = Environment(
+        loader=PackageLoader("service.web.dashboard"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(FILTERS)
+    environment.globals.update(to=_to, data=_data, version=__version__)
+    return environment
+
+
+_ENVIRONMENT = _environment()
+
+
+def rendered(template: str, shell: Shell, status: int = 200, **values: Any) -> Response:
+    """A page of the console."""
+    text = _ENVIRONMENT.get_template(template).render(shell=shell, **values)
+    return HTMLResponse(text, status, headers=dict(HEADERS))
+
+
+class PageRoute(APIRoute):
+    """A route whose errors are read by people: a page that says what was wrong, and leads on."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        """The handler, with what it raises on purpose turned into a page."""
+        inner = super().get_route_handler()
+
+        async def handler(request: Request) -> Response:
+            try:
+                return await inner(request)
+            except RequestValidationError as error:
+                return _error_page(KINDS[BadInput], problem_of_faults(query_faults(error)))
+            except AcquisitionError as error:
+                if (kind := kind_of(error)) is OUR_FAULT:
+                    raise
+                answer = _error_page(kind, problem_of(error))
+                if isinstance(error, Busy):
+                    answer.headers["Retry-After"] = str(error.retry_after_s)
+                return answer
+
+        return handler
+
+
+def _error_page(kind: Kind, told: Mapping[str, Any]) -> Response:
+    return rendered(
+        "error.html.jinja",
+        dataclasses.replace(BARE, now=present()),
+        kind.status,
+        kind=kind,
+        told=told,
+    )

@@ -1,0 +1,192 @@
+"""The geometry of the picture of a star field: places, sizes and arrows in pixels, no markup.
+
+The picture is the tracker's tangent plane, h to the right and v upwards, as
+the tracker sees the sky.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+SIZE = 640
+"""Width and height of the picture."""
+FIELD_MARGIN = 1.12
+LONGEST_ARROW = 70.0
+"""Pixels of the longest residual arrow."""
+ROUND = (1.0, 2.0, 5.0)
+
+
+@dataclass(frozen=True)
+class CatalogStar:
+    """A star of the zone; `role` is chosen, rival or none."""
+
+    id: str
+    magnitude: float
+    x: float
+    y: float
+    radius: float
+    role: str
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line from one place to another."""
+
+    x1: float
+    y1: float
+    x2: float
+    y2: float
+
+
+@dataclass(frozen=True)
+class ObservedStar:
+    """An observed star with its number, its residual arrow and its lines to rivals."""
+
+    number: int
+    outcome: str
+    star: str | None
+    magnitude: float | None
+    x: float
+    y: float
+    arrow: Line | None
+    head: str
+    rivals: tuple[Line, ...]
+
+
+@dataclass(frozen=True)
+class Ring:
+    """A circle of the grid with its label."""
+
+    radius: float
+    label: str
+
+
+@dataclass(frozen=True)
+class SkyChart:
+    """One tracker's picture; `key_px` is the length of the arrow that stands for `key_arcsec`."""
+
+    tracker: str
+    boresight: Mapping[str, float]
+    field_of_view: Ring
+    rings: tuple[Ring, ...]
+    edges: tuple[str, ...]
+    catalog: tuple[CatalogStar, ...]
+    observed: tuple[ObservedStar, ...]
+    key_arcsec: float | None
+    key_px: float
+    magnitudes: tuple[tuple[int, float], ...]
+    through: str
+    size: int = SIZE
+
+
+def sky_chart(tracker: Mapping[str, Any], through: str, view: str = "all") -> SkyChart:
+    """The picture of one tracker of a star field (see `records.star_field`).
+
+    Its `view` is "all" that the answer speaks of, or the "field" of view.
+    """
+    half = SIZE / 2
+    field_deg = tracker["field_of_view_radius_deg"]
+    radius_deg = tracker["radius_deg"] if view == "all" else field_deg * FIELD_MARGIN
+    scale = half / math.tan(math.radians(radius_deg))
+
+    def place(h_deg: float, v_deg: float) -> tuple[float, float]:
+        x = half + scale * math.tan(math.radians(h_deg))
+        return x, half - scale * math.tan(math.radians(v_deg))
+
+    def ring(radius_deg: float) -> Ring:
+        return Ring(scale * math.tan(math.radians(radius_deg)), f"{radius_deg:g}°")
+
+    limit_mag = tracker["magnitude_limit_mag"]
+    roles = {name: "rival" for each in tracker["observed"] for name in each["rivals"]}
+    roles |= {each["star"]: "chosen" for each in tracker["observed"] if each["star"]}
+    catalog = tuple(
+        CatalogStar(
+            star["id"],
+            star["magnitude"],
+            *place(star["h_deg"], star["v_deg"]),
+            star_radius(star["magnitude"], limit_mag),
+            roles.get(star["id"], "none"),
+        )
+        for star in tracker["catalog"]
+    )
+    at = {star.id: (star.x, star.y) for star in catalog}
+    px_per_arcsec, key_arcsec = _arrow_scale(
+        [
+            math.hypot(*each["residual_arcsec"])
+            for each in tracker["observed"]
+            if each["residual_arcsec"]
+        ]
+    )
+    observed = []
+    for number, each in enumerate(tracker["observed"], start=1):
+        x, y = place(each["h_deg"], each["v_deg"])
+        arrow = None
+        if each["residual_arcsec"] and px_per_arcsec:
+            along_h, along_v = each["residual_arcsec"]
+            arrow = Line(x, y, x + along_h * px_per_arcsec, y - along_v * px_per_arcsec)
+        observed.append(
+            ObservedStar(
+                number,
+                each["outcome"],
+                each["star"],
+                each["magnitude"],
+                x,
+                y,
+                arrow,
+                "" if arrow is None else _head(arrow),
+                tuple(Line(x, y, *at[name]) for name in each["rivals"] if name in at),
+            )
+        )
+    brightest = min((star.magnitude for star in catalog), default=limit_mag)
+    steps = range(math.ceil(brightest), math.floor(limit_mag) + 1)
+    return SkyChart(
+        tracker=tracker["tracker"],
+        boresight=tracker["boresight"],
+        field_of_view=ring(field_deg),
+        rings=tuple(ring(each) for each in _rings(radius_deg, field_deg)),
+        edges=tuple(
+            " ".join("{:.1f},{:.1f}".format(*place(h, v)) for h, v in line)
+            for line in tracker["zone_edges"]
+        ),
+        catalog=catalog,
+        observed=tuple(observed),
+        key_arcsec=key_arcsec,
+        key_px=0.0 if key_arcsec is None else key_arcsec * px_per_arcsec,
+        magnitudes=tuple((step, star_radius(step, limit_mag)) for step in steps)[-6:],
+        through=through,
+    )
+
+
+def star_radius(magnitude_mag: float, limit_mag: float) -> float:
+    """Pixels of a star's disc: a magnitude brighter is 0.9 px more, the faintest are still seen."""
+    return min(9.0, 1.3 + 0.9 * max(0.0, limit_mag - magnitude_mag))
+
+
+def _arrow_scale(lengths_arcsec: Sequence[float]) -> tuple[float, float | None]:
+    """Pixels per arcsecond, and a round length for the key that is no longer than the longest."""
+    longest = max(lengths_arcsec, default=0.0)
+    if longest <= 0.0:
+        return 0.0, None
+    power = 10.0 ** math.floor(math.log10(longest))
+    key = max((factor * power for factor in ROUND if factor * power <= longest), default=power)
+    return LONGEST_ARROW / longest, key
+
+
+def _rings(radius_deg: float, field_deg: float) -> list[float]:
+    """Two or three round radii within the picture, other than the field of view's own."""
+    step = next(s for s in (0.25, 0.5, 1.0, 2.0, 5.0, 10.0) if radius_deg / s <= 4.0)
+    count = int(radius_deg / step)
+    return [step * k for k in range(1, count + 1) if abs(step * k - field_deg) > step / 4]
+
+
+def _head(arrow: Line) -> str:
+    """The corners of an arrow's head."""
+    length = math.hypot(arrow.x2 - arrow.x1, arrow.y2 - arrow.y1)
+    if length == 0.0:
+        return ""
+    u, v = (arrow.x2 - arrow.x1) / length, (arrow.y2 - arrow.y1) / length
+    back, wide = min(8.0, length), min(3.2, length * 0.4)
+    x, y = arrow.x2 - u * back, arrow.y2 - v * back
+    corners = ((arrow.x2, arrow.y2), (x - v * wide, y + u * wide), (x + v * wide, y - u * wide))
+    return " ".join(f"{a:.1f},{b:.1f}" for a, b in corners)

@@ -1,0 +1,48 @@
+// Putting fresh parts of a page in the place of old ones, without disturbing whoever is reading.
+
+// The page at an address, as the server draws it now; an error page is an error here too.
+export async function fetchPage(address) {
+  const answer = await fetch(address, { headers: { Accept: "text/html" } });
+  // A session has ended: whoever reads signs in again and comes back here.
+  if (new URL(answer.url).pathname === "/sign-in") location.href = answer.url;
+  const fresh = new DOMParser().parseFromString(await answer.text(), "text/html");
+  if (!answer.ok) {
+    const told = fresh.getElementById("problem");
+    throw new Error(told ? told.querySelector("p").textContent : `the service answered ${answer.status}`);
+  }
+  return fresh;
+}
+
+// Somebody types in here, or has text marked: it is not pulled away.
+function isBusy(region) {
+  const active = document.activeElement;
+  const marked = document.getSelection();
+  const typing = region.contains(active) && active.matches("input, textarea, select");
+  return typing || (marked && !marked.isCollapsed && region.contains(marked.anchorNode));
+}
+
+// Replaces every region of the page that has changed; focus and open details stay where they were.
+export function swapRegions(fresh, selector = "[data-region]") {
+  for (const region of document.querySelectorAll(selector)) {
+    const next = fresh.getElementById(region.id);
+    if (!next || isBusy(region)) continue;
+    for (const open of region.querySelectorAll("details[open][id]")) {
+      const same = next.querySelector(`#${CSS.escape(open.id)}`);
+      if (same) same.open = true;
+    }
+    if (next.isEqualNode(region)) continue;
+    const focused = region.contains(document.activeElement) && placeOf(document.activeElement, region);
+    region.replaceWith(document.adoptNode(next));
+    if (focused) focused(next)?.focus({ preventScroll: true });
+  }
+}
+
+// How to find the like of an element in a fresh region: by its id, its address, or its label.
+function placeOf(element, region) {
+  if (element.id) return (next) => next.querySelector(`#${CSS.escape(element.id)}`);
+  const kind = element.tagName.toLowerCase();
+  const name = element.getAttribute("href") ?? element.getAttribute("aria-label");
+  const attribute = element.hasAttribute("href") ? "href" : "aria-label";
+  if (name === null) return null;
+  return (next) => next.querySelector(`${kind}[${attribute}="${CSS.escape(name)}"]`);
+}

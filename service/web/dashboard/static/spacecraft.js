@@ -1,0 +1,117 @@
+// The trends of one spacecraft: charts of a stretch of time that the address names.
+import { fetchPage, swapRegions } from "./regions.js";
+import { Trend } from "./trend.js";
+
+const stretch = () => document.getElementById("stretch");
+const status = document.getElementById("charts-status");
+
+const AMBIGUOUS = { name: "ambiguous_share", label: "ambiguous", tone: "--accent" };
+const UNMATCHED = { name: "unmatched_share", label: "unmatched", tone: "--soft", dash: [5, 4] };
+const CHARTS = {
+  stars: { percent: true, unit: " %", quantities: [AMBIGUOUS, UNMATCHED] },
+  batches: {
+    percent: true,
+    unit: " %",
+    quantities: [
+      { name: "no_attitude_share", label: "without attitude", tone: "--accent" },
+      { name: "suspect_share", label: "suspect", tone: "--soft", dash: [5, 4] },
+    ],
+  },
+  residual: {
+    unit: "″",
+    quantities: [
+      { name: "residual_rms_arcsec", label: "residual", tone: "--accent" },
+      { name: "predicted_rms_arcsec", label: "predicted", tone: "--soft", dash: [5, 4] },
+    ],
+  },
+  magnitude: { unit: " mag", quantities: [{ name: "magnitude_offset_mag", label: "offset", tone: "--accent" }] },
+  "a-priori": { unit: "°", quantities: [{ name: "a_priori_angle_deg", label: "angle", tone: "--accent" }] },
+  rate: { unit: "", quantities: [{ name: "batches_per_hour", label: "batches per hour", tone: "--accent" }] },
+};
+
+const { limits } = JSON.parse(document.querySelector("[data-json]").content.textContent);
+let trends = [];
+let asked = 0;
+let shown = null;
+
+const posix = (text) => Date.parse(text.replace(":60", ":59").replace(/(\.\d{3})\d*/, "$1")) / 1000;
+const asText = (seconds) => new Date(seconds * 1000).toISOString();
+
+function make() {
+  trends = [...document.querySelectorAll("[data-chart]")].map((holder) => {
+    const id = holder.dataset.chart;
+    const title = document.getElementById(`chart-${id}`).textContent;
+    const readout = document.querySelector(`[data-readout="${id}"]`);
+    return new Trend(holder, readout, { ...CHARTS[id], title }, limits, "trends", zoom);
+  });
+}
+
+async function draw() {
+  const mine = ++asked;
+  const { history, start, end } = stretch().dataset;
+  try {
+    const answer = await fetch(history);
+    const told = await answer.json();
+    if (!answer.ok) throw new Error(told.detail);
+    if (mine !== asked) return;
+    shown = told;
+    for (const trend of trends) trend.show(shown, posix(start), posix(end));
+    status.textContent = "";
+    document.getElementById("charts").dataset.drawn = String(told.unix_s.length);
+  } catch (error) {
+    if (mine !== asked) return;
+    status.className = "problem";
+    status.textContent = `The trends could not be read: ${error.message}. What is shown is of its own time.`;
+  }
+}
+
+async function go(address, push = true) {
+  if (push) history.pushState(null, "", address);
+  try {
+    swapRegions(await fetchPage(address));
+  } catch (error) {
+    status.className = "problem";
+    status.textContent = `Not shown: ${error.message}`;
+    return;
+  }
+  await draw();
+}
+
+function zoom(bounds) {
+  if (bounds === null) {
+    go(document.querySelector('[data-key="-"]').href);
+    return;
+  }
+  const address = new URL(location.href);
+  address.searchParams.delete("range");
+  address.searchParams.set("start", asText(bounds[0]));
+  address.searchParams.set("end", asText(bounds[1]));
+  go(address.href);
+}
+
+if (stretch()) {
+  make();
+  draw();
+  document.addEventListener("click", (event) => {
+    const link = event.target.closest("[data-go]");
+    if (!link || event.ctrlKey || event.metaKey) return;
+    event.preventDefault();
+    go(link.href);
+  });
+  document.addEventListener("keydown", (event) => {
+    if (!event.target.matches?.("[data-chart]")) return;
+    const link = document.querySelector(`[data-key="${CSS.escape(event.key)}"]`);
+    if (!link) return;
+    event.preventDefault();
+    go(link.href);
+  });
+  document.addEventListener("change", (event) => {
+    const form = event.target.closest("[data-worst]");
+    if (!form) return;
+    event.target.blur();
+    go(`${form.getAttribute("action")}?${new URLSearchParams(new FormData(form))}`);
+  });
+  addEventListener("popstate", () => go(location.href, false));
+  document.addEventListener("drawn", draw);
+  document.addEventListener("theme", () => shown && draw());
+}

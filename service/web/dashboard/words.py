@@ -1,0 +1,205 @@
+"""How the console writes values: UTC with the day of the year, numbers with units, states as words.
+
+A state has its word and its shape; colour only helps.  What is not known is a
+dash and never a zero.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+from markupsafe import Markup
+
+from service.times import Utc, parse_utc
+
+DASH = "–"
+THIN = "\N{NARROW NO-BREAK SPACE}"
+
+STATES: Mapping[str, tuple[str, str]] = {
+    "good": ("●", "good"),
+    "suspect": ("▲", "suspect"),
+    "no_attitude": ("○", "no attitude"),
+    "no_batches": ("–", "no batches"),
+    "unique": ("●", "unique"),
+    "ambiguous": ("▲", "ambiguous"),
+    "unmatched": ("✕", "unmatched"),
+    "watch": ("△", "watch"),
+    "warning": ("▲", "warning"),
+    "critical": ("◆", "critical"),
+    "open": ("!", "open"),
+    "acknowledged": ("✓", "acknowledged"),
+    "shelved": ("‖", "shelved"),
+    "cleared": ("○", "cleared"),
+    "running": ("▸", "running"),
+    "done": ("●", "done"),
+    "interrupted": ("‖", "interrupted"),
+    "failed": ("✕", "failed"),
+}
+"""Shape and word of every state there is."""
+
+QUANTITIES: Mapping[str, str] = {
+    "ambiguous_share": "ambiguous stars",
+    "unmatched_share": "unmatched stars",
+    "no_attitude_share": "batches without attitude",
+    "suspect_share": "batches with a suspect attitude",
+    "residual_rms_arcsec": "residual rms",
+    "predicted_rms_arcsec": "predicted residual rms",
+    "residual_ratio": "residual over predicted",
+    "magnitude_offset_mag": "magnitude offset",
+    "a_priori_angle_deg": "angle from the a priori attitude",
+    "batches_per_hour": "batches per hour",
+    "silence_s": "silence",
+}
+"""What is watched and drawn, in words."""
+
+
+def present() -> Utc:
+    """This moment, to the second."""
+    return parse_utc(datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"))
+
+
+def with_day_of_year(moment: Utc | str, seconds: bool = True) -> str:
+    """UTC for reading: date, day of the year, time of day."""
+    moment = parse_utc(moment) if isinstance(moment, str) else moment
+    day, _, clock = moment.text.partition("T")
+    return f"{day} ({moment.day_of_year:03d}) {clock[: 8 if seconds else 5]}"
+
+
+def utc(moment: Utc | str | None, seconds: bool = True) -> Markup:
+    """The same as an element that programs can read; a dash where there is none."""
+    if moment is None:
+        return Markup(DASH)
+    moment = parse_utc(moment) if isinstance(moment, str) else moment
+    return Markup('<time datetime="{}">{}</time>').format(
+        moment.text, with_day_of_year(moment, seconds)
+    )
+
+
+def age(seconds: float | None) -> str:
+    """A length of time in its two largest units."""
+    if seconds is None:
+        return DASH
+    whole = max(0, round(seconds))
+    for size, unit, below, smaller in (
+        (86400, "d", 3600, "h"),
+        (3600, "h", 60, "min"),
+        (60, "min", 1, "s"),
+    ):
+        if whole >= size:
+            large, small = whole // size, whole % size // below
+            return (
+                f"{large}{THIN}{unit} {small}{THIN}{smaller}" if small else f"{large}{THIN}{unit}"
+            )
+    return f"{whole}{THIN}s"
+
+
+def share(part: float | None, whole: float | None = 1) -> str:
+    """Percent to two or three digits; without a whole there is no share."""
+    if part is None or not whole:
+        return DASH
+    percent = 100 * part / whole
+    decimals = 0 if percent >= 99.95 or percent == 0 else 1 if percent >= 9.995 else 2
+    return f"{percent:.{decimals}f}{THIN}%"
+
+
+def number(value: float | None, decimals: int = 2) -> str:
+    """A number with so many decimals, and a true minus sign."""
+    if value is None or not math.isfinite(value):
+        return DASH
+    return f"{value:.{decimals}f}".replace("-", "−")
+
+
+def arcsec(value: float | None) -> str:
+    """Arcseconds to three digits; degrees where they become many."""
+    if value is None or not math.isfinite(value):
+        return DASH
+    if abs(value) >= 3600:
+        return f"{number(value / 3600)}°"
+    decimals = 0 if abs(value) >= 99.95 else 1 if abs(value) >= 9.995 else 2
+    return f"{number(value, decimals)}″"
+
+
+def degrees(value: float | None, decimals: int = 3) -> str:
+    """Degrees."""
+    return DASH if value is None else f"{number(value, decimals)}°"
+
+
+def magnitude(value: float | None, decimals: int = 2) -> str:
+    """Magnitudes."""
+    return DASH if value is None else f"{number(value, decimals)}{THIN}mag"
+
+
+def count(value: int | None) -> str:
+    """A whole number in groups of three."""
+    return DASH if value is None else f"{value:,}".replace(",", THIN)
+
+
+def microseconds(value: float | None) -> str:
+    """Microseconds, or milliseconds where they become many."""
+    if value is None:
+        return DASH
+    if value >= 10_000:
+        return f"{value / 1000:.1f}{THIN}ms"
+    return f"{count(round(value))}{THIN}µs"
+
+
+def size(value: int) -> str:
+    """Bytes in kB and MB."""
+    for least, unit in ((1_000_000, "MB"), (1_000, "kB")):
+        if value >= least:
+            return f"{value / least:.1f}{THIN}{unit}"
+    return f"{value}{THIN}B"
+
+
+def sigmas(covariance_arcsec2: Sequence[Sequence[float]]) -> list[float]:
+    """One standard deviation about each body axis."""
+    return [math.sqrt(max(covariance_arcsec2[k][k], 0.0)) for k in range(3)]
+
+
+def plain(word: str | None) -> str:
+    """A word of the interface for reading: `no_attitude` without its underscore."""
+    return (word or "").replace("_", " ")
+
+
+def state(name: str | None) -> Markup:
+    """Shape and word of a state, with a class to colour it by."""
+    name = name or "no_attitude"
+    shape, word = STATES[name]
+    return Markup('<span class="state {}"><span aria-hidden="true">{}</span> {}</span>').format(
+        name, shape, word
+    )
+
+
+def quantity(value: float | None, name: str) -> str:
+    """A value of a watched quantity with its unit."""
+    if value is None:
+        return DASH
+    if name.endswith("_share"):
+        return share(value)
+    if name.endswith("_arcsec"):
+        return arcsec(value)
+    if name.endswith("_deg"):
+        return degrees(value)
+    if name.endswith("_mag"):
+        return magnitude(value)
+    return age(value) if name.endswith("_s") else number(value)
+
+
+FILTERS: Mapping[str, Callable[..., Any]] = {
+    "utc": utc,
+    "age": age,
+    "share": share,
+    "num": number,
+    "arcsec": arcsec,
+    "deg": degrees,
+    "mag": magnitude,
+    "cnt": count,
+    "us": microseconds,
+    "size": size,
+    "sigmas": sigmas,
+    "plain": plain,
+    "state": state,
+    "quantity": quantity,
+    "called": lambda name: QUANTITIES.get(name, plain(name)),
+}

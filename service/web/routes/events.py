@@ -1,0 +1,105 @@
+"""Live events, as a stream that a browser's EventSource follows."""
+
+from collections.abc import AsyncIterator
+from typing import Annotated
+
+import anyio
+from fastapi import APIRouter, Depends
+from fastapi import Query as InQuery
+from pydantic import Field
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.types import Receive, Scope, Send
+
+from service.errors import BadBatch, Fault, shown_value
+from service.observe.wire import RunName
+from service.web.describe import LAST_EVENT_ID, Gives, described
+from service.web.live import Live
+from service.web.queries import Query, Spacecraft
+
+router = APIRouter(prefix="/api/v1", tags=["events"])
+
+EVENT_STREAM = "text/event-stream"
+SEND_S = 30.0
+"""Whoever takes nothing for so long is let go: it comes again and goes on where it was."""
+HEADERS = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+
+
+class EventQuery(Query):
+    """Which events."""
+
+    run: Annotated[RunName | None, Field(description="Only those of this run.")] = None
+    spacecraft: Spacecraft = None
+    last_event_id: Annotated[
+        int | None,
+        Field(ge=0, lt=1 << 63, description="As the header `Last-Event-ID`, which goes first."),
+    ] = None
+
+
+class EventStream(Response):
+    """An answer that goes on until the listener leaves, the events end, or nothing is taken."""
+
+    def __init__(self, lines: AsyncIterator[bytes]) -> None:
+        super().__init__(None, 200, HEADERS, EVENT_STREAM)
+        del self.headers["content-length"]
+        self._lines = lines
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the lines as they come."""
+        async with anyio.create_task_group() as group:
+
+            async def leave() -> None:
+                while (await receive())["type"] != "http.disconnect":
+                    pass
+                group.cancel_scope.cancel()
+
+            group.start_soon(leave)
+            try:
+                await self._send(send)
+            finally:
+                with anyio.CancelScope(shield=True):
+                    await self._lines.aclose()  # type: ignore[attr-defined]
+            group.cancel_scope.cancel()
+
+    async def _send(self, send: Send) -> None:
+        start = {"type": "http.response.start", "status": 200, "headers": self.raw_headers}
+        await send(start)
+        async for piece in self._lines:
+            with anyio.move_on_after(SEND_S) as waiting:
+                await send({"type": "http.response.body", "body": piece, "more_body": True})
+            if waiting.cancelled_caught:
+                return
+        await send({"type": "http.response.body", "body": b"", "more_body": False})
+
+
+async def _live(request: Request) -> Live:
+    live = request.app.state.live
+    assert isinstance(live, Live)
+    return live
+
+
+@router.get(
+    "/events",
+    **described(
+        {200: Gives("Events, without an end.", None, media_type=EVENT_STREAM)},
+        problems=(503,),
+        parameters=(LAST_EVENT_ID,),
+    ),
+)
+async def events(
+    request: Request,
+    query: Annotated[EventQuery, InQuery()],
+    live: Annotated[Live, Depends(_live)],
+) -> Response:
+    """What happens, as server-sent events: batches, alarms, limits, replays."""
+    last = _last_event_id(request, query)
+    return EventStream(await live.stream(last, query.run, query.spacecraft))
+
+
+def _last_event_id(request: Request, query: EventQuery) -> int | None:
+    text = request.headers.get("last-event-id")
+    if not text:
+        return query.last_event_id
+    if not (text.isascii() and text.isdigit() and len(text) < 19):
+        raise BadBatch(Fault("Last-Event-ID", "is none that an event had", shown_value(text)))
+    return int(text)

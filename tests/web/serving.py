@@ -1,0 +1,51 @@
+"""The app behind a real server, in a thread of this process."""
+
+import threading
+import time
+from collections.abc import Callable
+from functools import cache
+
+import uvicorn
+from fastapi import FastAPI
+
+from service.missions.mission import load_missions
+from service.sky.catalog import load_embedded
+from service.sky.shelf import Shelf
+from service.sky.view import Sky
+from service.warm import warm_up
+from service.web.server import Server as StreamingServer
+
+
+def _stop_streams_of(app: FastAPI) -> Callable[[], None]:
+    # Some tests put another app around the real one.
+    stop: Callable[[], None] = getattr(app, "app", app).state.live.stop
+    return stop
+
+
+@cache
+def compile_kernels() -> None:
+    """Compile what a first request would wait for: on a fresh checkout that takes minutes."""
+    warm_up(Sky(load_embedded(), Shelf(64 << 20)), load_missions())
+
+
+class Server:
+    """The app behind uvicorn on a free port, in a thread of this process."""
+
+    def __init__(self, app: FastAPI, port: int = 0) -> None:
+        compile_kernels()
+        config = uvicorn.Config(app, port=port, http="httptools", ws="none", log_level="warning")
+        self._server = StreamingServer(config, _stop_streams_of(app))
+        # Signals belong to the main thread, which is the caller's.
+        self._thread = threading.Thread(target=self._server.run, name="server")
+
+    def __enter__(self) -> str:
+        self._thread.start()
+        while not self._server.started:
+            assert self._thread.is_alive(), "the server did not start"
+            time.sleep(0.01)
+        port = self._server.servers[0].sockets[0].getsockname()[1]
+        return f"http://127.0.0.1:{port}"
+
+    def __exit__(self, *_: object) -> None:
+        self._server.should_exit = True
+        self._thread.join()

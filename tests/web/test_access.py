@@ -1,0 +1,279 @@
+"""Who may do what, held against the table of the routes themselves."""
+
+import json
+import re
+import time
+
+import httpx
+import pytest
+
+from service.operations import Operations
+from service.records import tokens
+from service.records.ids import Ulids
+from service.settings import Settings
+from service.times import shifted, utc_now
+from service.web.access import COOKIE, POLICIES
+from service.web.app import create_app
+from tests.web.serving import Server
+
+PLACES = {
+    "name": "XTE",
+    "id": "01JD0000000000000000000000",
+    "run": "pass-7",
+    "quantity": "ambiguous_share",
+}
+KNOWN_AGAIN_S = 1.3
+"""A little more than what is known of a token is believed for."""
+
+
+class Guarded:
+    """A service of its own with tokens of every kind."""
+
+    def __init__(self, folder):
+        self.settings = Settings(database=f"sqlite:///{folder / 'guarded.db'}")
+        self.operations = Operations.open(self.settings)
+        self._ids = Ulids()
+
+    def token(self, name, *scopes, days=1, **more):
+        secret, created = tokens.new_secret(), utc_now()
+        self.operations.store.writer.change(
+            lambda connection: tokens.add_token(
+                connection,
+                id=self._ids.new(),
+                name=name,
+                secret=secret,
+                scopes=scopes,
+                created=created.text,
+                expires=shifted(created, days * 86400).text,
+                **{"spacecraft": None, "rate_per_s": None} | more,
+            )
+        ).result()
+        return secret
+
+    def revoke(self, name):
+        self.operations.store.writer.change(
+            lambda connection: tokens.revoke_token(connection, name, utc_now().text)
+        ).result()
+
+
+@pytest.fixture(scope="module")
+def guarded(tmp_path_factory):
+    service = Guarded(tmp_path_factory.mktemp("guarded"))
+    service.all = service.token("all", "read", "submit", "operate")
+    service.expired = service.token("expired", "read", "submit", "operate", days=-1)
+    service.revoked = service.token("revoked", "read", "submit", "operate")
+    service.revoke("revoked")
+    service.of_scope = {each: service.token(each, each) for each in tokens.SCOPES}
+    service.swas = service.token("swas", "read", "submit", "operate", spacecraft=["SWAS"])
+    app = create_app(service.operations)
+    service.routes = app.state.routes
+    with Server(app) as service.url:
+        yield service
+
+
+@pytest.fixture(scope="module")
+def anybody(guarded):
+    with httpx.Client(base_url=guarded.url, timeout=60) as client:
+        yield client
+
+
+def shown(token):
+    return {"Authorization": f"Bearer {token}"}
+
+
+def asked(client, method, path, **more):
+    """The answer's status and headers; its body may be a stream without an end."""
+    with client.stream(method, path, **more) as response:
+        return response
+
+
+def requests_of(routes):
+    """A request to every route: its name, method and a path that fits."""
+    for route in routes:
+        path = re.sub(r"\{(\w+)[^}]*\}", lambda found: PLACES[found[1]], route.path)
+        for method in sorted(route.methods - {"HEAD"}):
+            yield route.name, method, path
+
+
+def test_every_route_has_a_policy_and_every_policy_a_route(guarded):
+    """A new route without one would be refused to everybody; an old policy would mislead."""
+    assert {route.name for route in guarded.routes} == set(POLICIES)
+
+
+def test_without_a_good_token_nothing_but_the_open_routes_answers(guarded, anybody):
+    """No token, an unknown one, an expired one, a revoked one: each route refuses each alike."""
+    bad = [{}, shown("acq_unknown"), shown(guarded.expired), shown(guarded.revoked)]
+    bad += [{"Authorization": "Basic YTpi"}, {"Cookie": f"{COOKIE}=acq_unknown"}]
+    for name, method, path in requests_of(guarded.routes):
+        for headers in bad:
+            response = asked(anybody, method, path, headers=headers)
+            if POLICIES[name].open:
+                assert response.status_code not in (403, 500), (name, headers)
+            elif response.status_code == 303:
+                assert response.headers["Location"].startswith("/sign-in?next="), name
+            else:
+                assert response.status_code == 401, (name, headers)
+                assert response.headers["WWW-Authenticate"].startswith("Bearer"), name
+
+
+def test_a_token_without_the_scope_is_refused_by_every_route(guarded, anybody):
+    """And one with it is let through to whatever the route says then."""
+    for name, method, path in requests_of(guarded.routes):
+        policy = POLICIES[name]
+        if policy.open:
+            continue
+        for scope, token in guarded.of_scope.items():
+            response = asked(anybody, method, path, headers=shown(token))
+            assert (response.status_code == 403) == (scope != policy.scope), (name, scope)
+            assert response.status_code < 500, (name, scope)
+
+
+def test_a_token_of_another_spacecraft_is_refused_by_every_route_about_one(guarded, anybody):
+    for name, method, path in requests_of(guarded.routes):
+        policy = POLICIES[name]
+        if policy.open or policy.about in ("nothing", "body"):
+            continue
+        query = {"spacecraft": "XTE"} if policy.about == "query" else None
+        response = asked(anybody, method, path, params=query, headers=shown(guarded.swas))
+        wanted = 404 if policy.about == "result" else 403
+        assert response.status_code == wanted, name
+        if policy.about == "query":
+            assert asked(anybody, method, path, headers=shown(guarded.swas)).status_code == 403
+
+
+def test_a_bound_token_submits_reads_and_replays_its_own_spacecraft_alone(guarded, anybody, drawn):
+    swas, xte = drawn("SWAS", 1)[0], drawn("XTE", 1)[0]
+    own = anybody.post("/api/v1/batches", json=swas, headers=shown(guarded.swas))
+    other = anybody.post("/api/v1/batches", json=xte, headers=shown(guarded.swas))
+    assert (own.status_code, other.status_code) == (201, 403)
+    kept = anybody.post("/api/v1/batches", json=xte, headers=shown(guarded.all))
+    for answer, status in ((own, 200), (kept, 404)):
+        path = answer.headers["Location"]
+        assert anybody.get(path, headers=shown(guarded.swas)).status_code == status
+        tried = anybody.post(path + "/what-if", json={}, headers=shown(guarded.swas))
+        assert tried.status_code == status
+    warm = {"spacecraft": "XTE", "time": xte["time"], "a_priori": [xte["a_priori"]]}
+    warmed = anybody.post("/api/v1/zones", json=warm, headers=shown(guarded.swas))
+    assert warmed.status_code == 403
+    listed = anybody.get("/api/v1/spacecraft", headers=shown(guarded.swas)).json()["items"]
+    assert [each["name"] for each in listed] == ["SWAS"]
+
+    lines = "\n".join(json.dumps(each) for each in (swas, xte, swas | {"batch": "another"}))
+    begun = anybody.post(
+        "/api/v1/replays?run=bound",
+        content=lines,
+        headers=shown(guarded.swas) | {"Content-Type": "application/x-ndjson"},
+    )
+    assert begun.status_code == 202
+    for _ in range(200):
+        state = anybody.get(begun.headers["Location"], headers=shown(guarded.all)).json()
+        if state["state"] != "running":
+            break
+        time.sleep(0.05)
+    assert (state["lines"]["done"], state["lines"]["refused"]) == (3, 1)
+    assert [each["line"] for each in state["errors"]] == [2]
+    assert "SWAS, not about XTE" in state["errors"][0]["problem"]["detail"]
+
+
+def test_revoking_a_token_holds_within_a_second(guarded, anybody):
+    token = guarded.token("short lived", "read")
+    assert anybody.get("/api/v1/session", headers=shown(token)).status_code == 200
+    guarded.revoke("short lived")
+    time.sleep(KNOWN_AGAIN_S)
+    assert anybody.get("/api/v1/session", headers=shown(token)).status_code == 401
+
+
+def test_a_session_is_a_cookie_that_scripts_cannot_read_and_other_sites_cannot_use(guarded, batch):
+    """Signed in, a browser may what its token may; a page elsewhere changes nothing by it."""
+    with httpx.Client(base_url=guarded.url, timeout=60) as browser:
+        assert browser.get("/").headers["Location"] == "/sign-in?next=/"
+        bad = browser.post("/api/v1/session", json={"token": "acq_no"})
+        assert (bad.status_code, dict(browser.cookies)) == (401, {})
+        begun = browser.post("/api/v1/session", json={"token": guarded.all})
+        cookie = begun.headers["Set-Cookie"].lower()
+        assert begun.json()["name"] == "all"
+        assert all(word in cookie for word in ("httponly", "samesite=strict", "path=/"))
+        assert guarded.all not in begun.headers["Set-Cookie"]
+        assert browser.get("/").status_code == 200
+
+        def drop(**headers):
+            return browser.delete("/api/v1/zones", headers=headers).status_code
+
+        host = guarded.url.partition("://")[2]
+        own, other = f"http://{host}", "https://elsewhere.example"
+        assert drop(**{"Sec-Fetch-Site": "same-origin"}) == drop(Origin=own) == 200
+        assert drop(**{"Sec-Fetch-Site": "cross-site"}) == drop(Origin=other) == drop() == 403
+        assert drop(**{"Sec-Fetch-Site": "same-site", "Origin": own}) == 403
+        # A token in the header is sent by nobody's browser of itself.
+        assert drop(**shown(guarded.all)) == 200
+
+        kept = dict(browser.cookies)
+        same = {"Sec-Fetch-Site": "same-origin"}
+        assert browser.delete("/api/v1/session", headers=same).status_code == 200
+        browser.cookies.update(kept)
+        time.sleep(KNOWN_AGAIN_S)
+        assert browser.get("/api/v1/session").status_code == 401
+
+
+def test_a_session_ends_with_its_token(guarded):
+    token = guarded.token("leaving", "read")
+    with httpx.Client(base_url=guarded.url, timeout=60) as browser:
+        browser.post("/api/v1/session", json={"token": token}).raise_for_status()
+        assert browser.get("/api/v1/session").json()["name"] == "leaving"
+        guarded.revoke("leaving")
+        time.sleep(KNOWN_AGAIN_S)
+        assert browser.get("/api/v1/session").status_code == 401
+
+
+def test_whoever_asks_too_often_is_told_when_to_come_again(guarded, anybody):
+    token = guarded.token("hasty", "read", rate_per_s=0.5)
+    answers = [anybody.get("/api/v1/session", headers=shown(token)) for _ in range(12)]
+    refused = [each for each in answers if each.status_code == 429]
+    assert 5 <= len(refused) <= 7
+    assert all(1 <= int(each.headers["Retry-After"]) <= 3 for each in refused)
+    # Nobody else is kept waiting by it.
+    assert anybody.get("/api/v1/session", headers=shown(guarded.all)).status_code == 200
+
+
+def test_what_is_changed_is_noted_with_who_changed_it(guarded, anybody, drawn):
+    """Also what was refused; reading and submitting are not changes."""
+    anybody.delete("/api/v1/zones?spacecraft=SWAS", headers=shown(guarded.of_scope["operate"]))
+    sent = anybody.post("/api/v1/batches", json=drawn("SOHO", 1)[0], headers=shown(guarded.all))
+    path = sent.headers["Location"] + "/what-if"
+    anybody.post(path, json={"record": True}, headers=shown(guarded.all))
+    anybody.post(path, json={}, headers=shown(guarded.all))
+    anybody.post(path, json={"adopt": True}, headers=shown(guarded.of_scope["read"]))
+    listed = anybody.get("/api/v1/audit", headers=shown(guarded.all)).json()["items"]
+    newest = [(each["who"], each["action"], each["status"]) for each in listed[:2]]
+    assert newest == [("all", "what_if", 201), ("operate", "drop_zones", 200)]
+    assert json.loads(listed[0]["body"]) == {"record": True}
+    assert listed[1]["about"] == "/api/v1/zones?spacecraft=SWAS"
+    page = anybody.get("/api/v1/audit?limit=1", headers=shown(guarded.all))
+    following = re.match("<([^>]+)>", page.headers["Link"])[1]
+    again = anybody.get(following, headers=shown(guarded.all)).json()["items"]
+    assert again[0] == listed[1]
+
+
+def test_the_database_holds_nothing_that_could_be_used(guarded):
+    """Tokens and sessions alike are kept as digests."""
+    with guarded.operations.store.reading() as connection:
+        kept = "\n".join(
+            str(tuple(row))
+            for table in ("access_tokens", "access_sessions", "audit")
+            for row in connection.exec_driver_sql(f"SELECT * FROM {table}")
+        )
+    assert tokens.digest_of(guarded.all) in kept
+    assert tokens.PREFIX not in kept
+
+
+def test_access_is_open_on_loopback_until_the_first_token_is_made(tmp_path):
+    service = Guarded(tmp_path)
+    with Server(create_app(service.operations)) as url, httpx.Client(base_url=url) as client:
+        assert client.get("/api/v1/session").json()["name"] == "local"
+        service.token("first", "read")
+        time.sleep(KNOWN_AGAIN_S)
+        assert client.get("/api/v1/session").status_code == 401
+        service.revoke("first")
+        time.sleep(KNOWN_AGAIN_S)
+        # Revoking the last one opens nothing.
+        assert client.get("/api/v1/session").status_code == 401

@@ -1,0 +1,345 @@
+"""The console in a real browser, against the real server, with a replay at work."""
+
+import json
+import re
+import time
+from itertools import count
+from pathlib import Path
+
+import httpx
+import pytest
+
+from service.operations import Operations
+from service.settings import Settings
+from service.web.app import create_app
+from tests.web.browser import CHROMIUM, Browser
+from tests.web.serving import Server
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
+
+AXE = (Path(__file__).parent / "axe" / "axe.min.js").read_text(encoding="utf-8")
+SERIOUS = """axe.run(document, {resultTypes: ["violations"], runOnly: ["wcag2a", "wcag2aa",
+    "wcag21a", "wcag21aa", "best-practice"]}).then(found => found.violations
+    .filter(each => ["serious", "critical"].includes(each.impact))
+    .map(each => [each.id, each.nodes.map(node => node.html).slice(0, 3)]))"""
+CONNECTED = "document.getElementById('connection')?.dataset.state === 'live'"
+DRAWN = "document.getElementById('charts')?.dataset.drawn !== undefined"
+
+_numbers = count(1)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    with Browser(tmp_path_factory.mktemp("profile")) as browser:
+        yield browser
+
+
+@pytest.fixture(scope="module")
+def other_browser(tmp_path_factory):
+    with Browser(tmp_path_factory.mktemp("other")) as browser:
+        yield browser
+
+
+def text(browser, selector="main"):
+    return browser.run(f"document.querySelector({json.dumps(selector)})?.innerText ?? ''")
+
+
+def shows(browser, wanted, selector="main"):
+    browser.wait(lambda: wanted in text(browser, selector))
+
+
+@pytest.fixture(scope="module")
+def pages(client, full_run):
+    found = client.get("/api/v1/batches", params={"run": full_run, "spacecraft": "XTE"}).json()[
+        "items"
+    ]
+    names = ["/", "/alarms", "/batches", "/compare", "/runs", "/zones", "/missions", "/about"]
+    names += ["/spacecraft/XTE", "/spacecraft/XTE/limits", "/advice/XTE"]
+    return [
+        *(f"{name}?run={full_run}" for name in names),
+        "/?run=nobody",
+        f"/compare?run={full_run}&spacecraft=XTE&a.identifier=starid&b.identifier=verified",
+        "/batches/nothing",
+        f"/batches/{found[0]['id']}",
+        f"/batches/{found[0]['id']}?identifier=starid&tolerances.separation_deg=0.02",
+    ]
+
+
+def test_every_page_fits_can_be_read_and_has_no_serious_fault(browser, address, pages):
+    """Wide and narrow, light and dark: no complaint, nothing beyond the edge, axe content."""
+    for page in pages:
+        for width, dark in ((1440, False), (400, True)):
+            browser.open(f"{address}{page}", width=width, dark=dark)
+            if page.startswith("/spacecraft/XTE?"):
+                browser.wait(lambda: browser.run(DRAWN))
+            assert browser.run("document.documentElement.scrollWidth") <= width, page
+            browser.run(AXE + ";0")
+            assert browser.run(SERIOUS) == [], (page, width, dark)
+    missing = [each for each in browser.complaints if "404" not in each]
+    assert missing == []
+    browser.complaints.clear()
+
+
+def test_dark_and_light_follow_the_system_until_chosen(browser, address, full_run):
+    ground = "getComputedStyle(document.body).backgroundColor"
+    browser.open(f"{address}/?run={full_run}", dark=False)
+    light = browser.run(ground)
+    browser.open(f"{address}/?run={full_run}", dark=True)
+    dark = browser.run(ground)
+    assert light != dark
+    browser.run("document.getElementById('theme').click()")
+    assert browser.run(ground) == light
+    browser.open(f"{address}/about", dark=True)
+    assert browser.run(ground) == light
+    browser.run("localStorage.removeItem('theme')")
+
+
+def test_every_control_can_be_reached_by_keyboard_and_shows_it(browser, address, full_run):
+    browser.open(f"{address}/spacecraft/XTE?run={full_run}")
+    browser.wait(lambda: browser.run(DRAWN))
+    wanted = {"Skip to the content", "Batches", "run", "theme", "hour", "Zoom in", "by"}
+    reached = set()
+    for _ in range(40):
+        browser.press("Tab")
+        reached |= set(
+            browser.run(
+                "[document.activeElement.id, document.activeElement.textContent.trim(),"
+                "document.activeElement.dataset?.chart ?? '']"
+            )
+        )
+        assert browser.run(
+            "getComputedStyle(document.activeElement).outlineStyle !== 'none'"
+            "|| document.activeElement === document.body"
+        )
+    assert wanted <= reached
+    assert "stars" in reached
+
+
+def test_a_chart_zooms_and_pans_and_the_address_says_where(browser, address, full_run):
+    stretch = "start=1999-060T00:00:00Z&end=1999-060T00:20:00Z"
+    browser.open(f"{address}/spacecraft/XTE?run={full_run}&{stretch}")
+    browser.wait(lambda: browser.run(DRAWN))
+    bounds = "(({start, end}) => [start, end])(document.getElementById('stretch').dataset)"
+    before = browser.run(bounds)
+    browser.run("document.querySelector('[data-key=\"+\"]').click()")
+    browser.wait(lambda: browser.run(bounds) != before)
+    start, end = browser.run(bounds)
+    assert before[0] < start < end < before[1]
+    assert f"start={start.replace(':', '%3A')}" in browser.run("location.href")
+    browser.run("document.querySelector('[data-chart]').focus()")
+    browser.press("ArrowLeft")
+    browser.wait(lambda: browser.run(bounds)[0] < start)
+    browser.run("history.back()")
+    browser.wait(lambda: browser.run(bounds) == [start, end])
+    browser.drag("[data-chart=stars] .u-over", 0.25, 0.75)
+    browser.wait(lambda: browser.run(bounds)[0] > start)
+    assert browser.complaints == []
+
+
+def test_a_what_if_changes_what_becomes_of_an_ambiguous_star(browser, address, client, drawn):
+    """Votes leave it ambiguous, verified identification names it; adopted, that stands."""
+    run = f"try-{next(_numbers)}"
+    found = ambiguous_by_votes(client, drawn, run)
+    browser.open(f"{address}/batches/{found}")
+    assert "▲ ambiguous" in text(browser, ".votes")
+    before = text(browser, ".strip")
+    browser.run("document.getElementById('w-identifier').focus()")
+    browser.run(
+        "(field => { field.value = 'verified';"
+        "field.dispatchEvent(new Event('input', {bubbles: true})); })"
+        "(document.getElementById('w-identifier'))"
+    )
+    shows(browser, "What-if, not recorded")
+    assert "was ambiguous" in text(browser, ".votes")
+    assert text(browser, ".strip") != before
+    assert 'identifier = "verified"' in text(browser, "#toml")
+    assert browser.run("document.activeElement.id") == "w-identifier"
+    assert "identifier=verified" in browser.run("location.search")
+    browser.run("document.querySelector('[data-adopt]').click()")
+    browser.wait(lambda: found not in browser.run("location.pathname"))
+    shows(browser, "This is an adopted what-if")
+    assert "ambiguous" not in text(browser, ".votes")
+    assert client.get(f"/api/v1/batches/{found}").json()["current"] is False
+    browser.open(f"{address}/batches/{found}")
+    shows(browser, "Another result stands for this batch")
+    assert browser.complaints == []
+
+
+def ambiguous_by_votes(client, drawn, run):
+    """The id of a recorded batch in which votes tie for a star that verification names."""
+    for each in drawn("XTE", 40, seed=2):
+        asked = {"run": run, "options": {"identifier": "starid"}}
+        answer = client.post("/api/v1/batches", json=each | asked).json()
+        if not answer["counts"]["ambiguous"]:
+            continue
+        tried = client.post(
+            f"/api/v1/batches/{answer['id']}/what-if", json={"options": {"identifier": "verified"}}
+        ).json()
+        if tried["counts"]["ambiguous"] == 0 and tried["counts"]["unique"] > 2:
+            return answer["id"]
+    raise AssertionError("no such batch was drawn")
+
+
+def test_a_new_batch_appears_at_once_in_both_browsers(
+    browser, other_browser, address, client, batch
+):
+    """Live, by the event stream; and a batch page that is open stays the batch it is."""
+    run = f"two-{next(_numbers)}"
+    for each in (browser, other_browser):
+        each.open(f"{address}/?run={run}")
+        assert f"No batches in run {run}" in text(each)
+        each.wait(lambda each=each: each.run(CONNECTED))
+    client.post("/api/v1/batches", json=batch | {"run": run}).raise_for_status()
+    for each in (browser, other_browser):
+        shows(each, batch["batch"])
+    stripped = [re.sub(r"shown as of.*", "", text(each)) for each in (browser, other_browser)]
+    assert stripped[0] == stripped[1]
+    assert browser.complaints == other_browser.complaints == []
+
+
+def test_a_lost_connection_is_told_and_what_was_missed_is_caught_up(
+    browser, address, client, drawn, tmp_path
+):
+    """The server goes away and comes back with batches that nobody heard of."""
+    settings = Settings(database=f"sqlite:///{tmp_path}/acquire.db")
+    first, second, third = drawn("XTE", 3, seed=6)
+    with Server(create_app(Operations.open(settings))) as own:
+        port = int(own.rpartition(":")[2])
+        httpx.post(f"{own}/api/v1/batches", json=first, timeout=60).raise_for_status()
+        browser.open(f"{own}/")
+        browser.wait(lambda: browser.run(CONNECTED))
+        shows(browser, first["batch"])
+    browser.wait(lambda: "Connection lost since" in text(browser, "#connection"))
+    assert first["batch"] in text(browser)
+    with Server(create_app(Operations.open(settings)), port) as own:
+        for each in (second, third):
+            httpx.post(f"{own}/api/v1/batches", json=each, timeout=60).raise_for_status()
+        shows(browser, third["batch"])
+        browser.wait(lambda: browser.run(CONNECTED))
+    browser.open(f"{address}/about")
+    browser.complaints.clear()
+
+
+def test_dropped_in_the_middle_of_a_stream_of_batches_nothing_is_missed(
+    browser, address, client, drawn
+):
+    run = f"drop-{next(_numbers)}"
+    passed = drawn("XTE", 8, seed=9)
+    client.post("/api/v1/batches", json=passed[0] | {"run": run}).raise_for_status()
+    browser.open(f"{address}/batches?run={run}")
+    browser.wait(lambda: browser.run(CONNECTED))
+    for k, each in enumerate(passed[1:]):
+        if k == 2:
+            browser.call("Network.emulateNetworkConditions", **OFFLINE)
+        client.post("/api/v1/batches", json=each | {"run": run}).raise_for_status()
+    time.sleep(0.2)
+    browser.call("Network.emulateNetworkConditions", **OFFLINE | {"offline": False})
+    for each in passed:
+        shows(browser, each["batch"])
+    rows = browser.run("document.querySelectorAll('#list tbody tr').length")
+    assert rows == len(passed)
+    browser.complaints.clear()
+
+
+OFFLINE = {"offline": True, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+
+
+# ---- a shift: a replay that is watched -----------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def watched(client, drawn):
+    """A pass of XTE in which the a priori attitude goes wrong, replayed with alarms."""
+    run = "watched"
+    lines = "\n".join(json.dumps(each) for each in drawn("XTE", 160, seed=1))
+    answer = client.post(
+        "/api/v1/replays",
+        params={"run": run, "alarms": "true"},
+        content=lines,
+        headers={"Content-Type": "application/x-ndjson"},
+    )
+    assert answer.status_code == 202
+    return run, answer.headers["Location"]
+
+
+def test_a_shift_from_the_overview_to_the_star_and_the_alarm(browser, address, client, watched):
+    """A spike is followed down to the stars; the alarm it raised is acknowledged and cleared."""
+    run, replay = watched
+    browser.open(f"{address}/?run={run}")
+    browser.wait(lambda: client.get(replay).json()["state"] == "done", 60)
+    shows(browser, "critical", "#overview")
+    shows(browser, "1999-060-0160", "#overview")
+
+    click(browser, "#overview .spark-link[aria-label='XTE, trend of the last hour']")
+    browser.wait(lambda: "/spacecraft/XTE" in browser.run("location.href"))
+    browser.wait(lambda: browser.run(DRAWN))
+    said = browser.run("document.querySelector('[data-chart=stars]').getAttribute('aria-label')")
+    assert re.search(r"unmatched: greatest \d+ % at 1999-03-01 \(060\)", said)
+    click(browser, "#worst tbody a")
+    browser.wait(lambda: "/batches/" in browser.run("location.pathname"))
+    browser.wait(lambda: browser.run("document.readyState") == "complete")
+    assert browser.run("document.querySelectorAll('.sky-chart .seen').length") >= 3
+    assert browser.run("document.querySelectorAll('.sky-chart .seen:not(.unique)').length") >= 1
+
+    browser.open(f"{address}/alarms?run={run}")
+    rows = "[...document.querySelectorAll('#alarms tbody tr')].map(row => row.innerText)"
+    (raised,) = [each for each in browser.run(rows) if "a priori" in each]
+    assert "open" in raised
+    assert "back in limits" in raised
+    browser.run(
+        "[...document.querySelectorAll('#alarms tbody tr')]"
+        ".find(row => row.innerText.includes('a priori')).querySelector('a').click()"
+    )
+    browser.wait(lambda: "/alarms/" in browser.run("location.pathname"))
+    browser.wait(lambda: browser.run("!!document.getElementById('act-form')"))
+    browser.wait(lambda: browser.run(CONNECTED))
+    browser.run(
+        "(form => { form.elements.who.value = 'J. Operator';"
+        "form.elements.comment.value = 'slew at 00:30, as announced'; })"
+        "(document.getElementById('act-form'))"
+    )
+    click(browser, "[data-act=acknowledge]")
+    shows(browser, "acknowledged by J. Operator", "#alarm")
+    shows(browser, "slew at 00:30, as announced", "#alarm")
+    shows(browser, "cleared", "#alarm")
+    places = browser.run("[...document.querySelectorAll('#alarm a')].map(each => each.href)")
+    assert [httpx.get(place, timeout=60).status_code for place in places] == [200] * 3
+    browser.wait(lambda: browser.run("document.querySelector('[data-act=acknowledge]').disabled"))
+    for page in (browser.run("location.pathname"), f"/alarms?run={run}&state=all"):
+        browser.open(f"{address}{page}")
+        browser.run(AXE + ";0")
+        assert browser.run(SERIOUS) == []
+    assert browser.complaints == []
+
+
+def test_a_limit_is_changed_on_its_page_and_kept_with_who_and_why(browser, address, client):
+    browser.open(f"{address}/spacecraft/SWAS/limits")
+    browser.wait(lambda: browser.run(CONNECTED))
+    browser.run(
+        "(form => { form.elements.who.value = 'J. Operator';"
+        "form.elements.comment.value = 'crowded field'; })(document.getElementById('signed'))"
+    )
+    form = "document.querySelector('[data-limit=ambiguous_share]')"
+    browser.run(f"{form}.elements['watch.high'].value = '0.2'")
+    browser.run(f"{form}.requestSubmit()")
+    shows(browser, "by J. Operator", "#ambiguous_share")
+    shows(browser, "crowded field", "#ambiguous_share")
+    limit = client.get("/api/v1/spacecraft/SWAS/limits/ambiguous_share").json()["limit"]
+    assert limit["settings"]["watch"]["high"] == 0.2
+    browser.run(f"{form}.elements['watch.high'].value = '0.9'")
+    browser.run(f"{form}.requestSubmit()")
+    shows(browser, "Not done", "#told")
+    click(browser, "#ambiguous_share [data-default]")
+    shows(browser, "as shipped", "#ambiguous_share")
+    assert client.get("/api/v1/spacecraft/SWAS/limits/ambiguous_share").json()["limit"][
+        "is_default"
+    ]
+    browser.complaints.clear()
+
+
+def click(browser, selector):
+    browser.wait(lambda: browser.run(f"!!document.querySelector({json.dumps(selector)})"))
+    browser.run(
+        f"(e => e.tagName === 'BUTTON' || e.tagName === 'A' ? e.click() : 0)"
+        f"(document.querySelector({json.dumps(selector)}))"
+    )

@@ -1,0 +1,141 @@
+"""A server that is killed again and again under load keeps every batch it acknowledged, once."""
+
+import hashlib
+import json
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from itertools import count
+
+import httpx
+import pytest
+from sqlalchemy import select
+
+from service.operations import Operations
+from service.records.tables import batches
+from service.settings import Settings
+from tests.records import samples
+from tests.records.whole import assert_whole
+from tests.scale import size
+
+KILLS = 500
+ACKNOWLEDGED_A_ROUND = 2_000
+"""At full size: a million in all."""
+CLIENTS = 8
+
+
+class Load:
+    """Clients that send batch after batch, and each again until it is acknowledged."""
+
+    def __init__(self, url, template, names):
+        self.acknowledged = {}
+        self._url, self._template, self._names = url, template, names
+        self._again = deque()
+        self._stopping = threading.Event()
+        self._faults = []
+        self._threads = [threading.Thread(target=self._send) for _ in range(CLIENTS)]
+        for thread in self._threads:
+            thread.start()
+
+    def stop(self):
+        self._stopping.set()
+        for thread in self._threads:
+            thread.join()
+        assert not self._faults, self._faults[0]
+
+    def _next(self):
+        try:
+            return self._again.popleft()
+        except IndexError:
+            return None if self._stopping.is_set() else next(self._names)
+
+    def _send(self):
+        with httpx.Client(base_url=self._url, timeout=30) as client:
+            while (name := self._next()) is not None:
+                body = self._template.replace("NAME", name)
+                headers = {"Content-Type": "application/json", "Idempotency-Key": name}
+                try:
+                    answer = client.post("/api/v1/batches", content=body, headers=headers)
+                except httpx.TransportError:
+                    self._again.append(name)
+                    time.sleep(0.02)
+                    continue
+                if answer.status_code == 503:
+                    self._again.append(name)
+                    time.sleep(0.1)
+                elif answer.status_code in (200, 201):
+                    digest = hashlib.sha256(answer.content).hexdigest()
+                    self.acknowledged[name] = (answer.json()["id"], digest)
+                else:
+                    self._faults.append(answer.text)
+                    return
+
+
+class Locked:
+    """An iterator that several threads may draw from."""
+
+    def __init__(self, inner):
+        self._inner, self._lock = inner, threading.Lock()
+
+    def __next__(self):
+        with self._lock:
+            return next(self._inner)
+
+
+@pytest.mark.torture
+def test_a_server_killed_under_load_loses_tears_and_doubles_nothing(tmp_path, sky, missions, rng):
+    kills = size(KILLS)
+    a_round = size(ACKNOWLEDGED_A_ROUND)
+    database = f"sqlite:///{tmp_path / 'acquire.db'}"
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    url = f"http://127.0.0.1:{port}"
+    command = [sys.executable, "-m", "service.cli", "serve", "--port", str(port)]
+    template = samples.batch(sky, missions, "NAME")
+    assert json.loads(template)["batch"] == "NAME"
+
+    def serve():
+        server = subprocess.Popen(
+            [*command, "--database", database], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        while True:
+            assert server.poll() is None, "the server ended by itself"
+            try:
+                if httpx.get(f"{url}/livez").status_code == 200:
+                    return server
+            except httpx.TransportError:
+                time.sleep(0.02)
+
+    server = serve()
+    load = Load(url, template, Locked(f"batch-{number}" for number in count()))
+    try:
+        for _ in range(kills):
+            wanted = len(load.acknowledged) + a_round
+            give_up = time.monotonic() + 120
+            while len(load.acknowledged) < wanted and time.monotonic() < give_up:
+                time.sleep(0.005)
+            time.sleep(float(rng.uniform(0, 0.05)))
+            server.send_signal(signal.SIGKILL)
+            server.wait()
+            server = serve()
+        load.stop()
+    finally:
+        load._stopping.set()
+        server.terminate()
+        server.wait()
+
+    assert len(load.acknowledged) >= kills * a_round
+    operations = Operations.open(Settings(database=database))
+    try:
+        assert_whole(operations, dict(load.acknowledged.values()))
+        with operations.store.reading() as connection:
+            held = dict(connection.execute(select(batches.c.batch, batches.c.id)).all())
+        # Nothing is left waiting at the end: what is there is what was acknowledged, one for one.
+        assert held == {name: id for name, (id, _) in load.acknowledged.items()}
+    finally:
+        operations.close()
