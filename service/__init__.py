@@ -16,8 +16,8 @@ def _keep_kernels_apart() -> None:
     """
     package = Path(__file__).parent
     state = hashlib.sha256()
-    for room in ("attitude", "identify", "sky"):
-        for path in sorted((package / room).glob("*.py")):
+    for room in ("attitude", "identify", "sky", "simulate/ptp/rivals"):
+        for path in sorted((package / room).rglob("*.py")):
             state.update(path.name.encode() + path.read_bytes())
     folder = package / "__pycache__"
     if not os.access(folder if folder.exists() else package, os.W_OK):

@@ -8,7 +8,7 @@ finding a star is a result; only bad input raises.
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from enum import StrEnum
 from time import perf_counter_ns as clock_ns
 
 import numpy as np
@@ -16,15 +16,19 @@ import numpy as np
 from service import __version__
 from service.attitude.solution import AttitudeSolution, NoAttitude
 from service.attitude.solve import solve_attitude
-from service.identify.identification import Identification, Outcome
+from service.identify.identification import Identification, Outcome, nothing_known
+from service.identify.lost_in_space.finder import find_attitude
+from service.identify.lost_in_space.solver import FEWEST_POINTS
 from service.identify.matched import matched_vectors
 from service.identify.presumed import Presumed, aim_of, presumed_attitude
+from service.identify.ptp import identify_ptp
 from service.identify.starid import Sighting, identify_by_votes
 from service.identify.verify import identify_verified
 from service.missions.mission import Band, Identifier, Mission, Solver, Tests, Tolerances
 from service.observe.batch import (
     BoresightPrior,
     ObservationBatch,
+    QuaternionPrior,
 )
 from service.observe.correct import CorrectedObservations, correct
 from service.sky.ephemeris import observer_velocity, sun_distance_au
@@ -36,13 +40,19 @@ from service.vectors import (
     Matrix,
     Vector,
     matrix_from_quaternion,
+    quaternion_from_matrix,
     separation_deg,
 )
 
 IDENTIFIERS: Mapping[Identifier, Callable[[Sighting], Identification]] = {
     "starid": identify_by_votes,
     "verified": identify_verified,
+    "ptp": identify_ptp,
+    # About the attitude that was found in the whole sky.
+    "lost_in_space": identify_verified,
 }
+WITHOUT_PRIOR: frozenset[Identifier] = frozenset({"ptp"})
+"""Identifiers that look in the whole sky, and are given its guide database."""
 
 
 @dataclass(frozen=True)
@@ -61,18 +71,29 @@ class TrackerResult:
     """One tracker's part: where its stars were looked for, and what was found.
 
     `stars` and `pairs` are those within the aim, the paper's NCAP and NTOT;
-    `zone`, from the shelf, may hold more.  `residual_arcsec` is NaN for stars
-    that are not unique and where there is no attitude.
+    `zone`, from the shelf, may hold more.  Aim and zone are None where the
+    whole sky gave no attitude to look about.  `residual_arcsec` is NaN for
+    stars that are not unique and where there is no attitude.
     """
 
     corrected: CorrectedObservations
-    aim: Aim
-    zone: Zone
+    aim: Aim | None
+    zone: Zone | None
     zone_cached: bool
     stars: int
     pairs: int
     identification: Identification
     residual_arcsec: Vector
+
+
+class Path(StrEnum):
+    """Which way an answer came."""
+
+    ZONE = "zone"
+    LOST_IN_SPACE = "lost_in_space"
+    """No a priori attitude was given, or it was not to be used."""
+    ZONE_THEN_LOST_IN_SPACE = "zone_then_lost_in_space"
+    """About the a priori attitude nothing good was found, and the whole sky was looked at."""
 
 
 @dataclass(frozen=True)
@@ -91,11 +112,14 @@ class Acquisition:
     """Everything that came of one batch.
 
     `solution` is None where `reason` says why; never an older attitude.
+    `presumed` is what the batch's a priori knowledge says, None without any.
     """
 
     batch: ObservationBatch
     mission: Mission
     choices: Choices
+    presumed: Presumed | None
+    path: Path
     run_catalog: RunCatalog
     trackers: tuple[TrackerResult, ...]
     solution: AttitudeSolution | None
@@ -114,57 +138,107 @@ class Acquisition:
         return counts
 
 
+@dataclass(frozen=True)
+class _Look:
+    """What came of looking about one presumed attitude."""
+
+    presumed: Presumed
+    places: list[tuple[Aim, Zone, bool]]
+    identifications: list[Identification]
+    solved: AttitudeSolution | NoAttitude
+
+    @property
+    def good(self) -> bool:
+        """Whether there is an attitude that its own residuals do not speak against."""
+        return isinstance(self.solved, AttitudeSolution) and not self.solved.suspect
+
+
+class _Clock:
+    """Time spent in each step, also where a step is taken again."""
+
+    def __init__(self) -> None:
+        self.ns = dict.fromkeys(("zone", "identify", "solve"), 0)
+        self._last = clock_ns()
+
+    def end(self, step: str) -> None:
+        """Count the time since the last call to a step."""
+        now = clock_ns()
+        self.ns[step] += now - self._last
+        self._last = now
+
+
 def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
     """Identify a batch's stars and solve for the attitude.
 
-    Raises `BadInput` for what does not fit the mission: a tracker it has not,
-    a kind of a priori knowledge that its zone cannot use.
+    Without a priori knowledge, or where it leads to nothing good, the whole sky
+    gives the attitude to look about.  Raises `BadInput` for what does not fit
+    the mission: a tracker it has not, a kind of a priori knowledge that its
+    zone cannot use.
     """
     choices = choices_of(batch, mission)
     corrected = correct(batch, mission)
-    presumed = presumed_attitude(batch.a_priori, batch.time, mission, batch.position_km)
-    # At rest, directions stay geometric.
-    velocity_c = np.zeros(3)
-    if batch.aberration == "to_correct":
-        velocity_c = observer_velocity(batch.time, batch.velocity_km_per_s)
-    seen = [_seen(each, presumed, velocity_c) for each in corrected]
+    given = batch.a_priori
+    presumed = (
+        None if given is None else presumed_attitude(given, batch.time, mission, batch.position_km)
+    )
+    velocity_c = velocity_to_correct(batch)
     sun_au = sun_distance_au(batch.time)
 
-    clock = [clock_ns()]
+    clock = _Clock()
     run_catalog = sky.run_catalog(mission, batch.time)
-    places = [
-        _place(each, index, presumed, mission, choices, run_catalog, sky)
-        for index, each in enumerate(corrected)
-    ]
-    sightings = [
-        Sighting(*each, aim, zone, choices.tolerances, choices.tests)
-        for each, (aim, zone, _) in zip(seen, places, strict=True)
-    ]
-    clock.append(clock_ns())
-    identify = IDENTIFIERS[choices.identifier]
-    identifications = [identify(sighting) for sighting in sightings]
-    clock.append(clock_ns())
-    solved = _solve(choices, corrected, sightings, identifications, run_catalog, sun_au)
-    clock.append(clock_ns())
 
+    def look(about: Presumed) -> _Look:
+        return _look(batch, mission, choices, corrected, about, velocity_c, sun_au, sky, clock)
+
+    path = Path.LOST_IN_SPACE
+    looked = refusal = None
+    warnings: list[str] = []
+    if presumed is not None and choices.identifier != "lost_in_space":
+        path, looked = Path.ZONE, look(presumed)
+        warnings += presumed.warnings
+        if _falls_back(looked, choices, mission, corrected):
+            path = Path.ZONE_THEN_LOST_IN_SPACE
+    if path is not Path.ZONE:
+        found = find_attitude(corrected, velocity_c, run_catalog, mission, sky)
+        clock.end("identify")
+        refusal = found.refusal
+        if found.attitude is not None:
+            quaternion = QuaternionPrior(quaternion_from_matrix(found.attitude))
+            again = look(presumed_attitude(quaternion, batch.time, mission, batch.position_km))
+            # What the zone gave stands unless the whole sky gives better.
+            if looked is None or again.good:
+                looked = again
+                warnings = list(again.presumed.warnings)
+        elif looked is not None:
+            warnings.append(f"lost_in_space_refused: {refusal}")
+        if found.bounded:
+            warnings.append("work_bound_hit: the search in the whole sky ended at its bound")
+
+    solved = looked.solved if looked is not None else refusal
     solution = solved if isinstance(solved, AttitudeSolution) else None
-    trackers = tuple(
-        TrackerResult(each, aim, zone, cached, *counts_within(zone, aim), identification, residual)
-        for each, (aim, zone, cached), identification, residual in zip(
-            corrected, places, identifications, _residuals(identifications, solution), strict=True
-        )
-    )
-    steps = (round((end - start) / 1000) for start, end in pairwise(clock))
+    trackers = _tracker_results(corrected, looked, solution)
     return Acquisition(
         batch=batch,
         mission=mission,
         choices=choices,
+        presumed=presumed,
+        path=path,
         run_catalog=run_catalog,
         trackers=trackers,
         solution=solution,
         reason=solved if isinstance(solved, NoAttitude) else None,
-        warnings=(*presumed.warnings, *_warnings(batch, mission, trackers, presumed, solution)),
-        timings_us=dict(zip(("zone", "identify", "solve"), steps, strict=True)),
+        warnings=(
+            *warnings,
+            *_warnings(
+                batch,
+                mission,
+                trackers,
+                presumed,
+                looked.presumed if looked is not None else None,
+                solution,
+            ),
+        ),
+        timings_us={step: round(ns / 1000) for step, ns in clock.ns.items()},
         provenance=Provenance(
             sky.catalog.digest,
             run_catalog.digest,
@@ -173,6 +247,96 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
             __version__,
         ),
     )
+
+
+def _look(
+    batch: ObservationBatch,
+    mission: Mission,
+    choices: Choices,
+    corrected: Sequence[CorrectedObservations],
+    presumed: Presumed,
+    velocity_c: Vector,
+    sun_au: float,
+    sky: Sky,
+    clock: _Clock,
+) -> _Look:
+    """Zones about a presumed attitude, identities, and the attitude that they give."""
+    run_catalog = sky.run_catalog(mission, batch.time)
+    seen = [_seen(each, presumed, velocity_c) for each in corrected]
+    places = [
+        _place(each, index, presumed, mission, choices, run_catalog, sky)
+        for index, each in enumerate(corrected)
+    ]
+    sightings = [
+        Sighting(
+            *each,
+            aim,
+            zone,
+            choices.tolerances,
+            choices.tests,
+            sky.guide(run_catalog, observed.tracker.field_of_view_radius_deg)
+            if choices.identifier in WITHOUT_PRIOR
+            else None,
+        )
+        for each, observed, (aim, zone, _) in zip(seen, corrected, places, strict=True)
+    ]
+    clock.end("zone")
+    identify = IDENTIFIERS[choices.identifier]
+    identifications = [identify(sighting) for sighting in sightings]
+    clock.end("identify")
+    solved = _solve(choices, corrected, sightings, identifications, run_catalog, sun_au)
+    clock.end("solve")
+    return _Look(presumed, places, identifications, solved)
+
+
+def _falls_back(
+    looked: _Look,
+    choices: Choices,
+    mission: Mission,
+    corrected: Sequence[CorrectedObservations],
+) -> bool:
+    """Whether an answer about the a priori attitude is so poor that the whole sky is asked."""
+    return (
+        not looked.good
+        and choices.identifier == "verified"
+        and mission.lost_in_space_fallback
+        and any(len(each.magnitude_mag) >= FEWEST_POINTS for each in corrected)
+    )
+
+
+def _tracker_results(
+    corrected: Sequence[CorrectedObservations],
+    looked: _Look | None,
+    solution: AttitudeSolution | None,
+) -> tuple[TrackerResult, ...]:
+    """The parts of the answer, every star unmatched where there was nowhere to look."""
+    if looked is None:
+        return tuple(
+            TrackerResult(each, None, None, False, 0, 0, nothing_known(n), np.full(n, np.nan))
+            for each, n in zip(
+                corrected, [len(each.magnitude_mag) for each in corrected], strict=True
+            )
+        )
+    return tuple(
+        TrackerResult(each, aim, zone, cached, *counts_within(zone, aim), identification, residual)
+        for each, (aim, zone, cached), identification, residual in zip(
+            corrected,
+            looked.places,
+            looked.identifications,
+            _residuals(looked.identifications, solution),
+            strict=True,
+        )
+    )
+
+
+def velocity_to_correct(batch: ObservationBatch) -> Vector:
+    """The velocity (3,), in units of c, whose aberration the catalog is given for a batch.
+
+    At rest, where nothing is to be corrected, directions stay geometric.
+    """
+    if batch.aberration != "to_correct":
+        return np.zeros(3)
+    return observer_velocity(batch.time, batch.velocity_km_per_s)
 
 
 def choices_of(batch: ObservationBatch, mission: Mission) -> Choices:
@@ -286,7 +450,8 @@ def _warnings(
     batch: ObservationBatch,
     mission: Mission,
     trackers: tuple[TrackerResult, ...],
-    presumed: Presumed,
+    presumed: Presumed | None,
+    looked_about: Presumed | None,
     solution: AttitudeSolution | None,
 ) -> list[str]:
     warnings = [
@@ -299,15 +464,19 @@ def _warnings(
             "velocity_of_earth_alone: no velocity_km_per_s was given; "
             "aberration was corrected for Earth's motion only"
         )
+    if looked_about is None:
+        return warnings
     attitude = (
-        presumed.attitude if solution is None else matrix_from_quaternion(solution.quaternion)
+        looked_about.attitude if solution is None else matrix_from_quaternion(solution.quaternion)
     )
     if solution is not None:
         warnings += _doubts(solution, attitude, mission, presumed)
     for each in trackers:
         tracker = each.corrected.tracker
         boresight = attitude.T @ tracker.body_from_tracker[:, 2]
-        if each.aim.reaches_past(boresight, tracker.field_of_view_radius_deg):
+        if each.aim is not None and each.aim.reaches_past(
+            boresight, tracker.field_of_view_radius_deg
+        ):
             warnings.append(
                 f"field_of_view_past_zone_edge: the field of view of {tracker.name} reaches past "
                 "the edge of its zone; stars beyond it cannot be identified"
@@ -323,7 +492,7 @@ def _warnings(
 
 
 def _doubts(
-    solution: AttitudeSolution, attitude: Matrix, mission: Mission, presumed: Presumed
+    solution: AttitudeSolution, attitude: Matrix, mission: Mission, presumed: Presumed | None
 ) -> list[str]:
     """What speaks against an attitude: its own residuals, and the a priori knowledge."""
     doubts = []
@@ -333,6 +502,8 @@ def _doubts(
             f"where {solution.predicted_rms_arcsec:.1f} are expected: a star is misidentified "
             "or noisier than its sigma"
         )
+    if presumed is None:
+        return doubts
     zone = mission.zone
     allowed_deg = zone.half_width_deg if isinstance(zone, Band) else zone.radius_deg
     axis = mission.axis_body

@@ -73,7 +73,13 @@ def run_demo(folder: Path, settings: Settings, batches: int, seed: int, once: bo
         for name, file in zip(MISSIONS, files, strict=True):
             results = file.with_name(f"{file.stem}.results.ndjson")
             with Tally([file], results, title=f"{name:<4}") as tally:
-                replay_over_http(url, items_of([file], run), tally.add, concurrency=CONCURRENCY)
+                replay_over_http(
+                    url,
+                    items_of([file], run),
+                    tally.add,
+                    concurrency=CONCURRENCY,
+                    watched_run=run,
+                )
             scores[name] = score(read_objects(results), read_objects(truth_path(file)))
         print(table(scores))
         print()
@@ -104,10 +110,13 @@ def _where_next(
     page = f"{url}/?run={run}"
     if once:
         # Nothing serves any more: an address alone would lead nowhere.
-        yield serve, "serve these records; the page of this run is then"
-        yield f"  {page}", "  ambiguous and unmatched stars over time"
+        yield serve, "serve these records; the console of this run is then"
+        yield f"  {page}", "  every spacecraft, its trends, each batch down to its stars"
     else:
-        yield page, "the page of this run: ambiguous and unmatched stars over time"
+        yield (
+            page,
+            "the console of this run: every spacecraft, its trends, each batch down to its stars",
+        )
         yield (
             f"curl -s '{url}/api/v1/batches?spacecraft=XTE&run={run}&limit=1'",
             "the latest batch of XTE as the API gives it",

@@ -6,8 +6,12 @@
     │   └── BadFile           a telemetry or catalog file: names line and column
     ├── Conflict              another body under a batch id that is taken
     ├── KeyReused             another body under an Idempotency-Key that is taken
+    ├── NotNow                an alarm is acknowledged or cleared already
     ├── NotFound              no such spacecraft, batch, zone, run or replay
     ├── NotAvailable          asked for something that is not there yet
+    ├── NotAdmitted           nobody is known by this token: absent, unknown, expired, revoked
+    ├── NotAllowed            known, but this is not theirs: a scope, another spacecraft
+    ├── TooOften              more requests than the token's rate allows
     ├── BadConfiguration      a mission file, a setting: names file, key and allowed values
     └── Busy                  the writer's queue is full, or the database cannot be reached now
         └── Stopping          the service is stopping: here, later will not succeed
@@ -68,12 +72,32 @@ class KeyReused(AcquisitionError):
     """Another body under an Idempotency-Key that is already taken."""
 
 
+class NotNow(AcquisitionError):
+    """What was asked does not fit the state that the thing is in."""
+
+
 class NotFound(AcquisitionError):
     """No such thing: names what was asked for and, where the list is short, what there is."""
 
 
 class NotAvailable(BadInput):
     """Something the interface names that this version does not do yet."""
+
+
+class NotAdmitted(AcquisitionError):
+    """No token, or one that nobody is known by; which of these is not told."""
+
+
+class NotAllowed(AcquisitionError):
+    """The token is good, but its scopes or its spacecraft do not cover what was asked."""
+
+
+class TooOften(AcquisitionError):
+    """More requests than a token's rate allows; trying again later will succeed."""
+
+    def __init__(self, message: str, retry_after_s: int = 1) -> None:
+        super().__init__(message)
+        self.retry_after_s = retry_after_s
 
 
 class BadConfiguration(AcquisitionError):

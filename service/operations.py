@@ -1,10 +1,23 @@
 """The one object that every door holds: web, replay, simulator and scripts go through it."""
 
+import hashlib
+import json
+import math
 import threading
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from typing import IO
 
 from pydantic import TypeAdapter, ValidationError
 
+from service import __version__
+from service.acquire import Choices, choices_of
+from service.advice.advice import Pace, advise
+from service.advice.report import as_row
+from service.alarms import latch
+from service.alarms.limits import LimitSettings
+from service.alarms.quantities import TRENDS, QuantityName
 from service.errors import (
     AcquisitionError,
     BadBatch,
@@ -14,32 +27,79 @@ from service.errors import (
     Stopping,
     shown_value,
 )
+from service.imaging.files import digest_of
+from service.imaging.marks import marks_of
+from service.imaging.overlay import draw_overlay
+from service.imaging.submit import FrameIn, submission_of_frame
 from service.missions.mission import Mission, load_missions, mission_named
-from service.observe.wire import APrioriIn, OptionsIn, RunName, Submission, prior_of
-from service.records import histories, reading, rollups
+from service.observe.wire import (
+    APrioriIn,
+    OptionsIn,
+    RunName,
+    Submission,
+    TolerancesIn,
+    prior_of,
+    submission_from_json,
+)
+from service.records import (
+    again,
+    alarms,
+    audit,
+    events,
+    histories,
+    limits,
+    overview,
+    reading,
+    rollups,
+    trends,
+)
+from service.records.access import Access
+from service.records.ahead import LIVE
+from service.records.comparing import Pair, compare
+from service.records.comparison import compare_runs
 from service.records.draft import Answered, Row
+from service.records.events import Event
 from service.records.ids import Ulids, is_ulid
-from service.records.intake import Intake, Observer, mission_in_input, now
+from service.records.intake import Intake, Observer, mission_in_input
+from service.records.looking import neighbours, recorded_batch, recorded_mission
 from service.records.pages import Page, Stretch
 from service.records.reading import OutcomeName, Status
-from service.records.recording import register
-from service.records.replays import Replay, mark_interrupted, read_replay
+from service.records.recording import register, watch_run
+from service.records.replays import Replay, list_replays, mark_interrupted, read_replay
+from service.records.reprocess import Plan, Progress, reprocess
+from service.records.star_field import star_field_of
 from service.records.store import Store
-from service.settings import Settings
+from service.records.watching import is_due, shelf_end, sweep
+from service.records.worst import worst_batches
+from service.settings import Settings, is_loopback
 from service.sky.catalog import open_catalog
 from service.sky.run_catalog import RunCatalog
 from service.sky.shelf import Shelf
 from service.sky.view import Sky
 from service.sky.zones import Zone
-from service.times import Utc
+from service.times import Utc, utc_now
 from service.warm import warm_up, warm_zones
 
 __all__ = ["LIVE", "Answered", "Operations", "Page"]
 
-LIVE = "live"
+ALL_RUNS = "*"
 MAX_REPLAYS = 8
 """Each keeps a thread and a file of its own; those that come later may come again."""
 REPLAY_RETRY_S = 30
+
+ADVICE_SAMPLE = 200
+"""Batches enough to tell a sigma to some five percent, and run again in seconds."""
+CREDITS = (
+    "Hipparcos and Tycho-2 catalogs: ESA 1997, ESA/ESTEC; Hog et al. 2000",
+    "Method: D. Fink and D. Shoup, Goddard Space Flight Center, 1994",
+    "Earth orientation, aberration and time: ERFA, derived from the IAU SOFA software",
+)
+COMPARE_SAMPLE, COMPARE_RETRY_S = 100, 10
+ADVICE_RETRY_S = 10
+NO_TOLERANCES = TolerancesIn()
+MAX_FRAMES_AT_WORK = 2
+"""A frame at work takes some twenty bytes a pixel."""
+FRAME_WAIT_S, FRAME_RETRY_S = 30.0, 5
 
 _RUN_NAME = TypeAdapter(RunName)
 
@@ -58,21 +118,29 @@ class Operations:
         self.missions = missions
         self.sky = sky
         self.store = store
+        self.access = Access(store, is_loopback(settings.host), utc_now)
         self._intake = Intake(missions, sky, store)
         self._ids = Ulids()
         self._replays: list[Replay] = []
         self._replays_lock = threading.Lock()
         self._closing = False
+        self._frame_desks = threading.BoundedSemaphore(MAX_FRAMES_AT_WORK)
         self._warming = threading.Lock()
         self._warm = False
+        self.started = utc_now()
+        self._comparing = threading.Lock()
+        self._advising = threading.Lock()
 
     @classmethod
-    def open(cls, settings: Settings) -> "Operations":
+    def open(cls, settings: Settings, mission: Mission | None = None) -> "Operations":
         """Read missions and catalog, open the database, start writing.
 
+        `mission`, where given, takes the place of the one of that name.
         Raises `BadConfiguration` for whatever of these cannot be used.
         """
         missions = load_missions(settings.missions)
+        if mission is not None:
+            missions[mission.name] = mission
         sky = Sky(open_catalog(settings.catalog), Shelf(settings.shelf_mb << 20))
         operations = cls(settings, missions, sky, Store(settings.database))
         try:
@@ -83,7 +151,7 @@ class Operations:
         return operations
 
     def _register(self) -> None:
-        moment = now().text
+        moment = utc_now().text
         mission_rows = [
             {
                 "digest": mission.digest,
@@ -147,6 +215,55 @@ class Operations:
         """`submit` of each in one transaction; an error stands in the place of what is refused."""
         return self._intake.submit_many(submissions)
 
+    def submit_frame(
+        self,
+        spacecraft: str,
+        known: FrameIn,
+        file: IO[bytes],
+        idempotency_key: str | None = None,
+    ) -> Answered:
+        """Find the stars on a frame, then `submit` the batch of them; see `imaging.submit`.
+
+        The same frame, told the same of, is a repeat and is not looked at again.
+        Raises `NotFound` for an unknown spacecraft, `BadInput` for a file that is no
+        frame of its tracker's, and whatever `submit` raises.
+        """
+        mission = mission_named(self.missions, spacecraft)
+        digest = digest_of(file)
+
+        def make() -> Submission:
+            if not self._frame_desks.acquire(timeout=FRAME_WAIT_S):
+                raise Busy("other frames are being worked on", FRAME_RETRY_S)
+            try:
+                max_pixels = self.settings.frame_megapixels * 1_000_000
+                return submission_of_frame(file, digest, known, mission, max_pixels)
+            finally:
+                self._frame_desks.release()
+
+        return self._intake.submit_made(
+            (mission.name, known.run, known.batch_of(digest)),
+            known.fingerprint(mission.name, digest),
+            make,
+            idempotency_key,
+        )
+
+    def overlay(self, id: str) -> bytes:
+        """A PNG of the frame that a result was made of, with what was made of it."""
+        with self.store.reading() as connection:
+            row = reading.frame_behind(connection, _known(id, "batch"))
+        # As it was for that result, whatever its file says now.
+        mission = Mission.model_validate_json(row["settings"])
+        answer, batch = json.loads(row["answer"]), submission_from_json(row["input"]).batch
+        tracker, camera = mission.camera_tracker(batch.observations[0].tracker, "tracker")
+        run_catalog = None
+        if row["catalog_digest"] == self.sky.catalog.digest:
+            run_catalog = self.sky.run_catalog(mission, batch.time)
+        detections = json.loads(row["detections"])
+        marks = marks_of(answer, batch, tracker, camera, detections, run_catalog)
+        state = answer["attitude"]["status"] if answer["attitude"] else answer["reason"]
+        title = f"{mission.name} {tracker.name}  {batch.batch}  {batch.time.text}  {state}"
+        return draw_overlay(row["preview"], row["preview_step"], marks, title)
+
     def what_if(
         self, id: str, options: OptionsIn, record: bool = False, adopt: bool = False
     ) -> Answered:
@@ -162,6 +279,29 @@ class Operations:
         with self.store.reading() as connection:
             return reading.whole_record(connection, _known(id, "batch"))
 
+    def neighbours(self, id: str) -> Row:
+        """The results before and after one in time: `earlier` and `later`, or None."""
+        with self.store.reading() as connection:
+            return neighbours(connection, _known(id, "batch"))
+
+    def star_field(self, id: str, answer: Row | None = None) -> Row:
+        """What a picture of a result's stars is drawn from; see `star_field.star_field_of`.
+
+        An `answer` in place of the recorded one, such as that of a what-if, is
+        drawn over the same batch.
+        """
+        with self.store.reading() as connection:
+            batch, recorded = recorded_batch(connection, _known(id, "batch"))
+            answer = answer or recorded
+            mission = recorded_mission(connection, answer["provenance"]["mission"])
+        return star_field_of(batch, mission, self.sky, answer)
+
+    def settings_for(self, id: str) -> Choices:
+        """The settings that a what-if of a result begins from."""
+        with self.store.reading() as connection:
+            batch, _ = recorded_batch(connection, _known(id, "batch"))
+        return choices_of(batch, mission_named(self.missions, batch.spacecraft))
+
     def batches(
         self,
         *,
@@ -176,9 +316,10 @@ class Operations:
     ) -> Page:
         """Current results, newest batch time first; see `reading.list_batches`.
 
+        The run `*` stands for every run, live batches included.
         Raises `BadBatch` for a spacecraft that has neither batches nor a mission.
         """
-        stretch = Stretch(run or LIVE, spacecraft, start, end)
+        stretch = Stretch(None if run == ALL_RUNS else run or LIVE, spacecraft, start, end)
         with self.store.reading() as connection:
             page = reading.list_batches(
                 connection, stretch, outcome=outcome, status=status, limit=limit, cursor=cursor
@@ -188,22 +329,67 @@ class Operations:
             mission_in_input(self.missions, spacecraft)
         return page
 
+    def spacecraft_of(self, id: str) -> str | None:
+        """The spacecraft that a recorded result belongs to; None where there is no such result."""
+        if not is_ulid(id):
+            return None
+        with self.store.reading() as connection:
+            return reading.spacecraft_of(connection, id)
+
+    # ---- access ------------------------------------------------------------------------------
+
+    def audit(self, limit: int = 100, cursor: str | None = None) -> Page:
+        """Who changed what, newest first."""
+        with self.store.reading() as connection:
+            return audit.list_entries(connection, limit, cursor)
+
     # ---- spacecraft --------------------------------------------------------------------------
 
-    def spacecraft(self) -> list[Row]:
-        """Every spacecraft that has a mission file, with its live state."""
+    def overview(self, run: str | None = None) -> Row:
+        """Every spacecraft in a run at a glance; see `overview.overview`."""
+        with self.store.reading() as connection:
+            missions = self.missions.values()
+            return overview.overview(connection, missions, run or LIVE, utc_now())
+
+    def about(self) -> Row:
+        """What answers: version, catalog, missions, kind of database."""
+        catalog = self.sky.catalog
+        return {
+            "version": __version__,
+            "started": self.started.text,
+            "database": self.store.url.get_backend_name(),
+            "catalog": {
+                "digest": catalog.digest,
+                "name": catalog.name,
+                "stars": len(catalog.magnitude_v_mag),
+            },
+            "missions": [
+                {"name": each.name, "description": each.description, "digest": each.digest}
+                for each in self.missions.values()
+            ],
+            "credits": list(CREDITS),
+        }
+
+    def default_run(self) -> str:
+        """The run to look at first: live, or while that is empty the newest."""
+        with self.store.reading() as connection:
+            return overview.default_run(connection)
+
+    def spacecraft(self, run: str | None = None) -> list[Row]:
+        """Every spacecraft that has a mission file, with its state in a run."""
+        moment = utc_now()
         with self.store.reading() as connection:
             return [
-                histories.live_state(connection, mission, LIVE)
+                histories.live_state(connection, mission, run or LIVE, moment)
                 for mission in self.missions.values()
             ]
 
-    def spacecraft_state(self, name: str) -> Row:
-        """One spacecraft's live state, its mission's settings and their history."""
+    def spacecraft_state(self, name: str, run: str | None = None) -> Row:
+        """One spacecraft's state in a run, its mission's settings and their history."""
         mission = mission_named(self.missions, name)
         with self.store.reading() as connection:
             return {
-                **histories.live_state(connection, mission, LIVE),
+                **histories.live_state(connection, mission, run or LIVE, utc_now()),
                 "mission": {"digest": mission.digest, "settings": mission.model_dump(mode="json")},
                 "history": histories.mission_history(connection, name),
             }
@@ -239,6 +425,249 @@ class Operations:
             return rollups.rates(
                 connection, name, run=run or LIVE, start=start, end=end, bucket=bucket
             )
+
+    def history(
+        self,
+        name: str,
+        *,
+        run: str | None = None,
+        start: Utc | None = None,
+        end: Utc | None = None,
+        strategy: trends.Strategy = "minmax",
+        size: int = 500,
+        quantities: Sequence[QuantityName] = (),
+    ) -> Row:
+        """Histories of quantities, all of them unless named, in at most `size` points each.
+
+        `minmax` gives buckets with mean, least and greatest, `latest` the newest
+        batches one by one; see `trends.history`.
+        """
+        mission_named(self.missions, name)
+        asked = trends.Asked(tuple(quantities) or TRENDS, strategy, size)
+        with self.store.reading() as connection:
+            return trends.history(
+                connection, name, run=run or LIVE, start=start, end=end, asked=asked
+            )
+
+    def worst_batches(
+        self,
+        name: str,
+        *,
+        by: QuantityName,
+        run: str | None = None,
+        start: Utc | None = None,
+        end: Utc | None = None,
+        limit: int = 20,
+    ) -> list[Row]:
+        """The batches of a stretch that are worst by a quantity, with its `value`, worst first."""
+        mission_named(self.missions, name)
+        stretch = Stretch(run or LIVE, name, start, end)
+        with self.store.reading() as connection:
+            return worst_batches(connection, stretch, by, limit)
+
+    def advise(
+        self,
+        name: str,
+        *,
+        run: str | None = None,
+        start: Utc | None = None,
+        end: Utc | None = None,
+        sample: int = ADVICE_SAMPLE,
+        tolerances: TolerancesIn = NO_TOLERANCES,
+        limit_s: float = math.inf,
+        step: Callable[[], object] = lambda: None,
+    ) -> Row:
+        """What the batches of a run say of a mission's settings; see `service.advice`.
+
+        Of the batches at most `sample` are run again, fewer where `limit_s`
+        seconds run out; `step` is called after each, twice a batch.  `tolerances`
+        are tried as well.  Raises `Busy` while other advice is being worked out.
+        """
+        mission = mission_named(self.missions, name)
+        own = tolerances.model_dump(exclude_none=True)
+        if not self._advising.acquire(blocking=False):
+            raise Busy("other advice is being worked out", ADVICE_RETRY_S)
+        try:
+            with self.store.reading() as connection:
+                drawn = again.sample(connection, Stretch(run or LIVE, name, start, end), sample)
+            began = time.monotonic()
+            pace = Pace(lambda share: time.monotonic() - began < share * limit_s, step)
+            # Were the worst looked up in the whole sky, the others would look too good.
+            run_again = partial(self._intake.run_again, mission=mission.within_zones)
+            advice = advise(mission, drawn.batches, run_again, own, pace)
+        finally:
+            self._advising.release()
+        return {
+            "spacecraft": name,
+            "run": run or LIVE,
+            "first": drawn.first,
+            "last": drawn.last,
+            "batches_in_range": drawn.total,
+            **as_row(advice),
+        }
+
+    def compare(
+        self,
+        name: str,
+        a: OptionsIn,
+        b: OptionsIn,
+        *,
+        run: str | None = None,
+        start: Utc | None = None,
+        end: Utc | None = None,
+        sample: int = COMPARE_SAMPLE,
+        limit_s: float = math.inf,
+    ) -> Row:
+        """Run recorded batches again with two sets of options and show where they differ.
+
+        Of a stretch at most `sample` batches, fewer where `limit_s` seconds run
+        out.  What options do not name stays as it was for a batch.  Raises
+        `Busy` while another comparison is being worked out.
+        """
+        mission_named(self.missions, name)
+        if not self._comparing.acquire(blocking=False):
+            raise Busy("another comparison is being worked out", COMPARE_RETRY_S)
+        try:
+            with self.store.reading() as connection:
+                drawn = again.sample(connection, Stretch(run or LIVE, name, start, end), sample)
+            pairs = [
+                Pair(
+                    row["id"], *(again.batch_again(row["input"], row["options"], o) for o in (a, b))
+                )
+                for row in drawn.rows
+            ]
+            found, cut_short = compare(pairs, self._intake.run_again, limit_s)
+        finally:
+            self._comparing.release()
+        options = (each.model_dump(mode="json", exclude_none=True) for each in (a, b))
+        return {
+            "spacecraft": name,
+            "run": run or LIVE,
+            "start": drawn.first,
+            "end": drawn.last,
+            "batches_in_stretch": drawn.total,
+            "sampled": len(pairs),
+            "cut_short": cut_short,
+            **found.row(*options),
+        }
+
+    # ---- limits and alarms -------------------------------------------------------------------
+
+    def limits(self, name: str) -> list[Row]:
+        """The limit of every quantity of a spacecraft."""
+        mission = mission_named(self.missions, name)
+        with self.store.reading() as connection:
+            return limits.list_limits(connection, mission)
+
+    def limit(self, name: str, quantity: QuantityName) -> Row:
+        """The limit of one quantity, the shipped one, and every one that was set."""
+        mission = mission_named(self.missions, name)
+        with self.store.reading() as connection:
+            return limits.limit_history(connection, mission, quantity)
+
+    def set_limit(
+        self,
+        name: str,
+        quantity: QuantityName,
+        settings: LimitSettings | None,
+        *,
+        who: str,
+        comment: str | None = None,
+    ) -> Row:
+        """Let a limit hold from the next batch on; None: the shipped one again."""
+        mission, moment = mission_named(self.missions, name), utc_now().text
+        return self.store.writer.change(
+            lambda connection: limits.set_limit(
+                connection, mission, quantity, settings, who=who, comment=comment, now=moment
+            )
+        ).result()
+
+    def alarms(
+        self,
+        *,
+        run: str | None = None,
+        spacecraft: str | None = None,
+        state: alarms.StateFilter = "active",
+        limit: int = 100,
+        cursor: str | None = None,
+    ) -> Page:
+        """Alarms, newest first; the run `*` stands for every run."""
+        with self.store.reading() as connection:
+            return alarms.list_alarms(
+                connection,
+                run=None if run == ALL_RUNS else run or LIVE,
+                spacecraft=spacecraft,
+                state=state,
+                limit=limit,
+                cursor=cursor,
+                now=utc_now().text,
+            )
+
+    def alarm(self, id: str) -> Row:
+        """One alarm with all that was noted of it."""
+        with self.store.reading() as connection:
+            return alarms.one_alarm(connection, _known(id, "alarm"), utc_now().text)
+
+    def acknowledge(self, id: str, who: str, comment: str | None = None) -> Row:
+        """Somebody has seen an alarm; with the quantity back in limits it is cleared."""
+        moment = utc_now().text
+        return self._act(
+            id, lambda alarm: latch.acknowledged(alarm, who, moment), who, comment, moment
+        )
+
+    def shelve(self, id: str, who: str, minutes: int, comment: str | None = None) -> Row:
+        """Put an alarm aside for some minutes."""
+        now = utc_now()
+        until = shelf_end(now, minutes)
+        return self._act(
+            id, lambda alarm: latch.shelved(alarm, who, until, now.text), who, comment, now.text
+        )
+
+    def unshelve(self, id: str, who: str, comment: str | None = None) -> Row:
+        """Take an alarm off the shelf."""
+        return self._act(id, latch.unshelved, who, comment, utc_now().text)
+
+    def comment(self, id: str, who: str, comment: str) -> Row:
+        """Say something about an alarm, cleared ones included."""
+        return self._act(id, lambda _: ({}, ["commented"]), who, comment, utc_now().text)
+
+    def _act(
+        self,
+        id: str,
+        step: Callable[[Row], latch.Step],
+        who: str,
+        comment: str | None,
+        moment: str,
+    ) -> Row:
+        known = _known(id, "alarm")
+        return self.store.writer.change(
+            lambda connection: alarms.act(
+                connection, known, step, who=who, comment=comment, now=moment
+            )
+        ).result()
+
+    def sweep(self) -> bool:
+        """Look for silent spacecraft and shelves whose time is over; whether there were any."""
+        moment = utc_now()
+        with self.store.reading() as connection:
+            due = is_due(connection, self.missions, moment)
+        if due:
+            self.store.writer.change(
+                lambda connection: sweep(connection, self.missions, moment)
+            ).result()
+        return due
+
+    # ---- events ------------------------------------------------------------------------------
+
+    def last_event(self) -> int:
+        """The number of the latest event."""
+        with self.store.reading() as connection:
+            return events.last_event(connection)
+
+    def events_after(self, last: int, limit: int) -> Sequence[Event] | None:
+        """The events after a number, oldest first; None where some are kept no more."""
+        with self.store.reading() as connection:
+            return events.events_after(connection, last, limit)
 
     # ---- zones -------------------------------------------------------------------------------
 
@@ -289,16 +718,84 @@ class Operations:
         with self.store.reading() as connection:
             return histories.list_runs(connection)
 
+    def reprocess(
+        self,
+        run: str | None,
+        *,
+        source: str = LIVE,
+        spacecraft: str | None = None,
+        start: Utc | None = None,
+        end: Utc | None = None,
+        processes: int = 0,
+        step: Callable[[Progress], object] = lambda progress: None,
+    ) -> tuple[Progress, Row]:
+        """Run the batches of a run again into another, and compare both.
+
+        The settings are those of these operations.  `run` None takes a name
+        that tells the settings.  What the run holds already is not run again.
+        Raises `BadBatch` where the run holds results of other settings.
+        """
+        if spacecraft is not None:
+            mission_named(self.missions, spacecraft)
+        chosen = {name: each for name, each in self.missions.items() if spacecraft in (None, name)}
+        stretch = Stretch(source, spacecraft, start, end)
+        plan = Plan(
+            stretch=stretch,
+            run=_run_name(run or self._run_of_settings(source, chosen)),
+            missions=chosen,
+            catalog=self.settings.catalog,
+            shelf_bytes=self.settings.shelf_mb << 20,
+            processes=processes,
+        )
+        progress = reprocess(self.store, plan, self.sky.catalog.digest, step)
+        return progress, self.compare_runs(source, plan.run, spacecraft, start, end)
+
+    def _run_of_settings(self, source: str, missions: Mapping[str, Mission]) -> str:
+        """A name for a run that the same settings give again, so that it can be gone on with."""
+        digests = [self.sky.catalog.digest, *sorted(each.digest for each in missions.values())]
+        short = hashlib.sha256("".join(digests).encode()).hexdigest()[:8]
+        return f"{source[:50]}-again-{short}"
+
+    def compare_runs(
+        self,
+        run: str,
+        other: str,
+        spacecraft: str | None = None,
+        start: Utc | None = None,
+        end: Utc | None = None,
+    ) -> Row:
+        """What became of the same stars in two runs, and how far the attitudes differ."""
+        with self.store.reading() as connection:
+            return compare_runs(connection, Stretch(run, spacecraft, start, end), other)
+
+    def watch_run(self, run: str, alarms: bool = True) -> Row:
+        """Let limits be held against the batches that a run gets from now on, or no longer."""
+        name = _run_name(run)
+        if name == LIVE and not alarms:
+            raise BadBatch(Fault("alarms", "live batches are always watched", "False"))
+        self.store.writer.change(
+            lambda connection: watch_run(connection, name, alarms, utc_now().text)
+        ).result()
+        return {"run": name, "alarms": alarms}
+
     def start_replay(
-        self, lines: Iterable[bytes], run: str, name: str = "replay", total: int | None = None
+        self,
+        lines: Iterable[bytes],
+        run: str,
+        name: str = "replay",
+        total: int | None = None,
+        check: Callable[[Submission], None] = lambda submission: None,
+        alarms: bool = False,
     ) -> str:
         """Work through NDJSON lines in the background; the id under which to ask for progress.
 
         Every batch goes to `run`.  `total` is the number of lines, where it is
-        known.  Lines that can be closed are closed at the end.
+        known.  Lines that can be closed are closed at the end.  A line for which
+        `check` raises an `AcquisitionError` is refused with it.  With `alarms`
+        limits are held against the run (see `watch_run`).
         """
         row = {"id": self._ids.new(), "run": _run_name(run), "name": name, "lines_total": total}
-        replay = Replay(self.store, self.submit_many, lambda: now().text, row)
+        replay = Replay(self.store, self.submit_many, lambda: utc_now().text, row, check)
         with self._replays_lock:
             if self._closing:
                 raise Stopping("the service is stopping")
@@ -306,8 +803,19 @@ class Operations:
             if len(at_work) >= MAX_REPLAYS:
                 raise Busy(f"{len(at_work)} replays are at work", REPLAY_RETRY_S)
             self._replays = [*at_work, replay]
+        try:
+            if alarms:
+                self.watch_run(run)
+        except BaseException:
+            replay.abandon()
+            raise
         replay.start(lines)
         return str(row["id"])
+
+    def replays(self) -> list[Row]:
+        """The latest replays and how far they are, newest first."""
+        with self.store.reading() as connection:
+            return list_replays(connection)
 
     def replay(self, id: str) -> Row:
         """A replay and how far it is, with the lines that were refused."""

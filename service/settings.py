@@ -2,6 +2,7 @@
 
 import ipaddress
 import os
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 from service.errors import BadConfiguration, shown_value
 
 PREFIX = "ACQUIRE_"
+_HOST = re.compile(r"[A-Za-z0-9.:_-]{1,253}", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -18,7 +20,10 @@ class Settings:
 
     `database` is a SQLAlchemy URL.  `missions` is a folder with a site's own
     mission files, `catalog` a site's own star catalog; None takes the shipped
-    ones alone.  `shelf_mb` bounds the cache of zones and run catalogs.
+    ones alone.  `shelf_mb` bounds the cache of zones and run catalogs.  `host`
+    other than loopback is served once there are tokens.  `token` is what
+    commands show that talk to a running service.  `frame_mb` and `frame_megapixels`
+    bound a frame's file and what it unfolds into.
     """
 
     database: str = "sqlite:///acquire.db"
@@ -27,17 +32,22 @@ class Settings:
     shelf_mb: int = 256
     host: str = "127.0.0.1"
     port: int = 8000
+    token: str | None = None
+    frame_mb: int = 64
+    frame_megapixels: int = 20
 
     def __post_init__(self) -> None:
         if not self.database.strip():
             raise _refusal("database", "must be a URL such as sqlite:///acquire.db", self.database)
         if not 1 <= self.shelf_mb <= 1_000_000:
             raise _refusal("shelf_mb", "must be from 1 to 1000000", self.shelf_mb)
+        for name, most in (("frame_mb", 2048), ("frame_megapixels", 400)):
+            if not 1 <= getattr(self, name) <= most:
+                raise _refusal(name, f"must be from 1 to {most}", getattr(self, name))
         if not 0 <= self.port <= 65535:
             raise _refusal("port", "must be from 0 to 65535", self.port)
-        # Nobody is asked who they are, so nobody but this machine may ask.
-        if not is_loopback(self.host):
-            raise _refusal("host", "must be a loopback address, such as 127.0.0.1", self.host)
+        if not _HOST.fullmatch(self.host):
+            raise _refusal("host", "must be an address or a name, such as 127.0.0.1", self.host)
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str] = os.environ) -> "Settings":
@@ -61,6 +71,8 @@ _READERS: dict[str, Callable[[str], Any]] = {
     "missions": Path,
     "catalog": Path,
     "shelf_mb": int,
+    "frame_mb": int,
+    "frame_megapixels": int,
     "port": int,
 }
 

@@ -10,20 +10,26 @@ safe between threads; the status they return is read instead.
 """
 
 import re
+import time
 from dataclasses import dataclass
-from datetime import date, timedelta
-from functools import cached_property
+from datetime import UTC, date, datetime, timedelta
+from functools import cache, cached_property
 
 import erfa
+import numpy as np
+import numpy.typing as npt
 from erfa import ufunc
 
 from service.errors import BadInput, Fault, shown_value
 
 FIRST_YEAR, LAST_YEAR = 1972, 2099
 HOUR_S, DAY_S = 3600, 86400
+UNIX_DAY = 40587
+"""The Modified Julian Date of 1970-01-01, where POSIX time begins."""
 
 _MJD_ZERO = date(1858, 11, 17).toordinal()
 _J2000_MJD = 51544
+_UNIX_J2000_S = 946_728_000
 _TEXT = re.compile(
     r"(?P<year>\d{4})-(?:(?P<month>\d{2})-(?P<day>\d{2})|(?P<doy>\d{3}))"
     r"T(?P<hour>\d{2}):(?P<minute>\d{2}):(?P<second>\d{2})(?P<fraction>\.\d{1,9})?Z?",
@@ -96,6 +102,44 @@ def bucket_start(number: int, width_s: int) -> Utc:
     """The moment at which hour or day `number` (see `Utc.bucket`) begins."""
     days, hour = (number, 0) if width_s == DAY_S else divmod(number, 24)
     return _from_fields(date.fromordinal(days + _MJD_ZERO), hour, 0, 0.0)
+
+
+def utc_now() -> Utc:
+    """This moment by the machine's clock."""
+    return utc_of_unix(time.time())
+
+
+@cache
+def _leap_seconds() -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """The moments (`tai_ns`) from which another number of leap seconds counts, and the numbers."""
+    counted = {
+        int(ufunc.dat(year, month, 1, 0.0)[0]): _from_fields(date(year, month, 1), 0, 0, 0.0).tai_ns
+        for year in range(LAST_YEAR, FIRST_YEAR - 1, -1)
+        for month in (7, 1)
+    }
+    numbers = sorted(counted)
+    return np.array([counted[number] for number in numbers]), np.array(numbers)
+
+
+def unix_seconds(tai_ns: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Seconds of POSIX time, which knows no leap seconds, of moments given as `Utc.tai_ns`.
+
+    A leap second is put just before the midnight that it leads to, and so is
+    of the same hour and day as in `Utc.bucket`.
+    """
+    tai = np.asarray(tai_ns, dtype=np.int64)
+    begin, number = _leap_seconds()
+    place = np.searchsorted(begin, tai, side="right") - 1
+    midnight = _UNIX_J2000_S + begin * 1e-9 - number
+    following = np.append(midnight[1:], np.inf)
+    unix_s = _UNIX_J2000_S + tai * 1e-9 - number[place]
+    return np.asarray(np.minimum(unix_s, np.nextafter(following[place], 0.0)))
+
+
+def utc_of_unix(unix_s: float) -> Utc:
+    """The moment of a POSIX time, to the microsecond."""
+    moment = datetime.fromtimestamp(unix_s, UTC)
+    return parse_utc(moment.strftime("%Y-%m-%dT%H:%M:%S.%fZ"))
 
 
 def shifted(moment: Utc, seconds: float) -> Utc:

@@ -1,4 +1,7 @@
-"""Building ahead of need: compiled kernels before the service is ready, zones when asked."""
+"""Building ahead of need: compiled kernels before the service is ready, zones when asked.
+
+python -m service.warm    compiles the kernels, so that nothing waits for it later
+"""
 
 from collections.abc import Mapping
 
@@ -47,6 +50,7 @@ def warm_up(sky: Sky, missions: Mapping[str, Mission]) -> None:
     moment = parse_utc("2000-01-01T12:00:00Z")
     apart = Sky(sky.catalog, Shelf(max_bytes=0))
     kinds = {mission.zone.kind: mission for mission in missions.values()}
+    first = next(iter(kinds.values()), None)
     for mission in kinds.values():
         tracker = mission.trackers[0]
         attitude = presumed_attitude(
@@ -70,6 +74,8 @@ def warm_up(sky: Sky, missions: Mapping[str, Mission]) -> None:
             sigma_arcsec=none,
         )
         for identifier in IDENTIFIERS:
+            if identifier == "lost_in_space" and mission is not first:
+                continue  # the same kernels, and an index of the whole sky to build
             batch = ObservationBatch(
                 spacecraft=mission.name,
                 batch="warm-up",
@@ -83,3 +89,10 @@ def warm_up(sky: Sky, missions: Mapping[str, Mission]) -> None:
                 options=Options(identifier=identifier, zone_grid_deg=0.0),
             )
             acquire(batch, mission, apart)
+
+
+if __name__ == "__main__":
+    from service.missions.mission import load_missions
+    from service.sky.catalog import load_embedded
+
+    warm_up(Sky(load_embedded(), Shelf(64 << 20)), load_missions())

@@ -2,6 +2,7 @@
 
 pytest --seed 7           other random draws, for hypothesis as well
 pytest --batches 2000     batches per mission held against the plain implementation
+pytest --torture          tests of kills, failing disks and odd input at full size, not a fiftieth
 """
 
 import os
@@ -15,6 +16,7 @@ from service.missions.mission import SHIPPED_FOLDER, load_missions
 from service.sky.catalog import load_embedded
 from service.sky.shelf import Shelf
 from service.sky.view import Sky
+from tests import scale
 
 DEFAULT_SEED = 19941026
 DEFAULT_BATCHES = 240
@@ -24,9 +26,12 @@ hypothesis.settings.register_profile(
     "repeatable",
     derandomize=True,
     deadline=None,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
     database=None,
 )
-hypothesis.settings.register_profile("seeded", deadline=None, database=None)
+hypothesis.settings.register_profile(
+    "seeded", hypothesis.settings.get_profile("repeatable"), derandomize=False
+)
 
 
 def pytest_addoption(parser):
@@ -39,10 +44,15 @@ def pytest_addoption(parser):
         default=int(os.environ.get("TEST_BATCHES", DEFAULT_BATCHES)),
         help="batches per mission held against the plain implementation",
     )
+    parser.addoption(
+        "--torture", action="store_true", help="kills, failing disks, odd input: at full size"
+    )
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_configure(config):
+    if config.getoption("--torture"):
+        os.environ[scale.VARIABLE] = "1"
     seed = config.getoption("--seed")
     if seed == DEFAULT_SEED:
         hypothesis.settings.load_profile("repeatable")

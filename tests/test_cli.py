@@ -1,12 +1,16 @@
 """The command: help that teaches, one clear line a mistake, exit codes that scripts can use."""
 
 import csv
+import gzip
 import json
+import re
 import signal
 import socket
+import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 
 import httpx
 import pytest
@@ -15,13 +19,18 @@ import yaml
 from service import __version__
 from service.cli import main
 from service.cli.parser import build_parser
+from service.missions.mission import SHIPPED_FOLDER
 from service.observe.csv_cells import COLUMNS
 from service.simulate.files import read_objects
 from service.times import parse_utc
+from tests.sky.test_sky2000 import SIRIUS, written
 
 COMMANDS = [
     "serve",
     "replay",
+    "advise",
+    "reprocess",
+    "frame",
     "catalog",
     "catalog build",
     "catalog import",
@@ -30,9 +39,13 @@ COMMANDS = [
     "simulate",
     "simulate telemetry",
     "simulate paper",
+    "simulate frames",
     "database",
     "database upgrade",
     "database check",
+    "database backup",
+    "database verify",
+    "database prune",
     "openapi",
     "demo",
     "version",
@@ -129,8 +142,25 @@ def test_the_version_is_the_packages(acquire):
         ("replay a --speed nan", "must be a number above 0, or max (got 'nan')"),
         ("replay a --concurrency 0", "must be a whole number of at least 1 (got '0')"),
         ("replay a --in-process --url http://x", "--url: not allowed with argument --in-process"),
+        ("database backup", "required: FILE (see `acquire database backup --help`)"),
+        ("database backup copy.db", "acquire.db: there is no such file"),
+        ("database verify", "acquire.db: there is no such file"),
+        ("database prune", "required: --before"),
+        ("database prune --before noon", "--before: must be UTC as"),
+        ("reprocess --spacecraft NO", "no spacecraft 'NO'; there are IMAGER, SOHO"),
+        ("reprocess --run live", "run: must be another run than the one"),
+        ("reprocess --run a/b", "run: String should match"),
+        ("reprocess --mission none.toml", "none.toml: cannot be read: "),
+        ("reprocess --from 1996-02-01T00:00:00Z --to 1996-01-01T00:00:00Z", "--to: must not be"),
+        ("advise", "required: --spacecraft (see `acquire advise --help`)"),
+        ("advise --spacecraft NO", "no spacecraft 'NO'; there are IMAGER, SOHO"),
+        ("advise --spacecraft XTE --from noon", "--from: must be UTC as"),
+        ("advise --spacecraft XTE --try septol=1", "--try.septol: there is no such field"),
         ("simulate telemetry --spacecraft XTE --batches 1 --stars 300 o", "stars: must be from 1"),
-        ("simulate telemetry --spacecraft NO --batches 1 o", "no spacecraft 'NO'; there are SOHO"),
+        (
+            "simulate telemetry --spacecraft NO --batches 1 o",
+            "no spacecraft 'NO'; there are IMAGER, SOHO",
+        ),
         ("simulate telemetry --spacecraft XTE --batches 1 no/o", "no/o.truth.ndjson: cannot be"),
         ("simulate telemetry --spacecraft XTE --batches 1 --start x o", "start: must be UTC as"),
         (
@@ -143,7 +173,7 @@ def test_the_version_is_the_packages(acquire):
         ("catalog import none.csv", "none.csv: "),
         ("catalog build .", "missing: download package"),
         ("openapi --check none.yaml", "none.yaml: No such file or directory"),
-        ("serve --host 0.0.0.0", "must be a loopback address"),
+        ("serve --host http://here", "must be an address or a name"),
         ("serve --port 70000", "must be from 0 to 65535"),
         ("serve --database no://where", "ACQUIRE_DATABASE: "),
         ("database check --database sqlite:///no/such/folder.db", "ACQUIRE_DATABASE: "),
@@ -236,6 +266,38 @@ def test_replay_in_process_records_answers_and_sums_up(acquire, tmp_path):
     code, out, _ = acquire("replay", path, "--in-process")
     assert code == 0
     assert "already recorded  6" in out
+
+
+def test_advice_is_printed_in_sentences_or_as_the_api_answers_it(acquire, tmp_path):
+    telemetry(acquire, tmp_path / "pass.ndjson", "XTE", 30, "--nominal")
+    assert acquire("replay", tmp_path / "pass.ndjson", "--in-process", "--run", "r")[0] == 0
+    asked = ("advise", "--spacecraft", "XTE", "--run", "r", "--quiet")
+    code, out, complaint = acquire(*asked, "--try", "separation_deg=0.01")
+    assert (code, "batches" in complaint) == (0, False)
+    assert "30 of 30 batches were looked at." in out
+    assert "ok  SEPTOL (separation_deg) fits: 99 %" in out
+    assert "separation_deg = 0.01, asked for" in out
+    code, out, _ = acquire(*asked, "--json")
+    assert code == 0
+    assert json.loads(out)["batches_sampled"] == 30
+
+
+def test_batches_are_run_again_with_another_mission_file_and_compared(acquire, tmp_path):
+    telemetry(acquire, tmp_path / "pass.ndjson", "XTE", 8, "--nominal")
+    assert acquire("replay", tmp_path / "pass.ndjson", "--in-process", "--run", "r")[0] == 0
+    shipped = (SHIPPED_FOLDER / "xte.toml").read_text(encoding="utf-8")
+    narrow = tmp_path / "narrow.toml"
+    votes = re.sub(r'identifier = "\w+"', 'identifier = "starid"', shipped)
+    narrow.write_text(votes.replace("separation_deg = 0.0066", "separation_deg = 1e-7"))
+    asked = ("reprocess", "--source", "r", "--quiet", "--processes", "1")
+    code, out, _ = acquire(*asked, "--mission", narrow, "--run", "narrow")
+    assert code == 0
+    assert "8 recorded, 0 there already, 0 refused" in out
+    assert "unique before, unmatched after" in out
+    code, out, _ = acquire(*asked, "--mission", narrow, "--run", "narrow", "--json")
+    assert (code, json.loads(out)["before"], json.loads(out)["recorded"]) == (0, 8, 0)
+    code, out, _ = acquire(*asked)
+    assert (code, "every star came out alike" in out) == (0, True)
 
 
 def test_a_bad_line_in_the_middle_gives_exit_code_1_and_the_rest_goes_on(acquire, tmp_path):
@@ -340,6 +402,24 @@ def test_a_site_brings_its_own_catalog(acquire, tmp_path, monkeypatch):
         assert [row["id"] for row in csv.DictReader(file)] == ["SKYMAP 2", "SKYMAP 1"]
 
 
+def test_a_site_that_has_skymap_brings_its_records(acquire, tmp_path, monkeypatch):
+    stars = [SIRIUS | {"ID": k, "RAm": k % 60, "Vmag": 1.0 + k / 100} for k in range(1, 50)]
+    stars.append(SIRIUS | {"ID": 50, "Vmag": None})
+    text = "".join(written(**star) + "\n" for star in stars)
+    (tmp_path / "sky2kv4.dat.gz").write_bytes(gzip.compress(text.encode()))
+    code, out, _ = acquire("catalog", "import", "sky2kv4.dat.gz")
+    assert code == 0
+    assert "sky2kv4.npz: 49 stars" in out
+    assert "left out: 1 stars that have no visual magnitude (SKYMAP 50)" in out
+    monkeypatch.setenv("ACQUIRE_CATALOG", str(tmp_path / "sky2kv4.npz"))
+    used = tmp_path / "used.csv"
+    assert acquire("catalog", "export", "--spacecraft", "XTE", "--epoch", 2000, used)[0] == 0
+    assert used.read_text().splitlines()[1].startswith("SKYMAP 1,")
+    code, _, complaint = acquire("catalog", "import", "sky2kv4.dat.gz", "--format", "csv")
+    assert code == 2
+    assert "is not UTF-8" in complaint or "NUL byte" in complaint
+
+
 def test_a_damaged_site_catalog_is_refused_with_line_and_column(acquire, tmp_path):
     (tmp_path / "site.csv").write_text("id,ra_deg,dec_deg,magnitude\nA,10,20,3\nB,10,200,3\n")
     code, _, err = acquire("catalog", "import", "site.csv")
@@ -361,6 +441,27 @@ def test_the_database_is_made_checked_and_its_migrations_are_whole(acquire, tmp_
     code, out, _ = acquire("database", "check", "--database", "sqlite:///empty.db")
     assert code == 1
     assert "acquire database upgrade" in out
+
+
+def test_records_are_copied_verified_and_pruned(acquire, tmp_path):
+    telemetry(acquire, tmp_path / "pass.ndjson", "XTE", 8, "--nominal")
+    assert acquire("replay", tmp_path / "pass.ndjson", "--in-process", "--run", "r")[0] == 0
+    code, out, _ = acquire("database", "backup", "copy.db")
+    assert (code, out) == (0, f"copy.db: {(tmp_path / 'copy.db').stat().st_size} bytes\n")
+    before = ("database", "prune", "--before", "1999-060T00:01:30Z")
+    told = "3 batches are before 1999-03-01T00:01:30.000Z; nothing was deleted\n"
+    assert acquire(*before, "--dry-run")[:2] == (0, told)
+    told = "3 batches before 1999-03-01T00:01:30.000Z were deleted\n"
+    assert acquire(*before)[:2] == (0, told)
+    assert acquire("database", "verify")[:2] == (0, "nothing is wrong with 5 batches\n")
+    copy = ("--database", "sqlite:///copy.db")
+    assert acquire("database", "verify", *copy)[:2] == (0, "nothing is wrong with 8 batches\n")
+    with closing(sqlite3.connect(tmp_path / "copy.db")) as connection:
+        connection.execute("DELETE FROM solutions")
+        connection.commit()
+    code, out, _ = acquire("database", "verify", *copy)
+    assert code == 1
+    assert "its attitude is missing" in out
 
 
 def test_the_description_is_printed_written_and_checked(acquire, tmp_path):

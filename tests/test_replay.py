@@ -14,6 +14,7 @@ from service.errors import BadFile, BadInput, Busy
 from service.observe.csv_rows import write_csv
 from service.observe.wire import BatchIn
 from service.operations import Operations
+from service.replay.in_bulk import replay_in_bulk
 from service.replay.in_process import replay_in_process
 from service.replay.items import Pace, items_of, run_name
 from service.replay.over_http import replay_over_http
@@ -23,7 +24,7 @@ from service.simulate.files import read_objects
 from service.simulate.stretches import Pass, Trouble, Troubles
 from service.simulate.telemetry import draw_pass
 from service.web.app import create_app
-from tests.web.conftest import Server
+from tests.web.serving import Server
 
 SERIOUS = Troubles(Trouble(0.2), Trouble(0.2, 2), Trouble(0.2, 0.5), Trouble(0.2, 12.0))
 _names = count(1)
@@ -97,7 +98,7 @@ def bad_lines(batch):
         {**batch, "batch": "eyes", "observations": [{"tracker": "EYE", "stars": [first]}]},
         {**batch, "batch": "odd", "time": "1996-02-30T00:00:00Z", "aberration": "maybe"},
         re.sub('"magnitude": [0-9.]+', '"magnitude": 1e999', json.dumps({**batch, "batch": "inf"})),
-        {**batch, "batch": "lost", "a_priori": None},
+        {**batch, "batch": "turned", "a_priori": {"roll_deg": 3.0}},
         {**batch, "time": "1999-03-01T12:00:00Z"},
         batch,
     ]
@@ -120,6 +121,36 @@ def test_both_ways_give_equal_results_star_by_star(operations, address, batches,
             for batch in [*batches, batches[0]]
             for tracker in batch["observations"]
         )
+
+
+def test_files_sent_as_a_whole_come_to_the_same_and_bad_lines_keep_their_place(
+    operations, address, batches, run, tmp_path, capsys
+):
+    """NDJSON and CSV in one upload; what one by one is refused is refused, line by line."""
+    first = written(tmp_path / "one.ndjson", [*batches[:5], *bad_lines(batches[0]), batches[5]])
+    second = tmp_path / "two.csv"
+    with second.open("w", newline="") as stream:
+        write_csv([BatchIn.model_validate(each) for each in batches[6:9]], stream)
+    rows = second.read_text().splitlines()
+    rows.insert(2, rows[1].replace("STARTRACKER_1", "STARTRACKER_1,5"))
+    second.write_text("\n".join(rows))
+    files = [first, second]
+    inside, _ = replayed(files, run, tmp_path / "in.ndjson", operations=operations)
+    told_one_by_one = capsys.readouterr().err
+    with Tally(files, progress=False) as tally:
+        replay_in_bulk(address, files, run, tally.add, tally.follow)
+    told = capsys.readouterr().err
+    assert sorted(told.splitlines()) == sorted(told_one_by_one.splitlines())
+    assert f"{first}:9: spacecraft: there is no such" in told
+    for name in ("new", "replayed", "refused", "attitudes", "stars"):
+        assert getattr(tally, name) == getattr(inside, name), name
+
+
+def test_a_service_that_is_not_there_is_named_before_anything_is_read(run, tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    with pytest.raises(Busy, match=r"no service answers at .*acquire serve"):
+        replay_in_bulk(f"http://127.0.0.1:{port}", [], run, print, print)
 
 
 def test_bad_lines_are_told_by_number_and_field_and_the_rest_goes_on(

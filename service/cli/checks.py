@@ -14,6 +14,11 @@ def count(text: str) -> int:
     return number
 
 
+def table(text: str) -> int | str:
+    """The number of a table, or the name of one such as ptp-5."""
+    return count(text) if text.lstrip("-").isdigit() else text
+
+
 def speed(text: str) -> float | None:
     """A factor above zero; None for `max`."""
     if text == "max":

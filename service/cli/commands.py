@@ -10,10 +10,16 @@ from service.cli.passes import pass_of
 from service.errors import BadInput, Fault, NotAvailable, shown_value
 from service.settings import Settings
 
+MAX_PROBLEMS = 100
+
 if TYPE_CHECKING:
     from service.missions.mission import Mission
     from service.sky.catalog import Catalog
     from service.sky.run_catalog import RunCatalog
+    from service.times import Utc
+
+
+DEFAULT_CONCURRENCY = 4
 
 
 def settings_of(parsed: Namespace) -> Settings:
@@ -56,6 +62,7 @@ def demo(parsed: Namespace) -> int:
 def replay(parsed: Namespace) -> int:
     """Send files through the service and print what became of them."""
     from service.observe.formats import read_lines
+    from service.replay.carrying import Carrier
     from service.replay.items import Pace, items_of, run_name
     from service.replay.tally import Tally
 
@@ -67,6 +74,7 @@ def replay(parsed: Namespace) -> int:
             raise BadInput(Fault("--results", "must not be a file that is replayed", str(file)))
     items, pace = items_of(parsed.files, run), Pace(parsed.speed)
     progress = True if parsed.progress else None
+    carrier = Carrier() if parsed.carry_attitude else None
     if parsed.in_process:
         from service.operations import Operations
         from service.replay.in_process import replay_in_process
@@ -74,21 +82,132 @@ def replay(parsed: Namespace) -> int:
         operations = Operations.open(settings_of(parsed))
         try:
             operations.ready()
+            if parsed.alarms:
+                operations.watch_run(run)
             with Tally(parsed.files, parsed.results, progress) as tally:
-                replay_in_process(operations, items, tally.add, pace)
+                replay_in_process(operations, items, tally.add, pace, carrier)
         finally:
             operations.close()
     else:
+        from service.replay.in_bulk import replay_in_bulk
         from service.replay.over_http import replay_over_http
 
         if parsed.database is not None:
             message = "goes with --in-process; a running service has its own"
             raise BadInput(Fault("--database", message, shown_value(parsed.database)))
+        token = settings_of(parsed).token
         with Tally(parsed.files, parsed.results, progress) as tally:
-            replay_over_http(parsed.url, items, tally.add, pace, parsed.concurrency)
+            watched = run if parsed.alarms else None
+            if carrier or parsed.results or parsed.speed or parsed.concurrency:
+                # Single answers are asked for, one by one or at their time.
+                many = parsed.concurrency or DEFAULT_CONCURRENCY
+                replay_over_http(
+                    parsed.url,
+                    items,
+                    tally.add,
+                    pace,
+                    many,
+                    token=token,
+                    watched_run=watched,
+                    carrier=carrier,
+                )
+            else:
+                replay_in_bulk(
+                    parsed.url,
+                    parsed.files,
+                    run,
+                    tally.add,
+                    tally.follow,
+                    token=token,
+                    query={"alarms": "true"} if parsed.alarms else None,
+                )
     print(f"{'run':<20}{run}")
     print(tally.table())
     return 1 if tally.refused else 0
+
+
+def advise(parsed: Namespace) -> int:
+    """Print what recorded batches say of a mission's settings."""
+    import json
+
+    from tqdm import tqdm
+
+    from service.advice.report import as_text
+    from service.observe.wire import tolerances_from_text
+    from service.operations import Operations
+
+    start, end = _stretch_of(parsed)
+    tolerances = tolerances_from_text(parsed.tolerance, "--try")
+    operations = Operations.open(settings_of(parsed))
+    try:
+        with tqdm(
+            total=None, unit=" batches", desc="running again", disable=parsed.quiet or None
+        ) as bar:
+            row = operations.advise(
+                parsed.spacecraft,
+                run=parsed.run,
+                start=start,
+                end=end,
+                sample=parsed.sample,
+                tolerances=tolerances,
+                step=bar.update,
+            )
+    finally:
+        operations.close()
+    print(json.dumps(row, ensure_ascii=False, indent=1) if parsed.json else as_text(row))
+    return 0
+
+
+def reprocess(parsed: Namespace) -> int:
+    """Run recorded batches again into another run, and print how both compare."""
+    import json
+
+    from tqdm import tqdm
+
+    from service.cli.compared import comparison_text
+    from service.missions.mission import read_mission
+    from service.operations import Operations
+    from service.records.reprocess import Progress
+
+    start, end = _stretch_of(parsed)
+    mission = None if parsed.mission is None else read_mission(parsed.mission)
+    spacecraft = parsed.spacecraft
+    if mission is not None:
+        spacecraft = spacecraft or mission.name
+        if spacecraft != mission.name:
+            message = f"is of {mission.name}, and only batches of {spacecraft} are asked for"
+            raise BadInput(Fault("--mission", message, str(parsed.mission)))
+    operations = Operations.open(settings_of(parsed), mission)
+    try:
+        with tqdm(
+            total=None, unit=" batches", desc="running again", disable=parsed.quiet or None
+        ) as bar:
+
+            def step(progress: Progress) -> None:
+                bar.total = progress.total
+                bar.update(progress.before + progress.recorded + progress.refused - bar.n)
+
+            progress, compared = operations.reprocess(
+                parsed.run,
+                source=parsed.source,
+                spacecraft=spacecraft,
+                start=start,
+                end=end,
+                processes=parsed.processes or 0,
+                step=step,
+            )
+    finally:
+        operations.close()
+    for refusal in progress.refusals:
+        print(f"refused: {refusal}", file=sys.stderr)
+    if parsed.json:
+        counts = {
+            name: getattr(progress, name) for name in ("total", "before", "recorded", "refused")
+        }
+        print(json.dumps(counts | compared, indent=1))
+    else:
+        print(comparison_text(progress, compared))
+    return 1 if progress.refused else 0
 
 
 def catalog_build(parsed: Namespace) -> int:
@@ -110,12 +229,24 @@ def catalog_build(parsed: Namespace) -> int:
 
 def catalog_import(parsed: Namespace) -> int:
     """Check a site's catalog and store it."""
-    from service.sky.catalog import import_csv, save
+    from tqdm import tqdm
 
-    output = parsed.output or parsed.file.with_suffix(".npz")
-    catalog = import_csv(parsed.file)
+    from service.sky.catalog import form_of, import_csv, import_sky2000, save
+
+    # Of night.dat.gz the name is night.
+    name = parsed.file.name.removesuffix(".gz").rpartition(".")[0] or parsed.file.name
+    output = parsed.output or parsed.file.with_name(f"{name}.npz")
+    left_out: tuple[str, ...] = ()
+    if (parsed.format or form_of(parsed.file)) == "sky2000":
+        with tqdm(unit=" stars", desc="reading", disable=None, leave=False) as bar:
+            catalog, left_out = import_sky2000(parsed.file, bar.update)
+    else:
+        catalog = import_csv(parsed.file)
     save(catalog, output)
     print(f"{output}: {len(catalog)} stars")
+    if left_out:
+        shown = ", ".join(left_out[:5]) + (", ..." if len(left_out) > 5 else "")
+        print(f"left out: {len(left_out)} stars that have no visual magnitude ({shown})")
     print(f"use it with ACQUIRE_CATALOG={output}")
     return 0
 
@@ -155,8 +286,30 @@ def simulate_telemetry(parsed: Namespace) -> int:
     return 0
 
 
+def frame(parsed: Namespace) -> int:
+    """Send frames and print what was made of them."""
+    from service.cli.frames import send_frames
+
+    return send_frames(parsed, settings_of(parsed))
+
+
+def simulate_frames(parsed: Namespace) -> int:
+    """Draw frames and write them with what is known and what is true of them."""
+    from service.cli.frames import write_drawn
+
+    return write_drawn(parsed, *_mission_and_catalog(parsed.spacecraft))
+
+
 def simulate_paper(parsed: Namespace) -> int:
-    """Fly the paper's experiments and print its tables."""
+    """Fly the experiments of a paper and print its tables."""
+    if isinstance(parsed.table, str):
+        return _simulate_ptp(parsed)
+    if parsed.scenes is not None:
+        raise BadInput(
+            Fault(
+                "--scenes", "goes with a table by name, such as --table ptp-6", str(parsed.scenes)
+            )
+        )
     from service.simulate.paper.command import DEFAULT_STARS, run_paper
 
     run_paper(
@@ -164,9 +317,45 @@ def simulate_paper(parsed: Namespace) -> int:
         parsed.stars or DEFAULT_STARS,
         parsed.seed,
         parsed.json,
+        parsed.identifier,
         processes=parsed.processes,
         plots=parsed.plots,
         report_path=parsed.report,
+    )
+    return 0
+
+
+def simulate_imaging(parsed: Namespace) -> int:
+    """Hold the star image detection report beside what is measured; 1 where a claim is off."""
+    from service.simulate.imaging.command import run_imaging
+
+    rows = run_imaging(
+        parsed.row,
+        parsed.seed,
+        parsed.quick,
+        json_path=parsed.json,
+        plots_folder=parsed.plots,
+        report_path=parsed.report,
+    )
+    return 0 if all(row.holds for row in rows) else 1
+
+
+def _simulate_ptp(parsed: Namespace) -> int:
+    from service.simulate.ptp.command import DEFAULT_SCENES, run_ptp
+
+    if parsed.stars is not None:
+        message = "goes with a table by number; a named one takes --scenes"
+        raise BadInput(Fault("--stars", message, str(parsed.stars)))
+    if len(parsed.seed) > 1:
+        raise BadInput(Fault("--seed", "is one with a table by name", shown_value(parsed.seed)))
+    run_ptp(
+        parsed.table,
+        parsed.scenes or DEFAULT_SCENES,
+        parsed.seed[0],
+        parsed.json,
+        parsed.processes,
+        parsed.plots,
+        parsed.report,
     )
     return 0
 
@@ -192,6 +381,98 @@ def database_check(parsed: Namespace) -> int:
     return 1 if differences else 0
 
 
+def token_create(parsed: Namespace) -> int:
+    """Make a token and print it."""
+    from service.cli.tokens import create
+
+    return create(
+        settings_of(parsed), parsed.name, parsed.scope, parsed.spacecraft, parsed.days, parsed.rate
+    )
+
+
+def token_list(parsed: Namespace) -> int:
+    """Print every token."""
+    from service.cli.tokens import show
+
+    return show(settings_of(parsed))
+
+
+def token_revoke(parsed: Namespace) -> int:
+    """End a token."""
+    from service.cli.tokens import revoke
+
+    return revoke(settings_of(parsed), parsed.name)
+
+
+def database_backup(parsed: Namespace) -> int:
+    """Copy the database."""
+    from tqdm import tqdm
+
+    from service.records.backup import back_up
+
+    with tqdm(total=None, unit=" pages", desc="copying", disable=None, leave=False) as bar:
+
+        def step(left: int, total: int) -> None:
+            bar.total = total
+            bar.update(total - left - bar.n)
+
+        back_up(settings_of(parsed).database, parsed.output, step)
+    print(f"{parsed.output}: {parsed.output.stat().st_size} bytes")
+    return 0
+
+
+def database_verify(parsed: Namespace) -> int:
+    """Tell what is wrong with the database."""
+    from tqdm import tqdm
+
+    from service.records.verify import verify
+
+    seen = 0
+    with tqdm(total=None, unit=" batches", desc="reading", disable=None, leave=False) as bar:
+
+        def step(done: int, total: int) -> None:
+            nonlocal seen
+            bar.total = total
+            bar.update(done - seen)
+            seen = done
+
+        problems = verify(settings_of(parsed).database, step)
+    for problem in problems[:MAX_PROBLEMS]:
+        print(problem)
+    if len(problems) > MAX_PROBLEMS:
+        print(f"and {len(problems) - MAX_PROBLEMS} more")
+    if not problems:
+        print(f"nothing is wrong with {seen} batches")
+    return 1 if problems else 0
+
+
+def database_prune(parsed: Namespace) -> int:
+    """Delete old batches."""
+    from tqdm import tqdm
+
+    from service.records.prune import Pruned, prune
+    from service.records.store import Store
+    from service.times import parse_utc
+
+    before = parse_utc(parsed.before, "--before")
+    store = Store(settings_of(parsed).database)
+    try:
+        with tqdm(total=None, unit=" batches", desc="deleting", disable=None, leave=False) as bar:
+
+            def step(pruned: Pruned) -> None:
+                bar.total = pruned.total
+                bar.update(pruned.batches - bar.n)
+
+            pruned = prune(store, before, parsed.run, dry_run=parsed.dry_run, step=step)
+    finally:
+        store.close()
+    if parsed.dry_run:
+        print(f"{pruned.total} batches are before {before.text}; nothing was deleted")
+    else:
+        print(f"{pruned.batches} batches before {before.text} were deleted")
+    return 0
+
+
 def openapi(parsed: Namespace) -> int:
     """Print, write or check the API's description."""
     from service.web.openapi import openapi_yaml
@@ -205,6 +486,17 @@ def openapi(parsed: Namespace) -> int:
         print(f"{parsed.check} is not what the service describes: run `make openapi`")
         return 1
     return 0
+
+
+def _stretch_of(parsed: Namespace) -> "tuple[Utc | None, Utc | None]":
+    """The times that --from and --to name; raises `BadInput` where they cross."""
+    from service.times import parse_utc
+
+    start = None if parsed.start is None else parse_utc(parsed.start, "--from")
+    end = None if parsed.end is None else parse_utc(parsed.end, "--to")
+    if start is not None and end is not None and start.tai_ns > end.tai_ns:
+        raise BadInput(Fault("--to", "must not be before --from", shown_value(parsed.end)))
+    return start, end
 
 
 def _mission_and_catalog(name: str) -> "tuple[Mission, Catalog]":

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 
 from service.errors import AcquisitionError, Busy, problem_of
 from service.operations import Operations
+from service.replay.carrying import Carrier, noted
 from service.replay.items import Item, Outcome, Pace, Report
 
 CHUNK = 500
@@ -12,13 +13,25 @@ CHUNK = 500
 
 
 def replay_in_process(
-    operations: Operations, items: Iterable[Item], report: Report, pace: Pace | None = None
+    operations: Operations,
+    items: Iterable[Item],
+    report: Report,
+    pace: Pace | None = None,
+    carrier: Carrier | None = None,
 ) -> None:
-    """Submit every item and report what became of it, in order."""
+    """Submit every item and report what became of it, in order.
+
+    With a `carrier` each batch waits for the answer to the one before.
+    """
     pace = pace or Pace()
     chunk: list[Item] = []
     for item in items:
         wait_s = pace.wait_s(item, time.monotonic())
+        if carrier is not None:
+            if wait_s > 0:
+                time.sleep(wait_s)
+            _submit(operations, [carrier.prepared(item)], noted(report, carrier))
+            continue
         if chunk and (wait_s > 0 or len(chunk) == CHUNK):
             _submit(operations, chunk, report)
             chunk = []

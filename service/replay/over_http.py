@@ -11,7 +11,8 @@ from collections.abc import Iterable
 
 import httpx
 
-from service.errors import BadInput, Busy, Fault, shown_value
+from service.errors import BadInput, Busy, Fault, NotAdmitted, shown_value
+from service.replay.carrying import Carrier, noted
 from service.replay.items import Item, Outcome, Pace, Problem, Report
 
 ROUTE = "/api/v1/batches"
@@ -29,16 +30,38 @@ def replay_over_http(
     pace: Pace | None = None,
     concurrency: int = 4,
     patience_s: float = PATIENCE_S,
+    token: str | None = None,
+    watched_run: str | None = None,
+    carrier: Carrier | None = None,
 ) -> None:
     """Post every item to the service at `url` and report what became of it, in order.
 
-    Raises `BadInput` for an address that is none, `Busy` when no service
-    answers there, or none any more for `patience_s`.
+    With a `carrier` each batch waits for the answer to the one before.
+    Raises `BadInput` for an address that is none, `NotAdmitted` where the
+    service knows nobody by `token`, `Busy` when no service answers there, or
+    none any more for `patience_s`.  `watched_run` is a run that limits are to
+    be held against.
     """
-    asyncio.run(_replay(_checked(url), items, report, pace or Pace(), concurrency, patience_s))
+    shown = {} if token is None else {"Authorization": f"Bearer {token}"}
+    if carrier is not None:
+        report, concurrency = noted(report, carrier), 1
+    asyncio.run(
+        _replay(
+            checked_url(url),
+            items,
+            report,
+            pace or Pace(),
+            concurrency,
+            patience_s,
+            shown,
+            watched_run,
+            carrier,
+        )
+    )
 
 
-def _checked(url: str) -> str:
+def checked_url(url: str) -> str:
+    """The address without a slash at its end; raises `BadInput` for one that is none."""
     try:
         parsed = httpx.URL(url)
         valid = parsed.scheme in ("http", "https") and bool(parsed.host)
@@ -57,13 +80,18 @@ async def _replay(
     pace: Pace,
     concurrency: int,
     patience_s: float,
+    shown: dict[str, str],
+    watched_run: str | None,
+    carrier: Carrier | None,
 ) -> None:
     limits = httpx.Limits(max_connections=concurrency, max_keepalive_connections=concurrency)
     # The service listens to this machine alone: a proxy of the environment cannot reach it.
     async with httpx.AsyncClient(
-        base_url=url, timeout=TIMEOUT, limits=limits, trust_env=False
+        base_url=url, timeout=TIMEOUT, limits=limits, trust_env=False, headers=shown
     ) as client:
         await _require_service(client, url)
+        if watched_run is not None:
+            await _watch(client, watched_run)
         clock = asyncio.get_running_loop().time
         window: deque[asyncio.Task[Outcome]] = deque()
         try:
@@ -74,6 +102,8 @@ async def _replay(
                     await asyncio.sleep(min(wait_s, 0.5))
                 if len(window) >= concurrency:
                     report(await window.popleft())
+                if carrier is not None:
+                    item = carrier.prepared(item)
                 window.append(asyncio.create_task(_outcome(client, url, item, patience_s)))
             while window:
                 report(await window.popleft())
@@ -88,11 +118,21 @@ async def _require_service(client: httpx.AsyncClient, url: str) -> None:
         response = await client.get("/livez")
     except httpx.TransportError as error:
         raise Busy(
-            f"no service answers at {url} ({_shown(error)}); "
+            f"no service answers at {url} ({shown_error(error)}); "
             "start one with `acquire serve`, or replay with --in-process"
         ) from None
     if response.status_code != 200:
         raise Busy(f"{url} is not this service: GET /livez gives {response.status_code}")
+    if (await client.get("/api/v1/session")).status_code == 401:
+        raise NotAdmitted(
+            f"{url} asks for a token: set ACQUIRE_TOKEN to one of its `acquire token create`"
+        )
+
+
+async def _watch(client: httpx.AsyncClient, run: str) -> None:
+    answer = await client.put(f"/api/v1/runs/{run}", json={"alarms": True})
+    if answer.status_code != 200:
+        raise BadInput(Fault("--alarms", str(_problem(answer)["detail"]), run))
 
 
 async def _outcome(client: httpx.AsyncClient, url: str, item: Item, patience_s: float) -> Outcome:
@@ -118,7 +158,7 @@ async def _post(
             why = f"HTTP {response.status_code}"
             asked_s = _seconds(response.headers.get("Retry-After", ""))
         except httpx.TransportError as error:
-            why = _shown(error)
+            why = shown_error(error)
         if clock() >= give_up:
             raise Busy(
                 f"{url} no longer answers ({why}); run the same command again to go on "
@@ -132,7 +172,8 @@ def _seconds(text: str) -> float:
     return float(text) if text.isascii() and text.isdigit() else 0.0
 
 
-def _shown(error: Exception) -> str:
+def shown_error(error: Exception) -> str:
+    """An error's words, or its name where it has none."""
     return str(error) or type(error).__name__
 
 

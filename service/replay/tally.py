@@ -18,6 +18,7 @@ from service.observe.formats import form_of
 from service.replay.items import Outcome
 
 MAX_PROBLEMS_SHOWN = 20
+STARS = ("observed", "unique", "ambiguous", "unmatched")
 
 
 class Tally:
@@ -70,6 +71,17 @@ class Tally:
             line = outcome.answer
         self._write(line + b"\n")
         self._bar.update()
+
+    def follow(self, state: dict[str, Any]) -> None:
+        """Take the counts of a replay that the service works through."""
+        counts, lines = state["counts"], state["lines"]
+        self.new, self.replayed = counts["new"], counts["repeated"]
+        self.attitudes = counts["attitudes"]
+        self.stars = Counter({each: counts[each] for each in STARS})
+        self._bar.update(lines["done"] - self._bar.n)
+        if state["state"] != "running":
+            # Those whose place is known are told one by one.
+            self.refused += lines["refused"] - len(state["errors"])
 
     def _write(self, text: bytes) -> None:
         if self._path is None:

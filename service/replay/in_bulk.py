@@ -1,0 +1,136 @@
+"""Replay through a running service as one upload, worked through there; its progress is asked for.
+
+The way for files of any length: nothing waits for single answers.  A second
+time adds nothing, as with single posts.
+"""
+
+import time
+from array import array
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from service.errors import BadInput, Busy, Fault, NotAdmitted, NotAllowed, problem_of_faults
+from service.observe.formats import read_lines
+from service.replay.items import Item, Outcome, Problem, Report
+from service.replay.over_http import PATIENCE_S, checked_url, shown_error
+
+ROUTE = "/api/v1/replays"
+NDJSON = {"Content-Type": "application/x-ndjson"}
+TIMEOUT = httpx.Timeout(120.0, connect=5.0)
+PAUSE_S = 0.25
+
+Told = dict[str, Any]
+
+
+class _Lines:
+    """The lines of files as they are sent, and where each of them stood."""
+
+    def __init__(self, files: Sequence[Path], report: Report) -> None:
+        self._files = files
+        self._report = report
+        self._places = array("L")
+        self._starts: list[int] = []
+
+    def __iter__(self) -> Iterator[bytes]:
+        for file in self._files:
+            self._starts.append(len(self._places))
+            for line in read_lines(file):
+                if line.body is None:
+                    assert line.fault is not None
+                    problem = problem_of_faults([line.fault])
+                    self._report(Outcome(Item(file, line.number, None), None, problem=problem))
+                    continue
+                self._places.append(line.number)
+                yield line.body + b"\n"
+
+    def item(self, number: int) -> Item:
+        """Where line `number` of what was sent stood."""
+        index = number - 1
+        which = max(i for i, start in enumerate(self._starts) if start <= index)
+        return Item(self._files[which], self._places[index], None)
+
+
+def replay_in_bulk(
+    url: str,
+    files: Sequence[Path],
+    run: str,
+    report: Report,
+    progress: Callable[[Told], None],
+    *,
+    token: str | None = None,
+    query: dict[str, str] | None = None,
+) -> None:
+    """Send files as one replay and follow it to its end.
+
+    `progress` is given the state of the replay now and then, and at the end;
+    `report` every refused line, those beyond the first thousand without their
+    place.  Raises `BadInput`, `NotAdmitted`, `NotAllowed` for what the service
+    refuses, and `Busy` where it does not answer or stopped before the end.
+    """
+    lines = _Lines(files, report)
+    shown = {} if token is None else {"Authorization": f"Bearer {token}"}
+    with httpx.Client(
+        base_url=checked_url(url), timeout=TIMEOUT, trust_env=False, headers=shown
+    ) as client:
+        begun = _begin(client, url, {"run": run, **(query or {})}, lines)
+        state = _followed(client, url, begun, progress)
+    for each in state["errors"]:
+        report(Outcome(lines.item(each["line"]), None, problem=each["problem"]))
+    if state["state"] != "done":
+        raise Busy(
+            f"{url} ended the replay before its end ({state['state']}, "
+            f"{state['lines']['done']} lines in); run the same command again to go on from "
+            "here: nothing is recorded twice"
+        )
+
+
+def _begin(client: httpx.Client, url: str, query: dict[str, str], lines: _Lines) -> str:
+    try:
+        response = client.post(ROUTE, params=query, content=iter(lines), headers=NDJSON)
+    except httpx.TransportError as error:
+        raise Busy(
+            f"no service answers at {url} ({shown_error(error)}); "
+            "start one with `acquire serve`, or replay with --in-process"
+        ) from None
+    if response.status_code == 202:
+        return str(response.headers["Location"])
+    detail = str(_problem(response)["detail"])
+    if response.status_code == 401:
+        raise NotAdmitted(f"{url} asks for a token ({detail}): set ACQUIRE_TOKEN")
+    if response.status_code == 403:
+        raise NotAllowed(f"{url}: {detail}")
+    if response.status_code >= 500:
+        raise Busy(f"{url}: {detail}")
+    raise BadInput(Fault("replay", detail))
+
+
+def _followed(client: httpx.Client, url: str, place: str, progress: Callable[[Told], None]) -> Told:
+    give_up = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            response = client.get(place)
+            if response.status_code == 200:
+                state: Told = response.json()
+                progress(state)
+                if state["state"] != "running":
+                    return state
+                give_up = time.monotonic() + PATIENCE_S
+        except httpx.TransportError:
+            pass
+        if time.monotonic() > give_up:
+            raise Busy(
+                f"{url} no longer answers; run the same command again to go on from here: "
+                "nothing is recorded twice"
+            )
+        time.sleep(PAUSE_S)
+
+
+def _problem(response: httpx.Response) -> Problem:
+    try:
+        told: Problem = response.json()
+        return told if "detail" in told else {"detail": f"HTTP {response.status_code}"}
+    except ValueError:
+        return {"detail": f"HTTP {response.status_code}: {response.text[:200]}"}
