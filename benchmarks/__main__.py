@@ -15,9 +15,17 @@ from pathlib import Path
 from benchmarks import (
     aberration,
     attitude_against_svd,
+    calibration,
+    centroids,
     covariance,
+    frames,
+    imaging_claims,
     plain_reference,
+    ptp,
+    spurious,
     staircase,
+    verified_cost,
+    whole_sky,
     zone_counts,
 )
 from benchmarks.report import Report
@@ -29,6 +37,14 @@ BENCHMARKS: dict[str, Callable[[bool, int], Report]] = {
     "covariance": covariance.run,
     "attitude_against_svd": attitude_against_svd.run,
     "plain_reference": plain_reference.run,
+    "calibration": calibration.run,
+    "spurious": spurious.run,
+    "whole_sky": whole_sky.run,
+    "verified_cost": verified_cost.run,
+    "frames": frames.run,
+    "centroids": centroids.run,
+    "imaging_claims": imaging_claims.run,
+    "ptp": ptp.run,
 }
 DEFAULT_SEED = 19941026
 RESULTS = Path(__file__).parent / "results.json"

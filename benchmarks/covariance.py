@@ -15,6 +15,7 @@ import numpy.typing as npt
 from tqdm import tqdm
 
 from benchmarks.report import Report
+from benchmarks.sections import Section, Written, table
 from service.acquire import Acquisition, acquire
 from service.missions.mission import SHIPPED_FOLDER, Mission
 from service.observe.wire import submission_from_json
@@ -148,3 +149,19 @@ def run(quick: bool, seed: int) -> Report:
             if beyond > max(0.006, 0.0027 + 5.0 * math.sqrt(0.0027 / len(squares))):
                 faults.append(f"{name}: {beyond:.2%} above {SQUARE_BOUND}")
     return Report("covariance", figures, not faults, faults)
+
+
+def write(quick: bool, seed: int) -> Written:
+    """The section of the verification."""
+    report = run(quick, seed)
+    text = f"""
+Nominal batches of up to five stars with two-axis Gaussian noise, through the whole staircase:
+identified, corrected for aberration and solved. With e the attitude error about the body axes and
+P the covariance, e^T P^-1 e is chi-square with three degrees of freedom, and TASTE with 2N - 3.
+
+{table(("", "figure"), report.figures.items())}
+"""
+    return Written(text, report.passed)
+
+
+SECTION = Section("Covariance", write)

@@ -12,6 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.report import Report
+from benchmarks.sections import Section, Written, table
 from service.missions.mission import SHIPPED_FOLDER
 from service.sky.catalog import load_embedded
 from service.sky.shelf import Shelf
@@ -51,3 +52,22 @@ def run(quick: bool, seed: int) -> Report:
             figures[name] = f"{size:,} batches, {shares}; {len(differ)} differ"
             faults += differ[:5]
     return Report("plain_reference", figures, not faults, faults)
+
+
+def write(quick: bool, seed: int) -> Written:
+    """The section of the verification."""
+    report = run(quick, seed)
+    text = f"""
+A second implementation of the votes stands in `tests/reference/plain_starid.py`. It was written
+from the paper and the description of a batch alone, has no index, no cache and no compiled code,
+and looks at every pair of the exact zone. Batches of every kind are given to both: all kinds of a
+priori knowledge, tests on and off in every combination, changed tolerances and grids, serious
+errors, spurious stars, missing magnitudes, body rates, several trackers. Outcome, star, votes,
+runner-up and rivals must be equal for every star.
+
+{table(("mission", "compared"), report.figures.items())}
+"""
+    return Written(text, report.passed)
+
+
+SECTION = Section("Identification by votes", write)

@@ -122,6 +122,7 @@ def measured(
         identify.append(found.timings_us["identify"])
         solve.append(found.timings_us["solve"])
     zone = found.trackers[0].zone
+    assert zone is not None
     empty_us = _empty_call_us(zone)
     begun = time.perf_counter()
     for body in drawn:

@@ -1,0 +1,223 @@
+"""Whether the probabilities mean what they say: of stars claimed at p a share p is right.
+
+python -m benchmarks.calibration           every condition by itself
+python -m benchmarks.calibration --quick   small samples
+"""
+
+import io
+import sys
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks.report import Report
+from benchmarks.sections import Section, Written, table
+from benchmarks.verified_views import Condition, interval, judged_views
+from service.vectors import Vector
+
+VIEWS, QUICK_VIEWS = 2400, 120
+EDGES = (0.0, 0.5, 0.9, 0.99, 0.999, 1.0)
+NAMED, NAMED_WRONG = 0.999, 0.001
+OFF = 0.03
+"""How far the share that is right may lie below what was claimed, in the bins from .9 to .999."""
+FEW = 20
+"""Claims in a bin below which its share says nothing."""
+
+TIMES_THE_VIEWS = {"two of five spurious": 2}
+"""Where fewer stars of a view can be named."""
+
+CONDITIONS = {
+    "nominal errors": Condition(("cap", "band")),
+    "serious errors": Condition(("cap", "band"), errors="serious"),
+    "two of five spurious": Condition(("cap", "band"), spurious=2),
+    "empty sky": Condition(("cap_desert", "band_desert")),
+    "dense sky": Condition(("cap_forest", "band_forest")),
+    "a fifth of the catalog missing": Condition(("cap", "band"), missing=0.2),
+    "magnitudes off by 0.5": Condition(("cap", "band"), offset_mag=0.5),
+    "doubles not merged": Condition(("cap", "band"), merged=False),
+    "3 to 12 stars": Condition(("cap", "band"), stars=3, most_stars=12),
+}
+
+
+@dataclass(frozen=True)
+class Bin:
+    """Claims between two probabilities: what they claim on average, and how many are right."""
+
+    least: float
+    most: float
+    claimed: float
+    claims: int
+    right: int
+
+    @property
+    def share(self) -> float:
+        """The share that is right."""
+        return self.right / self.claims if self.claims else float("nan")
+
+    @property
+    def shown(self) -> str:
+        """Claims, and of them the share that is right."""
+        return f"{self.claims:,}: {self.share:.2%}" if self.claims else "-"
+
+
+@dataclass(frozen=True)
+class Reliability:
+    """The bins of one condition, and what is out of bounds in them."""
+
+    condition: str
+    bins: tuple[Bin, ...]
+
+    @property
+    def named(self) -> Bin:
+        """The claims with which a star is named."""
+        return self.bins[-1]
+
+    @property
+    def wrong_at_most(self) -> float:
+        """The upper end of the 95 % interval of the share wrong among stars that are named."""
+        return interval(self.named.claims - self.named.right, self.named.claims)[1]
+
+    def faults(self, quick: bool) -> list[str]:
+        """Out of bounds; a small sample cannot tell the share of stars named wrongly."""
+        faults = []
+        wrong = self.named.claims - self.named.right
+        if self.wrong_at_most > NAMED_WRONG and not (quick and wrong == 0):
+            faults.append(f"{self.condition}: {wrong} of {self.named.claims} named wrongly")
+        for each in self.bins[2:-1]:
+            high = interval(each.right, each.claims)[1] if each.claims else 1.0
+            if each.claims >= FEW and min(each.share + OFF, high) < each.claimed:
+                faults.append(f"{self.condition}: {each.share:.1%} right at {each.claimed:.2%}")
+        return faults
+
+
+def claims(condition: Condition, views: int, seed: int) -> tuple[Vector, Vector]:
+    """The probability of every star's likeliest name, and whether that is right."""
+    claimed, right = [], []
+    for judged in judged_views(condition, views, seed):
+        star, probability = judged.first()
+        some = star >= 0
+        claimed.append(probability[some])
+        right.append((star == judged.truth)[some])
+    return np.concatenate(claimed), np.concatenate(right)
+
+
+def binned(name: str, claimed: Vector, right: Vector) -> Reliability:
+    """The claims of a condition by probability."""
+    bins = []
+    for k, (least, most) in enumerate(pairwise(EDGES)):
+        last = k == len(EDGES) - 2
+        inside = (claimed >= least) & ((claimed < most) | last)
+        number = int(inside.sum())
+        mean = float(claimed[inside].mean()) if number else (least + most) / 2.0
+        bins.append(Bin(least, most, mean, number, int(right[inside].sum())))
+    return Reliability(name, tuple(bins))
+
+
+def measured(quick: bool, seed: int) -> list[Reliability]:
+    """Every condition by itself."""
+    views = QUICK_VIEWS if quick else VIEWS
+    return [
+        binned(name, *claims(condition, views * TIMES_THE_VIEWS.get(name, 1), seed))
+        for name, condition in tqdm(CONDITIONS.items(), desc="calibration", unit="condition")
+    ]
+
+
+def run(quick: bool, seed: int) -> Report:
+    """The benchmark: of each condition the claims and the share right, by bin."""
+    found = measured(quick, seed)
+    figures = {
+        f"{each.condition}, {part.least:g} to {part.most:g}": part.shown
+        for each in found
+        for part in each.bins
+    }
+    figures |= {
+        f"{each.condition}, named: wrong at most (95 %)": f"{each.wrong_at_most:.3%}"
+        for each in found
+    }
+    faults = [fault for each in found for fault in each.faults(quick)]
+    return Report("calibration", figures, not faults, faults)
+
+
+def write(quick: bool, seed: int) -> Written:
+    """The section of the verification, with its picture."""
+    found = measured(quick, seed)
+    rows = [
+        (
+            each.condition,
+            *(part.shown for part in each.bins[:-1]),
+            f"{each.named.claims:,}",
+            each.named.claims - each.named.right,
+            f"{each.wrong_at_most:.3%}",
+        )
+        for each in found
+    ]
+    head = (
+        "condition",
+        *(f"{a:g} to {b:g}" for a, b in pairwise(EDGES[:-1])),
+        "named",
+        "wrong",
+        "at most",
+    )
+    faults = [fault for each in found for fault in each.faults(quick)]
+    text = f"""
+A star is `unique` from a probability of 0.999. Does that mean what it says? Of every star the
+likeliest name is taken, whether it was given as the answer or as the first of its rivals, and
+counted by the probability claimed for it: how many claims, and the share of them that is right.
+*Named* are the claims of 0.999 and more, with the number that is wrong and the upper end of the
+95 % interval of its share, which must not exceed 0.1 %. In the bins from 0.9 to 0.999 the share
+right may not be more than 3 points below what was claimed. Each condition is
+{QUICK_VIEWS if quick else VIEWS:,} views, twice that where two of five stars are spurious, half of
+them caps and half bands; serious errors are a rotation of 100° (cap) or 3° about each axis (band),
+12 arcsec and 0.3 mag at once.
+
+{table(head, rows, numbers=3)}
+
+![Wrong as often as claimed](plots/calibration.svg)
+
+Below the line the probabilities are too modest, above it they claim too much. An arrow is the upper
+end of the interval where no claim was wrong.
+"""
+    return Written(text, not faults, {"calibration.svg": picture(found)})
+
+
+def picture(found: list[Reliability]) -> str:
+    """How often claims were wrong over how often they say they are, as SVG."""
+    import matplotlib as mpl
+
+    mpl.use("svg")
+    from matplotlib import pyplot as plt
+
+    with mpl.rc_context({"svg.hashsalt": "calibration", "svg.fonttype": "path"}):
+        figure, axes = plt.subplots(figsize=(7.0, 5.0), layout="constrained")
+        axes.plot([1e-7, 1.0], [1e-7, 1.0], color="#888888", linewidth=0.8)
+        for place, each in enumerate(found):
+            parts = [part for part in each.bins if part.claims >= FEW]
+            color = f"C{place}"
+            for part in parts:
+                wrong = part.claims - part.right
+                low, high = interval(wrong, part.claims)
+                claimed = max(1.0 - part.claimed, 1e-7)
+                if wrong:
+                    axes.plot([claimed, claimed], [max(low, 1e-5), high], color=color, linewidth=1)
+                    axes.plot(claimed, wrong / part.claims, "o", color=color, markersize=4)
+                else:
+                    axes.plot(claimed, high, "v", color=color, markersize=5, fillstyle="none")
+            axes.plot([], [], "o", color=color, markersize=4, label=each.condition)
+        axes.set(xscale="log", yscale="log", xlim=(5e-8, 1.0), ylim=(1e-5, 1.0))
+        axes.set_xlabel("claimed to be wrong, on average of a bin")
+        axes.set_ylabel("wrong")
+        axes.legend(fontsize=7, loc="lower right")
+        text = io.StringIO()
+        figure.savefig(text, format="svg", metadata={"Date": None})
+        plt.close(figure)
+    return "\n".join(line.rstrip() for line in text.getvalue().splitlines()) + "\n"
+
+
+SECTION = Section("What a probability is worth", write)
+
+if __name__ == "__main__":
+    from benchmarks.__main__ import main
+
+    sys.exit(main(["calibration", *sys.argv[1:]]))

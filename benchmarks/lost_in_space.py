@@ -1,0 +1,125 @@
+"""Lost in space against other solvers: the same scenes in the same run, every answer checked.
+
+    python -m benchmarks.lost_in_space --scenes 40000 --seed 7            a table
+    python -m benchmarks.lost_in_space --scenes 40000 --write             docs/lost-in-space.md
+    pip install '.[peers]'                                                the others, in an
+                                                                          environment of their own
+
+Right: an attitude whose boresight is within 0.1 deg and whose total rotation is
+within 1 deg of the truth; wrong: any other; none: no answer.  `--scenes` is the
+number at one pixel; other conditions take a stated share of it, and slow solvers
+the first scenes only.  Times are of the process's own clock around the call
+from Python, scene by scene, solvers taking turns.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from tqdm import tqdm
+
+from benchmarks.lost_in_space_conditions import CONDITIONS, QUICK_SHARE, Condition, solvers_of
+from benchmarks.lost_in_space_document import document, faults_of, section_text, shown_rows
+from benchmarks.lost_in_space_rows import Count, Row, row_of
+from benchmarks.report import Report
+from benchmarks.sections import Section, Written
+
+DEFAULT_SEED = 19941026
+TARGET = Path(__file__).parent.parent / "docs" / "lost-in-space.md"
+SLOW_SCENES = 300
+"""For solvers that take milliseconds."""
+TURN = 100
+"""Scenes that one solver gets before the next has its turn."""
+OWN_SCENES, OWN_QUICK_SCENES = 8000, 400
+
+
+def measured(
+    names: Sequence[str], scenes: int, seed: int, with_peers: bool = True, quiet: bool = False
+) -> list[Row]:
+    """The rows of some conditions, solver by solver."""
+    rows: list[Row] = []
+    for name in names:
+        condition = CONDITIONS[name]
+        count = max(int(scenes * condition.share), 20)
+        with tqdm(total=count, desc=name, unit=" scenes", disable=quiet or None) as bar:
+            rows += _one(name, condition, count, seed, with_peers, bar)
+    return rows
+
+
+def _one(
+    name: str, condition: Condition, count: int, seed: int, with_peers: bool, bar: "tqdm[None]"
+) -> list[Row]:
+    solvers = solvers_of(condition, with_peers)
+    counts = {each.name: Count() for each in solvers}
+    for first in range(0, count, TURN):
+        drawn = condition.draw(min(TURN, count - first), seed, first)
+        for solver in solvers:
+            taken = drawn[: max(SLOW_SCENES - first, 0)] if solver.slow else drawn
+            counts[solver.name].take(solver, taken, condition.real)
+        bar.update(len(drawn))
+    return [row_of(name, each, counts[each.name]) for each in solvers]
+
+
+def run(quick: bool, seed: int) -> Report:
+    """The service's own solver in every condition, held to its bounds; no peers, no clock."""
+    scenes = OWN_QUICK_SCENES if quick else OWN_SCENES
+    rows = measured(list(CONDITIONS), scenes, seed, with_peers=False)
+    faults = faults_of(rows)
+    figures = {
+        f"{row.condition}: right, wrong, none of {row.scenes:,}": (
+            f"{row.right:,}, {row.wrong:,}, {row.none:,}"
+        )
+        for row in rows
+    }
+    return Report("lost_in_space", figures, not faults, faults)
+
+
+def _write(quick: bool, seed: int) -> Written:
+    scenes = int(OWN_SCENES * QUICK_SHARE) if quick else OWN_SCENES
+    rows = measured(list(CONDITIONS), scenes, seed, with_peers=False)
+    return Written(section_text(rows), not faults_of(rows))
+
+
+SECTION = Section("Lost in space", _write)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command; the exit code is 1 where a figure is out of bounds."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.lost_in_space",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("names", nargs="*", metavar="condition", help=", ".join(CONDITIONS))
+    parser.add_argument("--scenes", type=int, default=2000, help="at one pixel; default 2000")
+    parser.add_argument("--seed", type=int, default=DEFAULT_SEED)
+    parser.add_argument("--json", type=Path, metavar="OUT", help="write the rows")
+    parser.add_argument("--write", action="store_true", help=f"write docs/{TARGET.name}")
+    parser.add_argument("--alone", action="store_true", help="without the other solvers")
+    asked = parser.parse_args(arguments)
+    if unknown := set(asked.names) - set(CONDITIONS):
+        parser.error(f"no such condition: {', '.join(sorted(unknown))}")
+    if asked.scenes < 1:
+        parser.error("--scenes must be at least 1")
+    rows = measured(asked.names or list(CONDITIONS), asked.scenes, asked.seed, not asked.alone)
+    print(shown_rows(rows))
+    if asked.json is not None:
+        text = json.dumps([asdict(row) for row in rows], indent=1)
+        asked.json.write_text(text + "\n", encoding="utf-8")
+    if asked.write:
+        text, pictures = document(rows, asked.scenes, asked.seed)
+        TARGET.write_text(text, encoding="utf-8")
+        for name, svg in pictures.items():
+            (TARGET.parent / "plots" / name).write_text(svg, encoding="utf-8")
+        print(f"wrote {TARGET.name} and {len(pictures)} plots")
+    faults = faults_of(rows)
+    for fault in faults:
+        print(f"! {fault}")
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,145 @@
+"""Every page of the console as a picture: `python -m benchmarks.screenshots`.
+
+A service of its own is filled with a sample pass that is watched for alarms; a
+browser then looks at every page, wide and narrow, light and dark.  The
+pictures go to docs/images, where docs/operators.md shows them.
+"""
+
+import argparse
+import io
+import json
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+import httpx
+from PIL import Image
+from tqdm import tqdm
+
+from service.missions.mission import load_missions
+from service.operations import Operations
+from service.settings import Settings
+from service.simulate.stretches import Pass
+from service.simulate.telemetry import draw_pass
+from service.web.app import create_app
+from tests.web.browser import CHROMIUM, Browser
+from tests.web.serving import Server
+
+FOLDER = Path(__file__).parents[1] / "docs" / "images"
+RUN = "sample-pass"
+BATCHES = 240
+START = "1999-03-01T00:00:00.000Z"
+SIZES = {"wide": 1440, "narrow": 400}
+TALLEST = {"wide": 1350, "narrow": 1100}
+"""Pixels of a picture's height: what follows on a long page is more of the same."""
+QUALITY = 50
+PATIENCE_S = 60.0
+
+
+def main() -> int:
+    """Fill a service, look at every page, write the pictures."""
+    parser = argparse.ArgumentParser(prog="benchmarks.screenshots", description=__doc__)
+    parser.add_argument("--folder", type=Path, default=FOLDER, help="where the pictures go")
+    parser.add_argument("--only", help="pages by name, with commas between, e.g. batch,alarms")
+    asked = parser.parse_args()
+    if CHROMIUM is None:
+        parser.error("there is no chromium on this machine")
+    with tempfile.TemporaryDirectory() as folder:
+        operations = Operations.open(Settings(database=f"sqlite:///{folder}/acquire.db"))
+        with Server(create_app(operations)) as address:
+            pages = filled(address, operations)
+            if asked.only:
+                pages = {name: pages[name] for name in asked.only.split(",")}
+            asked.folder.mkdir(parents=True, exist_ok=True)
+            with Browser(Path(folder) / "profile") as browser:
+                total = look(browser, address, pages, asked.folder)
+    print(f"{total / 1e6:.2f} MB in {asked.folder}")
+    return 0
+
+
+def filled(address: str, operations: Operations) -> Mapping[str, str]:
+    """Replay a pass of every mission, act on its alarms; the pages that are worth a look."""
+    with httpx.Client(base_url=address, timeout=PATIENCE_S) as client:
+        while client.get("/readyz").status_code != 200:
+            time.sleep(0.2)
+        for name, mission in load_missions().items():
+            wanted = Pass(batches=BATCHES, seed=1, start=START, cadence_s=30.0)
+            drawn = draw_pass(mission, operations.sky, wanted)
+            lines = b"\n".join(json.dumps(each.batch).encode() for each in drawn)
+            replay(client, lines, name)
+        alarms = client.get("/api/v1/alarms", params={"run": RUN, "state": "all"}).json()["items"]
+        signed = {"who": "J. Operator", "comment": "a priori attitude drifts; slew at 00:40"}
+        xte = [each for each in alarms if each["spacecraft"] == "XTE"]
+        client.post(f"/api/v1/alarms/{xte[-1]['id']}/acknowledge", json=signed).raise_for_status()
+        shelved = signed | {"comment": "known, until the upload", "minutes": 120}
+        client.post(f"/api/v1/alarms/{alarms[0]['id']}/shelve", json=shelved).raise_for_status()
+        batch = looked_into(client)
+    run = f"run={RUN}"
+    tried = "identifier=starid&tolerances.separation_deg=0.012"
+    return {
+        "overview": f"/?{run}",
+        "spacecraft": f"/spacecraft/XTE?{run}&start=1999-060T00:00:00Z&end=1999-060T02:00:00Z",
+        "batch": f"/batches/{batch}",
+        "what-if": f"/batches/{batch}?{tried}",
+        "batches": f"/batches?{run}&outcome=ambiguous",
+        "compare": f"/compare?{run}&spacecraft=XTE&a.identifier=starid&b.identifier=verified",
+        "alarms": f"/alarms?{run}&state=all",
+        "alarm": f"/alarms/{xte[-1]['id']}",
+        "limits": f"/spacecraft/XTE/limits?{run}",
+        "runs": f"/runs?{run}",
+        "zones": f"/zones?{run}",
+        "missions": f"/missions?{run}",
+        "advice": f"/advice/XTE?{run}&sample=60",
+        "about": f"/about?{run}",
+    }
+
+
+def looked_into(client: httpx.Client) -> str:
+    """A batch of XTE that was solved though a star of it was none of the catalog's."""
+    asked = {"run": RUN, "spacecraft": "XTE", "outcome": "unmatched", "status": "good"}
+    found = client.get("/api/v1/batches", params=asked).json()["items"]
+    return str(max(found, key=lambda each: (each["counts"]["unique"], each["id"]))["id"])
+
+
+def replay(client: httpx.Client, lines: bytes, name: str) -> None:
+    """Send a file and wait until its last batch is recorded."""
+    answer = client.post(
+        "/api/v1/replays",
+        params={"run": RUN, "alarms": "true"},
+        content=lines,
+        headers={"Content-Type": "application/x-ndjson"},
+    )
+    answer.raise_for_status()
+    end = time.monotonic() + PATIENCE_S
+    while client.get(answer.headers["Location"]).json()["state"] == "running":
+        if time.monotonic() > end:
+            raise TimeoutError(f"the replay of {name} does not end")
+        time.sleep(0.1)
+
+
+def look(browser: Browser, address: str, pages: Mapping[str, str], folder: Path) -> int:
+    """Take every picture; bytes written."""
+    total = 0
+    views = [(page, size, dark) for page in pages for size in SIZES for dark in (False, True)]
+    for page, size, dark in tqdm(views, desc="pictures", unit="picture"):
+        browser.open(address + pages[page], width=SIZES[size], height=900, dark=dark)
+        browser.wait(lambda: browser.run(SETTLED))
+        height = min(browser.run("document.documentElement.scrollHeight"), TALLEST[size])
+        picture = browser.picture(SIZES[size], height)
+        file = folder / f"{page}-{size}-{'dark' if dark else 'light'}.webp"
+        with Image.open(io.BytesIO(picture)) as image:
+            image.convert("RGB").save(file, "WEBP", quality=QUALITY, method=6)
+        total += file.stat().st_size
+    return total
+
+
+SETTLED = """(() => {
+  const charts = document.getElementById("charts");
+  const live = document.getElementById("connection").dataset.state;
+  return live !== "idle" && (charts === null || charts.dataset.drawn !== undefined);
+})()"""
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,194 @@
+"""Views with known truth for the benchmarks of verified identification.
+
+They are the views of the paper's simulator, spoilt as a condition says, and go
+through the whole staircase.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import count
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import beta
+
+from service.acquire import acquire
+from service.identify.identification import Identification
+from service.missions.mission import Identifier, Mission
+from service.simulate.motion import tilted
+from service.simulate.paper.printed import Run, World, the_paper
+from service.simulate.paper.views import EPOCH, View, batch_of, draw_zone, paper_mission
+from service.sky.catalog import load_embedded
+from service.sky.run_catalog import RunCatalog
+from service.sky.shelf import Shelf
+from service.sky.view import Sky
+from service.times import Utc
+from service.vectors import Vector, read_only
+
+Rows = npt.NDArray[np.intp]
+
+SHELF_BYTES = 128 << 20
+# phi, theta, psi in arcsec; radial position error in arcsec; magnitude error and its bound.
+ERRORS = {
+    ("nominal", "XTE"): ((42.0, 42.0, 60.0), 3.0, 0.1, 0.6),
+    ("nominal", "SOHO"): ((360.0, 360.0, 648000.0), 3.0, 0.1, 0.6),
+    ("serious", "XTE"): ((360000.0, 40.0, 60.0), 12.0, 0.3, 6.0),
+    ("serious", "SOHO"): ((10800.0, 10800.0, 10800.0), 12.0, 0.3, 6.0),
+}
+
+
+@dataclass(frozen=True)
+class Condition:
+    """How views are drawn and spoilt: in which worlds of the paper, with which errors.
+
+    A view has `stars` stars, or any number from `stars` to `most_stars`;
+    `spurious` of them stand anywhere in the field.  The share `missing` of the
+    run catalog is withheld from the identifier.  Unless `merged`, the catalog
+    and the sky have every component of a double by itself.
+    """
+
+    worlds: tuple[str, ...]
+    errors: str = "nominal"
+    stars: int = 5
+    most_stars: int | None = None
+    spurious: int = 0
+    missing: float = 0.0
+    offset_mag: float = 0.0
+    merged: bool = True
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One view: what was said of its stars, and the row of each in the run catalog, -1 for none."""
+
+    found: Identification
+    truth: Rows
+
+    def first(self) -> tuple[Rows, Vector]:
+        """Of every star the likeliest row, named or the first of its rivals, and its probability.
+
+        -1 and 0 where there is none.
+        """
+        star = self.found.star.copy()
+        probability = np.where(self.found.unique, self.found.probability, 0.0)
+        for k, rivals in enumerate(self.found.rivals):
+            if rivals:
+                star[k], probability[k] = rivals[0], self.found.rival_probability[k][0]
+        return star, probability
+
+
+@dataclass(frozen=True)
+class ThinnedSky(Sky):
+    """A sky whose run catalogs have lost some stars, the same ones for every batch."""
+
+    kept: float
+    seed: int
+
+    def run_catalog(self, mission: Mission, time: Utc) -> RunCatalog:
+        """The run catalog less those stars."""
+        return thinned(super().run_catalog(mission, time), self.kept, self.seed)
+
+
+@lru_cache(maxsize=8)
+def thinned(catalog: RunCatalog, kept: float, seed: int) -> RunCatalog:
+    """A run catalog with a random share of its stars."""
+    rows = kept_rows(catalog, kept, seed)
+    return replace(
+        catalog,
+        ra_deg=read_only(catalog.ra_deg[rows]),
+        dec_deg=read_only(catalog.dec_deg[rows]),
+        magnitude_mag=read_only(catalog.magnitude_mag[rows]),
+        catalog_row=read_only(catalog.catalog_row[rows]),
+        star_id=tuple(catalog.star_id[row] for row in rows),
+        digest=f"{catalog.digest} thinned to {kept} by {seed}",
+    )
+
+
+def kept_rows(catalog: RunCatalog, kept: float, seed: int) -> Rows:
+    """The rows of a run catalog that thinning leaves."""
+    return np.flatnonzero(np.random.default_rng(seed).uniform(size=len(catalog)) < kept)
+
+
+def judged_views(
+    condition: Condition, views: int, seed: int, identifier: Identifier = "verified"
+) -> Iterator[Judged]:
+    """So many views of a condition, in its worlds by turns, identified."""
+    catalog, shelf = load_embedded(), Shelf(SHELF_BYTES)
+    whole = Sky(catalog, shelf)
+    kept = 1.0 - condition.missing
+    sky = ThinnedSky(catalog, shelf, kept, seed) if condition.missing else whole
+    worlds = [the_paper().worlds[name] for name in condition.worlds]
+    drawn = [
+        _drawn(condition, world, whole, np.random.default_rng([seed, place]))
+        for place, world in enumerate(worlds)
+    ]
+    for number in range(views):
+        place = number % len(worlds)
+        view, run, mission = next(drawn[place])
+        truth = view.star
+        if condition.missing:
+            run_catalog = whole.run_catalog(mission, EPOCH)
+            position = np.full(len(run_catalog) + 1, -1)
+            rows = kept_rows(run_catalog, kept, seed)
+            position[rows] = np.arange(len(rows))
+            truth = position[truth]
+        acquired = acquire(batch_of(view, run, mission, identifier), mission, sky)
+        yield Judged(acquired.trackers[0].identification, truth)
+
+
+def _drawn(
+    condition: Condition, world: World, sky: Sky, rng: np.random.Generator
+) -> Iterator[tuple[View, Run, Mission]]:
+    mission = _mission(world.mission, condition.merged)
+    catalog = sky.run_catalog(mission, EPOCH)
+    rotation, sigma_arcsec, sigma_mag, bound_mag = ERRORS[condition.errors, world.mission]
+    run = replace(
+        the_paper().runs[0],
+        world=world.name,
+        rotation_arcsec=rotation,
+        sigma_arcsec=sigma_arcsec,
+        sigma_mag=sigma_mag,
+        bound_mag=bound_mag,
+        geometry=True,
+    )
+    most = condition.most_stars or condition.stars
+    for zone in count():
+        for view in draw_zone(world, zone, mission, catalog, rng, most):
+            stars = int(rng.integers(condition.stars, most + 1))
+            if len(view.star) >= stars:
+                yield _spoilt(_cut(view, stars), condition, mission, rng), run, mission
+
+
+def _mission(name: str, merged: bool) -> Mission:
+    mission = paper_mission(name)
+    if merged:
+        return mission
+    settings = mission.model_dump()
+    settings["catalog"]["merge_within_arcsec"] = 0.0
+    return Mission.model_validate(settings)
+
+
+def _cut(view: View, stars: int) -> View:
+    names = ("star", "direction", "magnitude_mag", "radius", "bearing_rad", "share")
+    return replace(view, **{name: getattr(view, name)[:stars] for name in names})
+
+
+def _spoilt(view: View, condition: Condition, mission: Mission, rng: np.random.Generator) -> View:
+    """The view with spurious stars anywhere in its field and its magnitudes off."""
+    star, direction = view.star.copy(), view.direction.copy()
+    tracker = mission.trackers[0]
+    boresight = view.attitude.T @ tracker.body_from_tracker[:, 2]
+    radius = np.radians(tracker.field_of_view_radius_deg)
+    for k in rng.choice(len(star), condition.spurious, replace=False):
+        star[k], direction[k] = -1, tilted(boresight, radius * np.sqrt(rng.uniform()), rng)
+    magnitude = view.magnitude_mag + condition.offset_mag
+    return replace(view, star=star, direction=direction, magnitude_mag=magnitude)
+
+
+def interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
+    """The share's confidence interval by Clopper and Pearson."""
+    tail = (1.0 - confidence) / 2.0
+    low = float(beta.ppf(tail, successes, trials - successes + 1)) if successes else 0.0
+    high = float(beta.ppf(1.0 - tail, successes + 1, trials - successes))
+    return low, high if successes < trials else 1.0
