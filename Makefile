@@ -9,6 +9,8 @@ BATCHES ?=
 # Further arguments, e.g. make test PYTEST_ARGS="-k quest -x"
 DEMO_ARGS ?=
 PYTEST_ARGS ?=
+# Processes that share the tests between them, a file to each at a time; 0 for one after another
+WORKERS ?= 2
 BENCH_ARGS ?=
 # From the environment: TEST_POSTGRESQL_URL, a scratch database for the PostgreSQL tests, which
 # are skipped without it, e.g. postgresql+psycopg://user@127.0.0.1:5432/test
@@ -24,12 +26,13 @@ DEV = $(VENV)/.installed-dev
 .DEFAULT_GOAL = help
 # The steps of `make check` run one after another, also under -j.
 .NOTPARALLEL:
-.PHONY: help run test check format-check lint types floors migrations-check openapi-check \
+.PHONY: help run test torture check format-check lint types floors migrations-check openapi-check \
 	format lock bench openapi clean
 
 help:
 	@echo "make run      set up, serve on http://$(HOST):$(PORT), replay sample telemetry, print a table"
 	@echo "make test     set up and run the tests"
+	@echo "make torture  kills, failing disks, odd input at full size (tests do a fiftieth)"
 	@echo "make check    tests, format, lint, types, import floors, migrations, openapi.yaml"
 	@echo "make format   format the code and mend what the linter can"
 	@echo "make bench    run the benchmarks"
@@ -37,15 +40,21 @@ help:
 	@echo "make lock     resolve the dependencies anew (needs the package index)"
 	@echo "make clean    remove .venv and everything that was built or cached"
 	@echo
-	@echo "Variables: PORT, HOST, BATCHES, PYTHON, TEST_POSTGRESQL_URL,"
+	@echo "Variables: PORT, HOST, BATCHES, PYTHON, WORKERS, TEST_POSTGRESQL_URL,"
 	@echo "           DEMO_ARGS, PYTEST_ARGS, BENCH_ARGS"
 
 run: $(RUNTIME)
 	@exec $(BIN)/acquire demo --host $(HOST) --port $(PORT) $(if $(BATCHES),--batches $(BATCHES)) $(DEMO_ARGS)
 
 test: $(DEV)
+	@echo "== compiling the kernels (minutes after a change of the core, else seconds)"
+	@$(BIN)/python -m service.warm
 	@echo "== tests"
-	@$(BIN)/python -m pytest $(PYTEST_ARGS)
+	@$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile $(PYTEST_ARGS)
+
+torture: $(DEV)
+	@echo "== torture: kills, failing disks and odd input at full size; hours"
+	@$(BIN)/python -m pytest --torture -m torture $(PYTEST_ARGS)
 
 check: test format-check lint types floors migrations-check openapi-check
 	@echo "== all checks passed"
