@@ -78,6 +78,23 @@ def test_the_record_holds_the_batch_and_what_was_found(client, recorded):
     assert other["attitude"]["quaternion"] == answer["attitude"]["quaternion"]
 
 
+@pytest.mark.parametrize("told", [None, "nothing"])
+def test_a_frame_of_which_nothing_is_known_is_found_in_the_whole_sky(send, frames, told):
+    """`a_priori` may be null, or left out: a camera says enough by itself."""
+    known = {name: value for name, value in frames[1].known.items() if name != "a_priori"}
+    known |= {"batch": f"whole-sky-{told}"} | ({"a_priori": None} if told is None else {})
+    answer = send(frames[1], known)
+    assert answer.status_code == 201, answer.text
+    attitude = answer.json()["attitude"]
+    assert attitude["status"] == "good"
+    assert answer.json()["path"] == "lost_in_space"
+    error = attitude_error_arcsec(
+        matrix_from_quaternion(attitude["quaternion"]),
+        matrix_from_quaternion(frames[1].truth["quaternion"]),
+    )
+    assert error @ np.linalg.solve(attitude["covariance_arcsec2"], error) < 30.0
+
+
 def test_the_same_frame_again_gives_the_first_answer_and_another_is_a_conflict(
     send, recorded, frames
 ):
