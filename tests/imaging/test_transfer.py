@@ -158,6 +158,16 @@ def test_the_first_dark_ring_fills_as_the_line_widens(width, fill, within):
     assert null_fill(width) == pytest.approx(fill, rel=within)
 
 
+def test_a_fifth_of_the_colour_wide_there_is_no_ring_but_a_shoulder():
+    """Where the light falls off slowest, 1.3 % of the peak are left."""
+    radius = np.linspace(1.0, 1.4, 400) * first_null_rad(1.0, 1e-6)
+    light = disc_image(radius, 1.0, 1e-6, 0.2) / disc_image(np.zeros(1), 1.0, 1e-6, 0.2)
+    assert (np.diff(light) < 0).all()
+    shoulder = np.argmin(np.abs(np.gradient(light)))
+    assert 0 < shoulder < len(light) - 1
+    assert light[shoulder] == pytest.approx(1.3e-2, rel=0.03)
+
+
 def test_a_narrow_line_leaves_the_ring_dark():
     assert null_fill(1e-4) < 5e-8
 
