@@ -603,6 +603,11 @@ class Operations:
                 now=utc_now().text,
             )
 
+    def active_alarms(self, run: str = LIVE) -> list[Row]:
+        """Every alarm of a run that is not cleared, the worst first."""
+        with self.store.reading() as connection:
+            return alarms.active_alarms(connection, run, utc_now().text)
+
     def alarm(self, id: str) -> Row:
         """One alarm with all that was noted of it."""
         with self.store.reading() as connection:

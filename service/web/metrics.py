@@ -1,6 +1,9 @@
 """Counters for Prometheus, in a registry of the app's own: no state is shared between apps."""
 
+import logging
+from collections import Counter as Counted
 from collections.abc import Iterator
+from itertools import product
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -8,9 +11,13 @@ from prometheus_client.registry import Collector
 from starlette.types import Scope
 
 from service.acquire import Acquisition
+from service.alarms.limits import Severity
 from service.operations import LIVE, Operations
 
+log = logging.getLogger(__name__)
+
 OUTCOMES = ("unique", "ambiguous", "unmatched")
+ALARM_STATES = ("open", "acknowledged", "shelved")
 _METHODS = ("GET", "POST", "DELETE", "PUT", "PATCH", "OPTIONS")
 _SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
 
@@ -43,6 +50,33 @@ class _Zones(Collector):
         )
 
 
+class _Alarms(Collector):
+    """The live alarms that are not cleared, read when asked."""
+
+    def __init__(self, operations: Operations) -> None:
+        self._operations = operations
+
+    def collect(self) -> Iterator[Metric]:
+        family = GaugeMetricFamily(
+            "starid_alarms",
+            "Alarms of live batches that are not cleared.",
+            labels=("spacecraft", "severity", "state"),
+        )
+        try:
+            found = Counted(
+                (each["spacecraft"], each["severity"], each["state"])
+                for each in self._operations.active_alarms()
+            )
+        except Exception as error:
+            # A gauge that is missing is seen; zero would say that all is well.
+            log.warning("alarms cannot be counted: %s", error)
+            return
+        severities = [each.word for each in Severity]
+        for labels in product(self._operations.missions, severities, ALARM_STATES):
+            family.add_metric(labels, found[labels])
+        yield family
+
+
 class Metrics:
     """What is counted, and its text form."""
 
@@ -73,6 +107,7 @@ class Metrics:
             registry=self.registry,
         )
         self.registry.register(_Zones(operations))
+        self.registry.register(_Alarms(operations))
         operations.observers.append(self.count_batch)
         for name in operations.missions:
             # A counter that is there from the start has a first increase.

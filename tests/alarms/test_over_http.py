@@ -1,6 +1,7 @@
 """Limits and alarms over HTTP: what people do, who they are, and what is refused."""
 
 import pytest
+from prometheus_client.parser import text_string_to_metric_families
 
 from tests.web.conftest import (
     address,
@@ -110,3 +111,28 @@ def test_a_limit_goes_back_to_what_was_shipped(client):
 def test_live_batches_are_always_watched(client):
     answer = client.put("/api/v1/runs/live", json={"alarms": False})
     assert answer.status_code == 422
+
+
+def test_live_alarms_are_counted_for_prometheus(client, drawn):
+    """None but those of live batches, each under how bad it is and where it stands."""
+
+    def counted():
+        text = client.get("/metrics").text
+        (family,) = [f for f in text_string_to_metric_families(text) if f.name == "starid_alarms"]
+        of_swas = [s for s in family.samples if s.labels["spacecraft"] == "SWAS"]
+        assert len(of_swas) == 9
+        return {(s.labels["severity"], s.labels["state"]) for s in of_swas if s.value == 1}
+
+    asked = {"settings": TIGHT, "who": "jb"}
+    url = "/api/v1/spacecraft/SWAS/limits/no_attitude_share"
+    assert client.put(url, json=asked).status_code == 200
+    assert counted() == set()
+    (lone,) = drawn("SWAS", 1, stars=1)
+    client.put("/api/v1/runs/apart", json={"alarms": True}).raise_for_status()
+    client.post("/api/v1/batches", json=lone | {"run": "apart"}).raise_for_status()
+    assert counted() == set()
+    client.post("/api/v1/batches", json=lone).raise_for_status()
+    assert counted() == {("warning", "open")}
+    (alarm,) = client.get("/api/v1/alarms?spacecraft=SWAS").json()["items"]
+    client.post(f"/api/v1/alarms/{alarm['id']}/acknowledge", json={"who": "jb"}).raise_for_status()
+    assert counted() == {("warning", "acknowledged")}

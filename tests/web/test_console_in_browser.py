@@ -312,6 +312,36 @@ def test_a_shift_from_the_overview_to_the_star_and_the_alarm(browser, address, c
     assert browser.complaints == []
 
 
+def test_acknowledged_but_still_out_of_limits_an_alarm_stays(browser, address, client, drawn):
+    """Somebody knows of it; it is over only with a batch that is back in limits."""
+    run, tight = "unwell", {"warning": {"high": 0.5}, "minimum_count": 1, "duration_s": 0}
+    limit = "/api/v1/spacecraft/SOHO/limits/no_attitude_share"
+    client.put(limit, json={"settings": tight, "who": "J. Operator"}).raise_for_status()
+    client.put(f"/api/v1/runs/{run}", json={"alarms": True}).raise_for_status()
+    (lone,) = drawn("SOHO", 1, stars=1)
+    client.post("/api/v1/batches", json=lone | {"run": run}).raise_for_status()
+    (alarm,) = client.get("/api/v1/alarms", params={"run": run}).json()["items"]
+
+    browser.open(f"{address}/alarms/{alarm['id']}?run={run}")
+    browser.wait(lambda: browser.run("!!document.getElementById('act-form')"))
+    browser.wait(lambda: browser.run(CONNECTED))
+    browser.run("document.getElementById('act-form').elements.who.value = 'J. Operator'; 0")
+    click(browser, "[data-act=acknowledge]")
+    shows(browser, "acknowledged by J. Operator", "#alarm")
+    state = "document.getElementById('alarm').dataset.state"
+    browser.wait(lambda: browser.run(state) == "acknowledged")
+    assert "back in limits" not in browser.run("document.getElementById('alarm').innerText")
+
+    settings = tight | {"warning": {"high": 1.0}}
+    client.put(limit, json={"settings": settings, "who": "J. Operator"}).raise_for_status()
+    following = drawn("SOHO", 2)[1]
+    client.post("/api/v1/batches", json=following | {"run": run}).raise_for_status()
+    browser.wait(lambda: browser.run(state) == "cleared")
+    shows(browser, "back in limits", "#alarm")
+    client.delete(limit, params={"who": "J. Operator"}).raise_for_status()
+    assert browser.complaints == []
+
+
 def test_a_limit_is_changed_on_its_page_and_kept_with_who_and_why(browser, address, client):
     browser.open(f"{address}/spacecraft/SWAS/limits")
     browser.wait(lambda: browser.run(CONNECTED))
