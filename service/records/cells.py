@@ -93,7 +93,7 @@ def _whole(
         .order_by(columns.bucket)
     )
     # As tuples: numpy would ask each of SQLAlchemy's rows for more than its values.
-    rows = [tuple(row) for row in connection.execute(query)]
+    rows = [tuple(row) for row in connection.execute(query).all()]
     read = np.array(rows, dtype=float).reshape(-1, 1 + len(_NAMES)).T
     unix_s = read[0] * width_s - UNIX_DAY * DAY_S
     return {
