@@ -2,7 +2,8 @@
 
 A service of its own is filled with a sample pass that is watched for alarms; a
 browser then looks at every page, wide and narrow, light and dark.  The
-pictures go to docs/images, where docs/operators.md shows them.
+pictures go to docs/images, where docs/operators.md shows them; the table of
+all of them at its end is written anew.
 """
 
 import argparse
@@ -27,12 +28,16 @@ from tests.web.browser import CHROMIUM, Browser
 from tests.web.serving import Server
 
 FOLDER = Path(__file__).parents[1] / "docs" / "images"
+DOCUMENT = FOLDER.parent / "operators.md"
+HEADING = "## Every page, wide and narrow, light and dark"
 RUN = "sample-pass"
 BATCHES = 240
 START = "1999-03-01T00:00:00.000Z"
 SIZES = {"wide": 1440, "narrow": 400}
 TALLEST = {"wide": 1350, "narrow": 1100}
 """Pixels of a picture's height: what follows on a long page is more of the same."""
+WIDTHS = {"wide": 320, "narrow": 120}
+"""Of a picture in the table of all."""
 QUALITY = 50
 PATIENCE_S = 60.0
 
@@ -54,6 +59,9 @@ def main() -> int:
             asked.folder.mkdir(parents=True, exist_ok=True)
             with Browser(Path(folder) / "profile") as browser:
                 total = look(browser, address, pages, asked.folder)
+    if asked.folder == FOLDER and not asked.only:
+        before, _, _ = DOCUMENT.read_text(encoding="utf-8").partition(HEADING)
+        DOCUMENT.write_text(before + gallery(pages), encoding="utf-8")
     print(f"{total / 1e6:.2f} MB in {asked.folder}")
     return 0
 
@@ -75,6 +83,7 @@ def filled(address: str, operations: Operations) -> Mapping[str, str]:
         shelved = signed | {"comment": "known, until the upload", "minutes": 120}
         client.post(f"/api/v1/alarms/{alarms[0]['id']}/shelve", json=shelved).raise_for_status()
         batch = looked_into(client)
+        replays = client.get("/api/v1/replays").json()["items"]
     run = f"run={RUN}"
     tried = "identifier=starid&tolerances.separation_deg=0.012"
     return {
@@ -88,10 +97,12 @@ def filled(address: str, operations: Operations) -> Mapping[str, str]:
         "alarm": f"/alarms/{xte[-1]['id']}",
         "limits": f"/spacecraft/XTE/limits?{run}",
         "runs": f"/runs?{run}",
+        "replay": f"/replays/{replays[0]['id']}?{run}",
         "zones": f"/zones?{run}",
         "missions": f"/missions?{run}",
         "advice": f"/advice/XTE?{run}&sample=60",
         "about": f"/about?{run}",
+        "sign-in": "/sign-in",
     }
 
 
@@ -134,10 +145,29 @@ def look(browser: Browser, address: str, pages: Mapping[str, str], folder: Path)
     return total
 
 
+def gallery(pages: Mapping[str, str]) -> str:
+    """The last section of the guide: a table of every picture."""
+    views = [(size, light) for light in ("light", "dark") for size in SIZES]
+    head = " | ".join(f"{size}, {light}" for size, light in views)
+    rows = [
+        f"| {page} | "
+        + " | ".join(
+            f'<a href="images/{page}-{size}-{light}.webp">'
+            f'<img src="images/{page}-{size}-{light}.webp" width="{WIDTHS[size]}" '
+            f'alt="{page}, {size}, {light}"></a>'
+            for size, light in views
+        )
+        + " |"
+        for page in pages
+    ]
+    return "\n".join([HEADING, "", f"| page | {head} |", "|---|---|---|---|---|", *rows, ""])
+
+
 SETTLED = """(() => {
   const charts = document.getElementById("charts");
-  const live = document.getElementById("connection").dataset.state;
-  return live !== "idle" && (charts === null || charts.dataset.drawn !== undefined);
+  const connection = document.getElementById("connection");
+  const told = connection === null || connection.dataset.state !== "idle";
+  return told && (charts === null || charts.dataset.drawn !== undefined);
 })()"""
 
 

@@ -137,6 +137,21 @@ def test_the_work_is_bounded_however_many_points_there_are(sky, solver, rng):
     assert blurred.work < 700_000
 
 
+def test_a_rich_field_is_as_sure_as_can_be(index, rng):
+    """The evidence of many stars with small sigmas is beyond what an exponential can hold."""
+    stars, sigma_rad = index.arrays.stars[:, :3], 2e-7
+    neighbours = (stars @ stars.T > math.cos(math.radians(6.0))).sum(axis=1)
+    centre = stars[np.argmax(neighbours)]
+    field = index.arrays.stars[stars @ centre > math.cos(math.radians(6.0))]
+    assert len(field) > 60
+    places = unit(field[:, :3] + rng.normal(0.0, sigma_rad, (len(field), 3)))
+    sigmas = np.full(len(field), sigma_rad)
+    result = LostInSpace(index, FieldOfView(6.0)).solve(places, field[:, 3], sigmas)
+    assert result.attitude is not None
+    assert np.abs(result.attitude - np.eye(3)).max() < 1e-6
+    assert 690.0 < result.log_odds < math.inf
+
+
 @pytest.mark.parametrize("points", [0, 1, 2])
 def test_two_stars_are_too_few(points, sky, solver, seed):
     scene = next(draw_scenes(sky, Conditions(fewest=5), 1, seed))

@@ -16,6 +16,9 @@ LOG_NULL = -math.log(20.0)
 LARGEST_SIGMA_RAD = math.radians(0.25)
 """About its worst axis, for which an attitude is not told: a cluster in a corner fixes no roll."""
 
+LEAST = 1e-300
+"""Odds longer than this are told as this: a rich field's evidence is beyond every exponent."""
+
 FOUND, TOO_FEW, NOTHING, DOUBTFUL, DEGENERATE = 0, 1, 2, 3, 4
 
 
@@ -25,7 +28,7 @@ def judge(ledger, weights, attitudes, covariances, count):  # type: ignore[no-un
     if count == 0:
         return -1, -math.inf, NOTHING
     best = np.argmax(weights[:count])
-    same, others = 0.0, math.exp(LOG_NULL - weights[best])
+    same, others = 0.0, max(math.exp(LOG_NULL - weights[best]), LEAST)
     for h in range(count):
         share = math.exp(weights[h] - weights[best])
         # The trace of the turn between two attitudes: 1 + 2 cos.
