@@ -1,8 +1,4 @@
-"""Rates against each error, the paper's beside ours, as pictures for the documentation.
-
-matplotlib is imported when a picture is drawn: it is there where the project
-is developed, not where it only runs.
-"""
+"""Rates against each error, the paper's beside ours, as pictures for the documentation."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from service.errors import Fault, NotAvailable
+from service.simulate.drawing import pictures_in
 from service.simulate.paper.printed import Run
 from service.simulate.paper.region import spread
 from service.simulate.paper.tally import Tally
@@ -72,39 +68,22 @@ def draw(tallies: Sequence[Tally], folder: Path) -> list[Path]:
 
     Raises `NotAvailable` where matplotlib is not installed.
     """
-    try:
-        import matplotlib as mpl
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise NotAvailable(
-            Fault("plots", "needs matplotlib, one of the development packages")
-        ) from None
-    folder.mkdir(parents=True, exist_ok=True)
-    written = []
-    # The same numbers give the same file: nothing in it tells when it was drawn.
-    with mpl.rc_context(
-        {"svg.hashsalt": "paper", "font.size": 9, "axes.grid": True, "grid.alpha": 0.3}
-    ):
+    with pictures_in(folder, "paper") as pictures:
         for name, panels in PICTURES.items():
             shown = [(p, [t for t in tallies if p.shows(t.run)]) for p in panels]
             shown = [(panel, mine) for panel, mine in shown if mine]
             if shown:
-                figure = Figure(figsize=(3.4 * len(shown) + 0.6, 3.3), layout="constrained")
+                figure = pictures.figure(3.4 * len(shown) + 0.6, 3.3)
                 axes = figure.subplots(1, len(shown), squeeze=False)[0]
                 for axis, (panel, mine) in zip(axes, shown, strict=True):
                     _draw_panel(axis, panel, mine)
-                written.append(_save(figure, folder / f"{name}.svg"))
+                pictures.save(figure, name)
         places = [tally for tally in tallies if tally.run.number >= 8]
         if places:
-            figure = Figure(figsize=(9.0, 0.22 * len(places) + 1.2), layout="constrained")
+            figure = pictures.figure(9.0, 0.22 * len(places) + 1.2)
             _draw_places(figure.subplots(1, 2, sharey=True), places)
-            written.append(_save(figure, folder / f"{PLACES}.svg"))
-    return written
-
-
-def _save(figure: Any, path: Path) -> Path:
-    figure.savefig(path, metadata={"Date": None})
-    return path
+            pictures.save(figure, PLACES)
+    return pictures.written
 
 
 def _percent(tallies: Sequence[Tally], k: int) -> tuple[Any, Any, Any]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from service.errors import Fault, NotAvailable
+from service.simulate.drawing import pictures_in
 from service.simulate.ptp.printed import Ends, the_ptp_paper
 from service.simulate.ptp.tally import Rate, Tally
 
@@ -26,23 +26,12 @@ def draw(found: Drawn, folder: Path) -> list[Path]:
 
     Raises `NotAvailable` where matplotlib is not installed.
     """
-    try:
-        import matplotlib as mpl
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise NotAvailable(
-            Fault("plots", "needs matplotlib, one of the development packages")
-        ) from None
-    folder.mkdir(parents=True, exist_ok=True)
-    paper, written = the_ptp_paper(), []
-    # The same numbers give the same file: nothing in it tells when it was drawn.
-    with mpl.rc_context(
-        {"svg.hashsalt": "ptp", "font.size": 9, "axes.grid": True, "grid.alpha": 0.3}
-    ):
+    paper = the_ptp_paper()
+    with pictures_in(folder, "ptp") as pictures:
         for name, shown in found.items():
             if not name.startswith("figure"):
                 continue
-            figure = Figure(figsize=(7.4, 3.4), layout="constrained")
+            figure = pictures.figure(7.4, 3.4)
             if isinstance(shown, np.ndarray):
                 _histogram(figure.subplots(), shown)
             else:
@@ -60,10 +49,8 @@ def draw(found: Drawn, folder: Path) -> list[Path]:
                 left.set_ylabel("fields (%)")
                 if left.get_legend_handles_labels()[0]:
                     left.legend(fontsize=7)
-            path = folder / f"ptp-{name}.svg"
-            figure.savefig(path, metadata={"Date": None})
-            written.append(path)
-    return written
+            pictures.save(figure, f"ptp-{name}")
+    return pictures.written
 
 
 def _histogram(axis: Any, stars: npt.NDArray[np.int64]) -> None:
