@@ -12,6 +12,7 @@ import hypothesis
 import numpy as np
 import pytest
 
+from service.cli import main
 from service.missions.mission import SHIPPED_FOLDER, load_missions
 from service.sky.catalog import load_embedded
 from service.sky.shelf import Shelf
@@ -89,3 +90,21 @@ def mission_files():
         path.stem.upper(): tomllib.loads(path.read_text(encoding="utf-8"))
         for path in sorted(SHIPPED_FOLDER.glob("*.toml"))
     }
+
+
+@pytest.fixture
+def acquire(capsys, tmp_path, monkeypatch):
+    """Run a command in an empty folder with nothing set; its exit code, output and complaints."""
+    monkeypatch.chdir(tmp_path)
+    for name in [name for name in os.environ if name.startswith("ACQUIRE_")]:
+        monkeypatch.delenv(name)
+
+    def run(*arguments):
+        try:
+            code = main([str(argument) for argument in arguments])
+        except SystemExit as stop:
+            code = stop.code
+        printed = capsys.readouterr()
+        return code, printed.out, printed.err
+
+    return run

@@ -17,7 +17,6 @@ import pytest
 import yaml
 
 from service import __version__
-from service.cli import main
 from service.cli.parser import build_parser
 from service.missions.mission import SHIPPED_FOLDER
 from service.observe.csv_cells import COLUMNS
@@ -50,29 +49,6 @@ COMMANDS = [
     "demo",
     "version",
 ]
-
-
-@pytest.fixture(autouse=True)
-def _somewhere_else(tmp_path, monkeypatch):
-    """Every command runs in an empty folder, with nothing set."""
-    monkeypatch.chdir(tmp_path)
-    for name in ("DATABASE", "MISSIONS", "CATALOG", "SHELF_MB", "HOST", "PORT"):
-        monkeypatch.delenv(f"ACQUIRE_{name}", raising=False)
-
-
-@pytest.fixture
-def acquire(capsys):
-    """Run a command; its exit code, what it printed and what it complained of."""
-
-    def run(*arguments):
-        try:
-            code = main([str(argument) for argument in arguments])
-        except SystemExit as stop:
-            code = stop.code
-        printed = capsys.readouterr()
-        return code, printed.out, printed.err
-
-    return run
 
 
 def telemetry(acquire, path, spacecraft="XTE", batches=6, *more):

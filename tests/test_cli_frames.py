@@ -5,28 +5,6 @@ import json
 import pytest
 from PIL import Image
 
-from service.cli import main
-
-
-@pytest.fixture(autouse=True)
-def _somewhere_else(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for name in ("DATABASE", "MISSIONS", "CATALOG", "SHELF_MB", "HOST", "PORT", "TOKEN"):
-        monkeypatch.delenv(f"ACQUIRE_{name}", raising=False)
-
-
-@pytest.fixture
-def acquire(capsys):
-    def run(*arguments):
-        try:
-            code = main([str(argument) for argument in arguments])
-        except SystemExit as stop:
-            code = stop.code
-        printed = capsys.readouterr()
-        return code, printed.out, printed.err
-
-    return run
-
 
 @pytest.fixture
 def frames(acquire, tmp_path):
