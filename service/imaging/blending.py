@@ -6,8 +6,8 @@ from scipy.ndimage import correlate
 from service.imaging.psf import Psf
 from service.imaging.shape_fit import Fit
 
-BLEND_SIGMAS = 5.0
-BLEND_SHARE = 0.02
+BLEND_SIGMAS = 4.0
+BLEND_SHARE = 0.01
 """A second star is told where it stands this far above the noise and holds this share of light."""
 
 

@@ -12,6 +12,7 @@ from service.imaging.detect import MESH_PX, Detections
 from service.imaging.frame import Frame
 from service.imaging.psf import GaussianPsf, Psf
 from service.imaging.record import CentroidRecord
+from service.imaging.struck import hits_under
 from service.imaging.trail import TrailPsf, trails_px
 from service.imaging.window import Detector, Window, cutout
 from service.missions.camera import Camera, CentroidMethod
@@ -46,7 +47,7 @@ def measure(
     """The candidates bright enough to matter, the brightest first.
 
     Each is placed alone; those with others in their window are then placed once more
-    with the light of the others taken away.
+    with the light of the others taken away, and those on pixels that were hit without these.
     """
     exposure_s = frame.exposure_s or camera.exposure_s
     detector = detector_of(frame, found, camera)
@@ -71,9 +72,12 @@ def measure(
     starts = list(zip(found.u_px.tolist(), found.v_px.tolist(), strict=True))
     records = [centroid(windows[k], method, psfs[k], starts[k], half) for k in range(count)]
     for k, near in enumerate(_neighbours(found, count, half + MARGIN_PX + 2)):
+        window = _without(windows[k], near, records, found, psfs) if near else windows[k]
         if near:
-            window = _without(windows[k], near, records, found, psfs)
             records[k] = centroid(window, method, psfs[k], starts[k], half)
+        if records[k].usable and (hits := hits_under(window, psfs[k], records[k])).any():
+            clean = dataclasses.replace(window, good=window.usable & ~hits)
+            records[k] = centroid(clean, method, psfs[k], starts[k], half)
     flux = np.array([record.flux_counts for record in records], dtype=np.float64)
     magnitudes = camera.magnitude(flux, exposure_s)
     return _chosen(records, magnitudes.tolist(), faintest_mag, camera.most_stars)

@@ -1,4 +1,8 @@
-"""Stars that a cosmic ray struck: found again once the pixels that it struck are taken off."""
+"""Stars that a cosmic ray struck, or that lie on a hot pixel.
+
+Some are found again only once the pixels that were struck are taken off; others are
+placed, and what stands out from their own image is then no longer believed.
+"""
 
 from dataclasses import dataclass
 
@@ -6,8 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from service.imaging.frame import Counts
-from service.imaging.psf import GaussianPsf
+from service.imaging.psf import GaussianPsf, Psf
+from service.imaging.record import CentroidRecord
 from service.imaging.shapes import is_sharp, patches_of
+from service.imaging.window import Mask, Window
 from service.vectors import Vector
 
 HALF_PX = 5
@@ -18,6 +24,9 @@ MARGIN = 1.4
 LEAST_SIGMAS = 5.0
 CERTAIN_SIGMAS = 12.0
 """Of what is left of a star that was struck, so that the rest of a track is none."""
+
+HIT_SHARE = 0.1
+"""Of a star's brightest pixel: less may be a shape that is not quite the one presumed."""
 
 _ASIDE = ((-1, 0), (1, 0), (0, -1), (0, 1))
 
@@ -67,8 +76,28 @@ def stars_behind(
     )
 
 
+def hits_under(window: Window, psf: Psf, star: CentroidRecord) -> Mask:
+    """Pixels (rows, columns) of a window that stand out from a placed star as no light can.
+
+    The star is taken off at the place that it was given; a pixel was hit where more is
+    left of it than of its neighbours by a factor that no image of a point reaches.
+    """
+    rows, columns = window.counts.shape
+    du = np.arange(columns)[None, :] + window.corner_u_px - star.u_px
+    dv = np.arange(rows)[:, None] + window.corner_v_px - star.v_px
+    model = np.maximum(star.flux_counts * psf.pixel(du, dv), 0.0)
+    variance = window.floor_variance + model / window.detector.gain_e_per_count
+    left = np.where(window.usable, window.light_counts - model, 0.0)
+    middle, beside, above = psf.pixel(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+    ratio = float(middle / max(beside, above))
+    hot = _hot(left[None], ratio, np.sqrt(variance)[None])[0]
+    return np.asarray(hot & (left > HIT_SHARE * model.max()))
+
+
 def _hot(
-    patches: npt.NDArray[np.float64], peak_over_next: float, noise_counts: float
+    patches: npt.NDArray[np.float64],
+    peak_over_next: float,
+    noise_counts: float | npt.NDArray[np.float64],
 ) -> npt.NDArray[np.bool_]:
     """Pixels of (k, rows, columns) that stand out from their neighbours more than a star's can."""
     hot = np.zeros(patches.shape, dtype=np.bool_)

@@ -1,13 +1,20 @@
 """What is found on a frame: every star to the limit, nothing else; placed as well as it says."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
+from service.imaging.centroid import centroid
 from service.imaging.detect import detect
 from service.imaging.frame import Frame
 from service.imaging.measure import measure
+from service.imaging.psf import GaussianPsf
 from service.imaging.shapes import is_sharp
+from service.imaging.struck import hits_under
+from service.imaging.window import Detector
 from service.simulate.frames import FrameSettings, draw_frames
+from service.simulate.imaging.windows import draw_window
 
 
 @pytest.fixture(scope="module")
@@ -118,3 +125,24 @@ def test_a_star_on_a_trail_is_found_and_placed_at_mid_exposure(sky, missions, ca
             assert star.magnitude_mag == pytest.approx(magnitude[k], abs=0.2)
     assert len(offsets) >= 4
     assert np.abs(offsets).max() < 0.3
+
+
+@pytest.mark.parametrize("method", ["matched", "recursive"])
+def test_a_hot_pixel_under_a_star_is_not_believed(method, camera, rng):
+    """Found in a star's own light by what no image of a point can do; the rest places it."""
+    psf, detector, background = GaussianPsf(camera.psf_sigma_px), Detector(2.0, 12.0), 40.0
+    for _ in range(40):
+        u, v = rng.uniform(7.5, 8.5, 2)
+        window = draw_window(rng, psf, (u, v), 5000.0, detector, background, 17)
+        struck = tuple(rng.integers(7, 10, 2))
+        counts = window.counts.copy()
+        counts[struck] += 0.5 * 5000.0 * psf.pixel(np.zeros(1), np.zeros(1))[0]
+        dirty = dataclasses.replace(window, counts=counts)
+        pulled = centroid(dirty, method, psf, start=(8.0, 8.0), half_width_px=4)
+        hits = hits_under(dirty, psf, pulled)
+        assert hits[struck]
+        clean = dataclasses.replace(dirty, good=~hits)
+        found = centroid(clean, method, psf, start=(8.0, 8.0), half_width_px=4)
+        assert abs(found.u_px - u) < 5 * found.sigma_u_px
+        assert abs(found.v_px - v) < 5 * found.sigma_v_px
+        assert not hits_under(window, psf, centroid(window, method, psf, start=(8.0, 8.0))).any()
