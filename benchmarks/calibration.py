@@ -17,7 +17,7 @@ from benchmarks.sections import Section, Written, table
 from benchmarks.verified_views import Condition, interval, judged_views
 from service.vectors import Vector
 
-VIEWS, QUICK_VIEWS = 2400, 120
+VIEWS, QUICK_VIEWS = 10_000, 120
 EDGES = (0.0, 0.5, 0.9, 0.99, 0.999, 1.0)
 NAMED, NAMED_WRONG = 0.999, 0.001
 OFF = 0.03

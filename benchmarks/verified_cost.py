@@ -10,7 +10,7 @@ or busy, the ratios to the votes in the same run count.
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,8 +24,8 @@ from service.acquire import acquire
 from service.identify.hypotheses import MAX_HYPOTHESES, marginals
 from service.identify.pair_tests import cast_votes, count_votes
 from service.identify.presumed import presumed_attitude
-from service.identify.scene import Seen
-from service.identify.search import search
+from service.identify.scene import Seen, scratch_for
+from service.identify.search import search_in
 from service.identify.starid import MAX_RIVALS, Sighting
 from service.identify.verify import UNIQUE_PROBABILITY, scene_of
 from service.simulate.paper.experiments import open_sky
@@ -37,7 +37,9 @@ from service.vectors import ARCSEC_PER_RADIAN
 Rows = npt.NDArray[np.int64]
 
 STARS = 5
-VIEWS, QUICK_VIEWS = 400, 40
+VIEWS, QUICK_VIEWS = 2000, 100
+VIEWS_PER_ZONE = 100
+"""In one call of a kernel, so that what the call itself costs does not count."""
 REPEATS = 9
 VOTES, EXHAUSTIVE, EARLY = "votes", "exhaustive", "early stop"
 
@@ -73,7 +75,7 @@ def sightings(
 ) -> Iterator[list[tuple[Sighting, Rows]]]:
     """Views of five stars, zone by zone, with the zone rows that are true."""
     run = next(r for r in the_paper().runs if (r.table, r.run) == (place.table, place.run))
-    world = the_paper().worlds[run.world]
+    world = replace(the_paper().worlds[run.world], views=VIEWS_PER_ZONE)
     mission = paper_mission(world.mission)
     catalog = sky.run_catalog(mission, EPOCH)
     rng = np.random.default_rng(seed)
@@ -112,6 +114,7 @@ def _sighting(acquired: Any) -> Sighting:
 def many_verified(observed, magnitude, like, stars, pairs, exhaustive, room, star, probability):  # type: ignore[no-untyped-def]
     """Identify many views of one zone; `like` has what they share."""
     ledger, log_weight, none, rivals, likely = room
+    scratch = scratch_for(observed.shape[1])
     for k in range(len(observed)):
         seen = Seen(
             observed[k],
@@ -123,7 +126,7 @@ def many_verified(observed, magnitude, like, stars, pairs, exhaustive, room, sta
             like.prior_kind,
             like.prior_axis,
         )
-        count, rest, _, _ = search(seen, stars, pairs, exhaustive, ledger, log_weight)
+        count, rest, _, _ = search_in(scratch, seen, stars, pairs, exhaustive, ledger, log_weight)
         marginals(ledger, log_weight, count, rest, star[k], probability[k], none, rivals, likely)
 
 

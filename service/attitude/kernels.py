@@ -57,33 +57,29 @@ def _firmest_pair(b, r, weights):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _triad_frame(anchor, other, rows):  # type: ignore[no-untyped-def]
+def _triad_frame(anchor, other):  # type: ignore[no-untyped-def]
+    """The second and third axis of the frame whose first is the anchor."""
     x = anchor[1] * other[2] - anchor[2] * other[1]
     y = anchor[2] * other[0] - anchor[0] * other[2]
     z = anchor[0] * other[1] - anchor[1] * other[0]
     norm = math.sqrt(x * x + y * y + z * z)
     x, y, z = x / norm, y / norm, z / norm
-    rows[0] = anchor
-    rows[1, 0], rows[1, 1], rows[1, 2] = x, y, z
-    rows[2, 0] = anchor[1] * z - anchor[2] * y
-    rows[2, 1] = anchor[2] * x - anchor[0] * z
-    rows[2, 2] = anchor[0] * y - anchor[1] * x
+    third = (
+        anchor[1] * z - anchor[2] * y,
+        anchor[2] * x - anchor[0] * z,
+        anchor[0] * y - anchor[1] * x,
+    )
+    return (x, y, z), third
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def triad(b1, b2, r1, r2, attitude):  # type: ignore[no-untyped-def]
     """The matrix that takes r1 to b1 exactly and r2 into the plane of b1 and b2 (Black 1964)."""
-    body = np.empty((3, 3))
-    inertial = np.empty((3, 3))
-    _triad_frame(b1, b2, body)
-    _triad_frame(r1, r2, inertial)
+    body2, body3 = _triad_frame(b1, b2)
+    inertial2, inertial3 = _triad_frame(r1, r2)
     for i in range(3):
         for j in range(3):
-            attitude[i, j] = (
-                body[0, i] * inertial[0, j]
-                + body[1, i] * inertial[1, j]
-                + body[2, i] * inertial[2, j]
-            )
+            attitude[i, j] = b1[i] * r1[j] + body2[i] * inertial2[j] + body3[i] * inertial3[j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

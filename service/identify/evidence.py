@@ -19,6 +19,7 @@ rho the zone's stars per steradian; clutter's magnitude is uniform over 6 mag.
 import math
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
 CLUTTER_SPAN_MAG = 6.0
@@ -46,6 +47,20 @@ _LOG_BETA_OF_NONE = (
 )
 
 
+def _table_of_clutter() -> npt.NDArray[np.float64]:
+    """Log probability of so much clutter and so many stars, for few of both."""
+    table = np.empty((_FEW + 1, _FEW + 1))
+    for clutter in range(_FEW + 1):
+        for stars in range(_FEW + 1):
+            a, b = clutter + BETA_CLUTTER, stars + BETA_STAR
+            log_beta = math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
+            table[clutter, stars] = log_beta - _LOG_BETA_OF_NONE
+    return table
+
+
+_LOG_CLUTTER = _table_of_clutter()
+
+
 @njit(cache=True, nogil=True)
 def log_beta(a, b):  # type: ignore[no-untyped-def]
     """Logarithm of Euler's beta function."""
@@ -55,6 +70,8 @@ def log_beta(a, b):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def log_clutter(clutter, stars):  # type: ignore[no-untyped-def]
     """Log probability that just these are clutter."""
+    if clutter <= _FEW and stars <= _FEW:
+        return _LOG_CLUTTER[clutter, stars]
     return log_beta(clutter + BETA_CLUTTER, stars + BETA_STAR) - _LOG_BETA_OF_NONE
 
 
@@ -117,6 +134,20 @@ def log_magnitudes(count, total_mag, square_mag2):  # type: ignore[no-untyped-de
                 total += math.exp(term - largest)
     shared = -0.5 * count * _LOG_2PI
     return shared + largest + math.log(total / (2 * len(MAGNITUDE_SCALES_MAG)))
+
+
+_LOG_EQUAL = np.array(
+    [
+        log_magnitudes.py_func(count, 0.0, 0.0)  # type: ignore[no-untyped-call]
+        for count in range(_FEW + 1)
+    ]
+)
+
+
+@njit(cache=True, nogil=True)
+def log_equal_magnitudes(count):  # type: ignore[no-untyped-def]
+    """The magnitudes of `count` stars that are all as the catalog has them: the most they weigh."""
+    return _LOG_EQUAL[count] if count <= _FEW else log_magnitudes(count, 0.0, 0.0)
 
 
 @njit(cache=True, nogil=True)

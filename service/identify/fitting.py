@@ -12,6 +12,7 @@ from numba import njit
 from service.attitude.kernels import inverse_symmetric, triad
 from service.identify import evidence
 from service.identify.evidence import PRIOR_ROTATION
+from service.identify.scene import with_magnitude
 from service.sky.pairs import separation_rad
 
 LEAST_SINE2 = 4e-10
@@ -230,11 +231,11 @@ def most_log(seen, stars, count, compared, shift):  # type: ignore[no-untyped-de
     between any two of its stars, det N is at least sin^2 theta.
     """
     n = len(seen.observed)
-    clutter = n - np.isnan(seen.magnitude).sum() - compared
+    clutter = with_magnitude(seen) - compared
     return (
         evidence.log_prior(shift, seen.prior_kind)
         + evidence.log_positions(count, 0.0, 0.0, seen.reference_sigma)
-        + evidence.log_magnitudes(compared, 0.0, 0.0)
+        + evidence.log_equal_magnitudes(compared)
         + evidence.log_clutter(n - count, count)
         - clutter * evidence.LOG_CLUTTER_SPAN
         - count * stars.log_density

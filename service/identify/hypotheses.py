@@ -50,6 +50,16 @@ def part_of(match, whole):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def heaviest(log_weight, count):  # type: ignore[no-untyped-def]
+    """The first of the heaviest hypotheses, -1 where there is none."""
+    leader = -1
+    for h in range(count):
+        if leader < 0 or log_weight[h] > log_weight[leader]:
+            leader = h
+    return leader
+
+
+@njit(cache=True, nogil=True)
 def log_sum(a, b):  # type: ignore[no-untyped-def]
     """ln(e^a + e^b)."""
     top = max(a, b)
@@ -113,7 +123,7 @@ def consider(seen, stars, match, scratch, ledger, log_weight, count, rest, best)
             work += 1
         fresh[k] = mine
     for k in range(n):
-        if fresh[k] < 0 or second[k] < 0 or np.any(fresh == second[k]):
+        if fresh[k] < 0 or second[k] < 0 or _names(fresh, second[k]):
             continue
         mine = fresh[k]
         fresh[k] = second[k]
@@ -125,6 +135,15 @@ def consider(seen, stars, match, scratch, ledger, log_weight, count, rest, best)
             work += n
         fresh[k] = mine
     return count, rest, best, work
+
+
+@njit(cache=True, nogil=True)
+def _names(match, row):  # type: ignore[no-untyped-def]
+    """Whether a match has this zone star."""
+    for one in match:  # noqa: SIM110 - compiled, without a generator
+        if one == row:
+            return True
+    return False
 
 
 @njit(cache=True, nogil=True)
@@ -152,25 +171,19 @@ def _sits_well(seen, stars, match, k, scratch):  # type: ignore[no-untyped-def]
 def _match_at(seen, stars, t, first, second):  # type: ignore[no-untyped-def]
     """Match every observed star at an attitude: its nearest zone star, and the second-nearest."""
     n = len(seen.observed)
-    p = np.empty(3)
     first[:] = -1
     second[:] = -1
     for k in range(n):
-        norm = 0.0
-        for j in range(3):
-            p[j] = (
-                t[0, j] * seen.observed[k, 0]
-                + t[1, j] * seen.observed[k, 1]
-                + t[2, j] * seen.observed[k, 2]
-                - seen.velocity[j]
-            )
-            norm += p[j] * p[j]
-        norm = math.sqrt(norm)
+        o0, o1, o2 = seen.observed[k, 0], seen.observed[k, 1], seen.observed[k, 2]
+        p0 = t[0, 0] * o0 + t[1, 0] * o1 + t[2, 0] * o2 - seen.velocity[0]
+        p1 = t[0, 1] * o0 + t[1, 1] * o1 + t[2, 1] * o2 - seen.velocity[1]
+        p2 = t[0, 2] * o0 + t[1, 2] * o1 + t[2, 2] * o2 - seen.velocity[2]
+        norm = math.sqrt(p0 * p0 + p1 * p1 + p2 * p2)
         gate = min(MATCH_GATE * seen.sigma_rad[k], LARGEST_GATE_RAD)
         one, other = nearest(
-            p[0] / norm,
-            p[1] / norm,
-            p[2] / norm,
+            p0 / norm,
+            p1 / norm,
+            p2 / norm,
             gate,
             stars.grid_start,
             stars.grid_rows,
@@ -220,14 +233,14 @@ def marginals(ledger, log_weight, count, rest, star, probability, none, rivals, 
             share[at] += weight[h]
         none[k] = nothing / total
         star[k], probability[k] = -1, 0.0
+        rivals[k], likely[k] = -1, 0.0
         for rank in range(room):
-            rivals[k, rank], likely[k, rank] = -1, 0.0
             best = -1
             for at in range(different):
                 if share[at] >= 0.0 and (best < 0 or share[at] > share[best]):
                     best = at
             if best < 0:
-                continue
+                break
             chance = share[best] / total
             if rank == 0:
                 star[k], probability[k] = rows[best], chance
@@ -235,4 +248,4 @@ def marginals(ledger, log_weight, count, rest, star, probability, none, rivals, 
                 rivals[k, rank], likely[k, rank] = rows[best], chance
                 share[best] = -1.0
             else:
-                different = 0
+                break

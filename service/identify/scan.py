@@ -11,11 +11,12 @@ from service.identify.hypotheses import (
     LARGEST_GATE_RAD,
     NEGLIGIBLE,
     consider,
+    heaviest,
     known,
     log_sum,
     part_of,
 )
-from service.identify.scene import within
+from service.identify.scene import with_magnitude, within
 from service.identify.two_stars import MAX_WORK
 from service.sky.pairs import separation_rad
 from service.sky.star_buckets import nearest
@@ -24,15 +25,13 @@ PREDICTION_GATE = 20.0
 """In sigmas: how far a star may lie from where a pair of others puts it."""
 AGREEING_RAD = math.radians(0.25)
 """Pairs whose difference of angles to a presumed axis is within this of that observed go first."""
-MANY = 64
-"""From so many candidates on it pays to know how few stars no longer matter."""
 
 
 @njit(cache=True, nogil=True)
 def most_of(count, seen, stars, most):  # type: ignore[no-untyped-def]
     """What so many stars can weigh at most, but for det N, worked out once in a search."""
     if np.isnan(most[count]):
-        compared = min(count, len(seen.observed) - np.isnan(seen.magnitude).sum())
+        compared = min(count, with_magnitude(seen))
         most[count] = most_log(seen, stars, count, compared, 0.0)
     return most[count]
 
@@ -75,7 +74,7 @@ def scan(  # type: ignore[no-untyped-def]
     match[:] = -1
     # The fewest stars that matter beside the best, and the best that they were found for.
     fewest, fewest_for = 3, -math.inf
-    leader = int(np.argmax(log_weight[:count])) if count > 0 else -1
+    leader = heaviest(log_weight, count)
     by_axis = seen.prior_kind == PRIOR_DIRECTION
     tilt = 0.0
     if by_axis:
@@ -93,7 +92,7 @@ def scan(  # type: ignore[no-untyped-def]
                     a, b = b, a
                 if by_axis and (abs(polar[a] - polar[b] - tilt) <= AGREEING_RAD) != agreeing:
                     continue
-                if best > fewest_for and last - first >= MANY:
+                if best > fewest_for:
                     fewest, fewest_for = _fewest(
                         seen, stars, others, half_log_det, fewest, best, scratch.most
                     )
@@ -132,19 +131,12 @@ def scan(  # type: ignore[no-untyped-def]
                 match[i], match[j] = a, b
                 if known(match, ledger, count) or (leader >= 0 and part_of(match, ledger[leader])):
                     continue
-                if best > fewest_for:
-                    fewest, fewest_for = _fewest(
-                        seen, stars, others, half_log_det, fewest, best, scratch.most
-                    )
-                    if matched < fewest:
-                        light[matched] += 1
-                        continue
                 count, rest, best, cost = consider(
                     seen, stars, match, scratch, ledger, log_weight, count, rest, best
                 )
                 work += cost
                 if count > 0 and (leader < 0 or log_weight[leader] < best):
-                    leader = int(np.argmax(log_weight[:count]))
+                    leader = heaviest(log_weight, count)
             if work >= MAX_WORK:
                 break
         if not by_axis or best > enough:

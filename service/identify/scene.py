@@ -13,6 +13,9 @@ from numba import njit
 
 from service.sky.pairs import separation_rad
 
+MAX_SEEDS = 12
+"""Pairs of at most so many stars, the brightest, are scanned; all are matched."""
+
 
 class Seen(NamedTuple):
     """The observed stars (n): directions, magnitudes (NaN: none), sigmas, and what is presumed.
@@ -61,7 +64,10 @@ class Pairs(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Arrays that a search of n stars writes to again and again, so as to allocate them once."""
+    """Arrays that a search of n stars writes to again and again, so as to allocate them once.
+
+    Those of a search may serve the next one of as many stars.
+    """
 
     match: Any
     used: Any
@@ -78,6 +84,13 @@ class Scratch(NamedTuple):
     inverse: Any
     most: Any
     light: Any
+    seeds: Any
+    group: Any
+    group_of: Any
+    first_pair: Any
+    last_pair: Any
+    separation: Any
+    cost: Any
 
 
 @njit(cache=True, nogil=True)
@@ -85,12 +98,16 @@ def scratch_for(n):  # type: ignore[no-untyped-def]
     """The arrays for n stars; `most` is not worked out yet (NaN)."""
     rows = np.full((4, n), -1, np.int32)
     squares = np.empty((5, 3, 3))
+    numbers = np.empty((5, n + 1), np.int64)
+    s = min(n, MAX_SEEDS)
+    ranges = np.empty((2, s, s), np.int64)
+    angles = np.empty((2, s, s))
     return Scratch(
         rows[0],
         rows[1],
         rows[2],
         rows[3],
-        np.empty(n, np.int64),
+        numbers[0],
         np.empty((n, 3)),
         np.empty(n),
         np.empty((n, 3)),
@@ -100,8 +117,25 @@ def scratch_for(n):  # type: ignore[no-untyped-def]
         squares[3],
         squares[4],
         np.full(n + 1, np.nan),
-        np.empty(n + 1, np.int64),
+        numbers[1],
+        numbers[2, :s],
+        numbers[3, :s],
+        numbers[4],
+        ranges[0],
+        ranges[1],
+        angles[0],
+        angles[1],
     )
+
+
+@njit(cache=True, nogil=True)
+def with_magnitude(seen):  # type: ignore[no-untyped-def]
+    """How many of the observed stars have a magnitude."""
+    count = 0
+    for magnitude in seen.magnitude:
+        if not math.isnan(magnitude):
+            count += 1
+    return count
 
 
 @njit(cache=True, nogil=True)

@@ -20,12 +20,11 @@ from numba import njit
 from service.identify import evidence
 from service.identify.hypotheses import log_sum
 from service.identify.scan import PREDICTION_GATE, most_of, scan
-from service.identify.scene import scratch_for
+from service.identify.scene import MAX_SEEDS, scratch_for, with_magnitude
 from service.identify.two_stars import MAX_WORK, two_stars
+from service.identify.uncounted import uncounted
 from service.sky.pairs import separation_rad
 
-MAX_SEEDS = 12
-"""Pairs of at most so many stars, the brightest, are scanned; all are matched."""
 SHORT_PAIR_RAD = math.radians(0.35)
 CHANCE_PER_STAR, CHANCE_MARGIN = math.log(3.0), 12.0
 """Stop early once a hypothesis of three stars or more outweighs the null by 3^n e^12.
@@ -40,22 +39,34 @@ SETTLED = 10.0
 @njit(cache=True, nogil=True, error_model="numpy")
 def search(seen, stars, pairs, exhaustive, ledger, log_weight):  # type: ignore[no-untyped-def]
     """Search and weigh: the number of hypotheses, the rest, the work, whether it was bounded."""
+    scratch = scratch_for(len(seen.observed))
+    return search_in(scratch, seen, stars, pairs, exhaustive, ledger, log_weight)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def search_in(scratch, seen, stars, pairs, exhaustive, ledger, log_weight):  # type: ignore[no-untyped-def]
+    """As `search`, in the arrays of `scratch_for`, which a caller with many views makes once."""
+    seen, stars, pairs = uncounted(seen), uncounted(stars), uncounted(pairs)
+    scratch, ledger, log_weight = uncounted(scratch), uncounted(ledger), uncounted(log_weight)
     n = len(seen.observed)
-    with_magnitude = n - np.isnan(seen.magnitude).sum()
-    rest = evidence.log_null(n, with_magnitude)
+    scratch.most[:] = np.nan
+    rest = evidence.log_null(n, with_magnitude(seen))
     enough = rest + n * CHANCE_PER_STAR + CHANCE_MARGIN
     best = -math.inf
     count = work = 0
-    seeds = _seeds(seen.magnitude)
+    seeds, group, group_of = scratch.seeds, scratch.group, scratch.group_of
+    first_pair, last_pair, separation = scratch.first_pair, scratch.last_pair, scratch.separation
     s = len(seeds)
-    scratch = scratch_for(n)
-    first_pair, last_pair, separation = _candidates(seen, seeds, pairs)
-    group = np.arange(s)
+    _choose_seeds(seen.magnitude, seeds)
+    _candidates(seen, seeds, pairs, first_pair, last_pair, separation)
     # By observed star; those that are no seeds are each by themselves.
-    group_of = np.arange(s, s + n)
-    group_of[seeds] = group
+    for k in range(n):
+        group_of[k] = s + k
+    for x in range(s):
+        group[x] = x
+        group_of[seeds[x]] = x
     for groups in range(s, 2, -1):
-        left, right = _cheapest(group, first_pair, last_pair, separation)
+        left, right = _cheapest(group, first_pair, last_pair, separation, scratch.cost)
         for x in range(s):
             for y in range(x + 1, s):
                 joins = (group[x] == left and group[y] == right) or (
@@ -88,7 +99,7 @@ def search(seen, stars, pairs, exhaustive, ledger, log_weight):  # type: ignore[
         for x in range(s):
             if group[x] == right:
                 group[x] = left
-        group_of[seeds] = group
+                group_of[seeds[x]] = left
         if best > enough:
             unseen = _most_unseen(
                 seen, stars, groups - 1, group, first_pair, last_pair, separation, scratch
@@ -138,21 +149,20 @@ def _most_unseen(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _seeds(magnitude):  # type: ignore[no-untyped-def]
+def _choose_seeds(magnitude, seeds):  # type: ignore[no-untyped-def]
     """The stars whose pairs are scanned: all, or the brightest; those without a magnitude last."""
     if len(magnitude) <= MAX_SEEDS:
-        return np.arange(len(magnitude))
+        for x in range(len(seeds)):
+            seeds[x] = x
+        return
     ranked = np.argsort(np.where(np.isnan(magnitude), 99.0, magnitude), kind="mergesort")
-    return np.sort(ranked[:MAX_SEEDS])
+    seeds[:] = np.sort(ranked[:MAX_SEEDS])
 
 
 @njit(cache=True, nogil=True)
-def _candidates(seen, seeds, pairs):  # type: ignore[no-untyped-def]
+def _candidates(seen, seeds, pairs, first, last, separation):  # type: ignore[no-untyped-def]
     """Per pair of seeds the range of candidate pairs by separation, and the separation."""
     s = len(seeds)
-    first = np.zeros((s, s), np.int64)
-    last = np.zeros((s, s), np.int64)
-    separation = np.zeros((s, s))
     for x in range(s):
         for y in range(x + 1, s):
             i, j = seeds[x], seeds[y]
@@ -161,7 +171,6 @@ def _candidates(seen, seeds, pairs):  # type: ignore[no-untyped-def]
             first[x, y] = _first_at(angle - gate, pairs)
             last[x, y] = _first_at(angle + gate, pairs)
             separation[x, y] = angle
-    return first, last, separation
 
 
 @njit(cache=True, nogil=True)
@@ -177,13 +186,13 @@ def _first_at(angle, pairs):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _cheapest(group, first, last, separation):  # type: ignore[no-untyped-def]
+def _cheapest(group, first, last, separation, cost):  # type: ignore[no-untyped-def]
     """The two groups whose cross pairs cost least to scan.
 
     Short pairs predict badly and cost more than their number.
     """
     s = len(group)
-    cost = np.full((s, s), -1.0)
+    cost[:] = -1.0
     for x in range(s):
         for y in range(x + 1, s):
             low, high = min(group[x], group[y]), max(group[x], group[y])
