@@ -15,7 +15,7 @@ from scipy.stats import beta
 
 from service.acquire import acquire
 from service.identify.identification import Identification
-from service.missions.mission import Identifier, Mission
+from service.missions.mission import Band, Identifier, Mission
 from service.simulate.motion import tilted
 from service.simulate.paper.printed import Run, World, the_paper
 from service.simulate.paper.views import EPOCH, View, batch_of, draw_zone, paper_mission
@@ -29,6 +29,11 @@ from service.vectors import Vector, read_only
 Rows = npt.NDArray[np.intp]
 
 SHELF_BYTES = 128 << 20
+VIEWS_PER_BAND = 50
+"""Of one band, whose pairs take longer to list than many views to identify; a cap has ten.
+
+Fifty fields anywhere along a band hardly share a star.
+"""
 # phi, theta, psi in arcsec; radial position error in arcsec; magnitude error and its bound.
 ERRORS = {
     ("nominal", "XTE"): ((42.0, 42.0, 60.0), 3.0, 0.1, 0.6),
@@ -142,6 +147,8 @@ def _drawn(
 ) -> Iterator[tuple[View, Run, Mission]]:
     mission = _mission(world.mission, condition.merged)
     catalog = sky.run_catalog(mission, EPOCH)
+    if isinstance(mission.zone, Band):
+        world = replace(world, views=VIEWS_PER_BAND)
     rotation, sigma_arcsec, sigma_mag, bound_mag = ERRORS[condition.errors, world.mission]
     run = replace(
         the_paper().runs[0],

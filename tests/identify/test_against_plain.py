@@ -28,6 +28,20 @@ def test_batches_of_every_kind_agree(name, seed, mission_files, sky, request):
     assert min(outcomes[kind] for kind in ("unique", "ambiguous", "unmatched")) > 0
 
 
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("switch", ["fov_rotation", "match_groups"])
+def test_van_bezooijen_s_tests_agree(name, switch, rng, mission_files, sky, request):
+    """Each by itself, with all other tests as the mission has them; and it does change answers."""
+    count = request.config.getoption("--batches") // 3
+    states = rng.bit_generator.state
+    on, off = Judge(mission_files[name], sky), Judge(mission_files[name], sky)
+    said = {"tolerances": {"fov_rotation_deg": 2.0}}
+    agreed(on.hold_many(rng, count, options={**said, "tests": {switch: True}}), count)
+    rng.bit_generator.state = states
+    agreed(off.hold_many(rng, count, options=said), count)
+    assert on.comparison.outcomes != off.comparison.outcomes
+
+
 @pytest.mark.parametrize("name", ["XTE", "SOHO"])
 def test_several_trackers_agree_each_in_its_own_zone(name, rng, mission_files, sky, request):
     count = request.config.getoption("--batches") // 6

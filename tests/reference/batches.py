@@ -223,16 +223,19 @@ def _options(rng: np.random.Generator, mission: Json) -> tuple[Json, ...]:
     band = mission["zone"]["kind"] == "band"
     names = ("magnitude", "cross_product", "pole") if band else ("magnitude", "cross_product")
     tests = {name: bool(rng.integers(2)) for name in names}
+    # Left out by the prototype, and off unless a batch asks.
+    tests |= {name: bool(rng.random() < 0.4) for name in ("fov_rotation", "match_groups")}
     ranges = {
         "separation_deg": (0.001, 0.02),
         "magnitude_mag": (0.1, 1.5),
         "magnitude_order_mag": (0.0, 1.5),
         "cross_product_deg": (5.0, 180.0),
+        "fov_rotation_deg": (0.5, 180.0),
         "pole_difference_deg": (0.02, 0.5),
         "pole_angle_deg": (0.1, 10.0),
     }
     if not band:
-        ranges = {name: ranges[name] for name in list(ranges)[:4]}
+        ranges = {name: ranges[name] for name in list(ranges)[:5]}
     tolerances = {
         name: float(rng.uniform(*limits)) for name, limits in ranges.items() if rng.random() < 0.4
     }

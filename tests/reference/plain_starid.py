@@ -16,17 +16,19 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations
+from itertools import chain, combinations
 from typing import Any
 
 import erfa
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 Json = dict[str, Any]
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64]
 Triple = Sequence[float]
+Node = tuple[int, int]
 
 BODY_Z = np.array([0.0, 0.0, 1.0])
 SUN_UNCERTAINTY_DEG = 0.3
@@ -66,9 +68,12 @@ class Settings:
     CROSSMAX: float  # CAPMAX or BANMAX
     BANTOL1: float
     BANTOL2: float
+    rotation_deg: float
     magnitude_test: bool
     cross_product_test: bool
     pole_test: bool
+    rotation_test: bool
+    match_groups: bool
 
 
 @dataclass(frozen=True)
@@ -116,7 +121,8 @@ def identify(
         key = (tuple(axis), low, high, settings.HMAX)
         if key not in zones:
             zones[key] = zone_of(catalog, axis, low, high, settings.HMAX)
-        results.append(vote(inertial, magnitude, zones[key], catalog, pole, settings))
+        boresight = attitude.T @ alignment[:, 2]
+        results.append(vote(inertial, magnitude, zones[key], catalog, boresight, pole, settings))
     return results
 
 
@@ -137,9 +143,12 @@ def settings_of(batch: Json, mission: Json) -> Settings:
         CROSSMAX=tolerances["cross_product_deg"],
         BANTOL1=tolerances.get("pole_difference_deg", 0.13),
         BANTOL2=tolerances.get("pole_angle_deg", 7.2),
+        rotation_deg=tolerances.get("fov_rotation_deg", 10.0),
         magnitude_test=tests.get("magnitude", True),
         cross_product_test=tests.get("cross_product", True) and roll_known,
         pole_test=tests.get("pole", True) and is_band,
+        rotation_test=tests.get("fov_rotation", False) and roll_known,
+        match_groups=tests.get("match_groups", False),
     )
 
 
@@ -285,17 +294,14 @@ def vote(
     magnitude: list[float | None],
     zone: PlainZone,
     catalog: PlainCatalog,
+    boresight: Array,
     pole_vector: Array | None,
     settings: Settings,
 ) -> list[PlainOutcome]:
     """The outcome of each observed star from the votes of every surviving pair of pairs."""
     observed: list[Triple] = [v.tolist() for v in observed_vectors]
     pole: Triple | None = None if pole_vector is None else pole_vector.tolist()
-    tally: list[dict[int, int]] = [{} for _ in observed]
-
-    def cast(star: int, row: int) -> None:
-        tally[star][row] = tally[star].get(row, 0) + 1
-
+    said: list[tuple[Node, Node]] = []
     for one, two in combinations(range(len(observed)), 2):
         separation_deg = angle_deg(observed[one], observed[two])
         near = np.nonzero(np.abs(zone.separation_deg - separation_deg) <= settings.SEPTOL)[0]
@@ -311,12 +317,27 @@ def vote(
             )
             if not accepted:
                 continue
-            if LORD in (0, 1):
-                cast(one, c1)
-                cast(two, c2)
-            if LORD in (0, -1):
-                cast(one, c2)
-                cast(two, c1)
+            ways = [(c1, c2)] if LORD == 1 else [(c2, c1)] if LORD == -1 else [(c1, c2), (c2, c1)]
+            said += [
+                ((one, a), (two, b))
+                for a, b in ways
+                if not settings.rotation_test
+                or rotation_about_boresight_deg(
+                    (observed_vectors[one], observed_vectors[two]),
+                    (catalog.directions[a], catalog.directions[b]),
+                    boresight,
+                    pole_vector,
+                )
+                <= settings.rotation_deg
+            ]
+    tally: list[dict[int, int]] = [{} for _ in observed]
+    if settings.match_groups:
+        members, size = largest_groups(said)
+        for star, row in members:
+            tally[star][row] = size - 1
+    else:
+        for star, row in chain.from_iterable(said):
+            tally[star][row] = tally[star].get(row, 0) + 1
     return [outcome_of(votes, catalog) for votes in tally]
 
 
@@ -382,6 +403,69 @@ def cross_product_angle_deg(
     """CRSSEP; None where a pair stands in one line and has no cross product to compare."""
     a, b = cross(*observed), cross(*candidate)
     return None if not any(a) or not any(b) else angle_deg(a, b)
+
+
+# ---- the two tests that the prototype left out ------------------------------------------------
+
+
+def rotation_about_boresight_deg(
+    observed: tuple[Array, Array],
+    candidate: tuple[Array, Array],
+    boresight: Array,
+    pole: Array | None,
+) -> float:
+    """How far the sky would have to turn about the boresight for one pair to fall on the other.
+
+    The whole turn carries the middle of the observed pair, and the line from its
+    first star to its second, to those of the candidate.  In a cap it is split
+    into a rotation about the boresight and one that moves the boresight the
+    short way.  In a band it may hold any rotation about the pole, so that only
+    the pole tells: how it turns as seen along the boresight where that comes to.
+    Infinite where a pair is one point and gives no turn.
+    """
+
+    def frame(pair: tuple[Array, Array]) -> Array:
+        middle, line = pair[0] + pair[1], pair[1] - pair[0]
+        middle, line = middle / np.linalg.norm(middle), line / np.linalg.norm(line)
+        return np.column_stack([middle, line, np.cross(middle, line)])
+
+    if not np.any(observed[0] - observed[1]) or not np.any(candidate[0] - candidate[1]):
+        return math.inf
+    turn = frame(candidate) @ frame(observed).T
+    if pole is None:
+        quaternion = Rotation.from_matrix(turn).as_quat()
+        half = math.atan2(quaternion[:3] @ boresight, quaternion[3])
+        return abs(math.degrees(math.remainder(2.0 * half, math.tau)))
+    along = turn @ boresight
+    expected, found = pole - (pole @ along) * along, turn @ pole
+    return angle_deg(expected.tolist(), (found - (found @ along) * along).tolist())
+
+
+def largest_groups(said: list[tuple[Node, Node]]) -> tuple[set[Node], int]:
+    """The nodes of the largest groups of which every two are joined, and the size of these.
+
+    A node is an observed star taken for a row of the catalog.
+    """
+    joined: dict[Node, set[Node]] = {}
+    for one, two in said:
+        joined.setdefault(one, set()).add(two)
+        joined.setdefault(two, set()).add(one)
+    best, members = 0, set[Node]()
+
+    def grow(group: list[Node], open_nodes: set[Node]) -> None:
+        nonlocal best, members
+        if len(group) + len({star for star, _ in open_nodes}) < best:
+            return
+        if not open_nodes:
+            if len(group) > best:
+                best, members = len(group), set()
+            members |= set(group)
+        # A group is grown in the order of its stars.
+        for node in open_nodes:
+            grow([*group, node], {n for n in open_nodes & joined[node] if n[0] > node[0]})
+
+    grow([], set(joined))
+    return members, best
 
 
 def outcome_of(votes: dict[int, int], catalog: PlainCatalog) -> PlainOutcome:
