@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from sqlalchemy import Connection, Table, select
+from sqlalchemy import Connection, Select, Table, bindparam, select
 
 from service.records.draft import Row
 from service.records.tables import (
@@ -77,23 +77,31 @@ def _at_or_after(moment: Utc, width_s: int) -> int:
     return number + (bucket_start(number, width_s).tai_ns < moment.tai_ns)
 
 
-def _whole(
-    connection: Connection, span: Span, table: Table, width_s: int, first: int, last: int
-) -> Columns:
+def _stretch_of(table: Table) -> Select[Any]:
+    """The rows of a rollup in a stretch; made once, for to make it takes longer than to run it."""
     columns = table.c
-    query = (
+    return (
         select(columns.bucket, *(columns[name] for name in _NAMES))
         .where(
-            columns.spacecraft == span.spacecraft,
-            columns.run == span.run,
-            columns.bucket >= first,
-            columns.bucket < last,
+            columns.spacecraft == bindparam("spacecraft"),
+            columns.run == bindparam("run"),
+            columns.bucket >= bindparam("first"),
+            columns.bucket < bindparam("last"),
             columns.batches > 0,
         )
         .order_by(columns.bucket)
     )
+
+
+_STRETCHES = {table: _stretch_of(table) for table in (rollups_hourly, rollups_daily)}
+
+
+def _whole(
+    connection: Connection, span: Span, table: Table, width_s: int, first: int, last: int
+) -> Columns:
+    asked = {"spacecraft": span.spacecraft, "run": span.run, "first": first, "last": last}
     # As tuples: numpy would ask each of SQLAlchemy's rows for more than its values.
-    rows = [tuple(row) for row in connection.execute(query).all()]
+    rows = [tuple(row) for row in connection.execute(_STRETCHES[table], asked).all()]
     read = np.array(rows, dtype=float).reshape(-1, 1 + len(_NAMES)).T
     unix_s = read[0] * width_s - UNIX_DAY * DAY_S
     return {
@@ -103,21 +111,30 @@ def _whole(
     }
 
 
-_BATCH = select(
-    *(results.c[name] for name in ("time_ns", "status", "unique", "ambiguous", "unmatched")),
-    *(results.c[name] for name in MEASURED),
+_BATCHES = (
+    select(
+        *(results.c[name] for name in ("time_ns", "status", "unique", "ambiguous", "unmatched")),
+        *(results.c[name] for name in MEASURED),
+    )
+    .where(
+        results.c.current,
+        results.c.spacecraft == bindparam("spacecraft"),
+        results.c.run == bindparam("run"),
+        results.c.time_ns >= bindparam("start_ns"),
+        results.c.time_ns < bindparam("end_ns"),
+    )
+    .order_by(results.c.time_ns)
 )
 
 
 def _batches(connection: Connection, span: Span) -> list[Any]:
-    query = _BATCH.where(
-        results.c.current,
-        results.c.spacecraft == span.spacecraft,
-        results.c.run == span.run,
-        results.c.time_ns >= span.start.tai_ns,
-        results.c.time_ns < span.end.tai_ns,
-    )
-    return list(connection.execute(query.order_by(results.c.time_ns)).all())
+    asked = {
+        "spacecraft": span.spacecraft,
+        "run": span.run,
+        "start_ns": span.start.tai_ns,
+        "end_ns": span.end.tai_ns,
+    }
+    return list(connection.execute(_BATCHES, asked).all())
 
 
 def _of_batches(rows: list[Any]) -> Columns:
