@@ -90,27 +90,30 @@ def consider(seen, stars, match, scratch, ledger, log_weight, count, rest, best)
 
     Next to it stand the hypotheses without one of its stars, unless that one
     sits well, and with a star's second-nearest neighbour in its place.  Returns
-    the number of hypotheses, the rest, the heaviest and the work, in stars
-    looked up or fitted.
+    the number of hypotheses, the rest, the heaviest, the work, in stars looked
+    up or fitted, and whether the stars fit together at all.
     """
     n = len(match)
     matched, square, log_det = fit(seen, stars, match, scratch, 1)
     if matched == 0:
-        return count, rest, best, n
+        return count, rest, best, n, True
+    misfit = math.sqrt(square / matched) > evidence.POSITION_SCALES[-1] * seen.reference_sigma
+    if matched > 3 and misfit:
+        return count, rest, best, n, False
     fresh, second = scratch.fresh, scratch.second
     _match_at(seen, stars, scratch.t, fresh, second)
     if known(fresh, ledger, count):
-        return count, rest, best, 2 * n
+        return count, rest, best, 2 * n, not misfit
     if not (part_of(fresh, match) and part_of(match, fresh)):
         matched, square, log_det = fit(seen, stars, fresh, scratch, 1)
         if matched < 2:
-            return count, rest, best, 3 * n
+            return count, rest, best, 3 * n, not misfit
     base = log_weight_of(seen, stars, fresh, scratch.t, matched, square, log_det)
     count, rest = keep(fresh, base, ledger, log_weight, count, rest)
     best = max(best, base)
     work = 3 * n
     if base < max(best, rest) - NEGLIGIBLE:
-        return count, rest, best, work
+        return count, rest, best, work, not misfit
     for k in range(n):
         if fresh[k] < 0 or _sits_well(seen, stars, fresh, k, scratch):
             continue
@@ -134,7 +137,7 @@ def consider(seen, stars, match, scratch, ledger, log_weight, count, rest, best)
             best = max(best, value)
             work += n
         fresh[k] = mine
-    return count, rest, best, work
+    return count, rest, best, work, not misfit
 
 
 @njit(cache=True, nogil=True)

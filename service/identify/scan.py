@@ -23,6 +23,8 @@ from service.sky.star_buckets import nearest
 
 PREDICTION_GATE = 20.0
 """In sigmas: how far a star may lie from where a pair of others puts it."""
+MAX_THIRDS = 8
+"""So many stars, those that a pair fixes best, are tried with it where all together do not fit."""
 AGREEING_RAD = math.radians(0.25)
 """Pairs whose difference of angles to a presumed axis is within this of that observed go first."""
 
@@ -131,10 +133,44 @@ def scan(  # type: ignore[no-untyped-def]
                 match[i], match[j] = a, b
                 if known(match, ledger, count) or (leader >= 0 and part_of(match, ledger[leader])):
                     continue
-                count, rest, best, cost = consider(
+                count, rest, best, cost, fits = consider(
                     seen, stars, match, scratch, ledger, log_weight, count, rest, best
                 )
                 work += cost
+                # Where gates are wide, clutter meets a star of the zone by chance: one such
+                # spoils the fit of all, or has taken the star of another.  So each by itself.
+                third = -1
+                for at in range(0 if fits or matched > 3 else others):
+                    if match[order[at]] >= 0:
+                        third = order[at]
+                for at in range(0 if fits else min(others, MAX_THIRDS)):
+                    k = order[at]
+                    if k == third:
+                        continue
+                    alpha, beta, gamma = parts[k]
+                    one, _ = nearest(
+                        alpha * u[0] + beta * v[0] + gamma * w0,
+                        alpha * u[1] + beta * v[1] + gamma * w1,
+                        alpha * u[2] + beta * v[2] + gamma * w2,
+                        gate[k],
+                        start,
+                        rows,
+                        place,
+                        used,
+                        2,
+                    )
+                    if one < 0 or not within(one, stars):
+                        continue
+                    match[:] = -1
+                    match[i], match[j], match[k] = a, b, one
+                    if known(match, ledger, count) or (
+                        leader >= 0 and part_of(match, ledger[leader])
+                    ):
+                        continue
+                    count, rest, best, cost, _ = consider(
+                        seen, stars, match, scratch, ledger, log_weight, count, rest, best
+                    )
+                    work += cost
                 if count > 0 and (leader < 0 or log_weight[leader] < best):
                     leader = heaviest(log_weight, count)
             if work >= MAX_WORK:
