@@ -26,7 +26,7 @@ from service.identify.pair_tests import cast_votes, count_votes
 from service.identify.presumed import presumed_attitude
 from service.identify.scene import Seen, scratch_for
 from service.identify.search import search_in
-from service.identify.starid import MAX_RIVALS, Sighting
+from service.identify.starid import MAX_RIVALS, Sighting, polar_of
 from service.identify.verify import UNIQUE_PROBABILITY, scene_of
 from service.simulate.paper.experiments import open_sky
 from service.simulate.paper.printed import the_paper
@@ -131,13 +131,15 @@ def many_verified(observed, magnitude, like, stars, pairs, exhaustive, room, sta
 
 
 @njit(nogil=True)
-def many_votes(observed, magnitude, votes, edges, given, star_of, star, room):  # type: ignore[no-untyped-def]
+def many_votes(observed, magnitude, tallies, edges, given, star_of, star, room):  # type: ignore[no-untyped-def]
     """Count the votes of many views of one zone."""
     outcome, highest, second = room
+    votes, voted, counts = tallies
     for k in range(len(observed)):
         votes[:] = 0
-        cast_votes(observed[k], magnitude[k], *given, votes, edges)  # type: ignore[call-arg]
-        count_votes(votes, star_of, outcome, star[k], highest, second)
+        counts[:] = 0
+        cast_votes(observed[k], magnitude[k], *given, votes, voted, counts, edges)  # type: ignore[call-arg]
+        count_votes(votes, voted, counts, star_of, outcome, star[k], highest, second)
 
 
 def _kernels(several: list[Sighting], named: dict[str, Rows]) -> dict[str, Callable[[], object]]:
@@ -154,9 +156,14 @@ def _kernels(several: list[Sighting], named: dict[str, Rows]) -> dict[str, Calla
         np.full((STARS, MAX_RIVALS), -1),
         np.zeros((STARS, MAX_RIVALS)),
     )
-    given = _votes_arguments(several[0])
+    given = votes_arguments(several[0])
     count = len(several[0].zone.star)
-    votes, edges = np.zeros((STARS, count), np.int32), np.empty((0, 4), np.int32)
+    edges = np.empty((0, 4), np.int32)
+    tallies = (
+        np.zeros((STARS, count), np.int32),
+        np.empty((STARS, count), np.int32),
+        np.zeros(STARS, np.int32),
+    )
     counts = tuple(np.empty((3, STARS), np.int64))
     rows = np.arange(count)
 
@@ -170,7 +177,7 @@ def _kernels(several: list[Sighting], named: dict[str, Rows]) -> dict[str, Calla
         return call
 
     def by_votes() -> None:
-        many_votes(observed, magnitude, votes, edges, given, rows, star, counts)
+        many_votes(observed, magnitude, tallies, edges, given, rows, star, counts)
         named[VOTES] = star.copy()
 
     return {
@@ -180,9 +187,10 @@ def _kernels(several: list[Sighting], named: dict[str, Rows]) -> dict[str, Calla
     }
 
 
-def _votes_arguments(sighting: Sighting) -> tuple[Any, ...]:
+def votes_arguments(sighting: Sighting) -> tuple[Any, ...]:
     """What `cast_votes` is given between the stars and the tallies, as in `starid`."""
     zone, aim, limits, tests = sighting.zone, sighting.aim, sighting.tolerances, sighting.tests
+    polar, off_axis, all_inside = polar_of(zone, aim)
     return (
         zone.direction,
         zone.magnitude_mag,
@@ -191,7 +199,11 @@ def _votes_arguments(sighting: Sighting) -> tuple[Any, ...]:
         zone.pairs.dimmer,
         zone.pairs.bin_start,
         zone.pairs.bins_per_rad,
+        polar,
+        zone.polar_difference_rad,
         aim.axis,
+        off_axis,
+        all_inside,
         math.radians(aim.least_deg),
         math.radians(aim.most_deg),
         math.radians(limits.separation_deg),

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 from time import perf_counter_ns as clock_ns
 
 import numpy as np
@@ -128,10 +129,10 @@ class Acquisition:
     timings_us: Mapping[str, int]
     provenance: Provenance
 
-    @property
+    @cached_property
     def counts(self) -> dict[str, int]:
         """Stars observed, and of them unique, ambiguous and unmatched."""
-        found = Counter(int(o) for each in self.trackers for o in each.identification.outcome)
+        found = Counter(o for each in self.trackers for o in each.identification.outcome.tolist())
         counts = {"observed": sum(found.values())}
         for outcome in (Outcome.UNIQUE, Outcome.AMBIGUOUS, Outcome.UNMATCHED):
             counts[outcome.word] = found[int(outcome)]
@@ -347,12 +348,16 @@ def choices_of(batch: ObservationBatch, mission: Mission) -> Choices:
     """
     options = batch.options
     tests = {**options.tests, **dict.fromkeys(_impossible_tests(batch, mission), False)}
+    # Most batches name none, and the one that is impossible is off already.
+    other = {name: on for name, on in tests.items() if getattr(mission.tests, name) != on}
     grid_deg = options.zone_grid_deg
     return Choices(
         identifier=options.identifier or mission.identifier,
         solver=options.solver or mission.solver,
-        tolerances=mission.tolerances.model_copy(update=options.tolerances),
-        tests=mission.tests.model_copy(update=tests),
+        tolerances=mission.tolerances.model_copy(update=options.tolerances)
+        if options.tolerances
+        else mission.tolerances,
+        tests=mission.tests.model_copy(update=other) if other else mission.tests,
         zone_grid_deg=mission.zone.grid_deg if grid_deg is None else grid_deg,
     )
 
@@ -391,7 +396,8 @@ def _seen(
         np.dot(corrected.direction_body, presumed.attitude),
         corrected.magnitude_mag,
         corrected.sigma_arcsec / ARCSEC_PER_RADIAN,
-        presumed.known_axis,
+        # Kernels are compiled anew for an array that cannot be written to, as the client's own is.
+        None if presumed.known_axis is None else presumed.known_axis.copy(),
         velocity_c,
         corrected.tracker.body_from_tracker[:, 2] @ presumed.attitude,
     )

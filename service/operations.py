@@ -1,11 +1,13 @@
 """The one object that every door holds: web, replay, simulator and scripts go through it."""
 
+import gc
 import hashlib
 import json
 import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future
 from functools import partial
 from typing import IO
 
@@ -175,6 +177,7 @@ class Operations:
             self._closing = True
         for replay in self._replays:
             replay.stop()
+        self._intake.close()
         self.store.close()
 
     def ready(self) -> None:
@@ -188,6 +191,8 @@ class Operations:
                 raise Busy("the service is warming up")
             try:
                 warm_up(self.sky, self.missions)
+                gc.collect()
+                gc.freeze()
                 self._warm = True
             finally:
                 self._warming.release()
@@ -209,7 +214,13 @@ class Operations:
         batch that is taken, `BadBatch` for an unknown spacecraft and for what
         does not fit its mission, `Busy` when too much is waiting.
         """
-        return self._intake.submit(submission, idempotency_key)
+        return self.take(submission, idempotency_key).result()
+
+    def take(
+        self, submission: Submission, idempotency_key: str | None = None
+    ) -> "Future[Answered]":
+        """`submit` for who does not want to wait: the future gives the answer, or the error."""
+        return self._intake.take(submission, idempotency_key)
 
     def submit_many(self, submissions: Sequence[Submission]) -> list[Answered | AcquisitionError]:
         """`submit` of each in one transaction; an error stands in the place of what is refused."""

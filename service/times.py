@@ -13,7 +13,7 @@ import re
 import time
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 
 import erfa
 import numpy as np
@@ -139,7 +139,8 @@ def unix_seconds(tai_ns: npt.ArrayLike) -> npt.NDArray[np.float64]:
 def utc_of_unix(unix_s: float) -> Utc:
     """The moment of a POSIX time, to the microsecond."""
     moment = datetime.fromtimestamp(unix_s, UTC)
-    return parse_utc(moment.strftime("%Y-%m-%dT%H:%M:%S.%fZ"))
+    second = moment.second + moment.microsecond / 1e6
+    return _from_fields(moment.date(), moment.hour, moment.minute, second)
 
 
 def shifted(moment: Utc, seconds: float) -> Utc:
@@ -159,29 +160,36 @@ def parse_utc(text: object, field: str = "time") -> Utc:
     Raises `BadInput` naming `field` for another form, a day or second that
     does not exist, and years outside 1972 to 2099.
     """
+    try:
+        if not isinstance(text, str):
+            raise ValueError(f"must be {_FORMS}")
+        return _read(text)
+    except ValueError as error:
+        raise BadInput(Fault(field, str(error), shown_value(text))) from None
 
-    def refuse(why: str) -> BadInput:
-        return BadInput(Fault(field, why, shown_value(text)))
 
-    match = _TEXT.fullmatch(text) if isinstance(text, str) else None
+@lru_cache(maxsize=4096)
+def _read(text: str) -> Utc:
+    """The moment of a text, which one batch asks for again and again; raises `ValueError`."""
+    match = _TEXT.fullmatch(text)
     if match is None:
-        raise refuse(f"must be {_FORMS}")
+        raise ValueError(f"must be {_FORMS}")
     year, hour, minute, second = (int(match[n]) for n in ("year", "hour", "minute", "second"))
     if not FIRST_YEAR <= year <= LAST_YEAR:
-        raise refuse(f"the year must be from {FIRST_YEAR} to {LAST_YEAR}")
+        raise ValueError(f"the year must be from {FIRST_YEAR} to {LAST_YEAR}")
     if hour > 23 or minute > 59 or second > 60:
-        raise refuse("there is no such time of day")
+        raise ValueError("there is no such time of day")
     try:
         if match["doy"]:
             day = date(year, 1, 1) + timedelta(days=int(match["doy"]) - 1)
         else:
             day = date(year, int(match["month"]), int(match["day"]))
     except ValueError:
-        raise refuse("there is no such day") from None
+        raise ValueError("there is no such day") from None
     if day.year != year:
-        raise refuse("there is no such day of the year")
+        raise ValueError("there is no such day of the year")
     if second == 60 and not ((hour, minute) == (23, 59) and _ends_in_leap_second(day)):
-        raise refuse("there is no leap second at that time")
+        raise ValueError("there is no leap second at that time")
     return _from_fields(day, hour, minute, second + float(match["fraction"] or 0.0))
 
 

@@ -27,6 +27,11 @@ def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return array
 
 
+def locked(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """A view of an array that cannot be written to, whoever else may write to the array."""
+    return array if not array.flags.writeable else read_only(array.view())
+
+
 def unit(vectors: npt.ArrayLike) -> Vector:
     """Vectors of shape (..., 3) scaled to length one; a zero vector gives NaN."""
     v = np.asarray(vectors, dtype=np.float64)
@@ -43,12 +48,26 @@ def from_ra_dec(ra_deg: npt.ArrayLike, dec_deg: npt.ArrayLike) -> Vector:
     )
 
 
+def direction_of(ra_deg: float, dec_deg: float) -> Vector:
+    """`from_ra_dec` of one direction (3,), without an array's overhead."""
+    ra, dec = math.radians(ra_deg), math.radians(dec_deg)
+    across = math.cos(dec)
+    return np.array([across * math.cos(ra), across * math.sin(ra), math.sin(dec)])
+
+
 def to_ra_dec(vectors: npt.ArrayLike) -> tuple[Vector, Vector]:
     """Right ascension in [0, 360) and declination, in degrees, of vectors (..., 3)."""
     v = np.asarray(vectors, dtype=np.float64)
     ra = np.degrees(np.arctan2(v[..., 1], v[..., 0])) % 360.0
     dec = np.degrees(np.arctan2(v[..., 2], np.hypot(v[..., 0], v[..., 1])))
     return np.where(ra >= 360.0, 0.0, ra), dec
+
+
+def ra_dec_of(vector: Vector) -> tuple[float, float]:
+    """`to_ra_dec` of one unit vector (3,), without an array's overhead."""
+    x, y, z = vector.tolist()
+    ra_deg = math.degrees(math.atan2(y, x)) % 360.0
+    return 0.0 if ra_deg >= 360.0 else ra_deg, math.degrees(math.atan2(z, math.hypot(x, y)))
 
 
 def angle_between_deg(a: npt.ArrayLike, b: npt.ArrayLike) -> Vector:
@@ -91,6 +110,21 @@ def rotate_about(rotation_vectors_rad: npt.ArrayLike, vectors: npt.ArrayLike) ->
     second = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
     once = _cross(w, v)
     return np.asarray(v + first * once + second * _cross(w, once))
+
+
+def turned_at_rate(vectors: Vector, rate_rad_per_s: Vector, seconds: Vector) -> Vector:
+    """exp([w x] t) v: vectors (n, 3) turned about one rate w (3,) for times t (n,) of their own."""
+    x, y, z = rate_rad_per_s.tolist()
+    rate = math.hypot(x, y, z)
+    if rate == 0.0:
+        return vectors
+    x, y, z = x / rate, y / rate, z / rate
+    # v @ skew is the cross product of the axis with v.
+    skew = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
+    angle = rate * seconds[:, None]
+    once = vectors @ skew
+    half = np.sin(0.5 * angle)
+    return np.asarray(vectors + np.sin(angle) * once + (2.0 * half * half) * (once @ skew))
 
 
 def _cross(a: Vector, b: Vector) -> Vector:

@@ -3,6 +3,7 @@
 python -m service.warm    compiles the kernels, so that nothing waits for it later
 """
 
+import json
 from collections.abc import Mapping
 
 import numpy as np
@@ -10,15 +11,8 @@ import numpy as np
 from service.acquire import IDENTIFIERS, acquire
 from service.identify.presumed import aim_of, presumed_attitude
 from service.missions.mission import Band, Mission
-from service.observe.batch import (
-    APriori,
-    BoresightPrior,
-    ObservationBatch,
-    Options,
-    QuaternionPrior,
-    SunPointedPrior,
-    TrackerStars,
-)
+from service.observe.batch import APriori, BoresightPrior, SunPointedPrior
+from service.observe.wire import submission_from_json
 from service.sky.shelf import Shelf
 from service.sky.view import Sky
 from service.sky.zones import Zone
@@ -48,7 +42,8 @@ def warm_up(sky: Sky, missions: Mapping[str, Mission]) -> None:
     What is built for it goes on a shelf of its own and is forgotten.
     """
     moment = parse_utc("2000-01-01T12:00:00Z")
-    apart = Sky(sky.catalog, Shelf(max_bytes=0))
+    # Large enough that nothing is built twice on the way.
+    apart = Sky(sky.catalog, Shelf(max_bytes=256 << 20))
     kinds = {mission.zone.kind: mission for mission in missions.values()}
     first = next(iter(kinds.values()), None)
     for mission in kinds.values():
@@ -64,30 +59,30 @@ def warm_up(sky: Sky, missions: Mapping[str, Mission]) -> None:
         boresight = attitude.T @ tracker.body_from_tracker[:, 2]
         stars = np.argsort(-(run_catalog.direction @ boresight))[:5]
         seen = run_catalog.direction[stars] @ attitude.T @ tracker.body_from_tracker
-        none = np.full(len(stars), np.nan)
-        observed = TrackerStars(
-            tracker=tracker.name,
-            vector=seen,
-            angles_deg=np.full((len(stars), 2), np.nan),
-            magnitude_mag=run_catalog.magnitude_mag[stars],
-            time_offset_s=np.zeros(len(stars)),
-            sigma_arcsec=none,
-        )
+        body = {
+            "spacecraft": mission.name,
+            "batch": "warm-up",
+            "time": moment.text,
+            "a_priori": {"quaternion": quaternion_from_matrix(attitude).tolist()},
+            "body_rates_deg_per_s": [0.0, 0.0, 0.01],
+            "observations": [
+                {
+                    "tracker": tracker.name,
+                    "stars": [
+                        {"vector": vector, "magnitude": magnitude, "time_offset_s": 0.1}
+                        for vector, magnitude in zip(
+                            seen.tolist(), run_catalog.magnitude_mag[stars].tolist(), strict=True
+                        )
+                    ],
+                }
+            ],
+        }
         for identifier in IDENTIFIERS:
-            if identifier == "lost_in_space" and mission is not first:
+            if identifier in ("lost_in_space", "ptp") and mission is not first:
                 continue  # the same kernels, and an index of the whole sky to build
-            batch = ObservationBatch(
-                spacecraft=mission.name,
-                batch="warm-up",
-                run="warm-up",
-                time=moment,
-                a_priori=QuaternionPrior(quaternion_from_matrix(attitude)),
-                body_rates_deg_per_s=np.zeros(3),
-                velocity_km_per_s=None,
-                aberration="to_correct",
-                observations=(observed,),
-                options=Options(identifier=identifier, zone_grid_deg=0.0),
-            )
+            # Through the door that batches come by: kernels are compiled for arrays of its kind.
+            options = {"identifier": identifier, "zone_grid_deg": 0.0}
+            batch = submission_from_json(json.dumps(body | {"options": options})).batch
             acquire(batch, mission, apart)
 
 

@@ -5,8 +5,10 @@ is out of a bound when it lies beyond it, and stays out until it has come back
 by `hysteresis`.  Only what has been out for `duration_s` of batch time counts.
 """
 
+import math
 from collections.abc import Mapping
 from enum import IntEnum
+from functools import cached_property
 from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, model_validator
@@ -88,6 +90,24 @@ class LimitSettings(_Strict):
         above = bounds.high is not None and value > bounds.high - within
         below = bounds.low is not None and value < bounds.low + within
         return self.enabled and (above or below)
+
+    @cached_property
+    def _levels(self) -> tuple[tuple[Severity, float, float], ...]:
+        """Each severity with its bounds, infinite where there is none."""
+        levels = ((severity, self.bounds(severity)) for severity in Severity)
+        return tuple(
+            (
+                severity,
+                -math.inf if each.low is None else each.low,
+                math.inf if each.high is None else each.high,
+            )
+            for severity, each in levels
+            if self.enabled
+        )
+
+    def passed(self, value: float) -> list[Severity]:
+        """The severities whose bounds a value is out of that was in them so far."""
+        return [s for s, low, high in self._levels if value < low or value > high]
 
     def bound(self, severity: Severity, value: float) -> float:
         """The bound that a value is out of."""

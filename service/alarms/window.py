@@ -35,14 +35,14 @@ class Window:
         del self.samples[: -limits.minimum_count]
         if len(self.samples) < limits.minimum_count:
             return None
-        whole = sum(each[2] for each in self.samples)
-        value = sum(each[1] for each in self.samples) / whole
+        _, parts, wholes = zip(*self.samples, strict=True)
+        value = sum(parts) / sum(wholes)
         return Judged(value, self.judge(value, self.samples[-1][0], limits))
 
     def judge(self, value: float, time_ns: int, limits: LimitSettings) -> Severity | None:
         """The worst severity whose bound the value has been out of for long enough."""
         worst = None
-        for severity in Severity:
+        for severity in Severity if self.since_ns else limits.passed(value):
             if not limits.out(severity, value, severity in self.since_ns):
                 self.since_ns.pop(severity, None)
                 continue

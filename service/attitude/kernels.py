@@ -143,7 +143,9 @@ def quest(b, r, weights, start, q):  # type: ignore[no-untyped-def]
     total = 0.0
     for k in range(len(weights)):
         total += weights[k]
-    profile = np.zeros((3, 3))  # B = sum of a b r^T
+    room = np.empty((4, 3, 3))
+    profile = room[0]  # B = sum of a b r^T
+    profile[:] = 0.0
     for k in range(len(weights)):
         share = weights[k] / total
         for j in range(3):
@@ -151,7 +153,10 @@ def quest(b, r, weights, start, q):  # type: ignore[no-untyped-def]
             for i in range(3):
                 profile[i, j] += share * b[k, i] * reference
     sigma = profile[0, 0] + profile[1, 1] + profile[2, 2]
-    s = profile + profile.T
+    s = room[1]
+    for i in range(3):
+        for j in range(3):
+            s[i, j] = profile[i, j] + profile[j, i]
     z0 = profile[1, 2] - profile[2, 1]
     z1 = profile[2, 0] - profile[0, 2]
     z2 = profile[0, 1] - profile[1, 0]
@@ -200,14 +205,14 @@ def quest(b, r, weights, start, q):  # type: ignore[no-untyped-def]
     else:
         q[0], q[1], q[2], q[3] = x0, x1, x2, gamma
     _normalise(q)
-    if not _loss(b, r, weights, q) <= _loss(b, r, weights, start):
+    if not _loss(b, r, weights, q, s) <= _loss(b, r, weights, start, s):
         q[:] = start
-    _polish(b, r, weights, q)
+    _polish(b, r, weights, q, room)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _loss(b, r, weights, q):  # type: ignore[no-untyped-def]
-    a = np.empty((3, 3))
+def _loss(b, r, weights, q, a):  # type: ignore[no-untyped-def]
+    """Wahba's loss; `a` (3, 3) is written to."""
     to_matrix(q, a)
     total = 0.0
     for k in range(len(weights)):
@@ -248,11 +253,9 @@ def inverse_symmetric(m, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _polish(b, r, weights, q):  # type: ignore[no-untyped-def]
-    a = np.empty((3, 3))
+def _polish(b, r, weights, q, room):  # type: ignore[no-untyped-def]
+    a, matrix, inverse = room[0], room[1], room[2]
     p = np.empty_like(r)
-    matrix = np.empty((3, 3))
-    inverse = np.empty((3, 3))
     for _ in range(POLISHING_STEPS):
         to_matrix(q, a)
         g0 = g1 = g2 = 0.0
@@ -280,7 +283,8 @@ def _polish(b, r, weights, q):  # type: ignore[no-untyped-def]
         q[2] = qc * e2 + q2 + q0 * e1 - q1 * e0
         q[3] = qc - q0 * e0 - q1 * e1 - q2 * e2
         _normalise(q)
-        if square < 1e-30:
+        # What is left is smaller by the size of the residuals, as parts of a radian.
+        if square < 1e-24:
             return
 
 
@@ -293,7 +297,9 @@ def solve(b, r, sigma_rad, worst_rad, quaternions, covariance, squares, sums):  
     leaves an axis worse than `worst_rad`.
     """
     n = len(b)
-    weights = 1.0 / (sigma_rad * sigma_rad)
+    weights = np.empty(n)
+    for k in range(n):
+        weights[k] = 1.0 / (sigma_rad[k] * sigma_rad[k])
     first, second, sine = widest_pair(b, r, weights)
     if sine <= LEAST_SINE:
         return False
@@ -331,6 +337,9 @@ def solve(b, r, sigma_rad, worst_rad, quaternions, covariance, squares, sums):  
                     attitude[i, 0] * r[k, 0] + attitude[i, 1] * r[k, 1] + attitude[i, 2] * r[k, 2]
                 )
                 squares[method, k] += apart * apart
-        sums[method, 0] = squares[method].sum()
-        sums[method, 1] = (squares[method] * weights).sum()
+        plain = weighted = 0.0
+        for k in range(n):
+            plain += squares[method, k]
+            weighted += squares[method, k] * weights[k]
+        sums[method, 0], sums[method, 1] = plain, weighted
     return True

@@ -7,7 +7,6 @@ interpreter's lock.
 
 import math
 
-import numpy as np
 from numba import njit
 
 from service.identify.fov_rotation import rotation_rad
@@ -15,6 +14,12 @@ from service.identify.identification import Outcome
 from service.sky.pairs import separation_rad
 
 UNMATCHED, UNIQUE, AMBIGUOUS = (int(outcome) for outcome in Outcome)
+
+
+# What a difference of polar angles that is kept in single precision may be off, in radians.
+_SINGLE = 1e-6
+# On a right angle, where the order of a pair turns, rounding shall reject neither.
+_ROUNDING = 1e-14
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -28,7 +33,11 @@ def cast_votes(  # type: ignore[no-untyped-def]
     pair_dimmer,
     bin_start,
     bins_per_rad,
+    polar,  # (m,) a zone star's angle to the axis; -1: not worked out yet
+    pair_difference,  # (NTOT,) of the polar angles, about the zone's own axis; (0,) in a cap
     axis,  # (3,) the exact zone axis; in a band the catalog generation vector
+    off_axis,  # how far the zone's own axis lies from it, radians
+    all_inside,  # whether every zone star lies between the bounds
     least,  # bounds on a zone star's angle to the axis, radians
     most,
     separation_tolerance,  # SEPTOL, radians
@@ -45,19 +54,18 @@ def cast_votes(  # type: ignore[no-untyped-def]
     test_pole,
     test_rotation,
     votes,  # (n, m) counted up
+    voted,  # (n, m) the zone stars that got votes, `counts` (n,) of them
+    counts,
     edges,  # (0, 4), or as many rows as half the votes: each vote's i, a, j, b
 ):
     """Cast the votes of every observed pair's surviving candidate pairs."""
     kept = 0
-    n, m = len(observed), len(direction)
-    # A zone star's angle to the axis is worked out when first asked for; -1: not yet.
-    polar = np.full(m, -1.0)
-    observed_polar = np.empty(n)
-    for i in range(n):
-        observed_polar[i] = separation_rad(observed[i], axis)
+    n = len(observed)
+    # Cheap, and never too strict: the test itself follows.
+    look_at_difference = test_pole and len(pair_difference) > 0
+    difference_tolerance = pole_tolerance + 2.0 * off_axis + _SINGLE
+    cross_square = 4.0 * math.sin(0.5 * cross_tolerance) ** 2 + _ROUNDING
     last_bin = len(bin_start) - 2
-    normal = np.empty(3)
-    candidate_normal = np.empty(3)
     for i in range(n - 1):
         for j in range(i + 1, n):
             separation = separation_rad(observed[i], observed[j])
@@ -66,7 +74,17 @@ def cast_votes(  # type: ignore[no-untyped-def]
             first_bin = int(low * bins_per_rad)
             if first_bin > last_bin:
                 continue
-            has_normal = _unit_cross(observed[i], observed[j], normal)
+            n0 = observed[i, 1] * observed[j, 2] - observed[i, 2] * observed[j, 1]
+            n1 = observed[i, 2] * observed[j, 0] - observed[i, 0] * observed[j, 2]
+            n2 = observed[i, 0] * observed[j, 1] - observed[i, 1] * observed[j, 0]
+            normal = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+            if normal > 0.0:
+                n0, n1, n2 = n0 / normal, n1 / normal, n2 / normal
+            polar_i = polar_j = observed_difference = 0.0
+            if test_pole:
+                polar_i = separation_rad(observed[i], axis)
+                polar_j = separation_rad(observed[j], axis)
+                observed_difference = abs(polar_i - polar_j)
 
             # Steps 1 and 2: is the order of the observed pair told by the magnitudes? (LMAGT)
             bright, dim = i, j
@@ -82,6 +100,11 @@ def cast_votes(  # type: ignore[no-untyped-def]
                     break
                 if abs(pair_separation[k] - separation) > separation_tolerance:
                     continue
+                if (
+                    look_at_difference
+                    and abs(observed_difference - pair_difference[k]) > difference_tolerance
+                ):
+                    continue
                 a, b = pair_brighter[k], pair_dimmer[k]
                 order = 0  # LORD: +1 when i goes with a and j with b, -1 the other way round
 
@@ -94,17 +117,19 @@ def cast_votes(  # type: ignore[no-untyped-def]
                     order = 1 if bright == i else -1
 
                 # The zone on the shelf may be wider than the one that was asked for.
-                if polar[a] < 0.0:
-                    polar[a] = separation_rad(direction[a], axis)
-                if polar[b] < 0.0:
-                    polar[b] = separation_rad(direction[b], axis)
-                if polar[a] < least or polar[a] > most or polar[b] < least or polar[b] > most:
+                if test_pole or not all_inside:
+                    if polar[a] < 0.0:
+                        polar[a] = separation_rad(direction[a], axis)
+                    if polar[b] < 0.0:
+                        polar[b] = separation_rad(direction[b], axis)
+                if not all_inside and (
+                    polar[a] < least or polar[a] > most or polar[b] < least or polar[b] > most
+                ):
                     continue
 
                 by_pole = False
                 if test_pole:
                     # Step 6: GTODIF and GTRDIF.
-                    observed_difference = abs(observed_polar[i] - observed_polar[j])
                     candidate_difference = abs(polar[a] - polar[b])
                     if abs(observed_difference - candidate_difference) > pole_tolerance:
                         continue
@@ -114,11 +139,11 @@ def cast_votes(  # type: ignore[no-untyped-def]
                     )
                 if by_pole:
                     # Step 7: greater angle with greater, lesser with lesser, within BANTOL2.
-                    greater = max(observed_polar[i], observed_polar[j]) - max(polar[a], polar[b])
-                    lesser = min(observed_polar[i], observed_polar[j]) - min(polar[a], polar[b])
+                    greater = max(polar_i, polar_j) - max(polar[a], polar[b])
+                    lesser = min(polar_i, polar_j) - min(polar[a], polar[b])
                     if abs(greater) > angle_tolerance or abs(lesser) > angle_tolerance:
                         continue
-                    same = (observed_polar[i] > observed_polar[j]) == (polar[a] > polar[b])
+                    same = (polar_i > polar_j) == (polar[a] > polar[b])
                     pole_order = 1 if same else -1
                     # Steps 8 and 9: the magnitudes, where they told an order, must agree.
                     if order != 0 and order != pole_order:
@@ -126,13 +151,18 @@ def cast_votes(  # type: ignore[no-untyped-def]
                     order = pole_order
                 elif test_cross:
                     # Steps 4, 5 and 10: CRSSEP, or its supplement CRSSEN for the other order.
-                    if not has_normal or not _unit_cross(
-                        direction[a], direction[b], candidate_normal
-                    ):
+                    c0 = direction[a, 1] * direction[b, 2] - direction[a, 2] * direction[b, 1]
+                    c1 = direction[a, 2] * direction[b, 0] - direction[a, 0] * direction[b, 2]
+                    c2 = direction[a, 0] * direction[b, 1] - direction[a, 1] * direction[b, 0]
+                    square = c0 * c0 + c1 * c1 + c2 * c2
+                    if normal == 0.0 or square == 0.0:
                         continue
-                    crossing = separation_rad(normal, candidate_normal)
-                    along = crossing <= cross_tolerance
-                    against = math.pi - crossing <= cross_tolerance
+                    # By chords, which need no arc sine.
+                    norm = math.sqrt(square)
+                    d0, d1, d2 = n0 * norm - c0, n1 * norm - c1, n2 * norm - c2
+                    along = d0 * d0 + d1 * d1 + d2 * d2 <= cross_square * square
+                    d0, d1, d2 = n0 * norm + c0, n1 * norm + c1, n2 * norm + c2
+                    against = d0 * d0 + d1 * d1 + d2 * d2 <= cross_square * square
                     if order == 0:
                         if along:
                             order = 1
@@ -174,15 +204,15 @@ def cast_votes(  # type: ignore[no-untyped-def]
                         order = 1 if along else -1
 
                 if order >= 0:
-                    votes[i, a] += 1
-                    votes[j, b] += 1
+                    _vote(i, a, votes, voted, counts)
+                    _vote(j, b, votes, voted, counts)
                     if len(edges):
                         edges[kept, 0], edges[kept, 1] = i, a
                         edges[kept, 2], edges[kept, 3] = j, b
                         kept += 1
                 if order <= 0:
-                    votes[i, b] += 1
-                    votes[j, a] += 1
+                    _vote(i, b, votes, voted, counts)
+                    _vote(j, a, votes, voted, counts)
                     if len(edges):
                         edges[kept, 0], edges[kept, 1] = i, b
                         edges[kept, 2], edges[kept, 3] = j, a
@@ -190,20 +220,15 @@ def cast_votes(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _unit_cross(a, b, out):  # type: ignore[no-untyped-def]
-    """The unit cross product of two vectors; False where they are parallel."""
-    x = a[1] * b[2] - a[2] * b[1]
-    y = a[2] * b[0] - a[0] * b[2]
-    z = a[0] * b[1] - a[1] * b[0]
-    norm = math.sqrt(x * x + y * y + z * z)
-    if norm == 0.0:
-        return False
-    out[0], out[1], out[2] = x / norm, y / norm, z / norm
-    return True
+def _vote(i, row, votes, voted, counts):  # type: ignore[no-untyped-def]
+    if votes[i, row] == 0:
+        voted[i, counts[i]] = row
+        counts[i] += 1
+    votes[i, row] += 1
 
 
 @njit(cache=True, nogil=True)
-def count_votes(votes, star_of, outcome, star, highest, second):  # type: ignore[no-untyped-def]
+def count_votes(votes, voted, counts, star_of, outcome, star, highest, second):  # type: ignore[no-untyped-def]
     """Per observed star: outcome, the winner's `star_of` (-1: none) and the two highest tallies.
 
     True where any star is ambiguous.
@@ -213,7 +238,8 @@ def count_votes(votes, star_of, outcome, star, highest, second):  # type: ignore
         best = runner = 0
         row = -1
         share = 0
-        for k in range(votes.shape[1]):
+        for place in range(counts[i]):
+            k = voted[i, place]
             count = votes[i, k]
             if count > best:
                 runner, best, row, share = best, count, k, 1

@@ -53,7 +53,8 @@ def search_in(scratch, seen, stars, pairs, exhaustive, ledger, log_weight):  # t
     rest = evidence.log_null(n, with_magnitude(seen))
     enough = rest + n * CHANCE_PER_STAR + CHANCE_MARGIN
     best = -math.inf
-    count = work = 0
+    # No plain zeros: numba would compile all below for those constants as well.
+    count = work = 0 * n
     seeds, group, group_of = scratch.seeds, scratch.group, scratch.group_of
     first_pair, last_pair, separation = scratch.first_pair, scratch.last_pair, scratch.separation
     s = len(seeds)

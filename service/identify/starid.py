@@ -17,7 +17,7 @@ from service.identify.pair_tests import cast_votes, count_votes
 from service.missions.mission import Tests, Tolerances
 from service.sky.guide import Guide
 from service.sky.zones import Aim, Zone
-from service.vectors import Vector, angle_between_deg
+from service.vectors import Vector, angle_between_deg, separation_deg
 
 Tallies = npt.NDArray[np.int32]
 
@@ -62,11 +62,12 @@ def identify_by_votes(sighting: Sighting) -> Identification:
     n = len(sighting.direction)
     if n * (n - 1) // 2 * zone.pairs.count > MAX_COMPARISONS:
         _refuse_endless(sighting)
-    votes = np.zeros((n, len(zone.star)), np.int32)
-    _cast(sighting, votes, _NO_EDGES)
+    tallies = _tallies(n, len(zone.star))
+    votes = tallies[0]
+    _cast(sighting, tallies, _NO_EDGES)
     bounded = tests.match_groups and _keep_groups(sighting, votes)
     outcome, star, highest, second = np.empty((4, n), np.int64)
-    any_tie = count_votes(votes, zone.star, outcome, star, highest, second)
+    any_tie = count_votes(*tallies, zone.star, outcome, star, highest, second)
     return Identification(
         outcome=outcome,
         star=star,
@@ -97,7 +98,25 @@ def _refuse_endless(sighting: Sighting) -> None:
         )
 
 
-def _cast(sighting: Sighting, votes: Tallies, edges: Tallies) -> None:
+def _tallies(n: int, stars: int) -> tuple[Tallies, Tallies, Tallies]:
+    """No votes yet: `votes`, `voted` and `counts` of the kernels."""
+    return np.zeros((n, stars), np.int32), np.empty((n, stars), np.int32), np.zeros(n, np.int32)
+
+
+def polar_of(zone: Zone, aim: Aim) -> tuple[Vector, float, bool]:
+    """The zone stars' angles to the aim's axis, -1 where they are not known; see `cast_votes`.
+
+    With them how far off the zone's own axis lies, in radians, and whether every
+    star of the zone lies within the aim.
+    """
+    if zone.serves_exactly(aim):
+        polar = zone.polar_rad.copy() if len(zone.polar_rad) else np.empty(len(zone.star))
+        return polar, 0.0, True
+    off_axis = math.radians(separation_deg(zone.aim.axis, aim.axis))
+    return np.full(len(zone.star), -1.0), off_axis, False
+
+
+def _cast(sighting: Sighting, tallies: tuple[Tallies, Tallies, Tallies], edges: Tallies) -> None:
     """Cast the votes of all pairs, and write the pairs to `edges` where it has rows."""
     zone, aim, limits, tests = (
         sighting.zone,
@@ -105,6 +124,8 @@ def _cast(sighting: Sighting, votes: Tallies, edges: Tallies) -> None:
         sighting.tolerances,
         sighting.tests,
     )
+    polar, off_axis, all_inside = polar_of(zone, aim)
+    votes, voted, counts = tallies
     cast_votes(
         sighting.direction,
         sighting.magnitude_mag,
@@ -115,7 +136,11 @@ def _cast(sighting: Sighting, votes: Tallies, edges: Tallies) -> None:
         zone.pairs.dimmer,
         zone.pairs.bin_start,
         zone.pairs.bins_per_rad,
+        polar,
+        zone.polar_difference_rad,
         aim.axis,
+        off_axis,
+        all_inside,
         math.radians(aim.least_deg),
         math.radians(aim.most_deg),
         math.radians(limits.separation_deg),
@@ -132,6 +157,8 @@ def _cast(sighting: Sighting, votes: Tallies, edges: Tallies) -> None:
         tests.pole,
         tests.fov_rotation,
         votes,
+        voted,
+        counts,
         edges,
     )
 
@@ -142,7 +169,7 @@ def _keep_groups(sighting: Sighting, votes: Tallies) -> bool:
     if count > MAX_EDGES:
         return True
     edges = np.empty((count, 4), np.int32)
-    _cast(sighting, np.zeros_like(votes), edges)
+    _cast(sighting, _tallies(*votes.shape), edges)
     return keep_largest_groups(votes, edges)
 
 

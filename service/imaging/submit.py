@@ -8,16 +8,14 @@ import json
 import math
 from itertools import pairwise
 from time import perf_counter_ns as clock_ns
-from typing import IO, Annotated, Any
+from typing import IO, TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationError
 
 from service.errors import BadBatch, Fault
-from service.imaging.detect import Detections, detect
 from service.imaging.files import read_frame
 from service.imaging.frame import Frame, FrameLimits, refused, require_light
-from service.imaging.measure import MeasuredStar, measure
 from service.imaging.preview import preview_of
 from service.imaging.record import Flag
 from service.missions.camera import Camera, CentroidMethod
@@ -42,6 +40,10 @@ from service.observe.wire import (
     submission_from_model,
 )
 from service.vectors import Vector
+
+if TYPE_CHECKING:
+    from service.imaging.detect import Detections
+    from service.imaging.measure import MeasuredStar
 
 LEAST_SIGMA_ARCSEC = 1e-3
 BLENDED_SHARE = 0.15
@@ -106,6 +108,10 @@ def submission_of_frame(
     if known.exposure_s is not None:
         frame = _exposed(frame, known.exposure_s)
     clock.append(clock_ns())
+    # What these import takes a third of the service's start, which no frame may follow.
+    from service.imaging.detect import detect
+    from service.imaging.measure import measure
+
     found = detect(frame, camera)
     clock.append(clock_ns())
     faintest_mag = camera.faintest_mag
@@ -164,7 +170,7 @@ def _batch(
     return BatchIn.model_validate_json(json.dumps(whole))
 
 
-def _observed(stars: list[MeasuredStar], camera: Camera) -> list[dict[str, Any]]:
+def _observed(stars: "list[MeasuredStar]", camera: Camera) -> list[dict[str, Any]]:
     """The stars as a batch has them: direction, sigma and magnitude."""
     u, v = (np.array([getattr(star.record, name) for star in stars]) for name in ("u_px", "v_px"))
     sigma_u, sigma_v = (
@@ -185,7 +191,7 @@ def _observed(stars: list[MeasuredStar], camera: Camera) -> list[dict[str, Any]]
     ]
 
 
-def _sigma_px(star: MeasuredStar, name: str, camera: Camera) -> float:
+def _sigma_px(star: "MeasuredStar", name: str, camera: Camera) -> float:
     """The predicted error, what the calibration leaves, and for a blend what it may hide."""
     hidden = BLENDED_SHARE * camera.psf_sigma_px if Flag.BLENDED in star.record.flags else 0.0
     return math.hypot(getattr(star.record, name), camera.sigma_floor_px, hidden)
@@ -193,8 +199,8 @@ def _sigma_px(star: MeasuredStar, name: str, camera: Camera) -> float:
 
 def _record(
     frame: Frame,
-    found: Detections,
-    stars: list[MeasuredStar],
+    found: "Detections",
+    stars: "list[MeasuredStar]",
     tracker: Tracker,
     camera: Camera,
     known: FrameIn,
@@ -221,7 +227,7 @@ def _record(
     )
 
 
-def _told(star: MeasuredStar) -> dict[str, Any]:
+def _told(star: "MeasuredStar") -> dict[str, Any]:
     """A measured candidate, ready for JSON."""
     record = star.record
     return {

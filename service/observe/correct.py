@@ -5,6 +5,7 @@ from its own time to the batch's with the body rates.  Aberration is not
 touched here: observed vectors are never changed for it.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy.typing as npt
 
 from service.missions.mission import Calibration, Mission, Tracker
 from service.observe.batch import ObservationBatch, TrackerStars
-from service.vectors import Vector, read_only, rotate_about, unit
+from service.vectors import Vector, locked, read_only, turned_at_rate, unit
 
 
 @dataclass(frozen=True)
@@ -54,15 +55,15 @@ def _corrected(
     if as_angles.any():
         from_angles = tracker_vectors(stars.angles_deg, tracker.calibration)
         direction = np.where(as_angles[:, None], from_angles, direction)
-    outside = direction[:, 2] < np.cos(np.radians(tracker.field_of_view_radius_deg))
+    outside = direction[:, 2] < math.cos(math.radians(tracker.field_of_view_radius_deg))
     body = direction @ tracker.body_from_tracker.T
     if rates_deg_per_s.any() and stars.time_offset_s.any():
         # v(epoch) = exp([w x] dt) v, dt being the star's time minus the batch's.
-        body = rotate_about(np.radians(rates_deg_per_s) * stars.time_offset_s[:, None], body)
+        body = turned_at_rate(body, np.radians(rates_deg_per_s), stars.time_offset_s)
     return CorrectedObservations(
         tracker=tracker,
         direction_body=read_only(np.ascontiguousarray(body)),
-        magnitude_mag=stars.magnitude_mag,
+        magnitude_mag=locked(stars.magnitude_mag),
         sigma_arcsec=read_only(
             np.where(np.isnan(stars.sigma_arcsec), tracker.sigma_arcsec, stars.sigma_arcsec)
         ),

@@ -179,10 +179,16 @@ class OptionsIn(Wire):
         return Options(
             identifier=self.identifier,
             solver=self.solver,
-            tests=self.tests.model_dump(exclude_none=True),
-            tolerances=self.tolerances.model_dump(exclude_none=True),
+            tests=_named(self.tests),
+            tolerances=_named(self.tolerances),
             zone_grid_deg=self.zone_grid_deg,
         )
+
+
+def _named(model: Wire) -> dict[str, Any]:
+    """The fields that were given a value."""
+    values = ((name, getattr(model, name)) for name in model.model_fields_set)
+    return {name: value for name, value in values if value is not None}
 
 
 def _kind_of_prior(value: Any) -> str | None:
@@ -283,14 +289,23 @@ _NO_VECTOR = (math.nan, math.nan, math.nan)
 def _tracker_stars(tracker: TrackerIn) -> TrackerStars:
     stars = tracker.stars
     vector = np.array([star.vector or _NO_VECTOR for star in stars], dtype=np.float64)
+    # A number that is absent becomes NaN by numpy's reading of None.
+    numbers = _array(
+        [
+            [star.h_deg for star in stars],
+            [star.v_deg for star in stars],
+            [star.magnitude for star in stars],
+            [star.time_offset_s for star in stars],
+            [star.sigma_arcsec for star in stars],
+        ]
+    )
     return TrackerStars(
         tracker=tracker.tracker,
         vector=read_only(unit(vector.reshape(-1, 3))),
-        # A number that is absent becomes NaN by numpy's reading of None.
-        angles_deg=_array([(star.h_deg, star.v_deg) for star in stars]).reshape(-1, 2),
-        magnitude_mag=_array([star.magnitude for star in stars]),
-        time_offset_s=_array([star.time_offset_s for star in stars]),
-        sigma_arcsec=_array([star.sigma_arcsec for star in stars]),
+        angles_deg=numbers[:2].T,
+        magnitude_mag=numbers[2],
+        time_offset_s=numbers[3],
+        sigma_arcsec=numbers[4],
     )
 
 

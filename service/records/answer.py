@@ -1,18 +1,18 @@
 """The answer to a batch, as the interface shows it and as it is recorded."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
-
-import numpy as np
 
 from service.acquire import Acquisition, TrackerResult
 from service.attitude.solution import AttitudeSolution
 from service.identify.identification import Outcome
 from service.sky.run_catalog import RunCatalog
 from service.sky.zones import Aim
-from service.vectors import Vector, to_ra_dec
+from service.vectors import ra_dec_of
 
 FRAME = "EME2000"
+WORDS = {int(outcome): outcome.word for outcome in Outcome}
 
 
 @dataclass(frozen=True)
@@ -79,65 +79,91 @@ def star_rows(acquisition: Acquisition) -> list[StarRow]:
             star_id=_star_id(acquisition.run_catalog, int(each.identification.star[k])),
             votes=int(each.identification.votes[k]),
             runner_up=int(each.identification.runner_up[k]),
-            probability=_number(each.identification.probability[k]),
-            residual_arcsec=_number(each.residual_arcsec[k]),
+            probability=_number(float(each.identification.probability[k])),
+            residual_arcsec=_number(float(each.residual_arcsec[k])),
         )
         for each in acquisition.trackers
         for k, outcome in enumerate(each.identification.outcome)
     ]
 
 
+def rows_of_stars(answer: dict[str, Any]) -> list[dict[str, Any]]:
+    """`star_rows` as rows of the table, from the answer itself."""
+    return [
+        {
+            "result_id": answer["id"],
+            "tracker": tracker["tracker"],
+            "position": position,
+            "outcome": star["outcome"],
+            "star_id": star["star"] and star["star"]["id"],
+            "votes": star["votes"],
+            "runner_up": star["runner_up"],
+            "probability": star["probability"],
+            "residual_arcsec": star["residual_arcsec"],
+        }
+        for tracker in answer["observations"]
+        for position, star in enumerate(tracker["stars"])
+    ]
+
+
 def _tracker_answer(result: TrackerResult, run_catalog: RunCatalog) -> dict[str, Any]:
-    tracker, found = result.corrected.tracker, result.identification
     return {
-        "tracker": tracker.name,
+        "tracker": result.corrected.tracker.name,
         "zone": None if result.aim is None else _zone(result, result.aim),
-        "stars": [_star(result, k, run_catalog) for k in range(len(found.outcome))],
+        "stars": _stars(result, run_catalog),
     }
 
 
 def _zone(result: TrackerResult, aim: Aim) -> dict[str, Any]:
-    ra_deg, dec_deg = to_ra_dec(aim.axis)
+    ra_deg, dec_deg = ra_dec_of(aim.axis)
     return {
         "kind": aim.kind,
-        "ra_deg": float(ra_deg),
-        "dec_deg": float(dec_deg),
+        "ra_deg": ra_deg,
+        "dec_deg": dec_deg,
         "stars": result.stars,
         "pairs": result.pairs,
         "cached": result.zone_cached,
     }
 
 
-def _star(result: TrackerResult, k: int, run_catalog: RunCatalog) -> dict[str, Any]:
-    found = result.identification
-    outcome = Outcome(found.outcome[k])
-    name = _star_id(run_catalog, int(found.star[k]))
-    star: dict[str, Any] = {
-        "outcome": outcome.word,
-        "star": None if name is None else {"catalog": name.partition(" ")[0], "id": name},
-        "votes": int(found.votes[k]),
-        "runner_up": int(found.runner_up[k]),
-    }
-    if outcome is Outcome.AMBIGUOUS or found.rivals[k]:
-        star["rivals"] = [_star_id(run_catalog, rival) for rival in found.rivals[k]]
-        if found.rival_probability:
-            star["rival_probabilities"] = list(found.rival_probability[k])
-    star["probability"] = _number(found.probability[k])
-    star["residual_arcsec"] = _number(result.residual_arcsec[k])
-    star["flags"] = _flags(result, k)
-    return star
-
-
-def _flags(result: TrackerResult, k: int) -> list[str]:
-    flags = []
-    if result.corrected.outside_field_of_view[k]:
-        flags.append("outside_field_of_view")
-    if np.isnan(result.corrected.magnitude_mag[k]):
-        flags.append("no_magnitude")
-    star = result.identification.star
-    if star[k] >= 0 and np.count_nonzero(star == star[k]) > 1:
-        flags.append("same_star_twice")
-    return flags
+def _stars(result: TrackerResult, run_catalog: RunCatalog) -> list[dict[str, Any]]:
+    found, seen = result.identification, result.corrected
+    # Plain numbers: to take single ones out of arrays costs more than all the rest.
+    rows = found.star.tolist()
+    columns = zip(
+        found.outcome.tolist(),
+        rows,
+        found.votes.tolist(),
+        found.runner_up.tolist(),
+        found.probability.tolist(),
+        result.residual_arcsec.tolist(),
+        seen.outside_field_of_view.tolist(),
+        seen.magnitude_mag.tolist(),
+        strict=True,
+    )
+    stars = []
+    for k, (outcome, row, votes, second, probability, residual, outside, mag) in enumerate(columns):
+        name = _star_id(run_catalog, row)
+        star: dict[str, Any] = {
+            "outcome": WORDS[outcome],
+            "star": None if name is None else {"catalog": name.partition(" ")[0], "id": name},
+            "votes": votes,
+            "runner_up": second,
+        }
+        if outcome == Outcome.AMBIGUOUS or found.rivals[k]:
+            star["rivals"] = [_star_id(run_catalog, rival) for rival in found.rivals[k]]
+            if found.rival_probability:
+                star["rival_probabilities"] = list(found.rival_probability[k])
+        star["probability"] = _number(probability)
+        star["residual_arcsec"] = _number(residual)
+        flags = ["outside_field_of_view"] if outside else []
+        if math.isnan(mag):
+            flags.append("no_magnitude")
+        if row >= 0 and rows.count(row) > 1:
+            flags.append("same_star_twice")
+        star["flags"] = flags
+        stars.append(star)
+    return stars
 
 
 def _attitude(solution: AttitudeSolution) -> dict[str, Any]:
@@ -168,6 +194,5 @@ def _star_id(run_catalog: RunCatalog, row: int) -> str | None:
     return None if row < 0 else str(run_catalog.star_id[row])
 
 
-def _number(value: float | Vector) -> float | None:
-    number = float(value)
-    return None if np.isnan(number) else number
+def _number(value: float) -> float | None:
+    return None if math.isnan(value) else value

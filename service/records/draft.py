@@ -4,7 +4,6 @@ The rows are taken from the answer itself, so that what a list or a trend says
 cannot differ from what the client was told.
 """
 
-import dataclasses
 import json
 import time
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from service.acquire import Acquisition
 from service.observe.frame_record import FrameRecord
 from service.observe.wire import Submission
 from service.records.ahead import AHEAD_NS, LIVE
-from service.records.answer import answer_of, star_rows
+from service.records.answer import answer_of, rows_of_stars
 from service.records.measures import measures_of
 from service.times import DAY_S, HOUR_S, Utc
 
@@ -69,6 +68,8 @@ class Draft:
     buckets: Buckets
     key: str | None
     frame: Row | None = None
+    is_ahead: bool = False
+    """Of a live batch: dated so far ahead that its time cannot be believed."""
     handed: Handed | None = None
 
     @property
@@ -117,7 +118,8 @@ def submission_draft(
     answer = answer_of(acquisition, id=id)
     if submission.frame is not None:
         answer["frame"] = submission.frame.summary()
-    if batch.run == LIVE and batch.time.tai_ns > received.tai_ns + AHEAD_NS:
+    is_ahead = batch.run == LIVE and batch.time.tai_ns > received.tai_ns + AHEAD_NS
+    if is_ahead:
         answer["warnings"].append(
             f"dated_ahead: the batch is dated {batch.time.text} and came at {received.text}; it is "
             "not shown as the latest"
@@ -126,6 +128,7 @@ def submission_draft(
         acquisition, answer, batch_id=id, parent=None, current=True, created=received
     )
     draft = _draft(acquisition, answer, row, result, key)
+    draft.is_ahead = is_ahead
     if submission.frame is not None:
         draft.frame = _frame_row(submission.frame, id)
     return draft
@@ -157,7 +160,7 @@ def _draft(
     key: str | None,
 ) -> Draft:
     batch = acquisition.batch
-    stars = [{"result_id": result["id"], **vars(row)} for row in star_rows(acquisition)]
+    stars = rows_of_stars(answer)
     buckets = Buckets(
         batch.spacecraft, batch.run, batch.time.bucket(HOUR_S), batch.time.bucket(DAY_S)
     )
@@ -209,7 +212,7 @@ def _result_row(
 
 def options_text(acquisition: Acquisition) -> str:
     """The options that a result was computed with, as JSON, what was not named left out."""
-    named = dataclasses.asdict(acquisition.batch.options)
+    named = vars(acquisition.batch.options)
     return json.dumps({name: value for name, value in named.items() if value not in (None, {})})
 
 

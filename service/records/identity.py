@@ -1,29 +1,40 @@
 """Who was first: which batches and Idempotency-Keys are recorded, and with what body."""
 
-from collections.abc import Collection
+import json
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
-from sqlalchemy import Connection, bindparam, insert, select, tuple_
+from sqlalchemy import Connection, insert
 
 from service.errors import Conflict, KeyReused, shown_value
-from service.records.tables import batches, idempotency_keys, results
+from service.observe.batch import ObservationBatch
+from service.records.tables import idempotency_keys
 
 Identity = tuple[str, str, str]
 """(spacecraft, run, batch): unique among submissions."""
 
-# SQLite takes 32,766 values in a statement, three to an identity.
-_LOOKED_UP_AT_ONCE = 5_000
-
-_IDENTITY = (batches.c.spacecraft, batches.c.run, batches.c.batch)
-_BY_IDENTITY = select(*_IDENTITY, batches.c.id, batches.c.fingerprint).where(
-    tuple_(*_IDENTITY).in_(bindparam("identities", expanding=True))
-)
-_BY_KEY = select(
-    idempotency_keys.c.key, idempotency_keys.c.result_id, idempotency_keys.c.fingerprint
-).where(idempotency_keys.c.key.in_(bindparam("keys", expanding=True)))
-_ANSWERS = select(results.c.id, results.c.answer).where(
-    results.c.id.in_(bindparam("ids", expanding=True))
-)
+# What is looked for comes as one value, so that the text of each statement never changes: to
+# make one for so many values takes longer than to run it.
+_BY_IDENTITY = {
+    "sqlite": """
+        SELECT b.spacecraft, b.run, b.batch, b.id, b.fingerprint
+        FROM json_each(:wanted) AS w CROSS JOIN batches AS b
+        WHERE b.spacecraft = json_extract(w.value, '$[0]')
+          AND b.run = json_extract(w.value, '$[1]') AND b.batch = json_extract(w.value, '$[2]')
+    """,
+    "postgresql": """
+        SELECT b.spacecraft, b.run, b.batch, b.id, b.fingerprint
+        FROM json_array_elements(CAST(%(wanted)s AS json)) AS w JOIN batches AS b
+        ON b.spacecraft = w->>0 AND b.run = w->>1 AND b.batch = w->>2
+    """,
+}
+_AMONG = {
+    "sqlite": "(SELECT value FROM json_each(:wanted))",
+    "postgresql": "(SELECT json_array_elements_text(CAST(%(wanted)s AS json)))",
+}
+_BY_KEY = "SELECT key, result_id, fingerprint FROM idempotency_keys WHERE key IN "
+_ANSWERS = "SELECT id, answer FROM results WHERE id IN "
 
 
 @dataclass(frozen=True)
@@ -32,6 +43,11 @@ class Taken:
 
     result_id: str
     fingerprint: str
+
+
+def identity_of(batch: ObservationBatch) -> Identity:
+    """What is unique among submissions."""
+    return batch.spacecraft, batch.run, batch.batch
 
 
 @dataclass
@@ -72,15 +88,20 @@ def look_up(
 ) -> Registry:
     """What is recorded under these identities and keys."""
     registry = Registry()
-    wanted = list(identities)
-    for first in range(0, len(wanted), _LOOKED_UP_AT_ONCE):
-        part = {"identities": wanted[first : first + _LOOKED_UP_AT_ONCE]}
-        for spacecraft, run, batch, id, fingerprint in connection.execute(_BY_IDENTITY, part):
+    dialect = connection.dialect.name
+    if identities:
+        rows = _rows(connection, _BY_IDENTITY[dialect], identities)
+        for spacecraft, run, batch, id, fingerprint in rows:
             registry.identities[spacecraft, run, batch] = Taken(id, fingerprint)
     if keys:
-        rows = connection.execute(_BY_KEY, {"keys": list(keys)})
+        rows = _rows(connection, _BY_KEY + _AMONG[dialect], keys)
         registry.keys = {key: Taken(id, fingerprint) for key, id, fingerprint in rows}
     return registry
+
+
+def _rows(connection: Connection, sql: str, wanted: Collection[object]) -> Iterable[Any]:
+    text = json.dumps(list(wanted))
+    return connection.exec_driver_sql(sql, {"wanted": text})
 
 
 def remember_key(connection: Connection, identity: Identity, key: str, taken: Taken) -> None:
@@ -92,5 +113,5 @@ def remember_key(connection: Connection, identity: Identity, key: str, taken: Ta
 
 def stored_answers(connection: Connection, ids: Collection[str]) -> dict[str, bytes]:
     """The answers of recorded results, byte for byte as first sent."""
-    rows = connection.execute(_ANSWERS, {"ids": list(ids)}) if ids else ()
+    rows = _rows(connection, _ANSWERS + _AMONG[connection.dialect.name], ids) if ids else ()
     return {id: answer.encode() for id, answer in rows}

@@ -7,6 +7,8 @@ import time
 _ALPHABET = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"  # Crockford's: no I, L, O, U
 _RANDOM_BITS = 80
 LENGTH = 26
+_SHIFTS = range(10 * (LENGTH // 2 - 1), -1, -10)
+_PAIRS = [first + second for first in _ALPHABET for second in _ALPHABET]
 
 
 class Ulids:
@@ -26,7 +28,7 @@ class Ulids:
                 fresh if fresh >> _RANDOM_BITS > self._last >> _RANDOM_BITS else self._last + 1
             )
             value = self._last
-        return "".join(_ALPHABET[value >> shift & 31] for shift in range(5 * (LENGTH - 1), -1, -5))
+        return "".join([_PAIRS[value >> shift & 1023] for shift in _SHIFTS])
 
 
 def is_ulid(text: str) -> bool:

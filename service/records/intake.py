@@ -5,6 +5,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 
 import msgspec
 
@@ -15,11 +16,13 @@ from service.observe.batch import ObservationBatch
 from service.observe.wire import OptionsIn, Submission
 from service.records.again import batch_again
 from service.records.answer import answer_of
+from service.records.desk import Desk, Order
 from service.records.draft import Answered, Draft, Handed, submission_draft, what_if_draft
 from service.records.identity import (
     Identity,
     Registry,
     Taken,
+    identity_of,
     look_up,
     remember_key,
     stored_answers,
@@ -28,6 +31,7 @@ from service.records.ids import Ulids
 from service.records.reading import one_result
 from service.records.running import Running
 from service.records.store import Store
+from service.records.transaction import Results
 from service.records.writer import RETRY_AFTER_S
 from service.sky.view import Sky
 from service.times import utc_now
@@ -52,14 +56,21 @@ class Intake:
         self._store = store
         self._ids = Ulids()
         self._running = Running()
-        self._processors = threading.BoundedSemaphore(max(2, os.cpu_count() or 1))
+        processors = max(2, os.cpu_count() or 1)
+        self._processors = threading.BoundedSemaphore(processors)
+        self._desk = Desk(self._stored_orders, self._draft, self._written, processors)
         self.observers: list[Observer] = []
         """Called with the acquisition of every batch that is new, after its commit."""
 
-    def submit(self, submission: Submission, key: str | None) -> Answered:
+    def take(self, submission: Submission, key: str | None) -> "Future[Answered]":
         """Record a batch and answer it; a repeat gets the stored answer, at once or when it is."""
-        identity = identity_of(submission)
-        return self.submit_made(identity, submission.fingerprint, lambda: submission, key)
+        if key is not None:
+            _check_key(key)
+        return self._desk.take(submission, key)
+
+    def close(self) -> None:
+        """Work through what was taken, and take no more."""
+        self._desk.close()
 
     def submit_made(
         self,
@@ -68,7 +79,10 @@ class Intake:
         make: Callable[[], Submission],
         key: str | None,
     ) -> Answered:
-        """The same of a batch that is still to be made, and is not where it is recorded."""
+        """The same of a batch that is still to be made, and is not where it is recorded.
+
+        The thread that asks makes it, which may take seconds, and waits.
+        """
         if key is not None:
             _check_key(key)
         while True:
@@ -82,8 +96,11 @@ class Intake:
     def submit_many(self, submissions: Sequence[Submission]) -> Answers:
         """`submit` of each in one transaction; an error stands in the place of what is refused."""
         with self._store.reading() as connection:
-            registry = look_up(connection, {identity_of(each) for each in submissions})
-            holders = [_holder(registry, each) for each in submissions]
+            registry = look_up(connection, {identity_of(each.batch) for each in submissions})
+            holders = [
+                _holder(registry, identity_of(each.batch), None, each.fingerprint)
+                for each in submissions
+            ]
             repeats = {each.result_id for each in holders if isinstance(each, Taken)}
             stored = stored_answers(connection, repeats)
         # The connection is given back: a moment of the database that is held on to for as long
@@ -129,6 +146,42 @@ class Intake:
         """
         return self._acquire(batch, mission or mission_named(self._missions, batch.spacecraft))
 
+    def _stored_orders(self, orders: Sequence[Order]) -> list[Answered | AcquisitionError | None]:
+        """What is stored of each: the answer, the error of whose place is taken, or nothing."""
+        with self._store.reading() as connection:
+            registry = look_up(
+                connection,
+                {each.identity for each in orders},
+                {each.key for each in orders if each.key is not None},
+            )
+            holders = [
+                _holder(registry, each.identity, each.key, each.submission.fingerprint)
+                for each in orders
+            ]
+            repeats = {each.result_id for each in holders if isinstance(each, Taken)}
+            stored = stored_answers(connection, repeats)
+        found: list[Answered | AcquisitionError | None] = []
+        for order, holder in zip(orders, holders, strict=True):
+            if not isinstance(holder, Taken):
+                found.append(holder)
+                continue
+            try:
+                self._remember(order.identity, order.key, holder, registry)
+            except AcquisitionError as error:
+                found.append(error)
+            else:
+                found.append(Answered(holder.result_id, stored[holder.result_id], replayed=True))
+        return found
+
+    def _remember(
+        self, identity: Identity, key: str | None, first: Taken, registry: Registry
+    ) -> None:
+        """Give a repeat's key, where it is a new one, to the body that is recorded."""
+        if key is not None and key not in registry.keys:
+            self._store.writer.change(
+                lambda connection: remember_key(connection, identity, key, first)
+            ).result()
+
     def _stored(self, identity: Identity, fingerprint: str, key: str | None) -> Answered | None:
         with self._store.reading() as connection:
             registry = look_up(connection, [identity], [] if key is None else [key])
@@ -136,10 +189,7 @@ class Intake:
             if first is None:
                 return None
             body = stored_answers(connection, [first.result_id])[first.result_id]
-        if key is not None and key not in registry.keys:
-            self._store.writer.change(
-                lambda connection: remember_key(connection, identity, key, first)
-            ).result()
+        self._remember(identity, key, first, registry)
         return Answered(first.result_id, body, replayed=True)
 
     def _draft(self, submission: Submission, key: str | None = None) -> Draft:
@@ -168,29 +218,36 @@ class Intake:
             return error
         except Exception:
             # A fault of ours in one batch: the others are recorded all the same.
-            log.exception("%s, run %s, batch %s failed", *identity_of(submission))
+            log.exception("%s, run %s, batch %s failed", *identity_of(submission.batch))
             return AcquisitionError("the fault is on the service's side; it is logged")
 
     def _write(self, drafts: Sequence[Draft]) -> Answers:
-        if not drafts:
-            return []
-        handed = Handed(time.perf_counter_ns(), len(drafts))
-        for draft in drafts:
-            draft.handed = handed
-        outcomes = self._store.writer.record(drafts).result()
         answers: Answers = []
-        for draft, outcome in zip(drafts, outcomes, strict=True):
-            is_new = isinstance(outcome, Answered) and not outcome.replayed
-            # A what-if looks at the same stars again: there is nothing new to observe.
-            if is_new and draft.batch is not None and draft.acquisition is not None:
-                self._tell(draft.acquisition)
+        for outcome in self._written(drafts):
             # Neither is an answer to the batch: both say that nothing was decided about it.
             if isinstance(outcome, Busy) or not isinstance(outcome, Answered | AcquisitionError):
                 raise outcome
             answers.append(outcome)
         return answers
 
-    def _tell(self, acquisition: Acquisition) -> None:
+    def _written(self, drafts: Sequence[Draft]) -> Results:
+        """What became of each draft, when all are recorded."""
+        if not drafts:
+            return []
+        handed = Handed(time.perf_counter_ns(), len(drafts))
+        for draft in drafts:
+            draft.handed = handed
+        outcomes = self._store.writer.record(drafts).result()
+        for draft, outcome in zip(drafts, outcomes, strict=True):
+            is_new = isinstance(outcome, Answered) and not outcome.replayed
+            # A what-if looks at the same stars again: there is nothing new to observe.
+            if is_new and draft.batch is not None:
+                self._tell(draft.acquisition)
+        return outcomes
+
+    def _tell(self, acquisition: Acquisition | None) -> None:
+        if acquisition is None:
+            return
         for observer in self.observers:
             try:
                 observer(acquisition)
@@ -208,17 +265,13 @@ def mission_in_input(missions: Mapping[str, Mission], name: str) -> Mission:
         raise BadBatch(Fault("spacecraft", there_are, shown_value(name))) from None
 
 
-def _holder(registry: Registry, submission: Submission) -> Taken | AcquisitionError | None:
+def _holder(
+    registry: Registry, identity: Identity, key: str | None, fingerprint: str
+) -> Taken | AcquisitionError | None:
     try:
-        return registry.first(identity_of(submission), None, submission.fingerprint)
+        return registry.first(identity, key, fingerprint)
     except AcquisitionError as error:
         return error
-
-
-def identity_of(submission: Submission) -> Identity:
-    """What is unique among submissions."""
-    batch = submission.batch
-    return batch.spacecraft, batch.run, batch.batch
 
 
 def _check_key(key: str) -> None:

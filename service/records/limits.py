@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from sqlalchemy import Connection, insert, select, update
+from sqlalchemy import Connection, bindparam, insert, select, update
 
 from service.alarms.limits import LimitSettings, default_limits
 from service.alarms.quantities import QUANTITIES, QuantityName
@@ -15,6 +15,12 @@ from service.records.tables import limits
 
 Limits = Mapping[QuantityName, LimitSettings]
 
+_SHIPPED: dict[str, Limits] = {}
+# Put together once: with every batch of a live spacecraft it is run anew.
+_HOLDING = select(limits).where(
+    limits.c.spacecraft == bindparam("spacecraft"), limits.c.until.is_(None)
+)
+
 
 def limits_of(connection: Connection, mission: Mission) -> Limits:
     """The limits that hold for a spacecraft: its own in place of the shipped ones."""
@@ -23,7 +29,11 @@ def limits_of(connection: Connection, mission: Mission) -> Limits:
         for row in _holding(connection, mission.name)
         if row["settings"] is not None
     }
-    return {**default_limits(mission), **own}
+    shipped = _SHIPPED.get(mission.digest)
+    if shipped is None:
+        # Asked for with every batch; a process meets few missions.
+        shipped = _SHIPPED[mission.digest] = default_limits(mission)
+    return {**shipped, **own}
 
 
 def list_limits(connection: Connection, mission: Mission) -> list[Row]:
@@ -98,5 +108,4 @@ def limit_row(
 
 
 def _holding(connection: Connection, spacecraft: str) -> list[Any]:
-    query = select(limits).where(limits.c.spacecraft == spacecraft, limits.c.until.is_(None))
-    return list(connection.execute(query).mappings())
+    return list(connection.execute(_HOLDING, {"spacecraft": spacecraft}).mappings())

@@ -8,7 +8,6 @@ import numpy as np
 from service.acquire import Acquisition
 from service.records.tables import COUNTS, MAXIMA, MEASURED, MINIMA, SUMS
 from service.vectors import (
-    attitude_error_arcsec,
     matrix_from_quaternion,
     separation_deg,
 )
@@ -59,8 +58,9 @@ def a_priori_angle_deg(acquisition: Acquisition) -> float | None:
     if presumed.known_axis is not None:
         axis = acquisition.mission.axis_body
         return float(separation_deg(attitude.T @ axis, presumed.known_axis))
-    error_arcsec = attitude_error_arcsec(attitude, presumed.attitude)
-    return math.hypot(*error_arcsec.tolist()) / 3600.0
+    # |A - B| is 2 sqrt(2) sin(angle / 2) in the sense of Frobenius.
+    apart = math.hypot(*(attitude - presumed.attitude).ravel().tolist())
+    return math.degrees(2.0 * math.asin(min(1.0, apart / math.sqrt(8.0))))
 
 
 def residual_ratio(row: Row) -> float | None:

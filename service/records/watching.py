@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import msgspec
-from sqlalchemy import Connection, insert, select, update
+from sqlalchemy import Connection, bindparam, insert, select, update
 
 from service.alarms import latch
 from service.alarms.latch import Point
@@ -18,7 +18,7 @@ from service.alarms.limits import LimitSettings, Severity
 from service.alarms.quantities import QUANTITIES, QuantityName
 from service.alarms.window import Sample, Window
 from service.missions.mission import Mission
-from service.records.ahead import AHEAD_NS, LIVE
+from service.records.ahead import LIVE
 from service.records.alarms import change, note
 from service.records.draft import Draft, Row
 from service.records.ids import Ulids
@@ -31,26 +31,49 @@ from service.times import Utc, parse_utc, shifted
 _IDS = Ulids()
 SILENCE: QuantityName = "silence_s"
 
+# Put together once: each is run with every batch of a live spacecraft, or with a few of them.
+_PLACE = (
+    watches.c.spacecraft == bindparam("of_spacecraft"),
+    watches.c.run == bindparam("of_run"),
+)
+_LOCKED = select(watches).where(*_PLACE).with_for_update()
+_KEPT = ("time", "time_ns", "batch_id", "received", "state")
+_KEEP = update(watches).where(*_PLACE).values({name: bindparam(name) for name in _KEPT})
+_ACTIVE = (
+    select(alarms)
+    .where(
+        alarms.c.run == bindparam("of_run"),
+        alarms.c.spacecraft == bindparam("of_spacecraft"),
+        alarms.c.cleared_at.is_(None),
+    )
+    .order_by(alarms.c.id)
+    .with_for_update()
+)
+# What an active alarm that meets a value changes without anything to note.
+_MET = (
+    *(f"{which}_{part}" for which in ("latest", "worst") for part in ("value", "time", "batch_id")),
+    "current_severity",
+    "returned_at",
+)
+_MEET = (
+    update(alarms)
+    .where(alarms.c.id == bindparam("of_id"))
+    .values({name: bindparam(name) for name in _MET})
+)
+
 
 def watch(connection: Connection, new: Sequence[Draft]) -> None:
     """Hold the limits against new batches of live and of the runs that ask for it."""
     groups: dict[tuple[str, str], list[Draft]] = {}
     for draft in new:
         spacecraft, run, _ = draft.identity
-        if draft.batch is not None and not _is_ahead(draft):
+        if draft.batch is not None and not draft.is_ahead:
             groups.setdefault((run, spacecraft), []).append(draft)
     watched = _watched(connection, {run for run, _ in groups})
     for run, spacecraft in sorted(groups):
         if run in watched:
             drafts = sorted(groups[run, spacecraft], key=lambda each: each.result["time_ns"])
             _Watch(connection, spacecraft, run, drafts).look()
-
-
-def _is_ahead(draft: Draft) -> bool:
-    """Whether a live batch is dated so far ahead that its time cannot be believed."""
-    assert draft.batch is not None
-    received = parse_utc(draft.batch["received"])
-    return bool(draft.batch["run"] == LIVE and draft.batch["time_ns"] > received.tai_ns + AHEAD_NS)
 
 
 def _watched(connection: Connection, names: set[str]) -> set[str]:
@@ -100,13 +123,9 @@ class _Watch:
                 latest |= _latest_of(draft.batch)
             latest["received"] = max(latest["received"], draft.batch["received"])
         kept = {name: window.to_json() for name, window in self._windows.items()}
-        values = {name: latest[name] for name in ("time", "time_ns", "batch_id", "received")}
-        values["state"] = msgspec.json.encode(kept).decode()
-        self._connection.execute(
-            update(watches)
-            .where(watches.c.spacecraft == latest["spacecraft"], watches.c.run == self._run)
-            .values(values)
-        )
+        latest["state"] = msgspec.json.encode(kept).decode()
+        place = {"of_spacecraft": latest["spacecraft"], "of_run": self._run}
+        self._connection.execute(_KEEP, place | {name: latest[name] for name in _KEPT})
         self._board.save()
 
     def _mind_the_gap(self, latest: Row, batch: Row) -> None:
@@ -154,17 +173,8 @@ class Board:
     def __init__(self, connection: Connection, spacecraft: str, run: str) -> None:
         self._connection = connection
         self._place = {"spacecraft": spacecraft, "run": run}
-        query = (
-            select(alarms)
-            .where(
-                alarms.c.run == run,
-                alarms.c.spacecraft == spacecraft,
-                alarms.c.cleared_at.is_(None),
-            )
-            .order_by(alarms.c.id)
-            .with_for_update()
-        )
-        rows = [dict(row) for row in connection.execute(query).mappings()]
+        place = {"of_spacecraft": spacecraft, "of_run": run}
+        rows = [dict(row) for row in connection.execute(_ACTIVE, place).mappings()]
         self._alarms: dict[str, Row] = {row["quantity"]: row for row in rows}
         self._latest: dict[str, Row] = {}
 
@@ -204,10 +214,13 @@ class Board:
 
     def save(self) -> None:
         """Write the latest values of the alarms that did not change otherwise."""
-        for quantity, changes in self._latest.items():
-            id = self._alarms[quantity]["id"]
-            self._connection.execute(update(alarms).where(alarms.c.id == id).values(changes))
-        self._latest.clear()
+        if self._latest:
+            found = [self._alarms[quantity] for quantity in self._latest]
+            rows = [
+                {name: alarm[name] for name in _MET} | {"of_id": alarm["id"]} for alarm in found
+            ]
+            self._connection.execute(_MEET, rows)
+            self._latest.clear()
 
 
 def silence(
@@ -297,8 +310,8 @@ def _sample(name: QuantityName, parts: Row, time_ns: int) -> Sample | None:
 
 
 def _locked(connection: Connection, spacecraft: str, run: str) -> Row | None:
-    query = select(watches).where(watches.c.spacecraft == spacecraft, watches.c.run == run)
-    row = connection.execute(query.with_for_update()).mappings().first()
+    place = {"of_spacecraft": spacecraft, "of_run": run}
+    row = connection.execute(_LOCKED, place).mappings().first()
     return None if row is None else dict(row)
 
 

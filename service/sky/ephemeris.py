@@ -5,6 +5,7 @@ velocities of the spacecraft are geocentric; every axis is ICRS, with which
 EME2000 is taken as one.
 """
 
+import math
 from functools import lru_cache
 
 import erfa
@@ -13,7 +14,7 @@ import numpy.typing as npt
 from erfa import ufunc
 
 from service.times import Utc
-from service.vectors import Vector, unit
+from service.vectors import Vector, read_only, unit
 
 KM_PER_AU = erfa.DAU / 1000.0
 LIGHT_AU_PER_DAY = erfa.DAYSEC / erfa.AULT
@@ -21,11 +22,14 @@ LIGHT_KM_PER_S = erfa.CMPS / 1000.0
 
 
 @lru_cache(maxsize=64)
-def _earth(time: Utc) -> tuple[npt.NDArray[np.void], npt.NDArray[np.void]]:
+def _earth(time: Utc) -> tuple[Vector, float, Vector]:
+    """Earth from the Sun (3,) in au, its distance, and its barycentric velocity (3,) in c."""
     # epv00 asks for TDB, which differs from TT by under 2 ms.  Its status only
     # tells that the date lies outside 1900 to 2100.
     heliocentric, barycentric, _ = ufunc.epv00(*time.tt)
-    return heliocentric, barycentric
+    place = np.array(heliocentric["p"])
+    velocity = np.array(barycentric["v"]) / LIGHT_AU_PER_DAY
+    return read_only(place), math.hypot(*place.tolist()), read_only(velocity)
 
 
 def observer_velocity(time: Utc, velocity_km_per_s: npt.ArrayLike | None) -> Vector:
@@ -34,17 +38,16 @@ def observer_velocity(time: Utc, velocity_km_per_s: npt.ArrayLike | None) -> Vec
     Earth's velocity with the spacecraft's geocentric one added; Earth's alone
     where the latter is None.
     """
-    _, barycentric = _earth(time)
-    velocity = np.asarray(barycentric["v"]) / LIGHT_AU_PER_DAY
-    if velocity_km_per_s is not None:
-        velocity = velocity + np.asarray(velocity_km_per_s) / LIGHT_KM_PER_S
-    return np.asarray(velocity)
+    velocity = _earth(time)[2]
+    if velocity_km_per_s is None:
+        # Of one kind with the sum below: kernels are compiled for either.
+        return velocity.copy()
+    return np.asarray(velocity + np.asarray(velocity_km_per_s) / LIGHT_KM_PER_S)
 
 
 def sun_distance_au(time: Utc) -> float:
     """Distance from Earth to the Sun in astronomical units: near enough for a spacecraft's."""
-    heliocentric, _ = _earth(time)
-    return float(np.linalg.norm(heliocentric["p"]))
+    return _earth(time)[1]
 
 
 def apparent(directions: npt.ArrayLike, velocity_c: Vector, time: Utc) -> Vector:
@@ -55,8 +58,7 @@ def apparent(directions: npt.ArrayLike, velocity_c: Vector, time: Utc) -> Vector
 
 def sun_direction(time: Utc, position_km: npt.ArrayLike | None) -> Vector:
     """Unit vector (3,) from the spacecraft to the Sun, from Earth where no position is given."""
-    heliocentric, _ = _earth(time)
-    sun_km = -np.asarray(heliocentric["p"]) * KM_PER_AU
+    sun_km = -_earth(time)[0] * KM_PER_AU
     return unit(sun_km if position_km is None else sun_km - np.asarray(position_km))
 
 

@@ -17,6 +17,9 @@ from service.vectors import Vector, read_only
 Indices = npt.NDArray[np.int32]
 
 PAIRS_PER_BIN = 4
+MAX_IN_BIN = 64
+MAX_CUBES = 64
+"""Along an edge of the cube about the sphere."""
 MAX_PAIRS = 5_000_000
 """In one index, 80 MB: more than those of the whole sky to V 8 within 8 degrees."""
 
@@ -55,35 +58,33 @@ def build_pairs(direction: Vector, separation_max_deg: float) -> PairIndex:
     Raises `BadInput` where there would be too many to keep.
     """
     limit = math.radians(separation_max_deg)
-    # A sweep along the axis with the widest spread looks at few pairs beyond the limit.
-    axis = int(np.argmax(np.ptp(direction, axis=0))) if len(direction) else 0
-    sweep = np.argsort(direction[:, axis], kind="stable").astype(np.int32)
-    ordered = np.ascontiguousarray(direction[sweep])
-    count = _count_pairs(ordered, axis, limit)
+    n = len(direction)
+    # A guess from how many there would be were the stars spread evenly over a tenth of the sky.
+    share = min(1.0, 10.0 * math.sin(0.5 * min(limit, math.pi)) ** 2)
+    room = min(MAX_PAIRS, int(0.5 * n * n * share) + 1024)
+    found = (np.empty(room), np.empty(room, np.int32), np.empty(room, np.int32))
+    count = _find_pairs(direction, limit, *found)
     if count > MAX_PAIRS:
         raise BadInput(
             Fault(
                 "options.tolerances.pair_separation_max_deg",
-                f"makes {count:,} pairs of {len(direction):,} stars; "
-                f"at most {MAX_PAIRS:,} are kept",
+                f"makes {count:,} pairs of {n:,} stars; at most {MAX_PAIRS:,} are kept",
                 str(separation_max_deg),
             )
         )
-    separation = np.empty(count)
-    brighter, dimmer = np.empty(count, np.int32), np.empty(count, np.int32)
-    _fill_pairs(ordered, sweep, axis, limit, separation, brighter, dimmer)
-    # Equal separations keep a fixed order whatever the sweep was.
-    order = np.lexsort((dimmer, brighter, separation)) if count else np.empty(0, np.int64)
-    separation = separation[order]
+    if count > room:
+        found = (np.empty(count), np.empty(count, np.int32), np.empty(count, np.int32))
+        _find_pairs(direction, limit, *found)
     bins = max(1, count // PAIRS_PER_BIN)
     bins_per_rad = bins / limit
-    edges = np.arange(bins + 1) / bins_per_rad
-    bin_start = np.searchsorted(separation, edges).astype(np.int32)
-    bin_start[-1] = count
+    separation = np.empty(count)
+    brighter, dimmer = np.empty(count, np.int32), np.empty(count, np.int32)
+    bin_start = np.zeros(bins + 1, np.int32)
+    _sort_pairs(*found, bins_per_rad, separation, brighter, dimmer, bin_start)
     return PairIndex(
         read_only(separation),
-        read_only(brighter[order]),
-        read_only(dimmer[order]),
+        read_only(brighter),
+        read_only(dimmer),
         read_only(bin_start),
         bins_per_rad,
     )
@@ -101,29 +102,131 @@ def separation_rad(a, b):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _count_pairs(direction, axis, limit):  # type: ignore[no-untyped-def]
+def _find_pairs(direction, limit, separation, brighter, dimmer):  # type: ignore[no-untyped-def]
+    """The number of pairs up to a separation, of which as many as there is room for are written.
+
+    Stars are put into cubes as wide as the longest chord, so that partners are
+    in the same cube or in one that touches it.
+    """
+    n, room = len(direction), len(separation)
     chord = 2.0 * math.sin(0.5 * min(limit, math.pi))
+    side = max(1, min(MAX_CUBES, int(2.0 / chord))) if chord > 0.0 else MAX_CUBES
+    scale = 0.5 * side
+    cube = np.empty(n, np.int32)
+    start = np.zeros(side * side * side + 1, np.int32)
+    for row in range(n):
+        x = min(side - 1, max(0, int((direction[row, 0] + 1.0) * scale)))
+        y = min(side - 1, max(0, int((direction[row, 1] + 1.0) * scale)))
+        z = min(side - 1, max(0, int((direction[row, 2] + 1.0) * scale)))
+        cube[row] = (x * side + y) * side + z
+        start[cube[row] + 1] += 1
+    for k in range(len(start) - 1):
+        start[k + 1] += start[k]
+    place = start[:-1].copy()
+    rows = np.empty(n, np.int32)
+    ordered = np.empty((n, 3))
+    for row in range(n):
+        at = place[cube[row]]
+        rows[at] = row
+        ordered[at] = direction[row]
+        place[cube[row]] += 1
+    # A little more than the chord: the separation decides.
+    most = chord * chord * (1.0 + 1e-12)
     count = 0
-    for i in range(len(direction)):
-        for j in range(i + 1, len(direction)):
-            if direction[j, axis] - direction[i, axis] > chord:
-                break
-            if separation_rad(direction[i], direction[j]) <= limit:
+    for at in range(n):
+        own = cube[rows[at]]
+        x, y, z = own // (side * side), own // side % side, own % side
+        a0, a1, a2 = ordered[at, 0], ordered[at, 1], ordered[at, 2]
+        low, high = max(z - 1, 0), min(z + 1, side - 1)
+        # Cubes along z lie one after another; each pair of touching cubes is met once.
+        for part in range(5):
+            if part == 0:
+                first, last = at + 1, start[own - z + high + 1]
+            else:
+                u = x if part == 1 else x + 1
+                v = y + 1 if part == 1 else y + part - 3
+                if u >= side or v < 0 or v >= side:
+                    continue
+                base = (u * side + v) * side
+                first, last = start[base + low], start[base + high + 1]
+            for other in range(first, last):
+                d0, d1, d2 = a0 - ordered[other, 0], a1 - ordered[other, 1], a2 - ordered[other, 2]
+                square = d0 * d0 + d1 * d1 + d2 * d2
+                if square > most:
+                    continue
+                angle = (
+                    separation_of(square)
+                    if square < 1.96
+                    else separation_rad(ordered[at], ordered[other])
+                )
+                if angle > limit:
+                    continue
+                if count < room:
+                    separation[count] = angle
+                    brighter[count] = min(rows[at], rows[other])
+                    dimmer[count] = max(rows[at], rows[other])
                 count += 1
     return count
 
 
 @njit(cache=True, nogil=True)
-def _fill_pairs(direction, sweep, axis, limit, separation, brighter, dimmer):  # type: ignore[no-untyped-def]
-    chord = 2.0 * math.sin(0.5 * min(limit, math.pi))
-    count = 0
-    for i in range(len(direction)):
-        for j in range(i + 1, len(direction)):
-            if direction[j, axis] - direction[i, axis] > chord:
-                break
-            angle = separation_rad(direction[i], direction[j])
-            if angle <= limit:
-                separation[count] = angle
-                brighter[count] = min(sweep[i], sweep[j])
-                dimmer[count] = max(sweep[i], sweep[j])
-                count += 1
+def separation_of(square):  # type: ignore[no-untyped-def]
+    """The angle in radians of a squared chord; short ones by a series as exact as the arc sine."""
+    quarter = 0.25 * square
+    half = math.sqrt(quarter)
+    if quarter < 0.0064:
+        series = 1.0 / 6.0 + quarter * (
+            3.0 / 40.0
+            + quarter
+            * (
+                15.0 / 336.0
+                + quarter * (105.0 / 3456.0 + quarter * (945.0 / 42240.0 + quarter * 0.01735276))
+            )
+        )
+        return 2.0 * (half + half * quarter * series)
+    return 2.0 * math.asin(min(1.0, half))
+
+
+@njit(cache=True, nogil=True)
+def _sort_pairs(found, one, other, bins_per_rad, separation, brighter, dimmer, bin_start):  # type: ignore[no-untyped-def]
+    """Put pairs in order of separation, then of their stars; `bin_start` is zero at first."""
+    count, bins = len(separation), len(bin_start) - 1
+    for k in range(count):
+        bin_start[min(bins - 1, int(found[k] * bins_per_rad)) + 1] += 1
+    for k in range(bins):
+        bin_start[k + 1] += bin_start[k]
+    place = bin_start[:-1].copy()
+    for k in range(count):
+        own = min(bins - 1, int(found[k] * bins_per_rad))
+        at = place[own]
+        separation[at], brighter[at], dimmer[at] = found[k], one[k], other[k]
+        place[own] = at + 1
+    for k in range(bins):
+        first, last = bin_start[k], bin_start[k + 1]
+        if last - first > MAX_IN_BIN:
+            # Stars as evenly spaced as no sky has them.
+            for at in range(1, 4):
+                if at == 1:
+                    order = np.argsort(dimmer[first:last], kind="mergesort")
+                elif at == 2:
+                    order = np.argsort(brighter[first:last], kind="mergesort")
+                else:
+                    order = np.argsort(separation[first:last], kind="mergesort")
+                separation[first:last] = separation[first:last][order]
+                brighter[first:last] = brighter[first:last][order]
+                dimmer[first:last] = dimmer[first:last][order]
+            continue
+        for at in range(first + 1, last):
+            angle, a, b = separation[at], brighter[at], dimmer[at]
+            to = at
+            while to > first and (
+                separation[to - 1] > angle
+                or (
+                    separation[to - 1] == angle
+                    and (brighter[to - 1] > a or (brighter[to - 1] == a and dimmer[to - 1] > b))
+                )
+            ):
+                separation[to] = separation[to - 1]
+                brighter[to], dimmer[to] = brighter[to - 1], dimmer[to - 1]
+                to -= 1
+            separation[to], brighter[to], dimmer[to] = angle, a, b

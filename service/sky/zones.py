@@ -25,7 +25,7 @@ from service.sky.star_buckets import StarBuckets, build_star_buckets
 from service.vectors import (
     Vector,
     angle_between_deg,
-    from_ra_dec,
+    direction_of,
     read_only,
     separation_deg,
     to_ra_dec,
@@ -66,7 +66,9 @@ class Zone:
     """The stars of a zone, brightest first, and their pairs.
 
     `star` holds the rows in the run catalog, ascending; `direction` (n, 3) and
-    `magnitude_mag` belong to them.
+    `magnitude_mag` belong to them.  In a band `polar_rad` (n,) are the stars'
+    angles to the axis, and `polar_difference_rad` (NTOT,) how far those of a pair
+    lie apart, to a few digits; in a cap there are none.
     """
 
     mission: str
@@ -78,12 +80,25 @@ class Zone:
     magnitude_mag: Vector
     pairs: PairIndex
     grid: StarBuckets
+    polar_rad: Vector
+    polar_difference_rad: npt.NDArray[np.float32]
 
     @property
     def nbytes(self) -> int:
         """Bytes held."""
-        parts = (self.star, self.direction, self.magnitude_mag, self.pairs, self.grid)
+        parts = (
+            *(self.star, self.direction, self.magnitude_mag, self.pairs, self.grid),
+            *(self.polar_rad, self.polar_difference_rad),
+        )
         return sum(part.nbytes for part in parts)
+
+    def serves_exactly(self, aim: Aim) -> bool:
+        """Whether the zone's stars are just those within an aim."""
+        own = self.aim
+        return own is aim or (
+            (own.least_deg, own.most_deg) == (aim.least_deg, aim.most_deg)
+            and own.axis.tolist() == aim.axis.tolist()
+        )
 
     def summary(self) -> dict[str, Any]:
         """What the zone is, as the interface shows it."""
@@ -130,6 +145,11 @@ def build_zone(
     angle = angle_between_deg(run_catalog.direction[near], aim.axis)
     star = near[(angle >= aim.least_deg) & (angle <= aim.most_deg)].astype(np.int32)
     direction = np.ascontiguousarray(run_catalog.direction[star])
+    pairs = build_pairs(direction, separation_max_deg)
+    polar, difference = np.empty(0), np.empty(0, np.float32)
+    if aim.kind == "band":
+        polar, difference = np.empty(len(star)), np.empty(pairs.count, np.float32)
+        _polar_angles(direction, aim.axis, pairs.brighter, pairs.dimmer, polar, difference)
     return Zone(
         mission=mission,
         run_catalog=run_catalog.digest,
@@ -138,9 +158,19 @@ def build_zone(
         star=read_only(star),
         direction=read_only(direction),
         magnitude_mag=read_only(run_catalog.magnitude_mag[star]),
-        pairs=build_pairs(direction, separation_max_deg),
+        pairs=pairs,
         grid=build_star_buckets(direction),
+        polar_rad=read_only(polar),
+        polar_difference_rad=read_only(difference),
     )
+
+
+@njit(cache=True, nogil=True)
+def _polar_angles(direction, axis, brighter, dimmer, polar, difference):  # type: ignore[no-untyped-def]
+    for row in range(len(direction)):
+        polar[row] = separation_rad(direction[row], axis)
+    for k in range(len(brighter)):
+        difference[k] = abs(polar[brighter[k]] - polar[dimmer[k]])
 
 
 def counts_within(zone: Zone, aim: Aim) -> tuple[int, int]:
@@ -216,5 +246,5 @@ def snapped(axis: Vector, grid_deg: float) -> Vector:
     widest = max(0.0, abs(row_deg) - grid_deg / 2.0)
     steps = max(1, math.ceil(360.0 * math.cos(math.radians(widest)) / grid_deg))
     if abs(row_deg) >= 90.0:
-        return from_ra_dec(0.0, math.copysign(90.0, row_deg))
-    return from_ra_dec(round(ra_deg * steps / 360.0) % steps * 360.0 / steps, row_deg)
+        return direction_of(0.0, math.copysign(90.0, row_deg))
+    return direction_of(round(ra_deg * steps / 360.0) % steps * 360.0 / steps, row_deg)

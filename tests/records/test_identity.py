@@ -9,7 +9,9 @@ from sqlalchemy import func, select
 
 from service.errors import BadBatch, BadInput, Conflict, KeyReused
 from service.observe.wire import OptionsIn, submission_from_json
+from service.records.statements import COPIED_FROM
 from service.records.tables import batches, idempotency_keys, metadata, results, star_results
+from tests.records.recount import assert_equal_to_a_recount
 
 REPEATS = 50
 
@@ -180,3 +182,26 @@ def test_two_services_on_one_database_record_a_batch_once(opened, make):
         bodies = list(threads.map(lambda each: each[0](services[each[1]]), work))
     assert bodies[0] == bodies[1] == bodies[2] == bodies[3]
     assert count(services[0], results) == len(sent)
+
+
+def test_two_services_that_write_the_same_file_at_once_record_each_batch_once(opened, make):
+    """Chunks large enough for COPY on PostgreSQL: the conflict rules are those of inserts."""
+    services = [opened(), opened()]
+    sent = [make(f"b{i}", after_s=60.0 * i) for i in range(2 * COPIED_FROM)]
+
+    def submit_chunks(operations):
+        return [
+            answer.body
+            for first in range(0, len(sent), COPIED_FROM)
+            for answer in operations.submit_many(sent[first : first + COPIED_FROM])
+        ]
+
+    with ThreadPoolExecutor(2) as threads:
+        bodies = list(threads.map(submit_chunks, services))
+    assert bodies[0] == bodies[1]
+    assert count(services[0], results) == len(sent)
+    assert count(services[0], star_results) == sum(
+        len(each.batch.observations[0].magnitude_mag) for each in sent
+    )
+    with services[0].store.reading() as connection:
+        assert_equal_to_a_recount(connection)

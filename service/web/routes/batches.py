@@ -1,7 +1,9 @@
 """Batches: submit, list, look at one, try it with other options."""
 
+from asyncio import wrap_future
 from typing import Annotated
 
+from anyio.to_thread import run_sync
 from fastapi import APIRouter, Path
 from fastapi import Query as InQuery
 from pydantic import Field, StrictBool
@@ -18,6 +20,9 @@ from service.web.queries import NO_QUERY, BatchQuery
 from service.web.schemas.answers import Answer, BatchPage, Record
 
 router = APIRouter(prefix="/api/v1/batches", tags=["batches"])
+
+READ_AT_ONCE_BYTES = 32_768
+"""A hundred stars; to read more takes a thread, so that others need not wait for it."""
 
 ResultId = Annotated[str, Path(description="The `id` of a recorded result.")]
 
@@ -49,13 +54,16 @@ class WhatIfIn(Wire):
         parameters=(IDEMPOTENCY_KEY,),
     ),
 )
-def submit_batch(
+async def submit_batch(
     body: JsonBody, key: IdempotencyKey, operations: Held, metrics: Counted, caller: Asking
 ) -> Response:
     """Identify the stars of a batch, solve for the attitude, and record both."""
-    submission = read_submission(body)
+    if len(body) > READ_AT_ONCE_BYTES:
+        submission = await run_sync(read_submission, body)
+    else:
+        submission = read_submission(body)
     require_spacecraft(caller, submission.batch.spacecraft)
-    answered = operations.submit(submission, key)
+    answered = await wrap_future(operations.take(submission, key))
     if answered.replayed:
         metrics.count_repeat()
     return answer_response(answered)

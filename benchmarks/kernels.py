@@ -1,0 +1,400 @@
+"""Votes, TRIAD and QUEST beside bare kernels of the same work; pairs of stars beside a k-d tree.
+
+    python -m benchmarks kernels
+
+Each ratio is of the least times of several rounds in which both take turns, so
+that they meet the same machine.  Every star that one names, the other names;
+quaternions agree to a hundredth of an arcsecond.
+"""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+from scipy.spatial import cKDTree
+
+from benchmarks.bare import bare_many, bare_one, room_for
+from benchmarks.report import Report
+from benchmarks.verified_cost import votes_arguments
+from service.attitude.kernels import solve
+from service.attitude.solve import WORST_AXIS_DEG, solve_attitude
+from service.identify.matched import matched_vectors
+from service.identify.pair_tests import cast_votes, count_votes
+from service.identify.starid import Sighting, identify_by_votes
+from service.missions.mission import Band, Mission, load_missions
+from service.sky.catalog import load_embedded
+from service.sky.pairs import build_pairs
+from service.sky.shelf import Shelf
+from service.sky.view import Sky
+from service.sky.zones import Aim, Zone, build_zone
+from service.times import parse_utc
+from service.vectors import ARCSEC_PER_RADIAN, Vector, from_ra_dec, unit
+
+MOMENT = parse_utc("1996-01-10T12:00:00Z")
+STARS = (3, 5, 8, 12)
+VIEWS, QUICK_VIEWS = 300, 40
+ROUNDS = 9
+MOST_MANY, MOST_ONE, MOST_PAIRS = 1.5, 3.0, 1.5
+AGREE_ARCSEC = 0.01
+MEGABYTES_512 = 512 << 20
+TRIED = 1_000
+PAIRED_STARS, PAIRED_DEG = 3_000, 8.0
+
+
+@dataclass(frozen=True)
+class Place:
+    """A kind of zone by its mission and the number of pairs that is looked for."""
+
+    mission: str
+    pairs: int
+
+
+PLACES = {
+    "cap": Place("XTE", 1_000),
+    "band": Place("SOHO", 54_000),
+    "band forest": Place("SOHO", 115_000),
+}
+
+
+@dataclass(frozen=True)
+class Views:
+    """Views of n stars in one zone: what is observed (k, n, 3), and what is true (k, n)."""
+
+    zone: Zone
+    aim: Aim
+    observed: Vector
+    body: Vector
+    magnitude: Vector
+    star: npt.NDArray[np.int64]
+    boresight: Vector
+    attitude: Vector
+
+
+def zone_near(place: Place, sky: Sky, rng: np.random.Generator) -> tuple[Mission, Zone, Aim]:
+    """Of many zones one whose number of pairs is about that which is asked for, or the fullest."""
+    mission = load_missions()[place.mission]
+    catalog = sky.run_catalog(mission, MOMENT)
+    zone_of = mission.zone
+    axes = unit(rng.normal(size=(TRIED, 3)))
+    if isinstance(zone_of, Band):
+        kind, middle, half = "band", zone_of.coelevation_deg, zone_of.half_width_deg
+    else:
+        kind, middle, half = "cap", 0.0, zone_of.radius_deg
+    low, high = max(0.0, middle - half), middle + half
+    inner, outer = math.cos(math.radians(low)), math.cos(math.radians(high))
+    stars = [
+        int(((c := catalog.direction @ axis) <= inner).sum() - (c < outer).sum()) for axis in axes
+    ]
+    # More stars, more pairs: halve the ranks until the zone is found.
+    ranks = np.argsort(stars)
+    first, last = 0, TRIED - 1
+    while True:
+        rank = (first + last) // 2
+        aim = Aim(kind, axes[ranks[rank]], low, high)
+        reach = mission.tolerances.pair_separation_max_deg
+        zone = build_zone(mission.name, catalog, aim, reach)
+        if first >= last:
+            return mission, zone, aim
+        if zone.pairs.count < place.pairs:
+            first = rank + 1
+        else:
+            last = rank
+
+
+def draw_views(
+    mission: Mission, zone: Zone, aim: Aim, n: int, count: int, rng: np.random.Generator
+) -> Views:
+    """Views of n stars of a zone within one field of view, with nominal noise."""
+    tracker = mission.trackers[0]
+    radius = tracker.field_of_view_radius_deg
+    sigma = tracker.sigma_arcsec / ARCSEC_PER_RADIAN
+    parts: list[tuple[Vector, ...]] = []
+    middle = 0.5 * (aim.least_deg + aim.most_deg) if aim.kind == "band" else 0.0
+    spread = max(0.0, (aim.most_deg - aim.least_deg) / 2 - radius) if middle else aim.most_deg
+    while len(parts) < count:
+        boresight = _turned_from(aim.axis, middle + rng.uniform(-1, 1) * spread * 0.5, rng)
+        near = np.flatnonzero(zone.direction @ boresight >= math.cos(math.radians(radius)))
+        if len(near) < n:
+            radius *= 1.02  # a thin place: stars a little further out do as well
+            continue
+        star = np.sort(rng.choice(near, n, replace=False))
+        observed = unit(zone.direction[star] + sigma * rng.normal(size=(n, 3)))
+        magnitude = zone.magnitude_mag[star] + tracker_noise(rng, n)
+        parts.append((observed, magnitude, star, boresight))
+    attitude = _any_attitude(rng)
+    observed = np.array([part[0] for part in parts])
+    return Views(
+        zone,
+        aim,
+        observed,
+        np.ascontiguousarray(observed @ attitude.T),
+        np.array([part[1] for part in parts]),
+        np.array([part[2] for part in parts]),
+        np.array([part[3] for part in parts]),
+        attitude,
+    )
+
+
+def tracker_noise(rng: np.random.Generator, n: int) -> Vector:
+    return 0.1 * rng.normal(size=n)
+
+
+def _turned_from(axis: Vector, angle_deg: float, rng: np.random.Generator) -> Vector:
+    side = unit(np.cross(axis, rng.normal(size=3)))
+    angle = math.radians(angle_deg)
+    return np.asarray(math.cos(angle) * axis + math.sin(angle) * side)
+
+
+def _any_attitude(rng: np.random.Generator) -> Vector:
+    rows, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    return np.asarray(rows * np.linalg.det(rows))
+
+
+@njit(nogil=True)
+def service_many(  # type: ignore[no-untyped-def]
+    observed, mag, body, sigma, given, boresights, tests, rows, direction, worst, room, star, q
+):
+    """The service's kernels over many batches, as `identify_by_votes` and `solve_attitude` do."""
+    votes, voted, counts, edges, outcome, highest, second = room[:7]
+    quaternions, covariance, squares, sums = room[7:]
+    still = np.zeros(3)
+    for k in range(len(observed)):
+        votes[:] = 0
+        counts[:] = 0
+        cast_votes(observed[k], mag[k], *given, boresights[k], *tests, votes, voted, counts, edges)  # type: ignore[call-arg]
+        count_votes(votes, voted, counts, rows, outcome, star[k], highest, second)
+        b, r, s = matched_vectors(body[k], sigma, star[k], direction, still, 1.0)
+        if len(b) >= 2:
+            n = len(b)
+            part = squares if n == squares.shape[1] else squares[:, :n].copy()
+            if solve(b, r, s, worst, quaternions, covariance, part, sums):
+                q[k] = quaternions[1]
+
+
+def _sighting(views: Views, mission: Mission, k: int) -> Sighting:
+    n = views.observed.shape[1]
+    sigma = np.full(n, mission.trackers[0].sigma_arcsec / ARCSEC_PER_RADIAN)
+    return Sighting(
+        views.observed[k],
+        views.magnitude[k],
+        sigma,
+        None,
+        np.zeros(3),
+        views.boresight[k],
+        views.aim,
+        views.zone,
+        mission.tolerances,
+        mission.tests,
+    )
+
+
+def least_us(calls: Sequence[Callable[[], object]], each: int) -> list[float]:
+    """The least microseconds of each call over several rounds, in turn, shared among `each`."""
+    for call in calls:
+        call()
+    least = [math.inf] * len(calls)
+    for _ in range(ROUNDS):
+        for place, call in enumerate(calls):
+            started = time.perf_counter_ns()
+            call()
+            least[place] = min(least[place], (time.perf_counter_ns() - started) / 1000 / each)
+    return least
+
+
+def compare(mission: Mission, views: Views) -> tuple[dict[str, float], list[str]]:
+    """Times and ratios of the service's and the bare kernels on the same views."""
+    count, n = views.magnitude.shape
+    zone, aim, limits = views.zone, views.aim, mission.tolerances
+    sightings = [_sighting(views, mission, k) for k in range(count)]
+    given = votes_arguments(sightings[0])
+    cut = len(given) - 6
+    sigma = sightings[0].sigma_rad
+    star = {name: np.full((count, n), -1) for name in ("service", "bare")}
+    q = {name: np.zeros((count, 4)) for name in star}
+    stars = len(zone.star)
+    room = (
+        np.zeros((n, stars), np.int32),
+        np.empty((n, stars), np.int32),
+        np.zeros(n, np.int32),
+        np.empty((0, 4), np.int32),
+        *(np.empty((3, n), np.int64)),
+        np.empty((2, 4)),
+        np.empty((3, 3)),
+        np.empty((2, n)),
+        np.empty((2, 2)),
+    )
+    worst = math.radians(WORST_AXIS_DEG)
+    rows = np.arange(stars)
+    still = np.zeros(3)
+    tracker_of, names = np.zeros(n, np.int64), (mission.trackers[0].name,)
+
+    def service() -> None:
+        service_many(
+            views.observed,
+            views.magnitude,
+            views.body,
+            sigma,
+            given[:cut],
+            views.boresight,
+            given[cut + 1 :],
+            rows,
+            zone.direction,
+            worst,
+            room,
+            star["service"],
+            q["service"],
+        )
+
+    pairs = zone.pairs
+    arrays = (
+        zone.direction,
+        zone.magnitude_mag,
+        pairs.separation_rad,
+        pairs.brighter,
+        pairs.dimmer,
+        pairs.bin_start,
+        pairs.bins_per_rad,
+    )
+    settings = (
+        math.radians(limits.separation_deg),
+        limits.magnitude_mag,
+        limits.magnitude_order_mag,
+        math.radians(limits.cross_product_deg),
+        math.radians(limits.pole_difference_deg),
+        math.radians(limits.pole_angle_deg),
+    )
+    is_band = aim.kind == "band"
+    polar = np.arccos(np.clip(zone.direction @ aim.axis, -1.0, 1.0))
+    weight = np.broadcast_to(1.0 / sigma**2, (count, n)).copy()
+    bare_room = room_for(n, stars, pairs.count)
+    poles = np.broadcast_to(aim.axis, (count, 3)).copy()
+    about = (is_band, polar, bare_room)
+
+    def bare() -> None:
+        bare_many(
+            views.observed,
+            views.magnitude,
+            views.body,
+            weight,
+            arrays,
+            poles,
+            settings,
+            *about,
+            star["bare"],
+            q["bare"],
+        )
+
+    def service_one_by_one() -> None:
+        for k, sighting in enumerate(sightings):
+            found = identify_by_votes(sighting)
+            b, r, s = matched_vectors(
+                views.body[k], sigma, found.star, catalog_direction, still, 1.0
+            )
+            solve_attitude(b, r, s, tracker_of[: len(s)], names)
+
+    each = [
+        (views.observed[k], views.magnitude[k], views.body[k], weight[k], poles[k])
+        for k in range(count)
+    ]
+    one_star, one_q = np.empty(n, np.int64), np.empty(4)
+
+    def bare_one_by_one() -> None:
+        for observed, magnitude, body, w, pole in each:
+            bare_one(observed, magnitude, body, w, arrays, pole, settings, *about, one_star, one_q)
+
+    catalog_direction = _by_catalog_row(zone)
+    times = least_us([service, bare], count)
+    singles = least_us([service_one_by_one, bare_one_by_one], count)
+    differ = int((star["service"] != star["bare"]).sum())
+    apart = np.linalg.norm(q["service"] - q["bare"], axis=1) * 2.0 * ARCSEC_PER_RADIAN
+    right = float((star["service"] == views.star).mean())
+    figures = {
+        "stars": float(n),
+        "pairs": float(pairs.count),
+        "many, us": times[0],
+        "many, bare us": times[1],
+        "many, ratio": times[0] / times[1],
+        "one, us": singles[0],
+        "one, bare us": singles[1],
+        "one, ratio": singles[0] / singles[1],
+        "named rightly": right,
+    }
+    faults = []
+    if differ:
+        faults.append(f"{differ} of {star['bare'].size} stars are named otherwise by the bare one")
+    if float(apart.max()) > AGREE_ARCSEC:
+        faults.append(f"quaternions differ by up to {apart.max():.3g} arcsec")
+    return figures, faults
+
+
+def _by_catalog_row(zone: Zone) -> Vector:
+    directions = np.zeros((int(zone.star.max()) + 1, 3))
+    directions[zone.star] = zone.direction
+    return directions
+
+
+def pairs_beside_a_tree(rng: np.random.Generator, quick: bool) -> tuple[dict[str, Any], list[str]]:
+    """SIDS of stars drawn evenly over a band like SOHO's, beside a bare k-d tree of them."""
+    figures: dict[str, Any] = {}
+    faults: list[str] = []
+    for name, width_deg in (("whole sky", 90.0), ("band", 6.0)):
+        # A band about the equator of a tilted frame.
+        z = rng.uniform(-1, 1, PAIRED_STARS) * math.sin(math.radians(width_deg))
+        around = rng.uniform(0.0, 360.0, PAIRED_STARS)
+        tilt, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        direction = np.ascontiguousarray(from_ra_dec(around, np.degrees(np.arcsin(z))) @ tilt)
+        chord = 2.0 * math.sin(math.radians(PAIRED_DEG) / 2.0)
+
+        def tree(points: Vector = direction, reach: float = chord) -> Any:
+            return cKDTree(points).query_pairs(reach, output_type="ndarray")
+
+        def sids(points: Vector = direction) -> Any:
+            return build_pairs(points, PAIRED_DEG)
+
+        ours, theirs = least_us([sids, tree], 1)
+        found, expected = sids(), tree()
+        same = {*zip(found.brighter.tolist(), found.dimmer.tolist(), strict=True)} == {
+            (min(i, j), max(i, j)) for i, j in expected.tolist()
+        }
+        if not same:
+            faults.append(f"{name}: the pairs differ from those of the tree")
+        figures[f"SIDS, {name}: pairs"] = found.count
+        figures[f"SIDS, {name}: ms"] = ours / 1000
+        figures[f"SIDS, {name}: bare k-d tree, ms"] = theirs / 1000
+        figures[f"SIDS, {name}: ratio"] = ours / theirs
+        if ours > MOST_PAIRS * theirs:
+            faults.append(f"SIDS, {name}: {ours / theirs:.2f} times a bare k-d tree")
+    return figures, faults
+
+
+def run(quick: bool, seed: int) -> Report:
+    """The benchmark: every place, each number of stars."""
+    sky = Sky(load_embedded(), Shelf(MEGABYTES_512))
+    figures: dict[str, Any] = {}
+    faults: list[str] = []
+    for name, place in PLACES.items():
+        rng = np.random.default_rng(seed)
+        mission, zone, aim = zone_near(place, sky, rng)
+        for n in STARS:
+            if quick and n not in (5,):
+                continue
+            views = draw_views(mission, zone, aim, n, QUICK_VIEWS if quick else VIEWS, rng)
+            found, wrong = compare(mission, views)
+            figures |= {f"{name}, {n} stars: {key}": value for key, value in found.items()}
+            faults += [f"{name}, {n} stars: {each}" for each in wrong]
+            if n == 5 and found["many, ratio"] > MOST_MANY:
+                faults.append(f"{name}: {found['many, ratio']:.2f} times the bare kernel")
+            if n == 5 and name == "cap" and found["one, ratio"] > MOST_ONE:
+                faults.append(f"{name}: a single call is {found['one, ratio']:.2f} bare ones")
+    more, wrong = pairs_beside_a_tree(np.random.default_rng(seed), quick)
+    figures |= more
+    return Report("kernels", figures, not (faults + wrong), faults + wrong)
+
+
+if __name__ == "__main__":
+    print(run(True, 1).text())

@@ -1,0 +1,265 @@
+"""Posts: one by one beside a no-op, in bulk beside parsing and inserting alone, both at once.
+
+    python -m benchmarks posts
+
+The service runs as it is served, a process of its own over a SQLite file with
+synchronous=FULL; batches are live ones of a nominal pass, five stars, by votes.
+The no-op is the same framework and server, and the same body: its route parses
+the JSON and answers a small JSON (`benchmarks.no_op`).  Every answer is looked
+at: each post is recorded, new, and its stars are named as the pass drew them.
+"""
+
+import json
+import tempfile
+import threading
+import time
+import urllib.request
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from benchmarks.load import Driven, drive, request
+from benchmarks.report import Report
+from benchmarks.serving import Served, no_op, service
+from service.missions.mission import load_missions
+from service.observe.wire import submission_from_json
+from service.operations import Operations
+from service.settings import Settings
+from service.simulate.stretches import NO_TROUBLES, Pass
+from service.simulate.telemetry import Drawn, draw_pass
+from service.sky.catalog import load_embedded
+from service.sky.shelf import Shelf
+from service.sky.view import Sky
+
+API = "/api/v1"
+CONNECTIONS = 16
+POSTS, QUICK_POSTS = 6_000, 800
+BULK, QUICK_BULK = 30_000, 3_000
+ROUNDS = 3
+GAP_S = 0.02
+"""Between the posts of a connection, where waits and not rates are measured."""
+CHUNK = 250
+LEAST_OF_NO_OP, LEAST_OF_CEILING, MOST_WAIT, MOST_READY_S = 0.35, 0.5, 3.0, 3.0
+MOST_FIRST = 2.0
+RIGHT = 0.98
+
+
+@dataclass(frozen=True)
+class Telemetry:
+    """Batches of a pass, and the star ids that are true of each."""
+
+    drawn: Sequence[Drawn]
+
+    def bodies(self, count: int, tag: str) -> list[bytes]:
+        """So many bodies, each under a name of its own."""
+        own = {"options": {"identifier": "starid"}}
+        return [
+            json.dumps(self._of(k).batch | own | {"batch": f"{tag}-{k}"}).encode()
+            for k in range(count)
+        ]
+
+    def _of(self, k: int) -> Drawn:
+        return self.drawn[k % len(self.drawn)]
+
+    def right(self, k: int, answer: dict[str, Any]) -> tuple[int, int]:
+        """Of an answer's stars how many are named as they were drawn, and all."""
+        named = [star["star"] and star["star"]["id"] for star in answer["observations"][0]["stars"]]
+        true = self._of(k).truth["observations"][0]["stars"]
+        return sum(one == other for one, other in zip(named, true, strict=True)), len(named)
+
+
+def telemetry(seed: int) -> Telemetry:
+    """A nominal pass of XTE, long enough that its batches do not look alike."""
+    sky = Sky(load_embedded(), Shelf(64 << 20))
+    wanted = Pass(batches=400, seed=seed, troubles=NO_TROUBLES, angles_share=0.0)
+    return Telemetry(list(draw_pass(load_missions()["XTE"], sky, wanted)))
+
+
+def _posted(served: Served, path: str, bodies: Sequence[bytes], gap_s: float = 0.0) -> Driven:
+    connections = CONNECTIONS if gap_s == 0.0 else 4
+    driven = drive(served.port, [request(path, each) for each in bodies], connections, gap_s)
+    if set(driven.statuses) != {201}:
+        raise RuntimeError(f"{path}: {driven.statuses}")
+    return driven
+
+
+def _read(served: Served, path: str) -> Any:
+    with urllib.request.urlopen(served.address(path), timeout=60) as answer:
+        return json.load(answer)
+
+
+def _start_replay(served: Served, lines: Sequence[bytes], run: str) -> str:
+    head = {"Content-Type": "application/x-ndjson"}
+    asked = urllib.request.Request(
+        served.address(f"{API}/replays?run={run}"), b"\n".join(lines), head
+    )
+    with urllib.request.urlopen(asked, timeout=600) as answer:
+        return str(answer.headers["Location"])
+
+
+def _finished(served: Served, place: str) -> dict[str, Any]:
+    while (state := _read(served, place))["state"] == "running":
+        time.sleep(0.05)
+    return dict(state)
+
+
+def singles(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any], list[str]]:
+    """Single posts beside the no-op, and the start of the service."""
+    count = QUICK_POSTS if quick else POSTS
+    faults: list[str] = []
+    with service(folder / "start.db") as served:
+        _posted(served, f"{API}/batches", pass_.bodies(40, "before"))
+    with service(folder / "start.db") as served:
+        ready_s = served.ready_s
+        following = pass_.bodies(140, "start")[40:]
+        alone = drive(served.port, [request(f"{API}/batches", each) for each in following], 1)
+        first, hundredth = alone.waits_ms[0], median(alone.waits_ms[-20:])
+    rates: dict[str, list[float]] = {"no-op": [], "checked": [], "service": []}
+    cpu_us: dict[str, list[float]] = {name: [] for name in rates}
+    right = seen = 0
+    with no_op() as bare, service(folder / "single.db") as served:
+        at_ready_mb = served.resident_mb()
+        routes = {
+            "no-op": (bare, "/no-op"),
+            "checked": (bare, "/checked"),
+            "service": (served, f"{API}/batches"),
+        }
+        for name, (server, path) in routes.items():
+            _posted(server, path, pass_.bodies(400, f"warm-{name}"))
+        for round_ in range(ROUNDS):
+            bodies = pass_.bodies(count, f"round-{round_}")
+            for name, (server, path) in routes.items():
+                cpu = server.cpu_s()
+                driven = _posted(server, path, bodies)
+                rates[name].append(driven.per_second)
+                cpu_us[name].append((server.cpu_s() - cpu) / count * 1e6)
+                if name == "service":
+                    answer = json.loads(driven.last)
+                    got, of = pass_.right(int(answer["batch"].rpartition("-")[2]), answer)
+                    right, seen = right + got, seen + of
+        page = _read(served, f"{API}/batches?limit=500")["items"]
+        for item in page[:100]:
+            answer = _read(served, f"{API}/batches/{item['id']}")["answer"]
+            got, of = pass_.right(int(answer["batch"].rpartition("-")[2]), answer)
+            right, seen = right + got, seen + of
+        after_mb = served.resident_mb()
+    middle = {name: median(each) for name, each in rates.items()}
+    ratio = middle["service"] / middle["no-op"]
+    figures = {
+        "start: seconds until ready": ready_s,
+        "start: first request, ms": first,
+        "start: after a hundred, ms": hundredth,
+        "start: first over hundredth": first / hundredth,
+        "single: no-op posts a second": middle["no-op"],
+        "single: service posts a second": middle["service"],
+        "single: service over no-op": ratio,
+        "single: service over no-op that checks the body": middle["service"] / middle["checked"],
+        "single: cpu of no-op over service": median(cpu_us["no-op"]) / median(cpu_us["service"]),
+        "single: cpu of the service, us a post": median(cpu_us["service"]),
+        "single: stars named rightly": right / seen,
+        "memory: at ready, MB": at_ready_mb,
+        f"memory: after {3 * count + 400:,} posts, MB": after_mb,
+    }
+    if ratio < LEAST_OF_NO_OP:
+        faults.append(f"single posts reach {ratio:.3f} of the no-op's rate")
+    if ready_s > MOST_READY_S:
+        faults.append(f"ready after {ready_s:.1f} s")
+    if first > MOST_FIRST * hundredth:
+        faults.append(f"the first request took {first:.1f} ms, the hundredth {hundredth:.1f} ms")
+    if right < RIGHT * seen:
+        faults.append(f"{right} of {seen} stars were named as they were drawn")
+    return figures, faults
+
+
+def bulk(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any], list[str]]:
+    """Bulk beside its ceiling, and the waits of single posts while it runs."""
+    count = QUICK_BULK if quick else BULK
+    faults: list[str] = []
+    lines = pass_.bodies(count, "bulk")
+    ceiling = _parse_and_insert(pass_.bodies(min(count, 4_000), "ceiling"), folder)
+    with service(folder / "bulk.db") as served:
+        _posted(served, f"{API}/batches", pass_.bodies(400, "warm"))
+        started = time.perf_counter()
+        state = _finished(served, _start_replay(served, lines, "bulk"))
+        rate = count / (time.perf_counter() - started)
+        if (state["state"], state["counts"]["new"]) != ("done", count):
+            faults.append(f"the replay says {state}")
+        paced = 200 if quick else 1_000
+        idle = _posted(served, f"{API}/batches", pass_.bodies(paced, "idle"), GAP_S)
+        place = _start_replay(served, lines, "beside")
+        beside = Driven()
+        over = threading.Event()
+
+        def post_beside() -> None:
+            # Only what was posted while the replay ran counts.
+            part = 0
+            while not over.is_set():
+                part += 1
+                driven = _posted(served, f"{API}/batches", pass_.bodies(100, f"b{part}"), GAP_S)
+                if not over.is_set():
+                    beside.waits_ms += driven.waits_ms
+
+        posting = threading.Thread(target=post_beside)
+        posting.start()
+        try:
+            _finished(served, place)
+        finally:
+            over.set()
+            posting.join()
+        memory_mb = served.resident_mb()
+    figures = {
+        "bulk: batches a second": rate,
+        "bulk: parsing and inserting alone, batches a second": ceiling,
+        "bulk: bulk over parsing and inserting alone": rate / ceiling,
+        "beside bulk: p50 of single posts idle, ms": idle.percentile_ms(50),
+        "beside bulk: p99 of single posts idle, ms": idle.percentile_ms(99),
+        "beside bulk: posts while bulk ran": len(beside.waits_ms),
+        f"memory: after {2 * count:,} batches in bulk, MB": memory_mb,
+    }
+    if rate < LEAST_OF_CEILING * ceiling:
+        faults.append(f"bulk reaches {rate / ceiling:.3f} of its ceiling")
+    if beside.waits_ms:
+        wait = beside.percentile_ms(99) / idle.percentile_ms(99)
+        figures["beside bulk: p50 of single posts, ms"] = beside.percentile_ms(50)
+        figures["beside bulk: p99 of single posts, ms"] = beside.percentile_ms(99)
+        figures["beside bulk: p99 over idle"] = wait
+        if wait > MOST_WAIT:
+            faults.append(f"p99 of single posts is {wait:.1f} times its idle value beside bulk")
+    else:
+        faults.append("the replay was over before a hundred posts were: there is no p99")
+    return figures, faults
+
+
+def _parse_and_insert(lines: Sequence[bytes], folder: Path) -> float:
+    """Batches a second of the service's own parser and rows, nothing worked out between."""
+    operations = Operations.open(Settings(database=f"sqlite:///{folder / 'ceiling.db'}"))
+    try:
+        made = [submission_from_json(line, run="bulk") for line in lines]
+        drafts = [operations._intake._draft(each) for each in made]
+        operations.store.writer.change(lambda connection: None).result()
+        spent = 0.0
+        for first in range(0, len(lines), CHUNK):
+            started = time.perf_counter()
+            for line in lines[first : first + CHUNK]:
+                submission_from_json(line, run="bulk")
+            part = drafts[first : first + CHUNK]
+            operations.store.writer.record(part).result()
+            spent += time.perf_counter() - started
+    finally:
+        operations.close()
+    return len(lines) / spent
+
+
+def run(quick: bool, seed: int) -> Report:
+    """The benchmark."""
+    pass_ = telemetry(seed)
+    with tempfile.TemporaryDirectory() as folder:
+        figures, faults = singles(quick, pass_, Path(folder))
+        more, wrong = bulk(quick, pass_, Path(folder))
+    return Report("posts", figures | more, not (faults + wrong), faults + wrong)
+
+
+if __name__ == "__main__":
+    print(run(True, 1).text())

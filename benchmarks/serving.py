@@ -1,0 +1,89 @@
+"""Servers to measure: the service itself, and the no-op, each a process of its own."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+START_S = 120.0
+_TICKS = os.sysconf("SC_CLK_TCK")
+
+
+@dataclass(frozen=True)
+class Served:
+    """A server that answers: its port and process, and the seconds until it said it was ready."""
+
+    port: int
+    pid: int
+    ready_s: float
+
+    def cpu_s(self) -> float:
+        """Processor time so far."""
+        fields = _stat(self.pid)
+        return (int(fields[11]) + int(fields[12])) / _TICKS
+
+    def resident_mb(self) -> float:
+        """Memory that is held."""
+        pages = int(Path(f"/proc/{self.pid}/statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+    def address(self, path: str) -> str:
+        return f"http://127.0.0.1:{self.port}{path}"
+
+
+def _stat(pid: int) -> list[str]:
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+
+
+@contextmanager
+def service(database: Path) -> Iterator[Served]:
+    """`acquire serve` over a database file; it is told to stop at the end."""
+    arguments = ["-m", "service.cli", "serve", "--database", f"sqlite:///{database}"]
+    with _served(arguments, "/readyz") as served:
+        yield served
+
+
+@contextmanager
+def no_op() -> Iterator[Served]:
+    """The no-op (`benchmarks.no_op`) under the same server."""
+    arguments = ["-m", "uvicorn", "benchmarks.no_op:app", "--http", "httptools"]
+    arguments += ["--loop", "uvloop", "--no-access-log", "--log-level", "warning"]
+    with _served(arguments, "/") as served:
+        yield served
+
+
+@contextmanager
+def _served(arguments: list[str], path: str) -> Iterator[Served]:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    started = time.perf_counter()
+    command = [sys.executable, *arguments, "--port", str(port)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        while not _answers(f"http://127.0.0.1:{port}{path}"):
+            if process.poll() is not None or time.perf_counter() - started > START_S:
+                raise RuntimeError(f"no answer from: {' '.join(command)}")
+            time.sleep(0.02)
+        yield Served(port, process.pid, time.perf_counter() - started)
+    finally:
+        process.send_signal(signal.SIGTERM)
+        process.wait(60)
+
+
+def _answers(url: str) -> bool:
+    try:
+        with urllib.request.urlopen(url, timeout=5):
+            return True
+    except urllib.error.HTTPError as error:
+        return error.code == 404
+    except OSError:
+        return False

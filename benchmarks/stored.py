@@ -1,0 +1,138 @@
+"""What a batch and a trend cost as the database fills.
+
+    python -m benchmarks stored
+    python -m benchmarks.stored --batches 5000000     as for docs/performance.md
+
+The database is filled by `benchmarks.fill_database`; then batches are recorded
+in earnest and trends are read.  What a trend is held against is a count of the
+same results one by one; the answers must be equal.
+"""
+
+import argparse
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from sqlalchemy import text
+
+from benchmarks.fill_database import START, fill
+from benchmarks.posts import telemetry
+from benchmarks.report import Report
+from service.observe.wire import submission_from_json
+from service.operations import Operations
+from service.settings import Settings
+from service.times import parse_utc, shifted
+
+BATCHES, QUICK_BATCHES = 400_000, 20_000
+RECORDED = 2_000
+CHUNK = 250
+REPEATS = 5
+MOST_GROWTH = 1.5
+MOST_MONTH_MS, MOST_YEAR_MS = 10.0, 30.0
+
+
+def record_us(operations: Operations, seed: int) -> float:
+    """Microseconds a batch of a file in bulk, the median chunk."""
+    bodies = telemetry(seed).bodies(RECORDED, f"stored-{seed}")
+    made = [submission_from_json(body, run="stored") for body in bodies]
+    operations.submit_many(made[:CHUNK])
+    spent = []
+    for first in range(CHUNK, RECORDED, CHUNK):
+        started = time.perf_counter()
+        operations.submit_many(made[first : first + CHUNK])
+        spent.append((time.perf_counter() - started) / CHUNK * 1e6)
+    return median(spent)
+
+
+def _ms(call: Callable[[], object]) -> float:
+    spent = []
+    for _ in range(REPEATS):
+        started = time.perf_counter()
+        call()
+        spent.append((time.perf_counter() - started) * 1000)
+    return median(spent)
+
+
+def _scan(operations: Operations, start_ns: int, end_ns: int) -> tuple[int, int]:
+    """Observed and ambiguous stars of a stretch, counted from the results one by one."""
+    query = text(
+        "SELECT sum(observed), sum(ambiguous) FROM results WHERE +current = 1 AND +run = 'live' "
+        "AND +spacecraft = 'XTE' AND +time_ns >= :start AND +time_ns < :end"
+    )
+    with operations.store.reading() as connection:
+        found = connection.execute(query, {"start": start_ns, "end": end_ns}).one()
+    return int(found[0] or 0), int(found[1] or 0)
+
+
+def measured(total: int, seed: int) -> tuple[dict[str, Any], list[str]]:
+    """The figures of one size, and of an empty database."""
+    faults: list[str] = []
+    with tempfile.TemporaryDirectory() as folder:
+        empty = Operations.open(Settings(database=f"sqlite:///{Path(folder) / 'empty.db'}"))
+        try:
+            empty.ready()
+            alone_us = record_us(empty, seed)
+        finally:
+            empty.close()
+        file = Path(folder) / "filled.db"
+        fill(file, total, seed, 0)
+        operations = Operations.open(Settings(database=f"sqlite:///{file}"))
+        try:
+            operations.ready()
+            beside_us = record_us(operations, seed)
+            start = parse_utc(START)
+            spans = {"a month by hour": ("hour", 30), "a year by day": ("day", 365)}
+            figures: dict[str, Any] = {
+                "batches stored": total,
+                "size, MB": file.stat().st_size / 1e6,
+                "a batch in bulk, database empty, us": alone_us,
+                "a batch in bulk, database filled, us": beside_us,
+                "filled over empty": beside_us / alone_us,
+            }
+            for name, (bucket, days) in spans.items():
+                end = shifted(start, days * 86_400.0)
+
+                def read(bucket: Any = bucket, end: Any = end) -> Any:
+                    return operations.rates("XTE", start=start, end=end, bucket=bucket)
+
+                rows = read()
+                took = _ms(read)
+                counted = _scan(operations, start.tai_ns, end.tai_ns)
+                scan_ms = _ms(lambda end=end: _scan(operations, start.tai_ns, end.tai_ns))  # type: ignore[misc]
+                figures[f"{name}, buckets"] = len(rows)
+                figures[f"{name}, ms"] = took
+                figures[f"{name}: counted one by one, ms"] = scan_ms
+                figures[f"{name}: over counting"] = took / scan_ms
+                found = sum(r["observed"] for r in rows), sum(r["ambiguous"] for r in rows)
+                if found != counted:
+                    faults.append(f"{name}: {found} where a count gives {counted}")
+                most = MOST_MONTH_MS if bucket == "hour" else MOST_YEAR_MS
+                if took > most:
+                    faults.append(f"{name} takes {took:.1f} ms")
+        finally:
+            operations.close()
+    if beside_us > MOST_GROWTH * alone_us:
+        faults.append(f"a batch costs {beside_us / alone_us:.2f} times what it does at first")
+    return figures, faults
+
+
+def run(quick: bool, seed: int) -> Report:
+    """The benchmark, at a size that takes a minute."""
+    figures, faults = measured(QUICK_BATCHES if quick else BATCHES, seed)
+    return Report("stored", figures, not faults, faults)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.stored")
+    parser.add_argument("--batches", type=int, default=BATCHES, metavar="N")
+    parser.add_argument("--seed", type=int, default=1)
+    asked = parser.parse_args()
+    figures, faults = measured(asked.batches, asked.seed)
+    print(Report("stored", figures, not faults, faults).text())
+
+
+if __name__ == "__main__":
+    main()

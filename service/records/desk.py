@@ -1,0 +1,190 @@
+"""Where submissions that come one by one are worked through, together with what came meanwhile.
+
+One thread at a time takes what waits: it is looked up in one reading of the
+database, computed batch by batch, and recorded in one transaction.  To pass a
+batch from thread to thread costs more than to compute it.  Another thread
+steps in where the first has been at one batch for long.  Nobody's own thread
+waits: who submits is given a future.  A repeat of what is at work waits for it
+and is then looked up like any other.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+
+from service.errors import AcquisitionError, Busy, Stopping
+from service.observe.wire import Submission
+from service.records.draft import Answered, Draft
+from service.records.identity import Identity, identity_of
+from service.records.writer import RETRY_AFTER_S
+
+MAX_WAITING = 2_000
+TAKEN_AT_ONCE = 64
+HANDED_ON_S = 0.01
+"""What is computed goes to the writer after so long, however much else waits."""
+LONG_S = 0.01
+"""What has waited so long is taken by another thread."""
+WAIT_S = 5.0
+"""The longest that an order may wait for its turn."""
+
+Found = Sequence[Answered | AcquisitionError | None]
+
+
+@dataclass(eq=False)
+class Order:
+    """One submission, what its client calls it, and who waits for the answer."""
+
+    submission: Submission
+    key: str | None
+    done: "Future[Answered]" = field(default_factory=Future)
+    since_s: float = field(default_factory=time.monotonic)
+
+    @property
+    def identity(self) -> Identity:
+        """What is unique among submissions."""
+        return identity_of(self.submission.batch)
+
+
+class Desk:
+    """Takes orders from any thread; `close` ends its own."""
+
+    def __init__(
+        self,
+        look_up: Callable[[Sequence[Order]], Found],
+        draft: Callable[[Submission, str | None], Draft],
+        write: Callable[[Sequence[Draft]], Sequence[Answered | Exception]],
+        threads: int,
+    ) -> None:
+        """`look_up` finds what is stored, `draft` computes, `write` records and waits for that."""
+        self._look_up, self._draft, self._write = look_up, draft, write
+        self._new: deque[Order] = deque()
+        self._ready: deque[Order] = deque()
+        self._at_work: dict[Identity, list[Order]] = {}
+        self._changed = threading.Condition()
+        self._active = 0
+        self._closing = False
+        self._threads = [
+            threading.Thread(target=self._work, name=f"desk-{number}", daemon=True)
+            for number in range(threads)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def take(self, submission: Submission, key: str | None) -> "Future[Answered]":
+        """Queue a submission; raises `Busy` when too many wait.
+
+        The future gives the answer, stored, or the error that keeps it from being.
+        """
+        order = Order(submission, key)
+        # A request that is given up does not take its record back.
+        order.done.set_running_or_notify_cancel()
+        with self._changed:
+            if self._closing:
+                raise Stopping("the service is stopping")
+            if len(self._new) + len(self._ready) >= MAX_WAITING:
+                raise Busy(f"{MAX_WAITING} batches are waiting to be worked on", RETRY_AFTER_S)
+            self._new.append(order)
+            if not self._active:
+                self._changed.notify()
+        return order.done
+
+    def close(self) -> None:
+        """Refuse new orders, work through those that wait, and end the threads."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        for thread in self._threads:
+            thread.join()
+
+    def _work(self) -> None:
+        while self._wait_for_turn():
+            try:
+                self._look(self._taken())
+                self._compute()
+            finally:
+                with self._changed:
+                    self._active -= 1
+                    if self._closing:
+                        self._changed.notify_all()
+
+    def _wait_for_turn(self) -> bool:
+        """Whether there is something to do for this thread; False: there will never be."""
+        with self._changed:
+            while True:
+                first = self._ready or self._new
+                if first and (not self._active or time.monotonic() - first[0].since_s > LONG_S):
+                    self._active += 1
+                    # Whoever steps in next must be awake to see how long it takes.
+                    self._changed.notify()
+                    return True
+                if self._closing and not first and not self._active:
+                    return False
+                self._changed.wait(LONG_S if self._active else None)
+
+    def _taken(self) -> list[Order]:
+        with self._changed:
+            count = min(len(self._new), TAKEN_AT_ONCE)
+            return [self._new.popleft() for _ in range(count)]
+
+    def _look(self, orders: Sequence[Order]) -> None:
+        """Answer what is stored; let the rest be computed, each identity once."""
+        if not orders:
+            return
+        try:
+            found: Sequence[Answered | Exception | None] = self._look_up(orders)
+        except Exception as error:
+            found = [error] * len(orders)
+        with self._changed:
+            for order, answer in zip(orders, found, strict=True):
+                if answer is not None:
+                    continue
+                followers = self._at_work.get(order.identity)
+                if followers is None:
+                    self._at_work[order.identity] = []
+                    self._ready.append(order)
+                else:
+                    followers.append(order)
+        for order, answer in zip(orders, found, strict=True):
+            if answer is not None:
+                _settle(order, answer)
+
+    def _compute(self) -> None:
+        """Compute what is ready for a while, and have it recorded."""
+        began_s = time.monotonic()
+        computed: list[tuple[Order, Draft]] = []
+        while True:
+            with self._changed:
+                if not self._ready or time.monotonic() - began_s > HANDED_ON_S:
+                    break
+                order = self._ready.popleft()
+            try:
+                if time.monotonic() - order.since_s > WAIT_S:
+                    raise Busy("every processor is at work on other batches", RETRY_AFTER_S)
+                computed.append((order, self._draft(order.submission, order.key)))
+            except Exception as error:
+                self._finish([order], [error])
+        if not computed:
+            return
+        try:
+            outcomes = self._write([draft for _, draft in computed])
+        except Exception as error:
+            outcomes = [error] * len(computed)
+        self._finish([order for order, _ in computed], outcomes)
+
+    def _finish(self, orders: Sequence[Order], outcomes: Sequence[Answered | Exception]) -> None:
+        with self._changed:
+            for order in orders:
+                # Followers are looked up again: the first may have failed, or had another body.
+                self._new.extend(self._at_work.pop(order.identity))
+        for order, outcome in zip(orders, outcomes, strict=True):
+            _settle(order, outcome)
+
+
+def _settle(order: Order, outcome: Answered | Exception) -> None:
+    if isinstance(outcome, Exception):
+        order.done.set_exception(outcome)
+    else:
+        order.done.set_result(outcome)
