@@ -35,7 +35,7 @@ help:
 	@echo "make torture  kills, failing disks, odd input at full size (tests do a fiftieth)"
 	@echo "make check    tests, format, lint, types, import floors, migrations, openapi.yaml"
 	@echo "make format   format the code and mend what the linter can"
-	@echo "make bench    run the benchmarks"
+	@echo "make bench    measure speed, write docs/performance.md; BENCH_ARGS=--all for all benchmarks"
 	@echo "make openapi  write openapi.yaml anew"
 	@echo "make lock     resolve the dependencies anew (needs the package index)"
 	@echo "make clean    remove .venv and everything that was built or cached"
@@ -88,7 +88,7 @@ format: $(DEV)
 	@$(BIN)/ruff check --fix
 
 bench: $(DEV)
-	@$(BIN)/python -m benchmarks $(BENCH_ARGS)
+	@$(BIN)/python -m benchmarks --write $(BENCH_ARGS)
 
 # Written beside and then moved: a failure leaves the old file.
 openapi: $(DEV)

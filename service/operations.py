@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
+from contextlib import suppress
 from functools import partial
 from typing import IO
 
@@ -71,7 +72,7 @@ from service.records.replays import Replay, list_replays, mark_interrupted, read
 from service.records.reprocess import Plan, Progress, reprocess
 from service.records.star_field import star_field_of
 from service.records.store import Store
-from service.records.watching import is_due, shelf_end, sweep
+from service.records.watching import is_due, latest_inputs, shelf_end, sweep
 from service.records.worst import worst_batches
 from service.settings import Settings, is_loopback
 from service.sky.catalog import open_catalog
@@ -191,6 +192,9 @@ class Operations:
                 raise Busy("the service is warming up")
             try:
                 warm_up(self.sky, self.missions)
+                self._look_where_they_look()
+                # What is there by now stays: to go through it again and again costs more than
+                # a batch does.
                 gc.collect()
                 gc.freeze()
                 self._warm = True
@@ -199,6 +203,15 @@ class Operations:
         self.store.writer.require()
         with self.store.reading() as connection:
             connection.exec_driver_sql("SELECT 1")
+
+    def _look_where_they_look(self) -> None:
+        """Build what the next batch of each live spacecraft will most likely ask for."""
+        with self.store.reading() as connection:
+            inputs = latest_inputs(connection)
+        for text in inputs:
+            # One that cannot be run any more is no reason not to start.
+            with suppress(AcquisitionError):
+                self._intake.run_again(submission_from_json(text).batch)
 
     # ---- batches -----------------------------------------------------------------------------
 

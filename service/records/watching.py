@@ -25,7 +25,7 @@ from service.records.ids import Ulids
 from service.records.limits import limits_of
 from service.records.measures import contribution
 from service.records.statements import insert_missing
-from service.records.tables import alarms, missions, runs, watches
+from service.records.tables import alarms, batches, missions, runs, watches
 from service.times import Utc, parse_utc, shifted
 
 _IDS = Ulids()
@@ -82,6 +82,12 @@ def _watched(connection: Connection, names: set[str]) -> set[str]:
         return names
     query = select(runs.c.name).where(runs.c.name.in_(sorted(asked)), runs.c.alarms)
     return set(connection.scalars(query)) | (names & {LIVE})
+
+
+def latest_inputs(connection: Connection) -> Sequence[str]:
+    """The latest batch of every live spacecraft, as it was sent."""
+    query = select(batches.c.input).join_from(watches, batches, watches.c.batch_id == batches.c.id)
+    return connection.scalars(query.where(watches.c.run == LIVE)).all()
 
 
 class _Watch:

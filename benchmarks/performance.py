@@ -1,0 +1,185 @@
+"""docs/performance.md and its pictures, from benchmarks/results.json.
+
+    python -m benchmarks.performance
+
+Nothing is measured here: `make bench` measures, and then writes this.
+"""
+
+import json
+import os
+import platform
+import sqlite3
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from benchmarks.sections import table
+from service import __version__
+from service.simulate.drawing import Folder, pictures_in
+
+ROOT = Path(__file__).parents[1]
+RESULTS = Path(__file__).parent / "results.json"
+TARGET = ROOT / "docs" / "performance.md"
+PLOTS = TARGET.parent / "plots"
+PACKAGES = ("fastapi", "uvicorn", "pydantic", "msgspec", "sqlalchemy", "numpy", "numba", "scipy")
+
+INTRODUCTION = (
+    "Written by `make bench`; its figures are not edited by hand. Times move with the machine "
+    "and with what else runs on it; the ratios are of things measured in turn in one run, and "
+    "the answers of every one are checked. Bounds that do not hold are marked."
+)
+TITLES = {
+    "kernels": "Kernels: votes, TRIAD and QUEST; pairs of stars",
+    "staircase": "The whole way of a batch, zones cold and cached",
+    "verified_cost": "Verified identification beside the votes",
+    "posts": "Single posts, bulk, both at once, start, memory",
+    "stored": "As the database fills",
+}
+ABOUT = {
+    "kernels": (
+        "`many` runs the compiled kernels over batches of one zone in one compiled loop, `one` "
+        "calls them from Python batch by batch as the service does. The bare kernels "
+        "(`benchmarks/bare.py`) do the same work with every array ready and nothing that can be "
+        "switched off; they name the same stars and find the same quaternions. At most 1.5 times "
+        "the bare kernel in many, at most 3 in single calls in a cap, and for the pairs at most "
+        "1.5 times a bare k-d tree query, whose pairs must be the same and which neither works "
+        "out separations nor sorts."
+    ),
+    "staircase": "Single calls of the core without records; see `benchmarks/staircase.py`.",
+    "verified_cost": "Compiled loops over views of the paper's runs, in one thread.",
+    "posts": (
+        "The service as it is served, over SQLite with synchronous=FULL, beside a no-op of the "
+        "same server and framework whose route parses the same body and answers a small JSON. "
+        "Bounds: 0.35 of the no-op's rate at 16 connections; bulk 0.5 of parsing and inserting "
+        "alone; p99 of single posts beside bulk under 3 times its idle value; ready within 3 s of "
+        "the start of the process, the first request at most twice the hundredth."
+    ),
+    "stored": (
+        "A database filled by `benchmarks.fill_database`, then batches recorded in earnest and "
+        "trends read; counted one by one, the results give the same numbers."
+    ),
+}
+
+
+def record(seed: int, quick: bool) -> dict[str, Any]:
+    """What the figures were measured on."""
+    model = next(
+        (
+            line.partition(":")[2].strip()
+            for line in Path("/proc/cpuinfo").read_text().splitlines()
+            if line.startswith("model name")
+        ),
+        platform.machine(),
+    )
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    return {
+        "date": datetime.now(UTC).strftime("%Y-%m-%d"),
+        "seed": seed,
+        "samples": "small" if quick else "full",
+        "service": __version__,
+        "processor": f"{model}, {os.cpu_count()} cores",
+        "memory": f"{memory:.0f} GiB",
+        "system": f"{platform.system()} {platform.release().partition('-')[0]}",
+        "python": platform.python_version(),
+        "sqlite": sqlite3.sqlite_version,
+        **{name: version(name) for name in PACKAGES},
+    }
+
+
+def write() -> None:
+    """Write the page and its pictures."""
+    kept = json.loads(RESULTS.read_text("utf-8"))
+    machine = kept["record"]
+    parts = [
+        "# Performance",
+        "",
+        INTRODUCTION,
+        "",
+        table(["measured on", ""], machine.items()),
+    ]
+    with pictures_in(PLOTS, "performance") as folder:
+        for name, title in TITLES.items():
+            if name not in kept["benchmarks"]:
+                continue
+            found = kept["benchmarks"][name]
+            parts += ["", f"## {title}", "", ABOUT[name], ""]
+            parts += [f"- **Out of bounds:** {fault}" for fault in found["faults"]]
+            parts += [""] if found["faults"] else []
+            if name == "kernels":
+                parts += [*_kernels(found["figures"], folder), ""]
+            else:
+                parts += [table(["", "figure"], found["figures"].items(), 1), ""]
+            if name == "posts":
+                _posts_picture(found["figures"], folder)
+                parts += ["![Rates and ratios](plots/performance-posts.svg)", ""]
+            parts.append(f"Again: `python -m benchmarks {name}`.")
+    TARGET.write_text("\n".join(parts) + "\n", "utf-8")
+
+
+def _kernels(figures: Mapping[str, Any], folder: Folder) -> list[str]:
+    rows: dict[str, dict[str, Any]] = {}
+    for key, value in figures.items():
+        place, _, name = key.partition(": ")
+        rows.setdefault(place, {})[name] = value
+    kernels = {place: row for place, row in rows.items() if "many, ratio" in row}
+    head = ["pairs", "many, us", "many, bare us", "many, ratio"]
+    head += ["one, us", "one, bare us", "one, ratio"]
+    lines = table(
+        ["zone", *head],
+        [[p, int(r["pairs"]), *(r[h] for h in head[1:])] for p, r in kernels.items()],
+        7,
+    )
+    pairs = {place: row for place, row in rows.items() if place.startswith("SIDS")}
+    sids = table(
+        ["3,000 stars to 8°", "pairs", "ms", "k-d tree, ms", "ratio"],
+        [
+            [
+                place.removeprefix("SIDS, "),
+                row["pairs"],
+                row["ms"],
+                row["bare k-d tree, ms"],
+                row["ratio"],
+            ]
+            for place, row in pairs.items()
+        ],
+        4,
+    )
+    figure = folder.figure(7.0, 3.0)
+    times, ratios = figure.subplots(1, 2)
+    for place in dict.fromkeys(p.partition(",")[0] for p in kernels):
+        own = [row for p, row in kernels.items() if p.partition(",")[0] == place]
+        stars = [row["stars"] for row in own]
+        label = f"{place}, {int(own[0]['pairs']):,} pairs"
+        (line,) = times.plot(stars, [row["many, us"] for row in own], "o-", label=label)
+        times.plot(stars, [row["many, bare us"] for row in own], "x--", color=line.get_color())
+        ratios.plot(stars, [row["many, ratio"] for row in own], "o-", color=line.get_color())
+    times.set(xlabel="observed stars", ylabel="µs a batch", yscale="log")
+    times.set_title("many; dashed: bare")
+    times.legend(fontsize=7)
+    ratios.axhline(1.5, color="0.4", linestyle=":")
+    ratios.set(xlabel="observed stars", ylabel="times the bare kernel", ylim=(0, None))
+    folder.save(figure, "performance-kernels")
+    return [lines, "", "![Kernels](plots/performance-kernels.svg)", "", sids]
+
+
+def _posts_picture(figures: Mapping[str, Any], folder: Folder) -> None:
+    bounds = {
+        "single posts /\nno-op": (figures["single: service over no-op"], 0.35),
+        "bulk / parse\nand insert": (figures["bulk: bulk over parsing and inserting alone"], 0.5),
+        "p99 beside\nbulk / idle": (figures.get("beside bulk: p99 over idle", 0.0), 3.0),
+        "seconds\nto ready": (figures["start: seconds until ready"], 3.0),
+    }
+    figure = folder.figure(7.0, 2.4)
+    for place, (name, (value, bound)) in zip(
+        figure.subplots(1, len(bounds)), bounds.items(), strict=True
+    ):
+        place.bar([0], [value], width=0.5)
+        place.axhline(bound, color="0.3", linestyle=":")
+        place.set(xlim=(-0.6, 0.6), xticks=[], title=name, ylim=(0, 1.2 * max(value, bound)))
+    folder.save(figure, "performance-posts")
+
+
+if __name__ == "__main__":
+    write()
