@@ -4,7 +4,6 @@ python -m benchmarks.calibration           every condition by itself
 python -m benchmarks.calibration --quick   small samples
 """
 
-import io
 import sys
 from dataclasses import dataclass
 from itertools import pairwise
@@ -13,8 +12,9 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.report import Report
-from benchmarks.sections import Section, Written, table
+from benchmarks.sections import Section, Written, pictures_of, table
 from benchmarks.verified_views import Condition, interval, judged_views
+from service.simulate.drawing import Folder
 from service.vectors import Vector
 
 VIEWS, QUICK_VIEWS = 10_000, 120
@@ -179,40 +179,33 @@ them caps and half bands; serious errors are a rotation of 100° (cap) or 3° ab
 Below the line the probabilities are too modest, above it they claim too much. An arrow is the upper
 end of the interval where no claim was wrong.
 """
-    return Written(text, not faults, {"calibration.svg": picture(found)})
+    return Written(
+        text, not faults, pictures_of("calibration", lambda folder: _draw(found, folder))
+    )
 
 
-def picture(found: list[Reliability]) -> str:
-    """How often claims were wrong over how often they say they are, as SVG."""
-    import matplotlib as mpl
-
-    mpl.use("svg")
-    from matplotlib import pyplot as plt
-
-    with mpl.rc_context({"svg.hashsalt": "calibration", "svg.fonttype": "path"}):
-        figure, axes = plt.subplots(figsize=(7.0, 5.0), layout="constrained")
-        axes.plot([1e-7, 1.0], [1e-7, 1.0], color="#888888", linewidth=0.8)
-        for place, each in enumerate(found):
-            parts = [part for part in each.bins if part.claims >= FEW]
-            color = f"C{place}"
-            for part in parts:
-                wrong = part.claims - part.right
-                low, high = interval(wrong, part.claims)
-                claimed = max(1.0 - part.claimed, 1e-7)
-                if wrong:
-                    axes.plot([claimed, claimed], [max(low, 1e-5), high], color=color, linewidth=1)
-                    axes.plot(claimed, wrong / part.claims, "o", color=color, markersize=4)
-                else:
-                    axes.plot(claimed, high, "v", color=color, markersize=5, fillstyle="none")
-            axes.plot([], [], "o", color=color, markersize=4, label=each.condition)
-        axes.set(xscale="log", yscale="log", xlim=(5e-8, 1.0), ylim=(1e-5, 1.0))
-        axes.set_xlabel("claimed to be wrong, on average of a bin")
-        axes.set_ylabel("wrong")
-        axes.legend(fontsize=7, loc="lower right")
-        text = io.StringIO()
-        figure.savefig(text, format="svg", metadata={"Date": None})
-        plt.close(figure)
-    return "\n".join(line.rstrip() for line in text.getvalue().splitlines()) + "\n"
+def _draw(found: list[Reliability], pictures: Folder) -> None:
+    """How often claims were wrong over how often they say they are."""
+    figure = pictures.figure(7.5, 5.0)
+    axes = figure.subplots()
+    axes.plot([1e-7, 1.0], [1e-7, 1.0], color="#888888", linewidth=0.8)
+    for place, each in enumerate(found):
+        color = f"C{place}"
+        for part in (part for part in each.bins if part.claims >= FEW):
+            wrong = part.claims - part.right
+            low, high = interval(wrong, part.claims)
+            claimed = max(1.0 - part.claimed, 1e-7)
+            if wrong:
+                axes.plot([claimed, claimed], [max(low, 1e-5), high], color=color, linewidth=1)
+                axes.plot(claimed, wrong / part.claims, "o", color=color, markersize=4)
+            else:
+                axes.plot(claimed, high, "v", color=color, markersize=5, fillstyle="none")
+        axes.plot([], [], "o", color=color, markersize=4, label=each.condition)
+    axes.set(xscale="log", yscale="log", xlim=(5e-8, 1.0), ylim=(1e-5, 1.0))
+    axes.set_xlabel("claimed to be wrong, on average of a bin")
+    axes.set_ylabel("wrong")
+    axes.legend(fontsize=7, loc="lower right")
+    pictures.save(figure, "calibration")
 
 
 SECTION = Section("What a probability is worth", write)

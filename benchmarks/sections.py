@@ -10,10 +10,13 @@ others kept as they are:
 """
 
 import re
+import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from benchmarks.report import shown
+from service.simulate.drawing import Folder, pictures_in
 
 _KEPT = re.compile(
     r"<!-- section (?P<name>[\w-]+); seed (?P<seed>\d+); (?P<size>[^;]+); (?P<state>[^;]+) -->\n"
@@ -28,11 +31,13 @@ class Written:
     """What a section says, in Markdown without its heading, and whether it is within bounds.
 
     `pictures` are SVG texts by file name; the page finds them in its folder `plots`.
+    `pages` are other Markdown pages by file name, which stand beside it.
     """
 
     text: str
     passed: bool
     pictures: Mapping[str, str] = field(default_factory=dict)
+    pages: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,13 @@ class Section:
 
     title: str
     write: Callable[[bool, int], Written]
+
+
+def pictures_of(salt: str, paint: Callable[[Folder], None]) -> dict[str, str]:
+    """What `paint` draws and saves, as SVG texts by file name."""
+    with tempfile.TemporaryDirectory() as folder, pictures_in(Path(folder), salt) as pictures:
+        paint(pictures)
+        return {path.name: path.read_text(encoding="utf-8") for path in pictures.written}
 
 
 def framed(name: str, title: str, written: Written, quick: bool, seed: int) -> str:

@@ -10,9 +10,10 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.report import Report
-from benchmarks.sections import Section, Written, table
+from benchmarks.sections import Section, Written, pictures_of, table
 from benchmarks.verified_views import Condition, judged_views
 from service.missions.mission import Identifier
+from service.simulate.drawing import Folder
 
 SPURIOUS, QUICK_SPURIOUS = 20_000, 300
 VOTES_SHARE = 0.1
@@ -174,10 +175,30 @@ a row, a tenth of that for the votes.
 
 {table(head, rows, numbers=7)}
 
+![Real stars right, and spurious stars named](plots/spurious.svg)
+
 With three of five spurious in a band two real stars are left among thousands. Two stars fit by
 chance, so that hardly any is named; the ranked list still has the right one first.
 """
-    return Written(text, not faults)
+    return Written(text, not faults, pictures_of("spurious", lambda folder: _draw(found, folder)))
+
+
+def _draw(found: list[tuple[Case, Shares, Shares]], pictures: Folder) -> None:
+    """Bars of every case: the real stars right, and the spurious ones named."""
+    figure = pictures.figure(9.0, 4.2)
+    axes = figure.subplots(1, 2, sharey=True)
+    places = np.arange(len(found))[::-1]
+    names = [f"{PLACES[case.world]}, {case.spurious} of {case.stars}" for case, _, _ in found]
+    for up, color, label, which in ((0.2, "#0b5394", "verified", 0), (-0.2, "#b45309", "votes", 1)):
+        mine: list[Shares] = [(each[1], each[2])[which] for each in found]
+        style = {"height": 0.38, "color": color, "label": label}
+        axes[0].barh(places + up, [shares.right_pct for shares in mine], **style)
+        axes[1].barh(places + up, [shares.named_pct for shares in mine], **style)
+    axes[0].set_title("real stars named rightly (%)")
+    axes[1].set_title("spurious stars given a name (%)")
+    axes[0].set_yticks(places, names)
+    axes[1].legend(fontsize=7)
+    pictures.save(figure, "spurious")
 
 
 SECTION = Section("Spurious stars", write)

@@ -1,6 +1,6 @@
 """Writes docs/verification.md: what was verified, how, and the figures of this machine.
 
-    python -m benchmarks.verification                        every section, about five minutes
+    python -m benchmarks.verification                        every section, an hour or two
     python -m benchmarks.verification --quick                small samples, to see that it works
     python -m benchmarks.verification --only sky,covariance  these anew, the others as they are
 
@@ -10,6 +10,7 @@ The exit code is 1 where the page has a section out of its bounds.
 
 import argparse
 import platform
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,11 +18,16 @@ from pathlib import Path
 from benchmarks import (
     aberration,
     attitude_against_svd,
+    calibration,
     centroids,
     covariance,
     imaging_claims,
+    paper_runs,
     plain_reference,
     ptp,
+    spurious,
+    verified_cost,
+    whole_sky,
     zone_counts,
 )
 from benchmarks.sections import Section, framed, kept, out_of_bounds
@@ -30,6 +36,11 @@ from service import __version__
 SECTIONS: Mapping[str, Section] = {
     "sky": zone_counts.SECTION,
     "identification": plain_reference.SECTION,
+    "paper": paper_runs.SECTION,
+    "spurious": spurious.SECTION,
+    "calibration": calibration.SECTION,
+    "whole_sky": whole_sky.SECTION,
+    "verified_cost": verified_cost.SECTION,
     "attitude": attitude_against_svd.SECTION,
     "covariance": covariance.SECTION,
     "aberration": aberration.SECTION,
@@ -51,17 +62,26 @@ def page(sections: Mapping[str, str]) -> str:
         if doubtful
         else "Everything is within its bounds."
     )
-    body = "\n".join(sections[name] for name in SECTIONS if name in sections)
+    here = [name for name in SECTIONS if name in sections]
+    contents = "\n".join(f"- {_link(SECTIONS[name].title)}" for name in here)
+    body = "\n".join(sections[name] for name in here)
     return f"""# Verification
 
 Written by `python -m benchmarks.verification`; its figures are not edited by hand.
 Version {__version__}, Python {platform.python_version()}. {verdict}
 
 Every section is also a test: `make test` runs the same comparisons on smaller samples, and
-`make bench` prints them with the timings. The tables of the paper itself, theirs beside ours, are
-in [paper.md](paper.md).
+`make bench` prints them with the timings.
+
+{contents}
 
 {body}"""
+
+
+def _link(title: str) -> str:
+    """A link to the heading of a section of the same page."""
+    anchor = re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
+    return f"[{title}](#{anchor})"
 
 
 def remake(names: Sequence[str], quick: bool, seed: int, output: Path) -> bool:
@@ -73,13 +93,15 @@ def remake(names: Sequence[str], quick: bool, seed: int, output: Path) -> bool:
         here = kept(output.read_text(encoding="utf-8")) if output.exists() else {}
         sections = {name: text for name, text in here.items() if name in SECTIONS}
         sections[name] = framed(name, SECTIONS[name].title, written, quick, seed)
+        output.parent.mkdir(parents=True, exist_ok=True)
         if written.pictures:
             plots = output.parent / "plots"
             plots.mkdir(parents=True, exist_ok=True)
             for file, picture in written.pictures.items():
                 (plots / file).write_text(picture, encoding="utf-8")
+        for file, beside in written.pages.items():
+            (output.parent / file).write_text(beside, encoding="utf-8")
         # After each, so that a long run that is stopped has kept what it made.
-        output.parent.mkdir(parents=True, exist_ok=True)
         output.write_text(page(sections), encoding="utf-8")
     return not out_of_bounds(sections)
 
