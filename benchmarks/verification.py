@@ -18,15 +18,11 @@ from pathlib import Path
 from benchmarks import (
     aberration,
     attitude_against_svd,
-    calibration,
     centroids,
     covariance,
     imaging_claims,
-    paper_runs,
     plain_reference,
     ptp,
-    spurious,
-    verified_cost,
     whole_sky,
     zone_counts,
 )
@@ -36,11 +32,7 @@ from service import __version__
 SECTIONS: Mapping[str, Section] = {
     "sky": zone_counts.SECTION,
     "identification": plain_reference.SECTION,
-    "paper": paper_runs.SECTION,
-    "spurious": spurious.SECTION,
-    "calibration": calibration.SECTION,
     "whole_sky": whole_sky.SECTION,
-    "verified_cost": verified_cost.SECTION,
     "attitude": attitude_against_svd.SECTION,
     "covariance": covariance.SECTION,
     "aberration": aberration.SECTION,
@@ -71,7 +63,7 @@ Written by `python -m benchmarks.verification`; its figures are not edited by ha
 Version {__version__}, Python {platform.python_version()}. {verdict}
 
 Every section is also a test: `make test` runs the same comparisons on smaller samples, and
-`make bench` prints them with the timings.
+`python -m benchmarks --all` prints them.
 
 {contents}
 
