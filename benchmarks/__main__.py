@@ -21,6 +21,7 @@ from benchmarks import (
     frames,
     imaging_claims,
     kernels,
+    lost_in_space,
     paper_runs,
     performance,
     plain_reference,
@@ -54,6 +55,7 @@ BENCHMARKS: dict[str, Callable[[bool, int], Report]] = {
     "kernels": kernels.run,
     "posts": posts.run,
     "stored": stored.run,
+    "lost_in_space": lost_in_space.run,
 }
 OF_SPEED = tuple(performance.TITLES)
 DEFAULT_SEED = 19941026

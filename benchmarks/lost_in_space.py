@@ -29,7 +29,7 @@ from benchmarks.sections import Section, Written
 
 DEFAULT_SEED = 19941026
 TARGET = Path(__file__).parent.parent / "docs" / "lost-in-space.md"
-SLOW_SCENES = 300
+SLOW_SCENES = 100
 """For solvers that take milliseconds."""
 TURN = 100
 """Scenes that one solver gets before the next has its turn."""

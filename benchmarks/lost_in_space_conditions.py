@@ -25,6 +25,7 @@ from service.simulate.scenes import (
 )
 from service.sky.catalog import load_embedded
 from service.sky.shelf import Shelf
+from service.sky.sky_index import FURTHER_MAG
 from service.sky.view import Sky
 from service.times import parse_utc
 from service.vectors import (
@@ -114,7 +115,7 @@ def _sky() -> SceneSky:
 
 @cache
 def _database() -> SceneSky:
-    return SceneSky.to_magnitude(LIMIT_MAG)
+    return SceneSky.to_magnitude(LIMIT_MAG + FURTHER_MAG)
 
 
 def solvers_of(condition: Condition, with_peers: bool) -> list[Solver]:

@@ -14,8 +14,8 @@ from numba import njit
 
 from service.vectors import Vector
 
-CELLS = 1760
-"""Along an edge of the square: cells of 3.4 to 10 arcmin, 387 kB."""
+CELLS = 1248
+"""Along an edge of the square: cells of 4.8 to 14 arcmin, 195 kB; a cache holds several."""
 SAMPLE_RAD = 6e-4
 """Discs are filled by points so far apart, less than the narrowest cell is wide."""
 
@@ -45,10 +45,10 @@ def cell_of(x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def star_near(bits, x, y, z):  # type: ignore[no-untyped-def]
-    """Whether a star may stand near a direction of any length."""
+def star_near(bits, level, x, y, z):  # type: ignore[no-untyped-def]
+    """Whether a star may stand near a direction of any length, by one of several bitmaps."""
     cell = cell_of(x, y, z)
-    return (bits[cell >> 3] >> (cell & 7)) & 1 != 0
+    return (bits[level, cell >> 3] >> (cell & 7)) & 1 != 0
 
 
 @njit(cache=True, nogil=True)

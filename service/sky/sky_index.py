@@ -7,6 +7,7 @@ sky has a list of the stars that a field of view about it may hold.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -24,9 +25,13 @@ from service.vectors import ARCSEC_PER_RADIAN, Vector, read_only
 BUCKET_RAD = 4.0 / ARCSEC_PER_RADIAN
 """Separations are found to this much."""
 MAX_PAIR_DEG = 8.0
+FURTHER_MAG = 1.0
+"""Noise shows stars beyond the limit; so far beyond it they are matched, though not looked for."""
 CLASSES_BELOW_LIMIT_MAG = (2.5, 2.0, 1.5, 1.25, 1.0, 0.75, 0.5, 0.25)
-BITMAP_RADII_RAD = tuple(arcsec / ARCSEC_PER_RADIAN for arcsec in (60.0, 250.0, 600.0, 1500.0))
-PATCHES = 12
+BITMAP_RADII_RAD = tuple(
+    arcsec / ARCSEC_PER_RADIAN for arcsec in (60.0, 140.0, 240.0, 400.0, 700.0, 1500.0)
+)
+PATCHES = 24
 """Along an edge of a face of the cube."""
 PATCH_RADIUS_RAD = math.sqrt(2.0) / PATCHES
 """From the middle of a patch to its corners, at most: that of the largest, at a face's middle."""
@@ -40,9 +45,11 @@ class Index(NamedTuple):
     """The index as the kernels take it: every array fewer makes a call cheaper.
 
     `stars` (n, 4) holds x, y, z and the magnitude; `pairs` (p, 2) the brighter
-    and the dimmer row; `class_edge` (c, 2) the faintest magnitude of a class
-    and the share of all pairs in it and those before; `face` (6, 5) the grid's
-    box and offset.
+    and the dimmer row; `class_edge` (c, 2) the faintest magnitude of a class,
+    the limit for the last one, and the share of all pairs in it and those
+    before; `face` (6, 5) the grid's box and offset.  `bits` has a bitmap for every
+    radius, of the stars within the limit, then the same of all.  Pairs are of stars
+    within the limit, the grid and the patches have those further ones as well.
     """
 
     stars: Any
@@ -64,7 +71,9 @@ class SkyIndex:
     `offset` (classes, buckets + 1) tells where in `arrays.pairs` the pairs of a
     class and of a bucket of separation begin; `patch_start` and `patch_rows`
     list the stars within a field of view's reach of each patch, brightest
-    first.  Everything is in `arrays`, locked against writing.
+    first.  Pairs are looked for among stars to `limit_mag`; the attitudes that
+    they give are held against `FURTHER_MAG` more.  Everything is in `arrays`,
+    locked against writing.
     """
 
     run_catalog: str
@@ -98,17 +107,27 @@ class SkyIndexKey:
 
 
 def sky_index_for(
-    shelf: Shelf, run_catalog: RunCatalog, limit_mag: float, radius_deg: float
+    shelf: Shelf,
+    run_catalog: RunCatalog,
+    limit_mag: float,
+    radius_deg: float,
+    deeper: Callable[[], RunCatalog] | None = None,
 ) -> tuple[SkyIndex, bool]:
-    """The index from the shelf or built, and whether it was there."""
+    """The index from the shelf or built, and whether it was there.
+
+    `deeper` makes the same run catalog with the stars beyond its limit.
+    """
     key = SkyIndexKey(run_catalog.digest, limit_mag, radius_deg)
-    return shelf.get(key, lambda: build_sky_index(run_catalog, limit_mag, radius_deg))
+    return shelf.get(
+        key, lambda: build_sky_index(deeper() if deeper else run_catalog, limit_mag, radius_deg)
+    )
 
 
 def build_sky_index(run_catalog: RunCatalog, limit_mag: float, radius_deg: float) -> SkyIndex:
     """Index the stars to a limit for fields of view whose farthest corner is at `radius_deg`.
 
-    Where there are more stars than fit, the faintest are left out.
+    Stars of the run catalog beyond the limit are for matching alone.  Where
+    there are more stars than fit, the faintest are left out.
     """
     magnitude = run_catalog.magnitude_mag
     separation_max_deg = min(MAX_PAIR_DEG, 2.0 * radius_deg)
@@ -116,9 +135,14 @@ def build_sky_index(run_catalog: RunCatalog, limit_mag: float, radius_deg: float
     within = 1.0 - math.cos(math.radians(separation_max_deg))
     most = min(MAX_STARS, int(math.sqrt(3.0 * MAX_PAIRS / within)))
     count = min(int(np.searchsorted(magnitude, limit_mag, "right")), most)
-    direction = np.ascontiguousarray(run_catalog.direction[:count])
-    pairs = build_pairs(direction, separation_max_deg)
-    edge = limit_mag - np.array([*CLASSES_BELOW_LIMIT_MAG, -math.inf])
+    known = min(int(np.searchsorted(magnitude, limit_mag + FURTHER_MAG, "right")), MAX_STARS)
+    # Without room for all stars within the limit those beyond it would leave a gap.
+    if count < np.searchsorted(magnitude, limit_mag, "right"):
+        known = count
+    direction = np.ascontiguousarray(run_catalog.direction[:known])
+    within_limit = direction[:count]
+    pairs = build_pairs(within_limit, separation_max_deg)
+    edge = limit_mag - np.array([*CLASSES_BELOW_LIMIT_MAG, 0.0])
     pair_class = np.searchsorted(edge, magnitude[pairs.dimmer])
     bucket = (pairs.separation_rad / BUCKET_RAD).astype(np.int64)
     buckets = int(math.radians(separation_max_deg) / BUCKET_RAD) + 1
@@ -131,11 +155,17 @@ def build_sky_index(run_catalog: RunCatalog, limit_mag: float, radius_deg: float
     patch_start, patch_rows = _patches(direction, radius_deg)
     grid = build_star_grid(direction)
     arrays = Index(
-        stars=np.column_stack([direction, magnitude[:count]]),
+        stars=np.column_stack([direction, magnitude[:known]]),
         pairs=np.column_stack([pairs.brighter, pairs.dimmer])[order].astype(np.uint16),
         offset=start[rows].astype(np.int32),
         class_edge=np.column_stack([edge, share]),
-        bits=np.stack([build_sky_bitmap(direction, r) for r in BITMAP_RADII_RAD]),
+        bits=np.stack(
+            [
+                build_sky_bitmap(some, radius)
+                for some in (within_limit, direction)
+                for radius in BITMAP_RADII_RAD
+            ]
+        ),
         face=np.column_stack([grid.box, grid.offset]).astype(np.int32),
         cell_start=grid.start,
         cell_rows=grid.rows.astype(np.uint16),

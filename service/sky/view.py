@@ -7,7 +7,7 @@ from service.sky.catalog import Catalog
 from service.sky.guide import Guide, GuideKey, build_guide
 from service.sky.run_catalog import RunCatalog, build_run_catalog
 from service.sky.shelf import Shelf
-from service.sky.sky_index import SkyIndex, sky_index_for
+from service.sky.sky_index import FURTHER_MAG, SkyIndex, sky_index_for
 from service.sky.triangles import SLAVES
 from service.sky.zones import Aim, Zone, ZoneKey, zone_for
 from service.times import Utc
@@ -55,9 +55,22 @@ class Sky:
         guide, _ = self.shelf.get(key, lambda: build_guide(run_catalog, reach_deg))
         return guide
 
-    def index(self, run_catalog: RunCatalog, limit_mag: float, radius_deg: float) -> SkyIndex:
-        """The whole sky to a limit, for fields of view of a radius."""
-        index, _ = sky_index_for(self.shelf, run_catalog, limit_mag, radius_deg)
+    def index(self, mission: Mission, run_catalog: RunCatalog, radius_deg: float) -> SkyIndex:
+        """The whole sky of a mission's run catalog, for fields of view of a radius.
+
+        Stars a little beyond the catalog's limit, which noise may show, are known to it.
+        """
+        limit_mag = mission.catalog.magnitude_limit_mag
+        settings = mission.catalog.model_copy(
+            update={"magnitude_limit_mag": limit_mag + FURTHER_MAG}
+        )
+        index, _ = sky_index_for(
+            self.shelf,
+            run_catalog,
+            limit_mag,
+            radius_deg,
+            lambda: build_run_catalog(self.catalog, settings, run_catalog.epoch_year),
+        )
         return index
 
     def drop_zones(self, mission: str | None = None) -> int:

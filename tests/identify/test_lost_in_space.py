@@ -61,6 +61,7 @@ def right_and_wrong(results):
 
 
 CONDITIONS = {
+    "hardly any noise, many stars": (Conditions(position_px=0.005, fewest=35), {}),
     "no noise": (Conditions(position_px=0.05, magnitude_sigma_mag=0.0), {}),
     "one pixel": (Conditions(), {}),
     "two pixels": (Conditions(position_px=2.0), {}),

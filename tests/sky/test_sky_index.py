@@ -9,9 +9,10 @@ from service.missions.mission import RunCatalogSettings
 from service.sky.catalog import load_embedded
 from service.sky.run_catalog import build_run_catalog
 from service.sky.shelf import Shelf
-from service.sky.sky_bitmap import build_sky_bitmap, star_near
+from service.sky.sky_bitmap import CELLS, build_sky_bitmap, star_near
 from service.sky.sky_index import (
     BUCKET_RAD,
+    FURTHER_MAG,
     MAX_PAIR_DEG,
     build_sky_index,
     patch_of,
@@ -41,8 +42,9 @@ def test_every_pair_of_its_stars_stands_in_its_class_and_bucket(index):
             for at in range(offset[c, b], offset[c, b + 1]):
                 held[tuple(pairs[at].tolist())] = (c, b)
     assert len(held) == index.pairs
-    for row in range(0, index.stars, 97):
-        apart = np.radians(angle_between_deg(stars[:, :3], stars[row, :3]))
+    within = int(np.searchsorted(stars[:, 3], LIMIT_MAG, "right"))
+    for row in range(0, within, 97):
+        apart = np.radians(angle_between_deg(stars[:within, :3], stars[row, :3]))
         near = np.flatnonzero(apart <= math.radians(MAX_PAIR_DEG))
         for other in near[near > row]:
             c, b = held[(row, int(other))]
@@ -51,8 +53,13 @@ def test_every_pair_of_its_stars_stands_in_its_class_and_bucket(index):
             assert c == 0 or stars[other, 3] > index.arrays.class_edge[c - 1, 0]
 
 
-def test_it_holds_the_brightest_stars_to_the_limit(index, run_catalog):
-    assert index.stars == np.searchsorted(run_catalog.magnitude_mag, LIMIT_MAG, "right")
+def test_it_holds_the_stars_to_the_limit_and_those_further_ones_that_there_are(index, run_catalog):
+    """The run catalog ends half a magnitude beyond the limit; pairs end at the limit."""
+    assert index.stars == len(run_catalog)
+    within = np.searchsorted(run_catalog.magnitude_mag, LIMIT_MAG, "right")
+    assert index.arrays.pairs.max() == within - 1
+    alone = build_sky_index(run_catalog, LIMIT_MAG - FURTHER_MAG, 7.1)
+    assert alone.stars == within
     assert np.array_equal(index.arrays.stars[:, :3], run_catalog.direction[: index.stars])
 
 
@@ -67,9 +74,9 @@ def test_a_bitmap_never_denies_a_star(rng):
                 away = np.cross(star, unit(rng.normal(size=3)))
                 angle = radius * rng.uniform(0.0, 0.999)
                 p = star * math.cos(angle) + unit(away) * math.sin(angle)
-                assert star_near(bits, *(p * rng.uniform(0.5, 2.0)))
+                assert star_near(bits[None], 0, *(p * rng.uniform(0.5, 2.0)))
         share = np.unpackbits(bits).mean()
-        widened = len(direction) * math.pi * (radius + 4e-3) ** 2 / (4.0 * math.pi)
+        widened = len(direction) * math.pi * (radius + 7.0 / CELLS) ** 2 / (4.0 * math.pi)
         assert share < widened
 
 

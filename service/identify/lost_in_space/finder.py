@@ -51,7 +51,7 @@ def find_attitude(
     for each in sorted(corrected, key=lambda one: -len(one.magnitude_mag)):
         tracker = each.tracker
         field = field_of(tracker)
-        index = sky.index(run_catalog, mission.catalog.magnitude_limit_mag, field.radius_deg)
+        index = sky.index(mission, run_catalog, field.radius_deg)
         result = LostInSpace(index, field).solve(
             each.direction_body @ tracker.body_from_tracker,
             each.magnitude_mag,

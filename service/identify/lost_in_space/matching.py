@@ -16,6 +16,8 @@ MATCH_GATE = 4.5
 """In sigmas of a point's own noise and of the attitude at its place."""
 LARGEST_GATE_RAD = 0.006
 ROUNDS = 5
+HOPELESS = -4.0
+"""Log evidence of the points alone, before the last fit, that no further fit makes good."""
 EDGE = 0.985
 """A star is expected in the field only within this share of its half widths."""
 
@@ -71,6 +73,12 @@ def nearest_stars(  # type: ignore[no-untyped-def]
             else:
                 second, other = chord2, row
     return nearest, other, best
+
+
+@njit(cache=True, nogil=True)
+def faintest_star(index, magnitude, gate):  # type: ignore[no-untyped-def]
+    """How faint a point's star may be; of unknown magnitude none beyond the limit of pairs."""
+    return index.class_edge[-1, 0] if np.isnan(magnitude) else magnitude + gate
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -156,7 +164,7 @@ def match_at(points, index, magnitude_gate, t, covariance, match):  # type: igno
             row, _, chord2 = nearest_stars(
                 *(stars, faces, cell_start, cell_rows),
                 *(x * norm, y * norm, z * norm, gate),
-                *(m - magnitude_gate, m + magnitude_gate),
+                *(m - magnitude_gate, faintest_star(index, m, magnitude_gate)),
             )
             near[k] = chord2 / (gate * gate)
         for other in range(k):
@@ -187,10 +195,14 @@ def settle(points, index, field, magnitude_gate, t, covariance, match):  # type:
     if log_det == -math.inf:
         return 0, -math.inf
     matched = 0
-    for _ in range(ROUNDS):
+    for attempt in range(ROUNDS):
         matched, changed = match_at(points, index, magnitude_gate, t, covariance, match)
         if matched < 3:
             return matched, -math.inf
+        if attempt == 0:
+            at_most, _, _ = points_alone(points, index, field, match, matched, chi2, log_det)
+            if at_most < HOPELESS:
+                return matched, -math.inf
         if not changed:
             break
         chi2, log_det = fit(points, index, match, t, covariance)
@@ -200,13 +212,16 @@ def settle(points, index, field, magnitude_gate, t, covariance, match):  # type:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def evidence(points, index, field, t, match, matched, chi2, log_det):  # type: ignore[no-untyped-def]
-    """The log weight of a fitted match against all points being clutter; see `weighing`."""
+def points_alone(points, index, field, match, matched, chi2, log_det):  # type: ignore[no-untyped-def]
+    """The evidence without what stars are missing, which can only be less.
+
+    Also the number of magnitudes compared and the faintest star matched.
+    """
     n = len(match)
-    stars, patch_rows = index.stars, index.patch_rows
+    stars = index.stars
     log_spots = total = square = any_magnitude = 0.0
     compared = 0
-    faintest_point, faintest_star = -math.inf, -math.inf
+    faintest_point, faintest = -math.inf, -math.inf
     for k in range(n):
         if points.magnitude[k] > faintest_point:
             faintest_point = points.magnitude[k]
@@ -215,20 +230,45 @@ def evidence(points, index, field, t, match, matched, chi2, log_det):  # type: i
         if row < 0:
             continue
         log_spots += math.log(field.area / (2.0 * math.pi * points.sigma[k] ** 2))
-        faintest_star = max(faintest_star, stars[row, 3])
+        faintest = max(faintest, stars[row, 3])
         if not np.isnan(points.magnitude[k]):
             difference = points.magnitude[k] - stars[row, 3]
             compared += 1
             total += difference
             square += difference * difference
             any_magnitude += weighing.log_any_magnitude(points.magnitude[k], faintest_point)
+    weight = (
+        weighing.log_positions(matched, log_spots, chi2, log_det)
+        + weighing.log_labels(n, matched)
+        + weighing.log_magnitudes(compared, total, square, field.magnitude_sigma)
+        - any_magnitude
+    )
+    return weight, compared, faintest
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def evidence(points, index, field, t, match, matched, chi2, log_det):  # type: ignore[no-untyped-def]
+    """The log weight of a fitted match against all points being clutter; see `weighing`.
+
+    Exact where it is above zero; below, the search for missing stars may end early.
+    """
+    weight, compared, faintest = points_alone(points, index, field, match, matched, chi2, log_det)
+    if weight < 0.0:
+        return weight
+    n = len(match)
+    stars, patch_rows = index.stars, index.patch_rows
     # The field: stars that should be seen, in order of brightness.
-    limit = field.limit_mag if not np.isnan(field.limit_mag) else faintest_point
+    limit = field.limit_mag
+    if np.isnan(limit):
+        limit = -math.inf
+        for k in range(n):
+            if points.magnitude[k] > limit:
+                limit = points.magnitude[k]
     log_missing, expected = 0.0, 0
     sigma_mag = field.magnitude_sigma
-    reach = limit + weighing.MISSING_REACH * sigma_mag
-    if not reach > faintest_star:
-        reach = faintest_star
+    reach = limit + weighing.FAINT_REACH * sigma_mag
+    if not reach > faintest:
+        reach = faintest
     patch = patch_of(t[2])
     for at in range(index.patch_start[patch], index.patch_start[patch + 1]):
         row = patch_rows[at]
@@ -242,25 +282,22 @@ def evidence(points, index, field, t, match, matched, chi2, log_det):  # type: i
         y = t[1, 0] * r[0] + t[1, 1] * r[1] + t[1, 2] * r[2]
         if abs(x) > EDGE * field.tan_x * z or abs(y) > EDGE * field.tan_y * z:
             continue
-        if stars[row, 3] <= faintest_star:
+        if stars[row, 3] <= faintest:
             expected += 1
-        if compared:
-            taken = False
-            for k in range(n):
-                if match[k] == row:
-                    taken = True
-                    break
-            if not taken:
-                log_missing += weighing.log_missing((limit - stars[row, 3]) / sigma_mag)
+        taken = False
+        for k in range(n):
+            if match[k] == row:
+                taken = True
+                break
+        if taken:
+            continue
+        log_missing += weighing.log_missing((limit - stars[row, 3]) / sigma_mag)
+        if compared < matched or log_missing < -weight:
+            shares = weighing.log_any_share(matched, max(expected, matched))
+            if shares < -weight:
+                return -1.0
     shares = weighing.log_any_share(matched, max(expected, matched))
     complete = -math.inf
     if compared == matched:
         complete = matched * math.log(weighing.DETECTED) + log_missing
-    return (
-        weighing.log_positions(matched, log_spots, chi2, log_det)
-        + weighing.log_labels(n, matched)
-        + log_sum(shares, complete)
-        - math.log(2.0)
-        + weighing.log_magnitudes(compared, total, square, sigma_mag)
-        - any_magnitude
-    )
+    return weight + log_sum(shares, complete) - math.log(2.0)

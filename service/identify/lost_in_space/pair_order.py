@@ -5,6 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
+from service.identify.lost_in_space import weighing
 from service.identify.lost_in_space.predictors import GATE, SLACK_RAD
 from service.sky.sky_index import BUCKET_RAD
 
@@ -20,10 +21,12 @@ EXACT_COST = 2.0
 """Of holding a candidate against the exact place of one more point, in candidates."""
 PRIOR_COST = 40.0
 """Of trying a pair at all, in candidates."""
-RANK_COST = 0.4
+RANK_COST = 0.15
 """A pair of fainter points is less sure to be two stars of the index."""
 USE_COST = 3.0
 """Each failed try of a point makes it this much less attractive."""
+MOST_BEYOND = 0.9
+"""Of a point fainter than the limit.  None is given up: magnitudes may be off together."""
 MAGNITUDE_GATE = 3.3
 """In sigmas of magnitude."""
 OFFSET_ALLOWED_MAG = 0.15
@@ -58,6 +61,22 @@ def rows_within(index, magnitude, gate):  # type: ignore[no-untyped-def]
     return first, low
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def chances_beyond(points, index, sigma_mag):  # type: ignore[no-untyped-def]
+    """The chance (n,) of each point, if a star, to be one beyond the limit of pairs.
+
+    Noise shows more faint stars as bright than bright ones as faint, for there
+    are more of them: of a magnitude the likely truth is fainter.
+    """
+    limit = index.class_edge[-1, 0] - weighing.COUNT_SLOPE * sigma_mag * sigma_mag
+    beyond = np.zeros(len(points.magnitude))
+    for k in range(len(beyond)):
+        if not np.isnan(points.magnitude[k]):
+            off = (limit - points.magnitude[k]) / (sigma_mag * math.sqrt(2.0))
+            beyond[k] = min(0.5 * math.erfc(off), MOST_BEYOND)
+    return beyond
+
+
 @njit(cache=True, nogil=True)
 def chord(a, b):  # type: ignore[no-untyped-def]
     """The straight distance between two unit vectors."""
@@ -66,10 +85,10 @@ def chord(a, b):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def buckets_of(points, index, i, j):  # type: ignore[no-untyped-def]
-    """First and last bucket of separation that a pair's star pair may be in."""
+def buckets_of(points, index, i, j, gate):  # type: ignore[no-untyped-def]
+    """First and last bucket of separation that a pair's star pair may be in, by so many sigmas."""
     apart = 2.0 * math.asin(min(1.0, 0.5 * chord(points.observed[i], points.observed[j])))
-    tolerance = GATE * math.hypot(points.sigma[i], points.sigma[j]) + SLACK_RAD
+    tolerance = gate * math.hypot(points.sigma[i], points.sigma[j]) + SLACK_RAD
     last = index.offset.shape[1] - 2
     return (
         max(int((apart - tolerance) / BUCKET_RAD), 0),
@@ -94,15 +113,16 @@ def classes_of(points, index, i, j, gate):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def pair_costs(points, index, first_fresh, count, gate, cost):  # type: ignore[no-untyped-def]
+def pair_costs(points, index, first_fresh, count, gate, beyond, cost):  # type: ignore[no-untyped-def]
     """What each pair of the first `count` points costs to try, into `cost`; infinite: not at all.
 
     Pairs of the first `first_fresh` points keep what they have.  The number of
-    candidates is that of evenly spread stars.
+    candidates is that of evenly spread stars; `beyond` (n,) is each point's
+    chance of being no star of any pair.
     """
     buckets = index.offset.shape[1] - 1
     longest = buckets * BUCKET_RAD
-    density = len(index.stars) / (4.0 * math.pi)
+    density = math.sqrt(len(index.pairs) / (1.0 - math.cos(longest))) / (2.0 * math.pi)
     others = min(len(points.observed) - 2, 10)
     pairs_per_rad2 = 2.0 * len(index.pairs) / (longest * longest)
     for j in range(count):
@@ -122,7 +142,8 @@ def pair_costs(points, index, first_fresh, count, gate, cost):  # type: ignore[n
             lever = TYPICAL_REACH_RAD / apart
             around = GATE * points.sigma[i] * math.sqrt(1.0 + 2.0 * lever * lever) + CELL_RAD
             passing = density * math.pi * around * around * EXACT_COST * others
-            cost[i, j] = (PRIOR_COST + candidates * (1.0 + passing)) * (1.0 + RANK_COST * (i + j))
+            sure = (1.0 - beyond[i]) * (1.0 - beyond[j]) / (1.0 + RANK_COST * (i + j))
+            cost[i, j] = (PRIOR_COST + candidates * (1.0 + passing)) / sure
 
 
 @njit(cache=True, nogil=True)

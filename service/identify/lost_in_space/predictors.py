@@ -14,14 +14,19 @@ GATE = 3.6
 """In sigmas: how far a star may lie from its prediction, and a pair from its separation."""
 SLACK_RAD = 2e-5
 """Aberration changes a separation of 8 degrees by as much as this, 4 arcsec."""
-RANK_WEIGHT = 0.12
+RANK_WEIGHT = 0.04
 """A faint point is less sure to be a star of the index: what each rank adds to its gate's cost."""
 
 
+BEYOND, DEEP_COST = 0.02, 1.5
+"""A point likelier than this to be a star beyond the limit tells less: such stars are many."""
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def predict(points, i, j, largest, coefficients, gate, order):  # type: ignore[no-untyped-def]
+def predict(points, beyond, i, j, largest, coefficients, gate, order):  # type: ignore[no-untyped-def]
     """Coefficients (n, 3) and gates (n,) of all points; `order` gets the most telling first.
 
+    `beyond` (n,): the chance of each to be a star beyond the limit.
     Returns how many have a gate of at most `largest`.
     """
     observed, sigma = points.observed, points.sigma
@@ -53,6 +58,8 @@ def predict(points, i, j, largest, coefficients, gate, order):  # type: ignore[n
         if gate[k] > largest:
             continue
         cost[k] = (gate[k] + 1e-3) * (1.0 + RANK_WEIGHT * k)
+        if beyond[k] > BEYOND:
+            cost[k] *= DEEP_COST
         at = count
         while at > 0 and cost[order[at - 1]] > cost[k]:
             order[at] = order[at - 1]

@@ -11,35 +11,44 @@ import numpy as np
 from numba import njit
 
 from service.attitude.kernels import triad
-from service.identify.lost_in_space.matching import nearest_stars, settle
+from service.identify.lost_in_space import weighing
+from service.identify.lost_in_space.matching import faintest_star, nearest_stars, settle
 from service.identify.lost_in_space.pair_order import (
     buckets_of,
+    chances_beyond,
     cheapest_pair,
     classes_of,
     magnitude_gate,
     pair_costs,
     rows_within,
 )
-from service.identify.lost_in_space.predictors import predict
+from service.identify.lost_in_space.predictors import BEYOND, GATE, predict
 from service.sky.sky_bitmap import star_near
 from service.sky.sky_index import BITMAP_RADII_RAD
 
-FIRST_POINTS = 5
+FIRST_POINTS = 7
 MOST_POINTS = 24
 """Brightest points of which pairs are made: first of few, then of more."""
 FIRST_TRIES = 3
 """Pairs tried for being cheap, before those that every attitude must have one of."""
+NARROW_GATE, NARROW_MAG = 2.8, 0.75
+"""First tries look less far: sigmas of a separation, and a share of the gate of magnitudes.
+One in fifty true pairs is missed for half the work.  Of few points all is tried again in full."""
+FEW_POINTS, MOST_FIRST = 6, 4
+"""Of so few points a candidate is first held against all others; of more against three."""
 SIEVES_IN_TURN = 6
-"""Points of which two at a time are the first that a candidate is held against."""
+"""Points of which three at a time are the first that a candidate is held against."""
 MOST_SIEVES = 12
 """Further points that a candidate is held against."""
-SHARP_SIGMA_RAD = 3e-5
-"""Up to 6 arcsec chance seldom puts a third star in its place: no fourth is asked for."""
+MOST_HITS = 6
+"""Points of a candidate that is put off: its pair and up to three further ones, and one spare."""
+MOST_PUT_OFF = 1500
+"""Candidates with few further points wait until all pairs were tried for one that has more."""
 SETTLE_WORK = 60
 """What settling costs, in candidates."""
 MAX_WORK = 600_000
 """Candidates, at most: some 30 ms."""
-SURE = 9.0
+SURE = 7.5
 SURE_PER_CLUTTER = 0.5
 """Log evidence, and more for every point left unexplained, that ends the search."""
 SAME_ATTITUDE_RAD = 2e-3
@@ -55,11 +64,22 @@ def level_of(gate):  # type: ignore[no-untyped-def]
     return level
 
 
+@njit(cache=True, nogil=True)
+def levels_of(gate, beyond, order, sieves, level):  # type: ignore[no-untyped-def]
+    """Fill `level` with the bitmap of every sieve, one of all stars for points that need it."""
+    for s in range(sieves):
+        k = order[s]
+        level[k] = level_of(gate[k])
+        if beyond[k] > BEYOND:
+            level[k] += len(BITMAP_RADII_RAD)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def search(points, index, field, ledger, weights, attitudes, covariances):  # type: ignore[no-untyped-def]
     """Fill the ledger (LEDGER, n) with weighed matches, heaviest first by insertion.
 
-    Returns how many there are, the work done and whether it reached its bound.
+    Returns how many there are, the work done and whether it reached its bound; no
+    work where even a perfect match would not be believed.
     """
     n = len(points.observed)
     stars, pairs, offset, faces = index.stars, index.pairs, index.offset, index.face
@@ -68,17 +88,26 @@ def search(points, index, field, ledger, weights, attitudes, covariances):  # ty
     coefficients, gate = np.empty((n, 3)), np.empty(n)
     order = np.empty(n, np.int64)
     match = np.empty(n, np.int64)
+    level, turn = np.empty(n, np.int64), np.empty(MOST_FIRST, np.int64)
+    bits = index.bits
+    later = np.empty((MOST_PUT_OFF, 2 * MOST_HITS), np.int32)
+    put_off = 0
     t, covariance = np.empty((3, 3)), np.empty((3, 3))
     count = work = tries = 0
-    further = 2 if n > 4 and points.sigma[0] > SHARP_SIGMA_RAD else 1
+    fewest = weighing.fewest_stars(points, field.area, field.magnitude_sigma)
+    if fewest > n:
+        return 0, 0, False
+    further = fewest - 2
     most = min(n, MOST_POINTS)
+    beyond = chances_beyond(points, index, field.magnitude_sigma)
     cost = np.empty((most, most))
     used = np.ones(most)
     covered = np.zeros(most, np.bool_)
     done = best = 0
+    hasty = n - 3 if n <= FEW_POINTS else 0
     while done < most:
-        top = FIRST_POINTS if done == 0 and n > 2 * further + 2 else most
-        pair_costs(points, index, done, top, gate_mag, cost)
+        top = min(FIRST_POINTS, most) if done == 0 and n > 2 * further + 2 else most
+        pair_costs(points, index, done, top, gate_mag, beyond, cost)
         done = top
         while True:
             # Any attitude that explains so many points has two of them in one of so many groups;
@@ -91,29 +120,40 @@ def search(points, index, field, ledger, weights, attitudes, covariances):  # ty
             elif done < most:
                 break
             i, j = cheapest_pair(cost, top, used, groups, covered)
+            if hasty > 0 and (i < 0 or tries == hasty):
+                # Of few points every pair is needed: now all that count, in full.
+                hasty = 0
+                used[:] = 1.0
+                covered[:] = False
+                pair_costs(points, index, 0, top, gate_mag, beyond, cost)
+                i, j = cheapest_pair(cost, top, used, groups, covered)
             if i < 0:
                 break
             tries += 1
-            sieves = predict(points, i, j, BITMAP_RADII_RAD[-1], coefficients, gate, order)
+            sieves = predict(points, beyond, i, j, BITMAP_RADII_RAD[-1], coefficients, gate, order)
             if sieves < further:
                 continue
             # A poor lever does not reach all points: others must try again.
             covered[i] = covered[j] = covered[i] or sieves == n - 2
-            either = n <= 6 or tries > 1
             sieves = min(sieves, MOST_SIEVES)
-            low, high = buckets_of(points, index, i, j)
-            first, last = classes_of(points, index, i, j, gate_mag)
-            low_i, high_i = rows_within(index, points.magnitude[i], gate_mag)
-            low_j, high_j = rows_within(index, points.magnitude[j], gate_mag)
-            # Other points every time: those that tell most may be no stars.
+            narrow = sieves >= 2 and tries <= (hasty if n <= FEW_POINTS else FIRST_TRIES)
+            low, high = buckets_of(points, index, i, j, NARROW_GATE if narrow else GATE)
+            pair_mag = NARROW_MAG * gate_mag if narrow else gate_mag
+            first, last = classes_of(points, index, i, j, pair_mag)
+            low_i, high_i = rows_within(index, points.magnitude[i], pair_mag)
+            low_j, high_j = rows_within(index, points.magnitude[j], pair_mag)
+            levels_of(gate, beyond, order, sieves, level)
+            # Other points every time: those that tell most may be no stars.  Of few points all.
+            if narrow and (tries == 1 or n <= FEW_POINTS):
+                firsts = needed = 2
+            elif n <= FEW_POINTS:
+                firsts, needed = sieves, further
+            else:
+                firsts, needed = min(sieves, 3), 2
+            strong = min(further + 2, (3 * sieves + 3) // 4)
             turns = min(sieves, SIEVES_IN_TURN)
-            turn = 2 * (tries - 1)
-            k = order[turn % turns]
-            a0, b0, g0 = coefficients[k, 0], coefficients[k, 1], coefficients[k, 2]
-            bits = index.bits[level_of(gate[k])]
-            k = order[(turn + 1) % turns]
-            a1, b1, g1 = coefficients[k, 0], coefficients[k, 1], coefficients[k, 2]
-            bits1 = index.bits[level_of(gate[k])]
+            for s in range(firsts):
+                turn[s] = order[(firsts * (tries - 1) + s) % turns]
             for c in range(first, last + 1):
                 for at in range(offset[c, low], offset[c, high + 1]):
                     for swap in range(2):
@@ -127,26 +167,31 @@ def search(points, index, field, ledger, weights, attitudes, covariances):  # ty
                         z0 = x1 * y2 - x2 * y1
                         z1 = x2 * y0 - x0 * y2
                         z2 = x0 * y1 - x1 * y0
-                        if not star_near(
-                            bits,
-                            a0 * x0 + b0 * y0 + g0 * z0,
-                            a0 * x1 + b0 * y1 + g0 * z1,
-                            a0 * x2 + b0 * y2 + g0 * z2,
-                        ) and not (
-                            either
-                            and star_near(
-                                bits1,
-                                a1 * x0 + b1 * y0 + g1 * z0,
-                                a1 * x1 + b1 * y1 + g1 * z1,
-                                a1 * x2 + b1 * y2 + g1 * z2,
+                        possible = 0
+                        for s in range(firsts):
+                            k = turn[s]
+                            possible += star_near(
+                                bits,
+                                level[k],
+                                coefficients[k, 0] * x0
+                                + coefficients[k, 1] * y0
+                                + coefficients[k, 2] * z0,
+                                coefficients[k, 0] * x1
+                                + coefficients[k, 1] * y1
+                                + coefficients[k, 2] * z1,
+                                coefficients[k, 0] * x2
+                                + coefficients[k, 1] * y2
+                                + coefficients[k, 2] * z2,
                             )
-                        ):
+                            if possible == needed or possible + firsts - 1 - s < needed:
+                                break
+                        if possible < needed:
                             continue
                         # Exactly now: how many of the other points have a star in their place?
                         hits = 0
                         match[:] = -1
                         for s in range(sieves):
-                            if hits + sieves - s < further or hits > further:
+                            if hits + sieves - s < further or hits == strong:
                                 break
                             k = order[s]
                             p0 = coefficients[k, 0] * x0 + coefficients[k, 1] * y0
@@ -155,14 +200,14 @@ def search(points, index, field, ledger, weights, attitudes, covariances):  # ty
                             p1 += coefficients[k, 2] * z1
                             p2 = coefficients[k, 0] * x2 + coefficients[k, 1] * y2
                             p2 += coefficients[k, 2] * z2
-                            if not star_near(index.bits[level_of(gate[k])], p0, p1, p2):
+                            if not star_near(bits, level[k], p0, p1, p2):
                                 continue
                             norm = 1.0 / math.sqrt(p0 * p0 + p1 * p1 + p2 * p2)
                             m = points.magnitude[k]
                             row, _, _ = nearest_stars(
                                 *(stars, faces, cell_start, cell_rows),
                                 *(p0 * norm, p1 * norm, p2 * norm, gate[k]),
-                                *(m - gate_mag, m + gate_mag),
+                                *(m - gate_mag, faintest_star(index, m, gate_mag)),
                             )
                             work += 2
                             if row >= 0 and row != a and row != b:
@@ -171,33 +216,89 @@ def search(points, index, field, ledger, weights, attitudes, covariances):  # ty
                         if hits < further:
                             continue
                         match[i], match[j] = a, b
-                        known = False
-                        for h in range(count):
-                            if ledger[h, i] == a and ledger[h, j] == b:
-                                known = True
-                                break
-                        if known:
+                        if hits < strong and put_off < MOST_PUT_OFF:
+                            put_off = put(later, put_off, match, i, j)
                             continue
                         work += SETTLE_WORK
-                        triad(
-                            *(points.observed[i], points.observed[j]),
-                            *(stars[a, :3], stars[b, :3], t),
-                        )
-                        matched, weight = settle(
-                            points, index, field, gate_mag, t, covariance, match
-                        )
-                        if matched < 3 or weight < 0.0:
-                            continue
-                        count = enter(
-                            *(match, weight, t, covariance),
+                        count, matched, sure = weigh(
+                            *(points, index, field, gate_mag, i, j, t, covariance, match),
                             *(ledger, weights, attitudes, covariances, count),
                         )
                         best = max(best, matched)
-                        if weight > SURE + SURE_PER_CLUTTER * (n - matched):
+                        if sure:
                             return count, work, False
                 if work > MAX_WORK:
                     return count, work, True
+    for at in range(put_off):
+        i, j = take(later, at, match)
+        work += SETTLE_WORK
+        count, _, sure = weigh(
+            *(points, index, field, gate_mag, i, j, t, covariance, match),
+            *(ledger, weights, attitudes, covariances, count),
+        )
+        if sure:
+            return count, work, False
+        if work > MAX_WORK:
+            return count, work, True
     return count, work, False
+
+
+@njit(cache=True, nogil=True)
+def put(later, at, match, i, j):  # type: ignore[no-untyped-def]
+    """Put a candidate off: its pair of points first, then its further hits, each with its star."""
+    later[at] = -1
+    later[at, 0], later[at, 1] = i, match[i]
+    later[at, 2], later[at, 3] = j, match[j]
+    to = 4
+    for k in range(len(match)):
+        if match[k] >= 0 and k != i and k != j:
+            later[at, to], later[at, to + 1] = k, match[k]
+            to += 2
+    return at + 1
+
+
+@njit(cache=True, nogil=True)
+def take(later, at, match):  # type: ignore[no-untyped-def]
+    """The match of a candidate that was put off, and its pair of points."""
+    match[:] = -1
+    for to in range(0, later.shape[1], 2):
+        if later[at, to] >= 0:
+            match[later[at, to]] = later[at, to + 1]
+    return np.int64(later[at, 0]), np.int64(later[at, 2])
+
+
+@njit(cache=True, nogil=True)
+def weigh(  # type: ignore[no-untyped-def]
+    points,
+    index,
+    field,
+    gate_mag,
+    i,
+    j,
+    t,
+    covariance,
+    match,
+    ledger,
+    weights,
+    attitudes,
+    covariances,
+    count,
+):
+    """Settle a candidate and enter it: how many there are, how many stars it has, is it sure."""
+    for h in range(count):
+        if ledger[h, i] == match[i] and ledger[h, j] == match[j]:
+            return count, 0, False
+    triad(
+        *(points.observed[i], points.observed[j]),
+        *(index.stars[match[i], :3], index.stars[match[j], :3], t),
+    )
+    matched, weight = settle(points, index, field, gate_mag, t, covariance, match)
+    if matched < 3 or weight < 0.0:
+        return count, 0, False
+    count = enter(
+        *(match, weight, t, covariance), *(ledger, weights, attitudes, covariances, count)
+    )
+    return count, matched, weight > SURE + SURE_PER_CLUTTER * (len(match) - matched)
 
 
 @njit(cache=True, nogil=True)

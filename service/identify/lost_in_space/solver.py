@@ -13,7 +13,7 @@ import numpy.typing as npt
 from numba import njit
 
 from service.attitude.solution import NoAttitude
-from service.identify.lost_in_space import verdict
+from service.identify.lost_in_space import verdict, weighing
 from service.identify.lost_in_space.matching import match_at, settle
 from service.identify.lost_in_space.pair_order import magnitude_gate
 from service.identify.lost_in_space.search import LEDGER, search
@@ -26,6 +26,9 @@ _STILL = np.zeros(3)
 FEWEST_POINTS = 3
 """Two stars alone tell no attitude from another."""
 
+
+SURELY_NO_MIRROR = 25.0
+"""Log odds beyond which a field in a mirror is not thought of."""
 
 _REFUSALS = {
     verdict.FOUND: None,
@@ -222,6 +225,9 @@ def _judged(order, ledger, weights, attitudes, covariances, count, work, bounded
             matched += ledger[best, k] >= 0
     if n < FEWEST_POINTS:
         code = verdict.TOO_FEW
+    elif work == 0:
+        # Not searched: so few points, so coarsely known, are matched somewhere by chance.
+        code = verdict.DOUBTFUL
     return code, matrices, star, log_odds, matched, work, bounded
 
 
@@ -230,7 +236,18 @@ def _solve(direction, magnitude, sigma, velocity, index, field):  # type: ignore
     order, points = _sorted(direction, magnitude, sigma, velocity)
     ledger, weights, attitudes, covariances = _ledger(len(direction))
     count, work, bounded = search(points, index, field, ledger, weights, attitudes, covariances)
-    return _judged(order, ledger, weights, attitudes, covariances, count, work, bounded)
+    told = _judged(order, ledger, weights, attitudes, covariances, count, work, bounded)
+    code, matrices, star, log_odds, matched, _, _ = told
+    if code != verdict.FOUND or log_odds > SURELY_NO_MIRROR or len(order) - matched < 2:
+        return told
+    # Stars that lie alike on both sides of a line are found in a mirror too, though not all others.
+    weight = weights[:count].max()
+    for k in range(len(order)):
+        points.observed[k, 0] = -points.observed[k, 0]
+    count, more, bounded = search(points, index, field, ledger, weights, attitudes, covariances)
+    if count > 0 and weights[:count].max() > weight + math.log(weighing.DOUBT):
+        code = verdict.DOUBTFUL
+    return code, matrices, star, log_odds, matched, work + more, bounded
 
 
 @njit(cache=True, nogil=True)

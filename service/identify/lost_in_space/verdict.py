@@ -9,10 +9,6 @@ from service.identify.lost_in_space import weighing
 from service.identify.lost_in_space.matching import LARGEST_GATE_RAD, nearest_stars
 from service.identify.lost_in_space.search import SAME_ATTITUDE_RAD
 
-DOUBT = 1e-4
-"""What all other explanations together may hold of the posterior."""
-LOG_NULL = -math.log(20.0)
-"""Prior log odds of a field without stars: points of a tracker that sees none are rare."""
 LARGEST_SIGMA_RAD = math.radians(0.25)
 """About its worst axis, for which an attitude is not told: a cluster in a corner fixes no roll."""
 
@@ -28,7 +24,7 @@ def judge(ledger, weights, attitudes, covariances, count):  # type: ignore[no-un
     if count == 0:
         return -1, -math.inf, NOTHING
     best = np.argmax(weights[:count])
-    same, others = 0.0, max(math.exp(LOG_NULL - weights[best]), LEAST)
+    same, others = 0.0, max(math.exp(weighing.LOG_NULL - weights[best]), LEAST)
     for h in range(count):
         share = math.exp(weights[h] - weights[best])
         # The trace of the turn between two attitudes: 1 + 2 cos.
@@ -43,7 +39,7 @@ def judge(ledger, weights, attitudes, covariances, count):  # type: ignore[no-un
         else:
             others += share
     log_odds = math.log(same / others)
-    if others > DOUBT * (same + others):
+    if others > weighing.DOUBT * (same + others):
         return best, log_odds, DOUBTFUL
     if _largest_variance(covariances[best]) > LARGEST_SIGMA_RAD**2:
         return best, log_odds, DEGENERATE

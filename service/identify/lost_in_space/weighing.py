@@ -20,6 +20,13 @@ from numba import njit
 
 from service.identify.hypotheses import log_sum
 
+DOUBT = 1e-4
+"""What all other explanations together may hold of the posterior."""
+LOG_NULL = -math.log(20.0)
+"""Prior log odds of a field without stars: points of a tracker that sees none are rare."""
+LEAST_EVIDENCE = math.log(1.0 / DOUBT - 1.0) + LOG_NULL
+"""No attitude of less is ever told."""
+
 POSITION_SCALES = ((0.15, 0.5), (0.6, 1.0), (0.25, 2.0))
 """Weights, and the factors by which the sigmas may be off."""
 CLEAN_CLUTTER = 0.3
@@ -33,6 +40,8 @@ COUNT_SLOPE = 0.5 * math.log(10.0)
 
 MISSING_REACH, MISSING_STEPS = 2.0, 16
 """The table of missing stars: to so many sigmas on either side of the limit, steps a sigma."""
+FAINT_REACH = 1.0
+"""Stars fainter than the limit by more sigmas are seldom seen, and not looked for."""
 
 LOG_FACTORIAL = np.cumsum(np.log(np.maximum(np.arange(512), 1)))
 LOG_MISSING = np.array(
@@ -41,6 +50,10 @@ LOG_MISSING = np.array(
         for at in range(int(2 * MISSING_REACH * MISSING_STEPS) + 1)
     ]
 )
+CROWDED = 2.3
+"""Some of the points may lie closer together than all, and their attitude be so much less known."""
+ALWAYS_ENOUGH = 4
+"""So many matched points are never ruled out beforehand."""
 _LOG_2PI = math.log(2.0 * math.pi)
 _LOG_ROTATIONS = math.log(8.0 * math.pi**2)
 
@@ -59,12 +72,64 @@ def log_positions(matched, log_area_per_spot, chi2, log_det):  # type: ignore[no
     return log_area_per_spot + total + 1.5 * _LOG_2PI - 0.5 * log_det - _LOG_ROTATIONS
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def fewest_stars(points, area, sigma_mag):  # type: ignore[no-untyped-def]
+    """How many of the points must be matched to be evidence enough; more than all where none can.
+
+    The evidence is that of a perfect match of the brightest, with no star missing.
+    """
+    n = len(points.observed)
+    matrix = np.zeros((3, 3))
+    any_magnitude = np.zeros(n + 1)
+    known = 0
+    log_spot = -math.inf
+    for k in range(n):
+        w = 1.0 / (points.sigma[k] * points.sigma[k])
+        log_spot = max(log_spot, math.log(w * area) - _LOG_2PI)
+        for i in range(3):
+            matrix[i, i] += w
+            for j in range(3):
+                matrix[i, j] -= w * points.observed[k, i] * points.observed[k, j]
+        if not np.isnan(points.magnitude[k]):
+            known = k + 1
+    for k in range(known):
+        any_magnitude[k + 1] = any_magnitude[k] + log_any_magnitude(
+            points.magnitude[k], points.magnitude[known - 1]
+        )
+    det = (
+        matrix[0, 0] * (matrix[1, 1] * matrix[2, 2] - matrix[1, 2] ** 2)
+        - matrix[0, 1] * (matrix[0, 1] * matrix[2, 2] - matrix[1, 2] * matrix[0, 2])
+        + matrix[0, 2] * (matrix[0, 1] * matrix[1, 2] - matrix[1, 1] * matrix[0, 2])
+    )
+    if n < 3 or not det > 0.0:
+        return n + 1
+    for m in range(3, min(n, ALWAYS_ENOUGH) + 1):
+        log_det = math.log(det) + 3.0 * math.log(m / n)
+        if m < n:
+            log_det -= CROWDED
+        compared = min(m, known)
+        weight = (
+            log_positions(m, m * log_spot, 0.0, log_det)
+            + log_labels(n, m)
+            + log_magnitudes(compared, 0.0, 0.0, sigma_mag)
+            - any_magnitude[compared]
+            + log_sum(log_any_share(m, m), m * math.log(DETECTED))
+            - math.log(2.0)
+        )
+        if weight > LEAST_EVIDENCE:
+            return m
+    return ALWAYS_ENOUGH if n >= ALWAYS_ENOUGH else n + 1
+
+
 @njit(cache=True, nogil=True)
 def log_labels(points, matched):  # type: ignore[no-untyped-def]
     """Which of the points are stars, and that the others are clutter."""
     clutter = points - matched
     clean = math.log(1.0 - CLEAN_CLUTTER) + clutter * math.log(CLEAN_CLUTTER)
-    any_number = -math.log(points + 1.0)
+    # Of all shares the greater ones are likelier: two stars more that all share it.
+    any_number = math.log(
+        3.0 * (matched + 1.0) * (matched + 2.0) / ((points + 1.0) * (points + 2.0) * (points + 3.0))
+    )
     return (
         LOG_FACTORIAL[clutter] - LOG_FACTORIAL[points] + log_sum(clean, any_number) - math.log(2.0)
     )
