@@ -21,7 +21,6 @@ from benchmarks import (
     centroids,
     covariance,
     imaging_claims,
-    lost_in_space,
     plain_reference,
     ptp,
     whole_sky,
@@ -40,7 +39,6 @@ SECTIONS: Mapping[str, Section] = {
     "imaging": imaging_claims.SECTION,
     "centroids": centroids.SECTION,
     "ptp": ptp.SECTION,
-    "lost_in_space": lost_in_space.SECTION,
 }
 """In the order of the page."""
 

@@ -32,6 +32,7 @@ from service.sky.triangles import (
 )
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
+IN_A_MIRROR = np.array([-1.0, 1.0, 1.0])
 SIGMA_FLOOR_ARCSEC = 1.0
 """No star is taken as better known: the catalog serves a year, and parallax is left out."""
 
@@ -152,11 +153,19 @@ def explained(
     Proposals are pairs of a row of `direction` and of the guide, the likeliest
     first.  Gives each star the catalog row that it lies on and a second one that
     it might lie on as well, -1 for none; -1 throughout where no attitude is
-    believed.
+    believed, nor one of a field that a mirror shows as well.
     """
     match, rival = np.full((2, len(direction)), -1, np.int32)
     scene = scene_of(direction, sigma_rad, velocity_c, guide)
-    if not check_attitude(*scene, guide.density, image, star, match, rival, np.empty((3, 3))):
+    believed = check_attitude(*scene, guide.density, image, star, match, rival, np.empty((3, 3)))
+    matched = int((match >= 0).sum())
+    if believed and len(match) - matched >= 2:
+        # Stars that lie alike on both sides of a line stand in a mirror too, all others do not.
+        scene = scene_of(direction * IN_A_MIRROR, sigma_rad, velocity_c, guide)
+        seen, other = np.full((2, len(direction)), -1, np.int32)
+        if check_attitude(*scene, guide.density, image, star, seen, other, np.empty((3, 3))):
+            believed = int((seen >= 0).sum()) < matched
+    if not believed:
         match[:] = rival[:] = -1
     return match, rival
 
