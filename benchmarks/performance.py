@@ -97,7 +97,7 @@ def write() -> None:
         "",
         INTRODUCTION,
         "",
-        table(["measured on", ""], machine.items()),
+        table(["measured on", ""], [(name, str(value)) for name, value in machine.items()]),
     ]
     with pictures_in(PLOTS, "performance") as folder:
         for name, title in TITLES.items():
