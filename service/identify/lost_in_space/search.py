@@ -148,8 +148,11 @@ def search(points, index, field, ledger, weights, attitudes, covariances):  # ty
                 firsts = needed = 2
             elif n <= FEW_POINTS:
                 firsts, needed = sieves, further
-            else:
+            elif tries <= FIRST_TRIES:
                 firsts, needed = min(sieves, 3), 2
+            else:
+                # Where half of the points are no stars, two of three is too much to ask.
+                firsts, needed = min(sieves, 2), 1
             strong = min(further + 2, (3 * sieves + 3) // 4)
             turns = min(sieves, SIEVES_IN_TURN)
             for s in range(firsts):
