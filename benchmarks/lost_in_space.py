@@ -2,8 +2,10 @@
 
     python -m benchmarks.lost_in_space --scenes 40000 --seed 7            a table
     python -m benchmarks.lost_in_space --scenes 40000 --write             docs/lost-in-space.md
-    pip install '.[peers]'                                                the others, in an
-                                                                          environment of their own
+
+The others come into an environment of their own:
+
+    pip install '.[peers]' && pip install --no-deps cedar-solve
 
 Right: an attitude whose boresight is within 0.1 deg and whose total rotation is
 within 1 deg of the truth; wrong: any other; none: no answer.  `--scenes` is the
