@@ -149,5 +149,9 @@ class Browser:
         """Return once the condition holds."""
         end = time.monotonic() + seconds
         while not condition():
-            assert time.monotonic() < end, "waited in vain"
+            if time.monotonic() > end:
+                seen = self.run(
+                    "[location.href, document.body.innerText.slice(0, 1000)].join(': ')"
+                )
+                raise AssertionError(f"waited in vain at {seen}")
             time.sleep(0.05)

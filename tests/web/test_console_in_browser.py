@@ -131,6 +131,8 @@ def test_a_chart_zooms_and_pans_and_the_address_says_where(browser, address, ful
     browser.wait(lambda: browser.run(bounds)[0] < start)
     browser.run("history.back()")
     browser.wait(lambda: browser.run(bounds) == [start, end])
+    # What is drawn anew under the mouse ends a drag.
+    browser.wait(lambda: browser.run(DRAWN))
     browser.drag("[data-chart=stars] .u-over", 0.25, 0.75)
     browser.wait(lambda: browser.run(bounds)[0] > start)
     assert browser.complaints == []

@@ -3,7 +3,7 @@
 // Every message has a number.  After a break the last one heard is named, and what came since
 // follows.  A hidden page lets go of its connection, since a browser keeps only six to a server,
 // and catches up when it is looked at again.
-import { fetchPage, swapRegions } from "./regions.js";
+import { fetchLatest, swapRegions } from "./regions.js";
 
 const KINDS = ["batches", "alarm", "limit", "replay", "adopted"];
 const DRAW_EVERY_MS = 1000;
@@ -36,7 +36,9 @@ export function drawSoon() {
   drawing ??= setTimeout(async () => {
     drawing = null;
     try {
-      swapRegions(await fetchPage(location.href));
+      const fresh = await fetchLatest(location.href);
+      if (fresh === null) return;
+      swapRegions(fresh);
       document.dispatchEvent(new CustomEvent("drawn"));
     } catch (error) {
       say("lost", `▲ Could not be drawn anew: ${error.message}`);

@@ -13,6 +13,20 @@ export async function fetchPage(address) {
   return fresh;
 }
 
+let asked = 0;
+
+// The same, or null where another page was asked for since: what comes late is not shown.
+export async function fetchLatest(address) {
+  const mine = ++asked;
+  try {
+    const fresh = await fetchPage(address);
+    return mine === asked ? fresh : null;
+  } catch (error) {
+    if (mine === asked) throw error;
+    return null;
+  }
+}
+
 // Somebody types in here, or has text marked: it is not pulled away.
 function isBusy(region) {
   const active = document.activeElement;

@@ -1,5 +1,5 @@
 // The trends of one spacecraft: charts of a stretch of time that the address names.
-import { fetchPage, swapRegions } from "./regions.js";
+import { fetchLatest, swapRegions } from "./regions.js";
 import { Trend } from "./trend.js";
 
 const stretch = () => document.getElementById("stretch");
@@ -49,6 +49,7 @@ function make() {
 async function draw() {
   const mine = ++asked;
   const { history, start, end } = stretch().dataset;
+  delete document.getElementById("charts").dataset.drawn;
   try {
     const answer = await fetch(history);
     const told = await answer.json();
@@ -68,7 +69,9 @@ async function draw() {
 async function go(address, push = true) {
   if (push) history.pushState(null, "", address);
   try {
-    swapRegions(await fetchPage(address));
+    const fresh = await fetchLatest(address);
+    if (fresh === null) return;
+    swapRegions(fresh);
   } catch (error) {
     status.className = "problem";
     status.textContent = `Not shown: ${error.message}`;
