@@ -223,7 +223,9 @@ class _Waiting:
         """Tell how long it has been."""
         line = f"the server is starting: {waited_s:.0f} s"
         if waited_s >= COMPILES_AFTER_S:
-            line += "; a machine's first start compiles for 20 to 70 s, later ones are quick"
+            line += (
+                "; a machine's first start compiles for one to two minutes, later ones are quick"
+            )
         if self._moves:
             print(f"\r{line:<{self._shown}}", end="", file=sys.stderr, flush=True)
             self._shown = len(line)
