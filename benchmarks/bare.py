@@ -6,37 +6,47 @@ take beyond this is what settings, exact zones on a grid and warnings cost.
 """
 
 import math
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit
+
+from service.vectors import Matrix, Vector
+
+Integers = npt.NDArray[np.int32]
+Arrays = tuple[Any, ...]
+"""Of several types, in the order in which the first line of a kernel unpacks them."""
 
 
 @njit(nogil=True, error_model="numpy", fastmath=False)
-def _angle(a, b):  # type: ignore[no-untyped-def]
+def _angle(a: Vector, b: Vector) -> float:
     x, y, z = a[0] - b[0], a[1] - b[1], a[2] - b[2]
     half = 0.5 * math.sqrt(x * x + y * y + z * z)
     return 2.0 * math.asin(min(1.0, half))
 
 
 @njit(nogil=True, error_model="numpy")
-def bare_votes(  # type: ignore[no-untyped-def]
-    observed,
-    observed_mag,
-    direction,
-    magnitude,
-    separation,
-    brighter,
-    dimmer,
-    bin_start,
-    bins_per_rad,
-    pole,
-    settings,  # SEPTOL, XMTOL, TMAGMX, CAPMAX or BANMAX, BANTOL1, BANTOL2; radians, magnitudes
-    is_band,
-    polar,  # (m,) of the zone's stars, in a band
-    votes,  # (n, m)
-    touched,  # room for the zone stars that got votes
-    star,  # (n,) the winner's zone row, -1 without one
-):
+def bare_votes(
+    observed: Vector,
+    observed_mag: Vector,
+    direction: Vector,
+    magnitude: Vector,
+    separation: Vector,
+    brighter: Integers,
+    dimmer: Integers,
+    bin_start: Integers,
+    bins_per_rad: float,
+    pole: Vector,
+    settings: tuple[
+        float, ...
+    ],  # SEPTOL, XMTOL, TMAGMX, CAPMAX or BANMAX, BANTOL1, BANTOL2; radians, magnitudes
+    is_band: bool,
+    polar: Vector,  # (m,) of the zone's stars, in a band
+    votes: Integers,  # (n, m)
+    touched: Integers,  # room for the zone stars that got votes
+    star: npt.NDArray[np.int64],  # (n,) the winner's zone row, -1 without one
+) -> None:
     """Steps 1 to 10 for five stars or so, and the unique winners."""
     tolerance, mag_tolerance, order_tolerance, cross, pole_1, pole_2 = settings
     n = len(observed)
@@ -121,7 +131,9 @@ def bare_votes(  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, error_model="numpy")
-def bare_attitude(b, r, weight, turned, matrix, q):  # type: ignore[no-untyped-def]
+def bare_attitude(
+    b: Vector, r: Vector, weight: Vector, turned: Vector, matrix: Matrix, q: Vector
+) -> None:
     """TRIAD of the widest pair into `matrix`; from it the turn for QUEST, whose answer is q."""
     n = len(b)
     one, two, widest = 0, 1, -1.0
@@ -209,7 +221,7 @@ def bare_attitude(b, r, weight, turned, matrix, q):  # type: ignore[no-untyped-d
 
 
 @njit(nogil=True, error_model="numpy")
-def _frame(a, b, rows):  # type: ignore[no-untyped-def]
+def _frame(a: Vector, b: Vector, rows: Matrix) -> None:
     x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
     norm = math.sqrt(x * x + y * y + z * z)
     x, y, z = x / norm, y / norm, z / norm
@@ -223,9 +235,20 @@ def _frame(a, b, rows):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, error_model="numpy")
-def bare_one(  # type: ignore[no-untyped-def]
-    observed, mag, body, weight, zone, pole, settings, is_band, polar, room, star, q
-):
+def bare_one(
+    observed: Vector,
+    mag: Vector,
+    body: Vector,
+    weight: Vector,
+    zone: Arrays,
+    pole: Vector,
+    settings: tuple[float, ...],
+    is_band: bool,
+    polar: Vector,
+    room: Arrays,
+    star: npt.NDArray[np.int64],
+    q: Vector,
+) -> bool:
     """One batch: votes, and the attitude of those that are named; whether there is one."""
     direction, magnitude, separation, brighter, dimmer, bin_start, bins_per_rad = zone
     votes, touched, b, r, w, turned, matrix = room
@@ -259,9 +282,20 @@ def bare_one(  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, error_model="numpy")
-def bare_many(  # type: ignore[no-untyped-def]
-    observed, mag, body, weight, zone, pole, settings, is_band, polar, room, star, q
-):
+def bare_many(
+    observed: Vector,
+    mag: Vector,
+    body: Vector,
+    weight: Vector,
+    zone: Arrays,
+    pole: Vector,
+    settings: tuple[float, ...],
+    is_band: bool,
+    polar: Vector,
+    room: Arrays,
+    star: npt.NDArray[np.int64],
+    q: Vector,
+) -> None:
     """Many batches of one zone, one after another."""
     for k in range(len(observed)):
         bare_one(
@@ -280,7 +314,7 @@ def bare_many(  # type: ignore[no-untyped-def]
         )
 
 
-def room_for(n: int, stars: int, pairs: int) -> tuple[np.ndarray, ...]:
+def room_for(n: int, stars: int, pairs: int) -> Arrays:
     """The arrays that the bare kernels write to."""
     return (
         np.zeros((n, stars), np.int32),

@@ -156,9 +156,21 @@ def _any_attitude(rng: np.random.Generator) -> Vector:
 
 
 @njit(nogil=True)
-def service_many(  # type: ignore[no-untyped-def]
-    observed, mag, body, sigma, given, boresights, tests, rows, direction, worst, room, star, q
-):
+def service_many(
+    observed: Vector,
+    mag: Vector,
+    body: Vector,
+    sigma: Vector,
+    given: tuple[Any, ...],
+    boresights: Vector,
+    tests: tuple[Any, ...],
+    rows: npt.NDArray[np.int64],
+    direction: Vector,
+    worst: float,
+    room: tuple[Any, ...],
+    star: npt.NDArray[np.int64],
+    q: Vector,
+) -> None:
     """The service's kernels over many batches, as `identify_by_votes` and `solve_attitude` do."""
     votes, voted, counts, edges, outcome, highest, second = room[:7]
     quaternions, covariance, squares, sums = room[7:]
@@ -166,6 +178,7 @@ def service_many(  # type: ignore[no-untyped-def]
     for k in range(len(observed)):
         votes[:] = 0
         counts[:] = 0
+        # mypy takes what comes as a tuple for one argument.
         cast_votes(observed[k], mag[k], *given, boresights[k], *tests, votes, voted, counts, edges)  # type: ignore[call-arg]
         count_votes(votes, voted, counts, rows, outcome, star[k], highest, second)
         b, r, s = matched_vectors(body[k], sigma, star[k], direction, still, 1.0)

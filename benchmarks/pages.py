@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +64,7 @@ def asked_of(operations: Operations) -> list[Asked]:
             "Spacecraft",
             f"every trend of a {name}",
             MONTH_MS if name == "month" else PAGE_MS,
-            lambda span_s=span_s: drawn(span_s),  # type: ignore[misc]
+            partial(drawn, span_s),
             whole(span_s),
         )
         for name, span_s in spans.items()

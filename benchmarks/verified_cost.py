@@ -32,7 +32,7 @@ from service.simulate.paper.experiments import open_sky
 from service.simulate.paper.printed import the_paper
 from service.simulate.paper.views import EPOCH, batch_of, draw_zone, paper_mission
 from service.sky.view import Sky
-from service.vectors import ARCSEC_PER_RADIAN
+from service.vectors import ARCSEC_PER_RADIAN, Vector
 
 Rows = npt.NDArray[np.int64]
 
@@ -111,7 +111,17 @@ def _sighting(acquired: Any) -> Sighting:
 
 
 @njit(nogil=True)
-def many_verified(observed, magnitude, like, stars, pairs, exhaustive, room, star, probability):  # type: ignore[no-untyped-def]
+def many_verified(
+    observed: Vector,
+    magnitude: Vector,
+    like: Seen,
+    stars: Any,
+    pairs: Any,
+    exhaustive: bool,
+    room: tuple[Any, ...],
+    star: Rows,
+    probability: Vector,
+) -> None:
     """Identify many views of one zone; `like` has what they share."""
     ledger, log_weight, none, rivals, likely = room
     scratch = scratch_for(observed.shape[1])
@@ -131,13 +141,23 @@ def many_verified(observed, magnitude, like, stars, pairs, exhaustive, room, sta
 
 
 @njit(nogil=True)
-def many_votes(observed, magnitude, tallies, edges, given, star_of, star, room):  # type: ignore[no-untyped-def]
+def many_votes(
+    observed: Vector,
+    magnitude: Vector,
+    tallies: tuple[Any, ...],
+    edges: npt.NDArray[np.int32],
+    given: tuple[Any, ...],
+    star_of: Rows,
+    star: Rows,
+    room: tuple[Any, ...],
+) -> None:
     """Count the votes of many views of one zone."""
     outcome, highest, second = room
     votes, voted, counts = tallies
     for k in range(len(observed)):
         votes[:] = 0
         counts[:] = 0
+        # mypy takes what comes as a tuple for one argument.
         cast_votes(observed[k], magnitude[k], *given, votes, voted, counts, edges)  # type: ignore[call-arg]
         count_votes(votes, voted, counts, star_of, outcome, star[k], highest, second)
 
