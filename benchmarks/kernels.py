@@ -20,12 +20,11 @@ from scipy.spatial import cKDTree
 
 from benchmarks.bare import bare_many, bare_one, room_for
 from benchmarks.report import Report
-from benchmarks.verified_cost import votes_arguments
 from service.attitude.kernels import solve
 from service.attitude.solve import WORST_AXIS_DEG, solve_attitude
 from service.identify.matched import matched_vectors
 from service.identify.pair_tests import cast_votes, count_votes
-from service.identify.starid import Sighting, identify_by_votes
+from service.identify.starid import Sighting, identify_by_votes, votes_arguments
 from service.missions.mission import Band, Mission, load_missions
 from service.sky.catalog import load_embedded
 from service.sky.pairs import build_pairs

@@ -26,7 +26,7 @@ from service.identify.pair_tests import cast_votes, count_votes
 from service.identify.presumed import presumed_attitude
 from service.identify.scene import Seen, scratch_for
 from service.identify.search import search_in
-from service.identify.starid import MAX_RIVALS, Sighting, polar_of
+from service.identify.starid import MAX_RIVALS, Sighting, votes_arguments
 from service.identify.verify import UNIQUE_PROBABILITY, scene_of
 from service.simulate.paper.experiments import open_sky
 from service.simulate.paper.printed import the_paper
@@ -205,41 +205,6 @@ def _kernels(several: list[Sighting], named: dict[str, Rows]) -> dict[str, Calla
         EXHAUSTIVE: verified(EXHAUSTIVE, True),
         EARLY: verified(EARLY, False),
     }
-
-
-def votes_arguments(sighting: Sighting) -> tuple[Any, ...]:
-    """What `cast_votes` is given between the stars and the tallies, as in `starid`."""
-    zone, aim, limits, tests = sighting.zone, sighting.aim, sighting.tolerances, sighting.tests
-    polar, off_axis, all_inside = polar_of(zone, aim)
-    return (
-        zone.direction,
-        zone.magnitude_mag,
-        zone.pairs.separation_rad,
-        zone.pairs.brighter,
-        zone.pairs.dimmer,
-        zone.pairs.bin_start,
-        zone.pairs.bins_per_rad,
-        polar,
-        zone.polar_difference_rad,
-        aim.axis,
-        off_axis,
-        all_inside,
-        math.radians(aim.least_deg),
-        math.radians(aim.most_deg),
-        math.radians(limits.separation_deg),
-        limits.magnitude_mag,
-        limits.magnitude_order_mag,
-        math.radians(limits.cross_product_deg),
-        math.radians(limits.pole_difference_deg),
-        math.radians(limits.pole_angle_deg),
-        math.radians(limits.fov_rotation_deg),
-        sighting.boresight,
-        aim.kind == "band",
-        tests.magnitude,
-        tests.cross_product,
-        tests.pole,
-        tests.fov_rotation,
-    )
 
 
 def measured(place: Place, views: int, seed: int, sky: Sky) -> Cost:

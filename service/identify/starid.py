@@ -6,6 +6,7 @@ A tie is ambiguous, no votes is unmatched, one vote is enough (Fink & Shoup
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -116,19 +117,11 @@ def polar_of(zone: Zone, aim: Aim) -> tuple[Vector, float, bool]:
     return np.full(len(zone.star), -1.0), off_axis, False
 
 
-def _cast(sighting: Sighting, tallies: tuple[Tallies, Tallies, Tallies], edges: Tallies) -> None:
-    """Cast the votes of all pairs, and write the pairs to `edges` where it has rows."""
-    zone, aim, limits, tests = (
-        sighting.zone,
-        sighting.aim,
-        sighting.tolerances,
-        sighting.tests,
-    )
+def votes_arguments(sighting: Sighting) -> tuple[Any, ...]:
+    """What `cast_votes` is given between the observed stars and the tallies, in its order."""
+    zone, aim, limits, tests = sighting.zone, sighting.aim, sighting.tolerances, sighting.tests
     polar, off_axis, all_inside = polar_of(zone, aim)
-    votes, voted, counts = tallies
-    cast_votes(
-        sighting.direction,
-        sighting.magnitude_mag,
+    return (
         zone.direction,
         zone.magnitude_mag,
         zone.pairs.separation_rad,
@@ -156,11 +149,14 @@ def _cast(sighting: Sighting, tallies: tuple[Tallies, Tallies, Tallies], edges: 
         tests.cross_product,
         tests.pole,
         tests.fov_rotation,
-        votes,
-        voted,
-        counts,
-        edges,
     )
+
+
+def _cast(sighting: Sighting, tallies: tuple[Tallies, Tallies, Tallies], edges: Tallies) -> None:
+    """Cast the votes of all pairs, and write the pairs to `edges` where it has rows."""
+    observed = sighting.direction, sighting.magnitude_mag
+    # mypy takes what comes as a tuple for one argument.
+    cast_votes(*observed, *votes_arguments(sighting), *tallies, edges)  # type: ignore[call-arg]
 
 
 def _keep_groups(sighting: Sighting, votes: Tallies) -> bool:
