@@ -5,6 +5,7 @@ import os
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +89,7 @@ def _refusal(field: str, message: str, value: object) -> BadConfiguration:
     return BadConfiguration(f"{PREFIX}{field.upper()}: {message} (got {shown_value(value)})")
 
 
+@lru_cache(maxsize=256)
 def is_loopback(host: str) -> bool:
     """Whether a name or an address is this machine's own, whoever answers for names."""
     try:

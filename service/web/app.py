@@ -56,6 +56,9 @@ ROUTERS: tuple[APIRouter, ...] = (
     *PAGES,
 )
 
+DIRECT = (batches.submit_batch,)
+"""Handlers that are asked by the thousand a second: see `AroundRequests`."""
+
 
 def create_app(operations: Operations, limits: Limits = DEFAULT_LIMITS) -> FastAPI:
     """The app over open operations, which it closes when it has served its last request."""
@@ -81,7 +84,17 @@ def create_app(operations: Operations, limits: Limits = DEFAULT_LIMITS) -> FastA
     app.state.limits = limits
     app.state.metrics = Metrics(operations)
     app.state.live = Live(operations)
-    app.add_middleware(AroundRequests, metrics=app.state.metrics, access=operations.access)
+    app.add_middleware(
+        AroundRequests,
+        metrics=app.state.metrics,
+        access=operations.access,
+        direct={
+            (method, route.path): route
+            for route in app.state.routes
+            if isinstance(route, APIRoute) and route.endpoint in DIRECT
+            for method in route.methods or ()
+        },
+    )
     return app
 
 

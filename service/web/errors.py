@@ -6,7 +6,7 @@ logged, and its answer says nothing of what is inside.
 
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Any
@@ -171,9 +171,23 @@ async def _on_disconnect(request: Request, error: Exception) -> Response:
     return Response(status_code=400)
 
 
+_HANDLERS: Mapping[type[Exception], Callable[[Request, Exception], Awaitable[Response]]] = {
+    AcquisitionError: _on_acquisition_error,
+    RequestValidationError: _on_query_fault,
+    HTTPException: _on_http_error,
+    ClientDisconnect: _on_disconnect,
+}
+
+
 def add_error_handlers(app: FastAPI) -> None:
     """Let every error that is raised on purpose answer as a problem."""
-    app.add_exception_handler(AcquisitionError, _on_acquisition_error)
-    app.add_exception_handler(RequestValidationError, _on_query_fault)
-    app.add_exception_handler(HTTPException, _on_http_error)
-    app.add_exception_handler(ClientDisconnect, _on_disconnect)
+    for kind, handler in _HANDLERS.items():
+        app.add_exception_handler(kind, handler)
+
+
+async def answer_to(request: Request, error: Exception) -> Response:
+    """What the app answers to an error; one that was not raised on purpose is raised again."""
+    for kind in type(error).__mro__:
+        if kind in _HANDLERS:
+            return await _HANDLERS[kind](request, error)
+    raise error

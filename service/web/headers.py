@@ -8,7 +8,8 @@ from starlette.requests import Request
 from service.errors import BadBatch, Fault, shown_value
 
 
-async def _idempotency_key(request: Request) -> str | None:
+async def idempotency_key(request: Request) -> str | None:
+    """The request's key, None without one; raises `BadBatch` where there are several."""
     keys = request.headers.getlist("Idempotency-Key")
     if not keys:
         return None
@@ -18,7 +19,7 @@ async def _idempotency_key(request: Request) -> str | None:
     return key
 
 
-IdempotencyKey = Annotated[str | None, Depends(_idempotency_key)]
+IdempotencyKey = Annotated[str | None, Depends(idempotency_key)]
 
 
 async def _no_idempotency_key(request: Request) -> None:

@@ -106,6 +106,8 @@ class Metrics:
             buckets=_SECONDS,
             registry=self.registry,
         )
+        # Looked up by its own labels, the histogram would check them each time.
+        self._by_labels: dict[tuple[str, str, int], Histogram] = {}
         self.registry.register(_Zones(operations))
         self.registry.register(_Alarms(operations))
         operations.observers.append(self.count_batch)
@@ -133,7 +135,11 @@ class Metrics:
             return  # a stream lasts as long as somebody listens
         method = scope["method"] if scope["method"] in _METHODS else "other"
         route = getattr(scope.get("route"), "path", "none")
-        self._requests.labels(method, route, str(status)).observe(seconds)
+        labels = method, route, status
+        histogram = self._by_labels.get(labels)
+        if histogram is None:
+            histogram = self._by_labels[labels] = self._requests.labels(method, route, str(status))
+        histogram.observe(seconds)
 
     def text(self) -> bytes:
         """The exposition text."""

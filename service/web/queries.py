@@ -192,7 +192,8 @@ class SaidQuery(Query):
     comment: Comment = None
 
 
-async def _no_query(request: Request) -> None:
+async def require_no_query(request: Request) -> None:
+    """Raise `BadBatch` for every parameter that a request brings."""
     faults = [
         Fault(name[:80], "there is no such parameter here; there is none", shown_value(value))
         for name, value in request.query_params.items()
@@ -201,5 +202,5 @@ async def _no_query(request: Request) -> None:
         raise BadBatch(faults)
 
 
-NO_QUERY = Depends(_no_query)
+NO_QUERY = Depends(require_no_query)
 """For a route that takes no parameter."""

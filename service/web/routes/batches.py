@@ -12,11 +12,11 @@ from starlette.responses import Response
 
 from service.observe.wire import BatchIn, OptionsIn, Wire
 from service.web.access import Asking, require_scope, require_spacecraft
-from service.web.bodies import JsonBody, read_model, read_submission
+from service.web.bodies import JsonBody, json_body, read_model, read_submission
 from service.web.describe import IDEMPOTENCY_KEY, LINK, LOCATION, REPLAYED, Gives, described
-from service.web.headers import NO_IDEMPOTENCY_KEY, IdempotencyKey
-from service.web.holding import Counted, Held, answer_response, json_response, page_response
-from service.web.queries import NO_QUERY, BatchQuery
+from service.web.headers import NO_IDEMPOTENCY_KEY, idempotency_key
+from service.web.holding import Held, answer_response, json_response, page_response
+from service.web.queries import NO_QUERY, BatchQuery, require_no_query
 from service.web.schemas.answers import Answer, BatchPage, Record
 
 router = APIRouter(prefix="/api/v1/batches", tags=["batches"])
@@ -43,7 +43,6 @@ class WhatIfIn(Wire):
 
 @router.post(
     "",
-    dependencies=[NO_QUERY],
     **described(
         {
             201: Gives("The answer, now recorded.", Answer, LOCATION),
@@ -54,18 +53,20 @@ class WhatIfIn(Wire):
         parameters=(IDEMPOTENCY_KEY,),
     ),
 )
-async def submit_batch(
-    body: JsonBody, key: IdempotencyKey, operations: Held, metrics: Counted, caller: Asking
-) -> Response:
+async def submit_batch(request: Request) -> Response:
     """Identify the stars of a batch, solve for the attitude, and record both."""
+    await require_no_query(request)
+    body = await json_body(request)
+    key = await idempotency_key(request)
     if len(body) > READ_AT_ONCE_BYTES:
         submission = await run_sync(read_submission, body)
     else:
         submission = read_submission(body)
-    require_spacecraft(caller, submission.batch.spacecraft)
-    answered = await wrap_future(operations.take(submission, key))
+    require_spacecraft(request.state.caller, submission.batch.spacecraft)
+    held = request.app.state
+    answered = await wrap_future(held.operations.take(submission, key))
     if answered.replayed:
-        metrics.count_repeat()
+        held.metrics.count_repeat()
     return answer_response(answered)
 
 
