@@ -7,6 +7,10 @@ from pathlib import Path
 __version__ = "0.1.0"
 
 
+KERNELS = ("attitude", "identify", "observe/correct.py", "sky", "simulate/ptp/rivals")
+"""Where compiled code and what it takes in stands: folders, whole, and files."""
+
+
 def _keep_kernels_apart() -> None:
     """Give every state of the source its own folder of compiled kernels.
 
@@ -16,8 +20,9 @@ def _keep_kernels_apart() -> None:
     """
     package = Path(__file__).parent
     state = hashlib.sha256()
-    for room in ("attitude", "identify", "sky", "simulate/ptp/rivals"):
-        for path in sorted((package / room).rglob("*.py")):
+    for place in KERNELS:
+        room = package / place
+        for path in sorted(room.rglob("*.py")) if room.is_dir() else [room]:
             state.update(path.name.encode() + path.read_bytes())
     folder = package / "__pycache__"
     if not os.access(folder if folder.exists() else package, os.W_OK):

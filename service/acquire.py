@@ -5,7 +5,6 @@ Pure: an answer depends on the batch, the mission and the catalog alone.  Not
 finding a star is a result; only bad input raises.
 """
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -54,6 +53,11 @@ IDENTIFIERS: Mapping[Identifier, Callable[[Sighting], Identification]] = {
 }
 WITHOUT_PRIOR: frozenset[Identifier] = frozenset({"ptp"})
 """Identifiers that look in the whole sky, and are given its guide database."""
+
+
+_COUNTED = [
+    (int(each), each.word) for each in (Outcome.UNIQUE, Outcome.AMBIGUOUS, Outcome.UNMATCHED)
+]
 
 
 @dataclass(frozen=True)
@@ -132,11 +136,8 @@ class Acquisition:
     @cached_property
     def counts(self) -> dict[str, int]:
         """Stars observed, and of them unique, ambiguous and unmatched."""
-        found = Counter(o for each in self.trackers for o in each.identification.outcome.tolist())
-        counts = {"observed": sum(found.values())}
-        for outcome in (Outcome.UNIQUE, Outcome.AMBIGUOUS, Outcome.UNMATCHED):
-            counts[outcome.word] = found[int(outcome)]
-        return counts
+        found = [o for each in self.trackers for o in each.identification.outcome.tolist()]
+        return {"observed": len(found)} | {word: found.count(n) for n, word in _COUNTED}
 
 
 @dataclass(frozen=True)
@@ -189,7 +190,9 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
     run_catalog = sky.run_catalog(mission, batch.time)
 
     def look(about: Presumed) -> _Look:
-        return _look(batch, mission, choices, corrected, about, velocity_c, sun_au, sky, clock)
+        return _look(
+            mission, choices, corrected, about, velocity_c, sun_au, run_catalog, sky, clock
+        )
 
     path = Path.LOST_IN_SPACE
     looked = refusal = None
@@ -251,18 +254,17 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
 
 
 def _look(
-    batch: ObservationBatch,
     mission: Mission,
     choices: Choices,
     corrected: Sequence[CorrectedObservations],
     presumed: Presumed,
     velocity_c: Vector,
     sun_au: float,
+    run_catalog: RunCatalog,
     sky: Sky,
     clock: _Clock,
 ) -> _Look:
     """Zones about a presumed attitude, identities, and the attitude that they give."""
-    run_catalog = sky.run_catalog(mission, batch.time)
     seen = [_seen(each, presumed, velocity_c) for each in corrected]
     places = [
         _place(each, index, presumed, mission, choices, run_catalog, sky)
@@ -431,7 +433,9 @@ def _solve(
         observed,
         reference,
         sigma_rad,
-        np.repeat(np.arange(len(parts)), [len(part[2]) for part in parts]),
+        np.zeros(len(sigma_rad), np.int64)
+        if len(parts) == 1
+        else np.repeat(np.arange(len(parts)), [len(part[2]) for part in parts]),
         tuple(each.tracker.name for each in corrected),
         choices.solver,
     )
@@ -446,7 +450,7 @@ def _residuals(
         taken = 0
         for residual, identification in zip(residuals, identifications, strict=True):
             mask = identification.unique
-            used = int(mask.sum())
+            used = int(np.count_nonzero(mask))
             residual[mask] = solution.residual_arcsec[taken : taken + used]
             taken += used
     return residuals

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from functools import cache, cached_property, lru_cache
 
-import erfa
 import numpy as np
 import numpy.typing as npt
 from erfa import ufunc
@@ -71,9 +70,8 @@ class Utc:
     def tai_ns(self) -> int:
         """Nanoseconds of TAI since 2000-01-01T12:00:00 TAI: for sorting and differences."""
         day, hour, minute, second, nanoseconds = self._fields
-        leap_seconds, _ = ufunc.dat(day.year, day.month, day.day, 0.0)
         seconds = (day.toordinal() - _MJD_ZERO - _J2000_MJD) * DAY_S - DAY_S // 2
-        seconds += hour * HOUR_S + minute * 60 + second + int(leap_seconds)
+        seconds += hour * HOUR_S + minute * 60 + second + _tai_less_utc_s(day)
         return seconds * 1_000_000_000 + nanoseconds
 
     @cached_property
@@ -86,7 +84,7 @@ class Utc:
     @property
     def julian_year(self) -> float:
         """The moment as a Julian epoch, 2000.0 being J2000."""
-        return float(erfa.epj(*self.tt))
+        return float(ufunc.epj(*self.tt))
 
     def bucket(self, width_s: int) -> int:
         """The number of the UTC hour (3600) or day (86400) that holds the moment, from MJD 0.
@@ -96,6 +94,12 @@ class Utc:
         day, hour = self._fields[:2]
         days = day.toordinal() - _MJD_ZERO
         return days if width_s == DAY_S else days * 24 + hour
+
+
+@lru_cache(maxsize=1024)
+def _tai_less_utc_s(day: date) -> int:
+    """Seconds of TAI less UTC on a day."""
+    return int(ufunc.dat(day.year, day.month, day.day, 0.0)[0])
 
 
 def bucket_start(number: int, width_s: int) -> Utc:
@@ -190,14 +194,16 @@ def _read(text: str) -> Utc:
         raise ValueError("there is no such day of the year")
     if second == 60 and not ((hour, minute) == (23, 59) and _ends_in_leap_second(day)):
         raise ValueError("there is no leap second at that time")
-    return _from_fields(day, hour, minute, second + float(match["fraction"] or 0.0))
+    fraction = match["fraction"] or ".0"
+    moment = _from_fields(day, hour, minute, second + float(fraction))
+    # What was read need not be worked out again from the Julian date, which has it to 1e-11 s.
+    vars(moment)["_fields"] = day, hour, minute, second, int(fraction[1:].ljust(9, "0"))
+    return moment
 
 
 def _ends_in_leap_second(day: date) -> bool:
     following = day + timedelta(days=1)
-    before, _ = ufunc.dat(day.year, day.month, day.day, 0.0)
-    after, _ = ufunc.dat(following.year, following.month, following.day, 0.0)
-    return bool(after > before)
+    return _tai_less_utc_s(following) > _tai_less_utc_s(day)
 
 
 def _from_fields(day: date, hour: int, minute: int, second: float) -> Utc:

@@ -112,21 +112,6 @@ def rotate_about(rotation_vectors_rad: npt.ArrayLike, vectors: npt.ArrayLike) ->
     return np.asarray(v + first * once + second * _cross(w, once))
 
 
-def turned_at_rate(vectors: Vector, rate_rad_per_s: Vector, seconds: Vector) -> Vector:
-    """exp([w x] t) v: vectors (n, 3) turned about one rate w (3,) for times t (n,) of their own."""
-    x, y, z = rate_rad_per_s.tolist()
-    rate = math.hypot(x, y, z)
-    if rate == 0.0:
-        return vectors
-    x, y, z = x / rate, y / rate, z / rate
-    # v @ skew is the cross product of the axis with v.
-    skew = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
-    angle = rate * seconds[:, None]
-    once = vectors @ skew
-    half = np.sin(0.5 * angle)
-    return np.asarray(vectors + np.sin(angle) * once + (2.0 * half * half) * (once @ skew))
-
-
 def _cross(a: Vector, b: Vector) -> Vector:
     # numpy's own spends most of its time on choosing axes.
     x, y, z = a[..., 0], a[..., 1], a[..., 2]

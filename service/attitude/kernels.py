@@ -10,6 +10,8 @@ import math
 import numpy as np
 from numba import njit
 
+from service.vectors import ARCSEC_PER_RADIAN
+
 NEWTON_STEPS = 30
 POLISHING_STEPS = 10
 LEAST_SINE = 1e-12
@@ -343,3 +345,36 @@ def solve(b, r, sigma_rad, worst_rad, quaternions, covariance, squares, sums):  
             weighted += squares[method, k] * weights[k]
         sums[method, 0], sums[method, 1] = plain, weighted
     return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fit(b, r, sigma_rad, worst_rad, chosen):  # type: ignore[no-untyped-def]
+    """All that `solve` gives, in one call and in the units that are shown.
+
+    Whether there is an attitude; both quaternions (2, 4); the covariance (3, 3)
+    in arcsec^2; the residuals (n,) in arcsec of the method in row `chosen`; and
+    (4,) of it the rms residual, what the covariance predicts of that, TASTE,
+    and the angle between both attitudes, angles in arcsec.
+    """
+    n = len(b)
+    quaternions, covariance = np.empty((2, 4)), np.empty((3, 3))
+    squares, sums = np.empty((2, n)), np.empty((2, 2))
+    residual, told = np.empty(n), np.empty(4)
+    if not solve(b, r, sigma_rad, worst_rad, quaternions, covariance, squares, sums):
+        return False, quaternions, covariance, residual, told
+    covariance *= ARCSEC_PER_RADIAN * ARCSEC_PER_RADIAN
+    variance = 0.0
+    for k in range(n):
+        residual[k] = math.sqrt(squares[chosen, k]) * ARCSEC_PER_RADIAN
+        variance += sigma_rad[k] * sigma_rad[k]
+    apart = along = 0.0
+    for i in range(4):
+        apart += (quaternions[0, i] - quaternions[1, i]) ** 2
+        along += (quaternions[0, i] + quaternions[1, i]) ** 2
+    half = 0.5 * math.sqrt(min(apart, along))
+    told[0] = math.sqrt(sums[chosen, 0] / n) * ARCSEC_PER_RADIAN
+    # Of the 2 n measured angles the attitude takes up three.
+    told[1] = math.sqrt(variance / n * (2 * n - 3) / n) * ARCSEC_PER_RADIAN
+    told[2] = sums[chosen, 1]
+    told[3] = 4.0 * math.asin(min(1.0, half)) * ARCSEC_PER_RADIAN
+    return True, quaternions, covariance, residual, told

@@ -16,6 +16,7 @@ from service.attitude.solution import AttitudeSolution, NoAttitude, TrackerFit
 from service.vectors import ARCSEC_PER_RADIAN, Vector, read_only
 
 WORST_AXIS_DEG = 1.0
+WORST_AXIS_RAD = math.radians(WORST_AXIS_DEG)
 SUSPECT_TAIL = 0.001
 """A true solution's TASTE passes the bound that makes it suspect with this probability."""
 ODDS_OF_TWO = 100.0
@@ -41,51 +42,36 @@ def solve_attitude(
     n = len(observed)
     if n < 2:
         return NoAttitude.FEWER_THAN_TWO_UNIQUE_STARS
-    solved = _solved(observed, reference, sigma_rad)
-    if solved is None:
-        return NoAttitude.DEGENERATE_GEOMETRY
-    quaternions, covariance, squares, sums = solved
     chosen = METHODS.index(method)
-    square = squares[chosen]
-    square_sum, taste = sums[chosen].tolist()
+    solved, quaternions, covariance, residual, told = kernels.fit(
+        observed, reference, sigma_rad, WORST_AXIS_RAD, chosen
+    )
+    if not solved:
+        return NoAttitude.DEGENERATE_GEOMETRY
+    rms_arcsec, predicted_arcsec, taste, apart_arcsec = told.tolist()
     freedom = 2 * n - 3
     suspect = taste > taste_bound(freedom)
-    outlier = -1
-    if suspect and len(trackers) > 1:
-        outlier = _outlier(observed, reference, sigma_rad, tracker_of)
-    triad, quest = quaternions.tolist()
-    between = min(math.dist(triad, quest), math.dist(triad, [-part for part in quest]))
+    fits: tuple[TrackerFit, ...] = ()
+    if len(trackers) > 1:
+        outlier = _outlier(observed, reference, sigma_rad, tracker_of) if suspect else -1
+        weighted = (residual / (sigma_rad * ARCSEC_PER_RADIAN)) ** 2
+        fits = _tracker_fits(weighted, tracker_of, trackers, outlier)
+    read_only(quaternions)
     return AttitudeSolution(
         quaternion=quaternions[chosen],
         method=method,
-        covariance_arcsec2=read_only(covariance * ARCSEC_PER_RADIAN**2),
-        residual_arcsec=read_only(np.sqrt(square) * ARCSEC_PER_RADIAN),
-        residual_rms_arcsec=math.sqrt(square_sum / n) * ARCSEC_PER_RADIAN,
-        predicted_rms_arcsec=_predicted_rms_arcsec(sigma_rad, freedom),
+        covariance_arcsec2=read_only(covariance),
+        residual_arcsec=read_only(residual),
+        residual_rms_arcsec=rms_arcsec,
+        predicted_rms_arcsec=predicted_arcsec,
         taste=taste,
         degrees_of_freedom=freedom,
         suspect=suspect,
         triad=quaternions[0],
         quest=quaternions[1],
-        triad_quest_angle_arcsec=4.0 * math.asin(min(1.0, between / 2.0)) * ARCSEC_PER_RADIAN,
-        trackers=_tracker_fits(square / sigma_rad**2, tracker_of, trackers, outlier)
-        if len(trackers) > 1
-        else (),
+        triad_quest_angle_arcsec=apart_arcsec,
+        trackers=fits,
     )
-
-
-def _solved(
-    observed: Vector, reference: Vector, sigma_rad: Vector
-) -> tuple[Vector, Vector, Vector, Vector] | None:
-    """The kernel's arrays (see `kernels.solve`), None where the geometry gives no attitude."""
-    quaternions, covariance = np.empty((2, 4)), np.empty((3, 3))
-    squares, sums = np.empty((2, len(observed))), np.empty((2, 2))
-    worst_rad = math.radians(WORST_AXIS_DEG)
-    if not kernels.solve(
-        observed, reference, sigma_rad, worst_rad, quaternions, covariance, squares, sums
-    ):
-        return None
-    return read_only(quaternions), covariance, squares, sums
 
 
 @lru_cache(maxsize=1024)
@@ -94,13 +80,6 @@ def taste_bound(degrees_of_freedom: int) -> float:
     from scipy.special import chdtri
 
     return float(chdtri(degrees_of_freedom, SUSPECT_TAIL))
-
-
-def _predicted_rms_arcsec(sigma_rad: Vector, freedom: int) -> float:
-    # Of the 2 N measured angles the attitude takes up three.
-    n = len(sigma_rad)
-    mean_square = float(sigma_rad @ sigma_rad) / n
-    return math.sqrt(mean_square * freedom / n) * ARCSEC_PER_RADIAN
 
 
 def _tracker_fits(
@@ -130,8 +109,11 @@ def _outlier(
     for tracker in np.unique(tracker_of):
         rest = tracker_of != tracker
         n = int(rest.sum())
-        solved = _solved(observed[rest], reference[rest], sigma_rad[rest]) if n > 1 else None
-        tail = 0.0 if solved is None else float(chdtrc(2 * n - 3, solved[3][1, 1]))
+        tail = 0.0
+        if n > 1:
+            parts = observed[rest], reference[rest], sigma_rad[rest]
+            solved, *_, told = kernels.fit(*parts, WORST_AXIS_RAD, METHODS.index("quest"))
+            tail = float(chdtrc(2 * n - 3, told[2])) if solved else 0.0
         tails.append((tail, int(tracker)))
     (second, _), (best, outlier) = sorted(tails)[-2:] if len(tails) > 1 else [(0.0, -1)] * 2
     plain = len(tails) > 2 or best > ODDS_OF_TWO * second

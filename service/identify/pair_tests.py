@@ -7,6 +7,7 @@ interpreter's lock.
 
 import math
 
+import numpy as np
 from numba import njit
 
 from service.identify.fov_rotation import rotation_rad
@@ -225,6 +226,23 @@ def _vote(i, row, votes, voted, counts):  # type: ignore[no-untyped-def]
         voted[i, counts[i]] = row
         counts[i] += 1
     votes[i, row] += 1
+
+
+@njit(cache=True, nogil=True)
+def tally(star_of, *given):  # type: ignore[no-untyped-def]
+    """`cast_votes` of what is `given` before its tallies, then `count_votes`, in one call.
+
+    The three tallies; (4, n) outcome, star, highest and second; and whether any
+    star is ambiguous.
+    """
+    n, stars = len(given[0]), len(star_of)
+    votes, voted = np.zeros((n, stars), np.int32), np.empty((n, stars), np.int32)
+    counts, edges = np.zeros(n, np.int32), np.empty((0, 4), np.int32)
+    # mypy takes what comes as a tuple for one argument.
+    cast_votes(*given, votes, voted, counts, edges)  # type: ignore[call-arg]
+    found = np.empty((4, n), np.int64)
+    any_tie = count_votes(votes, voted, counts, star_of, found[0], found[1], found[2], found[3])
+    return votes, voted, counts, found, any_tie
 
 
 @njit(cache=True, nogil=True)

@@ -149,8 +149,9 @@ def aim_of(tracker: Tracker, presumed: Presumed, mission: Mission, field_name: s
             max(0.0, coelevation_deg - half_width_deg),
             min(180.0, coelevation_deg + half_width_deg),
         )
-    off_deg = separation_deg(boresight_body, mission.axis_body)
-    if not presumed.roll_known and off_deg > SAME_BORESIGHT_DEG:
+    if not presumed.roll_known and (
+        (off_deg := separation_deg(boresight_body, mission.axis_body)) > SAME_BORESIGHT_DEG
+    ):
         ra_deg, dec_deg = to_ra_dec(presumed.attitude.T @ mission.axis_body)
         raise BadBatch(
             Fault(

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from service.errors import BadBatch, Fault, shown_value
 from service.identify.identification import Identification, Integers, Outcome
 from service.identify.match_groups import MAX_EDGES, keep_largest_groups
-from service.identify.pair_tests import cast_votes, count_votes
+from service.identify.pair_tests import cast_votes, count_votes, tally
 from service.missions.mission import Tests, Tolerances
 from service.sky.guide import Guide
 from service.sky.zones import Aim, Zone
@@ -25,7 +25,6 @@ Tallies = npt.NDArray[np.int32]
 MAX_RIVALS = 20
 MAX_COMPARISONS = 30_000_000
 """Observed with candidate pairs, for one tracker: a second or two."""
-_NO_EDGES = np.empty((0, 4), np.int32)
 
 
 @dataclass(frozen=True)
@@ -63,12 +62,13 @@ def identify_by_votes(sighting: Sighting) -> Identification:
     n = len(sighting.direction)
     if n * (n - 1) // 2 * zone.pairs.count > MAX_COMPARISONS:
         _refuse_endless(sighting)
-    tallies = _tallies(n, len(zone.star))
-    votes = tallies[0]
-    _cast(sighting, tallies, _NO_EDGES)
-    bounded = tests.match_groups and _keep_groups(sighting, votes)
-    outcome, star, highest, second = np.empty((4, n), np.int64)
-    any_tie = count_votes(*tallies, zone.star, outcome, star, highest, second)
+    given = sighting.direction, sighting.magnitude_mag, *votes_arguments(sighting)
+    votes, voted, counts, found, any_tie = tally(zone.star, *given)
+    bounded = False
+    if tests.match_groups:
+        bounded = _keep_groups(given, votes)
+        any_tie = count_votes(votes, voted, counts, zone.star, *found)
+    outcome, star, highest, second = found
     return Identification(
         outcome=outcome,
         star=star,
@@ -97,11 +97,6 @@ def _refuse_endless(sighting: Sighting) -> None:
                 shown_value(tolerance_deg),
             )
         )
-
-
-def _tallies(n: int, stars: int) -> tuple[Tallies, Tallies, Tallies]:
-    """No votes yet: `votes`, `voted` and `counts` of the kernels."""
-    return np.zeros((n, stars), np.int32), np.empty((n, stars), np.int32), np.zeros(n, np.int32)
 
 
 def polar_of(zone: Zone, aim: Aim) -> tuple[Vector, float, bool]:
@@ -152,20 +147,15 @@ def votes_arguments(sighting: Sighting) -> tuple[Any, ...]:
     )
 
 
-def _cast(sighting: Sighting, tallies: tuple[Tallies, Tallies, Tallies], edges: Tallies) -> None:
-    """Cast the votes of all pairs, and write the pairs to `edges` where it has rows."""
-    observed = sighting.direction, sighting.magnitude_mag
-    # mypy takes what comes as a tuple for one argument.
-    cast_votes(*observed, *votes_arguments(sighting), *tallies, edges)  # type: ignore[call-arg]
-
-
-def _keep_groups(sighting: Sighting, votes: Tallies) -> bool:
+def _keep_groups(given: tuple[Any, ...], votes: Tallies) -> bool:
     """Leave only the votes of the largest match groups; whether that search was cut short."""
     count = int(votes.sum()) // 2
     if count > MAX_EDGES:
         return True
-    edges = np.empty((count, 4), np.int32)
-    _cast(sighting, _tallies(*votes.shape), edges)
+    edges, n = np.empty((count, 4), np.int32), len(votes)
+    tallies = np.zeros_like(votes), np.empty_like(votes), np.zeros(n, np.int32)
+    # mypy takes what comes as a tuple for one argument.
+    cast_votes(*given, *tallies, edges)  # type: ignore[call-arg]
     return keep_largest_groups(votes, edges)
 
 

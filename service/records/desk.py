@@ -65,6 +65,7 @@ class Desk:
         self._at_work: dict[Identity, list[Order]] = {}
         self._changed = threading.Condition()
         self._active = 0
+        self._moved_s = 0.0
         self._closing = False
         self._threads = [
             threading.Thread(target=self._work, name=f"desk-{number}", daemon=True)
@@ -115,8 +116,9 @@ class Desk:
         with self._changed:
             while True:
                 first = self._ready or self._new
-                if first and (not self._active or time.monotonic() - first[0].since_s > LONG_S):
+                if first and (not self._active or time.monotonic() - self._moved_s > LONG_S):
                     self._active += 1
+                    self._moved_s = time.monotonic()
                     # Whoever steps in next must be awake to see how long it takes.
                     self._changed.notify()
                     return True
@@ -160,6 +162,8 @@ class Desk:
                 if not self._ready or time.monotonic() - began_s > HANDED_ON_S:
                     break
                 order = self._ready.popleft()
+                self._moved_s = time.monotonic()
+            self._moved_s = time.monotonic()
             try:
                 if time.monotonic() - order.since_s > WAIT_S:
                     raise Busy("every processor is at work on other batches", RETRY_AFTER_S)

@@ -7,6 +7,7 @@ cannot differ from what the client was told.
 import json
 import time
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import msgspec
@@ -16,7 +17,7 @@ from service.observe.frame_record import FrameRecord
 from service.observe.wire import Submission
 from service.records.ahead import AHEAD_NS, LIVE
 from service.records.answer import answer_of, rows_of_stars
-from service.records.measures import measures_of
+from service.records.measures import contribution, measures_of
 from service.times import DAY_S, HOUR_S, Utc
 
 Row = dict[str, Any]
@@ -67,6 +68,8 @@ class Draft:
     solution: Row | None
     buckets: Buckets
     key: str | None
+    received_ns: int
+    """When it came, as `Utc.tai_ns`."""
     frame: Row | None = None
     is_ahead: bool = False
     """Of a live batch: dated so far ahead that its time cannot be believed."""
@@ -76,6 +79,11 @@ class Draft:
     def id(self) -> str:
         """The result's id."""
         return str(self.result["id"])
+
+    @cached_property
+    def contribution(self) -> Row:
+        """What the result is to the trends and to what is watched."""
+        return contribution(self.result)
 
     @property
     def identity(self) -> tuple[str, str, str]:
@@ -127,7 +135,7 @@ def submission_draft(
     result = _result_row(
         acquisition, answer, batch_id=id, parent=None, current=True, created=received
     )
-    draft = _draft(acquisition, answer, row, result, key)
+    draft = _draft(acquisition, answer, row, result, key, received)
     draft.is_ahead = is_ahead
     if submission.frame is not None:
         draft.frame = _frame_row(submission.frame, id)
@@ -149,7 +157,7 @@ def what_if_draft(
     result = _result_row(
         acquisition, answer, batch_id=batch_id, parent=parent, current=adopt, created=created
     )
-    return _draft(acquisition, answer, None, result, None)
+    return _draft(acquisition, answer, None, result, None, created)
 
 
 def _draft(
@@ -158,6 +166,7 @@ def _draft(
     batch_row: Row | None,
     result: Row,
     key: str | None,
+    received: Utc,
 ) -> Draft:
     batch = acquisition.batch
     stars = rows_of_stars(answer)
@@ -165,7 +174,17 @@ def _draft(
         batch.spacecraft, batch.run, batch.time.bucket(HOUR_S), batch.time.bucket(DAY_S)
     )
     solution = _solution_row(acquisition, answer, result["id"])
-    return Draft(acquisition, answer, batch_row, result, stars, solution, buckets, key)
+    return Draft(
+        acquisition,
+        answer,
+        batch_row,
+        result,
+        stars,
+        solution,
+        buckets,
+        key,
+        received.tai_ns,
+    )
 
 
 def _frame_row(frame: FrameRecord, batch_id: str) -> Row:

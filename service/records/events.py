@@ -14,6 +14,7 @@ import msgspec
 from sqlalchemy import Connection, delete, select
 
 from service.records.draft import Row
+from service.records.prepared import execute
 from service.records.statements import insert_all
 from service.records.tables import event_counter, events
 
@@ -61,7 +62,7 @@ def numbered(connection: Connection) -> Iterator[None]:
     yield
     if not outbox:
         return
-    last: int = connection.exec_driver_sql(_TAKE.format(len(outbox))).scalar_one()
+    ((last,),) = execute(connection, _TAKE.format(len(outbox)))
     first = last - len(outbox) + 1
     rows = [{"id": first + place} | row for place, row in enumerate(outbox)]
     insert_all(connection, events, rows)

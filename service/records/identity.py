@@ -9,6 +9,7 @@ from sqlalchemy import Connection, insert
 
 from service.errors import Conflict, KeyReused, shown_value
 from service.observe.batch import ObservationBatch
+from service.records.prepared import execute
 from service.records.tables import idempotency_keys
 
 Identity = tuple[str, str, str]
@@ -100,8 +101,7 @@ def look_up(
 
 
 def _rows(connection: Connection, sql: str, wanted: Collection[object]) -> Iterable[Any]:
-    text = json.dumps(list(wanted))
-    return connection.exec_driver_sql(sql, {"wanted": text})
+    return execute(connection, sql, {"wanted": json.dumps(list(wanted))})
 
 
 def remember_key(connection: Connection, identity: Identity, key: str, taken: Taken) -> None:

@@ -11,14 +11,17 @@ from service.alarms.quantities import QUANTITIES, QuantityName
 from service.missions.mission import Mission
 from service.records import events
 from service.records.draft import Row
+from service.records.prepared import prepared
 from service.records.tables import limits
 
 Limits = Mapping[QuantityName, LimitSettings]
 
 _SHIPPED: dict[str, Limits] = {}
-# Put together once: with every batch of a live spacecraft it is run anew.
-_HOLDING = select(limits).where(
-    limits.c.spacecraft == bindparam("spacecraft"), limits.c.until.is_(None)
+# With every batch of a live spacecraft it is run anew.
+_HOLDING = prepared(
+    select(limits).where(
+        limits.c.spacecraft == bindparam("of_spacecraft"), limits.c.until.is_(None)
+    )
 )
 
 
@@ -107,5 +110,5 @@ def limit_row(
     }
 
 
-def _holding(connection: Connection, spacecraft: str) -> list[Any]:
-    return list(connection.execute(_HOLDING, {"spacecraft": spacecraft}).mappings())
+def _holding(connection: Connection, spacecraft: str) -> list[Row]:
+    return _HOLDING.read(connection, {"of_spacecraft": spacecraft})

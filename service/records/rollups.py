@@ -37,11 +37,11 @@ _TRENDS: dict[Bucket, _Trend] = {
 
 
 def add(connection: Connection, new: Iterable[tuple[Buckets, Row]]) -> None:
-    """Add new current results (rows of `results`) to the hours and days that they belong to."""
+    """Add contributions of new current results to the hours and days that they belong to."""
     hourly: Rollups = {}
     daily: Rollups = {}
-    for buckets, result in new:
-        _put(hourly, (buckets.spacecraft, buckets.run, buckets.hour), contribution(result))
+    for buckets, part in new:
+        _put(hourly, (buckets.spacecraft, buckets.run, buckets.hour), dict(part))
     for (spacecraft, run, hour), row in hourly.items():
         _put(daily, (spacecraft, run, hour // 24), dict(row))
     for table, found in ((rollups_hourly, hourly), (rollups_daily, daily)):

@@ -1,8 +1,4 @@
-"""Inserts that are put into SQL once and run many times.
-
-SQLAlchemy works out the SQL of a statement at every execution.  With a dozen
-inserts for each result that takes longer than running them.
-"""
+"""The inserts of results and of their part in the trends."""
 
 import operator
 from collections.abc import Sequence
@@ -14,7 +10,7 @@ from sqlalchemy import (
     Boolean,
     Connection,
     Double,
-    Insert,
+    Executable,
     Integer,
     LargeBinary,
     SmallInteger,
@@ -23,10 +19,10 @@ from sqlalchemy import (
     case,
     or_,
 )
-from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import DBAPIError
 
 from service.records.draft import Row
+from service.records.prepared import Prepared
 from service.records.tables import COUNTS, MAXIMA, MINIMA, SUMS
 
 COPIED_FROM = 50
@@ -49,22 +45,17 @@ def insert_all(connection: Connection, table: Table, rows: Sequence[Row]) -> Non
     if len(rows) >= COPIED_FROM and connection.dialect.name == "postgresql":
         _copy(connection, table, rows)
         return
-    _run(connection, _insert(table, connection.dialect.name), rows)
+    _insert(table).run(connection, rows)
 
 
 def insert_missing(connection: Connection, table: Table, rows: Sequence[Row]) -> None:
     """Insert the rows whose keys are not there yet; leave the others as they are."""
-    _run(connection, _insert_missing(table, connection.dialect.name), rows)
+    _insert_missing(table).run(connection, rows)
 
 
 def add_rollups(connection: Connection, table: Table, rows: Sequence[Row]) -> None:
     """Merge each row of a rollup into that of its key: sums add up, outer extremes stay."""
-    _run(connection, _add_rollups(table, connection.dialect.name), rows)
-
-
-def _run(connection: Connection, sql: str, rows: Sequence[Row]) -> None:
-    if rows:
-        connection.exec_driver_sql(sql, list(rows))
+    _add_rollups(table).run(connection, rows)
 
 
 def _copy(connection: Connection, table: Table, rows: Sequence[Row]) -> None:
@@ -102,18 +93,21 @@ def _copy_of(table: Table) -> tuple[str, list[str]]:
 
 
 @cache
-def _insert(table: Table, dialect: str) -> str:
-    return _compiled(_kind(dialect).insert(table), dialect)
+def _insert(table: Table) -> Prepared:
+    return Prepared(lambda kind: kind.insert(table))
 
 
 @cache
-def _insert_missing(table: Table, dialect: str) -> str:
-    return _compiled(_kind(dialect).insert(table).on_conflict_do_nothing(), dialect)
+def _insert_missing(table: Table) -> Prepared:
+    return Prepared(lambda kind: kind.insert(table).on_conflict_do_nothing())
 
 
 @cache
-def _add_rollups(table: Table, dialect: str) -> str:
-    statement = _kind(dialect).insert(table)
+def _add_rollups(table: Table) -> Prepared:
+    return Prepared(lambda kind: _merging(kind.insert(table), table))
+
+
+def _merging(statement: Any, table: Table) -> Executable:
     new = statement.excluded
     merged = {name: table.c[name] + new[name] for name in (*COUNTS, *SUMS)}
     # By CASE: of a null SQLite's MIN is null, PostgreSQL's LEAST the other one.
@@ -122,17 +116,7 @@ def _add_rollups(table: Table, dialect: str) -> str:
             old = table.c[name]
             takes_over = or_(old.is_(None), is_outer(new[name], old))
             merged[name] = case((takes_over, new[name]), else_=old)
-    return _compiled(
-        statement.on_conflict_do_update(index_elements=list(table.primary_key), set_=merged),
-        dialect,
+    found: Executable = statement.on_conflict_do_update(
+        index_elements=list(table.primary_key), set_=merged
     )
-
-
-def _kind(dialect: str) -> Any:
-    return sqlite if dialect == "sqlite" else postgresql
-
-
-def _compiled(statement: Insert, dialect: str) -> str:
-    # Named parameters, so that both drivers take rows as they are.
-    style = "named" if dialect == "sqlite" else "pyformat"
-    return str(statement.compile(dialect=_kind(dialect).dialect(paramstyle=style)))
+    return found

@@ -19,6 +19,7 @@ from sqlalchemy.exc import (
 
 from service.records import events
 from service.records.draft import Draft
+from service.records.prepared import execute
 from service.records.recording import Outcome, record
 
 Results = list[Outcome | Exception]
@@ -90,15 +91,17 @@ def _savepoint(connection: Connection) -> Iterator[None]:
     Trouble of the database itself ends the whole transaction: SQLite, its disk
     full, may have rolled it back already, and what came before would be lost.
     """
-    savepoint, noted = connection.begin_nested(), events.noted(connection)
+    noted = events.noted(connection)
+    execute(connection, "SAVEPOINT block")
     try:
         yield
     except BaseException as error:
         events.undone(connection, noted)
         if not is_of_the_database(error):
-            savepoint.rollback()
+            execute(connection, "ROLLBACK TO SAVEPOINT block")
+            execute(connection, "RELEASE SAVEPOINT block")
         raise
-    savepoint.commit()
+    execute(connection, "RELEASE SAVEPOINT block")
 
 
 def is_of_the_database(error: BaseException) -> bool:

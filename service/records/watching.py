@@ -23,7 +23,7 @@ from service.records.alarms import change, note
 from service.records.draft import Draft, Row
 from service.records.ids import Ulids
 from service.records.limits import limits_of
-from service.records.measures import contribution
+from service.records.prepared import prepared
 from service.records.statements import insert_missing
 from service.records.tables import alarms, batches, missions, runs, watches
 from service.times import Utc, parse_utc, shifted
@@ -31,15 +31,15 @@ from service.times import Utc, parse_utc, shifted
 _IDS = Ulids()
 SILENCE: QuantityName = "silence_s"
 
-# Put together once: each is run with every batch of a live spacecraft, or with a few of them.
+# Each is run with every batch of a live spacecraft, or with a few of them.
 _PLACE = (
     watches.c.spacecraft == bindparam("of_spacecraft"),
     watches.c.run == bindparam("of_run"),
 )
-_LOCKED = select(watches).where(*_PLACE).with_for_update()
+_LOCKED = prepared(select(watches).where(*_PLACE).with_for_update())
 _KEPT = ("time", "time_ns", "batch_id", "received", "state")
-_KEEP = update(watches).where(*_PLACE).values({name: bindparam(name) for name in _KEPT})
-_ACTIVE = (
+_KEEP = prepared(update(watches).where(*_PLACE).values({name: bindparam(name) for name in _KEPT}))
+_ACTIVE = prepared(
     select(alarms)
     .where(
         alarms.c.run == bindparam("of_run"),
@@ -55,7 +55,7 @@ _MET = (
     "current_severity",
     "returned_at",
 )
-_MEET = (
+_MEET = prepared(
     update(alarms)
     .where(alarms.c.id == bindparam("of_id"))
     .values({name: bindparam(name) for name in _MET})
@@ -121,24 +121,27 @@ class _Watch:
         """Look at every batch in order of time, and keep what was found."""
         assert self._row is not None
         latest = dict(self._row)
+        received, received_ns = latest["received"], parse_utc(latest["received"]).tai_ns
         for draft in self._drafts:
             assert draft.batch is not None
-            self._mind_the_gap(latest, draft.batch)
+            since_ns = draft.received_ns - received_ns
+            if self._run != LIVE:
+                since_ns = draft.batch["time_ns"] - latest["time_ns"]
+            self._mind_the_gap(since_ns * 1e-9, draft.batch)
             self._judge(draft)
             if draft.batch["time_ns"] >= latest["time_ns"]:
                 latest |= _latest_of(draft.batch)
-            latest["received"] = max(latest["received"], draft.batch["received"])
+            if draft.received_ns > received_ns:
+                received, received_ns = draft.batch["received"], draft.received_ns
+        latest["received"] = received
         kept = {name: window.to_json() for name, window in self._windows.items()}
         latest["state"] = msgspec.json.encode(kept).decode()
         place = {"of_spacecraft": latest["spacecraft"], "of_run": self._run}
-        self._connection.execute(_KEEP, place | {name: latest[name] for name in _KEPT})
+        _KEEP.run(self._connection, [place | {name: latest[name] for name in _KEPT}])
         self._board.save()
 
-    def _mind_the_gap(self, latest: Row, batch: Row) -> None:
+    def _mind_the_gap(self, gap_s: float, batch: Row) -> None:
         """Silence: live by the clock, elsewhere by the batches' own time; over with this batch."""
-        gap_s = (batch["time_ns"] - latest["time_ns"]) * 1e-9
-        if self._run == LIVE:
-            gap_s = _seconds(latest["received"], batch["received"])
         point = Point(gap_s, batch["time"], batch["id"])
         severity, bound = silence(self._limits, gap_s)
         now = batch["received"]
@@ -149,7 +152,7 @@ class _Watch:
 
     def _judge(self, draft: Draft) -> None:
         assert draft.batch is not None
-        parts = contribution(draft.result)
+        parts = draft.contribution
         for name, limits in self._limits.items():
             sample = _sample(name, parts, draft.result["time_ns"])
             if sample is None:
@@ -180,7 +183,7 @@ class Board:
         self._connection = connection
         self._place = {"spacecraft": spacecraft, "run": run}
         place = {"of_spacecraft": spacecraft, "of_run": run}
-        rows = [dict(row) for row in connection.execute(_ACTIVE, place).mappings()]
+        rows = _ACTIVE.read(connection, place)
         self._alarms: dict[str, Row] = {row["quantity"]: row for row in rows}
         self._latest: dict[str, Row] = {}
 
@@ -225,7 +228,7 @@ class Board:
             rows = [
                 {name: alarm[name] for name in _MET} | {"of_id": alarm["id"]} for alarm in found
             ]
-            self._connection.execute(_MEET, rows)
+            _MEET.run(self._connection, rows)
             self._latest.clear()
 
 
@@ -317,8 +320,7 @@ def _sample(name: QuantityName, parts: Row, time_ns: int) -> Sample | None:
 
 def _locked(connection: Connection, spacecraft: str, run: str) -> Row | None:
     place = {"of_spacecraft": spacecraft, "of_run": run}
-    row = connection.execute(_LOCKED, place).mappings().first()
-    return None if row is None else dict(row)
+    return next(iter(_LOCKED.read(connection, place)), None)
 
 
 def _latest_of(batch: Row) -> Row:

@@ -21,15 +21,43 @@ LIGHT_AU_PER_DAY = erfa.DAYSEC / erfa.AULT
 LIGHT_KM_PER_S = erfa.CMPS / 1000.0
 
 
+_STEPS_PER_DAY = 32
+"""Between so close places a cubic follows epv00 within 0.03 m and 1e-8 m/s."""
+
+
 @lru_cache(maxsize=64)
 def _earth(time: Utc) -> tuple[Vector, float, Vector]:
     """Earth from the Sun (3,) in au, its distance, and its barycentric velocity (3,) in c."""
+    tt1, tt2 = time.tt
+    whole = (tt1 - erfa.DJ00) * _STEPS_PER_DAY
+    number = math.floor(whole + tt2 * _STEPS_PER_DAY)
+    x = (whole - number) + tt2 * _STEPS_PER_DAY
+    # Lagrange's weights for steps -1, 0, 1 and 2.
+    before, after, beyond = x + 1.0, x - 1.0, x - 2.0
+    weights = (
+        -x * after * beyond / 6.0,
+        before * after * beyond / 2.0,
+        -before * x * beyond / 2.0,
+        before * x * after / 6.0,
+    )
+    place_and_velocity = np.dot(weights, _about(number))
+    place, velocity = place_and_velocity[:3], place_and_velocity[3:]
+    return read_only(place), math.hypot(*place.tolist()), read_only(velocity)
+
+
+@lru_cache(maxsize=256)
+def _about(number: int) -> Vector:
+    """Earth (4, 6) at the steps from one before to two after a numbered one."""
+    return np.stack([_at(number + step) for step in (-1, 0, 1, 2)])
+
+
+@lru_cache(maxsize=1024)
+def _at(number: int) -> Vector:
+    """Earth at a step: heliocentric place in au and barycentric velocity in c, (6,)."""
     # epv00 asks for TDB, which differs from TT by under 2 ms.  Its status only
     # tells that the date lies outside 1900 to 2100.
-    heliocentric, barycentric, _ = ufunc.epv00(*time.tt)
-    place = np.array(heliocentric["p"])
-    velocity = np.array(barycentric["v"]) / LIGHT_AU_PER_DAY
-    return read_only(place), math.hypot(*place.tolist()), read_only(velocity)
+    heliocentric, barycentric, _ = ufunc.epv00(erfa.DJ00, number / _STEPS_PER_DAY)
+    return np.concatenate([heliocentric["p"], barycentric["v"] / LIGHT_AU_PER_DAY])
 
 
 def observer_velocity(time: Utc, velocity_km_per_s: npt.ArrayLike | None) -> Vector:

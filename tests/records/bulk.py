@@ -1,5 +1,6 @@
 """Many results at once, through the writer's own statements, without their stars."""
 
+from service.records.measures import contribution
 from service.records import rollups
 from service.records.draft import Buckets
 from service.records.ids import Ulids
@@ -63,7 +64,7 @@ def put(operations, rows):
         )
         insert_all(connection, batches, [batch for batch, _ in rows])
         insert_all(connection, results, [result for _, result in rows])
-        rollups.add(connection, [(_buckets(batch), result) for batch, result in rows])
+        rollups.add(connection, [(_buckets(batch), contribution(result)) for batch, result in rows])
 
     operations.store.writer.change(write).result()
 
