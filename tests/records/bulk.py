@@ -1,9 +1,9 @@
 """Many results at once, through the writer's own statements, without their stars."""
 
-from service.records.measures import contribution
 from service.records import rollups
 from service.records.draft import Buckets
 from service.records.ids import Ulids
+from service.records.measures import contribution
 from service.records.statements import insert_all, insert_missing
 from service.records.tables import batches, results, runs
 from service.times import DAY_S, HOUR_S, parse_utc
