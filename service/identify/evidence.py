@@ -95,6 +95,12 @@ def log_prior(angle, kind):  # type: ignore[no-untyped-def]
     return math.log(density / (len(TILT_SCALES_DEG) + 1) / (2.0 * math.pi))
 
 
+LOG_PRIOR_AT_BEST = np.array(
+    [log_prior.py_func(0.0, kind) for kind in (PRIOR_ROTATION, PRIOR_DIRECTION)]  # type: ignore[no-untyped-call]
+)
+"""The largest log density of an attitude, by the kind of prior."""
+
+
 @njit(cache=True, nogil=True)
 def log_positions(stars, square, log_det, reference_sigma_rad):  # type: ignore[no-untyped-def]
     """The attitude and the positions: Laplace's integral, averaged over the scales of noise."""
@@ -111,6 +117,22 @@ def log_positions(stars, square, log_det, reference_sigma_rad):  # type: ignore[
         else:
             total += math.exp(term - largest)
     return 1.5 * _LOG_2PI - 0.5 * log_det + largest + math.log(total / len(POSITION_SCALES))
+
+
+_LOG_EXACT = np.array(
+    [
+        log_positions.py_func(count, 0.0, 0.0, 1.0)  # type: ignore[no-untyped-call]
+        for count in range(_FEW + 1)
+    ]
+)
+
+
+@njit(cache=True, nogil=True)
+def log_exact_positions(stars, reference_sigma_rad):  # type: ignore[no-untyped-def]
+    """The attitude and the positions without residuals and det N: the most they weigh."""
+    if stars <= _FEW:
+        return _LOG_EXACT[stars] + (3 - 2 * stars) * math.log(reference_sigma_rad)
+    return log_positions(stars, 0.0, 0.0, reference_sigma_rad)
 
 
 @njit(cache=True, nogil=True)

@@ -223,18 +223,17 @@ def log_weight_of(seen, stars, match, t, count, square, log_det):  # type: ignor
 
 
 @njit(cache=True, nogil=True)
-def most_log(seen, stars, count, compared, shift):  # type: ignore[no-untyped-def]
+def most_log(seen, stars, count, compared):  # type: ignore[no-untyped-def]
     """What a hypothesis of `count` stars can weigh at most, but for det N.
 
-    That is without residual, at equal magnitudes; `compared` of its stars have
-    one.  The prior is that of an attitude off by `shift`.  With theta the angle
-    between any two of its stars, det N is at least sin^2 theta.
+    That is without residual, at equal magnitudes, of which `compared` of its stars
+    have one, and at the attitude presumed.
     """
     n = len(seen.observed)
     clutter = with_magnitude(seen) - compared
     return (
-        evidence.log_prior(shift, seen.prior_kind)
-        + evidence.log_positions(count, 0.0, 0.0, seen.reference_sigma)
+        evidence.LOG_PRIOR_AT_BEST[seen.prior_kind]
+        + evidence.log_exact_positions(count, seen.reference_sigma)
         + evidence.log_equal_magnitudes(compared)
         + evidence.log_clutter(n - count, count)
         - clutter * evidence.LOG_CLUTTER_SPAN

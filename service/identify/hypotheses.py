@@ -114,8 +114,9 @@ def consider(seen, stars, match, scratch, ledger, log_weight, count, rest, best)
     work = 3 * n
     if base < max(best, rest) - NEGLIGIBLE:
         return count, rest, best, work, not misfit
+    rare = _neighbours_are_rare(seen, stars)
     for k in range(n):
-        if fresh[k] < 0 or _sits_well(seen, stars, fresh, k, scratch):
+        if fresh[k] < 0 or (rare and _sits_well(seen, stars, fresh, k, scratch)):
             continue
         mine = fresh[k]
         fresh[k] = -1
@@ -150,27 +151,31 @@ def _names(match, row):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _sits_well(seen, stars, match, k, scratch):  # type: ignore[no-untyped-def]
-    """Whether a star fits so well, in place and magnitude, that it can hardly be clutter.
+def _neighbours_are_rare(seen, stars):  # type: ignore[no-untyped-def]
+    """Whether chance hardly ever puts a star of the zone within the widest scale of noise.
 
-    Chance puts a star of the zone within the widest scale of noise with the
-    probability rho 2 pi s^2; where that is as rare as e^-6, the hypothesis
-    without this star weighs less than about e^-8 of the one with it.
+    Its probability is rho 2 pi s^2; where that is as rare as e^-6, the hypothesis
+    without a star that sits well weighs less than about e^-8 of the one with it.
     """
     widest = evidence.POSITION_SCALES[-1] * seen.reference_sigma
-    if stars.log_density + math.log(2.0 * math.pi * widest * widest) > RARE:
-        return False
+    return stars.log_density + math.log(2.0 * math.pi * widest * widest) <= RARE
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _sits_well(seen, stars, match, k, scratch):  # type: ignore[no-untyped-def]
+    """Whether a star fits so well, in place and magnitude, that it can hardly be clutter."""
     # False where there is no magnitude, as with any comparison with NaN.
     if abs(seen.magnitude[k] - stars.magnitude[match[k]]) > NEAR_MAG:
         return False
-    t, r, v = scratch.t, scratch.references[k], seen.observed[k]
+    t, observed, references = scratch.t, seen.observed, scratch.references
+    r0, r1, r2 = references[k, 0], references[k, 1], references[k, 2]
     square = 0.0
     for i in range(3):
-        square += (v[i] - t[i, 0] * r[0] - t[i, 1] * r[1] - t[i, 2] * r[2]) ** 2
+        square += (observed[k, i] - t[i, 0] * r0 - t[i, 1] * r1 - t[i, 2] * r2) ** 2
     return square < (NEAR_SIGMAS * seen.sigma_rad[k]) ** 2
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _match_at(seen, stars, t, first, second):  # type: ignore[no-untyped-def]
     """Match every observed star at an attitude: its nearest zone star, and the second-nearest."""
     n = len(seen.observed)

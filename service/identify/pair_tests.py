@@ -103,7 +103,7 @@ def cast_votes(  # type: ignore[no-untyped-def]
                     continue
                 if (
                     look_at_difference
-                    and abs(observed_difference - pair_difference[k]) > difference_tolerance
+                    and abs(observed_difference - abs(pair_difference[k])) > difference_tolerance
                 ):
                     continue
                 a, b = pair_brighter[k], pair_dimmer[k]

@@ -202,6 +202,7 @@ def scene_of(
         grid_start=guide.grid.start,
         grid_rows=guide.grid.rows,
         grid_direction=guide.grid.direction,
+        voxels=np.empty((0, 0), np.uint8),
         axis=np.zeros(3),
         least=0.0,
         most=math.pi,

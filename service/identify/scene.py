@@ -46,6 +46,7 @@ class Stars(NamedTuple):
     grid_start: Any
     grid_rows: Any
     grid_direction: Any
+    voxels: Any
     axis: Any
     least: Any
     most: Any
@@ -54,13 +55,18 @@ class Stars(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """The zone's pair index, as in `sky.pairs`."""
+    """The zone's pair index, as in `sky.pairs`, and its polar differences, as in `sky.zones`.
+
+    Those are about the zone's own axis, which lies `off_axis` radians from the exact one.
+    """
 
     separation: Any
     brighter: Any
     dimmer: Any
     bin_start: Any
     bins_per_rad: Any
+    polar_difference: Any
+    off_axis: Any
 
 
 class Scratch(NamedTuple):

@@ -50,8 +50,8 @@ def two_stars(  # type: ignore[no-untyped-def]
                     compared += 1
             # At no shift; that of a candidate takes the prior's place.
             most = (
-                most_log(seen, stars, 2, compared, 0.0)
-                - evidence.log_prior(0.0, seen.prior_kind)
+                most_log(seen, stars, 2, compared)
+                - evidence.LOG_PRIOR_AT_BEST[seen.prior_kind]
                 - math.log(sine)
             )
             for c in range(first_pair[x, y], last_pair[x, y]):

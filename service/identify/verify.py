@@ -17,7 +17,7 @@ from service.identify.identification import Identification, Integers, Outcome
 from service.identify.scene import Pairs, Seen, Stars, log_density
 from service.identify.search import search
 from service.identify.starid import MAX_RIVALS, Sighting, identify_by_votes
-from service.vectors import Vector
+from service.vectors import Vector, separation_deg
 
 UNIQUE_PROBABILITY = 0.999
 
@@ -106,6 +106,7 @@ def scene_of(sighting: Sighting) -> tuple[Seen, Stars, Pairs]:
         grid_start=zone.grid.start,
         grid_rows=zone.grid.rows,
         grid_direction=zone.grid.direction,
+        voxels=zone.voxels,
         axis=aim.axis,
         least=least,
         most=most,
@@ -116,6 +117,12 @@ def scene_of(sighting: Sighting) -> tuple[Seen, Stars, Pairs]:
         seen,
         stars,
         Pairs(
-            pairs.separation_rad, pairs.brighter, pairs.dimmer, pairs.bin_start, pairs.bins_per_rad
+            pairs.separation_rad,
+            pairs.brighter,
+            pairs.dimmer,
+            pairs.bin_start,
+            pairs.bins_per_rad,
+            zone.polar_difference_rad,
+            math.radians(separation_deg(zone.aim.axis, aim.axis)),
         ),
     )

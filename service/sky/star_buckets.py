@@ -17,6 +17,7 @@ from service.vectors import Vector, read_only
 
 CELL = 0.004
 """Width of a cell, about 0.23 deg at the middle of a face."""
+_PER_CELL = 1.0 / CELL
 EDGE = 0.03
 """How far, in face coordinates, a star may stand over the edge of a face and still be on it."""
 BUCKETS_PER_STAR = 4
@@ -53,8 +54,8 @@ def build_star_buckets(direction: Vector) -> StarBuckets:
         u = direction[front, (axis + 1) % 3] / depth[front]
         v = direction[front, (axis + 2) % 3] / depth[front]
         on = (np.abs(u) <= 1.0 + EDGE) & (np.abs(v) <= 1.0 + EDGE)
-        cell_u = np.floor(u[on] / CELL).astype(np.int64)
-        cell_v = np.floor(v[on] / CELL).astype(np.int64)
+        cell_u = np.floor(u[on] * _PER_CELL).astype(np.int64)
+        cell_v = np.floor(v[on] * _PER_CELL).astype(np.int64)
         row_of.append(front[on])
         bucket_of.append((face * _FACE ^ cell_u * _U ^ cell_v * _V) & (buckets - 1))
     bucket = np.concatenate(bucket_of)
@@ -70,7 +71,7 @@ def build_star_buckets(direction: Vector) -> StarBuckets:
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def cells_about(x, y, z, gate):  # type: ignore[no-untyped-def]
     """The face of a direction and the block of cells within `gate` radians of it.
 
@@ -83,15 +84,16 @@ def cells_about(x, y, z, gate):  # type: ignore[no-untyped-def]
         face, depth, p, q = 2 if y >= 0.0 else 3, ay, z, x
     else:
         face, depth, p, q = 4 if z >= 0.0 else 5, az, x, y
-    u, v = p / depth, q / depth
+    shallow = 1.0 / depth
+    u, v = p * shallow, q * shallow
     # The projection stretches an angle by at most 1 + u^2 + v^2.
     reach = gate * (1.0 + u * u + v * v)
     return (
         face,
-        math.floor((u - reach) / CELL),
-        math.floor((u + reach) / CELL),
-        math.floor((v - reach) / CELL),
-        math.floor((v + reach) / CELL),
+        math.floor((u - reach) * _PER_CELL),
+        math.floor((u + reach) * _PER_CELL),
+        math.floor((v - reach) * _PER_CELL),
+        math.floor((v + reach) * _PER_CELL),
     )
 
 

@@ -22,6 +22,7 @@ from service.sky.pairs import PairIndex, build_pairs, separation_rad
 from service.sky.run_catalog import RunCatalog
 from service.sky.shelf import Shelf
 from service.sky.star_buckets import StarBuckets, build_star_buckets
+from service.sky.star_voxels import Bits, build_star_voxels
 from service.vectors import (
     Vector,
     angle_between_deg,
@@ -67,8 +68,8 @@ class Zone:
 
     `star` holds the rows in the run catalog, ascending; `direction` (n, 3) and
     `magnitude_mag` belong to them.  In a band `polar_rad` (n,) are the stars'
-    angles to the axis, and `polar_difference_rad` (NTOT,) how far those of a pair
-    lie apart, to a few digits; in a cap there are none.
+    angles to the axis, and `polar_difference_rad` (NTOT,) that of a pair's brighter
+    star less that of its dimmer, to a few digits; in a cap there are none.
     """
 
     mission: str
@@ -80,6 +81,7 @@ class Zone:
     magnitude_mag: Vector
     pairs: PairIndex
     grid: StarBuckets
+    voxels: Bits
     polar_rad: Vector
     polar_difference_rad: npt.NDArray[np.float32]
 
@@ -88,7 +90,7 @@ class Zone:
         """Bytes held."""
         parts = (
             *(self.star, self.direction, self.magnitude_mag, self.pairs, self.grid),
-            *(self.polar_rad, self.polar_difference_rad),
+            *(self.voxels, self.polar_rad, self.polar_difference_rad),
         )
         return sum(part.nbytes for part in parts)
 
@@ -160,6 +162,7 @@ def build_zone(
         magnitude_mag=read_only(run_catalog.magnitude_mag[star]),
         pairs=pairs,
         grid=build_star_buckets(direction),
+        voxels=build_star_voxels(direction),
         polar_rad=read_only(polar),
         polar_difference_rad=read_only(difference),
     )
@@ -170,7 +173,7 @@ def _polar_angles(direction, axis, brighter, dimmer, polar, difference):  # type
     for row in range(len(direction)):
         polar[row] = separation_rad(direction[row], axis)
     for k in range(len(brighter)):
-        difference[k] = abs(polar[brighter[k]] - polar[dimmer[k]])
+        difference[k] = polar[brighter[k]] - polar[dimmer[k]]
 
 
 def counts_within(zone: Zone, aim: Aim) -> tuple[int, int]:

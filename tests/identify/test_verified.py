@@ -21,6 +21,7 @@ from service.missions.mission import load_missions
 from service.simulate.paper.printed import the_paper
 from service.simulate.paper.views import EPOCH, batch_of, draw_zone
 from service.sky.star_buckets import build_star_buckets, nearest
+from service.sky.star_voxels import build_star_voxels
 from service.vectors import ARCSEC_PER_RADIAN, from_ra_dec, unit
 
 VIEWS = 60
@@ -213,7 +214,8 @@ def scene_of(direction):
     grid = build_star_buckets(direction)
     return Stars(
         direction, np.zeros(len(direction)), grid.start, grid.rows, grid.direction,
-        np.array([0.0, 0.0, 1.0]), 0.0, math.pi, np.full(len(direction), -1.0), 0.0,
+        build_star_voxels(direction), np.array([0.0, 0.0, 1.0]), 0.0, math.pi,
+        np.full(len(direction), -1.0), 0.0,
     )  # fmt: skip
 
 
