@@ -39,7 +39,6 @@ from service.vectors import (
     ARCSEC_PER_RADIAN,
     Matrix,
     Vector,
-    matrix_from_quaternion,
     quaternion_from_matrix,
     separation_deg,
 )
@@ -476,9 +475,7 @@ def _warnings(
         )
     if looked_about is None:
         return warnings
-    attitude = (
-        looked_about.attitude if solution is None else matrix_from_quaternion(solution.quaternion)
-    )
+    attitude = looked_about.attitude if solution is None else solution.matrix
     if solution is not None:
         warnings += _doubts(solution, attitude, mission, presumed)
     for each in trackers:

@@ -824,7 +824,7 @@ class Operations:
         limits are held against the run (see `watch_run`).
         """
         row = {"id": self._ids.new(), "run": _run_name(run), "name": name, "lines_total": total}
-        replay = Replay(self.store, self.submit_many, lambda: utc_now().text, row, check)
+        replay = Replay(self.store, self._intake.begin_many, lambda: utc_now().text, row, check)
         with self._replays_lock:
             if self._closing:
                 raise Stopping("the service is stopping")

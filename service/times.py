@@ -143,8 +143,10 @@ def unix_seconds(tai_ns: npt.ArrayLike) -> npt.NDArray[np.float64]:
 def utc_of_unix(unix_s: float) -> Utc:
     """The moment of a POSIX time, to the microsecond."""
     moment = datetime.fromtimestamp(unix_s, UTC)
-    second = moment.second + moment.microsecond / 1e6
-    return _from_fields(moment.date(), moment.hour, moment.minute, second)
+    day, hour, minute = moment.date(), moment.hour, moment.minute
+    found = _from_fields(day, hour, minute, moment.second + moment.microsecond / 1e6)
+    vars(found)["_fields"] = day, hour, minute, moment.second, moment.microsecond * 1000
+    return found
 
 
 def shifted(moment: Utc, seconds: float) -> Utc:

@@ -347,7 +347,7 @@ def solve(b, r, sigma_rad, worst_rad, quaternions, covariance, squares, sums):  
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def fit(b, r, sigma_rad, worst_rad, chosen):  # type: ignore[no-untyped-def]
     """All that `solve` gives, in one call and in the units that are shown.
 

@@ -2,8 +2,9 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 
-from service.vectors import Matrix, Vector
+from service.vectors import Matrix, Vector, matrix_from_quaternion
 
 
 class NoAttitude(StrEnum):
@@ -54,3 +55,8 @@ class AttitudeSolution:
     quest: Vector
     triad_quest_angle_arcsec: float
     trackers: tuple[TrackerFit, ...]
+
+    @cached_property
+    def matrix(self) -> Matrix:
+        """The attitude matrix (3, 3): body components = this @ inertial components."""
+        return matrix_from_quaternion(self.quaternion)

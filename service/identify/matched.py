@@ -9,7 +9,7 @@ SUN_SCHWARZSCHILD_AU = 1.97412574336e-8
 """The Sun's gravitational radius, as ERFA has it."""
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def matched_vectors(  # type: ignore[no-untyped-def]
     direction_body, sigma_rad, star, catalog_direction, velocity, sun_distance_au
 ):

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from service.errors import BadBatch, Fault, shown_value
 from service.identify.identification import Identification, Integers, Outcome
 from service.identify.match_groups import MAX_EDGES, keep_largest_groups
-from service.identify.pair_tests import cast_votes, count_votes, tally
+from service.identify.pair_tests import cast_votes, count_votes, tally, tally_aside
 from service.missions.mission import Tests, Tolerances
 from service.sky.guide import Guide
 from service.sky.zones import Aim, Zone
@@ -25,6 +25,9 @@ Tallies = npt.NDArray[np.int32]
 MAX_RIVALS = 20
 MAX_COMPARISONS = 30_000_000
 """Observed with candidate pairs, for one tracker: a second or two."""
+
+MUCH = 10_000_000
+"""Stars squared times candidate pairs: beyond it votes take a good part of a millisecond."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,8 @@ def identify_by_votes(sighting: Sighting) -> Identification:
     if n * (n - 1) // 2 * zone.pairs.count > MAX_COMPARISONS:
         _refuse_endless(sighting)
     given = sighting.direction, sighting.magnitude_mag, *votes_arguments(sighting)
-    votes, voted, counts, found, any_tie = tally(zone.star, *given)
+    count = tally_aside if n * n * zone.pairs.count > MUCH else tally
+    votes, voted, counts, found, any_tie = count(zone.star, *given)
     bounded = False
     if tests.match_groups:
         bounded = _keep_groups(given, votes)

@@ -74,7 +74,7 @@ def _corrected(
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _to_body(  # type: ignore[no-untyped-def]
     direction,  # (n, 3) in tracker axes
     body_from_tracker,

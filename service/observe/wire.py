@@ -265,7 +265,9 @@ def prior_of(
 ) -> APriori:
     """The a priori knowledge as the core takes it; the Sun's direction may stand beside it too."""
     if isinstance(prior, QuaternionIn):
-        return QuaternionPrior(read_only(unit(prior.quaternion)))
+        # By plain numbers: numpy takes as long for four as for a thousand.
+        norm = math.sqrt(sum(part * part for part in prior.quaternion))
+        return QuaternionPrior(_array([part / norm for part in prior.quaternion]))
     if isinstance(prior, BoresightIn):
         return BoresightPrior(prior.boresight.ra_deg, prior.boresight.dec_deg)
     sun = prior.sun_vector or sun_vector
@@ -276,7 +278,7 @@ def prior_of(
 
 
 def _array(values: Iterable[Any]) -> Vector:
-    return read_only(np.array(values, dtype=np.float64))
+    return read_only(np.array(values, np.float64))
 
 
 def _optional_array(values: Iterable[float] | None) -> Vector | None:
@@ -288,7 +290,7 @@ _NO_VECTOR = (math.nan, math.nan, math.nan)
 
 def _tracker_stars(tracker: TrackerIn) -> TrackerStars:
     stars = tracker.stars
-    vector = np.array([star.vector or _NO_VECTOR for star in stars], dtype=np.float64)
+    vector = np.array([star.vector or _NO_VECTOR for star in stars], np.float64).reshape(-1, 3)
     # A number that is absent becomes NaN by numpy's reading of None.
     numbers = _array(
         [
@@ -301,7 +303,8 @@ def _tracker_stars(tracker: TrackerIn) -> TrackerStars:
     )
     return TrackerStars(
         tracker=tracker.tracker,
-        vector=read_only(unit(vector.reshape(-1, 3))),
+        # Each has a norm near one, or is NaN: nothing is divided by zero.
+        vector=read_only(vector / np.sqrt((vector * vector).sum(axis=1, keepdims=True))),
         angles_deg=numbers[:2].T,
         magnitude_mag=numbers[2],
         time_offset_s=numbers[3],

@@ -66,6 +66,8 @@ class Desk:
         self._changed = threading.Condition()
         self._active = 0
         self._moved_s = 0.0
+        self._quiet = threading.Event()
+        self._quiet.set()
         self._closing = False
         self._threads = [
             threading.Thread(target=self._work, name=f"desk-{number}", daemon=True)
@@ -88,9 +90,14 @@ class Desk:
             if len(self._new) + len(self._ready) >= MAX_WAITING:
                 raise Busy(f"{MAX_WAITING} batches are waiting to be worked on", RETRY_AFTER_S)
             self._new.append(order)
+            self._quiet.clear()
             if not self._active:
                 self._changed.notify()
         return order.done
+
+    def let_pass(self, seconds: float) -> None:
+        """Wait until nothing lies here, but no longer than so; for whoever has more time."""
+        self._quiet.wait(seconds)
 
     def close(self) -> None:
         """Refuse new orders, work through those that wait, and end the threads."""
@@ -108,6 +115,8 @@ class Desk:
             finally:
                 with self._changed:
                     self._active -= 1
+                    if not (self._active or self._new or self._ready):
+                        self._quiet.set()
                     if self._closing:
                         self._changed.notify_all()
 

@@ -41,6 +41,9 @@ MAX_KEY_LENGTH = 255
 PROCESSOR_WAIT_S = 5.0
 """A batch takes a millisecond: whoever waits longer stands behind a pile of the worst ones."""
 
+LET_PASS_S = 0.002
+"""Before each of many batches those that came one by one have so long to be done with."""
+
 log = logging.getLogger(__name__)
 
 Observer = Callable[[Acquisition], None]
@@ -95,6 +98,10 @@ class Intake:
 
     def submit_many(self, submissions: Sequence[Submission]) -> Answers:
         """`submit` of each in one transaction; an error stands in the place of what is refused."""
+        return self.begin_many(submissions)()
+
+    def begin_many(self, submissions: Sequence[Submission]) -> Callable[[], Answers]:
+        """`submit_many` as far as the writer's queue; to call what it gives waits for the rest."""
         with self._store.reading() as connection:
             registry = look_up(connection, {identity_of(each.batch) for each in submissions})
             holders = [
@@ -105,20 +112,26 @@ class Intake:
             stored = stored_answers(connection, repeats)
         # The connection is given back: a moment of the database that is held on to for as long
         # as five hundred batches take keeps SQLite from ever shortening its log.
-        found = [
-            holder or self._draft_or_error(each)
-            for holder, each in zip(holders, submissions, strict=True)
-        ]
-        written = iter(self._write([each for each in found if isinstance(each, Draft)]))
-        answers: Answers = []
-        for one in found:
-            if isinstance(one, Draft):
-                answers.append(next(written))
-            elif isinstance(one, Taken):
-                answers.append(Answered(one.result_id, stored[one.result_id], replayed=True))
-            else:
-                answers.append(one)
-        return answers
+        found: list[Draft | Taken | AcquisitionError] = []
+        for holder, each in zip(holders, submissions, strict=True):
+            self._desk.let_pass(LET_PASS_S)
+            found.append(holder or self._draft_or_error(each))
+        drafts = [each for each in found if isinstance(each, Draft)]
+        finish = self._begin_writing(drafts, patient=True)
+
+        def finished() -> Answers:
+            written = iter(_decided(finish()))
+            answers: Answers = []
+            for one in found:
+                if isinstance(one, Draft):
+                    answers.append(next(written))
+                elif isinstance(one, Taken):
+                    answers.append(Answered(one.result_id, stored[one.result_id], replayed=True))
+                else:
+                    answers.append(one)
+            return answers
+
+        return finished
 
     def what_if(self, id: str, options: OptionsIn, *, record: bool, adopt: bool) -> Answered:
         """Run a recorded batch again; `options` replace what they name of the result's own."""
@@ -222,28 +235,33 @@ class Intake:
             return AcquisitionError("the fault is on the service's side; it is logged")
 
     def _write(self, drafts: Sequence[Draft]) -> Answers:
-        answers: Answers = []
-        for outcome in self._written(drafts):
-            # Neither is an answer to the batch: both say that nothing was decided about it.
-            if isinstance(outcome, Busy) or not isinstance(outcome, Answered | AcquisitionError):
-                raise outcome
-            answers.append(outcome)
-        return answers
+        return _decided(self._written(drafts))
 
     def _written(self, drafts: Sequence[Draft]) -> Results:
         """What became of each draft, when all are recorded."""
+        return self._begin_writing(drafts)()
+
+    def _begin_writing(
+        self, drafts: Sequence[Draft], patient: bool = False
+    ) -> Callable[[], Results]:
+        """Queue drafts for one transaction; to call what it gives waits for that."""
         if not drafts:
-            return []
+            return list
         handed = Handed(time.perf_counter_ns(), len(drafts))
         for draft in drafts:
             draft.handed = handed
-        outcomes = self._store.writer.record(drafts).result()
-        for draft, outcome in zip(drafts, outcomes, strict=True):
-            is_new = isinstance(outcome, Answered) and not outcome.replayed
-            # A what-if looks at the same stars again: there is nothing new to observe.
-            if is_new and draft.batch is not None:
-                self._tell(draft.acquisition)
-        return outcomes
+        future = self._store.writer.record(drafts, patient)
+
+        def written() -> Results:
+            outcomes = future.result()
+            for draft, outcome in zip(drafts, outcomes, strict=True):
+                is_new = isinstance(outcome, Answered) and not outcome.replayed
+                # A what-if looks at the same stars again: there is nothing new to observe.
+                if is_new and draft.batch is not None:
+                    self._tell(draft.acquisition)
+            return outcomes
+
+        return written
 
     def _tell(self, acquisition: Acquisition | None) -> None:
         if acquisition is None:
@@ -254,6 +272,16 @@ class Intake:
             except Exception:
                 # The batch is recorded and its answer due, whoever looks on.
                 log.exception("an observer failed")
+
+
+def _decided(outcomes: Results) -> Answers:
+    answers: Answers = []
+    for outcome in outcomes:
+        # Neither is an answer to the batch: both say that nothing was decided about it.
+        if isinstance(outcome, Busy) or not isinstance(outcome, Answered | AcquisitionError):
+            raise outcome
+        answers.append(outcome)
+    return answers
 
 
 def mission_in_input(missions: Mapping[str, Mission], name: str) -> Mission:

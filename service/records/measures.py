@@ -3,14 +3,9 @@
 import math
 from typing import Any
 
-import numpy as np
-
 from service.acquire import Acquisition
 from service.records.tables import COUNTS, MAXIMA, MEASURED, MINIMA, SUMS
-from service.vectors import (
-    matrix_from_quaternion,
-    separation_deg,
-)
+from service.vectors import separation_deg
 
 Row = dict[str, Any]
 
@@ -35,14 +30,13 @@ def magnitude_offset_mag(acquisition: Acquisition) -> float | None:
     None where no unique star has a magnitude.
     """
     catalog_mag = acquisition.run_catalog.magnitude_mag
-    offsets = [
-        each.corrected.magnitude_mag[unique] - catalog_mag[each.identification.star[unique]]
-        for each in acquisition.trackers
-        if (unique := each.identification.unique).any()
-    ]
-    offset = np.concatenate(offsets) if offsets else np.empty(0)
-    offset = offset[~np.isnan(offset)]
-    return float(offset.mean()) if len(offset) else None
+    offsets = []
+    for each in acquisition.trackers:
+        star, seen_mag = each.identification.star, each.corrected.magnitude_mag
+        # Rows without a star take the last one's; they are passed over.
+        known = zip(star.tolist(), seen_mag.tolist(), catalog_mag[star].tolist(), strict=True)
+        offsets += [mag - known_mag for row, mag, known_mag in known if row >= 0 and mag == mag]
+    return math.fsum(offsets) / len(offsets) if offsets else None
 
 
 def a_priori_angle_deg(acquisition: Acquisition) -> float | None:
@@ -54,7 +48,7 @@ def a_priori_angle_deg(acquisition: Acquisition) -> float | None:
     if acquisition.solution is None or acquisition.presumed is None:
         return None
     presumed = acquisition.presumed
-    attitude = matrix_from_quaternion(acquisition.solution.quaternion)
+    attitude = acquisition.solution.matrix
     if presumed.known_axis is not None:
         axis = acquisition.mission.axis_body
         return float(separation_deg(attitude.T @ axis, presumed.known_axis))

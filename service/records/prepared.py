@@ -10,6 +10,7 @@ name.
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import chain
 from operator import itemgetter
 from typing import Any
 
@@ -18,6 +19,9 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import DBAPIError
 
 Row = dict[str, Any]
+
+ROWS_AT_ONCE = (64, 8)
+"""Few sizes, so that the driver keeps what it made of each statement."""
 
 _STYLES = {"sqlite": (sqlite, "qmark"), "postgresql": (postgresql, "pyformat")}
 
@@ -41,6 +45,28 @@ class Prepared:
         take = itemgetter(*names)
         with _reported(connection, sql) as driver:
             driver.executemany(sql, map(take, rows) if len(names) > 1 else zip(map(take, rows)))
+
+    def insert(self, connection: Connection, rows: Sequence[Row]) -> None:
+        """`run` of an INSERT that ends with its values, on SQLite of many rows at a time.
+
+        The driver lets go of the interpreter's lock with every step, and while
+        others compute it takes longer to get that back than to write a row.
+        """
+        if connection.dialect.name != "sqlite" or len(rows) < ROWS_AT_ONCE[-1]:
+            self.run(connection, rows)
+            return
+        sql, names = self._sql("sqlite")
+        one_more = ", (" + ", ".join("?" * len(names)) + ")"
+        values = list(map(itemgetter(*names), rows))
+        done = 0
+        with _reported(connection, sql) as driver:
+            for count in ROWS_AT_ONCE:
+                many = sql + one_more * (count - 1)
+                while len(values) - done >= count:
+                    part = values[done : done + count]
+                    driver.execute(many, list(chain.from_iterable(part)))
+                    done += count
+            driver.executemany(sql, values[done:])
 
     def read(self, connection: Connection, values: Row) -> list[Row]:
         """The rows that the statement gives."""

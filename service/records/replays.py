@@ -5,6 +5,8 @@ import logging
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
@@ -25,7 +27,7 @@ from service.records.draft import Answered, Row
 from service.records.store import Store
 from service.records.tables import replays
 
-CHUNK_LINES = 250
+CHUNK_LINES = 64
 """Few enough that a single post, which waits for one chunk at most, is not kept waiting."""
 MAX_ERRORS_KEPT = 1_000
 MAX_LISTED = 100
@@ -39,8 +41,20 @@ COUNTED = ("new", "repeated", "observed", "unique", "ambiguous", "unmatched", "a
 
 log = logging.getLogger(__name__)
 
-SubmitMany = Callable[[Sequence[Submission]], list[Answered | AcquisitionError]]
+Answers = list[Answered | AcquisitionError]
+BeginMany = Callable[[Sequence[Submission]], Callable[[], Answers]]
 Numbered = tuple[int, bytes]
+
+
+@dataclass(frozen=True)
+class _Begun:
+    """A chunk that is being written: its last line, and its submissions with their lines."""
+
+    last: int
+    refused: list[tuple[int, Exception]]
+    numbers: list[int]
+    submissions: list[Submission]
+    finish: Callable[[], Answers]
 
 
 def read_replay(connection: Connection, id: str) -> Row:
@@ -108,19 +122,20 @@ class Replay:
     def __init__(
         self,
         store: Store,
-        submit_many: SubmitMany,
+        begin_many: BeginMany,
         now: Callable[[], str],
         row: Row,
         check: Callable[[Submission], None],
     ) -> None:
         self._store = store
-        self._submit_many = submit_many
+        self._begin_many = begin_many
         self._now = now
         self._row = row
         self._check = check
         self._counts: Counter[str] = Counter()
         self._errors: list[Row] = []
         self._errors_changed = False
+        self._noting: Future[None] | None = None
         self._stopping = threading.Event()
         self._over = threading.Event()
 
@@ -152,7 +167,7 @@ class Replay:
 
         def begin(connection: Connection) -> None:
             connection.execute(insert(replays), row)
-            self._tell(connection)
+            events.note(connection, "replay", self._state(), run=row["run"])
 
         self._store.writer.change(begin).result()
 
@@ -169,13 +184,7 @@ class Replay:
     def _work(self, lines: Iterable[bytes]) -> None:
         state = "failed"
         try:
-            for chunk in _chunks(enumerate(lines, start=1)):
-                if self._stopping.is_set():
-                    state = "interrupted"
-                    return
-                self._take(chunk)
-                self._save(state="running", finished=None)
-            state = "done"
+            state = self._worked_through(lines)
         except Busy:
             state = "interrupted"
         except BadInput as error:
@@ -190,11 +199,27 @@ class Replay:
                 if close is not None:
                     close()
                 self._save(state=state, finished=self._now())
+                self._require_noted()
             finally:
                 self._over.set()
 
-    def _take(self, chunk: list[Numbered]) -> None:
-        numbers, submissions = [], []
+    def _worked_through(self, lines: Iterable[bytes]) -> str:
+        """The state in the end; while a chunk is being written the next is computed."""
+        begun: _Begun | None = None
+        try:
+            for chunk in _chunks(enumerate(lines, start=1)):
+                if self._stopping.is_set():
+                    return "interrupted"
+                before, begun = begun, self._begin(chunk)
+                self._finish(before)
+            return "done"
+        finally:
+            self._finish(begun)
+
+    def _begin(self, chunk: list[Numbered]) -> _Begun:
+        numbers: list[int] = []
+        submissions: list[Submission] = []
+        refused: list[tuple[int, Exception]] = []
         for number, line in chunk:
             if line.strip():
                 try:
@@ -203,24 +228,53 @@ class Replay:
                     submissions.append(submission)
                     numbers.append(number)
                 except AcquisitionError as error:
-                    self._refuse(number, error)
-        for number, outcome in zip(numbers, self._submit(submissions), strict=True):
+                    refused.append((number, error))
+        finish = self._patiently(submissions)
+        return _Begun(chunk[-1][0], refused, numbers, submissions, finish)
+
+    def _finish(self, chunk: _Begun | None) -> None:
+        """Count what came of a chunk, once it is recorded."""
+        if chunk is None:
+            return
+        try:
+            outcomes = chunk.finish()
+        except Stopping:
+            raise
+        except Busy:
+            outcomes = self._again(chunk.submissions)
+        for number, error in chunk.refused:
+            self._refuse(number, error)
+        for number, outcome in zip(chunk.numbers, outcomes, strict=True):
             if isinstance(outcome, AcquisitionError):
                 self._refuse(number, outcome)
             else:
                 self._count(outcome)
-        self._row["lines_done"] = chunk[-1][0]
+        self._row["lines_done"] = chunk.last
+        self._save(state="running", finished=None)
 
-    def _submit(self, submissions: Sequence[Submission]) -> list[Answered | AcquisitionError]:
+    def _patiently(self, submissions: Sequence[Submission]) -> Callable[[], Answers]:
         while True:
             try:
-                return self._submit_many(submissions)
+                return self._begin_many(submissions)
             except Stopping:
                 raise
             except Busy:
-                # A replay has time; whoever posts single batches goes first.
-                if self._stopping.wait(BUSY_PAUSE_S):
-                    raise
+                self._pause()
+
+    def _again(self, submissions: Sequence[Submission]) -> Answers:
+        while True:
+            self._pause()
+            try:
+                return self._patiently(submissions)()
+            except Stopping:
+                raise
+            except Busy:
+                continue
+
+    def _pause(self) -> None:
+        """Wait: a replay has time, and whoever posts single batches goes first."""
+        if self._stopping.wait(BUSY_PAUSE_S):
+            raise Busy("the replay is to stop", round(BUSY_PAUSE_S) or 1)
 
     def _count(self, outcome: Answered) -> None:
         answer = _COUNTED.decode(outcome.body)
@@ -228,9 +282,8 @@ class Replay:
         self._counts["attitudes"] += bytes(answer.attitude) != b"null"
         self._counts.update(answer.counts)
 
-    def _tell(self, connection: Connection) -> None:
-        state = replay_state({"finished": None} | self._row)
-        events.note(connection, "replay", state, run=self._row["run"])
+    def _state(self) -> Row:
+        return replay_state({"finished": None} | self._row)
 
     def _refuse(self, number: int, error: Exception) -> None:
         self._row["lines_refused"] += 1
@@ -246,17 +299,34 @@ class Replay:
             values["errors"] = json.dumps(self._errors)
         change = update(replays).where(replays.c.id == self._row["id"]).values(values)
         self._row |= values
+        # As it is now: it is written while the next chunk is at work.
+        state = self._state()
 
         def save(connection: Connection) -> None:
             connection.execute(change)
-            self._tell(connection)
+            events.note(connection, "replay", state, run=state["run"])
 
+        self._require_noted()
+        self._errors_changed = False
         try:
-            self._store.writer.change(save).result()
-            self._errors_changed = False
+            self._noting = self._store.writer.change(save)
+        except AcquisitionError as error:
+            self._not_noted(error)
+
+    def _require_noted(self) -> None:
+        """Wait until the progress that was last told is stored."""
+        noting, self._noting = self._noting, None
+        if noting is None:
+            return
+        try:
+            noting.result()
         except Exception as error:
-            # The next chunk says how far it is; the batches themselves are recorded.
-            log.warning("progress of replay %s not noted: %s", self._row["id"], error)
+            self._not_noted(error)
+
+    def _not_noted(self, error: Exception) -> None:
+        # The next chunk says how far it is; the batches themselves are recorded.
+        self._errors_changed = True
+        log.warning("progress of replay %s not noted: %s", self._row["id"], error)
 
 
 def _kept(problem: Row) -> Row:

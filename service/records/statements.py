@@ -45,7 +45,7 @@ def insert_all(connection: Connection, table: Table, rows: Sequence[Row]) -> Non
     if len(rows) >= COPIED_FROM and connection.dialect.name == "postgresql":
         _copy(connection, table, rows)
         return
-    _insert(table).run(connection, rows)
+    _insert(table).insert(connection, rows)
 
 
 def insert_missing(connection: Connection, table: Table, rows: Sequence[Row]) -> None:

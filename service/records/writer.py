@@ -2,7 +2,8 @@
 
 It takes whatever is queued, writes it in one transaction, commits, and only
 then answers those who wait: under load a commit is shared by many, alone it is
-waited for by nobody else.  There is no timer.
+waited for by nobody else.  There is no timer.  Chunks of a bulk load, which
+have time, are written by themselves, in turn with all else.
 """
 
 import logging
@@ -39,6 +40,8 @@ class Writer:
         self._engine = engine
         self._max_queued = max_queued
         self._queue: deque[Job] = deque()
+        self._patient: deque[Job] = deque()
+        self._has_waited = False
         self._queued = 0
         self._closing = False
         self._changed = threading.Condition()
@@ -47,18 +50,21 @@ class Writer:
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
         self._thread.start()
 
-    def record(self, drafts: Sequence[Draft]) -> "Future[Results]":
+    def record(self, drafts: Sequence[Draft], patient: bool = False) -> "Future[Results]":
         """Queue drafts for one transaction; raises `Busy` when too much is waiting.
+
+        Those of whoever is `patient` get a transaction of their own, and what
+        else is queued goes first.
 
         The future gives one outcome each, in order: an answer, stored; or the
         error that kept this draft, and no other, from being recorded.  Where
         the database itself fails, the future raises `Busy`.
         """
-        return self._put(Job(drafts=drafts))
+        return self._put(Job(drafts=drafts), self._patient if patient else self._queue)
 
     def change(self, change: Callable[[Connection], T]) -> "Future[T]":
         """Queue another change, which is kept whole or not at all, and may be made twice over."""
-        return self._put(Job(change=change))
+        return self._put(Job(change=change), self._queue)
 
     def require(self) -> None:
         """Raise `Stopping` unless what is queued will be written."""
@@ -73,7 +79,7 @@ class Writer:
             self._changed.notify()
         self._thread.join()
 
-    def _put(self, job: Job) -> "Future[Any]":
+    def _put(self, job: Job, queue: deque[Job]) -> "Future[Any]":
         # A request that is given up does not take its record back.
         job.done.set_running_or_notify_cancel()
         with self._changed:
@@ -82,18 +88,25 @@ class Writer:
             # A job that alone is larger than the queue is still taken by an empty one.
             if self._queued and self._queued + job.weight > self._max_queued:
                 raise Busy(f"{self._queued} records are waiting to be written")
-            self._queue.append(job)
+            queue.append(job)
             self._queued += job.weight
             self._changed.notify()
         return job.done
 
     def _take(self) -> list[Job]:
+        """What is written next, in one transaction; nothing when all is over."""
         with self._changed:
-            while not self._queue and not self._closing:
+            while not (self._queue or self._patient) and not self._closing:
                 self._changed.wait()
-            jobs = list(self._queue)
-            self._queue.clear()
-            self._queued = 0
+            # What has time waits for what has none, but for one transaction only.
+            if self._patient and (self._has_waited or not self._queue):
+                jobs = [self._patient.popleft()]
+                self._has_waited = False
+            else:
+                jobs = list(self._queue)
+                self._queue.clear()
+                self._has_waited = bool(self._patient)
+            self._queued -= sum(job.weight for job in jobs)
         return jobs
 
     def _run(self) -> None:
@@ -104,8 +117,9 @@ class Writer:
             # Empty after closing in order; else nobody shall wait for what nobody will write.
             with self._changed:
                 self._closing = True
-                left = list(self._queue)
+                left = [*self._queue, *self._patient]
                 self._queue.clear()
+                self._patient.clear()
             for job in left:
                 job.done.set_exception(Stopping("the writer has ended"))
 

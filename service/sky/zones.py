@@ -191,7 +191,7 @@ def counts_within(zone: Zone, aim: Aim) -> tuple[int, int]:
     return int(stars), int(pairs)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _counts_within(direction, axis, least, most, brighter, dimmer):  # type: ignore[no-untyped-def]
     inside = np.zeros(len(direction), np.bool_)
     stars = pairs = 0
