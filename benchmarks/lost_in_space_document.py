@@ -105,7 +105,7 @@ def ratios(rows: Sequence[Row]) -> list[str]:
     ]
 
 
-def document(rows: Sequence[Row], scenes: int, seed: int) -> tuple[str, dict[str, str]]:
+def document(rows: Sequence[Row], scenes: int, seed: int, turn: int) -> tuple[str, dict[str, str]]:
     """The page and its plots by file name."""
     pictures = {
         "lost-in-space-rates.svg": _plot(rows, "rates"),
@@ -144,7 +144,10 @@ V 7.5 when it holds an attitude against the sky, for noise shows such stars, tho
 pairs of them; the peers take one limit for both. Each is driven as its documents say
 (`benchmarks/lost_in_space_peers.py`). tetra3rs and cedar-solve take edge ratios off by 0.005, which
 a pixel of noise needs. cedar-solve and ruststartracker, which take milliseconds, get the first
-scenes only. Solvers take turns; times are of the process's own clock around one call from Python.
+scenes only. Solvers take turns in blocks of {turn} scenes, another going first in every block, each
+as it would be run on a stream of pictures: what it is told is made ready before the block, one
+scene that is not timed comes first, answers are judged after the block. Times are of the process's
+own clock around one call from Python.
 
 ## What came of it
 

@@ -64,7 +64,6 @@ def ours(
 
 def peers(run_catalog: RunCatalog, camera: Camera, position_px: float) -> list[Solver]:
     """Those that are installed."""
-    CACHE.mkdir(exist_ok=True)
     made = []
     if importlib.util.find_spec("tetra3rs"):
         made.append(tetra3rs_solver(run_catalog, camera))
@@ -76,6 +75,7 @@ def peers(run_catalog: RunCatalog, camera: Camera, position_px: float) -> list[S
 
 
 def _cached(name: str, run_catalog: RunCatalog, suffix: str) -> Path:
+    CACHE.mkdir(exist_ok=True)
     return CACHE / f"{name}-{run_catalog.digest.removeprefix('sha256:')[:16]}{suffix}"
 
 

@@ -49,23 +49,29 @@ class Count:
     ns: list[int] = field(default_factory=list)
 
     def take(self, solver: Solver, scenes: Sequence[tuple[Scene, int]], real: bool) -> None:
-        """Solve some scenes, each with its number of stars in the database."""
-        if scenes and not self.ns:
-            # The first call may compile.
-            solver.solve(solver.ready(scenes[0][0]))
+        """Solve some scenes one after the other, each with its number of stars in the database."""
+        if not scenes:
+            return
+        told = [solver.ready(scene) for scene, _ in scenes]
+        # Not timed: it may compile, and finds the caches as another solver has left them.
+        solver.solve(told[0])
         clock = time.process_time_ns
-        for scene, held in scenes:
-            told = solver.ready(scene)
+        results = []
+        for each in told:
             started = clock()
-            result = solver.solve(told)
+            result = solver.solve(each)
             self.ns.append(clock() - started)
-            attitude = solver.attitude(result)
-            is_right = attitude is not None and real and right(scene, attitude)
-            self.none += attitude is None
-            self.right += is_right
-            self.wrong += attitude is not None and not is_right
-            self.six += held >= SIX
-            self.right_of_six += is_right and held >= SIX
+            results.append(result)
+        for (scene, held), result in zip(scenes, results, strict=True):
+            self._judge(scene, held, solver.attitude(result), real)
+
+    def _judge(self, scene: Scene, held: int, attitude: Matrix | None, real: bool) -> None:
+        is_right = attitude is not None and real and right(scene, attitude)
+        self.none += attitude is None
+        self.right += is_right
+        self.wrong += attitude is not None and not is_right
+        self.six += held >= SIX
+        self.right_of_six += is_right and held >= SIX
 
 
 def right(scene: Scene, attitude: Matrix) -> bool:
