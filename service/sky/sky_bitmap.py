@@ -18,6 +18,12 @@ CELLS = 1248
 """Along an edge of the square: cells of 4.8 to 14 arcmin, 195 kB; a cache holds several."""
 SAMPLE_RAD = 6e-4
 """Discs are filled by points so far apart, less than the narrowest cell is wide."""
+RIM_RAD, RIM_SAMPLE_RAD = 1.5e-4, 1e-4
+"""A rim is drawn so far outside of a disc, by points so far apart.
+
+A cell whose corner only just reaches into the disc has more of the rim than that, for no corner
+is sharper than 45 deg; what is left, 6 arcsec, is for directions in single precision.
+"""
 
 Bits = npt.NDArray[np.uint8]
 
@@ -25,7 +31,7 @@ Bits = npt.NDArray[np.uint8]
 def build_sky_bitmap(direction: Vector, radius_rad: float) -> Bits:
     """The bits of unit vectors (n, 3), eight to a byte."""
     bits = np.zeros(CELLS * CELLS // 8, np.uint8)
-    _fill(direction, radius_rad + SAMPLE_RAD, bits)
+    _fill(direction, _disc(radius_rad), bits)
     return bits
 
 
@@ -51,9 +57,65 @@ def star_near(bits, level, x, y, z):  # type: ignore[no-untyped-def]
     return (bits[level, cell >> 3] >> (cell & 7)) & 1 != 0
 
 
-@njit(cache=True, nogil=True)
-def _fill(direction, radius, bits):  # type: ignore[no-untyped-def]
-    steps = int(radius / SAMPLE_RAD) + 1
+@njit(inline="always")
+def _single_cell(x, y, z):  # type: ignore[no-untyped-def]
+    """As `cell_of`, in single precision and with nothing that keeps it from many at a time."""
+    one, half, last = np.float32(1.0), np.float32(0.5 * CELLS), np.int32(CELLS - 1)
+    scale = one / (abs(x) + abs(y) + abs(z))
+    u, v = x * scale, y * scale
+    fold_u, fold_v = one - abs(v), one - abs(u)
+    fold_u = -fold_u if u < 0 else fold_u
+    fold_v = -fold_v if v < 0 else fold_v
+    u = fold_u if z < 0 else u
+    v = fold_v if z < 0 else v
+    cu = min(max(np.int32((u + one) * half), np.int32(0)), last)
+    cv = min(max(np.int32((v + one) * half), np.int32(0)), last)
+    return cu * np.int32(CELLS) + cv
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def cells_of_candidates(count, alpha, beta, gamma, pair, cell):  # type: ignore[no-untyped-def]
+    """The cells (count) of one point's places in many pairs of stars.
+
+    `pair` (6, m) holds the two directions of every pair, component by component;
+    the coefficients are those of the two and of their cross product.  All are in
+    single precision, which is far within what the bitmaps allow for.
+    """
+    x0, x1, x2, y0, y1, y2 = pair[0], pair[1], pair[2], pair[3], pair[4], pair[5]
+    for q in range(count):
+        cell[q] = _single_cell(
+            alpha * x0[q] + beta * y0[q] + gamma * (x1[q] * y2[q] - x2[q] * y1[q]),
+            alpha * x1[q] + beta * y1[q] + gamma * (x2[q] * y0[q] - x0[q] * y2[q]),
+            alpha * x2[q] + beta * y2[q] + gamma * (x0[q] * y1[q] - x1[q] * y0[q]),
+        )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def cells_of_points(count, coefficients, pair, q, cell):  # type: ignore[no-untyped-def]
+    """The cells (count) of many points' places, coefficients (3, count), in one pair of stars."""
+    x0, x1, x2, y0, y1, y2 = pair[0, q], pair[1, q], pair[2, q], pair[3, q], pair[4, q], pair[5, q]
+    z0, z1, z2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
+    alpha, beta, gamma = coefficients[0], coefficients[1], coefficients[2]
+    for s in range(count):
+        cell[s] = _single_cell(
+            alpha[s] * x0 + beta[s] * y0 + gamma[s] * z0,
+            alpha[s] * x1 + beta[s] * y1 + gamma[s] * z1,
+            alpha[s] * x2 + beta[s] * y2 + gamma[s] * z2,
+        )
+
+
+def _disc(radius_rad: float) -> Vector:
+    """Points (k, 2) of a disc and its rim, so close that no cell which it touches has none."""
+    steps = np.arange(-int(radius_rad / SAMPLE_RAD), int(radius_rad / SAMPLE_RAD) + 1) * SAMPLE_RAD
+    inner = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    rim_rad = radius_rad + RIM_RAD
+    turn = np.linspace(0.0, 2.0 * math.pi, int(2.0 * math.pi * rim_rad / RIM_SAMPLE_RAD) + 2)[1:]
+    rim = rim_rad * np.column_stack([np.cos(turn), np.sin(turn)])
+    return np.concatenate([inner[np.hypot(*inner.T) <= radius_rad], rim])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fill(direction, disc, bits):  # type: ignore[no-untyped-def]
     for row in range(len(direction)):
         star = direction[row]
         # Two directions across the star's.
@@ -66,14 +128,11 @@ def _fill(direction, radius, bits):  # type: ignore[no-untyped-def]
         p = np.cross(star, axis)
         p /= math.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
         q = np.cross(star, p)
-        for i in range(-steps, steps + 1):
-            for j in range(-steps, steps + 1):
-                a, b = i * SAMPLE_RAD, j * SAMPLE_RAD
-                if a * a + b * b > (radius + SAMPLE_RAD) ** 2:
-                    continue
-                cell = cell_of(
-                    star[0] + a * p[0] + b * q[0],
-                    star[1] + a * p[1] + b * q[1],
-                    star[2] + a * p[2] + b * q[2],
-                )
-                bits[cell >> 3] |= np.uint8(1 << (cell & 7))
+        for at in range(len(disc)):
+            a, b = disc[at, 0], disc[at, 1]
+            cell = cell_of(
+                star[0] + a * p[0] + b * q[0],
+                star[1] + a * p[1] + b * q[1],
+                star[2] + a * p[2] + b * q[2],
+            )
+            bits[cell >> 3] |= np.uint8(1 << (cell & 7))

@@ -19,8 +19,9 @@ from service.sky.pairs import build_pairs
 from service.sky.run_catalog import RunCatalog
 from service.sky.shelf import Shelf
 from service.sky.sky_bitmap import build_sky_bitmap
+from service.sky.sky_store import Store, lent, stored
 from service.sky.star_grid import build_star_grid
-from service.vectors import ARCSEC_PER_RADIAN, Vector, read_only
+from service.vectors import ARCSEC_PER_RADIAN, Vector
 
 BUCKET_RAD = 4.0 / ARCSEC_PER_RADIAN
 """Separations are found to this much."""
@@ -29,12 +30,15 @@ FURTHER_MAG = 1.0
 """Noise shows stars beyond the limit; so far beyond it they are matched, though not looked for."""
 CLASSES_BELOW_LIMIT_MAG = (2.5, 2.0, 1.5, 1.25, 1.0, 0.75, 0.5, 0.25)
 BITMAP_RADII_RAD = tuple(
-    arcsec / ARCSEC_PER_RADIAN for arcsec in (60.0, 140.0, 240.0, 400.0, 700.0, 1500.0)
+    arcsec / ARCSEC_PER_RADIAN
+    for arcsec in (60.0, 140.0, 190.0, 240.0, 310.0, 400.0, 530.0, 700.0, 1500.0)
 )
 PATCHES = 24
 """Along an edge of a face of the cube."""
 PATCH_RADIUS_RAD = math.sqrt(2.0) / PATCHES
 """From the middle of a patch to its corners, at most: that of the largest, at a face's middle."""
+BRIGHTEST_MAG, STEP_MAG = -2.0, 0.05
+"""Where the table of rows by magnitude begins, and its steps."""
 MAX_STARS = 60_000
 """Rows are kept in 16 bits."""
 MAX_PAIRS = 1_500_000
@@ -42,10 +46,13 @@ MAX_PAIRS = 1_500_000
 
 
 class Index(NamedTuple):
-    """The index as the kernels take it: every array fewer makes a call cheaper.
+    """The index as the kernels take it.
 
-    `stars` (n, 4) holds x, y, z and the magnitude; `pairs` (p, 2) the brighter
-    and the dimmer row; `class_edge` (c, 2) the faintest magnitude of a class,
+    `stars` (n, 4) holds x, y, z and the magnitude, `place` (n, 4) the same in single
+    precision, which is enough to look for stars, and `cell_place` as `cell_rows` has them;
+    `brighter` (k) how many are brighter than every step of the magnitude;
+    `pairs` (p, 2) the brighter and the dimmer row; `class_edge` (c, 2) the faintest
+    magnitude of a class,
     the limit for the last one, and the share of all pairs in it and those
     before; `face` (6, 5) the grid's box and offset.  `bits` has a bitmap for every
     radius, of the stars within the limit, then the same of all.  Pairs are of stars
@@ -62,6 +69,12 @@ class Index(NamedTuple):
     cell_rows: Any
     patch_start: Any
     patch_rows: Any
+    place: Any
+    cell_place: Any
+    brighter: Any
+
+
+ARRAYS = len(Index._fields)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,19 +85,20 @@ class SkyIndex:
     class and of a bucket of separation begin; `patch_start` and `patch_rows`
     list the stars within a field of view's reach of each patch, brightest
     first.  Pairs are looked for among stars to `limit_mag`; the attitudes that
-    they give are held against `FURTHER_MAG` more.  Everything is in `arrays`,
-    locked against writing.
+    they give are held against `FURTHER_MAG` more.  Everything is in
+    `store`, one block locked against writing, of which `arrays` are views.
     """
 
     run_catalog: str
     limit_mag: float
     radius_deg: float
+    store: Store
     arrays: Index
 
     @property
     def nbytes(self) -> int:
         """Bytes held."""
-        return sum(array.nbytes for array in self.arrays)
+        return self.store.nbytes
 
     @property
     def stars(self) -> int:
@@ -154,6 +168,7 @@ def build_sky_index(run_catalog: RunCatalog, limit_mag: float, radius_deg: float
     share = np.cumsum(np.bincount(pair_class, minlength=len(edge))) / max(pairs.count, 1)
     patch_start, patch_rows = _patches(direction, radius_deg)
     grid = build_star_grid(direction)
+    place = np.column_stack([direction, magnitude[:known]]).astype(np.float32)
     arrays = Index(
         stars=np.column_stack([direction, magnitude[:known]]),
         pairs=np.column_stack([pairs.brighter, pairs.dimmer])[order].astype(np.uint16),
@@ -171,10 +186,43 @@ def build_sky_index(run_catalog: RunCatalog, limit_mag: float, radius_deg: float
         cell_rows=grid.rows.astype(np.uint16),
         patch_start=patch_start,
         patch_rows=patch_rows,
+        place=place,
+        cell_place=place[grid.rows],
+        brighter=_brighter(magnitude[:known]),
     )
-    for array in arrays:
-        read_only(array)
-    return SkyIndex(run_catalog.digest, limit_mag, radius_deg, arrays)
+    store, views = stored(arrays)
+    return SkyIndex(run_catalog.digest, limit_mag, radius_deg, store, Index(*views))
+
+
+def _brighter(magnitude: Vector) -> npt.NDArray[np.int32]:
+    """How many stars are brighter than each step; none before the first, which bounds nothing."""
+    steps = int((magnitude[-1] - BRIGHTEST_MAG) / STEP_MAG) + 2 if len(magnitude) else 1
+    brighter = np.searchsorted(magnitude, BRIGHTEST_MAG + STEP_MAG * np.arange(max(steps, 1)))
+    brighter[0] = 0
+    return brighter.astype(np.int32)
+
+
+@njit(cache=True, nogil=True)
+def index_in(store):  # type: ignore[no-untyped-def]
+    """The index that a store holds; borrowed from its caller."""
+    # Of every array its first byte, the one past its last, and its rows.
+    head = lent(store, 0, (ARRAYS, 3), np.int64)
+    classes, levels = head[2, 2], head[4, 2]
+    return Index(
+        lent(store, head[0, 0], (head[0, 2], 4), np.float64),
+        lent(store, head[1, 0], (head[1, 2], 2), np.uint16),
+        lent(store, head[2, 0], (classes, (head[2, 1] - head[2, 0]) // 4 // classes), np.int32),
+        lent(store, head[3, 0], (classes, 2), np.float64),
+        lent(store, head[4, 0], (levels, (head[4, 1] - head[4, 0]) // levels), np.uint8),
+        lent(store, head[5, 0], (6, 5), np.int32),
+        lent(store, head[6, 0], (head[6, 2],), np.int32),
+        lent(store, head[7, 0], (head[7, 2],), np.uint16),
+        lent(store, head[8, 0], (head[8, 2],), np.int32),
+        lent(store, head[9, 0], (head[9, 2],), np.uint16),
+        lent(store, head[10, 0], (head[10, 2], 4), np.float32),
+        lent(store, head[11, 0], (head[11, 2], 4), np.float32),
+        lent(store, head[12, 0], (head[12, 2],), np.int32),
+    )
 
 
 def _patches(

@@ -271,7 +271,7 @@ def test_the_nearest_stars_are_those_of_brute_force(index, rng):
             order = np.argsort(chord)[:2]
             expected = [int(row) if chord[row] < gate else -1 for row in order]
             found = nearest_stars(
-                *(arrays.stars, arrays.face, arrays.cell_start, arrays.cell_rows),
+                *(arrays.cell_place, arrays.face, arrays.cell_start, arrays.cell_rows),
                 *(*p, gate, -9.0, 99.0),
             )
             assert [int(found[0]), int(found[1])] == expected

@@ -4,20 +4,30 @@ import math
 
 import numpy as np
 import pytest
+from numba import njit
 
 from service.missions.mission import RunCatalogSettings
 from service.sky.catalog import load_embedded
 from service.sky.run_catalog import build_run_catalog
 from service.sky.shelf import Shelf
-from service.sky.sky_bitmap import CELLS, build_sky_bitmap, star_near
+from service.sky.sky_bitmap import (
+    CELLS,
+    build_sky_bitmap,
+    cell_of,
+    cells_of_candidates,
+    cells_of_points,
+    star_near,
+)
 from service.sky.sky_index import (
     BUCKET_RAD,
     FURTHER_MAG,
     MAX_PAIR_DEG,
     build_sky_index,
+    index_in,
     patch_of,
     sky_index_for,
 )
+from service.sky.sky_store import LARGE_PAGE
 from service.vectors import angle_between_deg, unit
 
 LIMIT_MAG = 6.5
@@ -78,6 +88,70 @@ def test_a_bitmap_never_denies_a_star(rng):
         share = np.unpackbits(bits).mean()
         widened = len(direction) * math.pi * (radius + 7.0 / CELLS) ** 2 / (4.0 * math.pi)
         assert share < widened
+
+
+def test_the_rim_of_a_disc_is_never_denied_in_single_precision_either(rng):
+    """Many directions at once: what the search asks most often."""
+    direction = unit(rng.normal(size=(60, 3)) * rng.choice([1.0, 0.01], size=(60, 3)))
+    for radius in (1e-4, 9e-4, 7e-3):
+        bits = build_sky_bitmap(direction, radius)
+        for star in direction:
+            away = unit(np.cross(star, unit(rng.normal(size=(40, 3)))))
+            rim = star * math.cos(radius) + away * math.sin(radius)
+            other = unit(np.cross(rim, away))
+            pair = np.concatenate([rim.T, other.T]).astype(np.float32)
+            cell = np.empty(len(rim), np.int32)
+            scale = np.float32(rng.uniform(0.5, 2.0))
+            cells_of_candidates(len(rim), scale, np.float32(0.0), np.float32(0.0), pair, cell)
+            assert ((bits[cell >> 3] >> (cell & 7)) & 1).all()
+
+
+def test_many_points_of_one_candidate_lie_where_one_point_of_many_does(rng):
+    pair = np.concatenate([unit(rng.normal(size=(50, 3))).T, unit(rng.normal(size=(50, 3))).T])
+    pair = pair.astype(np.float32)
+    coefficients = rng.normal(size=(3, 8)).astype(np.float32)
+    of_points, of_candidates = np.empty(8, np.int32), np.empty(50, np.int32)
+    for q in range(50):
+        cells_of_points(8, coefficients, pair, q, of_points)
+        exact = coefficients.T.astype(float) @ np.array(
+            [pair[:3, q], pair[3:, q], np.cross(pair[:3, q].astype(float), pair[3:, q])]
+        )
+        for s in range(8):
+            cells_of_candidates(50, *coefficients[:, s], pair, of_candidates)
+            assert of_candidates[q] == of_points[s]
+            u, v = np.divmod(of_points[s], CELLS)
+            expected = np.divmod(cell_of(*exact[s]), CELLS)
+            # Beside an edge single precision may fall on the other side of it.
+            at_fold = {0, CELLS - 1} & {int(u), int(v), *map(int, expected)}
+            assert at_fold or max(abs(u - expected[0]), abs(v - expected[1])) <= 1
+
+
+def test_a_store_holds_the_index_as_it_is(index):
+    """Compiled code cuts the same arrays from the one block."""
+    assert index.store.ctypes.data % LARGE_PAGE == 0
+    assert not index.store.flags.writeable
+    for cut, array in zip(_cut(index.store), index.arrays, strict=True):
+        assert cut.dtype == array.dtype
+        assert np.array_equal(cut, array)
+        assert not array.flags.writeable
+
+
+@njit
+def _cut(store):
+    """Copies, for what is cut from a block is only borrowed."""
+    index = index_in(store)
+    return (
+        *(index.stars.copy(), index.pairs.copy(), index.offset.copy(), index.class_edge.copy()),
+        *(index.bits.copy(), index.face.copy(), index.cell_start.copy(), index.cell_rows.copy()),
+        *(index.patch_start.copy(), index.patch_rows.copy(), index.place.copy()),
+        *(index.cell_place.copy(), index.brighter.copy()),
+    )
+
+
+def test_single_precision_places_are_those_of_the_stars(index):
+    arrays = index.arrays
+    assert np.array_equal(arrays.place, arrays.stars.astype(np.float32))
+    assert np.array_equal(arrays.cell_place, arrays.place[arrays.cell_rows])
 
 
 def test_a_patch_lists_every_star_of_a_field_about_it_brightest_first(index, rng):

@@ -24,7 +24,7 @@ EDGE = 0.985
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def nearest_stars(  # type: ignore[no-untyped-def]
-    stars, faces, cell_start, cell_rows, x, y, z, gate, brightest, faintest
+    cell_place, faces, cell_start, cell_rows, x, y, z, gate, brightest, faintest
 ):
     """The two stars nearest to a direction of length one, within a gate and two magnitudes.
 
@@ -57,16 +57,14 @@ def nearest_stars(  # type: ignore[no-untyped-def]
     for cu in range(first_u, last_u + 1):
         base = faces[face, 4] + cu * size_v
         for at in range(cell_start[base + first_v], cell_start[base + last_v + 1]):
-            row = np.int64(cell_rows[at])
-            dx = stars[row, 0] - x
-            dy = stars[row, 1] - y
-            dz = stars[row, 2] - z
+            dx, dy, dz = cell_place[at, 0] - x, cell_place[at, 1] - y, cell_place[at, 2] - z
             chord2 = dx * dx + dy * dy + dz * dz
             if chord2 >= second:
                 continue
             # Written so that an unknown magnitude passes.
-            if stars[row, 3] < brightest or stars[row, 3] > faintest:
+            if cell_place[at, 3] < brightest or cell_place[at, 3] > faintest:
                 continue
+            row = np.int64(cell_rows[at])
             if chord2 < best:
                 second, other = best, nearest
                 best, nearest = chord2, row
@@ -76,26 +74,27 @@ def nearest_stars(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def faintest_star(index, magnitude, gate):  # type: ignore[no-untyped-def]
+def faintest_star(limit_mag, magnitude, gate):  # type: ignore[no-untyped-def]
     """How faint a point's star may be; of unknown magnitude none beyond the limit of pairs."""
-    return index.class_edge[-1, 0] if np.isnan(magnitude) else magnitude + gate
+    return limit_mag if np.isnan(magnitude) else magnitude + gate
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def fit(points, index, match, t, inverse):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def fit(points, stars, hand):  # type: ignore[no-untyped-def]
     """One Gauss-Newton step of T towards the matched stars.
 
     Returns chi^2 before the step and ln det N, the latter -inf where the
-    geometry gives no attitude.  `inverse` gets the covariance, radians^2.
+    geometry gives no attitude.  The covariance becomes that of the fit, radians^2.
     """
-    matrix = np.zeros((3, 3))
+    match, t, matrix, inverse = hand.match, hand.t, hand.matrix, hand.covariance
+    m00 = m11 = m22 = m01 = m02 = m12 = 0.0
     g0 = g1 = g2 = chi2 = 0.0
     moving = points.velocity[0] != 0.0 or points.velocity[1] != 0.0 or points.velocity[2] != 0.0
     for k in range(len(match)):
         row = match[k]
         if row < 0:
             continue
-        r0, r1, r2 = index.stars[row, 0], index.stars[row, 1], index.stars[row, 2]
+        r0, r1, r2 = stars[row, 0], stars[row, 1], stars[row, 2]
         if moving:
             r0 += points.velocity[0]
             r1 += points.velocity[1]
@@ -113,17 +112,20 @@ def fit(points, index, match, t, inverse):  # type: ignore[no-untyped-def]
         g0 += w * (d1 * p2 - d2 * p1)
         g1 += w * (d2 * p0 - d0 * p2)
         g2 += w * (d0 * p1 - d1 * p0)
-        matrix[0, 0] += w * (1.0 - p0 * p0)
-        matrix[1, 1] += w * (1.0 - p1 * p1)
-        matrix[2, 2] += w * (1.0 - p2 * p2)
-        matrix[0, 1] -= w * p0 * p1
-        matrix[0, 2] -= w * p0 * p2
-        matrix[1, 2] -= w * p1 * p2
-    matrix[1, 0], matrix[2, 0], matrix[2, 1] = matrix[0, 1], matrix[0, 2], matrix[1, 2]
+        m00 += w * (1.0 - p0 * p0)
+        m11 += w * (1.0 - p1 * p1)
+        m22 += w * (1.0 - p2 * p2)
+        m01 -= w * p0 * p1
+        m02 -= w * p0 * p2
+        m12 -= w * p1 * p2
+    matrix[0, 0], matrix[1, 1], matrix[2, 2] = m00, m11, m22
+    matrix[0, 1] = matrix[1, 0] = m01
+    matrix[0, 2] = matrix[2, 0] = m02
+    matrix[1, 2] = matrix[2, 1] = m12
     det = (
-        matrix[0, 0] * (matrix[1, 1] * matrix[2, 2] - matrix[1, 2] ** 2)
-        - matrix[0, 1] * (matrix[0, 1] * matrix[2, 2] - matrix[1, 2] * matrix[0, 2])
-        + matrix[0, 2] * (matrix[0, 1] * matrix[1, 2] - matrix[1, 1] * matrix[0, 2])
+        m00 * (m11 * m22 - m12 * m12)
+        - m01 * (m01 * m22 - m12 * m02)
+        + m02 * (m01 * m12 - m11 * m02)
     )
     if not det > 0.0 or not inverse_symmetric(matrix, inverse):
         return chi2, -math.inf
@@ -136,35 +138,33 @@ def fit(points, index, match, t, inverse):  # type: ignore[no-untyped-def]
     return max(chi2, 0.0), math.log(det)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def match_at(points, index, magnitude_gate, t, covariance, match):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def match_at(points, index, magnitude_gate, hand):  # type: ignore[no-untyped-def]
     """Match every point at an attitude known to a covariance; how many, and whether any changed."""
-    stars, faces = index.stars, index.face
+    faces, cell_place = index.face, index.cell_place
     cell_start, cell_rows = index.cell_start, index.cell_rows
-    velocity, sigma = points.velocity, points.sigma
-    trace = covariance[0, 0] + covariance[1, 1] + covariance[2, 2]
+    limit_mag = index.class_edge[-1, 0]
+    velocity, sigma, observed = points.velocity, points.sigma, points.observed
+    match, near, t, p = hand.match, hand.near, hand.t, hand.covariance
+    trace = p[0, 0] + p[1, 1] + p[2, 2]
     matched, changed = 0, False
-    n = len(match)
-    near = np.empty(n)
-    for k in range(n):
-        b = points.observed[k]
-        x = t[0, 0] * b[0] + t[1, 0] * b[1] + t[2, 0] * b[2] - velocity[0]
-        y = t[0, 1] * b[0] + t[1, 1] * b[1] + t[2, 1] * b[2] - velocity[1]
-        z = t[0, 2] * b[0] + t[1, 2] * b[1] + t[2, 2] * b[2] - velocity[2]
+    for k in range(len(match)):
+        b0, b1, b2 = observed[k, 0], observed[k, 1], observed[k, 2]
+        x = t[0, 0] * b0 + t[1, 0] * b1 + t[2, 0] * b2 - velocity[0]
+        y = t[0, 1] * b0 + t[1, 1] * b1 + t[2, 1] * b2 - velocity[1]
+        z = t[0, 2] * b0 + t[1, 2] * b1 + t[2, 2] * b2 - velocity[2]
         norm = 1.0 / math.sqrt(x * x + y * y + z * z)
         # What the attitude's error moves here: trace of [b x] P [b x]^T, over two axes, at worst.
-        spread = trace
-        for i in range(3):
-            for j in range(3):
-                spread -= b[i] * covariance[i, j] * b[j]
+        spread = trace - (p[0, 0] * b0 * b0 + p[1, 1] * b1 * b1 + p[2, 2] * b2 * b2)
+        spread -= 2.0 * (p[0, 1] * b0 * b1 + p[0, 2] * b0 * b2 + p[1, 2] * b1 * b2)
         gate = MATCH_GATE * math.sqrt(sigma[k] * sigma[k] + spread)
         row = -1
         if gate <= LARGEST_GATE_RAD:
             m = points.magnitude[k]
             row, _, chord2 = nearest_stars(
-                *(stars, faces, cell_start, cell_rows),
+                *(cell_place, faces, cell_start, cell_rows),
                 *(x * norm, y * norm, z * norm, gate),
-                *(m - magnitude_gate, faintest_star(index, m, magnitude_gate)),
+                *(m - magnitude_gate, faintest_star(limit_mag, m, magnitude_gate)),
             )
             near[k] = chord2 / (gate * gate)
         for other in range(k):
@@ -185,42 +185,44 @@ def match_at(points, index, magnitude_gate, t, covariance, match):  # type: igno
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def settle(points, index, field, magnitude_gate, t, covariance, match):  # type: ignore[no-untyped-def]
-    """Fit to the match given, then match and fit until nothing changes.
+def settle(points, index, field, magnitude_gate, hand):  # type: ignore[no-untyped-def]
+    """Fit to the match in hand, then match and fit until nothing changes.
 
     Returns the number of stars and the log evidence, -inf where there is no
-    attitude; `t`, `covariance` and `match` get what was settled on.
+    attitude; `hand` gets what was settled on.
     """
-    chi2, log_det = fit(points, index, match, t, covariance)
+    chi2, log_det = fit(points, index.stars, hand)
     if log_det == -math.inf:
         return 0, -math.inf
     matched = 0
     for attempt in range(ROUNDS):
-        matched, changed = match_at(points, index, magnitude_gate, t, covariance, match)
+        matched, changed = match_at(points, index, magnitude_gate, hand)
         if matched < 3:
             return matched, -math.inf
         if attempt == 0:
-            at_most, _, _ = points_alone(points, index, field, match, matched, chi2, log_det)
+            at_most, _, _ = points_alone(
+                points, index.stars, field, hand.match, matched, chi2, log_det
+            )
             if at_most < HOPELESS:
                 return matched, -math.inf
         if not changed:
             break
-        chi2, log_det = fit(points, index, match, t, covariance)
+        chi2, log_det = fit(points, index.stars, hand)
         if log_det == -math.inf:
             return 0, -math.inf
-    return matched, evidence(points, index, field, t, match, matched, chi2, log_det)
+    return matched, evidence(points, index, field, hand, matched, chi2, log_det)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def points_alone(points, index, field, match, matched, chi2, log_det):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def points_alone(points, stars, field, match, matched, chi2, log_det):  # type: ignore[no-untyped-def]
     """The evidence without what stars are missing, which can only be less.
 
     Also the number of magnitudes compared and the faintest star matched.
     """
     n = len(match)
-    stars = index.stars
     log_spots = total = square = any_magnitude = 0.0
     compared = 0
+    sigma, log_spot = -1.0, 0.0
     faintest_point, faintest = -math.inf, -math.inf
     for k in range(n):
         if points.magnitude[k] > faintest_point:
@@ -229,7 +231,11 @@ def points_alone(points, index, field, match, matched, chi2, log_det):  # type: 
         row = match[k]
         if row < 0:
             continue
-        log_spots += math.log(field.area / (2.0 * math.pi * points.sigma[k] ** 2))
+        # Most often all are known alike.
+        if points.sigma[k] != sigma:
+            sigma = points.sigma[k]
+            log_spot = math.log(field.area / (2.0 * math.pi * sigma * sigma))
+        log_spots += log_spot
         faintest = max(faintest, stars[row, 3])
         if not np.isnan(points.magnitude[k]):
             difference = points.magnitude[k] - stars[row, 3]
@@ -246,17 +252,51 @@ def points_alone(points, index, field, match, matched, chi2, log_det):  # type: 
     return weight, compared, faintest
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def evidence(points, index, field, t, match, matched, chi2, log_det):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def stars_inside(place, patch_rows, at, end, reach, t, field, inside):  # type: ignore[no-untyped-def]
+    """The next stars of a patch within the field, as many as fit, and where to go on.
+
+    Without a branch on what was read, so that one look at memory need not wait for another.
+    """
+    x0, x1, x2 = np.float32(t[0, 0]), np.float32(t[0, 1]), np.float32(t[0, 2])
+    y0, y1, y2 = np.float32(t[1, 0]), np.float32(t[1, 1]), np.float32(t[1, 2])
+    z0, z1, z2 = np.float32(t[2, 0]), np.float32(t[2, 1]), np.float32(t[2, 2])
+    wide, high = np.float32(EDGE * field.tan_x), np.float32(EDGE * field.tan_y)
+    cosine = np.float32(field.cos_radius)
+    count = 0
+    last = min(end, at + len(inside))
+    while at < last:
+        row = patch_rows[at]
+        r0, r1, r2 = place[row, 0], place[row, 1], place[row, 2]
+        if place[row, 3] > reach:
+            return count, end
+        x, y, z = (
+            x0 * r0 + x1 * r1 + x2 * r2,
+            y0 * r0 + y1 * r1 + y2 * r2,
+            z0 * r0 + z1 * r1 + z2 * r2,
+        )
+        inside[count] = row
+        count += int((z >= cosine) & (abs(x) <= wide * z) & (abs(y) <= high * z))
+        at += 1
+    return count, at
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def evidence(points, index, field, hand, matched, chi2, log_det):  # type: ignore[no-untyped-def]
     """The log weight of a fitted match against all points being clutter; see `weighing`.
 
     Exact where it is above zero; below, the search for missing stars may end early.
     """
-    weight, compared, faintest = points_alone(points, index, field, match, matched, chi2, log_det)
+    match, t = hand.match, hand.t
+    weight, compared, faintest = points_alone(
+        points, index.stars, field, match, matched, chi2, log_det
+    )
     if weight < 0.0:
         return weight
     n = len(match)
-    stars, patch_rows = index.stars, index.patch_rows
+    place, patch_rows, inside = index.place, index.patch_rows, hand.inside
+    # As the magnitudes it is held against.
+    faintest = np.float32(faintest)
     # The field: stars that should be seen, in order of brightness.
     limit = field.limit_mag
     if np.isnan(limit):
@@ -270,32 +310,26 @@ def evidence(points, index, field, t, match, matched, chi2, log_det):  # type: i
     if not reach > faintest:
         reach = faintest
     patch = patch_of(t[2])
-    for at in range(index.patch_start[patch], index.patch_start[patch + 1]):
-        row = patch_rows[at]
-        if stars[row, 3] > reach:
-            break
-        r = stars[row]
-        z = t[2, 0] * r[0] + t[2, 1] * r[1] + t[2, 2] * r[2]
-        if z < field.cos_radius:
-            continue
-        x = t[0, 0] * r[0] + t[0, 1] * r[1] + t[0, 2] * r[2]
-        y = t[1, 0] * r[0] + t[1, 1] * r[1] + t[1, 2] * r[2]
-        if abs(x) > EDGE * field.tan_x * z or abs(y) > EDGE * field.tan_y * z:
-            continue
-        if stars[row, 3] <= faintest:
-            expected += 1
-        taken = False
-        for k in range(n):
-            if match[k] == row:
-                taken = True
-                break
-        if taken:
-            continue
-        log_missing += weighing.log_missing((limit - stars[row, 3]) / sigma_mag)
-        if compared < matched or log_missing < -weight:
-            shares = weighing.log_any_share(matched, max(expected, matched))
-            if shares < -weight:
-                return -1.0
+    at, end = np.int64(index.patch_start[patch]), np.int64(index.patch_start[patch + 1])
+    while at < end:
+        count, at = stars_inside(place, patch_rows, at, end, reach, t, field, inside)
+        for which in range(count):
+            row = inside[which]
+            magnitude = place[row, 3]
+            if magnitude <= faintest:
+                expected += 1
+            taken = False
+            for k in range(n):
+                if match[k] == row:
+                    taken = True
+                    break
+            if taken:
+                continue
+            log_missing += weighing.log_missing((limit - magnitude) / sigma_mag)
+            if compared < matched or log_missing < -weight:
+                shares = weighing.log_any_share(matched, max(expected, matched))
+                if shares < -weight:
+                    return -1.0
     shares = weighing.log_any_share(matched, max(expected, matched))
     complete = -math.inf
     if compared == matched:

@@ -7,7 +7,7 @@ from numba import njit
 
 from service.identify.lost_in_space import weighing
 from service.identify.lost_in_space.predictors import GATE, SLACK_RAD
-from service.sky.sky_index import BUCKET_RAD
+from service.sky.sky_index import BRIGHTEST_MAG, BUCKET_RAD, STEP_MAG
 
 LEAST_PAIR_RAD = 0.006
 """A shorter pair fixes the turn about itself too poorly to predict anything."""
@@ -27,6 +27,10 @@ USE_COST = 3.0
 """Each failed try of a point makes it this much less attractive."""
 MOST_BEYOND = 0.9
 """Of a point fainter than the limit.  None is given up: magnitudes may be off together."""
+SURELY_WITHIN = 5.0
+"""Sigmas by which a point is brighter than the limit, so that it is none from beyond."""
+NO_ROW = 1 << 16
+"""More than there are rows."""
 MAGNITUDE_GATE = 3.3
 """In sigmas of magnitude."""
 OFFSET_ALLOWED_MAG = 0.15
@@ -39,42 +43,40 @@ def magnitude_gate(sigma_mag):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def rows_within(index, magnitude, gate):  # type: ignore[no-untyped-def]
-    """First row and the one past the last of the stars that a point of this magnitude may be."""
-    n = len(index.stars)
+def rows_within(brighter, magnitude, gate):  # type: ignore[no-untyped-def]
+    """First row and the one past the last of the stars that a point of this magnitude may be.
+
+    To the steps of the table `brighter`: a few more than within the gate.
+    """
+    last = len(brighter) - 1
     if np.isnan(magnitude):
-        return 0, n
-    low, high = 0, n
-    while low < high:
-        middle = (low + high) // 2
-        if index.stars[middle, 3] < magnitude - gate:
-            low = middle + 1
-        else:
-            high = middle
-    first, high = low, n
-    while low < high:
-        middle = (low + high) // 2
-        if index.stars[middle, 3] <= magnitude + gate:
-            low = middle + 1
-        else:
-            high = middle
-    return first, low
+        return 0, NO_ROW
+    low = math.floor((magnitude - gate - BRIGHTEST_MAG) * (1.0 / STEP_MAG))
+    high = math.floor((magnitude + gate - BRIGHTEST_MAG) * (1.0 / STEP_MAG)) + 1
+    first = brighter[min(max(low, 0), last)]
+    return first, NO_ROW if high > last else brighter[max(high, 0)]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def chances_beyond(points, index, sigma_mag):  # type: ignore[no-untyped-def]
-    """The chance (n,) of each point, if a star, to be one beyond the limit of pairs.
+def look_at_points(points, index, sigma_mag, gate, pairs):  # type: ignore[no-untyped-def]
+    """What every point brings to a pair, into `pairs`: its classes, and the chance to be beyond.
 
     Noise shows more faint stars as bright than bright ones as faint, for there
     are more of them: of a magnitude the likely truth is fainter.
     """
     limit = index.class_edge[-1, 0] - weighing.COUNT_SLOPE * sigma_mag * sigma_mag
-    beyond = np.zeros(len(points.magnitude))
-    for k in range(len(beyond)):
-        if not np.isnan(points.magnitude[k]):
-            off = (limit - points.magnitude[k]) / (sigma_mag * math.sqrt(2.0))
-            beyond[k] = min(0.5 * math.erfc(off), MOST_BEYOND)
-    return beyond
+    for k in range(len(points.magnitude)):
+        first, last = classes_of(points.magnitude[k], index.class_edge, gate)
+        pairs.first[k], pairs.last[k] = first, last
+        pairs.share[k] = index.class_edge[last, 1]
+        if first > 0:
+            pairs.share[k] -= index.class_edge[first - 1, 1]
+        pairs.beyond[k] = 0.0
+        brighter = (limit - points.magnitude[k]) / sigma_mag
+        # Not so where the magnitude is unknown.
+        if brighter < SURELY_WITHIN:
+            chance = 0.5 * math.erfc(brighter * math.sqrt(0.5))
+            pairs.beyond[k] = min(chance, MOST_BEYOND)
 
 
 @njit(cache=True, nogil=True)
@@ -88,7 +90,8 @@ def chord(a, b):  # type: ignore[no-untyped-def]
 def buckets_of(points, index, i, j, gate):  # type: ignore[no-untyped-def]
     """First and last bucket of separation that a pair's star pair may be in, by so many sigmas."""
     apart = 2.0 * math.asin(min(1.0, 0.5 * chord(points.observed[i], points.observed[j])))
-    tolerance = gate * math.hypot(points.sigma[i], points.sigma[j]) + SLACK_RAD
+    variance = points.sigma[i] * points.sigma[i] + points.sigma[j] * points.sigma[j]
+    tolerance = gate * math.sqrt(variance) + SLACK_RAD
     last = index.offset.shape[1] - 2
     return (
         max(int((apart - tolerance) / BUCKET_RAD), 0),
@@ -97,69 +100,67 @@ def buckets_of(points, index, i, j, gate):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def classes_of(points, index, i, j, gate):  # type: ignore[no-untyped-def]
-    """First and last class of the fainter star of the pair; all where a magnitude is unknown."""
-    classes = len(index.class_edge)
-    faint = max(points.magnitude[i], points.magnitude[j])
-    if np.isnan(points.magnitude[i]) or np.isnan(points.magnitude[j]):
+def classes_of(magnitude, class_edge, gate):  # type: ignore[no-untyped-def]
+    """First and last class of pairs with this magnitude the fainter; all where it is unknown."""
+    classes = len(class_edge)
+    if np.isnan(magnitude):
         return 0, classes - 1
     first = 0
-    while first < classes - 1 and index.class_edge[first, 0] < faint - gate:
+    while first < classes - 1 and class_edge[first, 0] < magnitude - gate:
         first += 1
     last = first
-    while last < classes - 1 and index.class_edge[last, 0] < faint + gate:
+    while last < classes - 1 and class_edge[last, 0] < magnitude + gate:
         last += 1
     return first, last
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def pair_costs(points, index, first_fresh, count, gate, beyond, cost):  # type: ignore[no-untyped-def]
-    """What each pair of the first `count` points costs to try, into `cost`; infinite: not at all.
+def pair_costs(points, index, first_fresh, count, pairs):  # type: ignore[no-untyped-def]
+    """What each pair of the first `count` points costs to try; infinite: not at all.
 
     Pairs of the first `first_fresh` points keep what they have.  The number of
-    candidates is that of evenly spread stars; `beyond` (n,) is each point's
-    chance of being no star of any pair.
+    candidates is that of evenly spread stars.  Points are brightest first, those
+    of unknown magnitude last: the classes of a pair are those of its later point.
     """
-    buckets = index.offset.shape[1] - 1
-    longest = buckets * BUCKET_RAD
+    longest = (index.offset.shape[1] - 1) * BUCKET_RAD
     density = math.sqrt(len(index.pairs) / (1.0 - math.cos(longest))) / (2.0 * math.pi)
     others = min(len(points.observed) - 2, 10)
     pairs_per_rad2 = 2.0 * len(index.pairs) / (longest * longest)
-    for j in range(count):
+    observed, sigma = points.observed, points.sigma
+    cost, beyond = pairs.cost, pairs.beyond
+    for j in range(first_fresh, count):
+        per_rad = pairs.share[j] * pairs_per_rad2 * 2.0
+        y0, y1, y2 = observed[j, 0], observed[j, 1], observed[j, 2]
         for i in range(j):
-            if j < first_fresh:
-                continue
-            cost[i, j] = math.inf
-            apart = chord(points.observed[i], points.observed[j])
+            x0, x1, x2 = observed[i, 0] - y0, observed[i, 1] - y1, observed[i, 2] - y2
+            apart = math.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
             if apart < LEAST_PAIR_RAD or apart > longest * CHORD_OF_LONGEST:
+                cost[i, j] = math.inf
                 continue
-            first, last = classes_of(points, index, i, j, gate)
-            share = index.class_edge[last, 1]
-            if first > 0:
-                share -= index.class_edge[first - 1, 1]
-            tolerance = GATE * math.hypot(points.sigma[i], points.sigma[j]) + SLACK_RAD
-            candidates = share * pairs_per_rad2 * apart * 2.0 * tolerance
+            variance = sigma[i] * sigma[i] + sigma[j] * sigma[j]
+            candidates = per_rad * apart * (GATE * math.sqrt(variance) + SLACK_RAD)
             lever = TYPICAL_REACH_RAD / apart
-            around = GATE * points.sigma[i] * math.sqrt(1.0 + 2.0 * lever * lever) + CELL_RAD
+            around = GATE * sigma[i] * math.sqrt(1.0 + 2.0 * lever * lever) + CELL_RAD
             passing = density * math.pi * around * around * EXACT_COST * others
             sure = (1.0 - beyond[i]) * (1.0 - beyond[j]) / (1.0 + RANK_COST * (i + j))
             cost[i, j] = (PRIOR_COST + candidates * (1.0 + passing)) / sure
 
 
 @njit(cache=True, nogil=True)
-def cheapest_pair(cost, count, used, groups, covered):  # type: ignore[no-untyped-def]
+def cheapest_pair(pairs, count, groups):  # type: ignore[no-untyped-def]
     """The pair to try next, points tried in vain set back; (-1, -1) where none is left.
 
     Only pairs of one group: those whose ranks leave the same remainder.  With
     no groups (0) only pairs of points that are not `covered` yet.
     """
+    cost, used, covered = pairs.cost, pairs.used, pairs.covered
     left = right = -1
     least = math.inf
     for j in range(count):
         for i in range(j):
             if cost[i, j] == math.inf:
                 continue
-            if (covered[i] or covered[j]) if groups == 0 else (j - i) % groups != 0:
+            if (covered[i] != 0 or covered[j] != 0) if groups == 0 else (j - i) % groups != 0:
                 continue
             value = cost[i, j] * used[i] * used[j]
             if value < least:

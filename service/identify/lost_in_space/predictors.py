@@ -7,7 +7,6 @@ in the sky.  Handedness is in gamma: a mirrored sky is never predicted.
 
 import math
 
-import numpy as np
 from numba import njit
 
 GATE = 3.6
@@ -23,13 +22,14 @@ BEYOND, DEEP_COST = 0.02, 1.5
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def predict(points, beyond, i, j, largest, coefficients, gate, order):  # type: ignore[no-untyped-def]
-    """Coefficients (n, 3) and gates (n,) of all points; `order` gets the most telling first.
+def predict(points, beyond, i, j, largest, sieve):  # type: ignore[no-untyped-def]
+    """Coefficients and gates of all points into `sieve`, and their order, the most telling first.
 
     `beyond` (n,): the chance of each to be a star beyond the limit.
     Returns how many have a gate of at most `largest`.
     """
     observed, sigma = points.observed, points.sigma
+    coefficients, gate, order, cost = sieve.coefficients, sieve.gate, sieve.order, sieve.cost
     n = len(observed)
     i0, i1, i2 = observed[i, 0], observed[i, 1], observed[i, 2]
     j0, j1, j2 = observed[j, 0], observed[j, 1], observed[j, 2]
@@ -37,7 +37,6 @@ def predict(points, beyond, i, j, largest, coefficients, gate, order):  # type: 
     c0, c1, c2 = i1 * j2 - i2 * j1, i2 * j0 - i0 * j2, i0 * j1 - i1 * j0
     per_sine2 = 1.0 / (c0 * c0 + c1 * c1 + c2 * c2)
     vi, vj = sigma[i] * sigma[i], sigma[j] * sigma[j]
-    cost = np.empty(n)
     count = 0
     for k in range(n):
         if k in (i, j):

@@ -6,6 +6,7 @@ on the work is reached.
 """
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -15,20 +16,20 @@ from service.identify.lost_in_space import weighing
 from service.identify.lost_in_space.matching import faintest_star, nearest_stars, settle
 from service.identify.lost_in_space.pair_order import (
     buckets_of,
-    chances_beyond,
     cheapest_pair,
     classes_of,
+    look_at_points,
     magnitude_gate,
     pair_costs,
     rows_within,
 )
-from service.identify.lost_in_space.predictors import BEYOND, GATE, predict
-from service.sky.sky_bitmap import star_near
+from service.identify.lost_in_space.predictors import GATE, predict
+from service.identify.lost_in_space.room import MOST_POINTS, MOST_PUT_OFF
+from service.identify.lost_in_space.sieve import candidates_of, possible_of, ranked, stars_near
 from service.sky.sky_index import BITMAP_RADII_RAD
 
 FIRST_POINTS = 7
-MOST_POINTS = 24
-"""Brightest points of which pairs are made: first of few, then of more."""
+"""Of many points pairs are made of the brightest first, later of `MOST_POINTS`."""
 FIRST_TRIES = 3
 """Pairs tried for being cheap, before those that every attitude must have one of."""
 NARROW_GATE, NARROW_MAG = 2.8, 0.75
@@ -40,10 +41,6 @@ SIEVES_IN_TURN = 6
 """Points of which three at a time are the first that a candidate is held against."""
 MOST_SIEVES = 12
 """Further points that a candidate is held against."""
-MOST_HITS = 6
-"""Points of a candidate that is put off: its pair and up to three further ones, and one spare."""
-MOST_PUT_OFF = 1500
-"""Candidates with few further points wait until all pairs were tried for one that has more."""
 SETTLE_WORK = 60
 """What settling costs, in candidates."""
 MAX_WORK = 600_000
@@ -52,278 +49,283 @@ SURE = 7.5
 SURE_PER_CLUTTER = 0.5
 """Log evidence, and more for every point left unexplained, that ends the search."""
 SAME_ATTITUDE_RAD = 2e-3
-LEDGER = 12
 
 
-@njit(cache=True, nogil=True)
-def level_of(gate):  # type: ignore[no-untyped-def]
-    """The least bitmap that no star within a gate escapes."""
-    level = 0
-    while BITMAP_RADII_RAD[level] < gate:
-        level += 1
-    return level
+WORK, COUNT, PUT_OFF, BEST = 0, 1, 2, 3
+"""The tally: candidates looked at, entries in the ledger, those put off, the most stars matched."""
+GOING_ON, SURE_OF_ONE, AT_BOUND = 0, 1, 2
 
 
-@njit(cache=True, nogil=True)
-def levels_of(gate, beyond, order, sieves, level):  # type: ignore[no-untyped-def]
-    """Fill `level` with the bitmap of every sieve, one of all stars for points that need it."""
-    for s in range(sieves):
-        k = order[s]
-        level[k] = level_of(gate[k])
-        if beyond[k] > BEYOND:
-            level[k] += len(BITMAP_RADII_RAD)
+class Plan(NamedTuple):
+    """How the candidates of a pair of points (i, j) are tried.
+
+    At least `needed` of the `firsts` points in `turn` must possibly have a star,
+    at least `further` of the first `sieves` in `order` must have one; `strong` are
+    enough to be settled at once.  `gate` is for the separation in sigmas,
+    `gate_mag` for the magnitudes.
+    """
+
+    i: Any
+    j: Any
+    sieves: Any
+    firsts: Any
+    needed: Any
+    further: Any
+    strong: Any
+    gate: Any
+    gate_mag: Any
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def search(points, index, field, ledger, weights, attitudes, covariances):  # type: ignore[no-untyped-def]
-    """Fill the ledger (LEDGER, n) with weighed matches, heaviest first by insertion.
+def search(points, index, field, room):  # type: ignore[no-untyped-def]
+    """Fill the ledger with weighed matches.
 
     Returns how many there are, the work done and whether it reached its bound; no
     work where even a perfect match would not be believed.
     """
     n = len(points.observed)
-    stars, pairs, offset, faces = index.stars, index.pairs, index.offset, index.face
-    cell_start, cell_rows = index.cell_start, index.cell_rows
     gate_mag = magnitude_gate(field.magnitude_sigma)
-    coefficients, gate = np.empty((n, 3)), np.empty(n)
-    order = np.empty(n, np.int64)
-    match = np.empty(n, np.int64)
-    level, turn = np.empty(n, np.int64), np.empty(MOST_FIRST, np.int64)
-    bits = index.bits
-    later = np.empty((MOST_PUT_OFF, 2 * MOST_HITS), np.int32)
-    put_off = 0
-    t, covariance = np.empty((3, 3)), np.empty((3, 3))
-    count = work = tries = 0
+    tally, pairs = room.tally, room.pairs
+    tally[:] = 0
     fewest = weighing.fewest_stars(points, field.area, field.magnitude_sigma)
     if fewest > n:
         return 0, 0, False
     further = fewest - 2
     most = min(n, MOST_POINTS)
-    beyond = chances_beyond(points, index, field.magnitude_sigma)
-    cost = np.empty((most, most))
-    used = np.ones(most)
-    covered = np.zeros(most, np.bool_)
-    done = best = 0
+    look_at_points(points, index, field.magnitude_sigma, gate_mag, pairs)
+    pairs.used[:] = 1.0
+    pairs.covered[:] = 0
+    done = tries = 0
     hasty = n - 3 if n <= FEW_POINTS else 0
-    while done < most:
+    state = GOING_ON
+    while done < most and state == GOING_ON:
         top = min(FIRST_POINTS, most) if done == 0 and n > 2 * further + 2 else most
-        pair_costs(points, index, done, top, gate_mag, beyond, cost)
+        pair_costs(points, index, done, top, pairs)
         done = top
-        while True:
+        while state == GOING_ON:
             # Any attitude that explains so many points has two of them in one of so many groups;
             # of few points pairs that share none will do.
-            groups = max(further + 1, best - 1)
+            groups = max(further + 1, tally[BEST] - 1)
             if n <= 2 * groups:
                 groups = 0
             elif tries < FIRST_TRIES:
                 groups = 1
             elif done < most:
                 break
-            i, j = cheapest_pair(cost, top, used, groups, covered)
+            i, j = cheapest_pair(pairs, top, groups)
             if hasty > 0 and (i < 0 or tries == hasty):
                 # Of few points every pair is needed: now all that count, in full.
                 hasty = 0
-                used[:] = 1.0
-                covered[:] = False
-                pair_costs(points, index, 0, top, gate_mag, beyond, cost)
-                i, j = cheapest_pair(cost, top, used, groups, covered)
+                pairs.used[:] = 1.0
+                pairs.covered[:] = 0
+                pair_costs(points, index, 0, top, pairs)
+                i, j = cheapest_pair(pairs, top, groups)
             if i < 0:
                 break
             tries += 1
-            sieves = predict(points, beyond, i, j, BITMAP_RADII_RAD[-1], coefficients, gate, order)
+            sieves = predict(points, pairs.beyond, i, j, BITMAP_RADII_RAD[-1], room.sieve)
             if sieves < further:
                 continue
             # A poor lever does not reach all points: others must try again.
-            covered[i] = covered[j] = covered[i] or sieves == n - 2
-            sieves = min(sieves, MOST_SIEVES)
-            narrow = sieves >= 2 and tries <= (hasty if n <= FEW_POINTS else FIRST_TRIES)
-            low, high = buckets_of(points, index, i, j, NARROW_GATE if narrow else GATE)
-            pair_mag = NARROW_MAG * gate_mag if narrow else gate_mag
-            first, last = classes_of(points, index, i, j, pair_mag)
-            low_i, high_i = rows_within(index, points.magnitude[i], pair_mag)
-            low_j, high_j = rows_within(index, points.magnitude[j], pair_mag)
-            levels_of(gate, beyond, order, sieves, level)
-            # Other points every time: those that tell most may be no stars.  Of few points all.
-            if narrow and (tries == 1 or n <= FEW_POINTS):
-                firsts = needed = 2
-            elif n <= FEW_POINTS:
-                firsts, needed = sieves, further
-            elif tries <= FIRST_TRIES:
-                firsts, needed = min(sieves, 3), 2
-            else:
-                # Where half of the points are no stars, two of three is too much to ask.
-                firsts, needed = min(sieves, 2), 1
-            strong = min(further + 2, (3 * sieves + 3) // 4)
-            turns = min(sieves, SIEVES_IN_TURN)
-            for s in range(firsts):
-                turn[s] = order[(firsts * (tries - 1) + s) % turns]
-            for c in range(first, last + 1):
-                for at in range(offset[c, low], offset[c, high + 1]):
-                    for swap in range(2):
-                        a = np.int64(pairs[at, swap])
-                        b = np.int64(pairs[at, 1 - swap])
-                        if a < low_i or a >= high_i or b < low_j or b >= high_j:
-                            continue
-                        work += 1
-                        x0, x1, x2 = stars[a, 0], stars[a, 1], stars[a, 2]
-                        y0, y1, y2 = stars[b, 0], stars[b, 1], stars[b, 2]
-                        z0 = x1 * y2 - x2 * y1
-                        z1 = x2 * y0 - x0 * y2
-                        z2 = x0 * y1 - x1 * y0
-                        possible = 0
-                        for s in range(firsts):
-                            k = turn[s]
-                            possible += star_near(
-                                bits,
-                                level[k],
-                                coefficients[k, 0] * x0
-                                + coefficients[k, 1] * y0
-                                + coefficients[k, 2] * z0,
-                                coefficients[k, 0] * x1
-                                + coefficients[k, 1] * y1
-                                + coefficients[k, 2] * z1,
-                                coefficients[k, 0] * x2
-                                + coefficients[k, 1] * y2
-                                + coefficients[k, 2] * z2,
-                            )
-                            if possible == needed or possible + firsts - 1 - s < needed:
-                                break
-                        if possible < needed:
-                            continue
-                        # Exactly now: how many of the other points have a star in their place?
-                        hits = 0
-                        match[:] = -1
-                        for s in range(sieves):
-                            if hits + sieves - s < further or hits == strong:
-                                break
-                            k = order[s]
-                            p0 = coefficients[k, 0] * x0 + coefficients[k, 1] * y0
-                            p0 += coefficients[k, 2] * z0
-                            p1 = coefficients[k, 0] * x1 + coefficients[k, 1] * y1
-                            p1 += coefficients[k, 2] * z1
-                            p2 = coefficients[k, 0] * x2 + coefficients[k, 1] * y2
-                            p2 += coefficients[k, 2] * z2
-                            if not star_near(bits, level[k], p0, p1, p2):
-                                continue
-                            norm = 1.0 / math.sqrt(p0 * p0 + p1 * p1 + p2 * p2)
-                            m = points.magnitude[k]
-                            row, _, _ = nearest_stars(
-                                *(stars, faces, cell_start, cell_rows),
-                                *(p0 * norm, p1 * norm, p2 * norm, gate[k]),
-                                *(m - gate_mag, faintest_star(index, m, gate_mag)),
-                            )
-                            work += 2
-                            if row >= 0 and row != a and row != b:
-                                match[k] = row
-                                hits += 1
-                        if hits < further:
-                            continue
-                        match[i], match[j] = a, b
-                        if hits < strong and put_off < MOST_PUT_OFF:
-                            put_off = put(later, put_off, match, i, j)
-                            continue
-                        work += SETTLE_WORK
-                        count, matched, sure = weigh(
-                            *(points, index, field, gate_mag, i, j, t, covariance, match),
-                            *(ledger, weights, attitudes, covariances, count),
-                        )
-                        best = max(best, matched)
-                        if sure:
-                            return count, work, False
-                if work > MAX_WORK:
-                    return count, work, True
-    for at in range(put_off):
-        i, j = take(later, at, match)
-        work += SETTLE_WORK
-        count, _, sure = weigh(
-            *(points, index, field, gate_mag, i, j, t, covariance, match),
-            *(ledger, weights, attitudes, covariances, count),
-        )
-        if sure:
-            return count, work, False
-        if work > MAX_WORK:
-            return count, work, True
-    return count, work, False
+            pairs.covered[i] = pairs.covered[j] = pairs.covered[i] or sieves == n - 2
+            in_haste = tries <= (hasty if n <= FEW_POINTS else FIRST_TRIES)
+            plan = plan_of(n, i, j, sieves, tries, in_haste, further, gate_mag, room.sieve)
+            state = try_pair(points, index, field, gate_mag, plan, room)
+    if state == GOING_ON:
+        state = try_put_off(points, index, field, gate_mag, further, room)
+    return tally[COUNT], tally[WORK], state == AT_BOUND
 
 
 @njit(cache=True, nogil=True)
-def put(later, at, match, i, j):  # type: ignore[no-untyped-def]
-    """Put a candidate off: its pair of points first, then its further hits, each with its star."""
-    later[at] = -1
-    later[at, 0], later[at, 1] = i, match[i]
-    later[at, 2], later[at, 3] = j, match[j]
-    to = 4
-    for k in range(len(match)):
-        if match[k] >= 0 and k != i and k != j:
-            later[at, to], later[at, to + 1] = k, match[k]
-            to += 2
-    return at + 1
+def strong_of(further, sieves):  # type: ignore[no-untyped-def]
+    """How many further points make a candidate worth settling before others."""
+    return min(further + 2, (3 * sieves + 3) // 4)
 
 
 @njit(cache=True, nogil=True)
-def take(later, at, match):  # type: ignore[no-untyped-def]
-    """The match of a candidate that was put off, and its pair of points."""
+def plan_of(n, i, j, sieves, tries, in_haste, further, gate_mag, sieve):  # type: ignore[no-untyped-def]
+    """How a pair's candidates are tried; which ranks are asked first goes to `sieve.turn`."""
+    sieves = min(sieves, MOST_SIEVES)
+    narrow = sieves >= 2 and in_haste
+    # Other points every time: those that tell most may be no stars.  Of few points all.
+    if narrow and (tries == 1 or n <= FEW_POINTS):
+        firsts = needed = 2
+    elif n <= FEW_POINTS:
+        firsts, needed = sieves, further
+    elif tries <= FIRST_TRIES:
+        firsts, needed = min(sieves, 3), min(sieves, 2)
+    else:
+        # Where half of the points are no stars, two of three is too much to ask.
+        firsts, needed = min(sieves, 2), 1
+    turns = min(sieves, SIEVES_IN_TURN)
+    for s in range(firsts):
+        sieve.turn[s] = (firsts * (tries - 1) + s) % turns
+    strong = strong_of(further, sieves)
+    gate = NARROW_GATE if narrow else GATE
+    gate_mag = NARROW_MAG * gate_mag if narrow else gate_mag
+    return Plan(i, j, sieves, firsts, needed, further, strong, gate, gate_mag)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def try_pair(points, index, field, gate_mag, plan, room):  # type: ignore[no-untyped-def]
+    """Try every star pair that a pair of points may be; whether the search goes on."""
+    i, j = plan.i, plan.j
+    sieve, chunk, tally = room.sieve, room.chunk, room.tally
+    ranked(sieve, room.pairs.beyond, plan.sieves)
+    low, high = buckets_of(points, index, i, j, plan.gate)
+    first, last = classes_of(points.magnitude[j], index.class_edge, plan.gate_mag)
+    rows_i = rows_within(index.brighter, points.magnitude[i], plan.gate_mag)
+    rows_j = rows_within(index.brighter, points.magnitude[j], plan.gate_mag)
+    # So many of the points asked first that one of them must have a star.
+    asked = plan.firsts - plan.needed + 1
+    for c in range(first, last + 1):
+        at, end = np.int64(index.offset[c, low]), np.int64(index.offset[c, high + 1])
+        while at < end:
+            count, at = candidates_of(index.pairs, index.place, at, end, rows_i, rows_j, chunk)
+            tally[WORK] += count
+            for left in range(possible_of(index.bits, count, asked, sieve, chunk)):
+                q = chunk.possible[left]
+                near = stars_near(index.bits, sieve, plan, chunk.places, q)
+                possible = ones(near)
+                if possible < plan.further:
+                    continue
+                a, b = np.int64(chunk.rows[0, q]), np.int64(chunk.rows[1, q])
+                if possible < plan.strong and tally[PUT_OFF] < MOST_PUT_OFF:
+                    put_off(room, i, j, a, b, near)
+                    continue
+                hits = hits_of(points, index, gate_mag, plan, a, b, near, room)
+                if hits < plan.further:
+                    continue
+                if hits < plan.strong and tally[PUT_OFF] < MOST_PUT_OFF:
+                    put_off(room, i, j, a, b, near)
+                    continue
+                if weigh(points, index, field, gate_mag, i, j, room):
+                    return SURE_OF_ONE
+            if tally[WORK] > MAX_WORK:
+                return AT_BOUND
+    return GOING_ON
+
+
+@njit(cache=True, nogil=True)
+def ones(bits):  # type: ignore[no-untyped-def]
+    """How many bits are set."""
+    count = 0
+    while bits:
+        bits &= bits - 1
+        count += 1
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def hits_of(points, index, gate_mag, plan, a, b, near, room):  # type: ignore[no-untyped-def]
+    """How many further points have a star in their place where i and j are a and b.
+
+    Of those that may, one by one until they are `strong`, or cannot be enough
+    any more; their stars go to the match in hand.
+    """
+    coefficients, gate, match = room.sieve.coefficients, room.sieve.gate, room.hand.match
+    stars = index.stars
+    limit_mag = index.class_edge[-1, 0]
+    x0, x1, x2 = stars[a, 0], stars[a, 1], stars[a, 2]
+    y0, y1, y2 = stars[b, 0], stars[b, 1], stars[b, 2]
+    z0, z1, z2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
+    hits = 0
     match[:] = -1
-    for to in range(0, later.shape[1], 2):
-        if later[at, to] >= 0:
-            match[later[at, to]] = later[at, to + 1]
-    return np.int64(later[at, 0]), np.int64(later[at, 2])
+    for s in range(plan.sieves):
+        if hits + plan.sieves - s < plan.further or hits == plan.strong:
+            break
+        if (near >> s) & 1 == 0:
+            continue
+        k = room.sieve.order[s]
+        f, g, h = coefficients[k, 0], coefficients[k, 1], coefficients[k, 2]
+        p0, p1, p2 = f * x0 + g * y0 + h * z0, f * x1 + g * y1 + h * z1, f * x2 + g * y2 + h * z2
+        norm = 1.0 / math.sqrt(p0 * p0 + p1 * p1 + p2 * p2)
+        m = points.magnitude[k]
+        row, _, _ = nearest_stars(
+            *(index.cell_place, index.face, index.cell_start, index.cell_rows),
+            *(p0 * norm, p1 * norm, p2 * norm, gate[k]),
+            *(m - gate_mag, faintest_star(limit_mag, m, gate_mag)),
+        )
+        room.tally[WORK] += 2
+        if row >= 0 and row != a and row != b:
+            match[k] = row
+            hits += 1
+    match[plan.i], match[plan.j] = a, b
+    return hits
 
 
 @njit(cache=True, nogil=True)
-def weigh(  # type: ignore[no-untyped-def]
-    points,
-    index,
-    field,
-    gate_mag,
-    i,
-    j,
-    t,
-    covariance,
-    match,
-    ledger,
-    weights,
-    attitudes,
-    covariances,
-    count,
-):
-    """Settle a candidate and enter it: how many there are, how many stars it has, is it sure."""
-    for h in range(count):
-        if ledger[h, i] == match[i] and ledger[h, j] == match[j]:
-            return count, 0, False
+def put_off(room, i, j, a, b, near):  # type: ignore[no-untyped-def]
+    """Put off the candidate in which points i and j are stars a and b, with what is near."""
+    later = room.later
+    at = room.tally[PUT_OFF]
+    later[at, 0], later[at, 1], later[at, 2], later[at, 3] = i * MOST_POINTS + j, a, b, near
+    room.tally[PUT_OFF] += 1
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def try_put_off(points, index, field, gate_mag, further, room):  # type: ignore[no-untyped-def]
+    """Try the candidates that were put off, in their order; whether the search goes on."""
+    sieve, tally, later = room.sieve, room.tally, room.later
+    last_i = last_j = np.int64(-1)
+    sieves = 0
+    for at in range(tally[PUT_OFF]):
+        i, j = np.int64(later[at, 0] // MOST_POINTS), np.int64(later[at, 0] % MOST_POINTS)
+        a, b, near = np.int64(later[at, 1]), np.int64(later[at, 2]), np.int64(later[at, 3])
+        if i != last_i or j != last_j:
+            sieves = predict(points, room.pairs.beyond, i, j, BITMAP_RADII_RAD[-1], sieve)
+            sieves = min(sieves, MOST_SIEVES)
+            last_i, last_j = i, j
+        plan = Plan(i, j, sieves, 0, 0, further, strong_of(further, sieves), GATE, gate_mag)
+        if hits_of(points, index, gate_mag, plan, a, b, near, room) < further:
+            continue
+        if weigh(points, index, field, gate_mag, i, j, room):
+            return SURE_OF_ONE
+        if tally[WORK] > MAX_WORK:
+            return AT_BOUND
+    return GOING_ON
+
+
+@njit(cache=True, nogil=True)
+def weigh(points, index, field, gate_mag, i, j, room):  # type: ignore[no-untyped-def]
+    """Settle the candidate in hand and enter it in the ledger; whether it is beyond doubt."""
+    hand, ledger, tally = room.hand, room.ledger, room.tally
+    match, stars = hand.match, index.stars
+    tally[WORK] += SETTLE_WORK
+    for h in range(tally[COUNT]):
+        if ledger.match[h, i] == match[i] and ledger.match[h, j] == match[j]:
+            return False
     triad(
         *(points.observed[i], points.observed[j]),
-        *(index.stars[match[i], :3], index.stars[match[j], :3], t),
+        *(stars[match[i], :3], stars[match[j], :3], hand.t),
     )
-    matched, weight = settle(points, index, field, gate_mag, t, covariance, match)
+    matched, weight = settle(points, index, field, gate_mag, hand)
     if matched < 3 or weight < 0.0:
-        return count, 0, False
-    count = enter(
-        *(match, weight, t, covariance), *(ledger, weights, attitudes, covariances, count)
-    )
-    return count, matched, weight > SURE + SURE_PER_CLUTTER * (len(match) - matched)
+        return False
+    tally[COUNT] = enter(hand, weight, ledger, tally[COUNT])
+    tally[BEST] = max(tally[BEST], matched)
+    return weight > SURE + SURE_PER_CLUTTER * (len(match) - matched)
 
 
 @njit(cache=True, nogil=True)
-def enter(match, weight, t, covariance, ledger, weights, attitudes, covariances, count):  # type: ignore[no-untyped-def]
-    """Enter a match in the ledger, in place of the lightest where it is full."""
+def enter(hand, weight, ledger, count):  # type: ignore[no-untyped-def]
+    """Enter a match in the ledger, for the lightest where it is full; how many there are."""
+    match, weights = hand.match, ledger.weight
     for h in range(count):
         same = True
         for k in range(len(match)):
-            if ledger[h, k] != match[k]:
+            if ledger.match[h, k] != match[k]:
                 same = False
                 break
         if same:
             return count
-    if count < len(weights):
-        at = count
-        count += 1
-    else:
+    at = count
+    if count == len(weights):
         at = np.argmin(weights)
         if weights[at] >= weight:
             return count
-    ledger[at] = match
+    ledger.match[at] = match
     weights[at] = weight
-    attitudes[at] = t
-    covariances[at] = covariance
-    return count
+    ledger.attitude[at] = hand.t
+    ledger.covariance[at] = hand.covariance
+    return max(count, at + 1)

@@ -16,13 +16,17 @@ from service.attitude.solution import NoAttitude
 from service.identify.lost_in_space import verdict, weighing
 from service.identify.lost_in_space.matching import match_at, settle
 from service.identify.lost_in_space.pair_order import magnitude_gate
-from service.identify.lost_in_space.search import LEDGER, search
+from service.identify.lost_in_space.room import USUAL_POINTS, room_in, words_for
+from service.identify.lost_in_space.search import enter, search
 from service.identify.lost_in_space.seen import Field, Points
-from service.sky.sky_index import SkyIndex
+from service.identify.uncounted import uncounted
+from service.sky.sky_index import SkyIndex, index_in
 from service.vectors import Matrix, Vector
 
 Rows = npt.NDArray[np.int64]
 _STILL = np.zeros(3)
+_BLOCKS: list[Vector] = []
+"""Blocks to search in that nobody uses at the moment: as many as searches ever ran at once."""
 FEWEST_POINTS = 3
 """Two stars alone tell no attitude from another."""
 
@@ -122,8 +126,7 @@ class LostInSpace:
     def __init__(self, index: SkyIndex, field: FieldOfView) -> None:
         self.index = index
         self.field = field
-        self._arrays = index.arrays
-        self._field = field.as_field()
+        self._field = np.array(field.as_field())
 
     def solve(
         self,
@@ -138,9 +141,11 @@ class LostInSpace:
         `velocity_c` of the observer, inertial, in units of c, makes the stars
         apparent; zero leaves them geometric.
         """
+        block = _BLOCKS.pop() if _BLOCKS else np.empty(words_for(USUAL_POINTS))
         code, *rest = _solve(
-            direction, magnitude_mag, sigma_rad, velocity_c, self._arrays, self._field
+            direction, magnitude_mag, sigma_rad, velocity_c, self.index.store, self._field, block
         )
+        _BLOCKS.append(block)
         return LostInSpaceResult(_REFUSALS[code], *rest)
 
     def solve_near(
@@ -153,9 +158,10 @@ class LostInSpace:
         velocity_c: Vector = _STILL,
     ) -> LostInSpaceResult:
         """The same at an attitude that is known to a covariance: no search, the same judgement."""
+        block = np.empty(words_for(len(direction)))
         code, *rest = _solve_near(
-            *(direction, magnitude_mag, sigma_rad, velocity_c, self._arrays, self._field),
-            *(attitude, covariance_rad2),
+            *(direction, magnitude_mag, sigma_rad, velocity_c, self.index.store, self._field),
+            *(block, attitude, covariance_rad2),
         )
         return LostInSpaceResult(_REFUSALS[code], *rest)
 
@@ -173,97 +179,123 @@ class LostInSpace:
         gate = magnitude_gate(self.field.magnitude_sigma_mag)
         return StarChances(
             *verdict.star_probabilities(
-                *(points, self._arrays, self._field, gate, *result.matrices, result.star, doubt)
+                *(points, self.index.arrays, self.field.as_field(), gate),
+                *(*result.matrices, result.star, doubt),
             )
         )
 
 
 @njit(cache=True, nogil=True)
-def _sorted(direction, magnitude, sigma, velocity):  # type: ignore[no-untyped-def]
-    """The points brightest first, those of unknown magnitude last, each in the order given."""
+def _take_in(direction, magnitude, sigma, velocity, room):  # type: ignore[no-untyped-def]
+    """The points brightest first, those of unknown magnitude last, each in the order given.
+
+    What was given may be of many kinds of array, for each of which this is
+    compiled; what comes after is compiled once.
+    """
     n = len(direction)
-    order = np.empty(n, np.int64)
+    order = room.order
     for k in range(n):
+        m = magnitude[k]
         at = k
         while at > 0 and (
-            magnitude[order[at - 1]] > magnitude[k]
-            or (np.isnan(magnitude[order[at - 1]]) and not np.isnan(magnitude[k]))
+            magnitude[order[at - 1]] > m or (np.isnan(magnitude[order[at - 1]]) and not np.isnan(m))
         ):
             order[at] = order[at - 1]
             at -= 1
         order[at] = k
-    observed, magnitudes, sigmas = np.empty((n, 3)), np.empty(n), np.empty(n)
+    points = room.points
     for k in range(n):
         for i in range(3):
-            observed[k, i] = direction[order[k], i]
-        magnitudes[k], sigmas[k] = magnitude[order[k]], sigma[order[k]]
-    return order, Points(observed, magnitudes, sigmas, velocity)
+            points.observed[k, i] = direction[order[k], i]
+        points.magnitude[k], points.sigma[k] = magnitude[order[k]], sigma[order[k]]
+    for i in range(3):
+        points.velocity[i] = velocity[i]
 
 
 @njit(cache=True, nogil=True)
-def _ledger(n):  # type: ignore[no-untyped-def]
-    return (
-        np.empty((LEDGER, n), np.int64),
-        np.empty(LEDGER),
-        np.empty((LEDGER, 3, 3)),
-        np.empty((LEDGER, 3, 3)),
-    )
-
-
-@njit(cache=True, nogil=True)
-def _judged(order, ledger, weights, attitudes, covariances, count, work, bounded):  # type: ignore[no-untyped-def]
+def _judged(n, count, work, bounded, room, matrices, star):  # type: ignore[no-untyped-def]
     """The verdict, rows back in the order given: see `LostInSpaceResult`."""
-    n = len(order)
-    star = np.full(n, -1, np.int64)
-    matrices = np.zeros((2, 3, 3))
-    best, log_odds, code = verdict.judge(ledger, weights, attitudes, covariances, count)
+    ledger = room.ledger
+    best, log_odds, code = verdict.judge(ledger, count)
     matched = 0
     if best >= 0:
-        matrices[0], matrices[1] = attitudes[best], covariances[best]
+        for i in range(3):
+            for j in range(3):
+                matrices[0, i, j] = ledger.attitude[best, i, j]
+                matrices[1, i, j] = ledger.covariance[best, i, j]
         for k in range(n):
-            star[order[k]] = ledger[best, k]
-            matched += ledger[best, k] >= 0
+            star[room.order[k]] = ledger.match[best, k]
+            matched += ledger.match[best, k] >= 0
     if n < FEWEST_POINTS:
         code = verdict.TOO_FEW
     elif work == 0:
         # Not searched: so few points, so coarsely known, are matched somewhere by chance.
         code = verdict.DOUBTFUL
+    return code, log_odds, matched, work, bounded
+
+
+@njit(cache=True, nogil=True)
+def _field_in(values):  # type: ignore[no-untyped-def]
+    return Field(values[0], values[1], values[2], values[3], values[4], values[5])
+
+
+@njit(cache=True, nogil=True)
+def _solve(direction, magnitude, sigma, velocity, store, field, block):  # type: ignore[no-untyped-def]
+    n = len(direction)
+    matrices, star = np.zeros((2, 3, 3)), np.full(n, -1, np.int64)
+    if len(block) < words_for(n):
+        block = np.empty(words_for(n))
+    _take_in(direction, magnitude, sigma, velocity, room_in(block, n))
+    # What is made here is held here, so that what is called may borrow it.
+    code, log_odds, matched, work, bounded = _searched(n, store, field, block, matrices, star)
     return code, matrices, star, log_odds, matched, work, bounded
 
 
 @njit(cache=True, nogil=True)
-def _solve(direction, magnitude, sigma, velocity, index, field):  # type: ignore[no-untyped-def]
-    order, points = _sorted(direction, magnitude, sigma, velocity)
-    ledger, weights, attitudes, covariances = _ledger(len(direction))
-    count, work, bounded = search(points, index, field, ledger, weights, attitudes, covariances)
-    told = _judged(order, ledger, weights, attitudes, covariances, count, work, bounded)
-    code, matrices, star, log_odds, matched, _, _ = told
-    if code != verdict.FOUND or log_odds > SURELY_NO_MIRROR or len(order) - matched < 2:
+def _searched(n, store, field, block, matrices, star):  # type: ignore[no-untyped-def]
+    matrices, star = uncounted(matrices), uncounted(star)
+    index, room, field = index_in(store), room_in(block, n), _field_in(field)
+    points = room.points
+    count, work, bounded = search(points, index, field, room)
+    told = _judged(n, count, work, bounded, room, matrices, star)
+    code, log_odds, matched, _, _ = told
+    if code != verdict.FOUND or log_odds > SURELY_NO_MIRROR or n - matched < 2:
         return told
     # Stars that lie alike on both sides of a line are found in a mirror too, though not all others.
-    weight = weights[:count].max()
-    for k in range(len(order)):
+    weight = room.ledger.weight[:count].max()
+    for k in range(n):
         points.observed[k, 0] = -points.observed[k, 0]
-    count, more, bounded = search(points, index, field, ledger, weights, attitudes, covariances)
-    if count > 0 and weights[:count].max() > weight + math.log(weighing.DOUBT):
+    count, more, bounded = search(points, index, field, room)
+    if count > 0 and room.ledger.weight[:count].max() > weight + math.log(weighing.DOUBT):
         code = verdict.DOUBTFUL
-    return code, matrices, star, log_odds, matched, work + more, bounded
+    return code, log_odds, matched, work + more, bounded
 
 
 @njit(cache=True, nogil=True)
 def _solve_near(  # type: ignore[no-untyped-def]
-    direction, magnitude, sigma, velocity, index, field, attitude, covariance
+    direction, magnitude, sigma, velocity, store, field, block, attitude, covariance
 ):
-    order, points = _sorted(direction, magnitude, sigma, velocity)
-    ledger, weights, attitudes, covariances = _ledger(len(direction))
-    ledger[0] = -1
-    attitudes[0], covariances[0] = attitude, covariance
+    n = len(direction)
+    matrices, star = np.zeros((2, 3, 3)), np.full(n, -1, np.int64)
+    matrices[0], matrices[1] = attitude, covariance
+    _take_in(direction, magnitude, sigma, velocity, room_in(block, n))
+    code, log_odds, matched, work, bounded = _weighed(n, store, field, block, matrices, star)
+    return code, matrices, star, log_odds, matched, work, bounded
+
+
+@njit(cache=True, nogil=True)
+def _weighed(n, store, field, block, matrices, star):  # type: ignore[no-untyped-def]
+    """What the attitude and covariance in `matrices` come to."""
+    index, room, field = index_in(store), room_in(block, n), _field_in(field)
+    hand, points = room.hand, room.points
+    hand.match[:] = -1
+    hand.t[:], hand.covariance[:] = matrices[0], matrices[1]
+    matrices[:] = 0.0
     gate = magnitude_gate(field.magnitude_sigma)
-    matched, _ = match_at(points, index, gate, attitudes[0], covariances[0], ledger[0])
+    matched, _ = match_at(points, index, gate, hand)
     count = 0
     if matched >= 3:
-        matched, weights[0] = settle(
-            points, index, field, gate, attitudes[0], covariances[0], ledger[0]
-        )
-        count = int(matched >= 3 and weights[0] > 0.0)
-    return _judged(order, ledger, weights, attitudes, covariances, count, len(order), False)
+        matched, weight = settle(points, index, field, gate, hand)
+        if matched >= 3 and weight > 0.0:
+            count = enter(hand, weight, room.ledger, 0)
+    return _judged(n, count, n, False, room, matrices, star)

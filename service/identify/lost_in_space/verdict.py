@@ -19,11 +19,15 @@ FOUND, TOO_FEW, NOTHING, DOUBTFUL, DEGENERATE = 0, 1, 2, 3, 4
 
 
 @njit(cache=True, nogil=True)
-def judge(ledger, weights, attitudes, covariances, count):  # type: ignore[no-untyped-def]
+def judge(ledger, count):  # type: ignore[no-untyped-def]
     """The heaviest match, the log odds of its attitude against all else, and what it comes to."""
+    weights, attitudes, covariances = ledger.weight, ledger.attitude, ledger.covariance
     if count == 0:
         return -1, -math.inf, NOTHING
-    best = np.argmax(weights[:count])
+    best = 0
+    for h in range(count):
+        if weights[h] > weights[best]:
+            best = h
     same, others = 0.0, max(math.exp(weighing.LOG_NULL - weights[best]), LEAST)
     for h in range(count):
         share = math.exp(weights[h] - weights[best])
@@ -41,27 +45,22 @@ def judge(ledger, weights, attitudes, covariances, count):  # type: ignore[no-un
     log_odds = math.log(same / others)
     if others > weighing.DOUBT * (same + others):
         return best, log_odds, DOUBTFUL
-    if _largest_variance(covariances[best]) > LARGEST_SIGMA_RAD**2:
+    if not _within(covariances[best], LARGEST_SIGMA_RAD**2):
         return best, log_odds, DEGENERATE
     return best, log_odds, FOUND
 
 
 @njit(cache=True, nogil=True)
-def _largest_variance(p):  # type: ignore[no-untyped-def]
-    """The largest eigenvalue of a covariance (3, 3), by powers of it."""
-    a = p.copy()
-    trace = a[0, 0] + a[1, 1] + a[2, 2]
-    for _ in range(5):
-        a /= trace
-        a = a @ a
-        trace = a[0, 0] + a[1, 1] + a[2, 2]
-    # a is now nearly the projector on the largest axis.
-    a /= trace
-    largest = 0.0
-    for i in range(3):
-        for j in range(3):
-            largest += a[i, j] * p[j, i]
-    return largest
+def _within(p, largest):  # type: ignore[no-untyped-def]
+    """Whether no axis of a covariance (3, 3) has more than the largest variance allowed.
+
+    That is where I - P / largest is positive definite.
+    """
+    a, b, c = 1.0 - p[0, 0] / largest, 1.0 - p[1, 1] / largest, 1.0 - p[2, 2] / largest
+    d, e, f = p[0, 1] / largest, p[0, 2] / largest, p[1, 2] / largest
+    minor = a * b - d * d
+    det = a * (b * c - f * f) - d * (d * c + f * e) - e * (d * f + b * e)
+    return a > 0.0 and minor > 0.0 and det > 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -100,7 +99,7 @@ def star_probabilities(  # type: ignore[no-untyped-def]
         gate = min(6.0 * math.sqrt(variance), LARGEST_GATE_RAD)
         m = points.magnitude[k]
         found[0], found[1], _ = nearest_stars(
-            *(index.stars, index.face, index.cell_start, index.cell_rows),
+            *(index.cell_place, index.face, index.cell_start, index.cell_rows),
             *(x, y, z, gate, m - magnitude_gate, m + magnitude_gate),
         )
         total = clutter

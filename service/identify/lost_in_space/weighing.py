@@ -29,6 +29,7 @@ LEAST_EVIDENCE = math.log(1.0 / DOUBT - 1.0) + LOG_NULL
 
 POSITION_SCALES = ((0.15, 0.5), (0.6, 1.0), (0.25, 2.0))
 """Weights, and the factors by which the sigmas may be off."""
+_LOG_SCALES = tuple((math.log(w), math.log(s), 0.5 / (s * s)) for w, s in POSITION_SCALES)
 CLEAN_CLUTTER = 0.3
 """In a clean field each further point that is no star of the index is this likely."""
 DETECTED = 0.97
@@ -61,14 +62,15 @@ _LOG_ROTATIONS = math.log(8.0 * math.pi**2)
 @njit(cache=True, nogil=True)
 def log_positions(matched, log_area_per_spot, chi2, log_det):  # type: ignore[no-untyped-def]
     """Positions and the volume of the attitude; `log_area_per_spot`: sum of ln(A/2 pi sigma^2)."""
-    total = -math.inf
-    for weight, scale in POSITION_SCALES:
-        total = log_sum(
-            total,
-            math.log(weight)
-            + (3.0 - 2.0 * matched) * math.log(scale)
-            - 0.5 * chi2 / (scale * scale),
-        )
+    most = -math.inf
+    for log_weight, log_scale, half in _LOG_SCALES:
+        most = max(most, log_weight + (3.0 - 2.0 * matched) * log_scale - half * chi2)
+    if most == -math.inf:
+        return most
+    shares = 0.0
+    for log_weight, log_scale, half in _LOG_SCALES:
+        shares += math.exp(log_weight + (3.0 - 2.0 * matched) * log_scale - half * chi2 - most)
+    total = most + math.log(shares)
     return log_area_per_spot + total + 1.5 * _LOG_2PI - 0.5 * log_det - _LOG_ROTATIONS
 
 
