@@ -1,14 +1,15 @@
 """The one object that every door holds: web, replay, simulator and scripts go through it."""
 
+import dataclasses
 import gc
 import hashlib
 import json
+import logging
 import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import suppress
 from functools import partial
 from typing import IO
 
@@ -84,6 +85,8 @@ from service.times import Utc, utc_now
 from service.warm import warm_up, warm_zones
 
 __all__ = ["LIVE", "Answered", "Operations", "Page"]
+
+log = logging.getLogger(__name__)
 
 ALL_RUNS = "*"
 MAX_REPLAYS = 8
@@ -199,19 +202,27 @@ class Operations:
                 gc.freeze()
                 self._warm = True
             finally:
+                gc.enable()
                 self._warming.release()
         self.store.writer.require()
         with self.store.reading() as connection:
             connection.exec_driver_sql("SELECT 1")
 
     def _look_where_they_look(self) -> None:
-        """Build what the next batch of each live spacecraft will most likely ask for."""
+        """Build what the next batch of each live spacecraft will most likely ask for.
+
+        A batch of each is rehearsed, all but kept, under a name that it does not have.
+        """
         with self.store.reading() as connection:
             inputs = latest_inputs(connection)
         for text in inputs:
-            # One that cannot be run any more is no reason not to start.
-            with suppress(AcquisitionError):
-                self._intake.run_again(submission_from_json(text).batch)
+            try:
+                sent = submission_from_json(text)
+                batch = dataclasses.replace(sent.batch, batch=self._ids.new())
+                self._intake.rehearse(dataclasses.replace(sent, batch=batch))
+            except Exception as error:
+                # One that cannot be run any more is no reason not to start.
+                log.warning("the latest batch of a spacecraft could not be rehearsed: %s", error)
 
     # ---- batches -----------------------------------------------------------------------------
 

@@ -19,6 +19,9 @@ from service.sky.zones import Zone
 from service.times import Utc, parse_utc
 from service.vectors import quaternion_from_matrix
 
+BRIGHT_MAG = 5.5
+"""So few stars are enough for every kernel, and take a quarter of the time to be built from."""
+
 
 def warm_zones(sky: Sky, mission: Mission, prior: APriori, time: Utc) -> list[Zone]:
     """Put the zones on the shelf that a batch of this a priori knowledge will ask for."""
@@ -44,7 +47,7 @@ def warm_up(sky: Sky, missions: Mapping[str, Mission]) -> None:
     moment = parse_utc("2000-01-01T12:00:00Z")
     # Large enough that nothing is built twice on the way.
     apart = Sky(sky.catalog, Shelf(max_bytes=256 << 20))
-    kinds = {mission.zone.kind: mission for mission in missions.values()}
+    kinds = {mission.zone.kind: _of_bright_stars(mission) for mission in missions.values()}
     first = next(iter(kinds.values()), None)
     for mission in kinds.values():
         tracker = mission.trackers[0]
@@ -84,6 +87,12 @@ def warm_up(sky: Sky, missions: Mapping[str, Mission]) -> None:
             options = {"identifier": identifier, "zone_grid_deg": 0.0}
             batch = submission_from_json(json.dumps(body | {"options": options})).batch
             acquire(batch, mission, apart)
+
+
+def _of_bright_stars(mission: Mission) -> Mission:
+    limit_mag = min(BRIGHT_MAG, mission.catalog.magnitude_limit_mag)
+    settings = mission.catalog.model_copy(update={"magnitude_limit_mag": limit_mag})
+    return mission.model_copy(update={"catalog": settings})
 
 
 if __name__ == "__main__":

@@ -1,24 +1,28 @@
-"""The schema's migrations: bringing a database up to date, and telling whether it is."""
+"""The schema's migrations: bringing a database up to date, and telling whether it is.
+
+alembic is loaded only where there is something to change or to compare: a
+service that starts would wait for it.
+"""
 
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from alembic import command
-from alembic.autogenerate import compare_metadata
-from alembic.config import Config
-from alembic.runtime.migration import MigrationContext
-from alembic.script import ScriptDirectory
-from alembic.util import CommandError
-from sqlalchemy import URL, Connection, Engine
+from sqlalchemy import URL, Connection, Engine, inspect
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.errors import BadConfiguration
 from service.records.engines import database_url, reading_engine, shown_url, writing_engine
 from service.records.tables import metadata
 from service.resources import shipped
+
+if TYPE_CHECKING:
+    from alembic.config import Config
+
+HEAD = "0006"
+"""The latest revision of `migrations/`."""
 
 
 def upgrade(database: str) -> None:
@@ -41,9 +45,12 @@ def check(database: str) -> list[str]:
     if url.drivername == "sqlite" and not Path(url.database or "").is_file():
         raise BadConfiguration(f"ACQUIRE_DATABASE: {url.database}: there is no such file")
     with _disposed(reading_engine(url)) as engine, reported(url), engine.begin() as connection:
-        found, wanted = _revision(connection), _head()
-        if found != wanted:
-            return [_behind(found, wanted)]
+        found = _revision(connection)
+        if found != HEAD:
+            return [_behind(found)]
+        from alembic.autogenerate import compare_metadata
+        from alembic.runtime.migration import MigrationContext
+
         context = MigrationContext.configure(connection, opts={"compare_type": True})
         return [_in_words(difference) for difference in compare_metadata(context, metadata)]
 
@@ -59,20 +66,28 @@ def check_fresh() -> list[str]:
 def bring_up_to_date(engine: Engine) -> None:
     """Run the migrations that are missing, in one transaction."""
     with reported(engine.url), engine.begin() as connection:
+        if _revision(connection) == HEAD:
+            return
+        from alembic import command
+        from alembic.util import CommandError
+
         config = _config()
         config.attributes["connection"] = connection
-        command.upgrade(config, "head")
+        try:
+            command.upgrade(config, "head")
+        except CommandError:
+            raise BadConfiguration(
+                f"ACQUIRE_DATABASE: {shown_url(engine.url)}: was written by another version of "
+                "the service"
+            ) from None
 
 
 def require_up_to_date(engine: Engine) -> None:
     """Raise `BadConfiguration` unless the schema is this version's."""
     with reported(engine.url), engine.begin() as connection:
         found = _revision(connection)
-    wanted = _head()
-    if found != wanted:
-        raise BadConfiguration(
-            f"ACQUIRE_DATABASE: {shown_url(engine.url)}: {_behind(found, wanted)}"
-        )
+    if found != HEAD:
+        raise BadConfiguration(f"ACQUIRE_DATABASE: {shown_url(engine.url)}: {_behind(found)}")
 
 
 @contextmanager
@@ -80,10 +95,6 @@ def reported(url: URL) -> Iterator[None]:
     """Turn what a database says of itself on opening into a `BadConfiguration`."""
     try:
         yield
-    except CommandError:
-        raise BadConfiguration(
-            f"ACQUIRE_DATABASE: {shown_url(url)}: was written by another version of the service"
-        ) from None
     except SQLAlchemyError as error:
         said = str(getattr(error, "orig", None) or error).strip()
         raise BadConfiguration(f"ACQUIRE_DATABASE: {shown_url(url)}: {said}") from error
@@ -97,7 +108,9 @@ def _disposed(engine: Engine) -> Iterator[Engine]:
         engine.dispose()
 
 
-def _config() -> Config:
+def _config() -> "Config":
+    from alembic.config import Config
+
     config = Config()
     # A percent sign in a path would be taken for the start of a variable.
     config.set_main_option("script_location", str(shipped("migrations")).replace("%", "%%"))
@@ -105,16 +118,15 @@ def _config() -> Config:
 
 
 def _revision(connection: Connection) -> str | None:
-    return MigrationContext.configure(connection).get_current_revision()
+    if not inspect(connection).has_table("alembic_version"):
+        return None
+    revisions = connection.exec_driver_sql("SELECT version_num FROM alembic_version").scalars()
+    return next(iter(revisions), None)
 
 
-def _head() -> str | None:
-    return ScriptDirectory.from_config(_config()).get_current_head()
-
-
-def _behind(found: str | None, wanted: str | None) -> str:
+def _behind(found: str | None) -> str:
     return (
-        f"its schema is at {found or 'nothing'}, this version needs {wanted}: "
+        f"its schema is at {found or 'nothing'}, this version needs {HEAD}: "
         "run `acquire database upgrade`"
     )
 

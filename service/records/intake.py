@@ -6,8 +6,10 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
+from contextlib import suppress
 
 import msgspec
+from sqlalchemy import Connection
 
 from service.acquire import Acquisition, acquire
 from service.errors import AcquisitionError, BadBatch, Busy, Fault, NotFound, shown_value
@@ -29,6 +31,7 @@ from service.records.identity import (
 )
 from service.records.ids import Ulids
 from service.records.reading import one_result
+from service.records.recording import record
 from service.records.running import Running
 from service.records.store import Store
 from service.records.transaction import Results
@@ -48,6 +51,10 @@ log = logging.getLogger(__name__)
 
 Observer = Callable[[Acquisition], None]
 Answers = list[Answered | AcquisitionError]
+
+
+class _Rehearsed(Exception):
+    """Takes a rehearsal back."""
 
 
 class Intake:
@@ -151,6 +158,22 @@ class Intake:
             created=utc_now(),
         )
         return _raised(self._write([draft])[0])
+
+    def rehearse(self, submission: Submission) -> None:
+        """Take a batch all the way and take it back: nothing is kept, and nobody is told.
+
+        Connections are opened and statements put together that the first batch
+        would wait for.
+        """
+        self._stored_orders([Order(submission, None)])
+        draft = self._draft(submission)
+
+        def record_and_regret(connection: Connection) -> None:
+            record(connection, [draft])
+            raise _Rehearsed
+
+        with suppress(_Rehearsed):
+            self._store.writer.change(record_and_regret).result()
 
     def run_again(self, batch: ObservationBatch, mission: Mission | None = None) -> Acquisition:
         """A recorded batch down the staircase once more; nothing is kept.

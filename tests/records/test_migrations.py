@@ -51,6 +51,10 @@ def present(opened, make, database):
     return rows_of(database, metadata.sorted_tables)
 
 
+def test_the_latest_is_the_one_that_the_code_knows():
+    assert REVISIONS[-1] == migrations.HEAD
+
+
 def test_there_are_earlier_versions():
     assert REVISIONS[0] == "0001"
     assert len(REVISIONS) >= 4

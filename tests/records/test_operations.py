@@ -3,13 +3,16 @@
 import json
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+from sqlalchemy import select
 
 from service.errors import AcquisitionError, BadBatch, BadConfiguration, BadInput, Busy, Conflict
 from service.observe.wire import OptionsIn, QuaternionIn, submission_from_json
 from service.operations import Operations
 from service.records import intake
+from service.records.tables import metadata
 from service.settings import Settings
 from service.times import parse_utc
 from tests.records.samples import KINDS, QUATERNION, without_accidents
@@ -63,6 +66,50 @@ def test_many_at_once_give_what_each_by_itself_gives(operations, make):
             assert together == alone.replace("run live", "run bulk")
     live, bulk = (operations.rates("XTE", run=run) for run in ("live", "bulk"))
     assert live == bulk
+
+
+def everything(operations):
+    """Every row of every table."""
+    with operations.store.reading() as connection:
+        return {
+            table.name: sorted(map(str, connection.execute(select(table))))
+            for table in metadata.sorted_tables
+        }
+
+
+def test_what_is_rehearsed_to_be_ready_is_not_kept(operations, make, caplog):
+    operations.submit(make("b1", kind="suspect"))
+    operations.submit(make("s1", spacecraft="SWAS"))
+    before, observed = everything(operations), []
+    operations.observers.append(observed.append)
+    operations.ready()
+    assert everything(operations) == before
+    assert observed == []
+    assert "rehearsed" not in caplog.text
+    assert not operations.submit(make("b2")).replayed
+
+
+def test_single_posts_go_before_bulk(operations, make, monkeypatch):
+    """Between the batches of a bulk load whatever came one by one is computed and recorded."""
+    monkeypatch.setattr(intake, "LET_PASS_S", 10.0)
+    acquire, order, first_at_work = intake.acquire, [], threading.Event()
+
+    def noting(batch, mission, sky):
+        order.append(batch.batch)
+        if batch.batch == "m0":
+            first_at_work.set()
+            time.sleep(0.5)
+        return acquire(batch, mission, sky)
+
+    monkeypatch.setattr(intake, "acquire", noting)
+    bulk = [make(f"m{k}", run="bulk") for k in range(4)]
+    single = make("b1")
+    with ThreadPoolExecutor(1) as threads:
+        many = threads.submit(operations.submit_many, bulk)
+        assert first_at_work.wait(30)
+        operations.submit(single)
+        assert len(many.result(30)) == 4
+    assert order == ["m0", "b1", "m1", "m2", "m3"]
 
 
 def test_nothing_at_once_is_nothing(operations):

@@ -55,6 +55,26 @@ def test_what_waits_together_is_committed_together(store):
     assert len(commits) == 2
 
 
+def test_what_has_time_lets_others_pass_for_one_transaction(store):
+    """Chunks of a bulk load neither hold up single posts nor wait for them for ever."""
+    done, writer = [], store.writer
+
+    def later(future, name):
+        future.add_done_callback(lambda _: done.append(name))
+        return future
+
+    def post_meanwhile(_connection):
+        later(writer.change(lambda _: None), "a post that came meanwhile")
+
+    go_on = held_up(writer)
+    chunks = [later(writer.record([], patient=True), f"chunk {k}") for k in (1, 2)]
+    later(writer.change(post_meanwhile), "a post")
+    go_on.set()
+    for each in chunks:
+        each.result(30)
+    assert done == ["a post", "chunk 1", "a post that came meanwhile", "chunk 2"]
+
+
 def test_an_answer_comes_after_its_commit(store):
     for index in range(20):
         store.writer.change(new_run(f"run{index:02d}")).result(30)
