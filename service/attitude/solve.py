@@ -76,10 +76,32 @@ def solve_attitude(
 
 @lru_cache(maxsize=1024)
 def taste_bound(degrees_of_freedom: int) -> float:
-    """The 99.9 % point of chi-square: beyond it a solution is suspect."""
-    from scipy.special import chdtri
+    """The 99.9 % point of chi-square: beyond it a solution is suspect.
 
-    return float(chdtri(degrees_of_freedom, SUSPECT_TAIL))
+    `degrees_of_freedom` is odd, as 2 N - 3 is.  By Newton's steps on the
+    logarithm of the tail; scipy, which knows it too, takes longer to load than
+    the first hundred batches to solve.
+    """
+    bound = float(degrees_of_freedom) + 10.0
+    for _ in range(100):
+        tail, density = _chi_square(bound, degrees_of_freedom)
+        step = math.log(tail / SUSPECT_TAIL) * tail / density
+        bound += step
+        if abs(step) < 1e-13 * bound:
+            break
+    return bound
+
+
+def _chi_square(x: float, odd: int) -> tuple[float, float]:
+    """The probability of more than x, and the density there, of chi-square with `odd` degrees."""
+    half = odd / 2.0
+    density = math.exp((half - 1.0) * math.log(x / 2.0) - x / 2.0 - math.lgamma(half)) / 2.0
+    # Abramowitz & Stegun 26.4.4: each two degrees add twice the density of the sum.
+    tail, term = math.erfc(math.sqrt(x / 2.0)), density
+    for degrees in range(odd, 1, -2):
+        tail += 2.0 * term
+        term *= (degrees - 2) / x
+    return tail, density
 
 
 def _tracker_fits(

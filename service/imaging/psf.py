@@ -12,7 +12,6 @@ from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import erf
 
 from service.errors import BadInput, Fault
 
@@ -58,6 +57,9 @@ class GaussianPsf:
         return self._share_slope(du_px) * in_v, in_u * self._share_slope(dv_px)
 
     def _share(self, distance_px: npt.ArrayLike) -> Array:
+        # Loaded with the first frame: nothing else that is served asks for it.
+        from scipy.special import erf
+
         x = np.asarray(distance_px, dtype=np.float64)
         scale = math.sqrt(2.0) * self.sigma_px
         return np.asarray(0.5 * (erf((x + 0.5) / scale) - erf((x - 0.5) / scale)))

@@ -3,7 +3,8 @@
 import numpy as np
 import numpy.typing as npt
 
-from service.vectors import ARCSEC_PER_RADIAN, Vector
+from service.sky.pairs import build_pairs
+from service.vectors import Vector
 
 Rows = npt.NDArray[np.intp]
 
@@ -36,12 +37,8 @@ def merge(
 
 def pairs_within(direction: Vector, within_arcsec: float) -> Rows:
     """The pairs (P, 2) of rows not further apart than some arcsec."""
-    from scipy.spatial import cKDTree
-
-    # A tree that serves one search is quicker unbalanced than balanced first.
-    tree = cKDTree(direction, balanced_tree=False, compact_nodes=False)
-    chord = 2.0 * np.sin(within_arcsec / ARCSEC_PER_RADIAN / 2.0)
-    return np.asarray(tree.query_pairs(chord, output_type="ndarray"))
+    pairs = build_pairs(direction, within_arcsec / 3600.0)
+    return np.stack([pairs.brighter, pairs.dimmer], axis=1).astype(np.intp)
 
 
 def combined(

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from service.attitude.solve import taste_bound
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion
@@ -123,3 +124,9 @@ class TestOutlier:
     def test_one_tracker_is_compared_with_nothing(self, rng):
         inertial = field_of_stars(rng, rng.normal(size=3), 4.0, 5)
         assert solved(inertial, inertial, 2.0).trackers == ()
+
+
+def test_the_bounds_are_scipy_s_up_to_the_most_stars_that_a_batch_may_have():
+    freedoms = [*range(1, 400, 2), 2 * 250 - 3, 2 * 16 * 250 - 3]
+    bounds = [taste_bound(freedom) for freedom in freedoms]
+    assert bounds == pytest.approx(chi2.isf(0.001, freedoms), rel=1e-10)
