@@ -24,15 +24,18 @@ USUAL_POINTS = 64
 """A block that is kept is large enough for so many."""
 RANKS = 16
 """Places for the most telling points, `MOST_SIEVES` of them."""
-POINT_WORDS = 3 + 3 + 7 + 5
-FIXED_WORDS = (
-    (20 * RANKS + 88 + 44 * CHUNK) // 8
-    + 27
-    + 19 * LEDGER
-    + MOST_POINTS * (MOST_POINTS + 2)
-    + 2 * MOST_PUT_OFF
-)
-"""What `room_in` takes of every point, and whatever their number."""
+POINT_WORDS = 18
+"""Of every point, beside those of the ledger."""
+TALLY_AT = 0
+VELOCITY_AT = TALLY_AT + 8 * 4
+SIEVE_AT = VELOCITY_AT + 8 * 4
+CHUNK_AT = SIEVE_AT + 32 + 20 * RANKS
+HAND_AT = CHUNK_AT + 40 * CHUNK
+LEDGER_AT = HAND_AT + 216 + 4 * CHUNK
+PAIRS_AT = LEDGER_AT + 8 * 19 * LEDGER
+LATER_AT = PAIRS_AT + 8 * MOST_POINTS * (MOST_POINTS + 2)
+POINTS_AT = LATER_AT + 16 * MOST_PUT_OFF
+"""Where in a block what begins, in bytes; at the end what depends on the number of points."""
 
 
 class Ledger(NamedTuple):
@@ -115,76 +118,121 @@ class Chunk(NamedTuple):
 
 
 class Room(NamedTuple):
-    """What a search writes to.
+    """What a search for n points writes to: a block of `words_for(n)` words.
 
-    `order` (n,) are the rows, as they were given, of the `points`, which are brightest
-    first; `tally` is what the search counts; `later` (MOST_PUT_OFF, 4) keeps of
-    candidates that are put off the pair of points, the two stars, and which further
-    points may have one.
+    Handed on as it is, and cut where it is needed: code that hands on dozens of
+    arrays takes minutes to compile.
     """
 
-    order: Any
-    points: Points
-    tally: Any
-    later: Any
-    hand: Hand
-    ledger: Ledger
-    pairs: Pairs
-    sieve: Sieve
-    chunk: Chunk
+    block: Any
+    n: Any
 
 
 @njit(cache=True, nogil=True)
 def words_for(n):  # type: ignore[no-untyped-def]
     """How many words of 64 bits a search for n points needs."""
-    return FIXED_WORDS + n * (POINT_WORDS + LEDGER)
+    return POINTS_AT // 8 + n * (POINT_WORDS + LEDGER)
 
 
 @njit(cache=True, nogil=True)
-def room_in(block, n):  # type: ignore[no-untyped-def]
-    """The arrays of a search for n points, cut from a block of `words_for(n)` words."""
-    f8, f4, i8, i4 = np.float64, np.float32, np.int64, np.int32
-    at = 0
-    # What is most used comes first, so that it lies together.
-    single = lent(block, at, (3, RANKS), f4)
-    at += 12 * RANKS
-    level, cell = lent(block, at, (RANKS,), i4), lent(block, at + 4 * RANKS, (RANKS,), i4)
-    at += 8 * RANKS
-    turn, tally = lent(block, at, (4,), i8), lent(block, at + 32, (4,), i8)
-    velocity = lent(block, at + 64, (3,), f8)
-    at += 88
-    places = lent(block, at, (6, CHUNK), f4)
-    at += 24 * CHUNK
-    rows, cells = lent(block, at, (2, CHUNK), i4), lent(block, at + 8 * CHUNK, (CHUNK,), i4)
-    possible = lent(block, at + 12 * CHUNK, (CHUNK,), i4)
-    inside = lent(block, at + 16 * CHUNK, (CHUNK,), i4)
-    at += 20 * CHUNK
-    matrices = lent(block, at, (3, 3, 3), f8)
-    at += 8 * 27
-    weight = lent(block, at, (LEDGER,), f8)
-    at += 8 * LEDGER
-    attitudes = lent(block, at, (2, LEDGER, 3, 3), f8)
-    at += 8 * 18 * LEDGER
-    cost = lent(block, at, (MOST_POINTS, MOST_POINTS), f8)
-    at += 8 * MOST_POINTS * MOST_POINTS
-    used = lent(block, at, (MOST_POINTS,), f8)
-    covered = lent(block, at + 8 * MOST_POINTS, (MOST_POINTS,), i8)
-    at += 16 * MOST_POINTS
-    later = lent(block, at, (MOST_PUT_OFF, 4), i4)
-    at += 16 * MOST_PUT_OFF
-    observed, coefficients = lent(block, at, (n, 3), f8), lent(block, at + 24 * n, (n, 3), f8)
-    at += 48 * n
-    real, whole = lent(block, at, (7, n), f8), lent(block, at + 56 * n, (5, n), i8)
-    at += 96 * n
-    match = lent(block, at, (LEDGER, n), i8)
-    return Room(
-        whole[0],
-        Points(observed, real[0], real[1], velocity),
-        tally,
-        later,
-        Hand(whole[1], real[2], matrices[0], matrices[1], matrices[2], inside),
-        Ledger(match, weight, attitudes[0], attitudes[1]),
-        Pairs(cost, used, covered, whole[2], whole[3], real[3], real[4]),
-        Sieve(coefficients, real[5], whole[4], real[6], turn, single, level, cell),
-        Chunk(rows, places, cells, possible),
+def points_in(room):  # type: ignore[no-untyped-def]
+    """The points, brightest first."""
+    block, n = room
+    return Points(
+        lent(block, POINTS_AT, (n, 3), np.float64),
+        lent(block, POINTS_AT + 24 * n, (n,), np.float64),
+        lent(block, POINTS_AT + 32 * n, (n,), np.float64),
+        lent(block, VELOCITY_AT, (3,), np.float64),
     )
+
+
+@njit(cache=True, nogil=True)
+def order_in(room):  # type: ignore[no-untyped-def]
+    """The rows (n,) of the points as they were given."""
+    block, n = room
+    return lent(block, POINTS_AT + 40 * n, (n,), np.int64)
+
+
+@njit(cache=True, nogil=True)
+def hand_in(room):  # type: ignore[no-untyped-def]
+    """See `Hand`."""
+    block, n = room
+    return Hand(
+        lent(block, POINTS_AT + 48 * n, (n,), np.int64),
+        lent(block, POINTS_AT + 56 * n, (n,), np.float64),
+        lent(block, HAND_AT, (3, 3), np.float64),
+        lent(block, HAND_AT + 72, (3, 3), np.float64),
+        lent(block, HAND_AT + 144, (3, 3), np.float64),
+        lent(block, HAND_AT + 216, (CHUNK,), np.int32),
+    )
+
+
+@njit(cache=True, nogil=True)
+def pairs_in(room):  # type: ignore[no-untyped-def]
+    """See `Pairs`."""
+    block, n = room
+    every = MOST_POINTS * MOST_POINTS
+    return Pairs(
+        lent(block, PAIRS_AT, (MOST_POINTS, MOST_POINTS), np.float64),
+        lent(block, PAIRS_AT + 8 * every, (MOST_POINTS,), np.float64),
+        lent(block, PAIRS_AT + 8 * (every + MOST_POINTS), (MOST_POINTS,), np.int64),
+        lent(block, POINTS_AT + 64 * n, (n,), np.int64),
+        lent(block, POINTS_AT + 72 * n, (n,), np.int64),
+        lent(block, POINTS_AT + 80 * n, (n,), np.float64),
+        lent(block, POINTS_AT + 88 * n, (n,), np.float64),
+    )
+
+
+@njit(cache=True, nogil=True)
+def sieve_in(room):  # type: ignore[no-untyped-def]
+    """See `Sieve`."""
+    block, n = room
+    return Sieve(
+        lent(block, POINTS_AT + 96 * n, (n, 3), np.float64),
+        lent(block, POINTS_AT + 120 * n, (n,), np.float64),
+        lent(block, POINTS_AT + 128 * n, (n,), np.int64),
+        lent(block, POINTS_AT + 136 * n, (n,), np.float64),
+        lent(block, SIEVE_AT, (4,), np.int64),
+        lent(block, SIEVE_AT + 32, (3, RANKS), np.float32),
+        lent(block, SIEVE_AT + 32 + 12 * RANKS, (RANKS,), np.int32),
+        lent(block, SIEVE_AT + 32 + 16 * RANKS, (RANKS,), np.int32),
+    )
+
+
+@njit(cache=True, nogil=True)
+def chunk_in(room):  # type: ignore[no-untyped-def]
+    """See `Chunk`."""
+    block = room.block
+    return Chunk(
+        lent(block, CHUNK_AT, (2, CHUNK), np.int32),
+        lent(block, CHUNK_AT + 8 * CHUNK, (6, CHUNK), np.float32),
+        lent(block, CHUNK_AT + 32 * CHUNK, (CHUNK,), np.int32),
+        lent(block, CHUNK_AT + 36 * CHUNK, (CHUNK,), np.int32),
+    )
+
+
+@njit(cache=True, nogil=True)
+def ledger_in(room):  # type: ignore[no-untyped-def]
+    """See `Ledger`."""
+    block, n = room
+    return Ledger(
+        lent(block, POINTS_AT + 144 * n, (LEDGER, n), np.int64),
+        lent(block, LEDGER_AT, (LEDGER,), np.float64),
+        lent(block, LEDGER_AT + 8 * LEDGER, (LEDGER, 3, 3), np.float64),
+        lent(block, LEDGER_AT + 80 * LEDGER, (LEDGER, 3, 3), np.float64),
+    )
+
+
+@njit(cache=True, nogil=True)
+def tally_in(room):  # type: ignore[no-untyped-def]
+    """What the search counts (4,)."""
+    return lent(room.block, TALLY_AT, (4,), np.int64)
+
+
+@njit(cache=True, nogil=True)
+def later_in(room):  # type: ignore[no-untyped-def]
+    """Candidates put off (MOST_PUT_OFF, 4).
+
+    The pair of points, its two stars, and which further points may have one.
+    """
+    return lent(room.block, LATER_AT, (MOST_PUT_OFF, 4), np.int32)

@@ -24,7 +24,17 @@ from service.identify.lost_in_space.pair_order import (
     rows_within,
 )
 from service.identify.lost_in_space.predictors import GATE, predict
-from service.identify.lost_in_space.room import MOST_POINTS, MOST_PUT_OFF
+from service.identify.lost_in_space.room import (
+    MOST_POINTS,
+    MOST_PUT_OFF,
+    chunk_in,
+    hand_in,
+    later_in,
+    ledger_in,
+    pairs_in,
+    sieve_in,
+    tally_in,
+)
 from service.identify.lost_in_space.sieve import candidates_of, possible_of, ranked, stars_near
 from service.sky.sky_index import BITMAP_RADII_RAD
 
@@ -38,7 +48,8 @@ One in fifty true pairs is missed for half the work.  Of few points all is tried
 FEW_POINTS, MOST_FIRST = 6, 4
 """Of so few points a candidate is first held against all others; of more against three."""
 SIEVES_IN_TURN = 6
-"""Points of which three at a time are the first that a candidate is held against."""
+"""Points of which three at a time are the first that a candidate is held against.
+Later all are: the most telling are bright, and the bright ones may all be no stars."""
 MOST_SIEVES = 12
 """Further points that a candidate is held against."""
 SETTLE_WORK = 60
@@ -85,7 +96,7 @@ def search(points, index, field, room):  # type: ignore[no-untyped-def]
     """
     n = len(points.observed)
     gate_mag = magnitude_gate(field.magnitude_sigma)
-    tally, pairs = room.tally, room.pairs
+    tally, pairs, sieve = tally_in(room), pairs_in(room), sieve_in(room)
     tally[:] = 0
     fewest = weighing.fewest_stars(points, field.area, field.magnitude_sigma)
     if fewest > n:
@@ -123,13 +134,13 @@ def search(points, index, field, room):  # type: ignore[no-untyped-def]
             if i < 0:
                 break
             tries += 1
-            sieves = predict(points, pairs.beyond, i, j, BITMAP_RADII_RAD[-1], room.sieve)
+            sieves = predict(points, pairs.beyond, i, j, BITMAP_RADII_RAD[-1], sieve)
             if sieves < further:
                 continue
             # A poor lever does not reach all points: others must try again.
             pairs.covered[i] = pairs.covered[j] = pairs.covered[i] or sieves == n - 2
             in_haste = tries <= (hasty if n <= FEW_POINTS else FIRST_TRIES)
-            plan = plan_of(n, i, j, sieves, tries, in_haste, further, gate_mag, room.sieve)
+            plan = plan_of(n, i, j, sieves, tries, in_haste, further, gate_mag, sieve)
             state = try_pair(points, index, field, gate_mag, plan, room)
     if state == GOING_ON:
         state = try_put_off(points, index, field, gate_mag, further, room)
@@ -157,7 +168,7 @@ def plan_of(n, i, j, sieves, tries, in_haste, further, gate_mag, sieve):  # type
     else:
         # Where half of the points are no stars, two of three is too much to ask.
         firsts, needed = min(sieves, 2), 1
-    turns = min(sieves, SIEVES_IN_TURN)
+    turns = min(sieves, SIEVES_IN_TURN) if tries <= FIRST_TRIES else sieves
     for s in range(firsts):
         sieve.turn[s] = (firsts * (tries - 1) + s) % turns
     strong = strong_of(further, sieves)
@@ -170,8 +181,8 @@ def plan_of(n, i, j, sieves, tries, in_haste, further, gate_mag, sieve):  # type
 def try_pair(points, index, field, gate_mag, plan, room):  # type: ignore[no-untyped-def]
     """Try every star pair that a pair of points may be; whether the search goes on."""
     i, j = plan.i, plan.j
-    sieve, chunk, tally = room.sieve, room.chunk, room.tally
-    ranked(sieve, room.pairs.beyond, plan.sieves)
+    sieve, chunk, tally = sieve_in(room), chunk_in(room), tally_in(room)
+    ranked(sieve, pairs_in(room).beyond, plan.sieves)
     low, high = buckets_of(points, index, i, j, plan.gate)
     first, last = classes_of(points.magnitude[j], index.class_edge, plan.gate_mag)
     rows_i = rows_within(index.brighter, points.magnitude[i], plan.gate_mag)
@@ -223,7 +234,8 @@ def hits_of(points, index, gate_mag, plan, a, b, near, room):  # type: ignore[no
     Of those that may, one by one until they are `strong`, or cannot be enough
     any more; their stars go to the match in hand.
     """
-    coefficients, gate, match = room.sieve.coefficients, room.sieve.gate, room.hand.match
+    sieve, match, tally = sieve_in(room), hand_in(room).match, tally_in(room)
+    coefficients, gate, order = sieve.coefficients, sieve.gate, sieve.order
     stars = index.stars
     limit_mag = index.class_edge[-1, 0]
     x0, x1, x2 = stars[a, 0], stars[a, 1], stars[a, 2]
@@ -236,7 +248,7 @@ def hits_of(points, index, gate_mag, plan, a, b, near, room):  # type: ignore[no
             break
         if (near >> s) & 1 == 0:
             continue
-        k = room.sieve.order[s]
+        k = order[s]
         f, g, h = coefficients[k, 0], coefficients[k, 1], coefficients[k, 2]
         p0, p1, p2 = f * x0 + g * y0 + h * z0, f * x1 + g * y1 + h * z1, f * x2 + g * y2 + h * z2
         norm = 1.0 / math.sqrt(p0 * p0 + p1 * p1 + p2 * p2)
@@ -246,7 +258,7 @@ def hits_of(points, index, gate_mag, plan, a, b, near, room):  # type: ignore[no
             *(p0 * norm, p1 * norm, p2 * norm, gate[k]),
             *(m - gate_mag, faintest_star(limit_mag, m, gate_mag)),
         )
-        room.tally[WORK] += 2
+        tally[WORK] += 2
         if row >= 0 and row != a and row != b:
             match[k] = row
             hits += 1
@@ -257,23 +269,24 @@ def hits_of(points, index, gate_mag, plan, a, b, near, room):  # type: ignore[no
 @njit(cache=True, nogil=True)
 def put_off(room, i, j, a, b, near):  # type: ignore[no-untyped-def]
     """Put off the candidate in which points i and j are stars a and b, with what is near."""
-    later = room.later
-    at = room.tally[PUT_OFF]
+    later, tally = later_in(room), tally_in(room)
+    at = tally[PUT_OFF]
     later[at, 0], later[at, 1], later[at, 2], later[at, 3] = i * MOST_POINTS + j, a, b, near
-    room.tally[PUT_OFF] += 1
+    tally[PUT_OFF] += 1
 
 
 @njit(cache=True, nogil=True, forceinline=True)
 def try_put_off(points, index, field, gate_mag, further, room):  # type: ignore[no-untyped-def]
     """Try the candidates that were put off, in their order; whether the search goes on."""
-    sieve, tally, later = room.sieve, room.tally, room.later
+    sieve, tally, later = sieve_in(room), tally_in(room), later_in(room)
+    beyond = pairs_in(room).beyond
     last_i = last_j = np.int64(-1)
     sieves = 0
     for at in range(tally[PUT_OFF]):
         i, j = np.int64(later[at, 0] // MOST_POINTS), np.int64(later[at, 0] % MOST_POINTS)
         a, b, near = np.int64(later[at, 1]), np.int64(later[at, 2]), np.int64(later[at, 3])
         if i != last_i or j != last_j:
-            sieves = predict(points, room.pairs.beyond, i, j, BITMAP_RADII_RAD[-1], sieve)
+            sieves = predict(points, beyond, i, j, BITMAP_RADII_RAD[-1], sieve)
             sieves = min(sieves, MOST_SIEVES)
             last_i, last_j = i, j
         plan = Plan(i, j, sieves, 0, 0, further, strong_of(further, sieves), GATE, gate_mag)
@@ -289,7 +302,7 @@ def try_put_off(points, index, field, gate_mag, further, room):  # type: ignore[
 @njit(cache=True, nogil=True)
 def weigh(points, index, field, gate_mag, i, j, room):  # type: ignore[no-untyped-def]
     """Settle the candidate in hand and enter it in the ledger; whether it is beyond doubt."""
-    hand, ledger, tally = room.hand, room.ledger, room.tally
+    hand, ledger, tally = hand_in(room), ledger_in(room), tally_in(room)
     match, stars = hand.match, index.stars
     tally[WORK] += SETTLE_WORK
     for h in range(tally[COUNT]):

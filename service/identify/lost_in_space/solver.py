@@ -16,7 +16,15 @@ from service.attitude.solution import NoAttitude
 from service.identify.lost_in_space import verdict, weighing
 from service.identify.lost_in_space.matching import match_at, settle
 from service.identify.lost_in_space.pair_order import magnitude_gate
-from service.identify.lost_in_space.room import USUAL_POINTS, room_in, words_for
+from service.identify.lost_in_space.room import (
+    USUAL_POINTS,
+    Room,
+    hand_in,
+    ledger_in,
+    order_in,
+    points_in,
+    words_for,
+)
 from service.identify.lost_in_space.search import enter, search
 from service.identify.lost_in_space.seen import Field, Points
 from service.identify.uncounted import uncounted
@@ -193,7 +201,7 @@ def _take_in(direction, magnitude, sigma, velocity, room):  # type: ignore[no-un
     compiled; what comes after is compiled once.
     """
     n = len(direction)
-    order = room.order
+    order, points = order_in(room), points_in(room)
     for k in range(n):
         m = magnitude[k]
         at = k
@@ -203,7 +211,6 @@ def _take_in(direction, magnitude, sigma, velocity, room):  # type: ignore[no-un
             order[at] = order[at - 1]
             at -= 1
         order[at] = k
-    points = room.points
     for k in range(n):
         for i in range(3):
             points.observed[k, i] = direction[order[k], i]
@@ -215,7 +222,7 @@ def _take_in(direction, magnitude, sigma, velocity, room):  # type: ignore[no-un
 @njit(cache=True, nogil=True)
 def _judged(n, count, work, bounded, room, matrices, star):  # type: ignore[no-untyped-def]
     """The verdict, rows back in the order given: see `LostInSpaceResult`."""
-    ledger = room.ledger
+    ledger, order = ledger_in(room), order_in(room)
     best, log_odds, code = verdict.judge(ledger, count)
     matched = 0
     if best >= 0:
@@ -224,7 +231,7 @@ def _judged(n, count, work, bounded, room, matrices, star):  # type: ignore[no-u
                 matrices[0, i, j] = ledger.attitude[best, i, j]
                 matrices[1, i, j] = ledger.covariance[best, i, j]
         for k in range(n):
-            star[room.order[k]] = ledger.match[best, k]
+            star[order[k]] = ledger.match[best, k]
             matched += ledger.match[best, k] >= 0
     if n < FEWEST_POINTS:
         code = verdict.TOO_FEW
@@ -245,7 +252,7 @@ def _solve(direction, magnitude, sigma, velocity, store, field, block):  # type:
     matrices, star = np.zeros((2, 3, 3)), np.full(n, -1, np.int64)
     if len(block) < words_for(n):
         block = np.empty(words_for(n))
-    _take_in(direction, magnitude, sigma, velocity, room_in(block, n))
+    _take_in(direction, magnitude, sigma, velocity, Room(block, n))
     # What is made here is held here, so that what is called may borrow it.
     code, log_odds, matched, work, bounded = _searched(n, store, field, block, matrices, star)
     return code, matrices, star, log_odds, matched, work, bounded
@@ -254,19 +261,20 @@ def _solve(direction, magnitude, sigma, velocity, store, field, block):  # type:
 @njit(cache=True, nogil=True)
 def _searched(n, store, field, block, matrices, star):  # type: ignore[no-untyped-def]
     matrices, star = uncounted(matrices), uncounted(star)
-    index, room, field = index_in(store), room_in(block, n), _field_in(field)
-    points = room.points
+    index, field = index_in(store), _field_in(field)
+    room = Room(block, n)
+    points, ledger = points_in(room), ledger_in(room)
     count, work, bounded = search(points, index, field, room)
     told = _judged(n, count, work, bounded, room, matrices, star)
     code, log_odds, matched, _, _ = told
     if code != verdict.FOUND or log_odds > SURELY_NO_MIRROR or n - matched < 2:
         return told
     # Stars that lie alike on both sides of a line are found in a mirror too, though not all others.
-    weight = room.ledger.weight[:count].max()
+    weight = ledger.weight[:count].max()
     for k in range(n):
         points.observed[k, 0] = -points.observed[k, 0]
     count, more, bounded = search(points, index, field, room)
-    if count > 0 and room.ledger.weight[:count].max() > weight + math.log(weighing.DOUBT):
+    if count > 0 and ledger.weight[:count].max() > weight + math.log(weighing.DOUBT):
         code = verdict.DOUBTFUL
     return code, log_odds, matched, work + more, bounded
 
@@ -278,7 +286,7 @@ def _solve_near(  # type: ignore[no-untyped-def]
     n = len(direction)
     matrices, star = np.zeros((2, 3, 3)), np.full(n, -1, np.int64)
     matrices[0], matrices[1] = attitude, covariance
-    _take_in(direction, magnitude, sigma, velocity, room_in(block, n))
+    _take_in(direction, magnitude, sigma, velocity, Room(block, n))
     code, log_odds, matched, work, bounded = _weighed(n, store, field, block, matrices, star)
     return code, matrices, star, log_odds, matched, work, bounded
 
@@ -286,8 +294,9 @@ def _solve_near(  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _weighed(n, store, field, block, matrices, star):  # type: ignore[no-untyped-def]
     """What the attitude and covariance in `matrices` come to."""
-    index, room, field = index_in(store), room_in(block, n), _field_in(field)
-    hand, points = room.hand, room.points
+    index, field = index_in(store), _field_in(field)
+    room = Room(block, n)
+    hand, points = hand_in(room), points_in(room)
     hand.match[:] = -1
     hand.t[:], hand.covariance[:] = matrices[0], matrices[1]
     matrices[:] = 0.0
@@ -297,5 +306,5 @@ def _weighed(n, store, field, block, matrices, star):  # type: ignore[no-untyped
     if matched >= 3:
         matched, weight = settle(points, index, field, gate, hand)
         if matched >= 3 and weight > 0.0:
-            count = enter(hand, weight, room.ledger, 0)
+            count = enter(hand, weight, ledger_in(room), 0)
     return _judged(n, count, n, False, room, matrices, star)
