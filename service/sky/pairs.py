@@ -17,7 +17,9 @@ from service.vectors import Vector, read_only
 Indices = npt.NDArray[np.int32]
 
 PAIRS_PER_BIN = 4
-MAX_IN_BIN = 64
+PARTS = 4
+"""Of a bin, into which pairs are counted to be sorted."""
+MAX_IN_PART = 64
 MAX_CUBES = 64
 """Along an edge of the cube about the sphere."""
 MAX_PAIRS = 5_000_000
@@ -61,9 +63,9 @@ def build_pairs(direction: Vector, separation_max_deg: float) -> PairIndex:
     n = len(direction)
     # A guess from how many there would be were the stars spread evenly over a tenth of the sky.
     share = min(1.0, 10.0 * math.sin(0.5 * min(limit, math.pi)) ** 2)
-    room = min(MAX_PAIRS, int(0.5 * n * n * share) + 1024)
+    room = min(MAX_PAIRS, int(0.5 * n * n * share) + 1024) + n
     found = (np.empty(room), np.empty(room, np.int32), np.empty(room, np.int32))
-    count = _find_pairs(direction, limit, *found)
+    count, complete = _find_pairs(direction, limit, *found)
     if count > MAX_PAIRS:
         raise BadInput(
             Fault(
@@ -72,14 +74,15 @@ def build_pairs(direction: Vector, separation_max_deg: float) -> PairIndex:
                 str(separation_max_deg),
             )
         )
-    if count > room:
-        found = (np.empty(count), np.empty(count, np.int32), np.empty(count, np.int32))
-        _find_pairs(direction, limit, *found)
+    if not complete:
+        room = count + n
+        found = (np.empty(room), np.empty(room, np.int32), np.empty(room, np.int32))
+        count, _ = _find_pairs(direction, limit, *found)
     bins = max(1, count // PAIRS_PER_BIN)
     bins_per_rad = bins / limit
     separation = np.empty(count)
     brighter, dimmer = np.empty(count, np.int32), np.empty(count, np.int32)
-    bin_start = np.zeros(bins + 1, np.int32)
+    bin_start = np.empty(bins + 1, np.int32)
     _sort_pairs(*found, bins_per_rad, separation, brighter, dimmer, bin_start)
     return PairIndex(
         read_only(separation),
@@ -103,10 +106,12 @@ def separation_rad(a, b):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _find_pairs(direction, limit, separation, brighter, dimmer):  # type: ignore[no-untyped-def]
-    """The number of pairs up to a separation, of which as many as there is room for are written.
+    """The number of pairs up to a separation, and whether there was room to write all of them.
 
     Stars are put into cubes as wide as the longest chord, so that partners are
-    in the same cube or in one that touches it.
+    in the same cube or in one that touches it.  A third of those are partners,
+    which nothing foretells: everyone is written where the next one goes, and
+    counted if it is one, for that is cheaper than to branch.
     """
     n, room = len(direction), len(separation)
     chord = 2.0 * math.sin(0.5 * min(limit, math.pi))
@@ -133,8 +138,10 @@ def _find_pairs(direction, limit, separation, brighter, dimmer):  # type: ignore
     # A little more than the chord: the separation decides.
     most = chord * chord * (1.0 + 1e-12)
     count = 0
+    complete = True
     for at in range(n):
-        own = cube[rows[at]]
+        row = rows[at]
+        own = cube[row]
         x, y, z = own // (side * side), own // side % side, own % side
         a0, a1, a2 = ordered[at, 0], ordered[at, 1], ordered[at, 2]
         low, high = max(z - 1, 0), min(z + 1, side - 1)
@@ -149,24 +156,29 @@ def _find_pairs(direction, limit, separation, brighter, dimmer):  # type: ignore
                     continue
                 base = (u * side + v) * side
                 first, last = start[base + low], start[base + high + 1]
+            complete = complete and count + last - first <= room
             for other in range(first, last):
                 d0, d1, d2 = a0 - ordered[other, 0], a1 - ordered[other, 1], a2 - ordered[other, 2]
                 square = d0 * d0 + d1 * d1 + d2 * d2
-                if square > most:
-                    continue
-                angle = (
-                    separation_of(square)
-                    if square < 1.96
-                    else separation_rad(ordered[at], ordered[other])
-                )
-                if angle > limit:
-                    continue
-                if count < room:
-                    separation[count] = angle
-                    brighter[count] = min(rows[at], rows[other])
-                    dimmer[count] = max(rows[at], rows[other])
-                count += 1
-    return count
+                if complete:
+                    separation[count] = square
+                    brighter[count] = row
+                    dimmer[count] = rows[other]
+                count += square <= most
+    if not complete:
+        return count, False
+    kept = 0
+    for k in range(count):
+        square, one, other = separation[k], brighter[k], dimmer[k]
+        angle = (
+            separation_of(square)
+            if square < 1.96
+            else separation_rad(direction[one], direction[other])
+        )
+        separation[kept] = angle
+        brighter[kept], dimmer[kept] = min(one, other), max(one, other)
+        kept += angle <= limit
+    return kept, True
 
 
 @njit(cache=True, nogil=True)
@@ -189,44 +201,48 @@ def separation_of(square):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _sort_pairs(found, one, other, bins_per_rad, separation, brighter, dimmer, bin_start):  # type: ignore[no-untyped-def]
-    """Put pairs in order of separation, then of their stars; `bin_start` is zero at first."""
+    """Put pairs in order of separation, then of their stars, and tell where each bin starts.
+
+    They are counted into parts of bins, so few to a part that hardly any is out
+    of order.
+    """
     count, bins = len(separation), len(bin_start) - 1
+    parts, parts_per_rad = bins * PARTS, bins_per_rad * PARTS
+    start = np.zeros(parts + 1, np.int32)
     for k in range(count):
-        bin_start[min(bins - 1, int(found[k] * bins_per_rad)) + 1] += 1
-    for k in range(bins):
-        bin_start[k + 1] += bin_start[k]
-    place = bin_start[:-1].copy()
+        start[min(parts - 1, int(found[k] * parts_per_rad)) + 1] += 1
+    crowded = False
+    for k in range(parts):
+        crowded = crowded or start[k + 1] > MAX_IN_PART
+        start[k + 1] += start[k]
+    for k in range(bins + 1):
+        bin_start[k] = start[k * PARTS]
     for k in range(count):
-        own = min(bins - 1, int(found[k] * bins_per_rad))
-        at = place[own]
+        own = min(parts - 1, int(found[k] * parts_per_rad))
+        at = start[own]
         separation[at], brighter[at], dimmer[at] = found[k], one[k], other[k]
-        place[own] = at + 1
-    for k in range(bins):
-        first, last = bin_start[k], bin_start[k + 1]
-        if last - first > MAX_IN_BIN:
-            # Stars as evenly spaced as no sky has them.
-            for at in range(1, 4):
-                if at == 1:
-                    order = np.argsort(dimmer[first:last], kind="mergesort")
-                elif at == 2:
-                    order = np.argsort(brighter[first:last], kind="mergesort")
-                else:
-                    order = np.argsort(separation[first:last], kind="mergesort")
-                separation[first:last] = separation[first:last][order]
-                brighter[first:last] = brighter[first:last][order]
-                dimmer[first:last] = dimmer[first:last][order]
+        start[own] = at + 1
+    if crowded:
+        # Stars as evenly spaced as no sky has them.
+        order = np.argsort(dimmer, kind="mergesort")
+        order = order[np.argsort(brighter[order], kind="mergesort")]
+        order = order[np.argsort(separation[order], kind="mergesort")]
+        separation[:], brighter[:], dimmer[:] = separation[order], brighter[order], dimmer[order]
+        return
+    for at in range(1, count):
+        angle = separation[at]
+        if separation[at - 1] < angle:
             continue
-        for at in range(first + 1, last):
-            angle, a, b = separation[at], brighter[at], dimmer[at]
-            to = at
-            while to > first and (
-                separation[to - 1] > angle
-                or (
-                    separation[to - 1] == angle
-                    and (brighter[to - 1] > a or (brighter[to - 1] == a and dimmer[to - 1] > b))
-                )
-            ):
-                separation[to] = separation[to - 1]
-                brighter[to], dimmer[to] = brighter[to - 1], dimmer[to - 1]
-                to -= 1
-            separation[to], brighter[to], dimmer[to] = angle, a, b
+        a, b = brighter[at], dimmer[at]
+        to = at
+        while to > 0 and (
+            separation[to - 1] > angle
+            or (
+                separation[to - 1] == angle
+                and (brighter[to - 1] > a or (brighter[to - 1] == a and dimmer[to - 1] > b))
+            )
+        ):
+            separation[to] = separation[to - 1]
+            brighter[to], dimmer[to] = brighter[to - 1], dimmer[to - 1]
+            to -= 1
+        separation[to], brighter[to], dimmer[to] = angle, a, b

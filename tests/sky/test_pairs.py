@@ -43,6 +43,7 @@ def brute_force(directions, limit_deg):
 @example(seed=0, count=0, spread_deg=5.0, limit_deg=8.0)
 @example(seed=0, count=1, spread_deg=5.0, limit_deg=8.0)
 @example(seed=0, count=2, spread_deg=0.1, limit_deg=60.0)
+@example(seed=0, count=60, spread_deg=0.1, limit_deg=1.0)  # more pairs than room was made for
 def test_the_index_is_what_brute_force_finds(seed, count, spread_deg, limit_deg):
     directions = sky(seed, count, spread_deg)
     index = build_pairs(directions, limit_deg)
@@ -98,3 +99,14 @@ def test_what_is_held_is_counted_and_locked():
     for array in arrays:
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0
+
+
+def test_many_pairs_of_one_separation_are_in_order_of_their_stars():
+    """As of stars that a grid was drawn by: more to a bin than are sorted one by one."""
+    steps = from_ra_dec(np.arange(90.0), np.zeros(90))
+    index = build_pairs(steps[::-1], 2.5)
+    first = index.separation_rad < math.radians(1.5)
+    assert first.sum() == 89
+    got = [index.separation_rad, index.brighter, index.dimmer]
+    order = np.lexsort(got[::-1])
+    assert (order == np.arange(index.count)).all()
