@@ -18,11 +18,15 @@ from pathlib import Path
 from benchmarks import (
     aberration,
     attitude_against_svd,
+    calibration,
     centroids,
     covariance,
     imaging_claims,
+    paper_runs,
     plain_reference,
     ptp,
+    spurious,
+    verified_cost,
     whole_sky,
     zone_counts,
 )
@@ -32,7 +36,11 @@ from service import __version__
 SECTIONS: Mapping[str, Section] = {
     "sky": zone_counts.SECTION,
     "identification": plain_reference.SECTION,
+    "paper": paper_runs.SECTION,
+    "spurious": spurious.SECTION,
+    "calibration": calibration.SECTION,
     "whole_sky": whole_sky.SECTION,
+    "verified_cost": verified_cost.SECTION,
     "attitude": attitude_against_svd.SECTION,
     "covariance": covariance.SECTION,
     "aberration": aberration.SECTION,

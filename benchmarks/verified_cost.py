@@ -21,10 +21,10 @@ from tqdm import tqdm
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
 from service.acquire import acquire
-from service.identify.hypotheses import MAX_HYPOTHESES, marginals
+from service.identify.hypotheses import marginals
 from service.identify.pair_tests import cast_votes, count_votes
 from service.identify.presumed import presumed_attitude
-from service.identify.scene import Seen, scratch_for
+from service.identify.scene import MAX_HYPOTHESES, Seen, scratch_for
 from service.identify.search import search_in
 from service.identify.starid import MAX_RIVALS, Sighting, votes_arguments
 from service.identify.verify import UNIQUE_PROBABILITY, scene_of

@@ -14,12 +14,13 @@ from service.identify.fitting import fit, log_weight_of, weigh, weigh_without
 from service.identify.scene import within
 from service.sky.star_buckets import nearest
 
-MAX_HYPOTHESES = 2048
 MATCH_GATE = 34.0
 """In sigmas: how far a star may lie from where a hypothesis's attitude puts it."""
 LARGEST_GATE_RAD = 0.009
 NEGLIGIBLE = 18.0
 """A hypothesis lighter than the best by this, in logarithms, is only counted, not kept."""
+FEW = 32
+"""Hypotheses that are looked through one by one; of more there is a table by hash."""
 NEAR_SIGMAS, NEAR_MAG, RARE = 3.0, 0.5, -6.0
 """How near a matched star lies that is not tried as clutter, where chance neighbours are rare."""
 RIVAL_PROBABILITY = 1e-3
@@ -27,17 +28,44 @@ RIVAL_PROBABILITY = 1e-3
 
 
 @njit(cache=True, nogil=True)
-def known(match, ledger, count):  # type: ignore[no-untyped-def]
+def known(match, ledger, count, table):  # type: ignore[no-untyped-def]
     """Whether the ledger holds this hypothesis."""
-    for h in range(count):
-        same = True
-        for k in range(len(match)):
-            if ledger[h, k] != match[k]:
-                same = False
-                break
-        if same:
+    if count <= FEW:
+        for h in range(count):  # noqa: SIM110 - compiled, without a generator
+            if _same(match, ledger, h):
+                return True
+        return False
+    at = _hash(match) & (len(table) - 1)
+    while table[at] >= 0:
+        if _same(match, ledger, table[at]):
             return True
+        at = (at + 1) & (len(table) - 1)
     return False
+
+
+@njit(cache=True, nogil=True)
+def _same(match, ledger, h):  # type: ignore[no-untyped-def]
+    for k in range(len(match)):  # noqa: SIM110 - compiled, without a generator
+        if ledger[h, k] != match[k]:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _hash(match):  # type: ignore[no-untyped-def]
+    hashed = 0
+    for row in match:
+        hashed = (hashed ^ (row + 1)) * 73856093
+    return hashed ^ (hashed >> 17)
+
+
+@njit(cache=True, nogil=True)
+def _enter(ledger, h, table):  # type: ignore[no-untyped-def]
+    """Write where the ledger has hypothesis h into the table by hash."""
+    at = _hash(ledger[h]) & (len(table) - 1)
+    while table[at] >= 0:
+        at = (at + 1) & (len(table) - 1)
+    table[at] = h
 
 
 @njit(cache=True, nogil=True)
@@ -50,16 +78,6 @@ def part_of(match, whole):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def heaviest(log_weight, count):  # type: ignore[no-untyped-def]
-    """The first of the heaviest hypotheses, -1 where there is none."""
-    leader = -1
-    for h in range(count):
-        if leader < 0 or log_weight[h] > log_weight[leader]:
-            leader = h
-    return leader
-
-
-@njit(cache=True, nogil=True)
 def log_sum(a, b):  # type: ignore[no-untyped-def]
     """ln(e^a + e^b)."""
     top = max(a, b)
@@ -67,21 +85,42 @@ def log_sum(a, b):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def keep(match, value, ledger, log_weight, count, rest):  # type: ignore[no-untyped-def]
-    """Keep a weighed hypothesis; where there is no room, the lightest goes to the rest."""
-    if value == -math.inf:
-        return count, rest
-    if count < len(log_weight):
-        ledger[count] = match
-        log_weight[count] = value
-        return count + 1, rest
-    lightest = np.argmin(log_weight)
-    if value <= log_weight[lightest]:
+def keep(match, value, ledger, log_weight, count, rest, table, range_kept, leader):  # type: ignore[no-untyped-def]
+    """Keep a weighed hypothesis, the heaviest also as the `leader` (n,).
+
+    Where there is no room, the lightest quarter goes to the rest, and from then on
+    whatever is no heavier.  `range_kept` has the heaviest of those that went, and
+    the heaviest of all.
+    """
+    if value <= range_kept[0]:
         return count, log_sum(rest, value)
-    rest = log_sum(rest, log_weight[lightest])
-    ledger[lightest] = match
-    log_weight[lightest] = value
-    return count, rest
+    if value > range_kept[1]:
+        range_kept[1] = value
+        leader[:] = match
+    if count == len(log_weight):
+        quarter = count // 4
+        floor = range_kept[0] = np.partition(log_weight, quarter)[quarter]
+        stay = 0
+        for h in range(count):
+            if log_weight[h] <= floor and h - stay <= quarter:
+                rest = log_sum(rest, log_weight[h])
+                continue
+            ledger[stay], log_weight[stay] = ledger[h], log_weight[h]
+            stay += 1
+        count = stay
+        table[:] = -1
+        for h in range(count):
+            _enter(ledger, h, table)
+        if value <= floor:
+            return count, log_sum(rest, value)
+    ledger[count], log_weight[count] = match, value
+    if count > FEW:
+        _enter(ledger, count, table)
+    elif count == FEW:
+        table[:] = -1
+        for h in range(count + 1):
+            _enter(ledger, h, table)
+    return count + 1, rest
 
 
 @njit(cache=True, nogil=True)
@@ -100,16 +139,17 @@ def consider(seen, stars, match, scratch, ledger, log_weight, count, rest, best)
     misfit = math.sqrt(square / matched) > evidence.POSITION_SCALES[-1] * seen.reference_sigma
     if matched > 3 and misfit:
         return count, rest, best, n, False
-    fresh, second = scratch.fresh, scratch.second
+    fresh, second, table = scratch.fresh, scratch.second, scratch.table
+    kept, leader = scratch.range_kept, scratch.leader
     _match_at(seen, stars, scratch.t, fresh, second)
-    if known(fresh, ledger, count):
+    if known(fresh, ledger, count, table):
         return count, rest, best, 2 * n, not misfit
     if not (part_of(fresh, match) and part_of(match, fresh)):
         matched, square, log_det = fit(seen, stars, fresh, scratch, 1)
         if matched < 2:
             return count, rest, best, 3 * n, not misfit
     base = log_weight_of(seen, stars, fresh, scratch.t, matched, square, log_det)
-    count, rest = keep(fresh, base, ledger, log_weight, count, rest)
+    count, rest = keep(fresh, base, ledger, log_weight, count, rest, table, kept, leader)
     best = max(best, base)
     work = 3 * n
     if base < max(best, rest) - NEGLIGIBLE:
@@ -120,9 +160,9 @@ def consider(seen, stars, match, scratch, ledger, log_weight, count, rest, best)
             continue
         mine = fresh[k]
         fresh[k] = -1
-        if not known(fresh, ledger, count):
+        if not known(fresh, ledger, count, table):
             value = weigh_without(seen, stars, fresh, k, square, scratch)
-            count, rest = keep(fresh, value, ledger, log_weight, count, rest)
+            count, rest = keep(fresh, value, ledger, log_weight, count, rest, table, kept, leader)
             best = max(best, value)
             work += 1
         fresh[k] = mine
@@ -131,10 +171,10 @@ def consider(seen, stars, match, scratch, ledger, log_weight, count, rest, best)
             continue
         mine = fresh[k]
         fresh[k] = second[k]
-        if not known(fresh, ledger, count):
+        if not known(fresh, ledger, count, table):
             # This fits anew: nothing below may need the fit of the hypothesis itself.
             value = weigh(seen, stars, fresh, scratch)
-            count, rest = keep(fresh, value, ledger, log_weight, count, rest)
+            count, rest = keep(fresh, value, ledger, log_weight, count, rest, table, kept, leader)
             best = max(best, value)
             work += n
         fresh[k] = mine
@@ -222,17 +262,23 @@ def marginals(ledger, log_weight, count, rest, star, probability, none, rivals, 
     for h in range(count):
         weight[h] = math.exp(log_weight[h] - top)
         total += weight[h]
+    many = count > FEW
+    order = np.empty(0, np.int64)
     rows = np.empty(count + 1, np.int64)
     share = np.empty(count + 1)
     for k in range(n):
         different = 0
         nothing = unknown
-        for h in range(count):
+        if many:
+            order = np.argsort(ledger[:count, k])
+        for rank in range(count):
+            h = order[rank] if many else rank
             row = ledger[h, k]
             if row < 0:
                 nothing += weight[h]
                 continue
-            at = 0
+            # In order of rows, those of one star stand together.
+            at = max(different - 1, 0) if many else 0
             while at < different and rows[at] != row:
                 at += 1
             if at == different:

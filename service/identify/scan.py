@@ -11,19 +11,15 @@ from service.identify.hypotheses import (
     LARGEST_GATE_RAD,
     NEGLIGIBLE,
     consider,
-    heaviest,
     known,
     log_sum,
     part_of,
 )
-from service.identify.scene import with_magnitude, within
+from service.identify.scene import PREDICTION_GATE, polar_difference, with_magnitude, within
 from service.identify.two_stars import MAX_WORK
-from service.sky.pairs import separation_rad
 from service.sky.star_buckets import nearest
 from service.sky.star_voxels import level_for, star_within_reach
 
-PREDICTION_GATE = 20.0
-"""In sigmas: how far a star may lie from where a pair of others puts it."""
 MAX_THIRDS = 8
 """So many stars, those that a pair fixes best, are tried with it where all together do not fit."""
 AGREEING_TILT_RAD = math.radians(3.0)
@@ -157,7 +153,7 @@ def _through(  # type: ignore[no-untyped-def]
     )
     polar = tolerance = 0.0
     if by_axis:
-        polar, tolerance = _polar_difference(seen, i, j, AGREEING_TILT_RAD + pairs.off_axis)
+        polar, tolerance = polar_difference(seen, i, j, AGREEING_TILT_RAD + pairs.off_axis)
     for c in range(first, last):
         straight = swapped = True
         if by_axis:
@@ -251,8 +247,7 @@ def _try(  # type: ignore[no-untyped-def]
     if matched < fewest or not (within(a, stars) and within(b, stars)):
         return matched, count, rest, best, work
     match[i], match[j] = a, b
-    leader = heaviest(log_weight, count)
-    if known(match, ledger, count) or (leader >= 0 and part_of(match, ledger[leader])):
+    if known(match, ledger, count, scratch.table) or part_of(match, scratch.leader):
         return matched, count, rest, best, work
     count, rest, best, cost, fits = consider(
         seen, stars, match, scratch, ledger, log_weight, count, rest, best
@@ -275,8 +270,7 @@ def _try(  # type: ignore[no-untyped-def]
             continue
         match[:] = -1
         match[i], match[j], match[k] = a, b, one
-        leader = heaviest(log_weight, count)
-        if known(match, ledger, count) or (leader >= 0 and part_of(match, ledger[leader])):
+        if known(match, ledger, count, scratch.table) or part_of(match, scratch.leader):
             continue
         count, rest, best, cost, _ = consider(
             seen, stars, match, scratch, ledger, log_weight, count, rest, best
@@ -350,26 +344,6 @@ def _missing(voxels, test, u0, u1, u2, v0, v1, v2, w0, w1, w2):  # type: ignore[
         alpha * u1 + beta * v1 + gamma * w1,
         alpha * u2 + beta * v2 + gamma * w2,
     )
-
-
-@njit(cache=True, nogil=True)
-def _polar_difference(seen, i, j, tilt):  # type: ignore[no-untyped-def]
-    """The angle of star i to the axis less that of star j, and how far noise and a tilt move it.
-
-    A tilt of the axis moves the two angles apart by at most itself times the
-    chord between the stars' directions about the axis.
-    """
-    vi, vj = seen.observed[i], seen.observed[j]
-    polar_i, polar_j = separation_rad(vi, seen.prior_axis), separation_rad(vj, seen.prior_axis)
-    apart = separation_rad(vi, vj)
-    sines = math.sin(polar_i) * math.sin(polar_j)
-    chord2 = 4.0
-    if sines > 0.0:
-        # By half angles, which stay accurate where the angles are small.
-        half = math.sin(0.5 * apart) ** 2 - math.sin(0.5 * (polar_i - polar_j)) ** 2
-        chord2 = min(4.0, max(0.0, 4.0 * half / sines))
-    noise = PREDICTION_GATE * math.sqrt(seen.sigma_rad[i] ** 2 + seen.sigma_rad[j] ** 2)
-    return polar_i - polar_j, noise + tilt * math.sqrt(chord2)
 
 
 @njit(cache=True, nogil=True)

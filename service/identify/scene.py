@@ -13,6 +13,10 @@ from numba import njit
 
 from service.sky.pairs import separation_rad
 
+MAX_HYPOTHESES = 2048
+"""Kept of a search, a power of two; lighter ones are only added up."""
+PREDICTION_GATE = 20.0
+"""In sigmas: how far a star may lie from where a pair of others puts it."""
 MAX_SEEDS = 12
 """Pairs of at most so many stars, the brightest, are scanned; all are matched."""
 
@@ -90,6 +94,9 @@ class Scratch(NamedTuple):
     inverse: Any
     most: Any
     light: Any
+    table: Any
+    range_kept: Any
+    leader: Any
     seeds: Any
     group: Any
     group_of: Any
@@ -102,7 +109,7 @@ class Scratch(NamedTuple):
 @njit(cache=True, nogil=True)
 def scratch_for(n):  # type: ignore[no-untyped-def]
     """The arrays for n stars; `most` is not worked out yet (NaN)."""
-    rows = np.full((4, n), -1, np.int32)
+    rows = np.full((5, n), -1, np.int32)
     squares = np.empty((5, 3, 3))
     numbers = np.empty((5, n + 1), np.int64)
     s = min(n, MAX_SEEDS)
@@ -124,6 +131,9 @@ def scratch_for(n):  # type: ignore[no-untyped-def]
         squares[4],
         np.full(n + 1, np.nan),
         numbers[1],
+        np.empty(2 * MAX_HYPOTHESES, np.int32),
+        np.full(2, -math.inf),
+        rows[4],
         numbers[2, :s],
         numbers[3, :s],
         numbers[4],
@@ -164,3 +174,23 @@ def log_density(direction, axis, least, most):  # type: ignore[no-untyped-def]
             inside += 1
     area = 2.0 * math.pi * (inner - outer)
     return math.log(max(inside, 1) / area)
+
+
+@njit(cache=True, nogil=True)
+def polar_difference(seen, i, j, tilt):  # type: ignore[no-untyped-def]
+    """The angle of star i to the axis less that of star j, and how far noise and a tilt move it.
+
+    A tilt of the axis moves the two angles apart by at most itself times the
+    chord between the stars' directions about the axis.
+    """
+    vi, vj = seen.observed[i], seen.observed[j]
+    polar_i, polar_j = separation_rad(vi, seen.prior_axis), separation_rad(vj, seen.prior_axis)
+    apart = separation_rad(vi, vj)
+    sines = math.sin(polar_i) * math.sin(polar_j)
+    chord2 = 4.0
+    if sines > 0.0:
+        # By half angles, which stay accurate where the angles are small.
+        half = math.sin(0.5 * apart) ** 2 - math.sin(0.5 * (polar_i - polar_j)) ** 2
+        chord2 = min(4.0, max(0.0, 4.0 * half / sines))
+    noise = PREDICTION_GATE * math.sqrt(seen.sigma_rad[i] ** 2 + seen.sigma_rad[j] ** 2)
+    return polar_i - polar_j, noise + tilt * math.sqrt(chord2)

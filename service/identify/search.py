@@ -19,8 +19,8 @@ from numba import njit
 
 from service.identify import evidence
 from service.identify.hypotheses import log_sum
-from service.identify.scan import PREDICTION_GATE, most_of, scan
-from service.identify.scene import MAX_SEEDS, scratch_for, with_magnitude
+from service.identify.scan import most_of, scan
+from service.identify.scene import MAX_SEEDS, PREDICTION_GATE, scratch_for, with_magnitude
 from service.identify.two_stars import MAX_WORK, two_stars
 from service.identify.uncounted import uncounted
 from service.sky.pairs import separation_rad
@@ -50,6 +50,8 @@ def search_in(scratch, seen, stars, pairs, exhaustive, ledger, log_weight):  # t
     scratch, ledger, log_weight = uncounted(scratch), uncounted(ledger), uncounted(log_weight)
     n = len(seen.observed)
     scratch.most[:] = np.nan
+    scratch.range_kept[:] = -math.inf
+    scratch.leader[:] = -1
     rest = evidence.log_null(n, with_magnitude(seen))
     enough = rest + n * CHANCE_PER_STAR + CHANCE_MARGIN
     best = -math.inf

@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from service.identify.evidence import PRIOR_DIRECTION, PRIOR_ROTATION
-from service.identify.hypotheses import MAX_HYPOTHESES, marginals
+from service.identify.hypotheses import marginals
 from service.identify.identification import Identification, Integers, Outcome
-from service.identify.scene import Pairs, Seen, Stars, log_density
+from service.identify.scene import MAX_HYPOTHESES, Pairs, Seen, Stars, log_density
 from service.identify.search import search
 from service.identify.starid import MAX_RIVALS, Sighting, identify_by_votes
 from service.vectors import Vector, separation_deg
