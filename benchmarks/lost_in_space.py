@@ -98,7 +98,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("names", nargs="*", metavar="condition", help=", ".join(CONDITIONS))
+    every = ", ".join(CONDITIONS).replace("%", "%%")
+    parser.add_argument("names", nargs="*", metavar="condition", help=every)
     parser.add_argument("--scenes", type=int, default=2000, help="at one pixel; default 2000")
     parser.add_argument("--seed", type=int, default=DEFAULT_SEED)
     parser.add_argument("--json", type=Path, metavar="OUT", help="write the rows")

@@ -169,7 +169,7 @@ def mission_of(conditions: Conditions) -> Mission:
                 "cross_product_deg": 90.0,
             },
             "catalog": {
-                "magnitude_limit_mag": LIMIT_MAG,
+                "magnitude_limit_mag": LIMIT_MAG + FURTHER_MAG,
                 "merge_within_arcsec": MERGE_WITHIN_ARCSEC,
             },
             "trackers": [

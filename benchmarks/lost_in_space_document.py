@@ -135,7 +135,8 @@ fields with at least six detected stars of the database.
 
 - **five brightest**: of the fields of 4 deg radius that show five stars or more, at 0.1 px.
 - **prior**: the same with an a priori attitude off by so much about any axis, through the whole
-  staircase (`verified`, a zone built for every scene) and tetra3rs in its tracking mode.
+  staircase (`verified`, a zone of stars to V 7.5 built for every scene) and tetra3rs in its
+  tracking mode.
 - **ten and N spurious**: the ten brightest stars with N points anywhere, as bright as stars are.
 - **random points**: 5 to 20; **mirrored**: one axis turned round at 1 px. Nothing is right there.
 - **sigma told**, **magnitudes off**: what only our solver is told, and told wrongly.

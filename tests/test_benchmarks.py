@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import aberration, covariance
+from benchmarks import aberration, covariance, lost_in_space
 from benchmarks.__main__ import main
 from benchmarks.sections import Section, Written, kept
 from benchmarks.verification import SECTIONS, TARGET, remake
@@ -19,6 +19,14 @@ def test_a_benchmark_s_small_sample_is_within_its_bounds(benchmark, seed):
 def test_a_benchmark_prints_its_figures(capsys):
     assert main(["zone_counts", "--quick"]) == 0
     assert "zone_counts: within bounds" in capsys.readouterr().out
+
+
+def test_the_solvers_benchmark_explains_itself(capsys):
+    """Its conditions have percent signs in their names."""
+    with pytest.raises(SystemExit) as stopped:
+        lost_in_space.main(["--help"])
+    assert stopped.value.code == 0
+    assert "focal length off 0.2 %" in capsys.readouterr().out
 
 
 def test_an_unknown_benchmark_is_refused_by_name(capsys):
