@@ -40,6 +40,7 @@ VIEWS, QUICK_VIEWS = 300, 40
 ROUNDS = 9
 MOST_MANY, MOST_ONE, MOST_PAIRS = 1.5, 3.0, 1.5
 AGREE_ARCSEC = 0.01
+MOST_UNSOLVED = 0.02
 MEGABYTES_512 = 512 << 20
 TRIED = 1_000
 PAIRED_STARS, PAIRED_DEG = 3_000, 8.0
@@ -181,6 +182,7 @@ def service_many(
         cast_votes(observed[k], mag[k], *given, boresights[k], *tests, votes, voted, counts, edges)  # type: ignore[call-arg]
         count_votes(votes, voted, counts, rows, outcome, star[k], highest, second)
         b, r, s = matched_vectors(body[k], sigma, star[k], direction, still, 1.0)
+        q[k] = np.nan
         if len(b) >= 2:
             n = len(b)
             part = squares if n == squares.shape[1] else squares[:, :n].copy()
@@ -325,6 +327,9 @@ def compare(mission: Mission, views: Views) -> tuple[dict[str, float], list[str]
     differ = int((star["service"] != star["bare"]).sum())
     apart = np.linalg.norm(q["service"] - q["bare"], axis=1) * 2.0 * ARCSEC_PER_RADIAN
     right = float((star["service"] == views.star).mean())
+    # Stars named wrongly contradict one another, which the bare kernels do not look out for.
+    rightly = (star["service"] == views.star).all(axis=1)
+    solved = ~np.isnan(apart)
     figures = {
         "stars": float(n),
         "pairs": float(pairs.count),
@@ -339,8 +344,10 @@ def compare(mission: Mission, views: Views) -> tuple[dict[str, float], list[str]
     faults = []
     if differ:
         faults.append(f"{differ} of {star['bare'].size} stars are named otherwise by the bare one")
-    if float(apart.max()) > AGREE_ARCSEC:
-        faults.append(f"quaternions differ by up to {apart.max():.3g} arcsec")
+    if (unsolved := float((~solved[rightly]).mean())) > MOST_UNSOLVED:
+        faults.append(f"{unsolved:.1%} of the views named rightly have no attitude")
+    if (most := float(apart[rightly & solved].max())) > AGREE_ARCSEC:
+        faults.append(f"quaternions differ by up to {most:.3g} arcsec")
     return figures, faults
 
 
