@@ -224,7 +224,7 @@ class _Waiting:
         line = f"the server is starting: {waited_s:.0f} s"
         if waited_s >= COMPILES_AFTER_S:
             line += (
-                "; a machine's first start compiles for one to two minutes, later ones are quick"
+                "; a machine's first start compiles for two to three minutes, later ones are quick"
             )
         if self._moves:
             print(f"\r{line:<{self._shown}}", end="", file=sys.stderr, flush=True)
