@@ -1,0 +1,1 @@
+import service  # noqa: F401 - before numba, which asks only once where it keeps kernels

@@ -95,6 +95,7 @@ def log_prior(angle, kind):  # type: ignore[no-untyped-def]
     return math.log(density / (len(TILT_SCALES_DEG) + 1) / (2.0 * math.pi))
 
 
+# Tables are filled by the plain functions, so that an import compiles nothing.
 LOG_PRIOR_AT_BEST = np.array(
     [log_prior.py_func(0.0, kind) for kind in (PRIOR_ROTATION, PRIOR_DIRECTION)]  # type: ignore[no-untyped-call]
 )
@@ -125,6 +126,7 @@ _LOG_EXACT = np.array(
         for count in range(_FEW + 1)
     ]
 )
+"""By the number of stars, for a sigma of one radian; another adds a multiple of its logarithm."""
 
 
 @njit(cache=True, nogil=True)

@@ -45,6 +45,7 @@ def known(match, ledger, count, table):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _same(match, ledger, h):  # type: ignore[no-untyped-def]
+    """Whether hypothesis h of the ledger names the same stars."""
     for k in range(len(match)):  # noqa: SIM110 - compiled, without a generator
         if ledger[h, k] != match[k]:
             return False
@@ -53,6 +54,7 @@ def _same(match, ledger, h):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _hash(match):  # type: ignore[no-untyped-def]
+    """A number that scatters hypotheses, also those that differ in one star."""
     hashed = 0
     for row in match:
         hashed = (hashed ^ (row + 1)) * 73856093
