@@ -106,7 +106,7 @@ class LimitSettings(_Strict):
         )
 
     def passed(self, value: float) -> list[Severity]:
-        """The severities whose bounds a value is out of that was in them so far."""
+        """The severities whose bounds a value is out of that was in them so far, worst last."""
         return [s for s, low, high in self._levels if value < low or value > high]
 
     def bound(self, severity: Severity, value: float) -> float:

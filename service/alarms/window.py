@@ -5,13 +5,18 @@ a batch that comes late takes its place among them, or none if it is older.
 """
 
 from bisect import insort
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
 from typing import Any
 
 from service.alarms.limits import LimitSettings, Severity
 
 Sample = tuple[int, float, float]
 """(time_ns, part, whole): a share of counts, or a value over one."""
+
+SLACK = 1e-9
+"""Of the largest part: far more than sums in another order differ by."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,32 @@ class Window:
         _, parts, wholes = zip(*self.samples, strict=True)
         value = sum(parts) / sum(wholes)
         return Judged(value, self.judge(value, self.samples[-1][0], limits))
+
+    def pass_over(self, samples: Sequence[Sample], limits: LimitSettings) -> bool:
+        """Take many batches' parts at once, if none of them could change how bad it is.
+
+        True: what `add` makes of them one after the other is in limits each time,
+        and was before.  False: nothing is taken; they must be added one by one.
+        That is left to `add` where a value comes near a bound, since sums over
+        stretches are taken here as differences, or where the batches came late.
+        """
+        count, known = limits.minimum_count, len(self.samples)
+        taken = [*self.samples, *samples]
+        if self.since_ns or taken != sorted(taken):
+            return False
+        parts = [each[1] for each in taken]
+        part = list(accumulate(parts, initial=0.0))
+        whole = list(accumulate((each[2] for each in taken), initial=0.0))
+        ends = range(max(known + 1, count), len(taken) + 1)
+        values = [
+            (part[end] - part[end - count]) / (whole[end] - whole[end - count]) for end in ends
+        ]
+        if values:
+            slack = SLACK * max(map(abs, parts))
+            if limits.passed(min(values) - slack) or limits.passed(max(values) + slack):
+                return False
+        self.samples = taken[-count:]
+        return True
 
     def judge(self, value: float, time_ns: int, limits: LimitSettings) -> Severity | None:
         """The worst severity whose bound the value has been out of for long enough."""

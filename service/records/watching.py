@@ -120,6 +120,7 @@ class _Watch:
     def look(self) -> None:
         """Look at every batch in order of time, and keep what was found."""
         assert self._row is not None
+        alert = self._alert()
         latest = dict(self._row)
         received, received_ns = latest["received"], parse_utc(latest["received"]).tai_ns
         for draft in self._drafts:
@@ -128,7 +129,7 @@ class _Watch:
             if self._run != LIVE:
                 since_ns = draft.batch["time_ns"] - latest["time_ns"]
             self._mind_the_gap(since_ns * 1e-9, draft.batch)
-            self._judge(draft)
+            self._judge(draft, alert)
             if draft.batch["time_ns"] >= latest["time_ns"]:
                 latest |= _latest_of(draft.batch)
             if draft.received_ns > received_ns:
@@ -142,28 +143,44 @@ class _Watch:
 
     def _mind_the_gap(self, gap_s: float, batch: Row) -> None:
         """Silence: live by the clock, elsewhere by the batches' own time; over with this batch."""
-        point = Point(gap_s, batch["time"], batch["id"])
         severity, bound = silence(self._limits, gap_s)
         now = batch["received"]
         if severity is not None:
+            point = Point(gap_s, batch["time"], batch["id"])
             self._board.observe(SILENCE, severity, bound, point, now)
         if self._board.has(SILENCE):
             self._board.observe(SILENCE, None, None, Point(0.0, *_moment(batch)), now)
 
-    def _judge(self, draft: Draft) -> None:
-        assert draft.batch is not None
-        parts = draft.contribution
+    def _alert(self) -> list[tuple[QuantityName, LimitSettings]]:
+        """The quantities whose alarms a batch may raise or must meet; the others are done with.
+
+        Most are in limits all the time, and judging each batch by itself takes
+        as long as recording it.
+        """
+        alert = []
         for name, limits in self._limits.items():
-            sample = _sample(name, parts, draft.result["time_ns"])
-            if sample is None:
+            samples = [
+                sample
+                for draft in self._drafts
+                if (sample := _sample(name, draft.contribution, draft.result["time_ns"]))
+            ]
+            if not samples:
                 continue
             window = self._windows.setdefault(name, Window())
-            judged = window.add(sample, limits)
-            if judged is None:
+            if self._board.has(name) or not window.pass_over(samples, limits):
+                alert.append((name, limits))
+        return alert
+
+    def _judge(self, draft: Draft, alert: Sequence[tuple[QuantityName, LimitSettings]]) -> None:
+        assert draft.batch is not None
+        for name, limits in alert:
+            sample = _sample(name, draft.contribution, draft.result["time_ns"])
+            judged = sample and self._windows[name].add(sample, limits)
+            if not judged:
                 continue
-            point = Point(judged.value, *_moment(draft.batch))
-            bound = judged.severity and limits.bound(judged.severity, judged.value)
             if judged.severity is not None or self._board.has(name):
+                point = Point(judged.value, *_moment(draft.batch))
+                bound = judged.severity and limits.bound(judged.severity, judged.value)
                 now = draft.batch["received"]
                 self._board.observe(name, judged.severity, bound, point, now)
 
@@ -237,8 +254,8 @@ def silence(
 ) -> tuple[Severity | None, float | None]:
     """How bad a silence is, and the bound that it is beyond."""
     settings = limits[SILENCE]
-    worst = max((s for s in Severity if settings.out(s, gap_s, False)), default=None)
-    return worst, None if worst is None else settings.bound(worst, gap_s)
+    passed = settings.passed(gap_s)
+    return (passed[-1], settings.bound(passed[-1], gap_s)) if passed else (None, None)
 
 
 def sweep(connection: Connection, missions: Mapping[str, Mission], now: Utc) -> None:

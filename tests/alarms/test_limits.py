@@ -101,6 +101,37 @@ def test_the_value_does_not_depend_on_the_order_in_which_batches_come(samples, c
     assert last(sorted(samples)) == last(shuffled)
 
 
+@given(
+    st.lists(st.tuples(st.integers(0, 40), st.floats(-2, 1.5)), max_size=40),
+    st.integers(1, 6),
+    st.integers(0, 40),
+    st.sampled_from([0, 25]),
+)
+def test_what_is_passed_over_would_have_been_in_limits_one_by_one(values, count, first, duration_s):
+    settings = limits(watch={"low": -1.0, "high": 1.0}, minimum_count=count, duration_s=duration_s)
+    samples = [(time * S, value, 1) for time, value in values]
+    one_by_one, together = Window(), Window()
+    for each in samples[:first]:
+        one_by_one.add(each, settings)
+        together.add(each, settings)
+    before = together.to_json()
+    if together.pass_over(samples[first:], settings):
+        judged = [one_by_one.add(each, settings) for each in samples[first:]]
+        assert not any(each and each.severity for each in judged)
+        assert not one_by_one.since_ns
+        assert together.to_json() == one_by_one.to_json()
+    else:
+        assert together.to_json() == before
+
+
+def test_what_stays_well_in_limits_is_passed_over():
+    settings, window = limits(minimum_count=3), Window()
+    assert window.pass_over([(k, 0.5, 1) for k in range(10)], settings)
+    assert not window.pass_over([(k, 1.5, 1) for k in range(10, 13)], settings)
+    # A batch that came late moves values that were judged before.
+    assert not window.pass_over([(5, 0.5, 1)], settings)
+
+
 @given(st.lists(st.floats(-5, 5), max_size=30), st.floats(0, 100), st.integers(1, 5))
 def test_kept_and_read_again_a_window_goes_on_as_it_was(values, duration_s, count):
     settings = limits(duration_s=duration_s, minimum_count=count)
