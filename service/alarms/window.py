@@ -48,27 +48,24 @@ class Window:
         """Take many batches' parts at once, if none of them could change how bad it is.
 
         True: what `add` makes of them one after the other is in limits each time,
-        and was before.  False: nothing is taken; they must be added one by one.
-        That is left to `add` where a value comes near a bound, since sums over
-        stretches are taken here as differences, or where the batches came late.
+        and was before.  False: nothing is taken, and they must be added one by one.
         """
-        count, known = limits.minimum_count, len(self.samples)
-        taken = [*self.samples, *samples]
-        if self.since_ns or taken != sorted(taken):
+        if self.since_ns:
             return False
-        parts = [each[1] for each in taken]
-        part = list(accumulate(parts, initial=0.0))
-        whole = list(accumulate((each[2] for each in taken), initial=0.0))
-        ends = range(max(known + 1, count), len(taken) + 1)
-        values = [
-            (part[end] - part[end - count]) / (whole[end] - whole[end - count]) for end in ends
-        ]
-        if values:
-            slack = SLACK * max(map(abs, parts))
-            if limits.passed(min(values) - slack) or limits.passed(max(values) + slack):
-                return False
-        self.samples = taken[-count:]
-        return True
+        count = limits.minimum_count
+        if len(self.samples) >= count:
+            # What is older than all that is judged takes no place.
+            samples = [each for each in samples if each > self.samples[0]]
+        taken = [*self.samples, *samples]
+        in_order = sorted(taken)
+        # In whatever order they come, a mean lies between the least and the greatest.
+        calm = _all_within([part / whole for _, part, whole in taken], limits) or (
+            taken == in_order
+            and _all_within(_judged_values(taken, count, len(self.samples)), limits)
+        )
+        if calm:
+            self.samples = in_order[-count:]
+        return calm
 
     def judge(self, value: float, time_ns: int, limits: LimitSettings) -> Severity | None:
         """The worst severity whose bound the value has been out of for long enough."""
@@ -91,3 +88,25 @@ class Window:
         """A window as it was kept."""
         since_ns = {Severity[word.upper()]: time_ns for word, time_ns in kept["since_ns"].items()}
         return cls([tuple(each) for each in kept["samples"]], since_ns)
+
+
+def _all_within(values: Sequence[float], limits: LimitSettings) -> bool:
+    return not values or not (limits.passed(min(values)) or limits.passed(max(values)))
+
+
+def _judged_values(samples: Sequence[Sample], count: int, known: int) -> list[float]:
+    """The means over the latest `count`, after each sample beyond the `known` ones and before.
+
+    The least and the greatest are widened: as differences of sums from the start
+    they may differ in the last digits from sums of their own.
+    """
+    part = list(accumulate((each[1] for each in samples), initial=0.0))
+    whole = list(accumulate((each[2] for each in samples), initial=0.0))
+    values = [
+        (part[end] - part[end - count]) / (whole[end] - whole[end - count])
+        for end in range(max(known, count), len(samples) + 1)
+    ]
+    if values:
+        slack = SLACK * max(abs(each[1]) for each in samples)
+        values += [min(values) - slack, max(values) + slack]
+    return values
