@@ -64,7 +64,7 @@ from service.records.comparison import compare_runs
 from service.records.draft import Answered, Row
 from service.records.events import Event
 from service.records.ids import Ulids, is_ulid
-from service.records.intake import Intake, Observer, mission_in_input
+from service.records.intake import Asked, Intake, Observer, mission_in_input
 from service.records.looking import neighbours, recorded_batch, recorded_mission
 from service.records.pages import Page, Stretch
 from service.records.reading import OutcomeName, Status
@@ -73,6 +73,7 @@ from service.records.replays import Replay, list_replays, mark_interrupted, read
 from service.records.reprocess import Plan, Progress, reprocess
 from service.records.star_field import star_field_of
 from service.records.store import Store
+from service.records.tokens import Caller
 from service.records.watching import is_due, latest_inputs, shelf_end, sweep
 from service.records.worst import worst_batches
 from service.settings import Settings, is_loopback
@@ -241,10 +242,28 @@ class Operations:
         return self.take(submission, idempotency_key).result()
 
     def take(
-        self, submission: Submission, idempotency_key: str | None = None
+        self,
+        sent: bytes | Submission,
+        idempotency_key: str | None = None,
+        caller: Caller | None = None,
     ) -> "Future[Answered]":
-        """`submit` for who does not want to wait: the future gives the answer, or the error."""
-        return self._intake.take(submission, idempotency_key)
+        """`submit` for who does not want to wait: the future gives the answer, or the error.
+
+        What was sent as JSON is read here; `caller`, where given, must be allowed
+        to ask about its spacecraft.
+        """
+        done: Future[Answered] = Future()
+        # A request that is given up does not take its record back.
+        done.set_running_or_notify_cancel()
+
+        def settle(outcome: Answered | Exception) -> None:
+            if isinstance(outcome, Exception):
+                done.set_exception(outcome)
+            else:
+                done.set_result(outcome)
+
+        self._intake.take([Asked(sent, idempotency_key, settle, caller)])
+        return done
 
     def submit_many(self, submissions: Sequence[Submission]) -> list[Answered | AcquisitionError]:
         """`submit` of each in one transaction; an error stands in the place of what is refused."""

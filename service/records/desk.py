@@ -1,18 +1,17 @@
 """Where submissions that come one by one are worked through, together with what came meanwhile.
 
-One thread at a time takes what waits: it is looked up in one reading of the
-database, computed batch by batch, and recorded in one transaction.  To pass a
-batch from thread to thread costs more than to compute it.  Another thread
-steps in where the first has been at one batch for long.  Nobody's own thread
-waits: who submits is given a future.  A repeat of what is at work waits for it
-and is then looked up like any other.
+One thread at a time takes what waits: it is read, looked up in one reading of
+the database, computed batch by batch, recorded in one transaction, and
+answered, all together.  To pass a batch from thread to thread costs more than
+to compute it.  Another thread steps in where the first has been at one batch
+for long.  Nobody's own thread waits: who submits is called with the outcome.
+A repeat of what is at work waits for it and is then looked up like any other.
 """
 
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
 from dataclasses import dataclass, field
 
 from service.errors import AcquisitionError, Busy, Stopping
@@ -30,17 +29,30 @@ LONG_S = 0.01
 WAIT_S = 5.0
 """The longest that an order may wait for its turn."""
 
+Outcome = Answered | Exception
 Found = Sequence[Answered | AcquisitionError | None]
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class Order:
-    """One submission, what its client calls it, and who waits for the answer."""
+    """One submission, what its client calls it, and who is called with what became of it.
 
-    submission: Submission
+    It comes as it was sent, and is read where it is worked on: `read` gives the
+    submission, or raises what is wrong with it.
+    """
+
+    read: Callable[[], Submission]
     key: str | None
-    done: "Future[Answered]" = field(default_factory=Future)
+    settle: Callable[[Outcome], object]
     since_s: float = field(default_factory=time.monotonic)
+    _submission: Submission | None = None
+
+    @property
+    def submission(self) -> Submission:
+        """What was sent."""
+        if self._submission is None:
+            self._submission = self.read()
+        return self._submission
 
     @property
     def identity(self) -> Identity:
@@ -55,7 +67,7 @@ class Desk:
         self,
         look_up: Callable[[Sequence[Order]], Found],
         draft: Callable[[Submission, str | None], Draft],
-        write: Callable[[Sequence[Draft]], Sequence[Answered | Exception]],
+        write: Callable[[Sequence[Draft]], Sequence[Outcome]],
         threads: int,
     ) -> None:
         """`look_up` finds what is stored, `draft` computes, `write` records and waits for that."""
@@ -69,6 +81,8 @@ class Desk:
         self._quiet = threading.Event()
         self._quiet.set()
         self._closing = False
+        self.after_group: list[Callable[[], object]] = []
+        """Called when a group is settled: what is told of it may be told together."""
         self._threads = [
             threading.Thread(target=self._work, name=f"desk-{number}", daemon=True)
             for number in range(threads)
@@ -76,24 +90,26 @@ class Desk:
         for thread in self._threads:
             thread.start()
 
-    def take(self, submission: Submission, key: str | None) -> "Future[Answered]":
-        """Queue a submission; raises `Busy` when too many wait.
+    def take(self, orders: Sequence[Order]) -> None:
+        """Queue orders; those that are too many are settled with `Busy`.
 
-        The future gives the answer, stored, or the error that keeps it from being.
+        What an order is settled with is the answer, stored, or the error that
+        keeps it from being.
         """
-        order = Order(submission, key)
-        # A request that is given up does not take its record back.
-        order.done.set_running_or_notify_cancel()
         with self._changed:
+            room = MAX_WAITING - len(self._new) - len(self._ready)
+            taken = 0 if self._closing else max(0, min(room, len(orders)))
+            if taken:
+                self._new.extend(orders[:taken])
+                self._quiet.clear()
+                if not self._active:
+                    self._changed.notify()
+        for order in orders[taken:]:
             if self._closing:
-                raise Stopping("the service is stopping")
-            if len(self._new) + len(self._ready) >= MAX_WAITING:
-                raise Busy(f"{MAX_WAITING} batches are waiting to be worked on", RETRY_AFTER_S)
-            self._new.append(order)
-            self._quiet.clear()
-            if not self._active:
-                self._changed.notify()
-        return order.done
+                order.settle(Stopping("the service is stopping"))
+            else:
+                waiting = f"{MAX_WAITING} batches are waiting to be worked on"
+                order.settle(Busy(waiting, RETRY_AFTER_S))
 
     def let_pass(self, seconds: float) -> None:
         """Wait until nothing lies here, but no longer than so; for whoever has more time."""
@@ -141,11 +157,13 @@ class Desk:
             return [self._new.popleft() for _ in range(count)]
 
     def _look(self, orders: Sequence[Order]) -> None:
-        """Answer what is stored; let the rest be computed, each identity once."""
+        """Answer what is wrong or stored; let the rest be computed, each identity once."""
+        orders, refused = self._read(orders)
+        self._settle(refused)
         if not orders:
             return
         try:
-            found: Sequence[Answered | Exception | None] = self._look_up(orders)
+            found: Sequence[Outcome | None] = self._look_up(orders)
         except Exception as error:
             found = [error] * len(orders)
         with self._changed:
@@ -158,9 +176,21 @@ class Desk:
                     self._ready.append(order)
                 else:
                     followers.append(order)
-        for order, answer in zip(orders, found, strict=True):
-            if answer is not None:
-                _settle(order, answer)
+        self._settle([each for each in zip(orders, found, strict=True) if each[1] is not None])
+
+    def _read(
+        self, orders: Sequence[Order]
+    ) -> tuple[list[Order], list[tuple[Order, Outcome | None]]]:
+        good: list[Order] = []
+        refused: list[tuple[Order, Outcome | None]] = []
+        for order in orders:
+            self._moved_s = time.monotonic()
+            try:
+                _ = order.submission
+                good.append(order)
+            except Exception as error:
+                refused.append((order, error))
+        return good, refused
 
     def _compute(self) -> None:
         """Compute what is ready for a while, and have it recorded."""
@@ -182,22 +212,22 @@ class Desk:
         if not computed:
             return
         try:
-            outcomes = self._write([draft for _, draft in computed])
+            outcomes: Sequence[Outcome] = self._write([draft for _, draft in computed])
         except Exception as error:
             outcomes = [error] * len(computed)
         self._finish([order for order, _ in computed], outcomes)
 
-    def _finish(self, orders: Sequence[Order], outcomes: Sequence[Answered | Exception]) -> None:
+    def _finish(self, orders: Sequence[Order], outcomes: Sequence[Outcome]) -> None:
         with self._changed:
             for order in orders:
                 # Followers are looked up again: the first may have failed, or had another body.
                 self._new.extend(self._at_work.pop(order.identity))
-        for order, outcome in zip(orders, outcomes, strict=True):
-            _settle(order, outcome)
+        self._settle(list(zip(orders, outcomes, strict=True)))
 
-
-def _settle(order: Order, outcome: Answered | Exception) -> None:
-    if isinstance(outcome, Exception):
-        order.done.set_exception(outcome)
-    else:
-        order.done.set_result(outcome)
+    def _settle(self, settled: Sequence[tuple[Order, Outcome | None]]) -> None:
+        for order, outcome in settled:
+            assert outcome is not None
+            order.settle(outcome)
+        if settled:
+            for told in self.after_group:
+                told()

@@ -5,8 +5,9 @@ import os
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
 from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
 
 import msgspec
 from sqlalchemy import Connection
@@ -15,7 +16,7 @@ from service.acquire import Acquisition, acquire
 from service.errors import AcquisitionError, BadBatch, Busy, Fault, NotFound, shown_value
 from service.missions.mission import Mission, mission_named
 from service.observe.batch import ObservationBatch
-from service.observe.wire import OptionsIn, Submission
+from service.observe.wire import OptionsIn, Submission, submission_from_json
 from service.records.again import batch_again
 from service.records.answer import answer_of
 from service.records.desk import Desk, Order
@@ -34,6 +35,7 @@ from service.records.reading import one_result
 from service.records.recording import record
 from service.records.running import Running
 from service.records.store import Store
+from service.records.tokens import Caller
 from service.records.transaction import Results
 from service.records.writer import RETRY_AFTER_S
 from service.sky.view import Sky
@@ -51,6 +53,19 @@ log = logging.getLogger(__name__)
 
 Observer = Callable[[Acquisition], None]
 Answers = list[Answered | AcquisitionError]
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A batch as it was sent, in JSON or read already, and who is called with its outcome.
+
+    `caller`, where given, must be allowed to ask about its spacecraft.
+    """
+
+    sent: bytes | Submission
+    key: str | None
+    settle: Callable[[Answered | Exception], object]
+    caller: Caller | None = None
 
 
 class _Rehearsed(Exception):
@@ -72,11 +87,17 @@ class Intake:
         self.observers: list[Observer] = []
         """Called with the acquisition of every batch that is new, after its commit."""
 
-    def take(self, submission: Submission, key: str | None) -> "Future[Answered]":
-        """Record a batch and answer it; a repeat gets the stored answer, at once or when it is."""
-        if key is not None:
-            _check_key(key)
-        return self._desk.take(submission, key)
+    def take(self, asked: Sequence[Asked]) -> None:
+        """Record batches and answer each; a repeat gets the stored answer, at once or when it is.
+
+        Returns at once: `settle` of each is called when it is done.
+        """
+        self._desk.take([Order(partial(_read, each), each.key, each.settle) for each in asked])
+
+    @property
+    def after_group(self) -> list[Callable[[], object]]:
+        """Called when the outcomes of a group of those that `take` was given are all told."""
+        return self._desk.after_group
 
     def close(self) -> None:
         """Work through what was taken, and take no more."""
@@ -165,7 +186,7 @@ class Intake:
         Connections are opened and statements put together that the first batch
         would wait for.
         """
-        self._stored_orders([Order(submission, None)])
+        self._stored_orders([Order(lambda: submission, None, lambda outcome: None)])
         draft = self._draft(submission)
 
         def record_and_regret(connection: Connection) -> None:
@@ -262,7 +283,10 @@ class Intake:
 
     def _written(self, drafts: Sequence[Draft]) -> Results:
         """What became of each draft, when all are recorded."""
-        return self._begin_writing(drafts)()
+        if not drafts:
+            return []
+        _hand(drafts)
+        return self._told(drafts, self._store.writer.record_here(drafts))
 
     def _begin_writing(
         self, drafts: Sequence[Draft], patient: bool = False
@@ -270,21 +294,17 @@ class Intake:
         """Queue drafts for one transaction; to call what it gives waits for that."""
         if not drafts:
             return list
-        handed = Handed(time.perf_counter_ns(), len(drafts))
-        for draft in drafts:
-            draft.handed = handed
+        _hand(drafts)
         future = self._store.writer.record(drafts, patient)
+        return lambda: self._told(drafts, future.result())
 
-        def written() -> Results:
-            outcomes = future.result()
-            for draft, outcome in zip(drafts, outcomes, strict=True):
-                is_new = isinstance(outcome, Answered) and not outcome.replayed
-                # A what-if looks at the same stars again: there is nothing new to observe.
-                if is_new and draft.batch is not None:
-                    self._tell(draft.acquisition)
-            return outcomes
-
-        return written
+    def _told(self, drafts: Sequence[Draft], outcomes: Results) -> Results:
+        for draft, outcome in zip(drafts, outcomes, strict=True):
+            is_new = isinstance(outcome, Answered) and not outcome.replayed
+            # A what-if looks at the same stars again: there is nothing new to observe.
+            if is_new and draft.batch is not None:
+                self._tell(draft.acquisition)
+        return outcomes
 
     def _tell(self, acquisition: Acquisition | None) -> None:
         if acquisition is None:
@@ -295,6 +315,12 @@ class Intake:
             except Exception:
                 # The batch is recorded and its answer due, whoever looks on.
                 log.exception("an observer failed")
+
+
+def _hand(drafts: Sequence[Draft]) -> None:
+    handed = Handed(time.perf_counter_ns(), len(drafts))
+    for draft in drafts:
+        draft.handed = handed
 
 
 def _decided(outcomes: Results) -> Answers:
@@ -314,6 +340,16 @@ def mission_in_input(missions: Mapping[str, Mission], name: str) -> Mission:
     except NotFound:
         there_are = f"there is no such spacecraft; there are {', '.join(sorted(missions))}"
         raise BadBatch(Fault("spacecraft", there_are, shown_value(name))) from None
+
+
+def _read(asked: Asked) -> Submission:
+    sent = asked.sent
+    submission = sent if isinstance(sent, Submission) else submission_from_json(sent)
+    if asked.caller is not None:
+        asked.caller.require(submission.batch.spacecraft)
+    if asked.key is not None:
+        _check_key(asked.key)
+    return submission
 
 
 def _holder(

@@ -14,7 +14,7 @@ from typing import Literal, get_args
 
 from sqlalchemy import Connection, delete, insert, select, update
 
-from service.errors import BadInput, Conflict, Fault, NotFound, shown_value
+from service.errors import BadInput, Conflict, Fault, NotAllowed, NotFound, shown_value
 from service.records.draft import Row
 from service.records.tables import access_sessions, access_tokens
 
@@ -44,6 +44,12 @@ class Caller:
     def may_see(self, spacecraft: str) -> bool:
         """Whether a spacecraft is one of theirs."""
         return self.spacecraft is None or spacecraft in self.spacecraft
+
+    def require(self, spacecraft: str) -> None:
+        """Raise `NotAllowed` unless a spacecraft is one of theirs."""
+        if not self.may_see(spacecraft):
+            theirs = ", ".join(sorted(self.spacecraft or ()))
+            raise NotAllowed(f"{self.name} may ask about {theirs}, not about {spacecraft[:128]}")
 
 
 def new_secret() -> str:

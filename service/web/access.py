@@ -34,7 +34,7 @@ class Policy:
     `about` says where the spacecraft stands, for a token that is bound to some:
     in the `path`, in the `query` (which must then name it), in the recorded
     `result` of the path, or in the `body`, which the handler itself checks
-    with `require_spacecraft`; `every` is for tokens that are bound to none, and
+    with `Caller.require`; `every` is for tokens that are bound to none, and
     `nothing` for what is about no spacecraft, or where the handler shows a
     caller no other's.  `open` asks for no token.
     """
@@ -168,13 +168,6 @@ def require_scope(caller: Caller, scope: Scope) -> None:
         )
 
 
-def require_spacecraft(caller: Caller, spacecraft: str) -> None:
-    """Raise `NotAllowed` unless a spacecraft is one of the caller's."""
-    if not caller.may_see(spacecraft):
-        theirs = ", ".join(sorted(caller.spacecraft or ()))
-        raise NotAllowed(f"{caller.name} may ask about {theirs}, not about {spacecraft[:128]}")
-
-
 def bearer(request: Request) -> str | None:
     """The token in the header, if there is one."""
     kind, _, token = request.headers.get("authorization", "").partition(" ")
@@ -206,11 +199,11 @@ async def _require_own(
     request: Request, operations: Operations, caller: Caller, about: About
 ) -> None:
     if about == "path":
-        require_spacecraft(caller, request.path_params["name"])
+        caller.require(request.path_params["name"])
     elif about == "query":
         named = request.query_params.getlist("spacecraft")
         for each in named:
-            require_spacecraft(caller, each)
+            caller.require(each)
         if not named:
             theirs = " or ".join(f"?spacecraft={each}" for each in sorted(caller.spacecraft or ()))
             raise NotAllowed(f"{caller.name} must say which spacecraft: {theirs}")

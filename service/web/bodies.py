@@ -18,7 +18,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 
 from service.errors import BadBatch, BadInput, Fault
-from service.observe.wire import Submission, faults_of, submission_from_json
+from service.observe.wire import faults_of
 from service.web.compressed import Coding
 from service.web.errors import NotJson
 
@@ -172,31 +172,24 @@ async def frame_body(request: Request, max_bytes: int) -> IO[bytes]:
     return file
 
 
-def read_submission(body: bytes) -> Submission:
-    """The batch in a body; raises `NotJson` or `BadBatch`."""
-    try:
-        return submission_from_json(body)
-    except BadInput as error:
-        _require_json(body, error)
-        raise
-
-
 def read_model(model: type[Body], body: bytes) -> Body:
     """The checked object in a body; an empty body is the object with every default."""
     try:
         return model.model_validate_json(body or b"{}")
     except ValidationError as error:
-        refusal = BadBatch(faults_of(error))
-        _require_json(body, refusal)
-        raise refusal from None
+        raise refused(body, BadBatch(faults_of(error))) from None
 
 
-def _require_json(body: bytes, refusal: BadInput) -> None:
-    # Only looked at when something is wrong: is it the form of the text, or what it says?
+def refused(body: bytes, refusal: BadInput) -> BadInput:
+    """The refusal of a body, or `NotJson` where the form of its text is at fault.
+
+    That is only looked at when something is wrong.
+    """
     try:
         from_json(body)
     except ValueError:
-        raise NotJson(refusal.faults) from None
+        return NotJson(refusal.faults)
+    return refusal
 
 
 JsonBody = Annotated[bytes, Depends(json_body)]

@@ -9,7 +9,6 @@ from starlette.responses import Response
 from service.errors import NotFound, shown_value
 from service.observe.wire import Key
 from service.times import parse_utc, shifted
-from service.web.access import require_spacecraft
 from service.web.dashboard.rendering import PageRoute, rendered
 from service.web.dashboard.shell import AtDesk, RunQuery
 from service.web.queries import Cursor
@@ -34,7 +33,7 @@ class AlarmsQuery(RunQuery):
 def alarms_page(query: Annotated[AlarmsQuery, InQuery()], desk: AtDesk) -> Response:
     """The alarms of a run, newest first."""
     if query.spacecraft:
-        require_spacecraft(desk.caller, query.spacecraft)
+        desk.caller.require(query.spacecraft)
     elif desk.caller.spacecraft is not None:
         query = query.model_copy(update={"spacecraft": desk.spacecraft[0]})
     page = desk.operations.alarms(

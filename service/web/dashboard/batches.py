@@ -10,7 +10,6 @@ from starlette.responses import Response
 from service.observe.wire import Key
 from service.records.reading import OutcomeName, Status
 from service.times import parse_utc
-from service.web.access import require_spacecraft
 from service.web.dashboard.rendering import PageRoute, rendered
 from service.web.dashboard.shell import AtDesk, RunQuery
 from service.web.queries import Cursor
@@ -43,7 +42,7 @@ class BatchesQuery(RunQuery):
 def batches_page(query: Annotated[BatchesQuery, InQuery()], desk: AtDesk) -> Response:
     """The batches of a run, newest first."""
     if query.spacecraft:
-        require_spacecraft(desk.caller, query.spacecraft)
+        desk.caller.require(query.spacecraft)
     elif desk.caller.spacecraft is not None:
         query = query.model_copy(update={"spacecraft": desk.spacecraft[0]})
     page = desk.operations.batches(

@@ -11,7 +11,6 @@ from starlette.responses import Response
 from service.errors import BadBatch, Fault, shown_value
 from service.observe.wire import Key, OptionsIn
 from service.times import parse_utc
-from service.web.access import require_spacecraft
 from service.web.dashboard.options import asked_options, fields_of, settings_of_mission
 from service.web.dashboard.rendering import PageRoute, rendered
 from service.web.dashboard.shell import AtDesk, RunQuery
@@ -51,7 +50,7 @@ def compare_page(
     asked = {side: asked_options(request.query_params, f"{side}.") for side in SIDES}
     result = None
     if query.spacecraft is not None:
-        require_spacecraft(desk.caller, query.spacecraft)
+        desk.caller.require(query.spacecraft)
         a, b = (OptionsIn.model_validate(asked[side]) for side in SIDES)
         result = desk.operations.compare(
             query.spacecraft,

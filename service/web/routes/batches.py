@@ -3,16 +3,16 @@
 from asyncio import wrap_future
 from typing import Annotated
 
-from anyio.to_thread import run_sync
 from fastapi import APIRouter, Path
 from fastapi import Query as InQuery
 from pydantic import Field, StrictBool
 from starlette.requests import Request
 from starlette.responses import Response
 
+from service.errors import BadInput
 from service.observe.wire import BatchIn, OptionsIn, Wire
-from service.web.access import Asking, require_scope, require_spacecraft
-from service.web.bodies import JsonBody, json_body, read_model, read_submission
+from service.web.access import Asking, require_scope
+from service.web.bodies import JsonBody, json_body, read_model, refused
 from service.web.describe import IDEMPOTENCY_KEY, LINK, LOCATION, REPLAYED, Gives, described
 from service.web.headers import NO_IDEMPOTENCY_KEY, idempotency_key
 from service.web.holding import Held, answer_response, json_response, page_response
@@ -20,9 +20,6 @@ from service.web.queries import NO_QUERY, BatchQuery, require_no_query
 from service.web.schemas.answers import Answer, BatchPage, Record
 
 router = APIRouter(prefix="/api/v1/batches", tags=["batches"])
-
-READ_AT_ONCE_BYTES = 32_768
-"""A hundred stars; to read more takes a thread, so that others need not wait for it."""
 
 ResultId = Annotated[str, Path(description="The `id` of a recorded result.")]
 
@@ -58,13 +55,11 @@ async def submit_batch(request: Request) -> Response:
     await require_no_query(request)
     body = await json_body(request)
     key = await idempotency_key(request)
-    if len(body) > READ_AT_ONCE_BYTES:
-        submission = await run_sync(read_submission, body)
-    else:
-        submission = read_submission(body)
-    require_spacecraft(request.state.caller, submission.batch.spacecraft)
     held = request.app.state
-    answered = await wrap_future(held.operations.take(submission, key))
+    try:
+        answered = await wrap_future(held.operations.take(body, key, request.state.caller))
+    except BadInput as error:
+        raise refused(body, error) from None
     if answered.replayed:
         held.metrics.count_repeat()
     return answer_response(answered)

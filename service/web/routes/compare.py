@@ -8,7 +8,7 @@ from starlette.responses import Response
 
 from service.errors import BadBatch, Fault
 from service.observe.wire import Key, OptionsIn, RunName, Wire
-from service.web.access import Asking, require_spacecraft
+from service.web.access import Asking
 from service.web.bodies import JsonBody, read_model
 from service.web.describe import Gives, described
 from service.web.holding import Held, json_response
@@ -47,7 +47,7 @@ class CompareIn(Wire):
 def compare(body: JsonBody, operations: Held, caller: Asking) -> Response:
     """Run recorded batches again with two sets of options, side by side; nothing is kept."""
     asked = read_model(CompareIn, body)
-    require_spacecraft(caller, asked.spacecraft)
+    caller.require(asked.spacecraft)
     if asked.start and asked.end and asked.start.tai_ns > asked.end.tai_ns:
         raise BadBatch(Fault("start", f"must not be after end {asked.end}", repr(str(asked.start))))
     found = operations.compare(

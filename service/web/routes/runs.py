@@ -11,7 +11,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.observe.wire import BatchIn, RunName, Wire
-from service.web.access import Asking, require_spacecraft
+from service.web.access import Asking
 from service.web.bodies import (
     MAX_JSON_BYTES,
     JsonBody,
@@ -112,7 +112,7 @@ def start_replay(
             sent.run,
             name=sent.run,
             total=sent.body.lines,
-            check=lambda submission: require_spacecraft(caller, submission.batch.spacecraft),
+            check=lambda submission: caller.require(submission.batch.spacecraft),
             alarms=sent.alarms,
         )
         on_failure.pop_all()

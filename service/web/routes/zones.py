@@ -8,7 +8,7 @@ from pydantic import Field
 from starlette.responses import Response
 
 from service.observe.wire import APrioriIn, Key, Wire
-from service.web.access import Asking, require_spacecraft
+from service.web.access import Asking
 from service.web.bodies import JsonBody, read_model
 from service.web.describe import Gives, described
 from service.web.holding import Held, json_response
@@ -48,7 +48,7 @@ def list_zones(operations: Held) -> Response:
 def warm_zones(body: JsonBody, operations: Held, caller: Asking) -> Response:
     """Build the zones that batches with these a priori attitudes will use."""
     asked = read_model(WarmIn, body)
-    require_spacecraft(caller, asked.spacecraft)
+    caller.require(asked.spacecraft)
     warmed = operations.warm_zones(asked.spacecraft, asked.a_priori, asked.time)
     return json_response({"items": warmed})
 
