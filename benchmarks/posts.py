@@ -237,7 +237,7 @@ def _parse_and_insert(lines: Sequence[bytes], folder: Path) -> float:
     operations = Operations.open(Settings(database=f"sqlite:///{folder / 'ceiling.db'}"))
     try:
         made = [submission_from_json(line, run="bulk") for line in lines]
-        drafts = [operations._intake._draft(each) for each in made]
+        drafts = [operations._intake._bench.draft(each) for each in made]
         operations.store.writer.change(lambda connection: None).result()
         spent = 0.0
         for first in range(0, len(lines), CHUNK):

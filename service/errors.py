@@ -55,6 +55,10 @@ class BadInput(AcquisitionError):
         self.faults = (faults,) if isinstance(faults, Fault) else tuple(faults)
         super().__init__("; ".join(str(fault) for fault in self.faults))
 
+    def __reduce__(self) -> tuple[type["BadInput"], tuple[tuple[Fault, ...]]]:
+        # Made anew elsewhere of what it was made of here, not of its text.
+        return type(self), (self.faults,)
+
 
 class BadBatch(BadInput):
     """A batch, an option or a query that is refused."""

@@ -59,12 +59,14 @@ from service.records import (
 )
 from service.records.access import Access
 from service.records.ahead import LIVE
+from service.records.bench import mission_in_input
+from service.records.bulk import Bulk, Check
 from service.records.comparing import Pair, compare
 from service.records.comparison import compare_runs
 from service.records.draft import Answered, Row
 from service.records.events import Event
 from service.records.ids import Ulids, is_ulid
-from service.records.intake import Asked, Intake, Observer, mission_in_input
+from service.records.intake import Asked, Intake, Observer, Recorded
 from service.records.looking import neighbours, recorded_batch, recorded_mission
 from service.records.pages import Page, Stretch
 from service.records.reading import OutcomeName, Status
@@ -75,6 +77,7 @@ from service.records.star_field import star_field_of
 from service.records.store import Store
 from service.records.tokens import Caller
 from service.records.watching import is_due, latest_inputs, shelf_end, sweep
+from service.records.workers import Equipment
 from service.records.worst import worst_batches
 from service.settings import Settings, is_loopback
 from service.sky.catalog import open_catalog
@@ -85,7 +88,7 @@ from service.sky.zones import Zone
 from service.times import Utc, utc_now
 from service.warm import warm_up, warm_zones
 
-__all__ = ["LIVE", "Answered", "Operations", "Page"]
+__all__ = ["LIVE", "Answered", "Operations", "Page", "Recorded"]
 
 log = logging.getLogger(__name__)
 
@@ -127,6 +130,10 @@ class Operations:
         self.store = store
         self.access = Access(store, is_loopback(settings.host), utc_now)
         self._intake = Intake(missions, sky, store)
+        equipment = Equipment(
+            missions, settings.catalog, sky.catalog.digest, settings.shelf_mb << 20
+        )
+        self._bulk = Bulk(self._intake, store, equipment, settings.replay_processes)
         self._ids = Ulids()
         self._replays: list[Replay] = []
         self._replays_lock = threading.Lock()
@@ -182,6 +189,9 @@ class Operations:
             self._closing = True
         for replay in self._replays:
             replay.stop()
+        self._bulk.close()
+        for replay in self._replays:
+            replay.wait()
         self._intake.close()
         self.store.close()
 
@@ -229,7 +239,7 @@ class Operations:
 
     @property
     def observers(self) -> list[Observer]:
-        """Called with the acquisition of every batch that is new, after its commit."""
+        """Called with every batch that is new, after its commit."""
         return self._intake.observers
 
     def submit(self, submission: Submission, idempotency_key: str | None = None) -> Answered:
@@ -843,18 +853,18 @@ class Operations:
         run: str,
         name: str = "replay",
         total: int | None = None,
-        check: Callable[[Submission], None] = lambda submission: None,
+        check: Check = lambda spacecraft: None,
         alarms: bool = False,
     ) -> str:
         """Work through NDJSON lines in the background; the id under which to ask for progress.
 
         Every batch goes to `run`.  `total` is the number of lines, where it is
-        known.  Lines that can be closed are closed at the end.  A line for which
-        `check` raises an `AcquisitionError` is refused with it.  With `alarms`
+        known.  Lines that can be closed are closed at the end.  A line for whose
+        spacecraft `check` raises an `AcquisitionError` is refused with it.  With `alarms`
         limits are held against the run (see `watch_run`).
         """
         row = {"id": self._ids.new(), "run": _run_name(run), "name": name, "lines_total": total}
-        replay = Replay(self.store, self._intake.begin_many, lambda: utc_now().text, row, check)
+        replay = Replay(self.store, self._bulk, lambda: utc_now().text, row, check)
         with self._replays_lock:
             if self._closing:
                 raise Stopping("the service is stopping")

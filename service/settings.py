@@ -12,6 +12,8 @@ from typing import Any
 from service.errors import BadConfiguration, shown_value
 
 PREFIX = "ACQUIRE_"
+MOST_USEFUL_PROCESSES = 4
+"""One process writes: it takes no more than so many can compute."""
 _HOST = re.compile(r"[A-Za-z0-9.:_-]{1,253}", re.ASCII)
 
 
@@ -24,7 +26,8 @@ class Settings:
     ones alone.  `shelf_mb` bounds the cache of zones and run catalogs.  `host`
     other than loopback is served once there are tokens.  `token` is what
     commands show that talk to a running service.  `frame_mb` and `frame_megapixels`
-    bound a frame's file and what it unfolds into.
+    bound a frame's file and what it unfolds into.  `replay_processes` is how
+    many processes beside this one compute replays; 0: this one does.
     """
 
     database: str = "sqlite:///acquire.db"
@@ -36,6 +39,7 @@ class Settings:
     token: str | None = None
     frame_mb: int = 64
     frame_megapixels: int = 20
+    replay_processes: int = min(os.cpu_count() or 1, MOST_USEFUL_PROCESSES)
 
     def __post_init__(self) -> None:
         if not self.database.strip():
@@ -45,6 +49,8 @@ class Settings:
         for name, most in (("frame_mb", 2048), ("frame_megapixels", 400)):
             if not 1 <= getattr(self, name) <= most:
                 raise _refusal(name, f"must be from 1 to {most}", getattr(self, name))
+        if not 0 <= self.replay_processes <= 64:
+            raise _refusal("replay_processes", "must be from 0 to 64", self.replay_processes)
         if not 0 <= self.port <= 65535:
             raise _refusal("port", "must be from 0 to 65535", self.port)
         if not _HOST.fullmatch(self.host):
@@ -75,6 +81,7 @@ _READERS: dict[str, Callable[[str], Any]] = {
     "frame_mb": int,
     "frame_megapixels": int,
     "port": int,
+    "replay_processes": int,
 }
 
 

@@ -1,8 +1,6 @@
 """From a submission to its stored answer: compute first, then one transaction, then answer."""
 
 import logging
-import os
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -12,15 +10,16 @@ from functools import partial
 import msgspec
 from sqlalchemy import Connection
 
-from service.acquire import Acquisition, acquire
-from service.errors import AcquisitionError, BadBatch, Busy, Fault, NotFound, shown_value
+from service.acquire import Acquisition
+from service.errors import AcquisitionError, BadBatch, Busy, Fault, shown_value
 from service.missions.mission import Mission, mission_named
 from service.observe.batch import ObservationBatch
 from service.observe.wire import OptionsIn, Submission, submission_from_json
 from service.records.again import batch_again
 from service.records.answer import answer_of
+from service.records.bench import Bench
 from service.records.desk import Desk, Order
-from service.records.draft import Answered, Draft, Handed, submission_draft, what_if_draft
+from service.records.draft import Answered, Draft, Handed, what_if_draft
 from service.records.identity import (
     Identity,
     Registry,
@@ -30,29 +29,40 @@ from service.records.identity import (
     remember_key,
     stored_answers,
 )
-from service.records.ids import Ulids
 from service.records.reading import one_result
 from service.records.recording import record
 from service.records.running import Running
 from service.records.store import Store
 from service.records.tokens import Caller
 from service.records.transaction import Results
-from service.records.writer import RETRY_AFTER_S
 from service.sky.view import Sky
 from service.times import utc_now
 
 MAX_KEY_LENGTH = 255
-
-PROCESSOR_WAIT_S = 5.0
-"""A batch takes a millisecond: whoever waits longer stands behind a pile of the worst ones."""
 
 LET_PASS_S = 0.002
 """Before each of many batches those that came one by one have so long to be done with."""
 
 log = logging.getLogger(__name__)
 
-Observer = Callable[[Acquisition], None]
 Answers = list[Answered | AcquisitionError]
+
+COUNTED = ("observed", "unique", "ambiguous", "unmatched")
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A batch that is newly recorded, as observers are told of it."""
+
+    spacecraft: str
+    run: str
+    batch: str
+    counts: Mapping[str, int]
+    """Its stars: observed, and of them unique, ambiguous and unmatched."""
+    has_attitude: bool
+
+
+Observer = Callable[[Recorded], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,16 +86,14 @@ class Intake:
     """Takes batches in: each is identified, solved and recorded once, however often it is sent."""
 
     def __init__(self, missions: Mapping[str, Mission], sky: Sky, store: Store) -> None:
-        self._missions = missions
-        self._sky = sky
+        self._bench = Bench(missions, sky)
         self._store = store
-        self._ids = Ulids()
         self._running = Running()
-        processors = max(2, os.cpu_count() or 1)
-        self._processors = threading.BoundedSemaphore(processors)
-        self._desk = Desk(self._stored_orders, self._draft, self._written, processors)
+        self._desk = Desk(
+            self._stored_orders, self._bench.draft, self._written, self._bench.processors
+        )
         self.observers: list[Observer] = []
-        """Called with the acquisition of every batch that is new, after its commit."""
+        """Called with every batch that is new, after its commit."""
 
     def take(self, asked: Sequence[Asked]) -> None:
         """Record batches and answer each; a repeat gets the stored answer, at once or when it is.
@@ -122,14 +130,10 @@ class Intake:
                 return stored
             with self._running.turn(identity) as mine:
                 if mine:
-                    return _raised(self._write([self._draft(make(), key)])[0])
+                    return _raised(self._write([self._bench.draft(make(), key)])[0])
 
     def submit_many(self, submissions: Sequence[Submission]) -> Answers:
         """`submit` of each in one transaction; an error stands in the place of what is refused."""
-        return self.begin_many(submissions)()
-
-    def begin_many(self, submissions: Sequence[Submission]) -> Callable[[], Answers]:
-        """`submit_many` as far as the writer's queue; to call what it gives waits for the rest."""
         with self._store.reading() as connection:
             registry = look_up(connection, {identity_of(each.batch) for each in submissions})
             holders = [
@@ -142,24 +146,32 @@ class Intake:
         # as five hundred batches take keeps SQLite from ever shortening its log.
         found: list[Draft | Taken | AcquisitionError] = []
         for holder, each in zip(holders, submissions, strict=True):
-            self._desk.let_pass(LET_PASS_S)
-            found.append(holder or self._draft_or_error(each))
+            found.append(holder or self.draft_of_many(each))
         drafts = [each for each in found if isinstance(each, Draft)]
+        written = iter(self.begin_writing(drafts)())
+        answers: Answers = []
+        for one in found:
+            if isinstance(one, Draft):
+                answers.append(next(written))
+            elif isinstance(one, Taken):
+                answers.append(Answered(one.result_id, stored[one.result_id], replayed=True))
+            else:
+                answers.append(one)
+        return answers
+
+    def draft_of_many(self, submission: Submission) -> Draft | AcquisitionError:
+        """The draft of one of many, as soon as nobody waits who came with a single one."""
+        self.let_pass()
+        return self._bench.draft_or_error(submission)
+
+    def let_pass(self) -> None:
+        """Wait a little for what came one by one to be done."""
+        self._desk.let_pass(LET_PASS_S)
+
+    def begin_writing(self, drafts: Sequence[Draft]) -> Callable[[], Answers]:
+        """Queue many drafts for a transaction; to call what it gives waits for the answers."""
         finish = self._begin_writing(drafts, patient=True)
-
-        def finished() -> Answers:
-            written = iter(_decided(finish()))
-            answers: Answers = []
-            for one in found:
-                if isinstance(one, Draft):
-                    answers.append(next(written))
-                elif isinstance(one, Taken):
-                    answers.append(Answered(one.result_id, stored[one.result_id], replayed=True))
-                else:
-                    answers.append(one)
-            return answers
-
-        return finished
+        return lambda: _decided(finish())
 
     def what_if(self, id: str, options: OptionsIn, *, record: bool, adopt: bool) -> Answered:
         """Run a recorded batch again; `options` replace what they name of the result's own."""
@@ -172,7 +184,7 @@ class Intake:
             return Answered(None, msgspec.json.encode(answer), replayed=False)
         draft = what_if_draft(
             acquisition,
-            id=self._ids.new(),
+            id=self._bench.ids.new(),
             batch_id=parent["batch_id"],
             parent=id,
             adopt=adopt,
@@ -187,7 +199,7 @@ class Intake:
         would wait for.
         """
         self._stored_orders([Order(lambda: submission, None, lambda outcome: None)])
-        draft = self._draft(submission)
+        draft = self._bench.draft(submission)
 
         def record_and_regret(connection: Connection) -> None:
             record(connection, [draft])
@@ -201,7 +213,8 @@ class Intake:
 
         Other settings than those of the batch's mission may be given.
         """
-        return self._acquire(batch, mission or mission_named(self._missions, batch.spacecraft))
+        named = mission or mission_named(self._bench.missions, batch.spacecraft)
+        return self._bench.acquire(batch, named)
 
     def _stored_orders(self, orders: Sequence[Order]) -> list[Answered | AcquisitionError | None]:
         """What is stored of each: the answer, the error of whose place is taken, or nothing."""
@@ -249,35 +262,6 @@ class Intake:
         self._remember(identity, key, first, registry)
         return Answered(first.result_id, body, replayed=True)
 
-    def _draft(self, submission: Submission, key: str | None = None) -> Draft:
-        received = utc_now()
-        mission = mission_in_input(self._missions, submission.batch.spacecraft)
-        acquisition = self._acquire(submission.batch, mission)
-        return submission_draft(
-            submission, acquisition, id=self._ids.new(), received=received, key=key
-        )
-
-    def _acquire(self, batch: ObservationBatch, mission: Mission) -> Acquisition:
-        if not self._processors.acquire(timeout=PROCESSOR_WAIT_S):
-            raise Busy("every processor is at work on other batches", RETRY_AFTER_S)
-        try:
-            return acquire(batch, mission, self._sky)
-        finally:
-            self._processors.release()
-
-    def _draft_or_error(self, submission: Submission) -> Draft | AcquisitionError:
-        try:
-            return self._draft(submission)
-        except Busy:
-            # Says nothing about the batch: the whole chunk may come again.
-            raise
-        except AcquisitionError as error:
-            return error
-        except Exception:
-            # A fault of ours in one batch: the others are recorded all the same.
-            log.exception("%s, run %s, batch %s failed", *identity_of(submission.batch))
-            return AcquisitionError("the fault is on the service's side; it is logged")
-
     def _write(self, drafts: Sequence[Draft]) -> Answers:
         return _decided(self._written(drafts))
 
@@ -303,15 +287,20 @@ class Intake:
             is_new = isinstance(outcome, Answered) and not outcome.replayed
             # A what-if looks at the same stars again: there is nothing new to observe.
             if is_new and draft.batch is not None:
-                self._tell(draft.acquisition)
+                self._tell(draft)
         return outcomes
 
-    def _tell(self, acquisition: Acquisition | None) -> None:
-        if acquisition is None:
+    def _tell(self, draft: Draft) -> None:
+        if not self.observers:
             return
+        recorded = Recorded(
+            *draft.identity,
+            counts={name: draft.result[name] for name in COUNTED},
+            has_attitude=draft.solution is not None,
+        )
         for observer in self.observers:
             try:
-                observer(acquisition)
+                observer(recorded)
             except Exception:
                 # The batch is recorded and its answer due, whoever looks on.
                 log.exception("an observer failed")
@@ -331,15 +320,6 @@ def _decided(outcomes: Results) -> Answers:
             raise outcome
         answers.append(outcome)
     return answers
-
-
-def mission_in_input(missions: Mapping[str, Mission], name: str) -> Mission:
-    """The mission that an input names; raises `BadBatch` naming the field where there is none."""
-    try:
-        return mission_named(missions, name)
-    except NotFound:
-        there_are = f"there is no such spacecraft; there are {', '.join(sorted(missions))}"
-        raise BadBatch(Fault("spacecraft", there_are, shown_value(name))) from None
 
 
 def _read(asked: Asked) -> Submission:

@@ -3,11 +3,11 @@
 import json
 import logging
 import threading
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 from sqlalchemy import Connection, insert, select, update
@@ -21,9 +21,10 @@ from service.errors import (
     problem_of,
     shown_value,
 )
-from service.observe.wire import Submission, submission_from_json
 from service.records import events
+from service.records.bulk import Bulk, Check, Chunk
 from service.records.draft import Answered, Row
+from service.records.intake import Answers
 from service.records.store import Store
 from service.records.tables import replays
 
@@ -41,20 +42,18 @@ COUNTED = ("new", "repeated", "observed", "unique", "ambiguous", "unmatched", "a
 
 log = logging.getLogger(__name__)
 
-Answers = list[Answered | AcquisitionError]
-BeginMany = Callable[[Sequence[Submission]], Callable[[], Answers]]
 Numbered = tuple[int, bytes]
+T = TypeVar("T")
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Begun:
-    """A chunk that is being written: its last line, and its submissions with their lines."""
+    """A chunk on its way: its last line, and those that hold something, with their numbers."""
 
     last: int
-    refused: list[tuple[int, Exception]]
     numbers: list[int]
-    submissions: list[Submission]
-    finish: Callable[[], Answers]
+    texts: list[bytes]
+    chunk: Chunk
 
 
 def read_replay(connection: Connection, id: str) -> Row:
@@ -122,13 +121,13 @@ class Replay:
     def __init__(
         self,
         store: Store,
-        begin_many: BeginMany,
+        bulk: Bulk,
         now: Callable[[], str],
         row: Row,
-        check: Callable[[Submission], None],
+        check: Check,
     ) -> None:
         self._store = store
-        self._begin_many = begin_many
+        self._bulk = bulk
         self._now = now
         self._row = row
         self._check = check
@@ -136,6 +135,8 @@ class Replay:
         self._errors: list[Row] = []
         self._errors_changed = False
         self._noting: Future[None] | None = None
+        self._ahead: deque[_Begun] = deque()
+        self._written: _Begun | None = None
         self._stopping = threading.Event()
         self._over = threading.Event()
 
@@ -177,8 +178,11 @@ class Replay:
         return self._over.is_set()
 
     def stop(self) -> None:
-        """End after the chunk at hand, and wait for that."""
+        """Let it end after the chunk at hand."""
         self._stopping.set()
+
+    def wait(self) -> None:
+        """Return when it is over."""
         self._over.wait()
 
     def _work(self, lines: Iterable[bytes]) -> None:
@@ -204,68 +208,71 @@ class Replay:
                 self._over.set()
 
     def _worked_through(self, lines: Iterable[bytes]) -> str:
-        """The state in the end; while a chunk is being written the next is computed."""
-        begun: _Begun | None = None
+        """The state in the end; while a chunk is written, those after it are computed."""
         try:
-            for chunk in _chunks(enumerate(lines, start=1)):
-                if self._stopping.is_set():
-                    return "interrupted"
-                before, begun = begun, self._begin(chunk)
-                self._finish(before)
+            try:
+                for chunk in _chunks(enumerate(lines, start=1)):
+                    if self._stopping.is_set():
+                        return "interrupted"
+                    self._ahead.append(self._begin(chunk))
+                    self._hand_on(self._bulk.ahead)
+            finally:
+                # Where the lines break off, those before are recorded all the same.
+                if not self._stopping.is_set():
+                    self._hand_on(0)
             return "done"
         finally:
-            self._finish(begun)
+            self._finish(self._written)
 
-    def _begin(self, chunk: list[Numbered]) -> _Begun:
-        numbers: list[int] = []
-        submissions: list[Submission] = []
-        refused: list[tuple[int, Exception]] = []
-        for number, line in chunk:
-            if line.strip():
-                try:
-                    submission = submission_from_json(line.rstrip(b"\r\n"), run=self._row["run"])
-                    self._check(submission)
-                    submissions.append(submission)
-                    numbers.append(number)
-                except AcquisitionError as error:
-                    refused.append((number, error))
-        finish = self._patiently(submissions)
-        return _Begun(chunk[-1][0], refused, numbers, submissions, finish)
+    def _begin(self, numbered: list[Numbered]) -> _Begun:
+        some = [(number, line.rstrip(b"\r\n")) for number, line in numbered if line.strip()]
+        numbers, texts = [number for number, _ in some], [text for _, text in some]
+        return _Begun(numbered[-1][0], numbers, texts, self._patiently(self._chunk, texts))
 
-    def _finish(self, chunk: _Begun | None) -> None:
+    def _chunk(self, texts: list[bytes]) -> Chunk:
+        return self._bulk.begin(texts, self._row["run"], self._check)
+
+    def _hand_on(self, left: int) -> None:
+        """Queue chunks for the writer, one after the other, until so many are left."""
+        while len(self._ahead) > left:
+            self._patiently(self._ahead[0].chunk.hand_on)
+            before, self._written = self._written, self._ahead.popleft()
+            self._finish(before)
+
+    def _finish(self, begun: _Begun | None) -> None:
         """Count what came of a chunk, once it is recorded."""
-        if chunk is None:
+        if begun is None:
             return
         try:
-            outcomes = chunk.finish()
+            answers = begun.chunk.answers()
         except Stopping:
             raise
         except Busy:
-            outcomes = self._again(chunk.submissions)
-        for number, error in chunk.refused:
-            self._refuse(number, error)
-        for number, outcome in zip(chunk.numbers, outcomes, strict=True):
-            if isinstance(outcome, AcquisitionError):
-                self._refuse(number, outcome)
+            answers = self._again(begun.texts)
+        for number, answer in zip(begun.numbers, answers, strict=True):
+            if isinstance(answer, AcquisitionError):
+                self._refuse(number, answer)
             else:
-                self._count(outcome)
-        self._row["lines_done"] = chunk.last
+                self._count(answer)
+        self._row["lines_done"] = begun.last
         self._save(state="running", finished=None)
 
-    def _patiently(self, submissions: Sequence[Submission]) -> Callable[[], Answers]:
+    def _patiently(self, call: Callable[..., T], *given: Any) -> T:
         while True:
             try:
-                return self._begin_many(submissions)
+                return call(*given)
             except Stopping:
                 raise
             except Busy:
                 self._pause()
 
-    def _again(self, submissions: Sequence[Submission]) -> Answers:
+    def _again(self, texts: list[bytes]) -> Answers:
         while True:
             self._pause()
+            chunk = self._patiently(self._chunk, texts)
+            self._patiently(chunk.hand_on)
             try:
-                return self._patiently(submissions)()
+                return chunk.answers()
             except Stopping:
                 raise
             except Busy:

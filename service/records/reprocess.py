@@ -5,34 +5,26 @@ writer.  What the run holds already is left out of the reading, so that a
 reprocessing that was stopped, however hard, goes on where it was.
 """
 
-import dataclasses
 import json
-import multiprocessing
 import os
-import signal
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 from sqlalchemy import ColumnElement, and_, exists, func, select
 
-from service.acquire import acquire
 from service.errors import AcquisitionError, BadBatch, Busy, Fault, shown_value
 from service.missions.mission import Mission
 from service.observe.wire import BatchIn, OptionsIn, submission_from_model
-from service.records.draft import Answered, Draft, submission_draft
-from service.records.ids import Ulids
+from service.records.bench import Bench
+from service.records.draft import Answered, Draft
 from service.records.pages import PLACE, Stretch
 from service.records.store import Store
 from service.records.tables import batches, results
-from service.sky.catalog import open_catalog
-from service.sky.shelf import Shelf
-from service.sky.view import Sky
-from service.times import utc_now
+from service.records.workers import Equipment, WorkerLost, Workers
 
 CHUNK = 100
 """Batches that a worker takes, and that a transaction records."""
@@ -89,16 +81,16 @@ def reprocess(
     _require_same_settings(store, plan, catalog_digest)
     progress = _counted(store, plan)
     step(progress)
-    with _workers(plan) as submit:
-        waiting: deque[Future[list[Draft | Refused]]] = deque()
-        most = AHEAD * _processes(plan)
+    with closing(_Hands(plan, catalog_digest)) as hands:
+        waiting: deque[Callable[[], list[Draft | Refused]]] = deque()
+        most = AHEAD * hands.count
         for chunk in _chunks(store, plan):
-            waiting.append(submit(chunk))
+            waiting.append(hands.take(chunk))
             if len(waiting) >= most:
-                _record(store, waiting.popleft().result(), progress)
+                _record(store, waiting.popleft()(), progress)
                 step(progress)
         while waiting:
-            _record(store, waiting.popleft().result(), progress)
+            _record(store, waiting.popleft()(), progress)
             step(progress)
     return progress
 
@@ -191,73 +183,59 @@ def _record(store: Store, found: Sequence[Draft | Refused], progress: Progress) 
 # ---- workers -----------------------------------------------------------------------------------
 
 
-class Again:
-    """Computes batches again: what a worker holds."""
+@dataclass(frozen=True)
+class _Part:
+    """What a worker takes: stored batches, and the run that they go to."""
 
-    def __init__(self, plan: Plan) -> None:
-        self._plan = plan
-        self._sky = Sky(open_catalog(plan.catalog), Shelf(plan.shelf_bytes))
-        self._ids = Ulids()
-
-    def drafts(self, chunk: Sequence[Stored]) -> list[Draft | Refused]:
-        """The drafts of stored batches in the plan's run, with what cannot be taken."""
-        return [self._draft(*each) for each in chunk]
-
-    def _draft(self, input: str, options: str) -> Draft | Refused:
-        model = BatchIn.model_validate_json(input).model_copy(
-            update={
-                "run": self._plan.run,
-                "options": OptionsIn.model_validate(json.loads(options)),
-            }
-        )
-        try:
-            submission = submission_from_model(model)
-            batch = submission.batch
-            acquisition = acquire(batch, self._plan.missions[batch.spacecraft], self._sky)
-        except AcquisitionError as error:
-            return Refused(model.batch, str(error))
-        draft = submission_draft(submission, acquisition, id=self._ids.new(), received=utc_now())
-        # Zones and run catalogs stay where they are.
-        return dataclasses.replace(draft, acquisition=None)
+    run: str
+    stored: Sequence[Stored]
 
 
-_held: Again
+def work(bench: Bench, part: _Part) -> list[Draft | Refused]:
+    """The drafts of stored batches in a run, with what cannot be taken."""
+    return [_again(bench, part.run, *each) for each in part.stored]
 
 
-def _open(plan: Plan) -> None:
-    # Whoever interrupts the command interrupts its process, which ends its workers.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    global _held
-    _held = Again(plan)
-
-
-def _worked(chunk: Sequence[Stored]) -> list[Draft | Refused]:
-    return _held.drafts(chunk)
-
-
-def _processes(plan: Plan) -> int:
-    return plan.processes or os.cpu_count() or 1
-
-
-@contextmanager
-def _workers(
-    plan: Plan,
-) -> "Iterator[Callable[[Sequence[Stored]], Future[list[Draft | Refused]]]]":
-    """A function that hands a chunk to a worker; the workers end with the block."""
-    count = _processes(plan)
-    if count == 1:
-        again = Again(plan)
-
-        def here(chunk: Sequence[Stored]) -> "Future[list[Draft | Refused]]":
-            done: Future[Any] = Future()
-            done.set_result(again.drafts(chunk))
-            return done
-
-        yield here
-        return
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(count, mp_context=context, initializer=_open, initargs=(plan,))
+def _again(bench: Bench, run: str, input: str, options: str) -> Draft | Refused:
+    model = BatchIn.model_validate_json(input).model_copy(
+        update={"run": run, "options": OptionsIn.model_validate(json.loads(options))}
+    )
     try:
-        yield lambda chunk: pool.submit(_worked, chunk)
-    finally:
-        pool.shutdown(cancel_futures=True)
+        return bench.draft(submission_from_model(model))
+    except AcquisitionError as error:
+        return Refused(model.batch, str(error))
+
+
+class _Hands:
+    """Who computes: workers, or where there is only one, or they are lost, this process."""
+
+    def __init__(self, plan: Plan, catalog_digest: str) -> None:
+        self._run = plan.run
+        self._equipment = Equipment(plan.missions, plan.catalog, catalog_digest, plan.shelf_bytes)
+        self.count = plan.processes or os.cpu_count() or 1
+        self._workers: Workers[_Part, Draft | Refused] = Workers(self._equipment, work, self.count)
+        if self.count > 1:
+            self._workers.start()
+
+    @cached_property
+    def _bench(self) -> Bench:
+        return self._equipment.bench()
+
+    def take(self, stored: Sequence[Stored]) -> Callable[[], list[Draft | Refused]]:
+        """Begin with some batches; to call what it gives waits for what comes of them."""
+        part = _Part(self._run, stored)
+        if self.count == 1:
+            return lambda: work(self._bench, part)
+        future = self._workers.submit(part)
+
+        def found() -> list[Draft | Refused]:
+            try:
+                return future.result()
+            except WorkerLost:
+                return work(self._bench, part)
+
+        return found
+
+    def close(self) -> None:
+        """End the workers."""
+        self._workers.close()

@@ -10,9 +10,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 from starlette.types import Scope
 
-from service.acquire import Acquisition
 from service.alarms.limits import Severity
-from service.operations import LIVE, Operations
+from service.operations import LIVE, Operations, Recorded
 
 log = logging.getLogger(__name__)
 
@@ -116,14 +115,14 @@ class Metrics:
             for outcome in OUTCOMES:
                 self._stars.labels(name, outcome)
 
-    def count_batch(self, acquisition: Acquisition) -> None:
+    def count_batch(self, recorded: Recorded) -> None:
         """Count one newly recorded batch."""
-        batch, live = acquisition.batch, acquisition.batch.run == LIVE
-        result = "no_attitude" if acquisition.solution is None else "attitude"
-        self._batches.labels(batch.spacecraft, LIVE if live else "named", result).inc()
+        spacecraft, live = recorded.spacecraft, recorded.run == LIVE
+        result = "attitude" if recorded.has_attitude else "no_attitude"
+        self._batches.labels(spacecraft, LIVE if live else "named", result).inc()
         if live:
             for outcome in OUTCOMES:
-                self._stars.labels(batch.spacecraft, outcome).inc(acquisition.counts[outcome])
+                self._stars.labels(spacecraft, outcome).inc(recorded.counts[outcome])
 
     def count_repeat(self) -> None:
         """Count one submission that was recorded before."""

@@ -91,7 +91,7 @@ def test_one_change_that_fails_spoils_none_of_its_neighbours(store):
 
 def test_one_draft_that_cannot_be_kept_spoils_none_of_its_neighbours(operations, make):
     go_on = held_up(operations.store.writer)
-    drafts = [operations._intake._draft(make(name)) for name in ("b1", "b2", "b3")]
+    drafts = [operations._intake._bench.draft(make(name)) for name in ("b1", "b2", "b3")]
     drafts[1].result["mission_digest"] = "sha256:of nothing that is there"
     waiting = operations.store.writer.record(drafts)
     go_on.set()

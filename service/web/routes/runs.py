@@ -112,7 +112,7 @@ def start_replay(
             sent.run,
             name=sent.run,
             total=sent.body.lines,
-            check=lambda submission: caller.require(submission.batch.spacecraft),
+            check=caller.require,
             alarms=sent.alarms,
         )
         on_failure.pop_all()

@@ -1,0 +1,140 @@
+"""Many batches at once, from lines of telemetry to stored answers.
+
+Workers compute, where there are some; else this process does, a line whenever
+nobody waits who posts one by one.  The database is this process's own.
+"""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from functools import cached_property
+
+from service.errors import AcquisitionError, Busy
+from service.observe.wire import Submission, submission_from_json
+from service.records.bench import Bench
+from service.records.draft import Answered, Draft
+from service.records.identity import Registry, look_up, stored_answers
+from service.records.intake import Answers, Intake
+from service.records.lines import Found, Lines, Refused, Seen, found_in, named_in
+from service.records.store import Store
+from service.records.workers import Equipment, WorkerLost, Workers
+
+AHEAD = 2
+"""Chunks a worker that it has, or that wait for it."""
+
+Check = Callable[[str], None]
+"""Raises an `AcquisitionError` where batches of a spacecraft are not to be taken."""
+
+
+def work(bench: Bench, lines: Lines) -> list[Found]:
+    """What a worker makes of some lines."""
+    return found_in(lines, bench.draft_or_error)
+
+
+class Bulk:
+    """Takes chunks of lines in, by an intake and by workers of its own."""
+
+    def __init__(self, intake: Intake, store: Store, equipment: Equipment, workers: int) -> None:
+        self._intake = intake
+        self._store = store
+        self.workers: Workers[Lines, Found] = Workers(equipment, work, workers)
+
+    def close(self) -> None:
+        """End the workers; what they were at comes to nothing."""
+        self.workers.close()
+
+    @property
+    def ahead(self) -> int:
+        """How many chunks should be begun before the first of them is recorded."""
+        return AHEAD * self.workers.up
+
+    def begin(self, texts: Sequence[bytes], run: str, check: Check) -> "Chunk":
+        """Let a chunk be computed; raises `Busy` where the time has not come."""
+        self.workers.start()
+        self._intake.let_pass()
+        named = [named_in(text, run) for text in texts]
+        with self._store.reading() as connection:
+            registry = look_up(connection, {each for each in named if each is not None})
+            ids = {each.result_id for each in registry.identities.values()}
+            stored = stored_answers(connection, ids)
+        known = frozenset(k for k, each in enumerate(named) if each in registry.identities)
+        return Chunk(self, Lines(run, texts, known), check, registry, stored)
+
+    def compute(self, lines: Lines) -> "Future[list[Found]]":
+        """What the lines come to, as soon as a worker has found it out, or at once."""
+        if self.workers.up:
+            return self.workers.submit(lines)
+        done: Future[list[Found]] = Future()
+        done.set_result(self.compute_here(lines))
+        return done
+
+    def compute_here(self, lines: Lines) -> list[Found]:
+        """The same in this process, which nobody who posts one by one shall feel."""
+        return found_in(lines, self.draft_here)
+
+    def draft_here(self, submission: Submission) -> Draft | AcquisitionError:
+        """One of them, when nobody waits."""
+        return self._intake.draft_of_many(submission)
+
+    def begin_writing(self, drafts: Sequence[Draft]) -> Callable[[], Answers]:
+        """Queue drafts for a transaction of their own; to call what it gives waits for that."""
+        return self._intake.begin_writing(drafts)
+
+
+class Chunk:
+    """A chunk on its way: computed first, then recorded."""
+
+    def __init__(
+        self,
+        bulk: Bulk,
+        lines: Lines,
+        check: Check,
+        registry: Registry,
+        stored: dict[str, bytes],
+    ) -> None:
+        self._bulk, self._lines, self._check = bulk, lines, check
+        self._registry, self._stored = registry, stored
+        self._computed = bulk.compute(lines)
+
+    def hand_on(self) -> None:
+        """Queue what was computed for the writer; raises `Busy` where it must be called again."""
+        drafts = [each for each in self._decided if isinstance(each, Draft)]
+        self._finish = self._bulk.begin_writing(drafts)
+
+    def answers(self) -> Answers:
+        """The answer to each line, or what is wrong with it, when all is recorded."""
+        written = iter(self._finish())
+        return [next(written) if isinstance(each, Draft) else each for each in self._decided]
+
+    @cached_property
+    def _decided(self) -> list[Draft | Answered | AcquisitionError]:
+        try:
+            found = self._computed.result()
+        except WorkerLost:
+            found = self._bulk.compute_here(self._lines)
+        return [
+            self._decision(text, each) for text, each in zip(self._lines.texts, found, strict=True)
+        ]
+
+    def _decision(self, text: bytes, found: Found) -> Draft | Answered | AcquisitionError:
+        try:
+            if isinstance(found, Refused):
+                if found.spacecraft is not None:
+                    self._check(found.spacecraft)
+                return found.error
+            if isinstance(found, Draft):
+                self._check(found.identity[0])
+                return found
+            self._check(found.identity[0])
+            return self._repeat(text, found)
+        except Busy:
+            # Says nothing about the line.
+            raise
+        except AcquisitionError as error:
+            return error
+
+    def _repeat(self, text: bytes, seen: Seen) -> Draft | Answered | AcquisitionError:
+        first = self._registry.first(seen.identity, None, seen.fingerprint)
+        if first is None:
+            # It is not called what it seemed to be called.
+            return self._bulk.draft_here(submission_from_json(text, run=self._lines.run))
+        return Answered(first.result_id, self._stored[first.result_id], replayed=True)

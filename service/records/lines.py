@@ -1,0 +1,84 @@
+"""Lines of telemetry, a batch each: read and computed, many at once, in whichever process."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+
+from service.errors import AcquisitionError
+from service.observe.wire import Submission, submission_from_json
+from service.records.draft import Draft
+from service.records.identity import Identity, identity_of
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Some lines for one run; those `known` by their place among them seem to be recorded."""
+
+    run: str
+    texts: Sequence[bytes]
+    known: frozenset[int] = frozenset()
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A line that was read, but not computed."""
+
+    identity: Identity
+    fingerprint: str
+
+
+@dataclass(frozen=True)
+class Refused:
+    """What is wrong with a line, and whose batch it is where it can be read."""
+
+    spacecraft: str | None
+    error: AcquisitionError
+
+
+Found = Draft | Seen | Refused
+Drafting = Callable[[Submission], Draft | AcquisitionError]
+
+
+def found_in(lines: Lines, draft: Drafting) -> list[Found]:
+    """What each line comes to, in order."""
+    return [
+        _found(text, lines.run, draft, place in lines.known)
+        for place, text in enumerate(lines.texts)
+    ]
+
+
+def _found(text: bytes, run: str, draft: Drafting, is_known: bool) -> Found:
+    try:
+        submission = submission_from_json(text, run=run)
+    except AcquisitionError as error:
+        return Refused(None, error)
+    if is_known:
+        return Seen(identity_of(submission.batch), submission.fingerprint)
+    drafted = draft(submission)
+    if isinstance(drafted, AcquisitionError):
+        return Refused(submission.batch.spacecraft, drafted)
+    return drafted
+
+
+_Name = Annotated[str, msgspec.Meta(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\x7f]+\Z")]
+
+
+class _Named(msgspec.Struct):
+    """As much of a batch as names it."""
+
+    spacecraft: _Name
+    batch: _Name
+
+
+_NAMED = msgspec.json.Decoder(_Named)
+
+
+def named_in(text: bytes, run: str) -> Identity | None:
+    """What a line seems to be called, read in passing; None where that cannot be told."""
+    try:
+        named = _NAMED.decode(text)
+    except (msgspec.MsgspecError, UnicodeError, RecursionError):
+        return None
+    return named.spacecraft, run, named.batch
