@@ -28,7 +28,7 @@ from service.records.intake import Answers
 from service.records.store import Store
 from service.records.tables import replays
 
-CHUNK_LINES = 64
+CHUNK_LINES = 32
 """Few enough that a single post, which waits for one chunk at most, is not kept waiting."""
 MAX_ERRORS_KEPT = 1_000
 MAX_LISTED = 100

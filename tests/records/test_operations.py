@@ -11,7 +11,7 @@ from sqlalchemy import select
 from service.errors import AcquisitionError, BadBatch, BadConfiguration, BadInput, Busy, Conflict
 from service.observe.wire import OptionsIn, QuaternionIn, submission_from_json
 from service.operations import Operations
-from service.records import intake
+from service.records import bench, intake
 from service.records.tables import metadata
 from service.settings import Settings
 from service.times import parse_utc
@@ -92,7 +92,7 @@ def test_what_is_rehearsed_to_be_ready_is_not_kept(operations, make, caplog):
 def test_single_posts_go_before_bulk(operations, make, monkeypatch):
     """Between the batches of a bulk load whatever came one by one is computed and recorded."""
     monkeypatch.setattr(intake, "LET_PASS_S", 10.0)
-    acquire, order, first_at_work = intake.acquire, [], threading.Event()
+    acquire, order, first_at_work = bench.acquire, [], threading.Event()
 
     def noting(batch, mission, sky):
         order.append(batch.batch)
@@ -101,7 +101,7 @@ def test_single_posts_go_before_bulk(operations, make, monkeypatch):
             time.sleep(0.5)
         return acquire(batch, mission, sky)
 
-    monkeypatch.setattr(intake, "acquire", noting)
+    monkeypatch.setattr(bench, "acquire", noting)
     bulk = [make(f"m{k}", run="bulk") for k in range(4)]
     single = make("b1")
     with ThreadPoolExecutor(1) as threads:
@@ -118,7 +118,7 @@ def test_nothing_at_once_is_nothing(operations):
 
 def test_observers_see_every_new_batch_once_and_neither_repeats_nor_what_ifs(operations, make):
     seen = []
-    operations.observers.append(lambda acquisition: seen.append(acquisition.batch.batch))
+    operations.observers.append(lambda recorded: seen.append(recorded.batch))
     first = operations.submit(make("b1"))
     operations.submit(make("b1"))
     operations.what_if(first.id, OptionsIn(), adopt=True)
@@ -127,7 +127,7 @@ def test_observers_see_every_new_batch_once_and_neither_repeats_nor_what_ifs(ope
 
 
 def test_an_observer_that_fails_takes_no_answer_away(operations, make):
-    operations.observers.append(lambda acquisition: 1 / 0)
+    operations.observers.append(lambda recorded: 1 / 0)
     assert not operations.submit(make()).replayed
 
 
@@ -187,7 +187,7 @@ def test_a_catalog_that_cannot_be_read_is_a_mistake_in_the_configuration(tmp_pat
 
 def test_no_moment_of_the_database_is_held_while_many_are_worked_on(operations, make):
     held = []
-    operations._intake._acquire = lambda *asked, own=operations._intake._acquire: (
+    operations._intake._bench.acquire = lambda *asked, own=operations._intake._bench.acquire: (
         held.append(operations.store._readers.pool.checkedout()),
         own(*asked),
     )[1]
@@ -214,8 +214,8 @@ def test_a_fault_of_ours_in_one_batch_keeps_no_other_from_being_recorded(
             raise ZeroDivisionError("inside")
         return real(batch, *rest)
 
-    real = intake.acquire
-    monkeypatch.setattr(intake, "acquire", acquire)
+    real = bench.acquire
+    monkeypatch.setattr(bench, "acquire", acquire)
     first, second, third = operations.submit_many([make("b1"), make("b2"), make("b3")])
     assert not first.replayed
     assert not third.replayed
@@ -227,9 +227,9 @@ def test_a_fault_of_ours_in_one_batch_keeps_no_other_from_being_recorded(
 def test_whoever_finds_every_processor_taken_for_long_is_told_to_come_again(
     operations, make, monkeypatch
 ):
-    monkeypatch.setattr(intake, "PROCESSOR_WAIT_S", 0.01)
-    monkeypatch.setattr(operations._intake, "_processors", threading.BoundedSemaphore(1))
-    with operations._intake._processors:
+    monkeypatch.setattr(bench, "PROCESSOR_WAIT_S", 0.01)
+    monkeypatch.setattr(operations._intake._bench, "_free", threading.BoundedSemaphore(1))
+    with operations._intake._bench._free:
         with pytest.raises(Busy, match="processor"):
             operations.submit(make())
         with pytest.raises(Busy, match="processor"):
