@@ -21,10 +21,15 @@ from scipy.spatial import cKDTree
 from benchmarks.bare import bare_many, bare_one, room_for
 from benchmarks.report import Report
 from service.attitude.kernels import solve
-from service.attitude.solve import WORST_AXIS_DEG, solve_attitude
-from service.identify.matched import matched_vectors
+from service.attitude.solve import WORST_AXIS_DEG
+from service.identify.matched import attitude_of, matched_vectors
 from service.identify.pair_tests import cast_votes, count_votes
-from service.identify.starid import Sighting, identify_by_votes, votes_arguments
+from service.identify.starid import (
+    Sighting,
+    identify_by_votes,
+    votes_arguments,
+    with_polar_angles,
+)
 from service.missions.mission import Band, Mission, load_missions
 from service.sky.catalog import load_embedded
 from service.sky.pairs import build_pairs
@@ -163,7 +168,6 @@ def service_many(
     sigma: Vector,
     given: tuple[Any, ...],
     boresights: Vector,
-    tests: tuple[Any, ...],
     rows: npt.NDArray[np.int64],
     direction: Vector,
     worst: float,
@@ -171,7 +175,7 @@ def service_many(
     star: npt.NDArray[np.int64],
     q: Vector,
 ) -> None:
-    """The service's kernels over many batches, as `identify_by_votes` and `solve_attitude` do."""
+    """The service's kernels over many batches, as `identify_by_votes` and `attitude_of` do."""
     votes, voted, counts, edges, outcome, highest, second = room[:7]
     quaternions, covariance, squares, sums = room[7:]
     still = np.zeros(3)
@@ -179,7 +183,7 @@ def service_many(
         votes[:] = 0
         counts[:] = 0
         # mypy takes what comes as a tuple for one argument.
-        cast_votes(observed[k], mag[k], *given, boresights[k], *tests, votes, voted, counts, edges)  # type: ignore[call-arg]
+        cast_votes(observed[k], mag[k], boresights[k], *given, votes, voted, counts, edges)  # type: ignore[call-arg]
         count_votes(votes, voted, counts, rows, outcome, star[k], highest, second)
         b, r, s = matched_vectors(body[k], sigma, star[k], direction, still, 1.0)
         q[k] = np.nan
@@ -202,8 +206,7 @@ def _sighting(views: Views, mission: Mission, k: int) -> Sighting:
         views.boresight[k],
         views.aim,
         views.zone,
-        mission.tolerances,
-        mission.tests,
+        mission.rules,
     )
 
 
@@ -225,8 +228,7 @@ def compare(mission: Mission, views: Views) -> tuple[dict[str, float], list[str]
     count, n = views.magnitude.shape
     zone, aim, limits = views.zone, views.aim, mission.tolerances
     sightings = [_sighting(views, mission, k) for k in range(count)]
-    given = votes_arguments(sightings[0])
-    cut = len(given) - 6
+    given = with_polar_angles(votes_arguments(sightings[0]))[3:]
     sigma = sightings[0].sigma_rad
     star = {name: np.full((count, n), -1) for name in ("service", "bare")}
     q = {name: np.zeros((count, 4)) for name in star}
@@ -245,7 +247,7 @@ def compare(mission: Mission, views: Views) -> tuple[dict[str, float], list[str]
     worst = math.radians(WORST_AXIS_DEG)
     rows = np.arange(stars)
     still = np.zeros(3)
-    tracker_of, names = np.zeros(n, np.int64), (mission.trackers[0].name,)
+    names = (mission.trackers[0].name,)
 
     def service() -> None:
         service_many(
@@ -253,9 +255,8 @@ def compare(mission: Mission, views: Views) -> tuple[dict[str, float], list[str]
             views.magnitude,
             views.body,
             sigma,
-            given[:cut],
+            given,
             views.boresight,
-            given[cut + 1 :],
             rows,
             zone.direction,
             worst,
@@ -305,11 +306,10 @@ def compare(mission: Mission, views: Views) -> tuple[dict[str, float], list[str]
 
     def service_one_by_one() -> None:
         for k, sighting in enumerate(sightings):
-            found = identify_by_votes(sighting)
-            b, r, s = matched_vectors(
-                views.body[k], sigma, found.star, catalog_direction, still, 1.0
+            named = identify_by_votes(sighting).star
+            attitude_of(
+                views.body[k], sigma, named, None, names, catalog_direction, still, 1.0, "quest"
             )
-            solve_attitude(b, r, s, tracker_of[: len(s)], names)
 
     each = [
         (views.observed[k], views.magnitude[k], views.body[k], weight[k], poles[k])

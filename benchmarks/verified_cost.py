@@ -26,7 +26,7 @@ from service.identify.pair_tests import cast_votes, count_votes
 from service.identify.presumed import presumed_attitude
 from service.identify.scene import MAX_HYPOTHESES, Seen, scratch_for
 from service.identify.search import search_in
-from service.identify.starid import MAX_RIVALS, Sighting, votes_arguments
+from service.identify.starid import MAX_RIVALS, Sighting, votes_arguments, with_polar_angles
 from service.identify.verify import UNIQUE_PROBABILITY, scene_of
 from service.simulate.paper.experiments import open_sky
 from service.simulate.paper.printed import the_paper
@@ -105,8 +105,7 @@ def _sighting(acquired: Any) -> Sighting:
         boresight=mission.trackers[0].body_from_tracker[:, 2] @ presumed.attitude,
         aim=tracker.aim,
         zone=tracker.zone,
-        tolerances=acquired.choices.tolerances,
-        tests=acquired.choices.tests,
+        rules=acquired.choices.rules,
     )
 
 
@@ -144,6 +143,7 @@ def many_verified(
 def many_votes(
     observed: Vector,
     magnitude: Vector,
+    boresight: Vector,
     tallies: tuple[Any, ...],
     edges: npt.NDArray[np.int32],
     given: tuple[Any, ...],
@@ -158,7 +158,7 @@ def many_votes(
         votes[:] = 0
         counts[:] = 0
         # mypy takes what comes as a tuple for one argument.
-        cast_votes(observed[k], magnitude[k], *given, votes, voted, counts, edges)  # type: ignore[call-arg]
+        cast_votes(observed[k], magnitude[k], boresight, *given, votes, voted, counts, edges)  # type: ignore[call-arg]
         count_votes(votes, voted, counts, star_of, outcome, star[k], highest, second)
 
 
@@ -176,7 +176,7 @@ def _kernels(several: list[Sighting], named: dict[str, Rows]) -> dict[str, Calla
         np.full((STARS, MAX_RIVALS), -1),
         np.zeros((STARS, MAX_RIVALS)),
     )
-    given = votes_arguments(several[0])
+    given = with_polar_angles(votes_arguments(several[0]))[3:]
     count = len(several[0].zone.star)
     edges = np.empty((0, 4), np.int32)
     tallies = (
@@ -197,7 +197,8 @@ def _kernels(several: list[Sighting], named: dict[str, Rows]) -> dict[str, Calla
         return call
 
     def by_votes() -> None:
-        many_votes(observed, magnitude, tallies, edges, given, rows, star, counts)
+        boresight = several[0].boresight
+        many_votes(observed, magnitude, boresight, tallies, edges, given, rows, star, counts)
         named[VOTES] = star.copy()
 
     return {

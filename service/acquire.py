@@ -6,25 +6,33 @@ finding a star is a result; only bad input raises.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from enum import StrEnum
-from functools import cached_property
 from time import perf_counter_ns as clock_ns
 
 import numpy as np
+from msgspec import Struct
 
 from service import __version__
 from service.attitude.solution import AttitudeSolution, NoAttitude
-from service.attitude.solve import solve_attitude
-from service.identify.identification import Identification, Outcome, nothing_known
+from service.identify.identification import Identification, Outcome, not_known, nothing_known
 from service.identify.lost_in_space.finder import find_attitude
 from service.identify.lost_in_space.solver import FEWEST_POINTS
-from service.identify.matched import matched_vectors
+from service.identify.matched import attitude_of
 from service.identify.presumed import Presumed, aim_of, presumed_attitude
 from service.identify.ptp import identify_ptp
 from service.identify.starid import Sighting, identify_by_votes
 from service.identify.verify import identify_verified
-from service.missions.mission import Band, Identifier, Mission, Solver, Tests, Tolerances
+from service.missions.mission import (
+    TESTS_OF_ROLL,
+    Band,
+    Identifier,
+    Mission,
+    Rules,
+    Solver,
+    Tests,
+    Tolerances,
+    rules_of,
+)
 from service.observe.batch import (
     BoresightPrior,
     ObservationBatch,
@@ -32,14 +40,14 @@ from service.observe.batch import (
 )
 from service.observe.correct import CorrectedObservations, correct
 from service.sky.ephemeris import observer_velocity, sun_distance_au
+from service.sky.guide import Guide
 from service.sky.run_catalog import RunCatalog
 from service.sky.view import Sky
 from service.sky.zones import Aim, Zone, counts_within
 from service.vectors import (
-    ARCSEC_PER_RADIAN,
-    Matrix,
     Vector,
     quaternion_from_matrix,
+    read_only,
     separation_deg,
 )
 
@@ -59,19 +67,26 @@ _COUNTED = [
 ]
 
 
-@dataclass(frozen=True)
-class Choices:
+class Choices(Struct, frozen=True, eq=False, gc=False):
     """What holds for one batch: its mission's settings with its own options in their place."""
 
     identifier: Identifier
     solver: Solver
-    tolerances: Tolerances
-    tests: Tests
+    rules: Rules
     zone_grid_deg: float
 
+    @property
+    def tolerances(self) -> Tolerances:
+        """The tolerances of the identification."""
+        return self.rules.tolerances
 
-@dataclass(frozen=True)
-class TrackerResult:
+    @property
+    def tests(self) -> Tests:
+        """The tests that are made."""
+        return self.rules.tests
+
+
+class TrackerResult(Struct, frozen=True, eq=False, gc=False):
     """One tracker's part: where its stars were looked for, and what was found.
 
     `stars` and `pairs` are those within the aim, the paper's NCAP and NTOT;
@@ -100,8 +115,7 @@ class Path(StrEnum):
     """About the a priori attitude nothing good was found, and the whole sky was looked at."""
 
 
-@dataclass(frozen=True)
-class Provenance:
+class Provenance(Struct, frozen=True, eq=False, gc=False):
     """What an answer was made of."""
 
     catalog: str
@@ -111,12 +125,12 @@ class Provenance:
     version: str
 
 
-@dataclass(frozen=True)
-class Acquisition:
+class Acquisition(Struct, frozen=True, eq=False, gc=False):
     """Everything that came of one batch.
 
     `solution` is None where `reason` says why; never an older attitude.
     `presumed` is what the batch's a priori knowledge says, None without any.
+    `counts` are of the stars observed, and of them unique, ambiguous and unmatched.
     """
 
     batch: ObservationBatch
@@ -126,21 +140,15 @@ class Acquisition:
     path: Path
     run_catalog: RunCatalog
     trackers: tuple[TrackerResult, ...]
+    counts: dict[str, int]
     solution: AttitudeSolution | None
     reason: NoAttitude | None
     warnings: tuple[str, ...]
     timings_us: Mapping[str, int]
     provenance: Provenance
 
-    @cached_property
-    def counts(self) -> dict[str, int]:
-        """Stars observed, and of them unique, ambiguous and unmatched."""
-        found = [o for each in self.trackers for o in each.identification.outcome.tolist()]
-        return {"observed": len(found)} | {word: found.count(n) for n, word in _COUNTED}
 
-
-@dataclass(frozen=True)
-class _Look:
+class _Look(Struct, frozen=True, eq=False, gc=False):
     """What came of looking about one presumed attitude."""
 
     presumed: Presumed
@@ -206,7 +214,7 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
         clock.end("identify")
         refusal = found.refusal
         if found.attitude is not None:
-            quaternion = QuaternionPrior(quaternion_from_matrix(found.attitude))
+            quaternion = QuaternionPrior(read_only(quaternion_from_matrix(found.attitude)))
             again = look(presumed_attitude(quaternion, batch.time, mission, batch.position_km))
             # What the zone gave stands unless the whole sky gives better.
             if looked is None or again.good:
@@ -220,6 +228,9 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
     solved = looked.solved if looked is not None else refusal
     solution = solved if isinstance(solved, AttitudeSolution) else None
     trackers = _tracker_results(corrected, looked, solution)
+    warnings += _warnings(
+        batch, mission, trackers, presumed, None if looked is None else looked.presumed, solution
+    )
     return Acquisition(
         batch=batch,
         mission=mission,
@@ -228,19 +239,10 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
         path=path,
         run_catalog=run_catalog,
         trackers=trackers,
+        counts=_counts(trackers),
         solution=solution,
         reason=solved if isinstance(solved, NoAttitude) else None,
-        warnings=(
-            *warnings,
-            *_warnings(
-                batch,
-                mission,
-                trackers,
-                presumed,
-                looked.presumed if looked is not None else None,
-                solution,
-            ),
-        ),
+        warnings=tuple(warnings),
         timings_us={step: round(ns / 1000) for step, ns in clock.ns.items()},
         provenance=Provenance(
             sky.catalog.digest,
@@ -264,29 +266,29 @@ def _look(
     clock: _Clock,
 ) -> _Look:
     """Zones about a presumed attitude, identities, and the attitude that they give."""
-    seen = [_seen(each, presumed, velocity_c) for each in corrected]
     places = [
         _place(each, index, presumed, mission, choices, run_catalog, sky)
         for index, each in enumerate(corrected)
     ]
     sightings = [
-        Sighting(
-            *each,
+        _sighting(
+            each,
+            presumed,
+            velocity_c,
             aim,
             zone,
-            choices.tolerances,
-            choices.tests,
-            sky.guide(run_catalog, observed.tracker.field_of_view_radius_deg)
+            choices.rules,
+            sky.guide(run_catalog, each.tracker.field_of_view_radius_deg)
             if choices.identifier in WITHOUT_PRIOR
             else None,
         )
-        for each, observed, (aim, zone, _) in zip(seen, corrected, places, strict=True)
+        for each, (aim, zone, _) in zip(corrected, places, strict=True)
     ]
     clock.end("zone")
     identify = IDENTIFIERS[choices.identifier]
     identifications = [identify(sighting) for sighting in sightings]
     clock.end("identify")
-    solved = _solve(choices, corrected, sightings, identifications, run_catalog, sun_au)
+    solved = _solve(choices, corrected, identifications, run_catalog, velocity_c, sun_au)
     clock.end("solve")
     return _Look(presumed, places, identifications, solved)
 
@@ -314,21 +316,32 @@ def _tracker_results(
     """The parts of the answer, every star unmatched where there was nowhere to look."""
     if looked is None:
         return tuple(
-            TrackerResult(each, None, None, False, 0, 0, nothing_known(n), np.full(n, np.nan))
+            TrackerResult(each, None, None, False, 0, 0, nothing_known(n), not_known(n))
             for each, n in zip(
                 corrected, [len(each.magnitude_mag) for each in corrected], strict=True
             )
         )
-    return tuple(
-        TrackerResult(each, aim, zone, cached, *counts_within(zone, aim), identification, residual)
-        for each, (aim, zone, cached), identification, residual in zip(
-            corrected,
-            looked.places,
-            looked.identifications,
-            _residuals(looked.identifications, solution),
-            strict=True,
+    results = []
+    first = 0
+    for each, (aim, zone, cached), identification in zip(
+        corrected, looked.places, looked.identifications, strict=True
+    ):
+        n = len(each.magnitude_mag)
+        residual = not_known(n) if solution is None else solution.residual_arcsec[first : first + n]
+        first += n
+        stars, pairs = counts_within(zone, aim)
+        results.append(
+            TrackerResult(each, aim, zone, cached, stars, pairs, identification, residual)
         )
-    )
+    return tuple(results)
+
+
+def _counts(trackers: tuple[TrackerResult, ...]) -> dict[str, int]:
+    found = [outcome for each in trackers for outcome in each.identification.outcome.tolist()]
+    counts = {"observed": len(found)}
+    for number, word in _COUNTED:
+        counts[word] = found.count(number)
+    return counts
 
 
 def velocity_to_correct(batch: ObservationBatch) -> Vector:
@@ -348,25 +361,29 @@ def choices_of(batch: ObservationBatch, mission: Mission) -> Choices:
     compares with the presumed roll where an a priori boresight leaves it open.
     """
     options = batch.options
-    tests = {**options.tests, **dict.fromkeys(_impossible_tests(batch, mission), False)}
-    # Most batches name none, and the one that is impossible is off already.
-    other = {name: on for name, on in tests.items() if getattr(mission.tests, name) != on}
     grid_deg = options.zone_grid_deg
     return Choices(
-        identifier=options.identifier or mission.identifier,
-        solver=options.solver or mission.solver,
-        tolerances=mission.tolerances.model_copy(update=options.tolerances)
-        if options.tolerances
-        else mission.tolerances,
-        tests=mission.tests.model_copy(update=other) if other else mission.tests,
-        zone_grid_deg=mission.zone.grid_deg if grid_deg is None else grid_deg,
+        options.identifier or mission.identifier,
+        options.solver or mission.solver,
+        _rules(batch, mission),
+        mission.zone.grid_deg if grid_deg is None else grid_deg,
+    )
+
+
+def _rules(batch: ObservationBatch, mission: Mission) -> Rules:
+    options, roll_open = batch.options, isinstance(batch.a_priori, BoresightPrior)
+    if not (options.tests or options.tolerances):
+        return mission.rules_without_roll if roll_open else mission.rules
+    tests = {**options.tests, **dict.fromkeys(_impossible_tests(batch, mission), False)}
+    return rules_of(
+        mission.tolerances.model_copy(update=options.tolerances),
+        mission.tests.model_copy(update=tests),
     )
 
 
 def _impossible_tests(batch: ObservationBatch, mission: Mission) -> tuple[str, ...]:
     pole = () if isinstance(mission.zone, Band) else ("pole",)
-    roll = ("cross_product", "fov_rotation") if isinstance(batch.a_priori, BoresightPrior) else ()
-    return pole + roll
+    return pole + (TESTS_OF_ROLL if isinstance(batch.a_priori, BoresightPrior) else ())
 
 
 def _place(
@@ -389,70 +406,60 @@ def _place(
     return aim, zone, cached
 
 
-def _seen(
-    corrected: CorrectedObservations, presumed: Presumed, velocity_c: Vector
-) -> tuple[Vector, Vector, Vector, Vector | None, Vector, Vector]:
-    """What a sighting holds of the observation: the first fields of `Sighting`, in order."""
-    return (
+def _sighting(
+    corrected: CorrectedObservations,
+    presumed: Presumed,
+    velocity_c: Vector,
+    aim: Aim,
+    zone: Zone,
+    rules: Rules,
+    guide: Guide | None,
+) -> Sighting:
+    return Sighting(
         np.dot(corrected.direction_body, presumed.attitude),
         corrected.magnitude_mag,
-        corrected.sigma_arcsec / ARCSEC_PER_RADIAN,
+        corrected.sigma_rad,
         # Kernels are compiled anew for an array that cannot be written to, as the client's own is.
         None if presumed.known_axis is None else presumed.known_axis.copy(),
         velocity_c,
-        corrected.tracker.body_from_tracker[:, 2] @ presumed.attitude,
+        # A cap is looked for about the boresight itself.
+        aim.axis
+        if aim.kind == "cap"
+        else np.dot(corrected.tracker.boresight_body, presumed.attitude),
+        aim,
+        zone,
+        rules,
+        guide,
     )
 
 
 def _solve(
     choices: Choices,
     corrected: Sequence[CorrectedObservations],
-    sightings: Sequence[Sighting],
     identifications: Sequence[Identification],
     run_catalog: RunCatalog,
+    velocity_c: Vector,
     sun_au: float,
 ) -> AttitudeSolution | NoAttitude:
-    parts = [
-        matched_vectors(
-            each.direction_body,
-            sighting.sigma_rad,
-            identification.star,
-            run_catalog.direction,
-            sighting.velocity_c,
-            sun_au,
-        )
-        for each, sighting, identification in zip(
-            corrected, sightings, identifications, strict=True
-        )
-    ]
-    observed, reference, sigma_rad = (
-        parts[0] if len(parts) == 1 else (np.concatenate(each) for each in zip(*parts, strict=True))
-    )
-    return solve_attitude(
-        observed,
-        reference,
+    direction, sigma_rad = corrected[0].direction_body, corrected[0].sigma_rad
+    star, tracker_of = identifications[0].star, None
+    if len(corrected) > 1:
+        direction = read_only(np.concatenate([each.direction_body for each in corrected]))
+        sigma_rad = np.concatenate([each.sigma_rad for each in corrected])
+        star = np.concatenate([each.star for each in identifications])
+        counts = [len(each.sigma_rad) for each in corrected]
+        tracker_of = np.repeat(np.arange(len(corrected)), counts)
+    return attitude_of(
+        direction,
         sigma_rad,
-        np.zeros(len(sigma_rad), np.int64)
-        if len(parts) == 1
-        else np.repeat(np.arange(len(parts)), [len(part[2]) for part in parts]),
+        star,
+        tracker_of,
         tuple(each.tracker.name for each in corrected),
+        run_catalog.direction,
+        velocity_c,
+        sun_au,
         choices.solver,
     )
-
-
-def _residuals(
-    identifications: list[Identification], solution: AttitudeSolution | None
-) -> list[Vector]:
-    """The solution's residuals spread over the stars of each tracker, NaN where there is none."""
-    residuals = [np.full(len(each.outcome), np.nan) for each in identifications]
-    if solution is not None:
-        taken = 0
-        for residual, identification in zip(residuals, identifications, strict=True):
-            mask = identification.unique
-            used = int(np.count_nonzero(mask))
-            residual[mask] = solution.residual_arcsec[taken : taken + used]
-            taken += used
-    return residuals
 
 
 def _warnings(
@@ -463,11 +470,13 @@ def _warnings(
     looked_about: Presumed | None,
     solution: AttitudeSolution | None,
 ) -> list[str]:
-    warnings = [
-        f"test_off: {name} was asked for and cannot be made of this a priori knowledge"
-        for name in _impossible_tests(batch, mission)
-        if batch.options.tests.get(name)
-    ]
+    warnings = []
+    if batch.options.tests:
+        warnings += [
+            f"test_off: {name} was asked for and cannot be made of this a priori knowledge"
+            for name in _impossible_tests(batch, mission)
+            if batch.options.tests.get(name)
+        ]
     if batch.aberration == "to_correct" and batch.velocity_km_per_s is None:
         warnings.append(
             "velocity_of_earth_alone: no velocity_km_per_s was given; "
@@ -477,12 +486,11 @@ def _warnings(
         return warnings
     attitude = looked_about.attitude if solution is None else solution.matrix
     if solution is not None:
-        warnings += _doubts(solution, attitude, mission, presumed)
+        warnings += _doubts(solution, mission, presumed)
     for each in trackers:
-        tracker = each.corrected.tracker
-        boresight = attitude.T @ tracker.body_from_tracker[:, 2]
-        if each.aim is not None and each.aim.reaches_past(
-            boresight, tracker.field_of_view_radius_deg
+        tracker, aim = each.corrected.tracker, each.aim
+        if aim is not None and aim.reaches_past(
+            np.dot(tracker.boresight_body, attitude), tracker.field_of_view_radius_deg
         ):
             warnings.append(
                 f"field_of_view_past_zone_edge: the field of view of {tracker.name} reaches past "
@@ -492,15 +500,13 @@ def _warnings(
             warnings.append(
                 f"work_bound_hit: the search for the stars of {tracker.name} ended at its bound"
             )
-        stars = each.identification.star[each.identification.unique]
-        if len(set(stars.tolist())) < len(stars):
+        stars = [row for row in each.identification.star.tolist() if row >= 0]
+        if len(set(stars)) < len(stars):
             warnings.append(f"same_star_twice: two stars of {tracker.name} have one identity")
     return warnings
 
 
-def _doubts(
-    solution: AttitudeSolution, attitude: Matrix, mission: Mission, presumed: Presumed | None
-) -> list[str]:
+def _doubts(solution: AttitudeSolution, mission: Mission, presumed: Presumed | None) -> list[str]:
     """What speaks against an attitude: its own residuals, and the a priori knowledge."""
     doubts = []
     if solution.suspect:
@@ -512,10 +518,8 @@ def _doubts(
     if presumed is None:
         return doubts
     zone = mission.zone
-    allowed_deg = zone.half_width_deg if isinstance(zone, Band) else zone.radius_deg
-    axis = mission.axis_body
-    off_deg = separation_deg(attitude.T @ axis, presumed.attitude.T @ axis)
-    if off_deg > allowed_deg:
+    off_deg = separation_deg(np.dot(mission.axis_body, solution.matrix), presumed.axis)
+    if off_deg > (zone.half_width_deg if isinstance(zone, Band) else zone.radius_deg):
         doubts.append(
             f"attitude_off_a_priori: its {'pole' if isinstance(zone, Band) else 'boresight'} lies "
             f"{off_deg:.1f} deg from where the a priori knowledge has it"

@@ -11,9 +11,11 @@ safe between threads; the status they return is read instead.
 
 import re
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
-from functools import cache, cached_property, lru_cache
+from functools import cache, lru_cache
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -23,18 +25,40 @@ from service.errors import BadInput, Fault, shown_value
 
 FIRST_YEAR, LAST_YEAR = 1972, 2099
 HOUR_S, DAY_S = 3600, 86400
+J2000_YEAR = 2000.0
 UNIX_DAY = 40587
 """The Modified Julian Date of 1970-01-01, where POSIX time begins."""
 
 _MJD_ZERO = date(1858, 11, 17).toordinal()
 _J2000_MJD = 51544
+_J2000_JD = 2451545.0
+_DAYS_PER_JULIAN_YEAR = 365.25
+_MJD_ZERO_JD = 2400000.5
 _UNIX_J2000_S = 946_728_000
 _TEXT = re.compile(
     r"(?P<year>\d{4})-(?:(?P<month>\d{2})-(?P<day>\d{2})|(?P<doy>\d{3}))"
     r"T(?P<hour>\d{2}):(?P<minute>\d{2}):(?P<second>\d{2})(?P<fraction>\.\d{1,9})?Z?",
     re.ASCII,
 )
+T = TypeVar("T")
 _FORMS = "UTC as 1996-01-10T12:00:00.000Z or 1996-010T12:00:00.000Z"
+
+
+class _Once(Generic[T]):
+    """What is worked out when it is first asked for; `functools.cached_property` without its lock.
+
+    Until Python 3.12 that takes longer than most of what is worked out here.
+    Two threads may both work a value out, and find the same.
+    """
+
+    def __init__(self, work_out: Callable[[Any], T]) -> None:
+        self._work_out = work_out
+        self._name = work_out.__name__
+        self.__doc__ = work_out.__doc__
+
+    def __get__(self, owner: Any, kind: type | None = None) -> T:
+        value = vars(owner)[self._name] = self._work_out(owner)
+        return value
 
 
 @dataclass(frozen=True, order=True)
@@ -47,14 +71,14 @@ class Utc:
     def __str__(self) -> str:
         return self.text
 
-    @cached_property
+    @_Once
     def _fields(self) -> tuple[date, int, int, int, int]:
         """Date, hour, minute, second (0 to 60) and nanoseconds."""
         year, month, day, clock, _ = ufunc.d2dtf(b"UTC", 9, self.jd1, self.jd2)
         h, m, s, f = (int(clock[name]) for name in ("h", "m", "s", "f"))
         return date(int(year), int(month), int(day)), h, m, s, f
 
-    @cached_property
+    @_Once
     def text(self) -> str:
         """Calendar text with at least three and at most nine decimals, ending in Z."""
         day, hour, minute, second, nanoseconds = self._fields
@@ -66,7 +90,7 @@ class Utc:
         """Day of the year, 1 January being 1."""
         return self._fields[0].timetuple().tm_yday
 
-    @cached_property
+    @_Once
     def tai_ns(self) -> int:
         """Nanoseconds of TAI since 2000-01-01T12:00:00 TAI: for sorting and differences."""
         day, hour, minute, second, nanoseconds = self._fields
@@ -74,7 +98,7 @@ class Utc:
         seconds += hour * HOUR_S + minute * 60 + second + _tai_less_utc_s(day)
         return seconds * 1_000_000_000 + nanoseconds
 
-    @cached_property
+    @_Once
     def tt(self) -> tuple[float, float]:
         """The same moment in Terrestrial Time, two-part Julian date."""
         tai1, tai2, _ = ufunc.utctai(self.jd1, self.jd2)
@@ -84,7 +108,8 @@ class Utc:
     @property
     def julian_year(self) -> float:
         """The moment as a Julian epoch, 2000.0 being J2000."""
-        return float(ufunc.epj(*self.tt))
+        tt1, tt2 = self.tt
+        return J2000_YEAR + ((tt1 - _J2000_JD) + tt2) / _DAYS_PER_JULIAN_YEAR
 
     def bucket(self, width_s: int) -> int:
         """The number of the UTC hour (3600) or day (86400) that holds the moment, from MJD 0.
@@ -194,7 +219,7 @@ def _read(text: str) -> Utc:
         raise ValueError("there is no such day") from None
     if day.year != year:
         raise ValueError("there is no such day of the year")
-    if second == 60 and not ((hour, minute) == (23, 59) and _ends_in_leap_second(day)):
+    if second == 60 and not ((hour, minute) == (23, 59) and _length_s(day) > DAY_S):
         raise ValueError("there is no leap second at that time")
     fraction = match["fraction"] or ".0"
     moment = _from_fields(day, hour, minute, second + float(fraction))
@@ -203,11 +228,13 @@ def _read(text: str) -> Utc:
     return moment
 
 
-def _ends_in_leap_second(day: date) -> bool:
-    following = day + timedelta(days=1)
-    return _tai_less_utc_s(following) > _tai_less_utc_s(day)
+@lru_cache(maxsize=1024)
+def _length_s(day: date) -> int:
+    """Seconds of UTC in a day."""
+    return DAY_S + _tai_less_utc_s(day + timedelta(days=1)) - _tai_less_utc_s(day)
 
 
 def _from_fields(day: date, hour: int, minute: int, second: float) -> Utc:
-    jd1, jd2, _ = ufunc.dtf2d(b"UTC", day.year, day.month, day.day, hour, minute, second)
-    return Utc(float(jd1), float(jd2))
+    # As ERFA's `dtf2d` has it: the day's share of a day that a leap second may have made longer.
+    number = day.toordinal() - _MJD_ZERO
+    return Utc(_MJD_ZERO_JD + number, (60.0 * (60 * hour + minute) + second) / _length_s(day))

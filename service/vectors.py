@@ -39,6 +39,13 @@ def unit(vectors: npt.ArrayLike) -> Vector:
         return np.asarray(v / np.sqrt(np.sum(v * v, axis=-1, keepdims=True)))
 
 
+def unit_of(vector: Vector) -> Vector:
+    """`unit` of one vector (3,), without most of an array's overhead."""
+    x, y, z = vector.tolist()
+    norm = math.sqrt(x * x + y * y + z * z)
+    return vector / (norm or math.nan)
+
+
 def from_ra_dec(ra_deg: npt.ArrayLike, dec_deg: npt.ArrayLike) -> Vector:
     """Unit vectors (..., 3) of right ascensions and declinations in degrees."""
     ra, dec = np.radians(ra_deg), np.radians(dec_deg)
@@ -48,11 +55,11 @@ def from_ra_dec(ra_deg: npt.ArrayLike, dec_deg: npt.ArrayLike) -> Vector:
     )
 
 
-def direction_of(ra_deg: float, dec_deg: float) -> Vector:
-    """`from_ra_dec` of one direction (3,), without an array's overhead."""
+def direction_of(ra_deg: float, dec_deg: float) -> tuple[float, float, float]:
+    """`from_ra_dec` of one direction, without an array's overhead."""
     ra, dec = math.radians(ra_deg), math.radians(dec_deg)
     across = math.cos(dec)
-    return np.array([across * math.cos(ra), across * math.sin(ra), math.sin(dec)])
+    return across * math.cos(ra), across * math.sin(ra), math.sin(dec)
 
 
 def to_ra_dec(vectors: npt.ArrayLike) -> tuple[Vector, Vector]:

@@ -15,12 +15,11 @@ import numpy.typing as npt
 
 from service.acquire import Acquisition, Path, TrackerResult, velocity_to_correct
 from service.attitude.solution import AttitudeSolution
-from service.attitude.solve import solve_attitude
-from service.identify.matched import matched_vectors
+from service.identify.matched import attitude_of
 from service.missions.mission import Band
 from service.observe.batch import BoresightPrior
 from service.sky.ephemeris import sun_distance_au
-from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector, angle_between_deg, unit
+from service.vectors import Matrix, Vector, angle_between_deg, unit
 
 
 @dataclass(frozen=True)
@@ -180,20 +179,16 @@ def _alone(
     acquisition: Acquisition, result: TrackerResult, used: npt.NDArray[np.bool_]
 ) -> AttitudeSolution | None:
     """The attitude of one tracker's stars alone, whatever the other trackers say."""
-    observed, reference, sigma_rad = matched_vectors(
+    solved = attitude_of(
         result.corrected.direction_body,
-        result.corrected.sigma_arcsec / ARCSEC_PER_RADIAN,
+        result.corrected.sigma_rad,
         np.where(used, result.identification.star, -1),
+        None,
+        (result.corrected.tracker.name,),
         acquisition.run_catalog.direction,
         velocity_to_correct(acquisition.batch),
         sun_distance_au(acquisition.batch.time),
-    )
-    solved = solve_attitude(
-        observed,
-        reference,
-        sigma_rad,
-        np.zeros(len(observed), np.int64),
-        (result.corrected.tracker.name,),
+        "quest",
     )
     return solved if isinstance(solved, AttitudeSolution) else None
 

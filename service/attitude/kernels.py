@@ -348,21 +348,24 @@ def solve(b, r, sigma_rad, worst_rad, quaternions, covariance, squares, sums):  
 
 
 @njit(cache=True, error_model="numpy")
-def fit(b, r, sigma_rad, worst_rad, chosen):  # type: ignore[no-untyped-def]
-    """All that `solve` gives, in one call and in the units that are shown.
+def fit(b, r, sigma_rad, worst_rad, chosen, quaternions, matrices, residual):  # type: ignore[no-untyped-def]
+    """All that `solve` gives, in one call and in the units that are shown; whether there is any.
 
-    Whether there is an attitude; both quaternions (2, 4); the covariance (3, 3)
-    in arcsec^2; the residuals (n,) in arcsec of the method in row `chosen`; and
-    (4,) of it the rms residual, what the covariance predicts of that, TASTE,
-    and the angle between both attitudes, angles in arcsec.
+    `quaternions` (3, 4) gets those of TRIAD and QUEST and, of the method in row
+    `chosen`, the rms residual, what the covariance predicts of that, TASTE, and
+    the angle between both attitudes, angles in arcsec.  `matrices` (2, 3, 3)
+    gets the chosen attitude and the covariance in arcsec^2, `residual` (n,) the
+    residuals in arcsec.
     """
     n = len(b)
-    quaternions, covariance = np.empty((2, 4)), np.empty((3, 3))
     squares, sums = np.empty((2, n)), np.empty((2, 2))
-    residual, told = np.empty(n), np.empty(4)
+    covariance, told = matrices[1], quaternions[2]
     if not solve(b, r, sigma_rad, worst_rad, quaternions, covariance, squares, sums):
-        return False, quaternions, covariance, residual, told
-    covariance *= ARCSEC_PER_RADIAN * ARCSEC_PER_RADIAN
+        return False
+    to_matrix(quaternions[chosen], matrices[0])
+    for i in range(3):
+        for j in range(3):
+            covariance[i, j] *= ARCSEC_PER_RADIAN * ARCSEC_PER_RADIAN
     variance = 0.0
     for k in range(n):
         residual[k] = math.sqrt(squares[chosen, k]) * ARCSEC_PER_RADIAN
@@ -377,4 +380,4 @@ def fit(b, r, sigma_rad, worst_rad, chosen):  # type: ignore[no-untyped-def]
     told[1] = math.sqrt(variance / n * (2 * n - 3) / n) * ARCSEC_PER_RADIAN
     told[2] = sums[chosen, 1]
     told[3] = 4.0 * math.asin(min(1.0, half)) * ARCSEC_PER_RADIAN
-    return True, quaternions, covariance, residual, told
+    return True

@@ -2,9 +2,10 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
-from functools import cached_property
 
-from service.vectors import Matrix, Vector, matrix_from_quaternion
+from msgspec import Struct
+
+from service.vectors import Matrix, Vector
 
 
 class NoAttitude(StrEnum):
@@ -30,19 +31,21 @@ class TrackerFit:
     outlier: bool
 
 
-@dataclass(frozen=True)
-class AttitudeSolution:
+class AttitudeSolution(Struct, frozen=True, eq=False, gc=False):
     """An attitude, inertial to body, from N >= 2 matched vectors.
 
-    `quaternion` is the chosen method's; `triad` and `quest` stand side by side
-    with the angle between them.  `covariance_arcsec2` (3, 3) is of the small
-    rotation about the body axes.  `residual_arcsec` has one row a matched
-    vector, the angle between the observed direction and the predicted one.
-    `taste` is the weighted sum of squares, about chi-square with 2N - 3 degrees
-    of freedom; beyond its 99.9 % point the solution is suspect.
+    `quaternion` is the chosen method's and `matrix` (3, 3) that of it: body
+    components = matrix @ inertial components.  `triad` and `quest` stand side by
+    side with the angle between them.  `covariance_arcsec2` (3, 3) is of the small
+    rotation about the body axes.  `residual_arcsec` has one row a vector, the
+    angle between the observed direction and the predicted one, NaN where there
+    is no reference to predict it from.  `taste` is the weighted sum of squares,
+    about chi-square with 2N - 3 degrees of freedom; beyond its 99.9 % point the
+    solution is suspect.
     """
 
     quaternion: Vector
+    matrix: Matrix
     method: str
     covariance_arcsec2: Matrix
     residual_arcsec: Vector
@@ -55,8 +58,3 @@ class AttitudeSolution:
     quest: Vector
     triad_quest_angle_arcsec: float
     trackers: tuple[TrackerFit, ...]
-
-    @cached_property
-    def matrix(self) -> Matrix:
-        """The attitude matrix (3, 3): body components = this @ inertial components."""
-        return matrix_from_quaternion(self.quaternion)

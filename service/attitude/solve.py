@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from service.attitude import kernels
 from service.attitude.solution import AttitudeSolution, NoAttitude, TrackerFit
-from service.vectors import ARCSEC_PER_RADIAN, Vector, read_only
+from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector
 
 WORST_AXIS_DEG = 1.0
 WORST_AXIS_RAD = math.radians(WORST_AXIS_DEG)
@@ -42,33 +42,54 @@ def solve_attitude(
     n = len(observed)
     if n < 2:
         return NoAttitude.FEWER_THAN_TWO_UNIQUE_STARS
+    room = room_to_fit(n)
     chosen = METHODS.index(method)
-    solved, quaternions, covariance, residual, told = kernels.fit(
-        observed, reference, sigma_rad, WORST_AXIS_RAD, chosen
-    )
-    if not solved:
+    if not kernels.fit(observed, reference, sigma_rad, WORST_AXIS_RAD, chosen, *room):
         return NoAttitude.DEGENERATE_GEOMETRY
-    rms_arcsec, predicted_arcsec, taste, apart_arcsec = told.tolist()
-    freedom = 2 * n - 3
-    suspect = taste > taste_bound(freedom)
     fits: tuple[TrackerFit, ...] = ()
     if len(trackers) > 1:
-        outlier = _outlier(observed, reference, sigma_rad, tracker_of) if suspect else -1
-        weighted = (residual / (sigma_rad * ARCSEC_PER_RADIAN)) ** 2
-        fits = _tracker_fits(weighted, tracker_of, trackers, outlier)
-    read_only(quaternions)
+        suspect = is_suspect(room[0], n)
+        fits = tracker_fits(observed, reference, sigma_rad, room[2], suspect, tracker_of, trackers)
+    return solution_of(*room, n, method, fits)
+
+
+def room_to_fit(n: int) -> tuple[Vector, Matrix, Vector]:
+    """What `kernels.fit` writes to: quaternions, matrices and the residuals of n vectors."""
+    return np.empty((3, 4)), np.empty((2, 3, 3)), np.empty(n)
+
+
+def is_suspect(quaternions: Vector, matched: int) -> bool:
+    """Whether the TASTE that `kernels.fit` wrote is more than so many vectors explain."""
+    return float(quaternions[2, 2]) > taste_bound(2 * matched - 3)
+
+
+def solution_of(
+    quaternions: Vector,
+    matrices: Matrix,
+    residual_arcsec: Vector,
+    matched: int,
+    method: str,
+    fits: tuple[TrackerFit, ...] = (),
+) -> AttitudeSolution:
+    """The solution that `kernels.fit` wrote, of so many matched vectors."""
+    rms_arcsec, predicted_arcsec, taste, apart_arcsec = quaternions[2].tolist()
+    freedom = 2 * matched - 3
+    for array in (quaternions, matrices, residual_arcsec):
+        array.setflags(write=False)
+    triad, quest = quaternions[0], quaternions[1]
     return AttitudeSolution(
-        quaternion=quaternions[chosen],
+        quaternion=triad if method == "triad" else quest,
+        matrix=matrices[0],
         method=method,
-        covariance_arcsec2=read_only(covariance),
-        residual_arcsec=read_only(residual),
+        covariance_arcsec2=matrices[1],
+        residual_arcsec=residual_arcsec,
         residual_rms_arcsec=rms_arcsec,
         predicted_rms_arcsec=predicted_arcsec,
         taste=taste,
         degrees_of_freedom=freedom,
-        suspect=suspect,
-        triad=quaternions[0],
-        quest=quaternions[1],
+        suspect=taste > taste_bound(freedom),
+        triad=triad,
+        quest=quest,
         triad_quest_angle_arcsec=apart_arcsec,
         trackers=fits,
     )
@@ -104,12 +125,20 @@ def _chi_square(x: float, odd: int) -> tuple[float, float]:
     return tail, density
 
 
-def _tracker_fits(
-    weighted: Vector, tracker_of: npt.NDArray[np.int64], trackers: tuple[str, ...], outlier: int
+def tracker_fits(
+    observed: Vector,
+    reference: Vector,
+    sigma_rad: Vector,
+    residual_arcsec: Vector,
+    suspect: bool,
+    tracker_of: npt.NDArray[np.int64],
+    trackers: tuple[str, ...],
 ) -> tuple[TrackerFit, ...]:
-    """Each tracker's share of TASTE."""
+    """Each tracker's share of TASTE, and whether it is the one that does not agree."""
+    weighted = (residual_arcsec / (sigma_rad * ARCSEC_PER_RADIAN)) ** 2
     stars = np.bincount(tracker_of, minlength=len(trackers))
     taste = np.bincount(tracker_of, weights=weighted, minlength=len(trackers))
+    outlier = _outlier(observed, reference, sigma_rad, tracker_of) if suspect else -1
     return tuple(
         TrackerFit(name, int(stars[i]), float(taste[i]), i == outlier)
         for i, name in enumerate(trackers)
@@ -134,8 +163,9 @@ def _outlier(
         tail = 0.0
         if n > 1:
             parts = observed[rest], reference[rest], sigma_rad[rest]
-            solved, *_, told = kernels.fit(*parts, WORST_AXIS_RAD, METHODS.index("quest"))
-            tail = float(chdtrc(2 * n - 3, told[2])) if solved else 0.0
+            room = room_to_fit(n)
+            solved = kernels.fit(*parts, WORST_AXIS_RAD, METHODS.index("quest"), *room)
+            tail = float(chdtrc(2 * n - 3, room[0][2, 2])) if solved else 0.0
         tails.append((tail, int(tracker)))
     (second, _), (best, outlier) = sorted(tails)[-2:] if len(tails) > 1 else [(0.0, -1)] * 2
     plain = len(tails) > 2 or best > ODDS_OF_TWO * second

@@ -1,13 +1,13 @@
 """What an identifier says of the stars of one tracker."""
 
-from dataclasses import dataclass
 from enum import IntEnum
-from functools import cached_property
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Struct
 
-from service.vectors import Vector
+from service.vectors import Vector, read_only
 
 Integers = npt.NDArray[np.int64]
 
@@ -28,8 +28,7 @@ class Outcome(IntEnum):
 _UNIQUE = int(Outcome.UNIQUE)  # numpy compares with a plain number several times as fast
 
 
-@dataclass(frozen=True)
-class Identification:
+class Identification(Struct, frozen=True, eq=False, gc=False):
     """The identification of one tracker's stars, row by row in the order observed.
 
     `star` is the row in the run catalog of the unique winner, -1 without one.
@@ -52,10 +51,16 @@ class Identification:
     rival_probability: tuple[tuple[float, ...], ...] = ()
     bounded: bool = False
 
-    @cached_property
+    @property
     def unique(self) -> npt.NDArray[np.bool_]:
         """Mask of the stars with a unique winner."""
         return np.asarray(self.outcome == _UNIQUE)
+
+
+@lru_cache(maxsize=256)
+def not_known(n: int) -> Vector:
+    """NaN for each of n stars: a probability or a residual that there is not; locked."""
+    return read_only(np.full(n, np.nan))
 
 
 def nothing_known(n: int) -> Identification:
@@ -66,5 +71,5 @@ def nothing_known(n: int) -> Identification:
         votes=np.zeros(n, np.int64),
         runner_up=np.zeros(n, np.int64),
         rivals=((),) * n,
-        probability=np.full(n, np.nan),
+        probability=not_known(n),
     )

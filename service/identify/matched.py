@@ -5,8 +5,94 @@ import math
 import numpy as np
 from numba import njit
 
+from service.attitude.kernels import fit
+from service.attitude.solution import AttitudeSolution, NoAttitude
+from service.attitude.solve import (
+    METHODS,
+    WORST_AXIS_RAD,
+    is_suspect,
+    room_to_fit,
+    solution_of,
+    tracker_fits,
+)
+from service.identify.identification import Integers
+from service.vectors import Vector
+
 SUN_SCHWARZSCHILD_AU = 1.97412574336e-8
 """The Sun's gravitational radius, as ERFA has it."""
+
+
+def attitude_of(
+    direction_body: Vector,
+    sigma_rad: Vector,
+    star: Integers,
+    tracker_of: Integers | None,
+    trackers: tuple[str, ...],
+    catalog_direction: Vector,
+    velocity_c: Vector,
+    sun_distance_au: float,
+    method: str,
+) -> AttitudeSolution | NoAttitude:
+    """`solve_attitude` of the `matched_vectors` of n stars, in one compiled call.
+
+    `tracker_of` (n,) may be None where there is one of `trackers`.  The
+    solution's residuals have one row an observed star, NaN for those without an
+    identity.
+    """
+    given = direction_body, sigma_rad, star, catalog_direction, velocity_c, sun_distance_au
+    room = room_to_fit(len(star))
+    matched = _match_and_fit(*given, WORST_AXIS_RAD, METHODS.index(method), *room)
+    if matched < 0:
+        return NoAttitude.DEGENERATE_GEOMETRY
+    if matched < 2:
+        return NoAttitude.FEWER_THAN_TWO_UNIQUE_STARS
+    if tracker_of is None:
+        return solution_of(*room, matched, method)
+    named = star >= 0
+    observed, reference, sigma = matched_vectors(*given)
+    fits = tracker_fits(
+        observed,
+        reference,
+        sigma,
+        room[2][named],
+        is_suspect(room[0], matched),
+        tracker_of[named],
+        trackers,
+    )
+    return solution_of(*room, matched, method, fits)
+
+
+@njit(cache=True, error_model="numpy")
+def _match_and_fit(  # type: ignore[no-untyped-def]
+    direction_body,
+    sigma_rad,
+    star,
+    catalog_direction,
+    velocity,
+    sun_distance_au,
+    worst_rad,
+    chosen,
+    quaternions,
+    matrices,
+    residual,
+):
+    """How many stars are matched, or -1 where they are enough and yet give no attitude."""
+    observed, reference, sigma = matched_vectors(
+        direction_body, sigma_rad, star, catalog_direction, velocity, sun_distance_au
+    )
+    count = len(sigma)
+    if count < 2:
+        return count
+    found = np.empty(count)
+    if not fit(observed, reference, sigma, worst_rad, chosen, quaternions, matrices, found):
+        return -1
+    at = 0
+    for k in range(len(star)):
+        residual[k] = math.nan
+        if star[k] >= 0:
+            residual[k] = found[at]
+            at += 1
+    return count
 
 
 @njit(cache=True)

@@ -27,39 +27,35 @@ _ROUNDING = 1e-14
 def cast_votes(  # type: ignore[no-untyped-def]
     observed,  # (n, 3) unit vectors, inertial through the a priori attitude
     observed_magnitude,  # (n,) NaN: the magnitude tests pass the star by
-    direction,  # (m, 3) zone stars, brightest first
-    magnitude,  # (m,)
+    boresight,  # (3,) inertial through the a priori attitude
+    polar,  # (m,) a zone star's angle to the axis; -1: not worked out yet
+    star,  # (m, 4) zone stars, brightest first: unit vector and magnitude
     pair_separation,  # (NTOT,) radians, ascending
-    pair_brighter,
-    pair_dimmer,
+    pair_rows,  # (2, NTOT) of the brighter stars and of the dimmer
     bin_start,
     bins_per_rad,
-    polar,  # (m,) a zone star's angle to the axis; -1: not worked out yet
     pair_difference,  # (NTOT,) of the polar angles, about the zone's own axis; (0,) in a cap
     axis,  # (3,) the exact zone axis; in a band the catalog generation vector
     off_axis,  # how far the zone's own axis lies from it, radians
     all_inside,  # whether every zone star lies between the bounds
     least,  # bounds on a zone star's angle to the axis, radians
     most,
-    separation_tolerance,  # SEPTOL, radians
-    magnitude_tolerance,  # XMTOL
-    order_tolerance,  # TMAGMX
-    cross_tolerance,  # CAPMAX or BANMAX, radians
-    pole_tolerance,  # BANTOL1, radians
-    angle_tolerance,  # BANTOL2, radians
-    rotation_tolerance,  # of the field of view, radians
-    boresight,  # (3,) inertial through the a priori attitude
     is_band,
-    test_magnitude,
-    test_cross,
-    test_pole,
-    test_rotation,
+    limits,  # (7,) as `Rules` has them, radians and magnitudes
+    switches,  # (4,) likewise
     votes,  # (n, m) counted up
     voted,  # (n, m) the zone stars that got votes, `counts` (n,) of them
     counts,
     edges,  # (0, 4), or as many rows as half the votes: each vote's i, a, j, b
 ):
     """Cast the votes of every observed pair's surviving candidate pairs."""
+    # SEPTOL, XMTOL, TMAGMX, CAPMAX or BANMAX, BANTOL1, BANTOL2 and the field of view's own.
+    separation_tolerance, magnitude_tolerance, order_tolerance = limits[0], limits[1], limits[2]
+    cross_tolerance, pole_tolerance, angle_tolerance = limits[3], limits[4], limits[5]
+    rotation_tolerance = limits[6]
+    test_magnitude, test_cross, test_pole = switches[0], switches[1], switches[2]
+    test_rotation = switches[3]
+    pair_brighter, pair_dimmer = pair_rows[0], pair_rows[1]
     kept = 0
     n = len(observed)
     # Cheap, and never too strict: the test itself follows.
@@ -111,18 +107,18 @@ def cast_votes(  # type: ignore[no-untyped-def]
 
                 # Steps 2 and 3: brighter to brighter, dimmer to dimmer within XMTOL.
                 if ordered:
-                    if abs(observed_magnitude[bright] - magnitude[a]) > magnitude_tolerance:
+                    if abs(observed_magnitude[bright] - star[a, 3]) > magnitude_tolerance:
                         continue
-                    if abs(observed_magnitude[dim] - magnitude[b]) > magnitude_tolerance:
+                    if abs(observed_magnitude[dim] - star[b, 3]) > magnitude_tolerance:
                         continue
                     order = 1 if bright == i else -1
 
                 # The zone on the shelf may be wider than the one that was asked for.
                 if test_pole or not all_inside:
                     if polar[a] < 0.0:
-                        polar[a] = separation_rad(direction[a], axis)
+                        polar[a] = separation_rad(star[a], axis)
                     if polar[b] < 0.0:
-                        polar[b] = separation_rad(direction[b], axis)
+                        polar[b] = separation_rad(star[b], axis)
                 if not all_inside and (
                     polar[a] < least or polar[a] > most or polar[b] < least or polar[b] > most
                 ):
@@ -152,9 +148,9 @@ def cast_votes(  # type: ignore[no-untyped-def]
                     order = pole_order
                 elif test_cross:
                     # Steps 4, 5 and 10: CRSSEP, or its supplement CRSSEN for the other order.
-                    c0 = direction[a, 1] * direction[b, 2] - direction[a, 2] * direction[b, 1]
-                    c1 = direction[a, 2] * direction[b, 0] - direction[a, 0] * direction[b, 2]
-                    c2 = direction[a, 0] * direction[b, 1] - direction[a, 1] * direction[b, 0]
+                    c0 = star[a, 1] * star[b, 2] - star[a, 2] * star[b, 1]
+                    c1 = star[a, 2] * star[b, 0] - star[a, 0] * star[b, 2]
+                    c2 = star[a, 0] * star[b, 1] - star[a, 1] * star[b, 0]
                     square = c0 * c0 + c1 * c1 + c2 * c2
                     if normal == 0.0 or square == 0.0:
                         continue
@@ -181,8 +177,8 @@ def cast_votes(  # type: ignore[no-untyped-def]
                         turn = rotation_rad(
                             observed[i],
                             observed[j],
-                            direction[a],
-                            direction[b],
+                            star[a, :3],
+                            star[b, :3],
                             boresight,
                             axis,
                             is_band,
@@ -192,8 +188,8 @@ def cast_votes(  # type: ignore[no-untyped-def]
                         turn = rotation_rad(
                             observed[i],
                             observed[j],
-                            direction[b],
-                            direction[a],
+                            star[b, :3],
+                            star[a, :3],
                             boresight,
                             axis,
                             is_band,
@@ -229,27 +225,84 @@ def _vote(i, row, votes, voted, counts):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def tally(star_of, *given):  # type: ignore[no-untyped-def]
-    """`cast_votes` of what is `given` before its tallies, then `count_votes`, in one call.
+def tally(  # type: ignore[no-untyped-def]
+    observed,
+    observed_magnitude,
+    boresight,
+    zone_polar,  # (m,) of an exact zone in a band; `polar` of `cast_votes` is made of it
+    star,
+    pair_separation,
+    pair_rows,
+    bin_start,
+    bins_per_rad,
+    pair_difference,
+    axis,
+    off_axis,
+    all_inside,
+    least,
+    most,
+    is_band,
+    limits,
+    switches,
+    star_of,
+    found,
+):
+    """`cast_votes`, `count_votes` and, where a star is ambiguous, `name_rivals` in one call.
 
-    The three tallies; (4, n) outcome, star, highest and second; and whether any
-    star is ambiguous.  It keeps the interpreter's lock: where others wait for
-    that, it takes longer to get it back than to count a few votes.
+    `found` (4 + R, n) gets the rows of outcome, star, highest and second, and
+    below them those of up to R rivals.  Whether any star is ambiguous.  It keeps
+    the interpreter's lock: where others wait for that, it takes longer to get it
+    back than to count a few votes.
     """
-    n, stars = len(given[0]), len(star_of)
+    n, stars = len(observed), len(star)
+    polar = polar_angles(zone_polar, stars, all_inside, switches)
     votes, voted = np.zeros((n, stars), np.int32), np.empty((n, stars), np.int32)
     counts, edges = np.zeros(n, np.int32), np.empty((0, 4), np.int32)
-    # mypy takes what comes as a tuple for one argument.
-    cast_votes(*given, votes, voted, counts, edges)  # type: ignore[call-arg]
-    found = np.empty((4, n), np.int64)
+    cast_votes(
+        observed,
+        observed_magnitude,
+        boresight,
+        polar,
+        star,
+        pair_separation,
+        pair_rows,
+        bin_start,
+        bins_per_rad,
+        pair_difference,
+        axis,
+        off_axis,
+        all_inside,
+        least,
+        most,
+        is_band,
+        limits,
+        switches,
+        votes,
+        voted,
+        counts,
+        edges,
+    )
     any_tie = count_votes(votes, voted, counts, star_of, found[0], found[1], found[2], found[3])
-    return votes, voted, counts, found, any_tie
+    if any_tie:
+        name_rivals(votes, star_of, found[0], found[2], found[4:])
+    return any_tie
 
 
 @njit(cache=True, nogil=True)
-def tally_aside(star_of, *given):  # type: ignore[no-untyped-def]
+def tally_aside(*given):  # type: ignore[no-untyped-def]
     """`tally` of much, others working meanwhile."""
-    return tally(star_of, *given)
+    return tally(*given)
+
+
+@njit(cache=True, nogil=True)
+def polar_angles(zone_polar, stars, all_inside, switches):  # type: ignore[no-untyped-def]
+    """The zone stars' angles to the axis for `cast_votes`: known ones, or -1; (0,) if not asked."""
+    if all_inside and not switches[2]:
+        return np.empty(0)
+    polar = np.full(stars, -1.0)
+    if all_inside and len(zone_polar):
+        polar[:] = zone_polar
+    return polar
 
 
 @njit(cache=True, nogil=True)
@@ -278,3 +331,22 @@ def count_votes(votes, voted, counts, star_of, outcome, star, highest, second): 
         outcome[i] = UNMATCHED if share == 0 else UNIQUE if share == 1 else AMBIGUOUS
         any_tie = any_tie or share > 1
     return any_tie
+
+
+@njit(cache=True, nogil=True)
+def name_rivals(votes, star_of, outcome, highest, rivals):  # type: ignore[no-untyped-def]
+    """Into `rivals` (R, n) the `star_of` of who share an ambiguous star's highest tally, then -1.
+
+    The brightest come first, and at most R of them.
+    """
+    rivals[:] = -1
+    for i in range(votes.shape[0]):
+        if outcome[i] != AMBIGUOUS:
+            continue
+        place = 0
+        for row in range(votes.shape[1]):
+            if place == len(rivals):
+                break
+            if votes[i, row] == highest[i]:
+                rivals[place, i] = star_of[row]
+                place += 1

@@ -5,10 +5,10 @@ of geometry.  Where the roll is unknown it is made up, and the tests that would
 depend on it are switched off or, in a band, only vote.
 """
 
-from dataclasses import dataclass, field
-
 import numpy as np
+from msgspec import Struct
 
+from service.attitude.kernels import to_matrix
 from service.errors import BadBatch, Fault, shown_value
 from service.missions.mission import Band, Cap, Mission, Tracker
 from service.observe.batch import APriori, BoresightPrior, QuaternionPrior, SunPointedPrior
@@ -19,7 +19,6 @@ from service.vectors import (
     Matrix,
     Vector,
     from_ra_dec,
-    matrix_from_quaternion,
     separation_deg,
     to_ra_dec,
     unit,
@@ -33,19 +32,20 @@ ALONG = 0.999999
 """The cosine beyond which one direction does not fix a plane with another."""
 
 
-@dataclass(frozen=True)
-class Presumed:
+class Presumed(Struct, frozen=True, eq=False, gc=False):
     """The presumed attitude (3, 3), inertial to body, and what is not known of it.
 
-    `known_axis` (inertial) is what alone is known where the roll is not: the
-    boresight, or in a band the pole, about which any rotation may come.
+    `axis` (inertial) is where it has the zone's body axis.  `known_axis`
+    (inertial) is what alone is known where the roll is not: the boresight, or in
+    a band the pole, about which any rotation may come.
     """
 
     attitude: Matrix
+    axis: Vector
     roll_known: bool
     known_axis: Vector | None
     growth_deg: float = 0.0
-    warnings: list[str] = field(default_factory=list)
+    warnings: tuple[str, ...] = ()
 
 
 def presumed_attitude(
@@ -56,9 +56,13 @@ def presumed_attitude(
     Raises `BadBatch` where the kind of prior does not fit the mission's zone.
     """
     if isinstance(prior, QuaternionPrior):
-        attitude = matrix_from_quaternion(prior.quaternion)
-        pole = attitude.T @ mission.axis_body if isinstance(mission.zone, Band) else None
-        return Presumed(attitude, True, pole, warnings=_pole_warnings(pole, time, position_km))
+        attitude = np.empty((3, 3))
+        to_matrix(prior.quaternion, attitude)
+        axis = np.dot(mission.axis_body, attitude)
+        if not isinstance(mission.zone, Band):
+            return Presumed(attitude, axis, True, None)
+        warnings = _pole_warnings(axis, time, position_km)
+        return Presumed(attitude, axis, True, axis, warnings=warnings)
     if isinstance(prior, BoresightPrior):
         if not isinstance(mission.zone, Cap):
             raise BadBatch(
@@ -69,7 +73,8 @@ def presumed_attitude(
                 )
             )
         boresight = from_ra_dec(prior.ra_deg, prior.dec_deg)
-        return Presumed(_any_roll(mission.axis_body, boresight), False, boresight)
+        attitude = _any_roll(mission.axis_body, boresight)
+        return Presumed(attitude, np.dot(mission.axis_body, attitude), False, boresight)
     if not isinstance(mission.zone, Band):
         raise BadBatch(
             Fault(
@@ -82,11 +87,11 @@ def presumed_attitude(
 
 
 def _sun_pointed(prior: SunPointedPrior, time: Utc, mission: Mission) -> Presumed:
-    warnings: list[str] = []
+    warnings: tuple[str, ...] = ()
     growth_deg = 0.0
     pole = prior.sun_vector
     if pole is not None:
-        warnings += _pole_warnings(pole, time, prior.position_km)
+        warnings = _pole_warnings(pole, time, prior.position_km)
     else:
         pole = sun_direction(time, prior.position_km)
         if not np.isfinite(pole).all():
@@ -95,14 +100,17 @@ def _sun_pointed(prior: SunPointedPrior, time: Utc, mission: Mission) -> Presume
             )
         if prior.position_km is None:
             growth_deg = SUN_FROM_EARTH_GROWTH_DEG
-            warnings.append(
+            warned = (
                 "sun_seen_from_earth: neither sun_vector nor position_km was given; "
                 f"the band is {growth_deg} deg wider on either side"
             )
+            warnings = (warned,)
     # Body Z is presumed along the projection of ecliptic north.
     body = _frame(mission.axis_body, np.array([0.0, 0.0, 1.0]))
     inertial = _frame(pole, ecliptic_north(time))
-    return Presumed(body.T @ inertial, False, pole, growth_deg, warnings)
+    attitude = body.T @ inertial
+    axis = np.dot(mission.axis_body, attitude)
+    return Presumed(attitude, axis, False, pole, growth_deg, warnings)
 
 
 def _frame(first: Vector, second: Vector) -> Matrix:
@@ -121,13 +129,11 @@ def _any_roll(body_axis: Vector, inertial_axis: Vector) -> Matrix:
     return _frame(body_axis, body_axis).T @ _frame(inertial_axis, inertial_axis)
 
 
-def _pole_warnings(pole: Vector | None, time: Utc, position_km: Vector | None) -> list[str]:
-    if pole is None:
-        return []
+def _pole_warnings(pole: Vector, time: Utc, position_km: Vector | None) -> tuple[str, ...]:
     off_deg = separation_deg(pole, sun_direction(time, position_km))
     if off_deg <= POLE_FROM_SUN_WARNING_DEG:
-        return []
-    return [f"pole_off_sun: the a priori pole is {off_deg:.2f} deg from the Sun"]
+        return ()
+    return (f"pole_off_sun: the a priori pole is {off_deg:.2f} deg from the Sun",)
 
 
 def aim_of(tracker: Tracker, presumed: Presumed, mission: Mission, field_name: str) -> Aim:
@@ -138,21 +144,19 @@ def aim_of(tracker: Tracker, presumed: Presumed, mission: Mission, field_name: s
     whose boresight an a priori direction with unknown roll does not tell.
     """
     zone = mission.zone
-    boresight_body = tracker.body_from_tracker[:, 2]
     if isinstance(zone, Band):
         coelevation_deg = tracker.coelevation_deg or zone.coelevation_deg
-        axis = presumed.attitude.T @ mission.axis_body
         half_width_deg = zone.half_width_deg + presumed.growth_deg
         return Aim(
             "band",
-            axis,
+            presumed.axis,
             max(0.0, coelevation_deg - half_width_deg),
             min(180.0, coelevation_deg + half_width_deg),
         )
     if not presumed.roll_known and (
-        (off_deg := separation_deg(boresight_body, mission.axis_body)) > SAME_BORESIGHT_DEG
+        (off_deg := separation_deg(tracker.boresight_body, mission.axis_body)) > SAME_BORESIGHT_DEG
     ):
-        ra_deg, dec_deg = to_ra_dec(presumed.attitude.T @ mission.axis_body)
+        ra_deg, dec_deg = to_ra_dec(presumed.axis)
         raise BadBatch(
             Fault(
                 field_name,
@@ -161,4 +165,5 @@ def aim_of(tracker: Tracker, presumed: Presumed, mission: Mission, field_name: s
                 f"boresight {float(ra_deg):.3f}, {float(dec_deg):.3f} deg",
             )
         )
-    return Aim("cap", presumed.attitude.T @ boresight_body, 0.0, zone.radius_deg)
+    axis = np.dot(tracker.boresight_body, presumed.attitude)
+    return Aim("cap", axis, 0.0, zone.radius_deg)

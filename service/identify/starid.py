@@ -5,24 +5,34 @@ A tie is ambiguous, no votes is unmatched, one vote is enough (Fink & Shoup
 """
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Struct
 
 from service.errors import BadBatch, Fault, shown_value
-from service.identify.identification import Identification, Integers, Outcome
+from service.identify.identification import Identification, Integers, not_known
 from service.identify.match_groups import MAX_EDGES, keep_largest_groups
-from service.identify.pair_tests import cast_votes, count_votes, tally, tally_aside
-from service.missions.mission import Tests, Tolerances
+from service.identify.pair_tests import (
+    cast_votes,
+    count_votes,
+    name_rivals,
+    polar_angles,
+    tally,
+    tally_aside,
+)
+from service.missions.mission import Rules
 from service.sky.guide import Guide
 from service.sky.zones import Aim, Zone
 from service.vectors import Vector, angle_between_deg, separation_deg
 
 Tallies = npt.NDArray[np.int32]
+Rows = npt.NDArray[np.int32]
 
 MAX_RIVALS = 20
+_RIVALS = 4
+"""The row of what `tally` finds below which the rivals stand."""
 MAX_COMPARISONS = 30_000_000
 """Observed with candidate pairs, for one tracker: a second or two."""
 
@@ -30,8 +40,7 @@ MUCH = 10_000_000
 """Stars squared times candidate pairs: beyond it votes take a good part of a millisecond."""
 
 
-@dataclass(frozen=True)
-class Sighting:
+class Sighting(Struct, frozen=True, eq=False, gc=False):
     """What an identifier is given: one tracker's stars and where to look for them.
 
     `direction` (n, 3) is inertial through the presumed attitude; magnitudes may
@@ -51,8 +60,7 @@ class Sighting:
     boresight: Vector
     aim: Aim
     zone: Zone
-    tolerances: Tolerances
-    tests: Tests
+    rules: Rules
     guide: Guide | None = None
 
 
@@ -61,25 +69,26 @@ def identify_by_votes(sighting: Sighting) -> Identification:
 
     Raises `BadBatch` where tolerances make more comparisons than are allowed.
     """
-    zone, tests = sighting.zone, sighting.tests
-    n = len(sighting.direction)
-    if n * (n - 1) // 2 * zone.pairs.count > MAX_COMPARISONS:
+    zone = sighting.zone
+    n, pairs = len(sighting.direction), zone.pairs.count
+    if n * (n - 1) // 2 * pairs > MAX_COMPARISONS:
         _refuse_endless(sighting)
-    given = sighting.direction, sighting.magnitude_mag, *votes_arguments(sighting)
-    count = tally_aside if n * n * zone.pairs.count > MUCH else tally
-    votes, voted, counts, found, any_tie = count(zone.star, *given)
+    given = votes_arguments(sighting)
+    found = np.empty((_RIVALS + MAX_RIVALS, n), np.int64)
     bounded = False
-    if tests.match_groups:
-        bounded = _keep_groups(given, votes)
-        any_tie = count_votes(votes, voted, counts, zone.star, *found)
-    outcome, star, highest, second = found
+    if sighting.rules.tests.match_groups:
+        any_tie, bounded = _tally_groups(given, zone.star, found)
+    else:
+        count = tally_aside if n * n * pairs > MUCH else tally
+        # mypy takes what comes as a tuple for one argument.
+        any_tie = count(*given, zone.star, found)  # type: ignore[call-arg]
     return Identification(
-        outcome=outcome,
-        star=star,
-        votes=highest,
-        runner_up=second,
-        rivals=_tied(votes, outcome, highest, zone) if any_tie else ((),) * n,
-        probability=np.full(n, np.nan),
+        outcome=found[0],
+        star=found[1],
+        votes=found[2],
+        runner_up=found[3],
+        rivals=_rivals(found) if any_tie else ((),) * n,
+        probability=not_known(n),
         bounded=bounded,
     )
 
@@ -88,7 +97,7 @@ def _refuse_endless(sighting: Sighting) -> None:
     """Raise `BadBatch` where so many stars at so wide a tolerance would take seconds."""
     one, other = np.triu_indices(len(sighting.direction), 1)
     separation = np.radians(angle_between_deg(sighting.direction[one], sighting.direction[other]))
-    tolerance_deg = sighting.tolerances.separation_deg
+    tolerance_deg = sighting.rules.tolerances.separation_deg
     pairs, tolerance = sighting.zone.pairs.separation_rad, math.radians(tolerance_deg)
     found = np.searchsorted(pairs, separation + tolerance, "right")
     comparisons = int((found - np.searchsorted(pairs, separation - tolerance)).sum())
@@ -103,73 +112,71 @@ def _refuse_endless(sighting: Sighting) -> None:
         )
 
 
-def polar_of(zone: Zone, aim: Aim) -> tuple[Vector, float, bool]:
-    """The zone stars' angles to the aim's axis, -1 where they are not known; see `cast_votes`.
-
-    With them how far off the zone's own axis lies, in radians, and whether every
-    star of the zone lies within the aim.
-    """
-    if zone.serves_exactly(aim):
-        polar = zone.polar_rad.copy() if len(zone.polar_rad) else np.empty(len(zone.star))
-        return polar, 0.0, True
-    off_axis = math.radians(separation_deg(zone.aim.axis, aim.axis))
-    return np.full(len(zone.star), -1.0), off_axis, False
-
-
 def votes_arguments(sighting: Sighting) -> tuple[Any, ...]:
-    """What `cast_votes` is given between the observed stars and the tallies, in its order."""
-    zone, aim, limits, tests = sighting.zone, sighting.aim, sighting.tolerances, sighting.tests
-    polar, off_axis, all_inside = polar_of(zone, aim)
+    """What `tally` is given before the stars' names and the place for what it finds, in its order.
+
+    But for the angles to the axis, `polar`, `cast_votes` is given the same.
+    """
+    zone, aim, pairs, rules = sighting.zone, sighting.aim, sighting.zone.pairs, sighting.rules
+    is_band = aim.kind == "band"
+    all_inside = zone.serves_exactly(aim)
+    # Polar angles are kept in bands alone.
+    off_axis_deg = separation_deg(zone.aim.axis, aim.axis) if is_band and not all_inside else 0.0
     return (
-        zone.direction,
-        zone.magnitude_mag,
-        zone.pairs.separation_rad,
-        zone.pairs.brighter,
-        zone.pairs.dimmer,
-        zone.pairs.bin_start,
-        zone.pairs.bins_per_rad,
-        polar,
+        sighting.direction,
+        sighting.magnitude_mag,
+        sighting.boresight,
+        zone.polar_rad,
+        zone.vector_mag,
+        pairs.separation_rad,
+        pairs.rows,
+        pairs.bin_start,
+        pairs.bins_per_rad,
         zone.polar_difference_rad,
         aim.axis,
-        off_axis,
+        math.radians(off_axis_deg),
         all_inside,
         math.radians(aim.least_deg),
         math.radians(aim.most_deg),
-        math.radians(limits.separation_deg),
-        limits.magnitude_mag,
-        limits.magnitude_order_mag,
-        math.radians(limits.cross_product_deg),
-        math.radians(limits.pole_difference_deg),
-        math.radians(limits.pole_angle_deg),
-        math.radians(limits.fov_rotation_deg),
-        sighting.boresight,
-        aim.kind == "band",
-        tests.magnitude,
-        tests.cross_product,
-        tests.pole,
-        tests.fov_rotation,
+        is_band,
+        rules.limits,
+        rules.switches,
     )
 
 
-def _keep_groups(given: tuple[Any, ...], votes: Tallies) -> bool:
-    """Leave only the votes of the largest match groups; whether that search was cut short."""
-    count = int(votes.sum()) // 2
-    if count > MAX_EDGES:
-        return True
-    edges, n = np.empty((count, 4), np.int32), len(votes)
-    tallies = np.zeros_like(votes), np.empty_like(votes), np.zeros(n, np.int32)
-    # mypy takes what comes as a tuple for one argument.
-    cast_votes(*given, *tallies, edges)  # type: ignore[call-arg]
-    return keep_largest_groups(votes, edges)
+def with_polar_angles(given: tuple[Any, ...]) -> tuple[Any, ...]:
+    """The arguments of `tally` as `cast_votes` takes them."""
+    zone_polar, stars, all_inside, switches = (given[place] for place in (3, 4, 12, 17))
+    polar = polar_angles(zone_polar, len(stars), all_inside, switches)
+    return *given[:3], polar, *given[4:]
 
 
-def _tied(
-    votes: Tallies, outcome: Integers, highest: Integers, zone: Zone
-) -> tuple[tuple[int, ...], ...]:
+def _tally_groups(given: tuple[Any, ...], star_of: Rows, found: Integers) -> tuple[bool, bool]:
+    """`tally` of the votes of the largest match groups alone; whether that search was cut short."""
+    given = with_polar_angles(given)
+    shape = len(given[0]), len(star_of)
+    votes, voted, counts, edges = _room_for_votes(shape, 0)
+    cast_votes(*given, votes, voted, counts, edges)  # type: ignore[call-arg]
+    cast = int(votes.sum()) // 2
+    bounded = cast > MAX_EDGES
+    if not bounded:
+        again = _room_for_votes(shape, cast)
+        cast_votes(*given, *again)
+        bounded = keep_largest_groups(votes, again[-1])
+    any_tie = count_votes(votes, voted, counts, star_of, *found[:_RIVALS])
+    name_rivals(votes, star_of, found[0], found[2], found[_RIVALS:])
+    return any_tie, bounded
+
+
+def _room_for_votes(shape: tuple[int, int], edges: int) -> tuple[Tallies, ...]:
+    return (
+        np.zeros(shape, np.int32),
+        np.empty(shape, np.int32),
+        np.zeros(shape[0], np.int32),
+        np.empty((edges, 4), np.int32),
+    )
+
+
+def _rivals(found: Integers) -> tuple[tuple[int, ...], ...]:
     """The stars that share the highest tally of each ambiguous star, brightest first."""
-    return tuple(
-        tuple(zone.star[np.flatnonzero(row == most)[:MAX_RIVALS]].tolist())
-        if what == Outcome.AMBIGUOUS
-        else ()
-        for row, what, most in zip(votes, outcome, highest, strict=True)
-    )
+    return tuple(tuple(row for row in rivals if row >= 0) for rivals in found[_RIVALS:].T.tolist())

@@ -6,7 +6,7 @@ posterior (`search`, `evidence`); a star is unique from a probability of
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,8 @@ from service.identify.starid import MAX_RIVALS, Sighting, identify_by_votes
 from service.vectors import Vector, separation_deg
 
 UNIQUE_PROBABILITY = 0.999
+
+_UNMATCHED, _UNIQUE, _AMBIGUOUS = (int(outcome) for outcome in Outcome)
 
 
 @dataclass(frozen=True)
@@ -55,32 +57,33 @@ def posterior_of(sighting: Sighting, exhaustive: bool = False) -> Posterior:
 
 def identify_verified(sighting: Sighting) -> Identification:
     """Identify the stars of one tracker by the posterior of hypotheses."""
-    zone = sighting.zone
-    found = posterior_of(sighting)
-    probability, none = found.probability, found.none
-    unique = probability >= UNIQUE_PROBABILITY
-    unmatched = ~unique & (none >= probability)
-    named = np.full(len(unique), -1)
-    named[unique] = zone.star[found.star[unique]]
-    # Of a unique star the others are too unlikely to matter.
-    in_question = (found.rivals >= 0) & ~unique[:, None]
-    return replace(
-        identify_by_votes(sighting),
-        outcome=np.where(
-            unique,
-            int(Outcome.UNIQUE),
-            np.where(unmatched, int(Outcome.UNMATCHED), int(Outcome.AMBIGUOUS)),
-        ),
-        star=named,
-        rivals=tuple(
-            tuple(zone.star[row[mask]].tolist())
-            for row, mask in zip(found.rivals, in_question, strict=True)
-        ),
-        rival_probability=tuple(
-            tuple(row[mask].tolist())
-            for row, mask in zip(found.rival_probability, in_question, strict=True)
-        ),
-        probability=np.where(unmatched, none, probability),
+    star_of = sighting.zone.star
+    found, votes = posterior_of(sighting), identify_by_votes(sighting)
+    n = len(found.star)
+    outcome, star = np.empty(n, np.int64), np.full(n, -1)
+    probability = np.empty(n)
+    rivals: list[tuple[int, ...]] = [()] * n
+    likely: list[tuple[float, ...]] = [()] * n
+    columns = zip(found.star.tolist(), found.probability.tolist(), found.none.tolist(), strict=True)
+    for k, (row, chance, none) in enumerate(columns):
+        if chance >= UNIQUE_PROBABILITY:
+            # Of a unique star the others are too unlikely to matter.
+            outcome[k], star[k], probability[k] = _UNIQUE, star_of[row], chance
+            continue
+        unmatched = none >= chance
+        outcome[k] = _UNMATCHED if unmatched else _AMBIGUOUS
+        probability[k] = none if unmatched else chance
+        in_question = found.rivals[k] >= 0
+        rivals[k] = tuple(star_of[found.rivals[k][in_question]].tolist())
+        likely[k] = tuple(found.rival_probability[k][in_question].tolist())
+    return Identification(
+        outcome=outcome,
+        star=star,
+        votes=votes.votes,
+        runner_up=votes.runner_up,
+        rivals=tuple(rivals),
+        rival_probability=tuple(likely),
+        probability=probability,
         bounded=found.bounded,
     )
 

@@ -6,13 +6,16 @@ the files (Fink & Shoup 1994, Table 1).
 
 import hashlib
 import json
+import math
 import tomllib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import (
     AfterValidator,
     Field,
@@ -91,6 +94,45 @@ class Tests(Strict):
     match_groups: bool = False
 
 
+@dataclass(frozen=True, eq=False)
+class Rules:
+    """The tolerances and tests of an identification, and both as compiled code is given them.
+
+    `limits` (7,) are the tolerances from `separation_deg` on, angles in radians;
+    `switches` (4,) those of the tests up to `fov_rotation`.  They are not locked:
+    numba takes in an array that is at twice the cost.
+    """
+
+    tolerances: Tolerances
+    tests: Tests
+    limits: Vector
+    switches: npt.NDArray[np.bool_]
+
+
+def rules_of(tolerances: Tolerances, tests: Tests) -> Rules:
+    """The rules that tolerances and tests make together."""
+    return Rules(
+        tolerances,
+        tests,
+        np.array(
+            [
+                math.radians(tolerances.separation_deg),
+                tolerances.magnitude_mag,
+                tolerances.magnitude_order_mag,
+                math.radians(tolerances.cross_product_deg),
+                math.radians(tolerances.pole_difference_deg),
+                math.radians(tolerances.pole_angle_deg),
+                math.radians(tolerances.fov_rotation_deg),
+            ]
+        ),
+        np.array([tests.magnitude, tests.cross_product, tests.pole, tests.fov_rotation]),
+    )
+
+
+TESTS_OF_ROLL = ("cross_product", "fov_rotation")
+"""They compare with the presumed roll, which an a priori boresight leaves open."""
+
+
 class RunCatalogSettings(Strict):
     """How the run catalog of the mission is made from the star catalog."""
 
@@ -161,6 +203,11 @@ class Tracker(Strict):
         u, _, vt = np.linalg.svd(axes)
         return read_only(u @ vt)
 
+    @cached_property
+    def boresight_body(self) -> Vector:
+        """The boresight (3,) in body axes: the last column of the alignment."""
+        return read_only(self.body_from_tracker[:, 2].copy())
+
 
 class Mission(Strict):
     """All that is fixed for a mission."""
@@ -205,8 +252,18 @@ class Mission(Strict):
     @cached_property
     def within_zones(self) -> "Mission":
         """The mission with no look at the whole sky where a zone gave nothing good."""
-        # Validated anew: a plain copy would keep the digest.
-        return Mission.model_validate(self.model_dump() | {"lost_in_space_fallback": False})
+        return self.model_copy(update={"lost_in_space_fallback": False})
+
+    @cached_property
+    def rules(self) -> Rules:
+        """The mission's own tolerances and tests."""
+        return rules_of(self.tolerances, self.tests)
+
+    @cached_property
+    def rules_without_roll(self) -> Rules:
+        """The same with the tests off that compare with a presumed roll."""
+        tests = self.tests.model_copy(update=dict.fromkeys(TESTS_OF_ROLL, False))
+        return rules_of(self.tolerances, tests)
 
     @cached_property
     def axis_body(self) -> Vector:

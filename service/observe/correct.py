@@ -6,23 +6,22 @@ touched here: observed vectors are never changed for it.
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Struct
 from numba import njit
 
 from service.missions.mission import Calibration, Mission, Tracker
 from service.observe.batch import ObservationBatch, TrackerStars
-from service.vectors import Vector, locked, read_only, unit
+from service.vectors import ARCSEC_PER_RADIAN, Vector, locked, read_only, unit
 
 
-@dataclass(frozen=True)
-class CorrectedObservations:
+class CorrectedObservations(Struct, frozen=True, eq=False, gc=False):
     """The stars of one tracker as unit vectors (n, 3) in body axes at the batch's epoch.
 
-    Magnitude is NaN where none was given; sigma is one standard deviation per
-    tangent axis; `outside_field_of_view` marks stars that the tracker should
+    Magnitude is NaN where none was given; sigma, in either unit, is one standard
+    deviation per tangent axis; `outside_field_of_view` marks stars that the tracker should
     not be able to see.
     """
 
@@ -30,6 +29,7 @@ class CorrectedObservations:
     direction_body: Vector
     magnitude_mag: Vector
     sigma_arcsec: Vector
+    sigma_rad: Vector
     outside_field_of_view: npt.NDArray[np.bool_]
 
 
@@ -51,6 +51,8 @@ def correct(batch: ObservationBatch, mission: Mission) -> tuple[CorrectedObserva
 def _corrected(
     stars: TrackerStars, tracker: Tracker, rates_deg_per_s: Vector
 ) -> CorrectedObservations:
+    n = len(stars.vector)
+    body, sigma, outside = np.empty((n, 3)), np.empty((2, n)), np.empty(n, np.bool_)
     # The same for every tracker and batch, so that they are compiled once.
     given = (
         tracker.body_from_tracker,
@@ -59,18 +61,21 @@ def _corrected(
         rates_deg_per_s,
         stars.time_offset_s,
         stars.sigma_arcsec,
+        body,
+        sigma,
+        outside,
     )
-    complete, body, sigma_arcsec, outside = _to_body(stars.vector, *given)
-    if not complete:
+    if not _to_body(stars.vector, *given):
         from_angles = tracker_vectors(stars.angles_deg, tracker.calibration)
         direction = np.where(np.isnan(stars.vector), from_angles, stars.vector)
-        _, body, sigma_arcsec, outside = _to_body(read_only(direction), *given)
+        _to_body(read_only(direction), *given)
     return CorrectedObservations(
-        tracker=tracker,
-        direction_body=read_only(body),
-        magnitude_mag=locked(stars.magnitude_mag),
-        sigma_arcsec=read_only(sigma_arcsec),
-        outside_field_of_view=outside,
+        tracker,
+        read_only(body),
+        locked(stars.magnitude_mag),
+        read_only(sigma[0]),
+        sigma[1],
+        outside,
     )
 
 
@@ -83,13 +88,14 @@ def _to_body(  # type: ignore[no-untyped-def]
     rates_deg_per_s,
     time_offset_s,
     sigma,
+    body,  # (n, 3) in body axes
+    sigmas,  # (2, n) in arcsec and in radians
+    outside,  # (n,) of the field of view
 ):
-    """Whether every direction is known, and if so (n, 3) in body axes, sigmas, and who is outside.
+    """Whether every direction is known; if so `body`, `sigmas` and `outside` are written.
 
     v(epoch) = exp([w x] dt) v, dt being the star's time minus the batch's.
     """
-    n = len(direction)
-    body, sigmas, outside = np.empty((n, 3)), np.empty(n), np.empty(n, np.bool_)
     rate = math.radians(
         math.sqrt(rates_deg_per_s[0] ** 2 + rates_deg_per_s[1] ** 2 + rates_deg_per_s[2] ** 2)
     )
@@ -100,11 +106,12 @@ def _to_body(  # type: ignore[no-untyped-def]
             math.radians(rates_deg_per_s[1]) / rate,
             math.radians(rates_deg_per_s[2]) / rate,
         )
-    for k in range(n):
+    for k in range(len(direction)):
         if math.isnan(direction[k, 0]):
-            return False, body, sigmas, outside
+            return False
         outside[k] = direction[k, 2] < least_cosine
-        sigmas[k] = default_sigma if math.isnan(sigma[k]) else sigma[k]
+        sigmas[0, k] = default_sigma if math.isnan(sigma[k]) else sigma[k]
+        sigmas[1, k] = sigmas[0, k] / ARCSEC_PER_RADIAN
         for i in range(3):
             body[k, i] = (
                 direction[k, 0] * body_from_tracker[i, 0]
@@ -121,7 +128,7 @@ def _to_body(  # type: ignore[no-untyped-def]
         body[k, 0] += sine * once0 + versine * (y * once2 - z * once1)
         body[k, 1] += sine * once1 + versine * (z * once0 - x * once2)
         body[k, 2] += sine * once2 + versine * (x * once1 - y * once0)
-    return True, body, sigmas, outside
+    return True
 
 
 def tracker_vectors(angles_deg: Vector, calibration: Calibration) -> Vector:

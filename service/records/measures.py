@@ -3,6 +3,8 @@
 import math
 from typing import Any
 
+import numpy as np
+
 from service.acquire import Acquisition
 from service.records.tables import COUNTS, MAXIMA, MEASURED, MINIMA, SUMS
 from service.vectors import separation_deg
@@ -50,10 +52,10 @@ def a_priori_angle_deg(acquisition: Acquisition) -> float | None:
     presumed = acquisition.presumed
     attitude = acquisition.solution.matrix
     if presumed.known_axis is not None:
-        axis = acquisition.mission.axis_body
-        return float(separation_deg(attitude.T @ axis, presumed.known_axis))
+        axis = np.dot(acquisition.mission.axis_body, attitude)
+        return separation_deg(axis, presumed.known_axis)
     # |A - B| is 2 sqrt(2) sin(angle / 2) in the sense of Frobenius.
-    apart = math.hypot(*(attitude - presumed.attitude).ravel().tolist())
+    apart = math.dist(attitude.ravel().tolist(), presumed.attitude.ravel().tolist())
     return math.degrees(2.0 * math.asin(min(1.0, apart / math.sqrt(8.0))))
 
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from erfa import ufunc
 
 from service.times import Utc
-from service.vectors import Vector, read_only, unit
+from service.vectors import Vector, read_only, unit_of
 
 KM_PER_AU = erfa.DAU / 1000.0
 LIGHT_AU_PER_DAY = erfa.DAYSEC / erfa.AULT
@@ -26,8 +26,8 @@ _STEPS_PER_DAY = 32
 
 
 @lru_cache(maxsize=64)
-def _earth(time: Utc) -> tuple[Vector, float, Vector]:
-    """Earth from the Sun (3,) in au, its distance, and its barycentric velocity (3,) in c."""
+def _earth(time: Utc) -> tuple[Vector, float]:
+    """Earth from the Sun in au and its barycentric velocity in c (6,), and the Sun's distance."""
     tt1, tt2 = time.tt
     whole = (tt1 - erfa.DJ00) * _STEPS_PER_DAY
     number = math.floor(whole + tt2 * _STEPS_PER_DAY)
@@ -40,9 +40,9 @@ def _earth(time: Utc) -> tuple[Vector, float, Vector]:
         -before * x * beyond / 2.0,
         before * x * after / 6.0,
     )
-    place_and_velocity = np.dot(weights, _about(number))
-    place, velocity = place_and_velocity[:3], place_and_velocity[3:]
-    return read_only(place), math.hypot(*place.tolist()), read_only(velocity)
+    earth = read_only(np.dot(weights, _about(number)))
+    x, y, z, *_ = earth.tolist()
+    return earth, math.hypot(x, y, z)
 
 
 @lru_cache(maxsize=256)
@@ -66,11 +66,12 @@ def observer_velocity(time: Utc, velocity_km_per_s: npt.ArrayLike | None) -> Vec
     Earth's velocity with the spacecraft's geocentric one added; Earth's alone
     where the latter is None.
     """
-    velocity = _earth(time)[2]
+    velocity = _earth(time)[0][3:]
     if velocity_km_per_s is None:
         # Of one kind with the sum below: kernels are compiled for either.
         return velocity.copy()
-    return np.asarray(velocity + np.asarray(velocity_km_per_s) / LIGHT_KM_PER_S)
+    own_velocity: Vector = np.asarray(velocity_km_per_s) / LIGHT_KM_PER_S
+    return np.add(velocity, own_velocity)
 
 
 def sun_distance_au(time: Utc) -> float:
@@ -86,8 +87,8 @@ def apparent(directions: npt.ArrayLike, velocity_c: Vector, time: Utc) -> Vector
 
 def sun_direction(time: Utc, position_km: npt.ArrayLike | None) -> Vector:
     """Unit vector (3,) from the spacecraft to the Sun, from Earth where no position is given."""
-    sun_km = -_earth(time)[0] * KM_PER_AU
-    return unit(sun_km if position_km is None else sun_km - np.asarray(position_km))
+    sun_km = _earth(time)[0][:3] * -KM_PER_AU
+    return unit_of(sun_km if position_km is None else sun_km - np.asarray(position_km))
 
 
 def ecliptic_north(time: Utc) -> Vector:

@@ -30,17 +30,26 @@ MAX_PAIRS = 5_000_000
 class PairIndex:
     """Pairs in order of separation.
 
-    `separation_rad` (NTOT,) ascends; `brighter` and `dimmer` are rows of the
-    zone's arrays, of which the brighter is the lower because zones keep the
-    brightness order of the run catalog.  `bin_start[k]` is the first pair of
-    separation bin k; the last entry is NTOT.
+    `separation_rad` (NTOT,) ascends; `rows` (2, NTOT) are those of the brighter
+    and of the dimmer star in the zone's arrays, the brighter being the lower
+    because zones keep the brightness order of the run catalog.  `bin_start[k]`
+    is the first pair of separation bin k; the last entry is NTOT.
     """
 
     separation_rad: Vector
-    brighter: Indices
-    dimmer: Indices
+    rows: Indices
     bin_start: Indices
     bins_per_rad: float
+
+    @property
+    def brighter(self) -> Indices:
+        """The rows of the brighter stars (NTOT,)."""
+        return np.asarray(self.rows[0])
+
+    @property
+    def dimmer(self) -> Indices:
+        """The rows of the dimmer stars (NTOT,)."""
+        return np.asarray(self.rows[1])
 
     @property
     def count(self) -> int:
@@ -50,7 +59,7 @@ class PairIndex:
     @property
     def nbytes(self) -> int:
         """Bytes held."""
-        arrays = (self.separation_rad, self.brighter, self.dimmer, self.bin_start)
+        arrays = (self.separation_rad, self.rows, self.bin_start)
         return sum(array.nbytes for array in arrays)
 
 
@@ -80,17 +89,10 @@ def build_pairs(direction: Vector, separation_max_deg: float) -> PairIndex:
         count, _ = _find_pairs(direction, limit, *found)
     bins = max(1, count // PAIRS_PER_BIN)
     bins_per_rad = bins / limit
-    separation = np.empty(count)
-    brighter, dimmer = np.empty(count, np.int32), np.empty(count, np.int32)
+    separation, rows = np.empty(count), np.empty((2, count), np.int32)
     bin_start = np.empty(bins + 1, np.int32)
-    _sort_pairs(*found, bins_per_rad, separation, brighter, dimmer, bin_start)
-    return PairIndex(
-        read_only(separation),
-        read_only(brighter),
-        read_only(dimmer),
-        read_only(bin_start),
-        bins_per_rad,
-    )
+    _sort_pairs(*found, bins_per_rad, separation, rows[0], rows[1], bin_start)
+    return PairIndex(read_only(separation), read_only(rows), read_only(bin_start), bins_per_rad)
 
 
 @njit(cache=True, nogil=True)

@@ -1,6 +1,7 @@
 """The sky as one batch sees it: the run catalog of its epoch and the zones in it."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from service.missions.mission import Mission
 from service.sky.catalog import Catalog
@@ -13,8 +14,7 @@ from service.sky.zones import Aim, Zone, ZoneKey, zone_for
 from service.times import Utc
 
 
-@dataclass(frozen=True)
-class RunCatalogKey:
+class RunCatalogKey(NamedTuple):
     """What a run catalog depends on: the key under which the shelf keeps it."""
 
     catalog: str

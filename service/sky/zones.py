@@ -10,12 +10,12 @@ depends neither on the grid nor on the batches before it.
 """
 
 import math
-from collections.abc import Hashable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Struct
 from numba import njit
 
 from service.sky.pairs import PairIndex, build_pairs, separation_rad
@@ -34,25 +34,17 @@ from service.vectors import (
 
 # Keeps a star that stands on a bound within the grown zone through rounding.
 _ROUNDING_DEG = 1e-9
+# How far a cosine must lie from that of a bound for rounding to leave no doubt.
+_CLEAR = 1e-12
 
 
-@dataclass(frozen=True)
-class Aim:
+class Aim(Struct, frozen=True, eq=False, gc=False):
     """Where to look: an exact axis (3,), inertial, and the bounds on the angle to it."""
 
     kind: str
     axis: Vector
     least_deg: float
     most_deg: float
-
-    def grown(self, by_deg: float) -> "Aim":
-        """The same with both bounds moved outwards."""
-        return Aim(
-            self.kind,
-            self.axis,
-            max(0.0, self.least_deg - by_deg),
-            min(180.0, self.most_deg + by_deg),
-        )
 
     def reaches_past(self, boresight: Vector, radius_deg: float) -> bool:
         """Whether a field of view about an inertial boresight goes beyond the bounds."""
@@ -67,7 +59,8 @@ class Zone:
     """The stars of a zone, brightest first, and their pairs.
 
     `star` holds the rows in the run catalog, ascending; `direction` (n, 3) and
-    `magnitude_mag` belong to them.  In a band `polar_rad` (n,) are the stars'
+    `magnitude_mag` belong to them, and `vector_mag` (n, 4) has either, for what
+    is read together.  In a band `polar_rad` (n,) are the stars'
     angles to the axis, and `polar_difference_rad` (NTOT,) that of a pair's brighter
     star less that of its dimmer, to a few digits; in a cap there are none.
     """
@@ -79,6 +72,7 @@ class Zone:
     star: npt.NDArray[np.int32]
     direction: Vector
     magnitude_mag: Vector
+    vector_mag: Vector
     pairs: PairIndex
     grid: StarBuckets
     voxels: Bits
@@ -89,8 +83,8 @@ class Zone:
     def nbytes(self) -> int:
         """Bytes held."""
         parts = (
-            *(self.star, self.direction, self.magnitude_mag, self.pairs, self.grid),
-            *(self.voxels, self.polar_rad, self.polar_difference_rad),
+            *(self.star, self.direction, self.magnitude_mag, self.vector_mag, self.pairs),
+            *(self.grid, self.voxels, self.polar_rad, self.polar_difference_rad),
         )
         return sum(part.nbytes for part in parts)
 
@@ -98,7 +92,8 @@ class Zone:
         """Whether the zone's stars are just those within an aim."""
         own = self.aim
         return own is aim or (
-            (own.least_deg, own.most_deg) == (aim.least_deg, aim.most_deg)
+            own.least_deg == aim.least_deg
+            and own.most_deg == aim.most_deg
             and own.axis.tolist() == aim.axis.tolist()
         )
 
@@ -114,8 +109,7 @@ class Zone:
         }
 
 
-@dataclass(frozen=True)
-class ZoneKey:
+class ZoneKey(NamedTuple):
     """What a zone depends on: the key under which the shelf keeps it."""
 
     mission: str
@@ -147,6 +141,7 @@ def build_zone(
     angle = angle_between_deg(run_catalog.direction[near], aim.axis)
     star = near[(angle >= aim.least_deg) & (angle <= aim.most_deg)].astype(np.int32)
     direction = np.ascontiguousarray(run_catalog.direction[star])
+    magnitude = run_catalog.magnitude_mag[star]
     pairs = build_pairs(direction, separation_max_deg)
     polar, difference = np.empty(0), np.empty(0, np.float32)
     if aim.kind == "band":
@@ -159,7 +154,8 @@ def build_zone(
         grid_deg=grid_deg,
         star=read_only(star),
         direction=read_only(direction),
-        magnitude_mag=read_only(run_catalog.magnitude_mag[star]),
+        magnitude_mag=read_only(magnitude),
+        vector_mag=read_only(np.column_stack([direction, magnitude])),
         pairs=pairs,
         grid=build_star_buckets(direction),
         voxels=build_star_voxels(direction),
@@ -185,21 +181,26 @@ def counts_within(zone: Zone, aim: Aim) -> tuple[int, int]:
         aim.axis,
         math.radians(aim.least_deg),
         math.radians(aim.most_deg),
-        zone.pairs.brighter,
-        zone.pairs.dimmer,
+        zone.pairs.rows,
     )
-    return int(stars), int(pairs)
+    return stars, pairs
 
 
 @njit(cache=True)
-def _counts_within(direction, axis, least, most, brighter, dimmer):  # type: ignore[no-untyped-def]
-    inside = np.zeros(len(direction), np.bool_)
+def _counts_within(direction, axis, least, most, pair_rows):  # type: ignore[no-untyped-def]
+    inside = np.empty(len(direction), np.uint8)
+    inner, outer = math.cos(least) if least > 0.0 else 2.0, math.cos(most)
     stars = pairs = 0
     for row in range(len(direction)):
-        inside[row] = least <= separation_rad(direction[row], axis) <= most
+        r = direction[row]
+        cosine = r[0] * axis[0] + r[1] * axis[1] + r[2] * axis[2]
+        inside[row] = outer < cosine < inner
+        # The accurate angle decides about those near a bound alone.
+        if min(abs(cosine - inner), abs(cosine - outer)) <= _CLEAR:
+            inside[row] = least <= separation_rad(r, axis) <= most
         stars += inside[row]
-    for k in range(len(brighter)):
-        pairs += inside[brighter[k]] and inside[dimmer[k]]
+    for k in range(pair_rows.shape[1]):
+        pairs += inside[pair_rows[0, k]] & inside[pair_rows[1, k]]
     return stars, pairs
 
 
@@ -216,23 +217,28 @@ def zone_for(
     With a grid the zone's axis is the nearest grid point and its bounds are
     grown by half the diagonal of a grid cell; grid 0 is the exact zone.
     """
-    wide = aim
+    x, y, z = aim.axis.tolist()
+    least_deg, most_deg = aim.least_deg, aim.most_deg
     if grid_deg > 0.0:
-        grown = aim.grown(grid_deg / math.sqrt(2.0) + _ROUNDING_DEG)
-        wide = Aim(aim.kind, snapped(aim.axis, grid_deg), grown.least_deg, grown.most_deg)
-    x, y, z = (float(component) for component in wide.axis)
-    key: Hashable = ZoneKey(
+        x, y, z = _snapped(x, y, z, grid_deg)
+        grown_by_deg = grid_deg / math.sqrt(2.0) + _ROUNDING_DEG
+        least_deg = max(0.0, least_deg - grown_by_deg)
+        most_deg = min(180.0, most_deg + grown_by_deg)
+    key = ZoneKey(
         mission,
         run_catalog.digest,
-        wide.kind,
+        aim.kind,
         (x, y, z),
-        wide.least_deg,
-        wide.most_deg,
+        least_deg,
+        most_deg,
         separation_max_deg,
     )
-    return shelf.get(
-        key, lambda: build_zone(mission, run_catalog, wide, separation_max_deg, grid_deg)
-    )
+
+    def build() -> Zone:
+        wide = Aim(aim.kind, np.array([x, y, z]), least_deg, most_deg) if grid_deg > 0.0 else aim
+        return build_zone(mission, run_catalog, wide, separation_max_deg, grid_deg)
+
+    return shelf.get(key, build)
 
 
 def snapped(axis: Vector, grid_deg: float) -> Vector:
@@ -242,6 +248,10 @@ def snapped(axis: Vector, grid_deg: float) -> Vector:
     farther than grid_deg / sqrt(2) from its point.
     """
     x, y, z = axis.tolist()
+    return np.array(_snapped(x, y, z, grid_deg))
+
+
+def _snapped(x: float, y: float, z: float, grid_deg: float) -> tuple[float, float, float]:
     ra_deg = math.degrees(math.atan2(y, x)) % 360.0
     dec_deg = math.degrees(math.atan2(z, math.hypot(x, y)))
     row_deg = round(dec_deg / grid_deg) * grid_deg

@@ -3,7 +3,7 @@
 import numpy as np
 
 from service.identify.starid import Sighting, identify_by_votes
-from service.missions.mission import Tests, Tolerances
+from service.missions.mission import Tests, Tolerances, rules_of
 from service.sky.run_catalog import RunCatalog
 from service.sky.zones import Aim, build_zone
 from service.vectors import from_ra_dec, to_ra_dec, unit
@@ -62,8 +62,7 @@ def sighting(observed, magnitudes, aim, zone, tests, limits=TOLERANCES):
         boresight=aim.axis if aim.kind == "cap" else across / np.linalg.norm(across),
         aim=aim,
         zone=zone,
-        tolerances=limits,
-        tests=tests,
+        rules=rules_of(limits, tests),
     )
 
 
