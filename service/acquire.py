@@ -243,7 +243,7 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
         solution=solution,
         reason=solved if isinstance(solved, NoAttitude) else None,
         warnings=tuple(warnings),
-        timings_us={step: round(ns / 1000) for step, ns in clock.ns.items()},
+        timings_us={step: ns // 1000 for step, ns in clock.ns.items()},
         provenance=Provenance(
             sky.catalog.digest,
             run_catalog.digest,

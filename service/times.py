@@ -34,6 +34,7 @@ _J2000_MJD = 51544
 _J2000_JD = 2451545.0
 _DAYS_PER_JULIAN_YEAR = 365.25
 _MJD_ZERO_JD = 2400000.5
+_TT_LESS_TAI_D = 32.184 / DAY_S
 _UNIX_J2000_S = 946_728_000
 _TEXT = re.compile(
     r"(?P<year>\d{4})-(?:(?P<month>\d{2})-(?P<day>\d{2})|(?P<doy>\d{3}))"
@@ -101,9 +102,9 @@ class Utc:
     @_Once
     def tt(self) -> tuple[float, float]:
         """The same moment in Terrestrial Time, two-part Julian date."""
+        # The second part is the lesser one, to which `taitt` would add the same.
         tai1, tai2, _ = ufunc.utctai(self.jd1, self.jd2)
-        tt1, tt2, _ = ufunc.taitt(tai1, tai2)
-        return float(tt1), float(tt2)
+        return float(tai1), float(tai2) + _TT_LESS_TAI_D
 
     @property
     def julian_year(self) -> float:

@@ -3,7 +3,8 @@
 from datetime import UTC, datetime, timedelta
 
 import pytest
-from hypothesis import given
+from erfa import ufunc
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from service.errors import BadInput
@@ -118,3 +119,18 @@ def test_a_time_that_does_not_exist_is_refused_with_its_reason(text, why):
 def test_moments_hash_alike_where_they_are_equal():
     assert len({parse_utc("1996-010T12:00:00Z"), parse_utc("1996-01-10T12:00:00.000Z")}) == 1
     assert isinstance(parse_utc("1996-010T12:00:00"), Utc)
+
+
+@given(moments, nanoseconds)
+@example(datetime(1972, 6, 30, 23, 59, 59), 999_999_999)
+@example(datetime(2016, 12, 31, 23, 59, 59), 5)
+def test_the_julian_dates_are_those_of_erfa_to_the_last_bit(moment, ns):
+    text = text_of(moment, ns)
+    utc = parse_utc(text)
+    second = moment.second + float(text[19:-1])
+    day = moment.year, moment.month, moment.day
+    jd1, jd2, _ = ufunc.dtf2d(b"UTC", *day, moment.hour, moment.minute, second)
+    assert (utc.jd1, utc.jd2) == (jd1, jd2)
+    tai1, tai2, _ = ufunc.utctai(jd1, jd2)
+    assert utc.tt == tuple(ufunc.taitt(tai1, tai2)[:2])
+    assert utc.julian_year == ufunc.epj(*utc.tt)

@@ -7,9 +7,11 @@ posterior (`search`, `evidence`); a star is unique from a probability of
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 from service.identify.evidence import PRIOR_DIRECTION, PRIOR_ROTATION
 from service.identify.hypotheses import marginals
@@ -44,15 +46,12 @@ class Posterior:
 def posterior_of(sighting: Sighting, exhaustive: bool = False) -> Posterior:
     """Weigh the hypotheses of a sighting; `exhaustive`: go on after one that outweighs chance."""
     n = len(sighting.direction)
-    star, probability, none = np.full(n, -1), np.zeros(n), np.ones(n)
-    rivals, likely = np.full((n, MAX_RIVALS), -1), np.zeros((n, MAX_RIVALS))
-    bounded = False
-    if n >= 2 and len(sighting.zone.star) >= 2:
-        ledger = np.empty((MAX_HYPOTHESES, n), np.int32)
-        log_weight = np.empty(MAX_HYPOTHESES)
-        count, rest, _, bounded = search(*scene_of(sighting), exhaustive, ledger, log_weight)
-        marginals(ledger, log_weight, count, rest, star, probability, none, rivals, likely)
-    return Posterior(star, probability, none, rivals, likely, bool(bounded))
+    star, probability = np.empty(n, np.int64), np.empty((2, n))
+    rivals, likely = np.empty((n, MAX_RIVALS), np.int64), np.empty((n, MAX_RIVALS))
+    found = star, probability, rivals, likely
+    # mypy takes what comes as a tuple for one argument.
+    bounded = _weigh(*_scene_arguments(sighting), exhaustive, *found)  # type: ignore[call-arg]
+    return Posterior(star, probability[0], probability[1], rivals, likely, bounded)
 
 
 def identify_verified(sighting: Sighting) -> Identification:
@@ -90,42 +89,160 @@ def identify_verified(sighting: Sighting) -> Identification:
 
 def scene_of(sighting: Sighting) -> tuple[Seen, Stars, Pairs]:
     """The sighting as the kernels take it."""
+    return _scene(*_scene_arguments(sighting))  # type: ignore[no-any-return]
+
+
+def _scene_arguments(sighting: Sighting) -> tuple[Any, ...]:
     zone, aim, pairs = sighting.zone, sighting.aim, sighting.zone.pairs
-    reference_sigma = float(sighting.sigma_rad.min())
-    seen = Seen(
-        observed=sighting.direction,
-        magnitude=sighting.magnitude_mag,
-        sigma_rad=sighting.sigma_rad,
-        weight=(reference_sigma / sighting.sigma_rad) ** 2,
-        reference_sigma=reference_sigma,
-        velocity=sighting.velocity_c,
-        prior_kind=PRIOR_ROTATION if sighting.known_axis is None else PRIOR_DIRECTION,
-        prior_axis=aim.axis if sighting.known_axis is None else sighting.known_axis,
-    )
-    least, most = math.radians(aim.least_deg), math.radians(aim.most_deg)
-    stars = Stars(
-        direction=zone.direction,
-        magnitude=zone.magnitude_mag,
-        grid_start=zone.grid.start,
-        grid_rows=zone.grid.rows,
-        grid_direction=zone.grid.direction,
-        voxels=zone.voxels,
-        axis=aim.axis,
-        least=least,
-        most=most,
-        polar=np.full(len(zone.star), -1.0),
-        log_density=log_density(zone.direction, aim.axis, least, most),
-    )
+    rotation_known = sighting.known_axis is None
     return (
-        seen,
-        stars,
-        Pairs(
-            pairs.separation_rad,
-            pairs.brighter,
-            pairs.dimmer,
-            pairs.bin_start,
-            pairs.bins_per_rad,
-            zone.polar_difference_rad,
-            math.radians(separation_deg(zone.aim.axis, aim.axis)),
-        ),
+        sighting.direction,
+        sighting.magnitude_mag,
+        sighting.sigma_rad,
+        sighting.velocity_c,
+        PRIOR_ROTATION if rotation_known else PRIOR_DIRECTION,
+        aim.axis if rotation_known else sighting.known_axis,
+        zone.direction,
+        zone.magnitude_mag,
+        zone.grid.start,
+        zone.grid.rows,
+        zone.grid.direction,
+        zone.voxels,
+        aim.axis,
+        math.radians(aim.least_deg),
+        math.radians(aim.most_deg),
+        pairs.separation_rad,
+        pairs.rows,
+        pairs.bin_start,
+        pairs.bins_per_rad,
+        zone.polar_difference_rad,
+        math.radians(separation_deg(zone.aim.axis, aim.axis)),
     )
+
+
+@njit(cache=True, nogil=True)
+def _scene(  # type: ignore[no-untyped-def]
+    observed,
+    observed_magnitude,
+    sigma_rad,
+    velocity,
+    prior_kind,
+    prior_axis,
+    direction,
+    magnitude,
+    grid_start,
+    grid_rows,
+    grid_direction,
+    voxels,
+    axis,
+    least,
+    most,
+    pair_separation,
+    pair_rows,
+    bin_start,
+    bins_per_rad,
+    polar_difference,
+    off_axis,
+):
+    reference_sigma = sigma_rad.min()
+    weight = np.empty(len(sigma_rad))
+    for k in range(len(sigma_rad)):
+        ratio = reference_sigma / sigma_rad[k]
+        weight[k] = ratio * ratio
+    seen = Seen(
+        observed,
+        observed_magnitude,
+        sigma_rad,
+        weight,
+        reference_sigma,
+        velocity,
+        prior_kind,
+        prior_axis,
+    )
+    stars = Stars(
+        direction,
+        magnitude,
+        grid_start,
+        grid_rows,
+        grid_direction,
+        voxels,
+        axis,
+        least,
+        most,
+        np.full(len(direction), -1.0),
+        log_density(direction, axis, least, most),
+    )
+    pairs = Pairs(
+        pair_separation,
+        pair_rows[0],
+        pair_rows[1],
+        bin_start,
+        bins_per_rad,
+        polar_difference,
+        off_axis,
+    )
+    return seen, stars, pairs
+
+
+@njit(cache=True, nogil=True)
+def _weigh(  # type: ignore[no-untyped-def]
+    observed,
+    observed_magnitude,
+    sigma_rad,
+    velocity,
+    prior_kind,
+    prior_axis,
+    direction,
+    magnitude,
+    grid_start,
+    grid_rows,
+    grid_direction,
+    voxels,
+    axis,
+    least,
+    most,
+    pair_separation,
+    pair_rows,
+    bin_start,
+    bins_per_rad,
+    polar_difference,
+    off_axis,
+    exhaustive,
+    star,
+    probability,  # (2, n) of the likeliest star, and of none
+    rivals,
+    likely,
+):
+    """Search and marginals of a scene in one call; whether the search was bounded."""
+    n = len(observed)
+    star[:], probability[0], probability[1] = -1, 0.0, 1.0
+    rivals[:], likely[:] = -1, 0.0
+    if n < 2 or len(direction) < 2:
+        return False
+    seen, stars, pairs = _scene(
+        observed,
+        observed_magnitude,
+        sigma_rad,
+        velocity,
+        prior_kind,
+        prior_axis,
+        direction,
+        magnitude,
+        grid_start,
+        grid_rows,
+        grid_direction,
+        voxels,
+        axis,
+        least,
+        most,
+        pair_separation,
+        pair_rows,
+        bin_start,
+        bins_per_rad,
+        polar_difference,
+        off_axis,
+    )
+    ledger, log_weight = np.empty((MAX_HYPOTHESES, n), np.int32), np.empty(MAX_HYPOTHESES)
+    count, rest, _, bounded = search(seen, stars, pairs, exhaustive, ledger, log_weight)
+    marginals(ledger, log_weight, count, rest, star, probability[0], probability[1], rivals, likely)
+    return bounded

@@ -204,6 +204,11 @@ class Tracker(Strict):
         return read_only(u @ vt)
 
     @cached_property
+    def least_cosine(self) -> float:
+        """The cosine of the angle to the boresight at the edge of the field of view."""
+        return math.cos(math.radians(self.field_of_view_radius_deg))
+
+    @cached_property
     def boresight_body(self) -> Vector:
         """The boresight (3,) in body axes: the last column of the alignment."""
         return read_only(self.body_from_tracker[:, 2].copy())

@@ -56,7 +56,7 @@ def _corrected(
     # The same for every tracker and batch, so that they are compiled once.
     given = (
         tracker.body_from_tracker,
-        math.cos(math.radians(tracker.field_of_view_radius_deg)),
+        tracker.least_cosine,
         tracker.sigma_arcsec,
         rates_deg_per_s,
         stars.time_offset_s,

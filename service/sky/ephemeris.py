@@ -70,8 +70,8 @@ def observer_velocity(time: Utc, velocity_km_per_s: npt.ArrayLike | None) -> Vec
     if velocity_km_per_s is None:
         # Of one kind with the sum below: kernels are compiled for either.
         return velocity.copy()
-    own_velocity: Vector = np.asarray(velocity_km_per_s) / LIGHT_KM_PER_S
-    return np.add(velocity, own_velocity)
+    total: Vector = velocity + np.divide(velocity_km_per_s, LIGHT_KM_PER_S)
+    return total
 
 
 def sun_distance_au(time: Utc) -> float:

@@ -13,6 +13,7 @@ from service.missions.mission import (
     load_missions,
     mission_named,
     parse_mission,
+    rules_of,
 )
 
 XTE = (SHIPPED_FOLDER / "xte.toml").read_text(encoding="utf-8")
@@ -176,3 +177,28 @@ def test_without_a_word_on_tests_the_paper_s_three_are_on_and_the_pole_s_in_band
         tests = parse_mission(without_tests(text), "x.toml").tests
         assert (tests.magnitude, tests.cross_product, tests.pole) == (True, True, pole)
         assert (tests.fov_rotation, tests.match_groups) == (False, False)
+
+
+def test_a_changed_copy_keeps_nothing_that_was_worked_out_from_the_old_values(missions):
+    mission = missions["XTE"]
+    for old in (mission, mission.model_copy()):
+        assert old.rules.limits[1] == 0.6
+        tolerances = old.tolerances.model_copy(update={"magnitude_mag": 0.9})
+        changed = old.model_copy(update={"tolerances": tolerances})
+        assert changed.rules.limits[1] == 0.9
+        assert changed.digest != old.digest
+        assert changed.model_copy(update={"tolerances": old.tolerances}).digest == old.digest
+
+
+def test_rules_hold_every_tolerance_and_test_as_the_kernels_read_them(missions):
+    tolerances, tests = missions["SOHO"].tolerances, missions["SOHO"].tests
+    names = list(type(tolerances).model_fields)[1:]
+    for place, name in enumerate(names):
+        other = tolerances.model_copy(update={name: getattr(tolerances, name) + 1.0})
+        apart = rules_of(other, tests).limits - missions["SOHO"].rules.limits
+        assert np.flatnonzero(apart).tolist() == [place]
+        assert apart[place] == pytest.approx(math.radians(1.0) if "deg" in name else 1.0)
+    for place, name in enumerate(list(type(tests).model_fields)[:4]):
+        other = tests.model_copy(update={name: not getattr(tests, name)})
+        apart = rules_of(tolerances, other).switches != missions["SOHO"].rules.switches
+        assert np.flatnonzero(apart).tolist() == [place]

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.sky.shelf import Shelf
-from service.sky.zones import Aim, build_zone, snapped, zone_for
+from service.sky.zones import Aim, build_zone, counts_within, snapped, zone_for
 from service.vectors import angle_between_deg, from_ra_dec, unit
 from tests.reference.small_sky import run_catalog
 
@@ -82,6 +82,8 @@ def test_the_shelf_s_zone_holds_every_star_of_the_exact_one(seed, aim, grid_deg)
     assert not cached
     assert set(exact.star.tolist()) <= set(wide.star.tolist())
     assert exact.star.tolist() == within(catalog, aim.axis, aim.least_deg, aim.most_deg)
+    assert counts_within(wide, aim) == counts_within(exact, aim)
+    assert counts_within(exact, aim) == (len(exact.star), exact.pairs.count)
 
 
 def test_aims_of_one_grid_cell_share_a_zone_and_others_do_not():
