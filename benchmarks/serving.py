@@ -9,7 +9,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,14 +26,25 @@ class Served:
     ready_s: float
 
     def cpu_s(self) -> float:
-        """Processor time so far."""
-        fields = _stat(self.pid)
-        return (int(fields[11]) + int(fields[12])) / _TICKS
+        """Processor time so far, of the processes that it started as well."""
+        return sum(int(each) for pid in self._pids() for each in _stat(pid)[11:13]) / _TICKS
 
     def resident_mb(self) -> float:
-        """Memory that is held."""
-        pages = int(Path(f"/proc/{self.pid}/statm").read_text().split()[1])
+        """Memory that is held, by what it started as well; what is shared counts each time."""
+        pages = sum(int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in self._pids())
         return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+    def _pids(self) -> list[int]:
+        """The server and whatever it started, however far down."""
+        parents = {}
+        for each in Path("/proc").iterdir():
+            if each.name.isdigit():
+                with suppress(OSError):
+                    parents[int(each.name)] = int(_stat(int(each.name))[1])
+        found = [self.pid]
+        for pid in found:
+            found += [child for child, parent in parents.items() if parent == pid]
+        return found
 
     def address(self, path: str) -> str:
         return f"http://127.0.0.1:{self.port}{path}"

@@ -8,12 +8,15 @@ import logging
 import math
 import threading
 import time
+from asyncio import wrap_future
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
+from contextlib import AbstractContextManager, ExitStack
 from functools import partial
-from typing import IO
+from typing import IO, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
+from sqlalchemy import Connection
 
 from service import __version__
 from service.acquire import Choices, choices_of
@@ -36,6 +39,7 @@ from service.imaging.marks import marks_of
 from service.imaging.overlay import draw_overlay
 from service.imaging.submit import FrameIn, submission_of_frame
 from service.missions.mission import Mission, load_missions, mission_named
+from service.observe.compressed import Coding, unpacked_lines
 from service.observe.wire import (
     APrioriIn,
     OptionsIn,
@@ -74,7 +78,7 @@ from service.records.recording import register, watch_run
 from service.records.replays import Replay, list_replays, mark_interrupted, read_replay
 from service.records.reprocess import Plan, Progress, reprocess
 from service.records.star_field import star_field_of
-from service.records.store import Store
+from service.records.store import Readers, Store
 from service.records.tokens import Caller
 from service.records.watching import is_due, latest_inputs, shelf_end, sweep
 from service.records.workers import Equipment
@@ -113,6 +117,8 @@ FRAME_WAIT_S, FRAME_RETRY_S = 30.0, 5
 
 _RUN_NAME = TypeAdapter(RunName)
 
+T = TypeVar("T")
+
 
 class Operations:
     """Everything the service does, over one sky, one set of missions and one database.
@@ -128,7 +134,8 @@ class Operations:
         self.missions = missions
         self.sky = sky
         self.store = store
-        self.access = Access(store, is_loopback(settings.host), utc_now)
+        self.readers: Readers = store
+        self.access = Access(self.reading, self.change, is_loopback(settings.host), utc_now)
         self._intake = Intake(missions, sky, store)
         equipment = Equipment(
             missions, settings.catalog, sky.catalog.digest, settings.shelf_mb << 20
@@ -209,14 +216,13 @@ class Operations:
                 self._look_where_they_look()
                 # What is there by now stays: to go through it again and again costs more than
                 # a batch does.
-                gc.collect()
                 gc.freeze()
                 self._warm = True
             finally:
                 gc.enable()
                 self._warming.release()
         self.store.writer.require()
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             connection.exec_driver_sql("SELECT 1")
 
     def _look_where_they_look(self) -> None:
@@ -224,7 +230,7 @@ class Operations:
 
         A batch of each is rehearsed, all but kept, under a name that it does not have.
         """
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             inputs = latest_inputs(connection)
         for text in inputs:
             try:
@@ -234,6 +240,27 @@ class Operations:
             except Exception as error:
                 # One that cannot be run any more is no reason not to start.
                 log.warning("the latest batch of a spacecraft could not be rehearsed: %s", error)
+
+    async def attach(self) -> None:
+        """Be asked from an event loop from now on."""
+
+    def reading(self) -> AbstractContextManager[Connection]:
+        """A connection that sees one moment of the database; see `Readers.reading`."""
+        return self.readers.reading()
+
+    def change(self, change: Callable[[Connection], T]) -> T:
+        """Have something changed in the database, whole or not at all, and wait until it is."""
+        return self.store.writer.change(change).result()
+
+    def listen(self, listener: Callable[[], object]) -> None:
+        """Have a function called, from any thread, whenever something was written."""
+        self.store.writer.after_commit.append(listener)
+        self._intake.after_group.append(listener)
+
+    def unlisten(self, listener: Callable[[], object]) -> None:
+        """Have it called no more."""
+        self.store.writer.after_commit.remove(listener)
+        self._intake.after_group.remove(listener)
 
     # ---- batches -----------------------------------------------------------------------------
 
@@ -263,7 +290,7 @@ class Operations:
         to ask about its spacecraft.
         """
         done: Future[Answered] = Future()
-        # A request that is given up does not take its record back.
+        # Who gives up does not take the record back.
         done.set_running_or_notify_cancel()
 
         def settle(outcome: Answered | Exception) -> None:
@@ -274,6 +301,16 @@ class Operations:
 
         self._intake.take([Asked(sent, idempotency_key, settle, caller)])
         return done
+
+    def take_all(self, asked: Sequence[Asked]) -> None:
+        """`take` of many at once, each of which says who is called with its outcome."""
+        self._intake.take(asked)
+
+    async def answered(
+        self, sent: bytes, idempotency_key: str | None = None, caller: Caller | None = None
+    ) -> Answered:
+        """`take` for an event loop, which does other things meanwhile."""
+        return await wrap_future(self.take(sent, idempotency_key, caller))
 
     def submit_many(self, submissions: Sequence[Submission]) -> list[Answered | AcquisitionError]:
         """`submit` of each in one transaction; an error stands in the place of what is refused."""
@@ -289,9 +326,16 @@ class Operations:
         """Find the stars on a frame, then `submit` the batch of them; see `imaging.submit`.
 
         The same frame, told the same of, is a repeat and is not looked at again.
+        The file is closed at the end.
         Raises `NotFound` for an unknown spacecraft, `BadInput` for a file that is no
         frame of its tracker's, and whatever `submit` raises.
         """
+        with file:
+            return self._submit_frame(spacecraft, known, file, idempotency_key)
+
+    def _submit_frame(
+        self, spacecraft: str, known: FrameIn, file: IO[bytes], idempotency_key: str | None
+    ) -> Answered:
         mission = mission_named(self.missions, spacecraft)
         digest = digest_of(file)
 
@@ -313,7 +357,7 @@ class Operations:
 
     def overlay(self, id: str) -> bytes:
         """A PNG of the frame that a result was made of, with what was made of it."""
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             row = reading.frame_behind(connection, _known(id, "batch"))
         # As it was for that result, whatever its file says now.
         mission = Mission.model_validate_json(row["settings"])
@@ -340,12 +384,12 @@ class Operations:
 
     def batch(self, id: str) -> Row:
         """One result: `answer`, `input`, `current`, `parent`, and the `what_ifs` of its batch."""
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return reading.whole_record(connection, _known(id, "batch"))
 
     def neighbours(self, id: str) -> Row:
         """The results before and after one in time: `earlier` and `later`, or None."""
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return neighbours(connection, _known(id, "batch"))
 
     def star_field(self, id: str, answer: Row | None = None) -> Row:
@@ -354,7 +398,7 @@ class Operations:
         An `answer` in place of the recorded one, such as that of a what-if, is
         drawn over the same batch.
         """
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             batch, recorded = recorded_batch(connection, _known(id, "batch"))
             answer = answer or recorded
             mission = recorded_mission(connection, answer["provenance"]["mission"])
@@ -362,7 +406,7 @@ class Operations:
 
     def settings_for(self, id: str) -> Choices:
         """The settings that a what-if of a result begins from."""
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             batch, _ = recorded_batch(connection, _known(id, "batch"))
         return choices_of(batch, mission_named(self.missions, batch.spacecraft))
 
@@ -384,7 +428,7 @@ class Operations:
         Raises `BadBatch` for a spacecraft that has neither batches nor a mission.
         """
         stretch = Stretch(None if run == ALL_RUNS else run or LIVE, spacecraft, start, end)
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             page = reading.list_batches(
                 connection, stretch, outcome=outcome, status=status, limit=limit, cursor=cursor
             )
@@ -397,21 +441,21 @@ class Operations:
         """The spacecraft that a recorded result belongs to; None where there is no such result."""
         if not is_ulid(id):
             return None
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return reading.spacecraft_of(connection, id)
 
     # ---- access ------------------------------------------------------------------------------
 
     def audit(self, limit: int = 100, cursor: str | None = None) -> Page:
         """Who changed what, newest first."""
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return audit.list_entries(connection, limit, cursor)
 
     # ---- spacecraft --------------------------------------------------------------------------
 
     def overview(self, run: str | None = None) -> Row:
         """Every spacecraft in a run at a glance; see `overview.overview`."""
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             missions = self.missions.values()
             return overview.overview(connection, missions, run or LIVE, utc_now())
 
@@ -421,7 +465,7 @@ class Operations:
         return {
             "version": __version__,
             "started": self.started.text,
-            "database": self.store.url.get_backend_name(),
+            "database": self.readers.url.get_backend_name(),
             "catalog": {
                 "digest": catalog.digest,
                 "name": catalog.name,
@@ -436,13 +480,13 @@ class Operations:
 
     def default_run(self) -> str:
         """The run to look at first: live, or while that is empty the newest."""
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return overview.default_run(connection)
 
     def spacecraft(self, run: str | None = None) -> list[Row]:
         """Every spacecraft that has a mission file, with its state in a run."""
         moment = utc_now()
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return [
                 histories.live_state(connection, mission, run or LIVE, moment)
                 for mission in self.missions.values()
@@ -451,7 +495,7 @@ class Operations:
     def spacecraft_state(self, name: str, run: str | None = None) -> Row:
         """One spacecraft's state in a run, its mission's settings and their history."""
         mission = mission_named(self.missions, name)
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return {
                 **histories.live_state(connection, mission, run or LIVE, utc_now()),
                 "mission": {"digest": mission.digest, "settings": mission.model_dump(mode="json")},
@@ -471,7 +515,7 @@ class Operations:
         """The attitudes of current results, oldest batch time first."""
         mission_named(self.missions, name)
         stretch = Stretch(run or LIVE, name, start, end)
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return histories.list_attitudes(connection, stretch, limit=limit, cursor=cursor)
 
     def rates(
@@ -485,7 +529,7 @@ class Operations:
     ) -> list[Row]:
         """Stars by outcome over all observed ones, in UTC hours or days by batch time."""
         mission_named(self.missions, name)
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return rollups.rates(
                 connection, name, run=run or LIVE, start=start, end=end, bucket=bucket
             )
@@ -508,7 +552,7 @@ class Operations:
         """
         mission_named(self.missions, name)
         asked = trends.Asked(tuple(quantities) or TRENDS, strategy, size)
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return trends.history(
                 connection, name, run=run or LIVE, start=start, end=end, asked=asked
             )
@@ -526,7 +570,7 @@ class Operations:
         """The batches of a stretch that are worst by a quantity, with its `value`, worst first."""
         mission_named(self.missions, name)
         stretch = Stretch(run or LIVE, name, start, end)
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return worst_batches(connection, stretch, by, limit)
 
     def advise(
@@ -552,7 +596,7 @@ class Operations:
         if not self._advising.acquire(blocking=False):
             raise Busy("other advice is being worked out", ADVICE_RETRY_S)
         try:
-            with self.store.reading() as connection:
+            with self.reading() as connection:
                 drawn = again.sample(connection, Stretch(run or LIVE, name, start, end), sample)
             began = time.monotonic()
             pace = Pace(lambda share: time.monotonic() - began < share * limit_s, step)
@@ -592,7 +636,7 @@ class Operations:
         if not self._comparing.acquire(blocking=False):
             raise Busy("another comparison is being worked out", COMPARE_RETRY_S)
         try:
-            with self.store.reading() as connection:
+            with self.reading() as connection:
                 drawn = again.sample(connection, Stretch(run or LIVE, name, start, end), sample)
             pairs = [
                 Pair(
@@ -620,13 +664,13 @@ class Operations:
     def limits(self, name: str) -> list[Row]:
         """The limit of every quantity of a spacecraft."""
         mission = mission_named(self.missions, name)
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return limits.list_limits(connection, mission)
 
     def limit(self, name: str, quantity: QuantityName) -> Row:
         """The limit of one quantity, the shipped one, and every one that was set."""
         mission = mission_named(self.missions, name)
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return limits.limit_history(connection, mission, quantity)
 
     def set_limit(
@@ -656,7 +700,7 @@ class Operations:
         cursor: str | None = None,
     ) -> Page:
         """Alarms, newest first; the run `*` stands for every run."""
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return alarms.list_alarms(
                 connection,
                 run=None if run == ALL_RUNS else run or LIVE,
@@ -669,12 +713,12 @@ class Operations:
 
     def active_alarms(self, run: str = LIVE) -> list[Row]:
         """Every alarm of a run that is not cleared, the worst first."""
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return alarms.active_alarms(connection, run, utc_now().text)
 
     def alarm(self, id: str) -> Row:
         """One alarm with all that was noted of it."""
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return alarms.one_alarm(connection, _known(id, "alarm"), utc_now().text)
 
     def acknowledge(self, id: str, who: str, comment: str | None = None) -> Row:
@@ -718,7 +762,7 @@ class Operations:
     def sweep(self) -> bool:
         """Look for silent spacecraft and shelves whose time is over; whether there were any."""
         moment = utc_now()
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             due = is_due(connection, self.missions, moment)
         if due:
             self.store.writer.change(
@@ -730,12 +774,12 @@ class Operations:
 
     def last_event(self) -> int:
         """The number of the latest event."""
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return events.last_event(connection)
 
     def events_after(self, last: int, limit: int) -> Sequence[Event] | None:
         """The events after a number, oldest first; None where some are kept no more."""
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return events.events_after(connection, last, limit)
 
     # ---- zones -------------------------------------------------------------------------------
@@ -784,7 +828,7 @@ class Operations:
 
     def runs(self) -> list[Row]:
         """Every run that holds batches."""
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return histories.list_runs(connection)
 
     def reprocess(
@@ -834,7 +878,7 @@ class Operations:
         end: Utc | None = None,
     ) -> Row:
         """What became of the same stars in two runs, and how far the attitudes differ."""
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return compare_runs(connection, Stretch(run, spacecraft, start, end), other)
 
     def watch_run(self, run: str, alarms: bool = True) -> Row:
@@ -881,14 +925,37 @@ class Operations:
         replay.start(lines)
         return str(row["id"])
 
+    def start_replay_of(
+        self,
+        file: IO[bytes],
+        coding: Coding,
+        run: str,
+        *,
+        name: str,
+        total: int | None,
+        longest_bytes: int,
+        check: Callable[[Submission], None],
+        alarms: bool = False,
+    ) -> str:
+        """`start_replay` of the lines of a file, which is closed at the end.
+
+        Of a line with more than `longest_bytes` the rest is not read.
+        """
+        with ExitStack() as on_failure:
+            on_failure.callback(file.close)
+            lines = unpacked_lines(file, coding, longest_bytes)
+            id = self.start_replay(lines, run, name, total, check, alarms)
+            on_failure.pop_all()
+        return id
+
     def replays(self) -> list[Row]:
         """The latest replays and how far they are, newest first."""
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return list_replays(connection)
 
     def replay(self, id: str) -> Row:
         """A replay and how far it is, with the lines that were refused."""
-        with self.store.reading() as connection:
+        with self.reading() as connection:
             return read_replay(connection, _known(id, "replay"))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from service.acquire import IDENTIFIERS, acquire
 from service.identify.presumed import aim_of, presumed_attitude
-from service.missions.mission import Band, Mission
+from service.missions.mission import Band, Identifier, Mission
 from service.observe.batch import APriori, BoresightPrior, SunPointedPrior
 from service.observe.wire import submission_from_json
 from service.sky.shelf import Shelf
@@ -19,8 +19,13 @@ from service.sky.zones import Zone
 from service.times import Utc, parse_utc
 from service.vectors import quaternion_from_matrix
 
-BRIGHT_MAG = 5.5
-"""So few stars are enough for every kernel, and take a quarter of the time to be built from."""
+ORION = 84.0, -1.0
+"""Where there are many bright stars: right ascension and declination, in degrees."""
+BRIGHT_MAG = 4.0
+"""So few stars are enough for every kernel, and are soon built from."""
+BRIGHTEST_MAG = 3.0
+"""And so few where every pair and every patch of the whole sky is to be indexed."""
+WHOLE_SKY: frozenset[Identifier] = frozenset({"lost_in_space", "ptp"})
 
 
 def warm_zones(sky: Sky, mission: Mission, prior: APriori, time: Utc) -> list[Zone]:
@@ -47,14 +52,15 @@ def warm_up(sky: Sky, missions: Mapping[str, Mission]) -> None:
     moment = parse_utc("2000-01-01T12:00:00Z")
     # Large enough that nothing is built twice on the way.
     apart = Sky(sky.catalog, Shelf(max_bytes=256 << 20))
-    kinds = {mission.zone.kind: _of_bright_stars(mission) for mission in missions.values()}
-    first = next(iter(kinds.values()), None)
-    for mission in kinds.values():
+    kinds = {mission.zone.kind: mission for mission in missions.values()}
+    first = next(iter(kinds), None)
+    for kind, given in kinds.items():
+        mission = _of_bright_stars(given, BRIGHT_MAG)
         tracker = mission.trackers[0]
         attitude = presumed_attitude(
             SunPointedPrior(None, None)
             if isinstance(mission.zone, Band)
-            else BoresightPrior(0.0, 0.0),
+            else BoresightPrior(*ORION),
             moment,
             mission,
         ).attitude
@@ -81,16 +87,17 @@ def warm_up(sky: Sky, missions: Mapping[str, Mission]) -> None:
             ],
         }
         for identifier in IDENTIFIERS:
-            if identifier in ("lost_in_space", "ptp") and mission is not first:
-                continue  # the same kernels, and an index of the whole sky to build
+            if identifier in WHOLE_SKY and kind != first:
+                continue  # the same kernels
             # Through the door that batches come by: kernels are compiled for arrays of its kind.
             options = {"identifier": identifier, "zone_grid_deg": 0.0}
             batch = submission_from_json(json.dumps(body | {"options": options})).batch
-            acquire(batch, mission, apart)
+            indexed = identifier == "lost_in_space"
+            acquire(batch, _of_bright_stars(given, BRIGHTEST_MAG) if indexed else mission, apart)
 
 
-def _of_bright_stars(mission: Mission) -> Mission:
-    limit_mag = min(BRIGHT_MAG, mission.catalog.magnitude_limit_mag)
+def _of_bright_stars(mission: Mission, to_mag: float) -> Mission:
+    limit_mag = min(to_mag, mission.catalog.magnitude_limit_mag)
     settings = mission.catalog.model_copy(update={"magnitude_limit_mag": limit_mag})
     return mission.model_copy(update={"catalog": settings})
 

@@ -44,9 +44,14 @@ def serve(parsed: Namespace) -> int:
     # What is loaded on the way stays: to look through it for what does not, again and again,
     # takes a sixth of the start.  Once it is ready the service looks again.
     gc.disable()
+    settings = settings_of(parsed)
+    from service.backend.start import start_backend
+
+    # It loads its part while this process loads the server.
+    started = start_backend(settings)
     from service.web.server import serve as serve_forever
 
-    serve_forever(settings_of(parsed))
+    serve_forever(settings, started)
     return 0
 
 

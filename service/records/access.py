@@ -8,12 +8,16 @@ every process a second later at most.
 import threading
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from sqlalchemy import Connection
 
 from service.errors import NotAdmitted, TooOften
 from service.records import audit, tokens
 from service.records.ids import Ulids
-from service.records.store import Store
 from service.records.tokens import SCOPES, Caller
 from service.times import Utc, shifted
 
@@ -25,6 +29,8 @@ MAX_KNOWN = 10_000
 LEAST_BURST = 5.0
 
 Now = Callable[[], Utc]
+Reading = Callable[[], AbstractContextManager[Connection]]
+Change = Callable[[Callable[[Connection], Any]], Any]
 
 
 @dataclass
@@ -38,9 +44,12 @@ class _Bucket:
 class Access:
     """The one place that knows who a caller is."""
 
-    def __init__(self, store: Store, loopback: bool, now: Now) -> None:
-        """`loopback`: whether the service listens to this machine alone."""
-        self._store = store
+    def __init__(self, reading: Reading, change: Change, loopback: bool, now: Now) -> None:
+        """`reading` gives a connection, `change` has one changed and waits until that is stored.
+
+        `loopback`: whether the service listens to this machine alone.
+        """
+        self._reading, self._change = reading, change
         self._loopback = loopback
         self._now = now
         self._ids = Ulids()
@@ -64,7 +73,7 @@ class Access:
 
     def has_tokens(self) -> bool:
         """Whether a token was ever made."""
-        with self._store.reading() as connection:
+        with self._reading() as connection:
             return tokens.any_token(connection)
 
     def known(self, token: str | None, session: str | None) -> Caller | None:
@@ -91,7 +100,7 @@ class Access:
         if known is not None and clock_s < known[1]:
             return known[0]
         look_up = tokens.holder_of if kind == "token" else tokens.session_holder
-        with self._store.reading() as connection:
+        with self._reading() as connection:
             caller = look_up(connection, digest, self._now().text)
         with self._lock:
             self._known.pop(key, None)
@@ -124,32 +133,30 @@ class Access:
             raise NotAdmitted("there is nothing to sign in to")
         token_id, secret, begun = caller.token_id, tokens.new_secret(), self._now()
         expires = shifted(begun, tokens.SESSION_H * 3600)
-        self._store.writer.change(
-            lambda connection: tokens.add_session(
-                connection,
+        self._change(
+            partial(
+                tokens.add_session,
                 secret=secret,
                 token_id=token_id,
                 created=begun.text,
                 expires=expires.text,
             )
-        ).result()
+        )
         return secret, caller
 
     def sign_out(self, session: str) -> None:
         """End a browser's session."""
         digest = tokens.digest_of(session)
-        self._store.writer.change(
-            lambda connection: tokens.end_session(connection, digest)
-        ).result()
+        self._change(partial(tokens.end_session, digest=digest))
         with self._lock:
             self._known.pop(("session", digest), None)
 
     def note(self, who: str, action: str, about: str, body: str | None, status: int) -> None:
         """Add to the list of what was changed; returns once that is stored."""
         id, moment = self._ids.new(), self._now().text
-        self._store.writer.change(
-            lambda connection: audit.note(
-                connection,
+        self._change(
+            partial(
+                audit.note,
                 id=id,
                 moment=moment,
                 who=who,
@@ -158,4 +165,4 @@ class Access:
                 body=body,
                 status=status,
             )
-        ).result()
+        )

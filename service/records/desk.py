@@ -24,7 +24,7 @@ MAX_WAITING = 2_000
 TAKEN_AT_ONCE = 64
 HANDED_ON_S = 0.01
 """What is computed goes to the writer after so long, however much else waits."""
-LONG_S = 0.01
+LONG_S = 0.05
 """What has waited so long is taken by another thread."""
 WAIT_S = 5.0
 """The longest that an order may wait for its turn."""

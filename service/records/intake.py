@@ -90,7 +90,10 @@ class Intake:
         self._store = store
         self._running = Running()
         self._desk = Desk(
-            self._stored_orders, self._bench.draft, self._written, self._bench.processors
+            self._stored_orders,
+            self._bench.draft,
+            partial(self._written, tell=False),
+            self._bench.processors,
         )
         self.observers: list[Observer] = []
         """Called with every batch that is new, after its commit."""
@@ -265,12 +268,12 @@ class Intake:
     def _write(self, drafts: Sequence[Draft]) -> Answers:
         return _decided(self._written(drafts))
 
-    def _written(self, drafts: Sequence[Draft]) -> Results:
+    def _written(self, drafts: Sequence[Draft], tell: bool = True) -> Results:
         """What became of each draft, when all are recorded."""
         if not drafts:
             return []
         _hand(drafts)
-        return self._told(drafts, self._store.writer.record_here(drafts))
+        return self._told(drafts, self._store.writer.record_here(drafts, tell))
 
     def _begin_writing(
         self, drafts: Sequence[Draft], patient: bool = False

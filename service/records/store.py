@@ -20,27 +20,13 @@ log = logging.getLogger(__name__)
 _WAL_RESET_BUG = (3, 7, 0), (3, 51, 2)
 
 
-class Store:
-    """The one connection that writes, behind its thread, and the readers."""
+class Readers:
+    """Connections that see one moment of a database each, and cannot write."""
 
     def __init__(self, database: str) -> None:
-        """Open a database: SQLite is created and migrated, PostgreSQL must be up to date.
-
-        Raises `BadConfiguration` with what to do.
-        """
+        """Nothing is connected yet; raises `BadConfiguration` for what is no database's URL."""
         self.url = database_url(database)
-        self._writing = writing_engine(self.url)
-        try:
-            if self.url.drivername == "sqlite":
-                bring_up_to_date(self._writing)
-                _warn_of_old_sqlite()
-            else:
-                require_up_to_date(self._writing)
-        except BaseException:
-            self._writing.dispose()
-            raise
         self._readers = reading_engine(self.url)
-        self.writer = Writer(self._writing)
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
@@ -60,10 +46,36 @@ class Store:
             raise Busy("the database cannot be read now", RETRY_AFTER_S) from error
 
     def close(self) -> None:
+        """Let go of the database."""
+        self._readers.dispose()
+
+
+class Store(Readers):
+    """The one connection that writes, behind its thread, and the readers."""
+
+    def __init__(self, database: str) -> None:
+        """Open a database: SQLite is created and migrated, PostgreSQL must be up to date.
+
+        Raises `BadConfiguration` with what to do.
+        """
+        self._writing = writing_engine(database_url(database))
+        try:
+            if self._writing.dialect.name == "sqlite":
+                bring_up_to_date(self._writing)
+                _warn_of_old_sqlite()
+            else:
+                require_up_to_date(self._writing)
+        except BaseException:
+            self._writing.dispose()
+            raise
+        super().__init__(database)
+        self.writer = Writer(self._writing)
+
+    def close(self) -> None:
         """Write what is queued, then let go of the database."""
         self.writer.close()
         # The writer goes last: the last connection to leave checkpoints the log.
-        self._readers.dispose()
+        super().close()
         self._writing.dispose()
 
 

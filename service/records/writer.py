@@ -49,7 +49,7 @@ class Writer:
         self._changed = threading.Condition()
         self._turn = threading.Lock()
         self.after_commit: list[Callable[[], object]] = []
-        """Called, without being waited for long, when something was written."""
+        """Called, without being waited for long, when something may have been written."""
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
         self._thread.start()
 
@@ -65,13 +65,18 @@ class Writer:
         """
         return self._put(Job(drafts=drafts), self._patient if patient else self._queue)
 
-    def record_here(self, drafts: Sequence[Draft]) -> Results:
-        """`record`, in the thread that asks, as soon as nothing else is being written."""
+    def record_here(self, drafts: Sequence[Draft], tell: bool = True) -> Results:
+        """`record`, in the thread that asks, as soon as nothing else is being written.
+
+        Without `tell` those who listen for commits hear of it from who asks.
+        """
         job = Job(drafts=drafts)
         job.done.set_running_or_notify_cancel()
         with self._turn:
             self.require()
             self._settle([job])
+        if tell:
+            self._tell()
         results: Results = job.done.result()
         return results
 
@@ -127,6 +132,7 @@ class Writer:
             while jobs := self._take():
                 with self._turn:
                     self._settle(jobs)
+                self._tell()
         finally:
             # Empty after closing in order; else nobody shall wait for what nobody will write.
             with self._changed:
@@ -152,6 +158,8 @@ class Writer:
                 job.done.set_exception(outcome)
             else:
                 job.done.set_result(outcome)
+
+    def _tell(self) -> None:
         for told in self.after_commit:
             try:
                 told()

@@ -66,6 +66,7 @@ def create_app(operations: Operations, limits: Limits = DEFAULT_LIMITS) -> FastA
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         anyio.to_thread.current_default_thread_limiter().total_tokens = WORKER_THREADS
+        await operations.attach()
         warming = threading.Thread(target=_warm_up, args=(operations,), name="warm-up")
         warming.start()
         await app.state.live.start()

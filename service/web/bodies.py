@@ -18,8 +18,8 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 
 from service.errors import BadBatch, BadInput, Fault
+from service.observe.compressed import Coding
 from service.observe.wire import faults_of
-from service.web.compressed import Coding
 from service.web.errors import NotJson
 
 JSON = "application/json"

@@ -58,7 +58,7 @@ class Live:
         loop = asyncio.get_running_loop()
         self._last = await self._read(self._operations.last_event)
         self._on_commit = lambda: loop.call_soon_threadsafe(self._poke.set)
-        self._operations.store.writer.after_commit.append(self._on_commit)
+        self._operations.listen(self._on_commit)
         self._task = asyncio.create_task(self._follow())
 
     def stop(self) -> None:
@@ -69,7 +69,7 @@ class Live:
     async def close(self) -> None:
         """Stop following."""
         self.stop()
-        self._operations.store.writer.after_commit.remove(self._on_commit)
+        self._operations.unlisten(self._on_commit)
         if self._task is not None:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)

@@ -28,24 +28,26 @@ class _Zones(Collector):
         self._operations = operations
 
     def collect(self) -> Iterator[Metric]:
-        shelf = self._operations.sky.shelf.state()
+        shelf = self._operations.zones()
         yield CounterMetricFamily(
-            "starid_zone_cache_hits", "Zones and run catalogs found in the cache.", value=shelf.hits
+            "starid_zone_cache_hits",
+            "Zones and run catalogs found in the cache.",
+            value=shelf["hits"],
         )
         yield CounterMetricFamily(
             "starid_zone_cache_misses",
             "Zones and run catalogs built.",
-            value=shelf.misses,
+            value=shelf["misses"],
         )
         yield CounterMetricFamily(
             "starid_zone_build_seconds",
             "Time spent building them.",
-            value=shelf.build_us / 1e6,
+            value=shelf["build_us"] / 1e6,
         )
         yield GaugeMetricFamily(
             "starid_zone_cache_bytes",
             "Memory that the cache holds.",
-            value=shelf.nbytes,
+            value=shelf["bytes"],
         )
 
 

@@ -8,8 +8,9 @@ from contextlib import suppress
 
 import uvicorn
 
+from service.backend.front import Front
+from service.backend.start import Started, start_backend
 from service.errors import BadConfiguration
-from service.operations import Operations
 from service.settings import Settings, is_loopback
 from service.web.app import create_app
 
@@ -22,13 +23,14 @@ GRACE_S = 10
 """How long running requests may still take when the server is told to stop."""
 
 
-def serve(settings: Settings) -> None:
-    """Open the operations and serve until told to stop (SIGINT, SIGTERM).
+def serve(settings: Settings, started: Started | None = None) -> None:
+    """Serve until told to stop (SIGINT, SIGTERM); the operations have a process of their own.
 
+    That process may have been `started` before.
     Raises `BadConfiguration` for a host beyond this machine while there are no
     tokens: nobody would be asked who they are.
     """
-    operations = Operations.open(settings)
+    operations = Front(start_backend(settings) if started is None else started)
     if not is_loopback(settings.host) and not operations.access.has_tokens():
         operations.close()
         raise BadConfiguration(

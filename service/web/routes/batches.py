@@ -1,6 +1,5 @@
 """Batches: submit, list, look at one, try it with other options."""
 
-from asyncio import wrap_future
 from typing import Annotated
 
 from fastapi import APIRouter, Path
@@ -57,7 +56,7 @@ async def submit_batch(request: Request) -> Response:
     key = await idempotency_key(request)
     held = request.app.state
     try:
-        answered = await wrap_future(held.operations.take(body, key, request.state.caller))
+        answered = await held.operations.answered(body, key, request.state.caller)
     except BadInput as error:
         raise refused(body, error) from None
     if answered.replayed:

@@ -1,6 +1,5 @@
 """Named runs, and replays of telemetry files into them."""
 
-from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -19,7 +18,6 @@ from service.web.bodies import (
     ndjson_body,
     read_model,
 )
-from service.web.compressed import unpacked_lines
 from service.web.describe import LOCATION, Gives, described
 from service.web.holding import Held, json_response
 from service.web.queries import NO_QUERY, Query
@@ -104,18 +102,16 @@ def start_replay(
     sent: Annotated[Sent, Depends(_telemetry)], operations: Held, caller: Asking
 ) -> Response:
     """Take a telemetry file, a batch a line, and work through it in the background."""
-    with ExitStack() as on_failure:
-        on_failure.callback(sent.body.file.close)
-        lines = unpacked_lines(sent.body.file, sent.body.coding, MAX_JSON_BYTES)
-        id = operations.start_replay(
-            lines,
-            sent.run,
-            name=sent.run,
-            total=sent.body.lines,
-            check=caller.require,
-            alarms=sent.alarms,
-        )
-        on_failure.pop_all()
+    id = operations.start_replay_of(
+        sent.body.file,
+        sent.body.coding,
+        sent.run,
+        name=sent.run,
+        total=sent.body.lines,
+        longest_bytes=MAX_JSON_BYTES,
+        check=caller.require,
+        alarms=sent.alarms,
+    )
     location = {"Location": f"/api/v1/replays/{id}"}
     return json_response(operations.replay(id), 202, location)
 

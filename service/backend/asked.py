@@ -1,0 +1,82 @@
+"""The words between front and backend."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from service.errors import AcquisitionError
+from service.missions.mission import Mission
+from service.records.draft import Answered
+from service.records.tokens import Caller
+from service.settings import Settings
+from service.times import Utc
+
+Take = tuple[int, bytes, str | None, Caller | None]
+"""A batch that is to be taken: its number, as it was sent, its key, and who is bound to theirs."""
+Outcome = tuple[int, Answered | Exception]
+"""What became of what was asked under a number."""
+
+
+@dataclass(frozen=True)
+class Open:
+    """The first word of the front: open the operations."""
+
+    settings: Settings
+
+
+@dataclass(frozen=True)
+class Opened:
+    """The first word of the backend: what the front needs to know of the operations."""
+
+    missions: Mapping[str, Mission]
+    started: Utc
+
+
+@dataclass(frozen=True)
+class Refused:
+    """The other first word: they cannot be opened."""
+
+    error: AcquisitionError
+
+
+@dataclass(frozen=True)
+class Takes:
+    """Batches that came at once."""
+
+    batches: list[Take]
+
+
+@dataclass(frozen=True)
+class Call:
+    """A method of the operations is to be called; files among what it is given are `Handed`."""
+
+    number: int
+    method: str
+    given: tuple[Any, ...]
+    named: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Close:
+    """The last word of the front: finish what was taken, and end."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What the backend tells together: which batches are new, and what became of what was asked.
+
+    `news`: something was written.
+    """
+
+    recorded: list[Any]
+    outcomes: list[Outcome]
+    news: bool
+
+
+@dataclass(frozen=True)
+class Gave:
+    """What a call gave, or raised."""
+
+    number: int
+    value: Any
+    error: Exception | None

@@ -1,0 +1,99 @@
+"""What goes over the socket between front and backend: pickled objects, each with its length."""
+
+import os
+import pickle
+import socket
+import struct
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import IO, Any
+
+_LENGTH = struct.Struct("<Q")
+_NUMBER = struct.Struct("<Q")
+PIECE_BYTES = 1 << 20
+
+
+def packed(message: object) -> bytes:
+    """A message as it goes over the socket."""
+    body = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
+    return _LENGTH.pack(len(body)) + body
+
+
+class Unpacker:
+    """Puts messages together from the pieces in which they arrive."""
+
+    def __init__(self) -> None:
+        self._held = bytearray()
+
+    def feed(self, piece: bytes) -> Iterator[Any]:
+        """The messages that a piece completes."""
+        self._held += piece
+        while len(self._held) >= _LENGTH.size:
+            end = _LENGTH.size + _LENGTH.unpack_from(self._held)[0]
+            if len(self._held) < end:
+                return
+            with memoryview(self._held) as held:
+                message = pickle.loads(held[_LENGTH.size : end])
+            del self._held[:end]
+            yield message
+
+
+class Channel:
+    """A socket that is written and read by threads that wait for it."""
+
+    def __init__(self, line: socket.socket) -> None:
+        self._line = line
+        self._unpacker = Unpacker()
+        self._waiting: list[Any] = []
+        self._sending = threading.Lock()
+
+    def send(self, message: object) -> None:
+        """Send a message; from any thread."""
+        data = packed(message)
+        with self._sending:
+            self._line.sendall(data)
+
+    def receive(self) -> Any:
+        """The next message; raises `EOFError` where the other side is gone.  One thread asks."""
+        while not self._waiting:
+            piece = self._line.recv(PIECE_BYTES)
+            if not piece:
+                raise EOFError("the other side is gone")
+            self._waiting = list(self._unpacker.feed(piece))
+        return self._waiting.pop(0)
+
+
+@dataclass(frozen=True)
+class Handed:
+    """Stands in a message for a file, which is handed over beside it under a number."""
+
+    number: int
+
+
+class Files:
+    """A socket that hands open files from one process to the other."""
+
+    def __init__(self, line: socket.socket) -> None:
+        self._line = line
+        self._lock = threading.Lock()
+        self._arrived: dict[int, int] = {}
+        self._sent = 0
+
+    def hand(self, file: IO[bytes]) -> Handed:
+        """Hand over a file, its place kept; it is closed here."""
+        with file, self._lock:
+            self._sent += 1
+            number = self._sent
+            socket.send_fds(self._line, [_NUMBER.pack(number)], [file.fileno()])
+        return Handed(number)
+
+    def take(self, handed: Handed) -> IO[bytes]:
+        """The file that was handed over under a number."""
+        with self._lock:
+            while handed.number not in self._arrived:
+                data, descriptors, _, _ = socket.recv_fds(self._line, _NUMBER.size, 1)
+                if not data:
+                    raise EOFError("the other side is gone")
+                self._arrived[_NUMBER.unpack(data)[0]] = descriptors[0]
+            return os.fdopen(self._arrived.pop(handed.number), "rb")

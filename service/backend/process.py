@@ -1,0 +1,140 @@
+"""The backend: a process that opens the operations and does what the front asks for."""
+
+import ctypes
+import gc
+import logging
+import os
+import pickle
+import signal
+import socket
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any
+
+from service.backend.asked import Call, Close, Gave, Open, Opened, Outcome, Refused, Takes, Told
+from service.backend.channel import Channel, Files, Handed
+from service.errors import AcquisitionError
+from service.operations import Operations
+from service.records.draft import Answered
+from service.records.intake import Asked
+
+THREADS = 72
+"""Somewhat more than the front has handlers that may wait for one."""
+TURN_S = 0.001
+"""How long a thread keeps others waiting that want to go on."""
+_DIE_WITH_PARENT = 1
+"""Linux's PR_SET_PDEATHSIG."""
+
+log = logging.getLogger(__name__)
+
+
+def run(line: int, files: int) -> None:
+    """Serve the front at the other end of two sockets, given by their numbers, until it closes."""
+    _end_with_parent()
+    gc.disable()
+    sys.setswitchinterval(TURN_S)
+    channel = Channel(socket.socket(fileno=line))
+    try:
+        first: Open = channel.receive()
+        operations = Operations.open(first.settings)
+    except AcquisitionError as error:
+        channel.send(Refused(error))
+        return
+    except EOFError:
+        return
+    channel.send(Opened(operations.missions, operations.started))
+    Backend(operations, channel, Files(socket.socket(fileno=files))).serve()
+
+
+def _end_with_parent() -> None:
+    # Whoever stops the whole group stops the front, which ends this process in order.
+    for each in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(each, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT, signal.SIGTERM))
+    if sys.platform == "linux":
+        # Also where the front is killed: nothing may go on writing beside its successor.
+        ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
+
+
+class Backend:
+    """Operations that are asked over a channel."""
+
+    def __init__(self, operations: Operations, channel: Channel, files: Files) -> None:
+        self._operations = operations
+        self._channel = channel
+        self._files = files
+        self._threads = ThreadPoolExecutor(THREADS, "call")
+        self._lock = threading.Lock()
+        self._recorded: list[Any] = []
+        self._outcomes: list[Outcome] = []
+        self._news = False
+
+    def serve(self) -> None:
+        """Do what is asked until the front says that it is over, or is gone."""
+        # OBS self._operations.observers.append(self._recorded.append)
+        self._operations.listen(self._tell_news)
+        try:
+            while not isinstance(asked := self._channel.receive(), Close):
+                if isinstance(asked, Takes):
+                    self._take(asked)
+                else:
+                    self._threads.submit(self._call, asked)
+        except (EOFError, OSError):
+            # The front is gone, and with it everybody who waits for an answer.
+            os._exit(1)
+        self._operations.close()
+        self._threads.shutdown()
+        self._tell()
+
+    def _take(self, asked: Takes) -> None:
+        self._operations.take_all(
+            [
+                Asked(sent, key, partial(self._settle, number), caller)
+                for number, sent, key, caller in asked.batches
+            ]
+        )
+
+    def _settle(self, number: int, outcome: Answered | Exception) -> None:
+        with self._lock:
+            self._outcomes.append((number, outcome))
+
+    def _tell_news(self) -> None:
+        self._news = True
+        self._tell()
+
+    def _tell(self) -> None:
+        """Tell the front what there is to tell, all at once."""
+        with self._lock:
+            told = Told(self._recorded[:], self._outcomes, self._news)
+            del self._recorded[: len(told.recorded)]
+            self._outcomes, self._news = [], False
+        if told.recorded or told.outcomes or told.news:
+            self._channel.send(told)
+
+    def _call(self, asked: Call) -> None:
+        try:
+            method = getattr(self._operations, asked.method)
+            given = [self._opened(each) for each in asked.given]
+            named = {name: self._opened(each) for name, each in asked.named.items()}
+            gave = Gave(asked.number, method(*given, **named), None)
+        except Exception as error:
+            gave = Gave(asked.number, None, _portable(error))
+        self._tell()
+        self._channel.send(gave)
+
+    def _opened(self, given: Any) -> Any:
+        return self._files.take(given) if isinstance(given, Handed) else given
+
+
+def _portable(error: Exception) -> Exception:
+    """An error that the front can be told; what cannot be packed is logged here, and named."""
+    if isinstance(error, AcquisitionError):
+        return error
+    log.exception("a call failed")
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        return RuntimeError(repr(error))
+    return error
