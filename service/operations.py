@@ -934,7 +934,7 @@ class Operations:
         name: str,
         total: int | None,
         longest_bytes: int,
-        check: Callable[[Submission], None],
+        check: Check,
         alarms: bool = False,
     ) -> str:
         """`start_replay` of the lines of a file, which is closed at the end.

@@ -7,6 +7,7 @@ from typing import Any
 from service.errors import AcquisitionError
 from service.missions.mission import Mission
 from service.records.draft import Answered
+from service.records.intake import Recorded
 from service.records.tokens import Caller
 from service.settings import Settings
 from service.times import Utc
@@ -68,7 +69,7 @@ class Told:
     `news`: something was written.
     """
 
-    recorded: list[Any]
+    recorded: list[Recorded]
     outcomes: list[Outcome]
     news: bool
 

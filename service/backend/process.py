@@ -18,7 +18,7 @@ from service.backend.channel import Channel, Files, Handed
 from service.errors import AcquisitionError
 from service.operations import Operations
 from service.records.draft import Answered
-from service.records.intake import Asked
+from service.records.intake import Asked, Recorded
 
 THREADS = 72
 """Somewhat more than the front has handlers that may wait for one."""
@@ -67,7 +67,7 @@ class Backend:
         self._files = files
         self._threads = ThreadPoolExecutor(THREADS, "call")
         self._lock = threading.Lock()
-        self._recorded: list[Any] = []
+        self._recorded: list[Recorded] = []
         self._outcomes: list[Outcome] = []
         self._news = False
 

@@ -24,7 +24,7 @@ MAX_WAITING = 2_000
 TAKEN_AT_ONCE = 64
 HANDED_ON_S = 0.01
 """What is computed goes to the writer after so long, however much else waits."""
-LONG_S = 0.05
+LONG_S = 0.02
 """What has waited so long is taken by another thread."""
 WAIT_S = 5.0
 """The longest that an order may wait for its turn."""
@@ -75,7 +75,9 @@ class Desk:
         self._new: deque[Order] = deque()
         self._ready: deque[Order] = deque()
         self._at_work: dict[Identity, list[Order]] = {}
-        self._changed = threading.Condition()
+        lock = threading.RLock()
+        self._changed = threading.Condition(lock)
+        self._step_in = threading.Condition(lock)
         self._active = 0
         self._moved_s = 0.0
         self._quiet = threading.Event()
@@ -84,7 +86,14 @@ class Desk:
         self.after_group: list[Callable[[], object]] = []
         """Called when a group is settled: what is told of it may be told together."""
         self._threads = [
-            threading.Thread(target=self._work, name=f"desk-{number}", daemon=True)
+            threading.Thread(
+                target=self._work,
+                # The first does everything, as long as it keeps up: what it works with lies in
+                # the cache of its processor.
+                args=(self._step_in if number else self._changed,),
+                name=f"desk-{number}",
+                daemon=True,
+            )
             for number in range(threads)
         ]
         for thread in self._threads:
@@ -119,37 +128,49 @@ class Desk:
         """Refuse new orders, work through those that wait, and end the threads."""
         with self._changed:
             self._closing = True
-            self._changed.notify_all()
+            self._notify_all()
         for thread in self._threads:
             thread.join()
 
-    def _work(self) -> None:
-        while self._wait_for_turn():
+    def _notify_all(self) -> None:
+        self._changed.notify_all()
+        self._step_in.notify_all()
+
+    def _work(self, turn: threading.Condition) -> None:
+        while self._wait_for(turn):
             try:
                 self._look(self._taken())
                 self._compute()
             finally:
                 with self._changed:
                     self._active -= 1
-                    if not (self._active or self._new or self._ready):
-                        self._quiet.set()
+                    if not self._active:
+                        if self._new or self._ready:
+                            self._changed.notify()
+                        else:
+                            self._quiet.set()
                     if self._closing:
-                        self._changed.notify_all()
+                        self._notify_all()
 
-    def _wait_for_turn(self) -> bool:
+    def _wait_for(self, turn: threading.Condition) -> bool:
         """Whether there is something to do for this thread; False: there will never be."""
-        with self._changed:
+        with turn:
             while True:
-                first = self._ready or self._new
-                if first and (not self._active or time.monotonic() - self._moved_s > LONG_S):
+                waiting = self._ready or self._new
+                if waiting and self._may_begin(turn):
                     self._active += 1
                     self._moved_s = time.monotonic()
                     # Whoever steps in next must be awake to see how long it takes.
-                    self._changed.notify()
+                    self._step_in.notify()
                     return True
-                if self._closing and not first and not self._active:
+                if self._closing and not waiting and not self._active:
                     return False
-                self._changed.wait(LONG_S if self._active else None)
+                turn.wait(LONG_S if self._active else None)
+
+    def _may_begin(self, turn: threading.Condition) -> bool:
+        if self._active:
+            return time.monotonic() - self._moved_s > LONG_S
+        return turn is self._changed
 
     def _taken(self) -> list[Order]:
         with self._changed:
@@ -211,6 +232,7 @@ class Desk:
                 self._finish([order], [error])
         if not computed:
             return
+        self._moved_s = time.monotonic()
         try:
             outcomes: Sequence[Outcome] = self._write([draft for _, draft in computed])
         except Exception as error:
