@@ -90,7 +90,9 @@ def warm_up(sky: Sky, missions: Mapping[str, Mission]) -> None:
             if identifier in WHOLE_SKY and kind != first:
                 continue  # the same kernels
             # Through the door that batches come by: kernels are compiled for arrays of its kind.
-            options = {"identifier": identifier, "zone_grid_deg": 0.0}
+            # One zone on the mission's grid, where more is to be worked out; the others are small.
+            exact = {} if identifier == "starid" else {"zone_grid_deg": 0.0}
+            options = {"identifier": identifier} | exact
             batch = submission_from_json(json.dumps(body | {"options": options})).batch
             indexed = identifier == "lost_in_space"
             acquire(batch, _of_bright_stars(given, BRIGHTEST_MAG) if indexed else mission, apart)

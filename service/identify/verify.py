@@ -6,11 +6,11 @@ posterior (`search`, `evidence`); a star is unique from a probability of
 """
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Struct
 from numba import njit
 
 from service.identify.evidence import PRIOR_DIRECTION, PRIOR_ROTATION
@@ -26,8 +26,7 @@ UNIQUE_PROBABILITY = 0.999
 _UNMATCHED, _UNIQUE, _AMBIGUOUS = (int(outcome) for outcome in Outcome)
 
 
-@dataclass(frozen=True)
-class Posterior:
+class Posterior(Struct, frozen=True, eq=False, gc=False):
     """What the hypotheses say of each of n stars.
 
     `star` is the likeliest zone row, -1 where there is none, and `probability`
