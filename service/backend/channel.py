@@ -97,3 +97,7 @@ class Files:
                     raise EOFError("the other side is gone")
                 self._arrived[_NUMBER.unpack(data)[0]] = descriptors[0]
             return os.fdopen(self._arrived.pop(handed.number), "rb")
+
+    def close(self) -> None:
+        """Hand over no more."""
+        self._line.close()

@@ -211,20 +211,27 @@ class Front(Operations):
         self._transport = None
         if not self._closing:
             log.error("the process that works on batches has ended; it is started again")
-            threading.Thread(target=self._start_again, name="restart", daemon=True).start()
+            self._backend.process.kill()
+            self._backend.process.wait()
+            self._files.close()
+            # From this thread, which lasts: the backend ends with the thread that starts it.
+            started = start_backend(self.settings)
+            threading.Thread(
+                target=self._go_on, args=(started,), name="restart", daemon=True
+            ).start()
         self._give_up(list(self._waiting))
 
-    def _start_again(self) -> None:
-        self._backend.process.wait()
-        started = start_backend(self.settings)
+    def _go_on(self, started: Started) -> None:
+        """Go on with another backend, once it has opened its operations and is warm."""
         try:
             _handshake(started)
-        except (AcquisitionError, EOFError) as error:
+        except AcquisitionError as error:
             log.error("it could not be started: %s", error)
             return
         assert self._loop is not None
         self._backend, self._files = started, Files(started.files)
         asyncio.run_coroutine_threadsafe(self._connect(), self._loop).result()
+        self.ready()
 
     def close(self) -> None:
         """Let the backend finish what it has taken, and wait until it has ended."""
@@ -234,7 +241,7 @@ class Front(Operations):
         else:
             self._backend.line.close()
         self._backend.process.wait()
-        self._backend.files.close()
+        self._files.close()
         self.readers.close()
 
     def _send_close(self) -> None:

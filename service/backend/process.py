@@ -38,11 +38,12 @@ def run(line: int, files: int) -> None:
     channel = Channel(socket.socket(fileno=line))
     try:
         first: Open = channel.receive()
+    except EOFError:
+        return
+    try:
         operations = Operations.open(first.settings)
     except AcquisitionError as error:
         channel.send(Refused(error))
-        return
-    except EOFError:
         return
     channel.send(Opened(operations.missions, operations.started))
     Backend(operations, channel, Files(socket.socket(fileno=files))).serve()
@@ -73,7 +74,7 @@ class Backend:
 
     def serve(self) -> None:
         """Do what is asked until the front says that it is over, or is gone."""
-        # OBS self._operations.observers.append(self._recorded.append)
+        self._operations.observers.append(self._recorded.append)
         self._operations.listen(self._tell_news)
         try:
             while not isinstance(asked := self._channel.receive(), Close):
