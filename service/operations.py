@@ -948,6 +948,10 @@ class Operations:
             on_failure.pop_all()
         return id
 
+    def replay_processes(self) -> int:
+        """How many processes beside this one are ready to compute replays."""
+        return self._bulk.workers.up
+
     def replays(self) -> list[Row]:
         """The latest replays and how far they are, newest first."""
         with self.reading() as connection:

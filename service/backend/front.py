@@ -48,6 +48,7 @@ ASKED = (
     "drop_zones",
     "overlay",
     "ready",
+    "replay_processes",
     "set_limit",
     "shelve",
     "star_field",

@@ -1,7 +1,8 @@
 """Processes that compute: each has missions and a sky of its own, and never sees the database.
 
 A thread of this process stands beside each worker: hands it a task, waits, and
-unpacks what comes back.  A worker that dies costs its task and is replaced.
+unpacks what comes back.  A worker that dies costs its task and is replaced; one
+that has had nothing to do for long gives its memory back, until it is wanted.
 """
 
 import atexit
@@ -37,6 +38,7 @@ NICENESS = 10
 """Whoever waits for one answer goes first."""
 PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0
 """Before a worker is started in place of one that died before it was ready: twice as long each."""
+IDLE_S = 600.0
 
 _CONTEXT = multiprocessing.get_context("spawn")
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -76,7 +78,7 @@ class _Order(Generic[Task, Found]):
 
 
 class Workers(Generic[Task, Found]):
-    """Workers that do one kind of work; they are started by `start` and end with `close`."""
+    """Workers that do one kind of work, from the first `start` to `close`."""
 
     def __init__(self, equipment: Equipment, work: "Work[Task, Found]", count: int) -> None:
         """`work` is a function of a module, so that a worker finds it by its name."""
@@ -85,6 +87,8 @@ class Workers(Generic[Task, Found]):
         self._changed = threading.Condition()
         self._processes: dict[int, SpawnProcess] = {}
         self._up: set[int] = set()
+        self._wanted = 0
+        """Rises with every call of `start`."""
         self._closing = False
         self._threads: list[threading.Thread] = []
 
@@ -94,9 +98,13 @@ class Workers(Generic[Task, Found]):
         return len(self._up)
 
     def start(self) -> None:
-        """Begin to start the workers, unless that was begun before."""
+        """Have the workers started, unless they are there; returns at once."""
         with self._changed:
-            if self._threads or self._closing:
+            self._wanted += 1
+            if self._closing or len(self._up) == self.count:
+                return
+            self._changed.notify_all()
+            if self._threads:
                 return
             atexit.register(self.close)
             self._threads = [
@@ -105,8 +113,8 @@ class Workers(Generic[Task, Found]):
                 )
                 for place in range(self.count)
             ]
-        for thread in self._threads:
-            thread.start()
+            for thread in self._threads:
+                thread.start()
 
     def submit(self, task: Task) -> "Future[list[Found]]":
         """Queue a task; the future gives what was found, or raises `WorkerLost` or `Stopping`."""
@@ -138,8 +146,9 @@ class Workers(Generic[Task, Found]):
             try:
                 with self._worker(place) as line:
                     pause_s = PAUSE_S
-                    self._keep_busy(line)
-                    return
+                    calls = self._keep_busy(line)
+                self._rest(calls)
+                continue
             except BadConfiguration as error:
                 log.error("no worker can be started: %s", error)
                 pause_s = LONGEST_PAUSE_S
@@ -148,11 +157,16 @@ class Workers(Generic[Task, Found]):
                     seconds = time.monotonic() - started
                     log.warning("a worker ended after %.0f s (%r)", seconds, error)
             if not self._up:
-                # Whoever waits has other means, or other words for it.
+                # Whoever waits has other means.
                 self._fail_waiting(WorkerLost("there is no worker"))
             with self._changed:
                 self._changed.wait_for(lambda: self._closing, pause_s)
             pause_s = min(2.0 * pause_s, LONGEST_PAUSE_S)
+
+    def _rest(self, calls: int) -> None:
+        """Wait until a worker is wanted again."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closing or self._orders or self._wanted != calls)
 
     @contextmanager
     def _worker(self, place: int) -> Iterator[Connection]:
@@ -180,13 +194,16 @@ class Workers(Generic[Task, Found]):
                 process.kill()
                 process.join()
 
-    def _keep_busy(self, line: Connection) -> None:
-        """Hand tasks on until all is over; raises what a line raises that has broken."""
+    def _keep_busy(self, line: Connection) -> int:
+        """Hand tasks on while there are some; how often workers were wanted until then.
+
+        Raises what a line raises that has broken.
+        """
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._orders or self._closing)
-                if self._closing:
-                    return
+                self._changed.wait_for(lambda: self._orders or self._closing, IDLE_S)
+                if self._closing or not self._orders:
+                    return self._wanted
                 order = self._orders.popleft()
             try:
                 line.send(order.task)

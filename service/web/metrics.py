@@ -22,7 +22,7 @@ _SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5
 
 
 class _Zones(Collector):
-    """The cache of zones and run catalogs, read when asked."""
+    """The cache of zones and run catalogs, and who computes replays beside it, read when asked."""
 
     def __init__(self, operations: Operations) -> None:
         self._operations = operations
@@ -31,7 +31,7 @@ class _Zones(Collector):
         shelf = self._operations.zones()
         yield CounterMetricFamily(
             "starid_zone_cache_hits",
-            "Zones and run catalogs found in the cache.",
+            "Zones and run catalogs found in the cache; replays have others.",
             value=shelf["hits"],
         )
         yield CounterMetricFamily(
@@ -48,6 +48,11 @@ class _Zones(Collector):
             "starid_zone_cache_bytes",
             "Memory that the cache holds.",
             value=shelf["bytes"],
+        )
+        yield GaugeMetricFamily(
+            "starid_replay_processes",
+            "Processes that are ready to compute replays, each with a cache of its own.",
+            value=self._operations.replay_processes(),
         )
 
 

@@ -50,8 +50,10 @@ def opened(database):
     """Opens operations on the test's database, as often as asked; all are closed at the end."""
     held = []
 
-    def open_operations(mission=None, **settings):
-        held.append(Operations.open(Settings(database=database, **settings), mission))
+    def open_operations(mission=None, **wanted):
+        # Processes of their own take seconds to start: only tests about them ask for some.
+        settings = Settings(**({"database": database, "replay_processes": 0} | wanted))
+        held.append(Operations.open(settings, mission))
         return held[-1]
 
     yield open_operations

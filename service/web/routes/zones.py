@@ -36,7 +36,10 @@ class DropQuery(Query):
 
 @router.get("", dependencies=[NO_QUERY], **described({200: Gives("The cache.", ZoneCache)}))
 def list_zones(operations: Held) -> Response:
-    """The cached zones, their size, hits, misses and build times."""
+    """The cached zones, their size, hits, misses and build times.
+
+    Processes that compute replays have caches of their own, which are not shown.
+    """
     return json_response(operations.zones())
 
 
