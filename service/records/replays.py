@@ -3,6 +3,7 @@
 import json
 import logging
 import threading
+import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
@@ -36,6 +37,8 @@ MAX_FAULTS_KEPT = 3
 """Of one line: they are written anew with every chunk that adds to them, and read as a whole."""
 MAX_TEXT_KEPT = 300
 BUSY_PAUSE_S = 0.5
+PROGRESS_S = 0.2
+"""Between two notes of how far a replay is: each is a transaction, and told to all who listen."""
 
 COUNTED = ("new", "repeated", "observed", "unique", "ambiguous", "unmatched", "attitudes")
 """What a replay counts: batches by whether they were recorded before, their stars, attitudes."""
@@ -116,7 +119,7 @@ _COUNTED = msgspec.json.Decoder(_Counted)
 
 
 class Replay:
-    """One replay at work; its progress is in the table after every chunk."""
+    """One replay at work; its progress is in the table, a moment late."""
 
     def __init__(
         self,
@@ -137,6 +140,7 @@ class Replay:
         self._noting: Future[None] | None = None
         self._ahead: deque[_Begun] = deque()
         self._written: _Begun | None = None
+        self._saved_s = 0.0
         self._stopping = threading.Event()
         self._over = threading.Event()
 
@@ -255,7 +259,9 @@ class Replay:
             else:
                 self._count(answer)
         self._row["lines_done"] = begun.last
-        self._save(state="running", finished=None)
+        if time.monotonic() - self._saved_s > PROGRESS_S:
+            self._save(state="running", finished=None)
+            self._saved_s = time.monotonic()
 
     def _patiently(self, call: Callable[..., T], *given: Any) -> T:
         while True:
