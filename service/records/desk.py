@@ -111,8 +111,8 @@ class Desk:
             if taken:
                 self._new.extend(orders[:taken])
                 self._quiet.clear()
-                if not self._active:
-                    self._changed.notify()
+                # Whoever steps in must be awake to see how long it takes.
+                (self._step_in if self._active else self._changed).notify()
         for order in orders[taken:]:
             if self._closing:
                 order.settle(Stopping("the service is stopping"))
@@ -160,8 +160,6 @@ class Desk:
                 if waiting and self._may_begin(turn):
                     self._active += 1
                     self._moved_s = time.monotonic()
-                    # Whoever steps in next must be awake to see how long it takes.
-                    self._step_in.notify()
                     return True
                 if self._closing and not waiting and not self._active:
                     return False
@@ -217,6 +215,9 @@ class Desk:
         """Compute what is ready for a while, and have it recorded."""
         began_s = time.monotonic()
         computed: list[tuple[Order, Draft]] = []
+        with self._changed:
+            if len(self._ready) > 1:
+                self._step_in.notify()
         while True:
             with self._changed:
                 if not self._ready or time.monotonic() - began_s > HANDED_ON_S:

@@ -54,7 +54,9 @@ def writing_engine(url: URL) -> Engine:
         return _postgresql(url, pool_size=1, max_overflow=0)
     _check_place(Path(url.database or ""))
     engine = create_engine(url, poolclass=QueuePool, pool_size=1, max_overflow=0)
-    _set_up_sqlite(engine, "journal_mode = WAL", "synchronous = FULL", begin="BEGIN IMMEDIATE")
+    # What a savepoint may have to take back is kept in memory: a file would be made for each.
+    pragmas = ("journal_mode = WAL", "synchronous = FULL", "temp_store = MEMORY")
+    _set_up_sqlite(engine, *pragmas, begin="BEGIN IMMEDIATE")
     return engine
 
 
