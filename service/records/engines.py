@@ -17,6 +17,8 @@ from sqlalchemy.pool import QueuePool
 from service.errors import BadConfiguration
 
 BUSY_TIMEOUT_MS = 10_000
+WRITER_CACHE_KIB = 32_768
+"""Of pages: the inner ones of every index are read with each batch."""
 MAX_POSTGRESQL_READERS = 16
 """A server allows a hundred connections as it comes; whoever finds none free waits for one."""
 
@@ -55,8 +57,10 @@ def writing_engine(url: URL) -> Engine:
     _check_place(Path(url.database or ""))
     engine = create_engine(url, poolclass=QueuePool, pool_size=1, max_overflow=0)
     # What a savepoint may have to take back is kept in memory: a file would be made for each.
-    pragmas = ("journal_mode = WAL", "synchronous = FULL", "temp_store = MEMORY")
-    _set_up_sqlite(engine, *pragmas, begin="BEGIN IMMEDIATE")
+    kept = ("temp_store = MEMORY", f"cache_size = -{WRITER_CACHE_KIB}")
+    _set_up_sqlite(
+        engine, "journal_mode = WAL", "synchronous = FULL", *kept, begin="BEGIN IMMEDIATE"
+    )
     return engine
 
 
