@@ -30,6 +30,10 @@ def work(bench: Bench, lines: Lines) -> list[Found]:
     return found_in(lines, bench.draft_or_error)
 
 
+LATELY_S = 0.5
+"""Whoever posts one by one may post again for so long after the last."""
+
+
 class Bulk:
     """Takes chunks of lines in, by an intake and by workers of its own."""
 
@@ -44,8 +48,15 @@ class Bulk:
 
     @property
     def ahead(self) -> int:
-        """How many chunks should be begun before the first of them is recorded."""
-        return AHEAD * self.workers.up
+        """How many chunks should be begun before the first of them is recorded.
+
+        While batches come one by one as well, a worker less is given to do, so that
+        theirs find a processor free.
+        """
+        up = self.workers.up
+        if up > 1 and self._intake.idle_s < LATELY_S:
+            return up - 2
+        return AHEAD * up
 
     def begin(self, texts: Sequence[bytes], run: str, check: Check) -> "Chunk":
         """Let a chunk be computed; raises `Busy` where the time has not come."""

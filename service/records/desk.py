@@ -8,6 +8,7 @@ for long.  Nobody's own thread waits: who submits is called with the outcome.
 A repeat of what is at work waits for it and is then looked up like any other.
 """
 
+import math
 import threading
 import time
 from collections import deque
@@ -80,6 +81,7 @@ class Desk:
         self._step_in = threading.Condition(lock)
         self._active = 0
         self._moved_s = 0.0
+        self._taken_s = -math.inf
         self._quiet = threading.Event()
         self._quiet.set()
         self._closing = False
@@ -106,6 +108,7 @@ class Desk:
         keeps it from being.
         """
         with self._changed:
+            self._taken_s = time.monotonic()
             room = MAX_WAITING - len(self._new) - len(self._ready)
             taken = 0 if self._closing else max(0, min(room, len(orders)))
             if taken:
@@ -119,6 +122,11 @@ class Desk:
             else:
                 waiting = f"{MAX_WAITING} batches are waiting to be worked on"
                 order.settle(Busy(waiting, RETRY_AFTER_S))
+
+    @property
+    def idle_s(self) -> float:
+        """Seconds since something was last put here."""
+        return time.monotonic() - self._taken_s
 
     def let_pass(self, seconds: float) -> None:
         """Wait until nothing lies here, but no longer than so; for whoever has more time."""

@@ -167,6 +167,11 @@ class Intake:
         self.let_pass()
         return self._bench.draft_or_error(submission)
 
+    @property
+    def idle_s(self) -> float:
+        """Seconds since batches last came one by one."""
+        return self._desk.idle_s
+
     def let_pass(self) -> None:
         """Wait a little for what came one by one to be done."""
         self._desk.let_pass(LET_PASS_S)
