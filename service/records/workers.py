@@ -34,7 +34,7 @@ from service.sky.shelf import Shelf
 from service.sky.view import Sky
 from service.warm import warm_up
 
-NICENESS = 7
+NICENESS = 10
 """Whoever waits for one answer goes first."""
 PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0
 """Before a worker is started in place of one that died before it was ready: twice as long each."""
