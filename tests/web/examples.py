@@ -7,6 +7,8 @@ into `openapi.yaml`.
 import json
 import tempfile
 import time
+from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +22,11 @@ from service.simulate.frame_files import frame_bytes
 from service.simulate.frames import FrameSettings, draw_frames
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
+from service.sky.catalog import load_embedded
+from service.sky.shelf import Shelf
+from service.sky.view import Sky
 from service.web.app import create_app
-from tests.web.serving import Server
+from tests.web.serving import Server, compile_kernels
 
 FILE = Path(__file__).parents[2] / "service" / "web" / "examples.json"
 API = "/api/v1"
@@ -44,12 +49,12 @@ def walk(client: httpx.Client, operations: Operations) -> Json:
         answer = client.post(f"{API}/batches", json=body, headers=headers)
         return take("submit_batch", answer, name, body if answer.status_code == 201 else None)
 
-    xte = _drawn(operations, "XTE", stars=3)
+    xte = _drawn("XTE", stars=3)
     first = submit("attitude", xte, **{"Idempotency-Key": "1999-060-0001"})
     lone = xte["observations"][0] | {"stars": xte["observations"][0]["stars"][:1]}
     submit("no_attitude", xte | {"batch": "1999-060-0002", "observations": [lone]})
-    submit("direction_only", _drawn(operations, "SWAS", stars=3, prior="direction"))
-    submit("sun_pointed", _drawn(operations, "SOHO", stars=3, prior="direction"))
+    submit("direction_only", _drawn("SWAS", stars=3, prior="direction"))
+    submit("sun_pointed", _drawn("SOHO", stars=3, prior="direction"))
     other = xte | {"aberration": "ignore"}
     submit("another_body", other)
     submit("key_of_another_body", other, **{"Idempotency-Key": "1999-060-0001"})
@@ -60,7 +65,7 @@ def walk(client: httpx.Client, operations: Operations) -> Json:
     take("submit_batch", truncated, "truncated")
     take("submit_batch", client.post(f"{API}/batches", content=b"{}"), "no_content_type")
 
-    frame, file = _frame(operations)
+    frame, file = _frame()
     take("submit_frame", _send(client, "IMAGER", frame, file), "attitude")
     cut_off = frame | {"batch": "cut-off"}
     take("submit_frame", _send(client, "IMAGER", cut_off, file[:5760]), "cut_off")
@@ -86,7 +91,7 @@ def walk(client: httpx.Client, operations: Operations) -> Json:
         "b": {"tolerances": {"separation_deg": 1e-5}},
     }
     take("compare", client.post(f"{API}/compare", json=asked), "tighter", asked)
-    _alarm(client, operations, take)
+    _alarm(client, take)
     take("list_attitudes", client.get(f"{API}/spacecraft/SWAS/attitudes"), "one")
     take("list_rates", client.get(f"{API}/spacecraft/XTE/rates"), "one_hour")
 
@@ -122,7 +127,7 @@ def walk(client: httpx.Client, operations: Operations) -> Json:
     return found
 
 
-def _alarm(client: httpx.Client, operations: Operations, take: Any) -> None:
+def _alarm(client: httpx.Client, take: Any) -> None:
     here = f"{API}/spacecraft/SWAS/limits"
     settings = {"warning": {"high": 0.5}, "minimum_count": 2, "duration_s": 0}
     asked = {"settings": settings, "who": "J. Operator", "comment": "for the next pass"}
@@ -131,7 +136,7 @@ def _alarm(client: httpx.Client, operations: Operations, take: Any) -> None:
     take("get_limit", client.get(limit), "with_history")
     take("list_limits", client.get(here), "of_swas")
     client.put(f"{API}/runs/pass-8", json={"alarms": True})
-    lone = _drawn(operations, "SWAS", stars=1)
+    lone = _drawn("SWAS", stars=1)
     for name in ("1999-060-0001", "1999-060-0002"):
         client.post(f"{API}/batches", json=lone | {"batch": name, "run": "pass-8"})
     found = take("list_alarms", client.get(f"{API}/alarms?run=pass-8"), "open")
@@ -150,9 +155,9 @@ def _alarm(client: httpx.Client, operations: Operations, take: Any) -> None:
 
 def _sign_in(client: httpx.Client, operations: Operations, take: Any) -> None:
     secret = new_secret()
-    operations.store.writer.change(
-        lambda connection: add_token(
-            connection,
+    operations.change(
+        partial(
+            add_token,
             id="01JD0000000000000000000001",
             name="J. Operator",
             secret=secret,
@@ -162,7 +167,7 @@ def _sign_in(client: httpx.Client, operations: Operations, take: Any) -> None:
             created="1999-03-01T12:00:00.000Z",
             expires="2099-03-01T12:00:00.000Z",
         )
-    ).result()
+    )
     # What is known of tokens is believed for a second.
     time.sleep(1.2)
     asked = {"token": "acq_the-secret-that-was-printed-once"}
@@ -173,10 +178,14 @@ def _sign_in(client: httpx.Client, operations: Operations, take: Any) -> None:
     take("sign_out", client.delete(f"{API}/session", headers=same), "signed_out")
 
 
-def _frame(operations: Operations) -> tuple[Json, bytes]:
+@cache
+def _sky() -> Sky:
+    return Sky(load_embedded(), Shelf(64 << 20))
+
+
+def _frame() -> tuple[Json, bytes]:
     """What is told of a frame, as a query, and its file."""
-    mission = operations.missions["IMAGER"]
-    (drawn,) = draw_frames(mission, operations.sky, FrameSettings(frames=1))
+    (drawn,) = draw_frames(load_missions()["IMAGER"], _sky(), FrameSettings(frames=1))
     query = {
         name: value if isinstance(value, str) else json.dumps(value)
         for name, value in drawn.known.items()
@@ -190,18 +199,18 @@ def _send(client: httpx.Client, spacecraft: str, query: Json, file: bytes) -> ht
     return client.post(url, params=query, content=file, headers=headers)
 
 
-def _drawn(operations: Operations, spacecraft: str, **wanted: Any) -> Json:
+def _drawn(spacecraft: str, **wanted: Any) -> Json:
     wanted_pass = Pass(batches=1, troubles=NO_TROUBLES, angles_share=0.0, **wanted)
-    (drawn,) = draw_pass(load_missions()[spacecraft], operations.sky, wanted_pass)
+    (drawn,) = draw_pass(load_missions()[spacecraft], _sky(), wanted_pass)
     return drawn.batch
 
 
-def fresh_walk() -> Json:
+def fresh_walk(open_operations: Callable[[Settings], Operations] = Operations.open) -> Json:
     """The walk through a server of its own with an empty database."""
     with tempfile.TemporaryDirectory() as folder:
-        operations = Operations.open(Settings(database=f"sqlite:///{folder}/acquire.db"))
         # Where nothing is compiled yet, that takes longer than a client waits.
-        operations.ready()
+        compile_kernels()
+        operations = open_operations(Settings(database=f"sqlite:///{folder}/acquire.db"))
         with (
             Server(create_app(operations)) as address,
             httpx.Client(base_url=address, timeout=300) as client,
