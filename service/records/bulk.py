@@ -32,6 +32,8 @@ def work(bench: Bench, lines: Lines) -> list[Found]:
 
 LATELY_S = 0.5
 """Whoever posts one by one may post again for so long after the last."""
+LINES, FEW_LINES = 64, 12
+"""Of a chunk: the more, the less each costs; but a single post waits for one chunk at most."""
 
 
 class Bulk:
@@ -54,9 +56,17 @@ class Bulk:
         theirs find a processor free.
         """
         up = self.workers.up
-        if up > 1 and self._intake.idle_s < LATELY_S:
-            return up - 2
-        return AHEAD * up
+        return up - 2 if up > 1 and self._gives_way else AHEAD * up
+
+    @property
+    def lines(self) -> int:
+        """How many lines a chunk should have."""
+        return FEW_LINES if self._gives_way else LINES
+
+    @property
+    def _gives_way(self) -> bool:
+        """Whether batches come one by one as well."""
+        return self._intake.idle_s < LATELY_S
 
     def begin(self, texts: Sequence[bytes], run: str, check: Check) -> "Chunk":
         """Let a chunk be computed; raises `Busy` where the time has not come."""

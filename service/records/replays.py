@@ -29,8 +29,6 @@ from service.records.intake import Answers
 from service.records.store import Store
 from service.records.tables import replays
 
-CHUNK_LINES = 32
-"""Few enough that a single post, which waits for one chunk at most, is not kept waiting."""
 MAX_ERRORS_KEPT = 1_000
 MAX_LISTED = 100
 MAX_FAULTS_KEPT = 3
@@ -215,7 +213,7 @@ class Replay:
         """The state in the end; while a chunk is written, those after it are computed."""
         try:
             try:
-                for chunk in _chunks(enumerate(lines, start=1)):
+                for chunk in _chunks(enumerate(lines, start=1), lambda: self._bulk.lines):
                     if self._stopping.is_set():
                         return "interrupted"
                     self._ahead.append(self._begin(chunk))
@@ -357,12 +355,12 @@ def _cut(text: str) -> str:
     return text if len(text) <= MAX_TEXT_KEPT else text[: MAX_TEXT_KEPT - 1] + "…"
 
 
-def _chunks(lines: Iterator[Numbered]) -> Iterator[list[Numbered]]:
+def _chunks(lines: Iterator[Numbered], most: Callable[[], int]) -> Iterator[list[Numbered]]:
     chunk: list[Numbered] = []
     try:
         for each in lines:
             chunk.append(each)
-            if len(chunk) == CHUNK_LINES:
+            if len(chunk) >= most():
                 yield chunk
                 chunk = []
     except BadInput:
