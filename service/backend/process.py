@@ -121,9 +121,16 @@ class Backend:
             named = {name: self._opened(each) for name, each in asked.named.items()}
             gave = Gave(asked.number, method(*given, **named), None)
         except Exception as error:
+            # The front answers for it, as it would for an error of its own.
             gave = Gave(asked.number, None, _portable(error))
         self._tell()
-        self._channel.send(gave)
+        try:
+            self._channel.send(gave)
+        except OSError:
+            raise  # the front is gone
+        except Exception as error:
+            # It cannot be packed, and nothing of it was sent: nobody shall wait for it in vain.
+            self._channel.send(Gave(asked.number, None, _portable(error)))
 
     def _opened(self, given: Any) -> Any:
         return self._files.take(given) if isinstance(given, Handed) else given
@@ -137,5 +144,6 @@ def _portable(error: Exception) -> Exception:
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:
+        # An error may hold anything.
         return RuntimeError(repr(error))
     return error

@@ -153,6 +153,7 @@ class Workers(Generic[Task, Found]):
                 log.error("no worker can be started: %s", error)
                 pause_s = LONGEST_PAUSE_S
             except Exception as error:
+                # Whatever ended it, the next one may do better; who waited for it was told.
                 if not self._closing:
                     seconds = time.monotonic() - started
                     log.warning("a worker ended after %.0f s (%r)", seconds, error)
@@ -209,6 +210,7 @@ class Workers(Generic[Task, Found]):
                 line.send(order.task)
                 found = [pickle.loads(each) for each in line.recv()]
             except Exception as error:
+                # Whoever waits is told in any case; then the worker is given up.
                 order.done.set_exception(WorkerLost(f"a worker died ({error!r})"))
                 raise
             order.done.set_result(found)
