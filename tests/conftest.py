@@ -5,12 +5,14 @@ pytest --batches 2000     batches per mission held against the plain implementat
 pytest --torture          tests of kills, failing disks and odd input at full size, not a fiftieth
 """
 
+import faulthandler
 import os
 import tomllib
 
 import hypothesis
 import numpy as np
 import pytest
+from _pytest.faulthandler import fault_handler_stderr_fd_key
 
 from service.cli import main
 from service.missions.mission import SHIPPED_FOLDER, load_missions
@@ -21,6 +23,8 @@ from tests import scale
 
 DEFAULT_SEED = 19941026
 DEFAULT_BATCHES = 240
+TORTURE_TIMEOUT_S = 6 * 3600
+FIGURES = "figures"
 
 hypothesis.settings.register_profile(
     # Two shared cores: a deadline would fail on the machine, not on the code.
@@ -62,9 +66,43 @@ def pytest_configure(config):
         hypothesis.core.global_force_seed = seed
 
 
+def pytest_runtest_setup(item):
+    """Hours, not the minutes of `faulthandler_timeout`, before a torture counts as hanging."""
+    if item.config.getoption("--torture") and item.get_closest_marker("torture"):
+        stderr = item.config.stash[fault_handler_stderr_fd_key]
+        faulthandler.dump_traceback_later(TORTURE_TIMEOUT_S, exit=True, file=stderr)
+
+
+def pytest_terminal_summary(terminalreporter):
+    """What tests of endurance did, a line each."""
+    told = [
+        f"{report.nodeid}: {value}"
+        for reports in terminalreporter.stats.values()
+        for report in reports
+        if getattr(report, "when", None) == "call"
+        for name, value in report.user_properties
+        if name == FIGURES
+    ]
+    if told:
+        terminalreporter.section("figures")
+        for line in sorted(told):
+            terminalreporter.line(line)
+
+
 @pytest.fixture
 def seed(request):
     return request.config.getoption("--seed")
+
+
+@pytest.fixture
+def figures(seed, record_property):
+    """Takes down how much was tried and what came of it: figures(kills=500); told at the end."""
+
+    def note(**counted):
+        told = ", ".join(f"{name} {value}" for name, value in counted.items())
+        record_property(FIGURES, f"{told}; seed {seed}")
+
+    return note
 
 
 @pytest.fixture

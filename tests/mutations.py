@@ -3,30 +3,47 @@
     python -m tests.mutations READER COUNT SEED
 
 Every reader must read a file or refuse it as its documentation says; anything
-else, also a lack of memory, ends the process with the file that did it.
+else, also a lack of memory, ends the process with the file that did it.  Prints
+one JSON line: how many were read, how many refused, and the most memory held.
 """
 
+import gzip
 import io
 import json
 import random
 import resource
+import struct
 import sys
 import tempfile
+import zlib
 from pathlib import Path
 
+import numpy as np
+import zstandard
+from PIL import Image
+
 from service.errors import BadConfiguration, BadInput
+from service.imaging.files import read_frame
+from service.imaging.fits import write_fits
+from service.imaging.frame import FrameLimits
 from service.missions.mission import SHIPPED_FOLDER, load_missions
+from service.observe.compressed import unpacked_lines
 from service.observe.csv_rows import write_csv
-from service.observe.formats import read_lines
+from service.observe.formats import MAX_LINE_BYTES, read_lines
 from service.observe.wire import BatchIn, submission_from_json
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
-from service.sky.catalog import import_csv, load, load_embedded, save
+from service.sky.catalog import import_csv, import_sky2000, load, load_embedded, save
 from service.sky.shelf import Shelf
 from service.sky.view import Sky
+from tests.sky.sky2000_records import SIRIUS, written
 
 MORE_MEMORY = 1 << 30
 """What a reader may take beyond what the process holds already."""
+FRAME_LIMITS = FrameLimits(max_pixels=1_000_000)
+MEMORY = Path("/dev/shm")
+"""To write each file to a disk would take most of the time."""
+PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 
 TOKENS = (
     b'"', b",", b"{", b"}", b"[", b"]", b"\n", b"\r", b"\0", b"\xff\xfe", b"NaN", b"1e999", b"-",
@@ -58,6 +75,18 @@ def mutated(data, draw):
     return bytes(data)
 
 
+def with_right_sums(data):
+    """A PNG file whose chunks have the checksums of what they hold, so that more of it is read."""
+    data, at = bytearray(data), len(PNG_MAGIC)
+    while at + 12 <= len(data):
+        end = at + 8 + int.from_bytes(data[at : at + 4], "big")
+        if end + 4 > len(data):
+            break
+        data[end : end + 4] = struct.pack(">L", zlib.crc32(data[at + 4 : end]))
+        at = end + 4
+    return bytes(data)
+
+
 def pass_lines():
     sky = Sky(load_embedded(), Shelf(64 << 20))
     drawn = list(draw_pass(load_missions()["XTE"], sky, Pass(batches=3, seed=1)))
@@ -79,8 +108,31 @@ def read_telemetry(data, form):
         raise BadInput(faults)
 
 
+def read_packed(data, coding):
+    """Every line of a compressed body, as a replay over HTTP takes them."""
+    lines = list(unpacked_lines(io.BytesIO(data), coding, MAX_LINE_BYTES))
+    read_telemetry(b"".join(lines), "ndjson")
+
+
+def frame_counts():
+    counts = np.random.default_rng(5).integers(0, 65536, (12, 20))
+    return counts.astype(np.uint16)
+
+
+def picture(file_format, dtype=np.uint16, **options):
+    file = io.BytesIO()
+    values = frame_counts()
+    image = Image.fromarray(values if dtype is np.uint16 else (values >> 8).astype(dtype))
+    image.save(file, file_format, **options)
+    return file.getvalue()
+
+
+def read_frame_of(data):
+    read_frame(io.BytesIO(data), FRAME_LIMITS)
+
+
 class Readers:
-    """By name: a good file, and what reads it."""
+    """By name: good files, and what reads them."""
 
     def __init__(self, folder):
         self._folder = folder
@@ -110,6 +162,44 @@ class Readers:
         good = (SHIPPED_FOLDER / "xte.toml").read_bytes()
         return good, self._file("own.toml", lambda path: load_missions(path.parent))
 
+    def ndjson_gzip(self):
+        return gzip.compress(self.ndjson()[0], mtime=0), lambda data: read_packed(data, "gzip")
+
+    def ndjson_zstd(self):
+        packed = zstandard.ZstdCompressor(write_checksum=False).compress(self.ndjson()[0])
+        return packed, lambda data: read_packed(data, "zstd")
+
+    def sky2000(self):
+        stars = [SIRIUS | {"ID": 6450085 + i, "RAh": i, "HD": 48915 + i} for i in range(3)]
+        good = "".join(written(**star) + "\n" for star in stars).encode("latin-1")
+        return good, self._file("sky2kv4.dat", import_sky2000)
+
+    def sky2000_gzip(self):
+        return gzip.compress(self.sky2000()[0], mtime=0), self.sky2000()[1]
+
+    def fits(self):
+        file = io.BytesIO()
+        cards = {"DATE-OBS": "2026-03-01T00:00:00", "EXPTIME": 0.5, "OBSERVER": "D'Arcy"}
+        write_fits(file, frame_counts(), cards)
+        return file.getvalue(), read_frame_of
+
+    def tiff(self):
+        return picture("TIFF"), read_frame_of
+
+    def tiff_packed(self):
+        return picture("TIFF", np.uint8, compression="tiff_adobe_deflate"), read_frame_of
+
+    def png(self):
+        return picture("PNG"), read_frame_of
+
+    def png_with_right_sums(self):
+        return picture("PNG", np.uint8), lambda data: read_frame_of(with_right_sums(data))
+
+    def npy(self):
+        file = io.BytesIO()
+        np.save(file, frame_counts())
+        return file.getvalue(), read_frame_of
+
     def _file(self, name, read):
         # A folder of its own: a folder of missions is read whole.
         path = self._folder / name.replace(".", "-") / name
@@ -127,7 +217,7 @@ NAMES = tuple(name for name in vars(Readers) if not name.startswith("_"))
 
 def main(name, count, seed):
     draw = random.Random(int(seed))
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None) as folder:
         good, read = getattr(Readers(Path(folder)), name)()
         read(good)
         held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
@@ -142,7 +232,8 @@ def main(name, count, seed):
             except BaseException:
                 sys.stderr.write(f"{name}: {data!r}\n"[:4000])
                 raise
-    print(refused)
+    most_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+    print(json.dumps({"read": int(count) - refused, "refused": refused, "most_mb": most_mb}))
 
 
 if __name__ == "__main__":

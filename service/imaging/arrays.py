@@ -7,6 +7,7 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 
+from service.errors import BadFile
 from service.imaging.frame import Counts, Frame, FrameLimits, refused
 
 _HEADERS = {
@@ -23,7 +24,10 @@ def read_npy(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
         if version not in _HEADERS:
             raise refused("is of a .npy version that frames do not need", str(version))
         shape, by_column, dtype = _HEADERS[version](file, max_header_size=_MAX_HEADER)
-    except ValueError as error:
+    except BadFile:
+        raise
+    except Exception as error:
+        # numpy reads its header as an expression of Python, which gives up in many ways.
         raise refused(f"has no readable .npy header: {str(error)[:200]}") from None
     if dtype.kind not in "iuf" or dtype.itemsize > 8:
         raise refused("must hold numbers of up to 64 bits", str(dtype)[:80])

@@ -60,6 +60,7 @@ def hostile_files(rng):
     yield "npy of three dimensions", _npy((SIDE, SIDE, 3), "<u2"), "two dimensions"
     yield "npy with less than it says", _npy((SIDE, SIDE), "<f8"), "cut off"
     yield "npy with a long header", b"\x93NUMPY\x02\0" + struct.pack("<L", 1 << 30), "header"
+    yield "npy with a header that does not end", _npy_header(b"{'shape': (\n"), "header"
     yield "npy negative", _npy((-SIDE, -SIDE), "<u2"), "px"
     yield "all NaN", _array(np.full((SIDE, SIDE), np.nan)), "no number"
     yield "all infinite", _array(np.full((SIDE, SIDE), np.inf, np.float32)), "no number"
@@ -171,7 +172,11 @@ def _tiff_tags(count):
 
 def _npy(shape, descr):
     text = str({"descr": descr, "fortran_order": False, "shape": shape}).encode()
-    return b"\x93NUMPY\x01\0" + struct.pack("<H", len(text)) + text + bytes(1000)
+    return _npy_header(text) + bytes(1000)
+
+
+def _npy_header(text):
+    return b"\x93NUMPY\x01\0" + struct.pack("<H", len(text)) + text
 
 
 def _array(values):

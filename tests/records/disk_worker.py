@@ -3,8 +3,9 @@
     python -m tests.records.disk_worker DATABASE BATCHES.ndjson FAULTS SEED
 
 Started with `faulty_disk.c` preloaded.  Prints one JSON line: what was
-acknowledged (id to the digest of the answer), how many faults struck, how often
-it was told to come again, and how many reads failed meanwhile.
+acknowledged (id to the digest of the answer), how many faults struck and at what,
+how many calls they made fail, how often it was told to come again, and how many
+reads failed meanwhile.
 """
 
 import ctypes
@@ -14,6 +15,7 @@ import json
 import random
 import sys
 import time
+from collections import Counter
 from itertools import islice
 from pathlib import Path
 
@@ -27,14 +29,16 @@ PATIENCE_S = 60.0
 
 def main(database, file, faults, seed):
     disk, draw = ctypes.CDLL(None), random.Random(int(seed))
+    disk.faulty_struck.restype = ctypes.c_char_p
     operations = Operations.open(Settings(database=database))
     lines = Path(file).read_bytes().splitlines()
-    acknowledged, told_busy, struck, reads_failed = {}, 0, 0, 0
+    acknowledged, told_busy, kinds, reads_failed = {}, 0, Counter(), 0
     waiting = iter(lines)
     for _ in range(int(faults)):
         before = disk.faulty_failed()
         # A single write or a disk that stays full for a while, at any write of a commit.
-        disk.faulty_fail(draw.randrange(12), draw.choice((1, 1, 3, 25)), _error(draw))
+        error = draw.choice((errno.ENOSPC, errno.EIO))
+        disk.faulty_fail(draw.randrange(12), draw.choice((1, 1, 3, 25)), error)
         while disk.faulty_failed() == before:
             chunk = [submission_from_json(line) for line in islice(waiting, 3)]
             assert chunk, "the batches ended before the disk failed"
@@ -52,18 +56,22 @@ def main(database, file, faults, seed):
                     assert time.monotonic() < give_up, "writing did not resume"
             for each in answers:
                 acknowledged[each.id] = hashlib.sha256(each.body).hexdigest()
-        struck += 1
+        call, place = disk.faulty_struck().decode().split(" ", 1)
+        kinds[f"{call} {Path(place).name} {errno.errorcode[error]}"] += 1
     disk.faulty_fail(0, 0, 0)
     rest = [submission_from_json(line) for line in waiting]
     for each in operations.submit_many(rest):
         acknowledged[each.id] = hashlib.sha256(each.body).hexdigest()
     operations.close()
-    told = {"acknowledged": acknowledged, "struck": struck, "told_busy": told_busy}
-    print(json.dumps(told | {"reads_failed": reads_failed}))
-
-
-def _error(draw):
-    return draw.choice((errno.ENOSPC, errno.EIO))
+    told = {
+        "acknowledged": acknowledged,
+        "struck": kinds.total(),
+        "kinds": dict(kinds.most_common()),
+        "calls_failed": disk.faulty_failed(),
+        "told_busy": told_busy,
+        "reads_failed": reads_failed,
+    }
+    print(json.dumps(told))
 
 
 if __name__ == "__main__":

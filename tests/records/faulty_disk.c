@@ -5,6 +5,7 @@
  *                                                        following ones, `count` in all
  *   ctypes.CDLL(None).faulty_calls()                     writes so far
  *   ctypes.CDLL(None).faulty_failed()                    of these, how many were made to fail
+ *   ctypes.CDLL(None).faulty_struck()                    the first of them: its call and its file
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -18,9 +19,11 @@
 
 static atomic_long calls, failed, first = -1, last = -1;
 static atomic_int error;
+static char struck[4200];
 
 long faulty_calls(void) { return calls; }
 long faulty_failed(void) { return failed; }
+const char *faulty_struck(void) { return struck; }
 
 void faulty_fail(long after, long count, int number) {
     error = number;
@@ -28,7 +31,7 @@ void faulty_fail(long after, long count, int number) {
     first = calls + after + 1;
 }
 
-static int fails(int fd) {
+static int fails(int fd, const char *call) {
     static const char *folder;
     char link[64], path[4096];
     if (!folder && !(folder = getenv("FAULTY_FOLDER"))) return 0;
@@ -37,6 +40,8 @@ static int fails(int fd) {
     if (length < 0 || strncmp(path, folder, strlen(folder)) != 0) return 0;
     long number = ++calls;
     if (number < first || number > last) return 0;
+    path[length] = 0;
+    if (number == first) snprintf(struck, sizeof struck, "%s %s", call, path);
     ++failed;
     errno = error;
     return 1;
@@ -46,35 +51,35 @@ static int fails(int fd) {
 
 ssize_t write(int fd, const void *data, size_t size) {
     REAL(write);
-    return fails(fd) ? -1 : real(fd, data, size);
+    return fails(fd, __func__) ? -1 : real(fd, data, size);
 }
 
 ssize_t pwrite(int fd, const void *data, size_t size, off_t at) {
     REAL(pwrite);
-    return fails(fd) ? -1 : real(fd, data, size, at);
+    return fails(fd, __func__) ? -1 : real(fd, data, size, at);
 }
 
 ssize_t pwrite64(int fd, const void *data, size_t size, off64_t at) {
     REAL(pwrite64);
-    return fails(fd) ? -1 : real(fd, data, size, at);
+    return fails(fd, __func__) ? -1 : real(fd, data, size, at);
 }
 
 int fsync(int fd) {
     REAL(fsync);
-    return fails(fd) ? -1 : real(fd);
+    return fails(fd, __func__) ? -1 : real(fd);
 }
 
 int fdatasync(int fd) {
     REAL(fdatasync);
-    return fails(fd) ? -1 : real(fd);
+    return fails(fd, __func__) ? -1 : real(fd);
 }
 
 int ftruncate(int fd, off_t size) {
     REAL(ftruncate);
-    return fails(fd) ? -1 : real(fd, size);
+    return fails(fd, __func__) ? -1 : real(fd, size);
 }
 
 int ftruncate64(int fd, off64_t size) {
     REAL(ftruncate64);
-    return fails(fd) ? -1 : real(fd, size);
+    return fails(fd, __func__) ? -1 : real(fd, size);
 }

@@ -34,7 +34,7 @@ def faulty_disk(tmp_path_factory):
 
 @pytest.mark.torture
 def test_whatever_write_fails_nothing_acknowledged_is_lost_and_writing_resumes(
-    faulty_disk, tmp_path, sky, missions, seed
+    faulty_disk, tmp_path, sky, missions, seed, figures
 ):
     """Full or broken, once or for a while, at every kind of write: WAL, sync, checkpoint."""
     faults = size(FAULTS)
@@ -67,5 +67,12 @@ def test_whatever_write_fails_nothing_acknowledged_is_lost_and_writing_resumes(
     try:
         assert_whole(operations, told["acknowledged"])
         assert len(told["acknowledged"]) == len(sent)
+        figures(
+            faults=told["struck"],
+            by_call_and_error=told["kinds"],
+            calls_failed=told["calls_failed"],
+            told_to_come_again=told["told_busy"],
+            acknowledged=len(told["acknowledged"]),
+        )
     finally:
         operations.close()

@@ -41,7 +41,7 @@ def acknowledged_in(output):
 
 @pytest.mark.torture
 def test_nothing_acknowledged_is_lost_torn_or_doubled_by_kills(
-    database, tmp_path, sky, missions, rng
+    database, tmp_path, sky, missions, rng, figures
 ):
     """Each round repeats the batches of the one before, as clients do that were left waiting."""
     acknowledged, killed = {}, 0
@@ -69,6 +69,7 @@ def test_nothing_acknowledged_is_lost_torn_or_doubled_by_kills(
             assert_whole(operations, acknowledged)
         finally:
             operations.close()
+    figures(kills=kills, while_at_work=killed, acknowledged=len(acknowledged), sent=len(lines))
     assert acknowledged
     # Had the workers finished, nothing would have been shown.
     assert killed > kills / 2
