@@ -3,19 +3,27 @@
 pytest --seed 7           other random draws, for hypothesis as well
 pytest --batches 2000     batches per mission held against the plain implementation
 pytest --torture          tests of kills, failing disks and odd input at full size, not a fiftieth
+
+Every test that asks for `database` runs on SQLite and on PostgreSQL, which takes
+part where TEST_POSTGRESQL_URL names a database to be used for tests; each test has
+a schema of its own there.
 """
 
 import faulthandler
 import os
 import tomllib
+import uuid
 
 import hypothesis
 import numpy as np
 import pytest
 from _pytest.faulthandler import fault_handler_stderr_fd_key
+from sqlalchemy import create_engine, make_url, text
 
 from service.cli import main
 from service.missions.mission import SHIPPED_FOLDER, load_missions
+from service.records.database import upgrade
+from service.records.engines import database_url
 from service.sky.catalog import load_embedded
 from service.sky.shelf import Shelf
 from service.sky.view import Sky
@@ -128,6 +136,34 @@ def mission_files():
         path.stem.upper(): tomllib.loads(path.read_text(encoding="utf-8"))
         for path in sorted(SHIPPED_FOLDER.glob("*.toml"))
     }
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def empty_database(request, tmp_path):
+    """The URL of a database with nothing in it."""
+    if request.param == "sqlite":
+        yield f"sqlite:///{tmp_path / 'acquire.db'}"
+        return
+    server = os.environ.get("TEST_POSTGRESQL_URL")
+    if not server:
+        pytest.skip("TEST_POSTGRESQL_URL names no PostgreSQL database to test on")
+    schema = f"test_{uuid.uuid4().hex}"
+    engine = create_engine(database_url(server), isolation_level="AUTOCOMMIT")
+    with engine.connect() as connection:
+        connection.execute(text(f"CREATE SCHEMA {schema}"))
+        # The server itself is never killed here: its commits need not wait for the disk.
+        options = f"-csearch_path={schema} -csynchronous_commit=off"
+        url = make_url(server).update_query_dict({"options": options})
+        yield url.render_as_string(hide_password=False)
+        connection.execute(text(f"DROP SCHEMA {schema} CASCADE"))
+    engine.dispose()
+
+
+@pytest.fixture
+def database(empty_database):
+    """The URL of a database that is up to date."""
+    upgrade(empty_database)
+    return empty_database
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ from service.errors import BadConfiguration, BadInput
 from service.imaging.files import read_frame
 from service.imaging.fits import write_fits
 from service.imaging.frame import FrameLimits
-from service.missions.mission import SHIPPED_FOLDER, load_missions
+from service.missions.mission import SHIPPED_FOLDER, load_missions, read_mission
 from service.observe.compressed import unpacked_lines
 from service.observe.csv_rows import write_csv
 from service.observe.formats import MAX_LINE_BYTES, read_lines
@@ -160,7 +160,7 @@ class Readers:
 
     def mission(self):
         good = (SHIPPED_FOLDER / "xte.toml").read_bytes()
-        return good, self._file("own.toml", lambda path: load_missions(path.parent))
+        return good, self._file("own.toml", read_mission)
 
     def ndjson_gzip(self):
         return gzip.compress(self.ndjson()[0], mtime=0), lambda data: read_packed(data, "gzip")
@@ -201,9 +201,7 @@ class Readers:
         return file.getvalue(), read_frame_of
 
     def _file(self, name, read):
-        # A folder of its own: a folder of missions is read whole.
-        path = self._folder / name.replace(".", "-") / name
-        path.parent.mkdir(exist_ok=True)
+        path = self._folder / name
 
         def write_and_read(data):
             path.write_bytes(data)

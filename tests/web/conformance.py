@@ -1,6 +1,8 @@
 """Holds every answer against the committed `openapi.yaml`."""
 
+import json
 import re
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -37,26 +39,38 @@ def validator(*place: str) -> Draft202012Validator:
 def check(response: httpx.Response) -> None:
     """Fail where an answer is not as described: its status, its type, its headers, its shape."""
     request = response.request
-    path = next((each for each in reference()["paths"] if _fits(each, request.url.path)), None)
-    method = "get" if request.method == "HEAD" else request.method.lower()
-    operation = reference()["paths"].get(path, {}).get(method)
+    check_answer(request.method, request.url, response.status_code, response.headers, response.read)
+
+
+def check_answer(
+    method: str,
+    url: httpx.URL,
+    status_code: int,
+    headers: httpx.Headers,
+    read: Callable[[], bytes],
+) -> None:
+    """The same of an answer that some other client got."""
+    path = next((each for each in reference()["paths"] if _fits(each, url.path)), None)
+    operation = (
+        reference()["paths"].get(path, {}).get("get" if method == "HEAD" else method.lower())
+    )
     if operation is None:
-        assert response.status_code in (404, 405) or path is None, request.url
+        assert status_code in (404, 405) or path is None, url
         return
-    status = str(response.status_code)
+    status = str(status_code)
     if status not in operation["responses"]:
-        assert response.status_code >= 400, f"{status} is not described: {request.url}"
+        assert status_code >= 400, f"{status} is not described: {url}"
         status = "default"
     described = operation["responses"][status]
-    kind = response.headers["content-type"].partition(";")[0]
-    assert kind in described["content"], (kind, request.url)
+    kind = headers["content-type"].partition(";")[0]
+    assert kind in described["content"], (kind, url)
     for header in set(described.get("headers", {})) - {"Link"}:
-        assert header in response.headers, (header, request.url)
-    response.read()
-    if kind.endswith("json") and request.method != "HEAD":
-        place = ("paths", path, method, "responses", status, "content", kind, "schema")
-        errors = list(validator(*place).iter_errors(response.json()))
-        assert not errors, f"{request.method} {request.url}: {errors[0]}"
+        assert header in headers, (header, url)
+    content = read()
+    if kind.endswith("json") and method != "HEAD":
+        place = ("paths", path, method.lower(), "responses", status, "content", kind, "schema")
+        errors = list(validator(*place).iter_errors(json.loads(content)))
+        assert not errors, f"{method} {url}: {errors[0]}"
 
 
 def _fits(template: str, path: str) -> bool:

@@ -1,10 +1,15 @@
-"""The app behind a real server, in a thread of this process."""
+"""The app behind a real server: in a thread of this process, or as `acquire serve` has it."""
 
+import socket
+import subprocess
+import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 
+import httpx
 import uvicorn
 from fastapi import FastAPI
 
@@ -49,3 +54,26 @@ class Server:
     def __exit__(self, *_: object) -> None:
         self._server.should_exit = True
         self._thread.join()
+
+
+@contextmanager
+def served(database: str) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
+    """`acquire serve` on a database, ready for work: its process, which has others, and its URL."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "service.cli", "serve", "--port", str(port)]
+    process = subprocess.Popen([*command, "--database", database])
+    url = f"http://127.0.0.1:{port}"
+    try:
+        while True:
+            assert process.poll() is None
+            try:
+                if httpx.get(f"{url}/readyz").status_code == 200:
+                    break
+            except httpx.TransportError:
+                pass
+            time.sleep(0.1)
+        yield process, url
+    finally:
+        process.terminate()
+        process.wait()
