@@ -1,5 +1,6 @@
 """Serving the app with uvicorn: on this machine alone, until there are tokens."""
 
+import asyncio
 import resource
 import socket
 import sys
@@ -7,6 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 import uvicorn
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from service.backend.front import Front
 from service.backend.start import Started, start_backend
@@ -21,6 +23,8 @@ TURN_S = 0.001
 """How long a thread keeps others waiting that want to go on: a post changes threads four times."""
 GRACE_S = 10
 """How long running requests may still take when the server is told to stop."""
+UNREAD_S = 60
+"""An answer of which so long nothing was read is given up: it takes memory until it is gone."""
 
 
 def serve(settings: Settings, started: Started | None = None) -> None:
@@ -43,7 +47,7 @@ def serve(settings: Settings, started: Started | None = None) -> None:
         app,
         host=settings.host,
         port=settings.port,
-        http="httptools",
+        http=Connection,
         loop="uvloop",
         ws="none",
         access_log=False,
@@ -56,6 +60,42 @@ def serve(settings: Settings, started: Started | None = None) -> None:
         server.run()
     if not server.started:
         raise SystemExit(START_FAILED)
+
+
+class Connection(HttpToolsProtocol):
+    """A connection that ends where its client leaves an answer unread; uvicorn would keep both."""
+
+    _looking: asyncio.TimerHandle | None = None
+
+    def pause_writing(self) -> None:
+        """More is to be sent than the client takes off."""
+        super().pause_writing()
+        self._look_again()
+
+    def resume_writing(self) -> None:
+        """It has taken most of it."""
+        self._look_no_more()
+        super().resume_writing()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """There is nobody any more."""
+        self._look_no_more()
+        super().connection_lost(exc)
+
+    def _look_again(self) -> None:
+        left = self.transport.get_write_buffer_size()
+        self._looking = self.loop.call_later(UNREAD_S, self._look, left)
+
+    def _look(self, left_before: int) -> None:
+        if self.transport.get_write_buffer_size() >= left_before:
+            self.transport.abort()
+        else:
+            self._look_again()
+
+    def _look_no_more(self) -> None:
+        if self._looking is not None:
+            self._looking.cancel()
+            self._looking = None
 
 
 class Server(uvicorn.Server):

@@ -18,6 +18,7 @@ from service.sky.catalog import load_embedded
 from service.sky.shelf import Shelf
 from service.sky.view import Sky
 from service.warm import warm_up
+from service.web.server import Connection
 from service.web.server import Server as StreamingServer
 
 
@@ -38,7 +39,7 @@ class Server:
 
     def __init__(self, app: FastAPI, port: int = 0) -> None:
         compile_kernels()
-        config = uvicorn.Config(app, port=port, http="httptools", ws="none", log_level="warning")
+        config = uvicorn.Config(app, port=port, http=Connection, ws="none", log_level="warning")
         self._server = StreamingServer(config, _stop_streams_of(app))
         # Signals belong to the main thread, which is the caller's.
         self._thread = threading.Thread(target=self._server.run, name="server")
