@@ -306,6 +306,14 @@ class Operations:
         """`take` of many at once, each of which says who is called with its outcome."""
         self._intake.take(asked)
 
+    def take_all_here(self, asked: Sequence[Asked], more: Callable[[], Sequence[Asked]]) -> None:
+        """`take_all`, worked through in this thread until nothing waits any longer.
+
+        `more` is called before each group, by whichever thread is at work then,
+        for what came meanwhile.
+        """
+        self._intake.take_here(asked, more)
+
     async def answered(
         self, sent: bytes, idempotency_key: str | None = None, caller: Caller | None = None
     ) -> Answered:

@@ -11,7 +11,7 @@ from typing import IO, Any
 
 _LENGTH = struct.Struct("<Q")
 _NUMBER = struct.Struct("<Q")
-PIECE_BYTES = 1 << 20
+PIECE_BYTES = 1 << 18
 
 
 def packed(message: object) -> bytes:
@@ -26,7 +26,7 @@ class Unpacker:
     def __init__(self) -> None:
         self._held = bytearray()
 
-    def feed(self, piece: bytes) -> Iterator[Any]:
+    def feed(self, piece: bytes | memoryview) -> Iterator[Any]:
         """The messages that a piece completes."""
         self._held += piece
         while len(self._held) >= _LENGTH.size:
@@ -45,8 +45,9 @@ class Channel:
     def __init__(self, line: socket.socket) -> None:
         self._line = line
         self._unpacker = Unpacker()
-        self._waiting: list[Any] = []
+        self._piece = memoryview(bytearray(PIECE_BYTES))
         self._sending = threading.Lock()
+        self._receiving = threading.Lock()
 
     def send(self, message: object) -> None:
         """Send a message; from any thread."""
@@ -54,14 +55,30 @@ class Channel:
         with self._sending:
             self._line.sendall(data)
 
-    def receive(self) -> Any:
-        """The next message; raises `EOFError` where the other side is gone.  One thread asks."""
-        while not self._waiting:
-            piece = self._line.recv(PIECE_BYTES)
-            if not piece:
-                raise EOFError("the other side is gone")
-            self._waiting = list(self._unpacker.feed(piece))
-        return self._waiting.pop(0)
+    def receive(self) -> list[Any]:
+        """The next messages, one at least; raises `EOFError` where the other side is gone."""
+        with self._receiving:
+            while not (messages := self._received(0)):
+                pass
+        return messages
+
+    def arrived(self) -> list[Any]:
+        """The messages that are there; none while another thread waits for some."""
+        if not self._receiving.acquire(blocking=False):
+            return []
+        try:
+            return self._received(socket.MSG_DONTWAIT)
+        except (BlockingIOError, EOFError):
+            # Of an end whoever receives is told.
+            return []
+        finally:
+            self._receiving.release()
+
+    def _received(self, flags: int) -> list[Any]:
+        count = self._line.recv_into(self._piece, 0, flags)
+        if not count:
+            raise EOFError("the other side is gone")
+        return list(self._unpacker.feed(self._piece[:count]))
 
 
 @dataclass(frozen=True)

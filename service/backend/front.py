@@ -296,7 +296,7 @@ def _handshake(started: Started) -> Opened:
         on_failure.callback(started.process.wait)
         try:
             channel.send(Open(started.settings))
-            said = channel.receive()
+            said = channel.receive()[0]
         except (EOFError, OSError):
             code = started.process.wait()
             message = f"the process that works on batches ended with code {code}; its log says why"

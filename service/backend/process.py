@@ -9,6 +9,7 @@ import signal
 import socket
 import sys
 import threading
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
@@ -37,7 +38,7 @@ def run(line: int, files: int) -> None:
     sys.setswitchinterval(TURN_S)
     channel = Channel(socket.socket(fileno=line))
     try:
-        first: Open = channel.receive()
+        first: Open = channel.receive()[0]
     except EOFError:
         return
     try:
@@ -71,17 +72,16 @@ class Backend:
         self._recorded: list[Recorded] = []
         self._outcomes: list[Outcome] = []
         self._news = False
+        self._over = False
 
     def serve(self) -> None:
         """Do what is asked until the front says that it is over, or is gone."""
         self._operations.observers.append(self._recorded.append)
         self._operations.listen(self._tell_news)
         try:
-            while not isinstance(asked := self._channel.receive(), Close):
-                if isinstance(asked, Takes):
-                    self._take(asked)
-                else:
-                    self._threads.submit(self._call, asked)
+            while not self._over:
+                if batches := self._sorted(self._channel.receive()):
+                    self._operations.take_all_here(batches, self._more)
         except (EOFError, OSError):
             # The front is gone, and with it everybody who waits for an answer.
             os._exit(1)
@@ -89,13 +89,21 @@ class Backend:
         self._threads.shutdown()
         self._tell()
 
-    def _take(self, asked: Takes) -> None:
-        self._operations.take_all(
-            [
-                Asked(sent, key, partial(self._settle, number), caller)
-                for number, sent, key, caller in asked.batches
-            ]
-        )
+    def _more(self) -> list[Asked]:
+        return self._sorted(self._channel.arrived())
+
+    def _sorted(self, messages: Sequence[Any]) -> list[Asked]:
+        """The batches among messages; what else is asked is begun."""
+        batches: list[Asked] = []
+        for message in messages:
+            if isinstance(message, Takes):
+                for number, sent, key, caller in message.batches:
+                    batches.append(Asked(sent, key, partial(self._settle, number), caller))
+            elif isinstance(message, Close):
+                self._over = True
+            else:
+                self._threads.submit(self._call, message)
+        return batches
 
     def _settle(self, number: int, outcome: Answered | Exception) -> None:
         with self._lock:

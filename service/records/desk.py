@@ -3,9 +3,11 @@
 One thread at a time takes what waits: it is read, looked up in one reading of
 the database, computed batch by batch, recorded in one transaction, and
 answered, all together.  To pass a batch from thread to thread costs more than
-to compute it.  Another thread steps in where the first has been at one batch
-for long.  Nobody's own thread waits: who submits is called with the outcome.
-A repeat of what is at work waits for it and is then looked up like any other.
+to compute it, and so does waking a thread: whoever submits may work through
+what it brought by itself.  Another thread looks from time to time, and steps in
+where the one has been at a batch for long.  Who submits is called with the
+outcome.  A repeat of what is at work waits for it and is then looked up like any
+other.
 """
 
 import math
@@ -27,11 +29,14 @@ HANDED_ON_S = 0.01
 """What is computed goes to the writer after so long, however much else waits."""
 LONG_S = 0.02
 """What has waited so long is taken by another thread."""
+AWAKE_S = 1.0
+"""So long after the last batch one thread goes on looking: to be woken is dear."""
 WAIT_S = 5.0
 """The longest that an order may wait for its turn."""
 
 Outcome = Answered | Exception
 Found = Sequence[Answered | AcquisitionError | None]
+More = Callable[[], Sequence["Order"]]
 
 
 @dataclass(eq=False, slots=True)
@@ -80,25 +85,24 @@ class Desk:
         self._changed = threading.Condition(lock)
         self._step_in = threading.Condition(lock)
         self._active = 0
-        self._moved_s = 0.0
+        self._watched = False
+        self._last = 0
+        self._moved_s = -math.inf
         self._taken_s = -math.inf
         self._quiet = threading.Event()
         self._quiet.set()
         self._closing = False
+        self._more: More = list
         self.after_group: list[Callable[[], object]] = []
         """Called when a group is settled: what is told of it may be told together."""
-        self._threads = [
-            threading.Thread(
-                target=self._work,
-                # The first does everything, as long as it keeps up: what it works with lies in
-                # the cache of its processor.
-                args=(self._step_in if number else self._changed,),
-                name=f"desk-{number}",
-                daemon=True,
-            )
-            for number in range(threads)
+        # The first does everything, as long as it keeps up: what it works with lies in the cache
+        # of its processor.
+        self._first = threading.Thread(target=self._work, name="desk", daemon=True)
+        self._others = [
+            threading.Thread(target=self._watch, name=f"desk-{number}", daemon=True)
+            for number in range(1, threads)
         ]
-        for thread in self._threads:
+        for thread in self._others:
             thread.start()
 
     def take(self, orders: Sequence[Order]) -> None:
@@ -107,6 +111,27 @@ class Desk:
         What an order is settled with is the answer, stored, or the error that
         keeps it from being.
         """
+        refused = self._put(orders)
+        with self._changed:
+            if not self._first.ident and not self._closing:
+                self._first.start()
+            if not self._active:
+                self._changed.notify()
+        self._refuse(refused)
+
+    def take_here(self, orders: Sequence[Order], more: "More") -> None:
+        """Queue orders, and work in this thread until nothing waits any longer.
+
+        Before each group `more` is called for what came meanwhile, by whichever
+        thread works then: while this one is at a batch for long, another.
+        """
+        self._more = more
+        self._refuse(self._put(orders))
+        while self._begins(self._changed, leave=True):
+            self._work_through_group()
+
+    def _put(self, orders: Sequence[Order]) -> Sequence[Order]:
+        """Queue orders; gives those for which there is no room."""
         with self._changed:
             self._taken_s = time.monotonic()
             room = MAX_WAITING - len(self._new) - len(self._ready)
@@ -114,9 +139,10 @@ class Desk:
             if taken:
                 self._new.extend(orders[:taken])
                 self._quiet.clear()
-                # Whoever steps in must be awake to see how long it takes.
-                (self._step_in if self._active else self._changed).notify()
-        for order in orders[taken:]:
+        return orders[taken:]
+
+    def _refuse(self, orders: Sequence[Order]) -> None:
+        for order in orders:
             if self._closing:
                 order.settle(Stopping("the service is stopping"))
             else:
@@ -137,50 +163,87 @@ class Desk:
         with self._changed:
             self._closing = True
             self._notify_all()
-        for thread in self._threads:
-            thread.join()
+        for thread in (self._first, *self._others):
+            if thread.ident:
+                thread.join()
 
     def _notify_all(self) -> None:
         self._changed.notify_all()
         self._step_in.notify_all()
 
-    def _work(self, turn: threading.Condition) -> None:
-        while self._wait_for(turn):
-            try:
-                self._look(self._taken())
-                self._compute()
-            finally:
-                with self._changed:
-                    self._active -= 1
-                    if not self._active:
-                        if self._new or self._ready:
-                            self._changed.notify()
-                        else:
-                            self._quiet.set()
-                    if self._closing:
-                        self._notify_all()
+    def _work(self) -> None:
+        while self._begins(self._changed):
+            self._work_through_group()
 
-    def _wait_for(self, turn: threading.Condition) -> bool:
-        """Whether there is something to do for this thread; False: there will never be."""
+    def _watch(self) -> None:
+        while self._begins(self._step_in):
+            self._work_through_group()
+
+    def _begins(self, turn: threading.Condition, leave: bool = False) -> bool:
+        """Whether there is something to do for this thread, and it has begun; it waits for that.
+
+        False: there will never be, or to `leave`, there is nothing now.
+        """
         with turn:
             while True:
                 waiting = self._ready or self._new
                 if waiting and self._may_begin(turn):
                     self._active += 1
                     self._moved_s = time.monotonic()
+                    if not self._watched:
+                        # Who may have to step in must be awake to see how long it takes.
+                        self._step_in.notify()
                     return True
-                if self._closing and not waiting and not self._active:
+                if not waiting and (leave or (self._closing and not self._active)):
                     return False
-                turn.wait(LONG_S if self._active else None)
+                self._wait(turn)
 
     def _may_begin(self, turn: threading.Condition) -> bool:
         if self._active:
             return time.monotonic() - self._moved_s > LONG_S
         return turn is self._changed
 
+    def _wait(self, turn: threading.Condition) -> None:
+        awake = self._active or time.monotonic() - self._moved_s < AWAKE_S
+        if turn is self._changed:
+            turn.wait(LONG_S if self._active else None)
+        elif awake and not self._watched:
+            self._watched = True
+            try:
+                turn.wait(LONG_S)
+            finally:
+                self._watched = False
+        else:
+            turn.wait()
+
+    def _work_through_group(self) -> None:
+        try:
+            came = self._more()
+            if came:
+                self._refuse(self._put(came))
+            self._look(self._taken())
+            self._compute()
+        finally:
+            with self._changed:
+                self._active -= 1
+                if not self._active:
+                    if self._new or self._ready:
+                        self._changed.notify()
+                    else:
+                        self._quiet.set()
+                if self._closing:
+                    self._notify_all()
+
     def _taken(self) -> list[Order]:
+        """Half of those that are about, which those who were answered last are as well.
+
+        While these are worked on, the others can be answered and come again:
+        all together they would wait for each other.
+        """
         with self._changed:
-            count = min(len(self._new), TAKEN_AT_ONCE)
+            about = len(self._new) + self._last
+            count = min(len(self._new), (about + 1) // 2, TAKEN_AT_ONCE)
+            self._last = count
             return [self._new.popleft() for _ in range(count)]
 
     def _look(self, orders: Sequence[Order]) -> None:
@@ -223,9 +286,6 @@ class Desk:
         """Compute what is ready for a while, and have it recorded."""
         began_s = time.monotonic()
         computed: list[tuple[Order, Draft]] = []
-        with self._changed:
-            if len(self._ready) > 1:
-                self._step_in.notify()
         while True:
             with self._changed:
                 if not self._ready or time.monotonic() - began_s > HANDED_ON_S:

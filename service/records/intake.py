@@ -103,7 +103,15 @@ class Intake:
 
         Returns at once: `settle` of each is called when it is done.
         """
-        self._desk.take([Order(partial(_read, each), each.key, each.settle) for each in asked])
+        self._desk.take(_orders(asked))
+
+    def take_here(self, asked: Sequence[Asked], more: "Callable[[], Sequence[Asked]]") -> None:
+        """`take`, in this thread, until nothing waits any longer.
+
+        `more` is called from time to time, by whichever thread is at work, for
+        what came meanwhile.
+        """
+        self._desk.take_here(_orders(asked), lambda: _orders(more()))
 
     @property
     def after_group(self) -> list[Callable[[], object]]:
@@ -312,6 +320,10 @@ class Intake:
             except Exception:
                 # The batch is recorded and its answer due, whoever looks on.
                 log.exception("an observer failed")
+
+
+def _orders(asked: Sequence[Asked]) -> list[Order]:
+    return [Order(partial(_read, each), each.key, each.settle) for each in asked]
 
 
 def _hand(drafts: Sequence[Draft]) -> None:
