@@ -234,7 +234,7 @@ class Intake:
 
     def _stored_orders(self, orders: Sequence[Order]) -> list[Answered | AcquisitionError | None]:
         """What is stored of each: the answer, the error of whose place is taken, or nothing."""
-        with self._store.reading() as connection:
+        with self._store.glancing() as connection:
             registry = look_up(
                 connection,
                 {each.identity for each in orders},

@@ -8,15 +8,15 @@ name.
 """
 
 import sqlite3
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from itertools import chain
 from operator import itemgetter
 from typing import Any
 
 from sqlalchemy import Connection, Executable
 from sqlalchemy.dialects import postgresql, sqlite
-from sqlalchemy.exc import DBAPIError
+
+from service.records.engines import reported
 
 Row = dict[str, Any]
 
@@ -43,7 +43,7 @@ class Prepared:
             connection.exec_driver_sql(sql, list(rows))
             return
         take = itemgetter(*names)
-        with _reported(connection, sql) as driver:
+        with reported(connection, sql) as driver:
             driver.executemany(sql, map(take, rows) if len(names) > 1 else zip(map(take, rows)))
 
     def insert(self, connection: Connection, rows: Sequence[Row]) -> None:
@@ -59,7 +59,7 @@ class Prepared:
         one_more = ", (" + ", ".join("?" * len(names)) + ")"
         values = list(map(itemgetter(*names), rows))
         done = 0
-        with _reported(connection, sql) as driver:
+        with reported(connection, sql) as driver:
             for count in ROWS_AT_ONCE:
                 many = sql + one_more * (count - 1)
                 while len(values) - done >= count:
@@ -74,7 +74,7 @@ class Prepared:
         if connection.dialect.name != "sqlite":
             found = connection.exec_driver_sql(sql, values)
             return [dict(row) for row in found.mappings()]
-        with _reported(connection, sql) as driver:
+        with reported(connection, sql) as driver:
             cursor = driver.execute(sql, [values[name] for name in names])
             rows = cursor.fetchall()
             return [dict(zip(_names(cursor), row, strict=True)) for row in rows]
@@ -100,22 +100,9 @@ def execute(connection: Connection, sql: str, values: Row | None = None) -> list
     if connection.dialect.name != "sqlite":
         result = connection.exec_driver_sql(sql, values or {})
         return [tuple(row) for row in result] if result.returns_rows else []
-    with _reported(connection, sql) as driver:
+    with reported(connection, sql) as driver:
         return driver.execute(sql, values or {}).fetchall()
 
 
 def _names(cursor: sqlite3.Cursor) -> list[str]:
     return [column[0] for column in cursor.description]
-
-
-@contextmanager
-def _reported(connection: Connection, sql: str) -> Iterator[sqlite3.Connection]:
-    """The driver's connection; what it says against a statement is raised as SQLAlchemy would."""
-    driver = connection.connection.driver_connection
-    assert isinstance(driver, sqlite3.Connection)
-    try:
-        yield driver
-    except sqlite3.Error as error:
-        raise DBAPIError.instance(
-            sql, None, error, sqlite3.Error, dialect=connection.dialect
-        ) from error

@@ -10,7 +10,7 @@ from sqlalchemy.exc import DBAPIError, TimeoutError
 
 from service.errors import Busy
 from service.records.database import bring_up_to_date, require_up_to_date
-from service.records.engines import database_url, reading_engine, writing_engine
+from service.records.engines import Kept, database_url, reading_engine, writing_engine
 from service.records.transaction import may_pass
 from service.records.writer import RETRY_AFTER_S, Writer
 
@@ -27,6 +27,7 @@ class Readers:
         """Nothing is connected yet; raises `BadConfiguration` for what is no database's URL."""
         self.url = database_url(database)
         self._readers = reading_engine(self.url)
+        self._glances = Kept(self._readers)
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
@@ -34,20 +35,33 @@ class Readers:
 
         Raises `Busy` where the database is out of reach or every reader taken.
         """
-        try:
-            with self._readers.connect() as connection, connection.begin():
-                yield connection
-        except TimeoutError as error:
-            raise Busy("every connection to the database is in use") from error
-        except DBAPIError as error:
-            if not may_pass(error):
-                raise
-            log.error("the database could not be read: %s", error.orig)
-            raise Busy("the database cannot be read now", RETRY_AFTER_S) from error
+        with _reported(), self._readers.connect() as connection, connection.begin():
+            yield connection
+
+    @contextmanager
+    def glancing(self) -> Iterator[Connection]:
+        """`reading` for a moment, again and again: others who glance wait for it."""
+        with _reported(), self._glances.transaction() as connection:
+            yield connection
 
     def close(self) -> None:
         """Let go of the database."""
+        self._glances.close()
         self._readers.dispose()
+
+
+@contextmanager
+def _reported() -> Iterator[None]:
+    """Say `Busy` of trouble with the database that may pass."""
+    try:
+        yield
+    except TimeoutError as error:
+        raise Busy("every connection to the database is in use") from error
+    except DBAPIError as error:
+        if not may_pass(error):
+            raise
+        log.error("the database could not be read: %s", error.orig)
+        raise Busy("the database cannot be read now", RETRY_AFTER_S) from error
 
 
 class Store(Readers):

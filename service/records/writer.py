@@ -20,6 +20,7 @@ from sqlalchemy.exc import DBAPIError
 
 from service.errors import Busy, Stopping
 from service.records.draft import Draft
+from service.records.engines import Kept
 from service.records.transaction import Job, Results, is_of_the_database, transact
 
 log = logging.getLogger(__name__)
@@ -39,7 +40,7 @@ class Writer:
     """Writes what is queued, from one thread over one connection."""
 
     def __init__(self, engine: Engine, max_queued: int = MAX_QUEUED) -> None:
-        self._engine = engine
+        self._connection = Kept(engine)
         self._max_queued = max_queued
         self._queue: deque[Job] = deque()
         self._patient: deque[Job] = deque()
@@ -96,6 +97,7 @@ class Writer:
             self._closing = True
             self._changed.notify()
         self._thread.join()
+        self._connection.close()
 
     def _put(self, job: Job, queue: deque[Job]) -> "Future[Any]":
         # A request that is given up does not take its record back.
@@ -168,16 +170,13 @@ class Writer:
                 log.exception("nobody could be told of a commit")
 
     def _write(self, jobs: Sequence[Job], attempt: int = 1) -> list[Any]:
-        with self._engine.connect() as connection:
-            try:
-                with connection.begin():
-                    return transact(connection, jobs)
-            except BaseException as error:
-                # The next transaction shall not inherit what this one broke.
-                connection.invalidate()
-                crossed = getattr(getattr(error, "orig", None), "sqlstate", None) in _CROSSED
-                if not crossed or attempt == MAX_ATTEMPTS:
-                    raise
+        try:
+            with self._connection.transaction() as connection:
+                return transact(connection, jobs)
+        except BaseException as error:
+            crossed = getattr(getattr(error, "orig", None), "sqlstate", None) in _CROSSED
+            if not crossed or attempt == MAX_ATTEMPTS:
+                raise
         return self._write(jobs, attempt + 1)
 
 
