@@ -86,7 +86,6 @@ class Desk:
         self._step_in = threading.Condition(lock)
         self._active = 0
         self._watched = False
-        self._last = 0
         self._moved_s = -math.inf
         self._taken_s = -math.inf
         self._quiet = threading.Event()
@@ -235,15 +234,8 @@ class Desk:
                     self._notify_all()
 
     def _taken(self) -> list[Order]:
-        """Half of those that are about, which those who were answered last are as well.
-
-        While these are worked on, the others can be answered and come again:
-        all together they would wait for each other.
-        """
         with self._changed:
-            about = len(self._new) + self._last
-            count = min(len(self._new), (about + 1) // 2, TAKEN_AT_ONCE)
-            self._last = count
+            count = min(len(self._new), TAKEN_AT_ONCE)
             return [self._new.popleft() for _ in range(count)]
 
     def _look(self, orders: Sequence[Order]) -> None:
