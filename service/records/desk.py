@@ -91,7 +91,7 @@ class Desk:
         self._quiet = threading.Event()
         self._quiet.set()
         self._closing = False
-        self._more: More = list
+        self._more: More | None = None
         self.after_group: list[Callable[[], object]] = []
         """Called when a group is settled: what is told of it may be told together."""
         # The first does everything, as long as it keeps up: what it works with lies in the cache
@@ -186,7 +186,9 @@ class Desk:
         with turn:
             while True:
                 waiting = self._ready or self._new
-                if waiting and self._may_begin(turn):
+                # Who is at a batch cannot see what comes meanwhile.
+                unseen = self._active and self._more is not None
+                if (waiting or unseen) and self._may_begin(turn):
                     self._active += 1
                     self._moved_s = time.monotonic()
                     if not self._watched:
@@ -198,9 +200,9 @@ class Desk:
                 self._wait(turn)
 
     def _may_begin(self, turn: threading.Condition) -> bool:
-        if self._active:
-            return time.monotonic() - self._moved_s > LONG_S
-        return turn is self._changed
+        if turn is self._changed and not self._active:
+            return True
+        return time.monotonic() - self._moved_s > LONG_S
 
     def _wait(self, turn: threading.Condition) -> None:
         awake = self._active or time.monotonic() - self._moved_s < AWAKE_S
@@ -217,8 +219,7 @@ class Desk:
 
     def _work_through_group(self) -> None:
         try:
-            came = self._more()
-            if came:
+            if self._more is not None and (came := self._more()):
                 self._refuse(self._put(came))
             self._look(self._taken())
             self._compute()

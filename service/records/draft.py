@@ -6,13 +6,15 @@ cannot differ from what the client was told.
 
 import json
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import msgspec
 
 from service.acquire import Acquisition
+from service.missions.mission import Identifier, Solver
 from service.observe.frame_record import FrameRecord
 from service.observe.wire import Submission
 from service.records.ahead import AHEAD_NS, LIVE
@@ -231,7 +233,23 @@ def _result_row(
 
 def options_text(acquisition: Acquisition) -> str:
     """The options that a result was computed with, as JSON, what was not named left out."""
-    named = vars(acquisition.batch.options)
+    options = acquisition.batch.options
+    if not (options.tests or options.tolerances):
+        return _few_options(options.identifier, options.solver, options.zone_grid_deg)
+    return _options_text(vars(options))
+
+
+@lru_cache(maxsize=256, typed=True)
+def _few_options(
+    identifier: Identifier | None, solver: Solver | None, zone_grid_deg: float | None
+) -> str:
+    # The same text again and again: to put it together takes longer than to insert a star.
+    return _options_text(
+        {"identifier": identifier, "solver": solver, "zone_grid_deg": zone_grid_deg}
+    )
+
+
+def _options_text(named: Mapping[str, object]) -> str:
     return json.dumps({name: value for name, value in named.items() if value not in (None, {})})
 
 

@@ -22,6 +22,9 @@ from service.errors import BadConfiguration
 BUSY_TIMEOUT_MS = 10_000
 WRITER_CACHE_KIB = 32_768
 """Of pages: the inner ones of every index are read with each batch."""
+LOG_PAGES = 4_000
+"""Of the write-ahead log, 16 MB, before they go to where they belong: each page goes there once
+for all its changes, and the group that is written then waits for that."""
 MAX_POSTGRESQL_READERS = 16
 """A server allows a hundred connections as it comes; whoever finds none free waits for one."""
 
@@ -60,7 +63,11 @@ def writing_engine(url: URL) -> Engine:
     _check_place(Path(url.database or ""))
     engine = create_engine(url, poolclass=QueuePool, pool_size=1, max_overflow=0)
     # What a savepoint may have to take back is kept in memory: a file would be made for each.
-    kept = ("temp_store = MEMORY", f"cache_size = -{WRITER_CACHE_KIB}")
+    kept = (
+        f"wal_autocheckpoint = {LOG_PAGES}",
+        "temp_store = MEMORY",
+        f"cache_size = -{WRITER_CACHE_KIB}",
+    )
     _set_up_sqlite(
         engine, "journal_mode = WAL", "synchronous = FULL", *kept, begin="BEGIN IMMEDIATE"
     )

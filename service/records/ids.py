@@ -6,6 +6,8 @@ import time
 
 _ALPHABET = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"  # Crockford's: no I, L, O, U
 _RANDOM_BITS = 80
+_AT_ONCE = 64
+"""Identifiers whose random bits are asked of the system together: it is slow to be asked."""
 LENGTH = 26
 _SHIFTS = range(10 * (LENGTH // 2 - 1), -1, -10)
 _PAIRS = [first + second for first in _ALPHABET for second in _ALPHABET]
@@ -17,12 +19,16 @@ class Ulids:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._last = 0
+        self._random = b""
 
     def new(self) -> str:
         """The next identifier: 48 bits of Unix milliseconds, 80 random ones."""
         now = time.time_ns() // 1_000_000 << _RANDOM_BITS
-        fresh = now | int.from_bytes(os.urandom(_RANDOM_BITS // 8), "big")
         with self._lock:
+            if not self._random:
+                self._random = os.urandom(_AT_ONCE * _RANDOM_BITS // 8)
+            fresh = now | int.from_bytes(self._random[: _RANDOM_BITS // 8], "big")
+            self._random = self._random[_RANDOM_BITS // 8 :]
             # In the same millisecond, or after the clock was set back, count up from the last.
             self._last = (
                 fresh if fresh >> _RANDOM_BITS > self._last >> _RANDOM_BITS else self._last + 1

@@ -46,7 +46,16 @@ READ_HERE = {
     "worst_batches",
 }
 """What looks into the records alone."""
-NOT_OVER_HTTP = {"open", "reprocess", "start_replay", "submit", "submit_many", "take", "take_all"}
+NOT_OVER_HTTP = {
+    "open",
+    "reprocess",
+    "start_replay",
+    "submit",
+    "submit_many",
+    "take",
+    "take_all",
+    "take_all_here",
+}
 """What commands and the backend itself call."""
 
 

@@ -183,7 +183,7 @@ def test_a_database_out_of_reach_is_busy_and_the_reason_is_for_the_log_alone(ope
 
 @pytest.mark.parametrize("empty_database", ["sqlite"], indirect=True)
 def test_a_table_that_is_missing_is_no_passing_trouble(operations):
-    with operations.store._writing.begin() as connection:
-        connection.execute(text("ALTER TABLE runs RENAME TO elsewhere"))
+    rename = text("ALTER TABLE runs RENAME TO elsewhere")
+    operations.store.writer.change(lambda connection: connection.execute(rename).close()).result()
     with pytest.raises(DBAPIError, match="no such table"):
         operations.runs()

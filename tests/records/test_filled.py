@@ -62,21 +62,23 @@ def test_no_page_reads_a_large_table_from_end_to_end(filled):
     asked = pages(filled)
     seen, asking = [], []
 
-    def note(_connection, _cursor, statement, parameters, *_):
-        seen.append((asking[-1], statement, parameters))
+    def note(driver, _record, _proxy):
+        # Of SQLite itself: what is prepared does not pass through SQLAlchemy.
+        driver.set_trace_callback(lambda statement: seen.append((asking[-1], statement)))
 
     engine = filled.store._readers
-    event.listen(engine, "before_cursor_execute", note)
+    event.listen(engine, "checkout", note)
     for page, ask in asked.items():
         asking.append(page)
         ask()
-    event.remove(engine, "before_cursor_execute", note)
-    assert {page for page, *_ in seen} == set(asked)
+    event.remove(engine, "checkout", note)
+    statements = [each for each in seen if each[1].lstrip().upper().startswith("SELECT")]
+    assert {page for page, _ in statements} == set(asked)
     with filled.store.reading() as connection:
-        for page, statement, parameters in seen:
-            if not statement.lstrip().upper().startswith("SELECT"):
-                continue
-            plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", parameters).all()
+        driver = connection.connection.driver_connection
+        driver.set_trace_callback(None)
+        for page, statement in statements:
+            plan = driver.execute(f"EXPLAIN QUERY PLAN {statement}").fetchall()
             for *_, step in plan:
                 scanned = re.match(r"SCAN (\w+)", step)
                 # From its newest end an index is read as far as the page goes.

@@ -162,12 +162,12 @@ def test_a_full_disk_loses_nothing_acknowledged_and_writing_resumes_with_room(
     engine = operations.store._writing
     limit = {"pages": 0}
 
-    def bound(connection, _record):
-        connection.execute(f"PRAGMA max_page_count = {limit['pages']}")
+    def bound(connection):
+        connection.connection.execute(f"PRAGMA max_page_count = {limit['pages']}")
 
     with operations.store.reading() as connection:
         used = connection.exec_driver_sql("PRAGMA page_count").scalar()
-    event.listen(engine, "checkout", lambda connection, record, _proxy: bound(connection, record))
+    event.listen(engine, "begin", bound)
     acknowledged, refused = [], []
     for index in range(60):
         limit["pages"] = used + index  # a little more room each time
