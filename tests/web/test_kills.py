@@ -33,7 +33,7 @@ class Load:
 
     def __init__(self, url, template, names):
         self.acknowledged = {}
-        self.met = Counter()
+        self.met, self._counting = Counter(), threading.Lock()
         self._url, self._template, self._names = url, template, names
         self._again = deque()
         self._stopping = threading.Event()
@@ -47,6 +47,10 @@ class Load:
         for thread in self._threads:
             thread.join()
         assert not self._faults, self._faults[0]
+
+    def _count(self, met):
+        with self._counting:
+            self.met[met] += 1
 
     def _next(self):
         try:
@@ -62,11 +66,12 @@ class Load:
                 try:
                     answer = client.post("/api/v1/batches", content=body, headers=headers)
                 except httpx.TransportError:
-                    self.met["broken off"] += 1
+                    self._count("broken off")
                     self._again.append(name)
-                    time.sleep(0.02)
+                    # More often would keep the processor from the start that is waited for.
+                    time.sleep(0.1)
                     continue
-                self.met[answer.status_code] += 1
+                self._count(answer.status_code)
                 if answer.status_code == 503:
                     self._again.append(name)
                     time.sleep(0.1)
