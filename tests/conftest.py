@@ -65,7 +65,7 @@ def pytest_addoption(parser):
 @pytest.hookimpl(tryfirst=True)
 def pytest_configure(config):
     if config.getoption("--torture"):
-        os.environ[scale.VARIABLE] = "1"
+        os.environ.setdefault(scale.VARIABLE, "1")
     seed = config.getoption("--seed")
     if seed == DEFAULT_SEED:
         hypothesis.settings.load_profile("repeatable")

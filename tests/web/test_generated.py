@@ -77,6 +77,7 @@ class Answers:
 
     def __init__(self):
         self.counts, self.faults = Counter(), {}
+        self._session = requests.Session()
 
     def take(self, case, response):
         """Note an answer: it must be no fault of ours, and one that is described."""
@@ -93,7 +94,7 @@ class Answers:
     def ask(self, case, **wanted):
         """The answer; where there is none for long, what every thread was doing is noted."""
         try:
-            return case.call(timeout=PATIENCE_S, **wanted)
+            return case.call(session=self._session, timeout=PATIENCE_S, **wanted)
         except requests.Timeout:
             threads = "\n".join(
                 "".join(traceback.format_stack(frame)) for frame in sys._current_frames().values()
@@ -102,6 +103,9 @@ class Answers:
                 f"{case.as_curl_command():.2000}\n{threads}"
             )
             raise
+
+    def close(self):
+        self._session.close()
 
     def told(self):
         """What came of them, for `figures`."""
@@ -112,16 +116,22 @@ class Answers:
         assert not told, "\n\n".join(told)
 
 
+@pytest.fixture
+def answers():
+    taken = Answers()
+    yield taken
+    taken.close()
+
+
 def inputs(operation):
     """How much of an operation can be made up: its parameters, and a body."""
     return len(list(operation.iter_parameters())) + len(operation.body)
 
 
 @pytest.mark.torture
-def test_any_request_that_the_description_suggests(ready, seed, figures):
+def test_any_request_that_the_description_suggests(ready, answers, seed, figures):
     """As many of each operation; where there are not so many different ones, more of the next."""
     operations = sorted((each.ok() for each in described.get_all_operations()), key=inputs)
-    answers = Answers()
 
     def tried(operation, count):
         """How many different requests were made."""
@@ -152,8 +162,8 @@ def test_any_request_that_the_description_suggests(ready, seed, figures):
 
 
 @pytest.mark.torture
-def test_any_sequence_of_requests(ready, seed, figures):
-    answers, sequences = Answers(), Counter()
+def test_any_sequence_of_requests(ready, answers, seed, figures):
+    sequences = Counter()
 
     class Sequences(described.as_state_machine()):
         def teardown(self):
