@@ -5,8 +5,9 @@ status and its length are looked at.  It costs a tenth of what it measures.
 """
 
 import asyncio
+import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from time import perf_counter
@@ -51,15 +52,27 @@ def request(path: str, body: bytes, kind: str = "application/json") -> bytes:
     return HEAD.format(path=path, kind=kind, length=len(body)).encode() + body
 
 
-def drive(port: int, requests: Sequence[bytes], connections: int, gap_s: float = 0.0) -> Driven:
-    """Send every request once; a connection waits for an answer, and `gap_s`, before its next."""
-    return uvloop.run(_drive(port, iter(requests), connections, gap_s))
+def drive(
+    port: int,
+    requests: Iterable[bytes],
+    connections: int,
+    gap_s: float = 0.0,
+    per_second: float = math.inf,
+) -> Driven:
+    """Send every request once; a connection waits for an answer, and `gap_s`, before its next.
+
+    Nor does it send one before its turn comes at so many `per_second` in all.
+    """
+    return uvloop.run(_drive(port, iter(requests), connections, gap_s, per_second))
 
 
-async def _drive(port: int, requests: Iterator[bytes], connections: int, gap_s: float) -> Driven:
+async def _drive(
+    port: int, requests: Iterator[bytes], connections: int, gap_s: float, per_second: float
+) -> Driven:
     driven = Driven()
     loop = asyncio.get_running_loop()
-    clients = [_Client(requests, driven, gap_s) for _ in range(connections)]
+    paced = _paced(requests, per_second)
+    clients = [_Client(paced, driven, gap_s) for _ in range(connections)]
     for client in clients:
         await loop.create_connection(partial(_same, client), "127.0.0.1", port)
     await asyncio.gather(*(client.ready for client in clients))
@@ -71,6 +84,13 @@ async def _drive(port: int, requests: Iterator[bytes], connections: int, gap_s: 
     return driven
 
 
+def _paced(requests: Iterator[bytes], per_second: float) -> Iterator[tuple[float, bytes]]:
+    """Requests, each with the time before which it is not sent."""
+    started = perf_counter()
+    for number, each in enumerate(requests):
+        yield started + number / per_second, each
+
+
 def _same(client: "_Client") -> "_Client":
     return client
 
@@ -78,7 +98,9 @@ def _same(client: "_Client") -> "_Client":
 class _Client(asyncio.Protocol):
     """One connection."""
 
-    def __init__(self, requests: Iterator[bytes], driven: Driven, gap_s: float) -> None:
+    def __init__(
+        self, requests: Iterator[tuple[float, bytes]], driven: Driven, gap_s: float
+    ) -> None:
         loop = asyncio.get_running_loop()
         self.ready: asyncio.Future[None] = loop.create_future()
         self.over: asyncio.Future[None] = loop.create_future()
@@ -97,8 +119,15 @@ class _Client(asyncio.Protocol):
             if not self.over.done():
                 self.over.set_result(None)
             return
+        turn, request = following
+        if (ahead_s := turn - perf_counter()) > 0.0:
+            asyncio.get_running_loop().call_later(ahead_s, self._send, request)
+        else:
+            self._send(request)
+
+    def _send(self, request: bytes) -> None:
         self._sent = perf_counter()
-        self._transport.write(following)
+        self._transport.write(request)
 
     def data_received(self, data: bytes) -> None:
         self._read += data

@@ -36,6 +36,7 @@ TITLES = {
     "verified_cost": "Verified identification beside the votes",
     "posts": "Single posts, bulk, both at once, start, memory",
     "stored": "As the database fills",
+    "soak": "An hour at 70 % load",
 }
 ABOUT = {
     "kernels": (
@@ -60,6 +61,12 @@ ABOUT = {
     "stored": (
         "A database filled by `benchmarks.fill_database`, then batches recorded in earnest and "
         "trends read; counted one by one, the results give the same numbers."
+    ),
+    "soak": (
+        "What the service can do at 16 connections is measured, then batches come for an hour at "
+        "70 % of that, each at its time, while a page is read every second. Bounds: the memory of "
+        "all its processes in the last sixth at most 5 % above that in the second, the write-ahead "
+        "log under 64 MB, every batch recorded."
     ),
 }
 
@@ -115,6 +122,9 @@ def write() -> None:
             if name == "posts":
                 _posts_picture(found["figures"], folder)
                 parts += ["![Rates and ratios](plots/performance-posts.svg)", ""]
+            if name == "soak":
+                _soak_picture(found["curves"], folder)
+                parts += ["![An hour](plots/performance-soak.svg)", ""]
             parts.append(f"Again: `python -m benchmarks {name}`.")
     TARGET.write_text("\n".join(parts) + "\n", "utf-8")
 
@@ -180,6 +190,14 @@ def _posts_picture(figures: Mapping[str, Any], folder: Folder) -> None:
         place.axhline(bound, color="0.3", linestyle=":")
         place.set(xlim=(-0.6, 0.6), xticks=[], title=name, ylim=(0, 1.2 * max(value, bound)))
     folder.save(figure, "performance-posts")
+
+
+def _soak_picture(curves: Mapping[str, list[float]], folder: Folder) -> None:
+    figure = folder.figure(7.0, 2.6)
+    for place, (name, values) in zip(figure.subplots(1, len(curves)), curves.items(), strict=True):
+        place.plot(range(1, len(values) + 1), values)
+        place.set(xlabel="minute", title=name, ylim=(0, 1.2 * max(values)))
+    folder.save(figure, "performance-soak")
 
 
 if __name__ == "__main__":

@@ -6,12 +6,16 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Report:
-    """Figures in the order in which they are shown; `faults` says what is out of bounds."""
+    """Figures in the order in which they are shown; `faults` says what is out of bounds.
+
+    `curves` are drawn rather than shown: values by name, one for each step of a run.
+    """
 
     name: str
     figures: dict[str, Any]
     passed: bool
     faults: list[str] = field(default_factory=list)
+    curves: dict[str, list[float]] = field(default_factory=dict)
 
     def text(self) -> str:
         """The report as it is printed."""

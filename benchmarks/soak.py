@@ -1,0 +1,143 @@
+"""An hour at 70 % of what the service can do: whether it goes on as it began.
+
+    python -m benchmarks soak           an hour; not among those that are run by default
+    python -m benchmarks soak --quick   two minutes
+
+The service runs as it is served, over SQLite with synchronous=FULL.  What it
+can do is measured first, at 16 connections; then batches come at 70 % of that,
+each at its time, while a page is read every second.  Every minute the waiting
+times are taken, and the memory of all processes; every second the size of the
+write-ahead log.  At the end the records are counted.
+"""
+
+import json
+import tempfile
+import threading
+import urllib.request
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from benchmarks.load import drive, request
+from benchmarks.posts import API, CONNECTIONS, Telemetry, telemetry
+from benchmarks.report import Report
+from benchmarks.serving import Served, service
+
+SHARE = 0.7
+SLICES, SLICE_S = 60, 60.0
+QUICK_SLICES, QUICK_SLICE_S = 12, 10.0
+PROBES, PROBED = 3, 3_000
+SETTLED = 1 / 6
+"""After so much of the time the memory is what it should stay."""
+MOST_DRIFT, MOST_LOG_MB = 0.05, 64.0
+_NAME = b"soak-NAME"
+
+
+@dataclass
+class _Watched:
+    """What is seen second by second."""
+
+    log_mb: list[float] = field(default_factory=list)
+    reads: int = 0
+
+
+def _bodies(pass_: Telemetry, first: int, count: int) -> Iterator[bytes]:
+    """Requests of batches with names of their own; made as they are needed."""
+    templates = [
+        json.dumps(
+            drawn.batch | {"options": {"identifier": "starid"}, "batch": _NAME.decode()}
+        ).encode()
+        for drawn in pass_.drawn
+    ]
+    for number in range(first, first + count):
+        body = templates[number % len(templates)].replace(_NAME, b"soak-%d" % number)
+        yield request(f"{API}/batches", body)
+
+
+def _watch(served: Served, log: Path, watched: _Watched, over: threading.Event) -> None:
+    while not over.wait(1.0):
+        watched.log_mb.append(log.stat().st_size / 1e6)
+        with urllib.request.urlopen(served.address(f"{API}/overview"), timeout=60) as answer:
+            json.load(answer)
+        watched.reads += 1
+
+
+def _recorded(served: Served) -> int:
+    address = served.address(f"{API}/spacecraft/XTE/rates?bucket=day")
+    with urllib.request.urlopen(address, timeout=60) as answer:
+        return sum(int(each["batches"]) for each in json.load(answer)["items"])
+
+
+def run(quick: bool, seed: int) -> Report:
+    """Post for an hour, and compare its end with its beginning."""
+    pass_ = telemetry(seed)
+    slices, slice_s = (QUICK_SLICES, QUICK_SLICE_S) if quick else (SLICES, SLICE_S)
+    faults: list[str] = []
+    sent = 0
+    watched, over = _Watched(), threading.Event()
+    rates: list[float] = []
+    p50_ms: list[float] = []
+    p99_ms: list[float] = []
+    memory_mb: list[float] = []
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        service(Path(folder) / "soak.db") as served,
+    ):
+        probes = []
+        for _ in range(PROBES):
+            driven = drive(served.port, list(_bodies(pass_, sent, PROBED)), CONNECTIONS)
+            sent += PROBED
+            probes.append(driven.per_second)
+        capacity = median(probes)
+        log = Path(folder) / "soak.db-wal"
+        watcher = threading.Thread(target=_watch, args=(served, log, watched, over))
+        watcher.start()
+        try:
+            for _ in range(slices):
+                count = round(SHARE * capacity * slice_s)
+                bodies = _bodies(pass_, sent, count)
+                driven = drive(served.port, bodies, CONNECTIONS, per_second=SHARE * capacity)
+                sent += count
+                if set(driven.statuses) != {201}:
+                    faults.append(f"there were answers {dict(driven.statuses)}")
+                rates.append(driven.per_second)
+                p50_ms.append(driven.percentile_ms(50.0))
+                p99_ms.append(driven.percentile_ms(99.0))
+                memory_mb.append(served.resident_mb())
+        finally:
+            over.set()
+            watcher.join()
+        recorded = _recorded(served)
+        size_mb = (Path(folder) / "soak.db").stat().st_size / 1e6
+    settled = max(1, round(SETTLED * slices))
+    before = median(memory_mb[settled : 2 * settled])
+    drift = median(memory_mb[-settled:]) / before - 1.0
+    half = len(watched.log_mb) // 2
+    figures: dict[str, Any] = {
+        "minutes": slices * slice_s / 60.0,
+        "can do, posts a second": capacity,
+        "posts a second": median(rates),
+        "posts in all": sent,
+        "recorded": recorded,
+        "overviews read meanwhile": watched.reads,
+        "p50 of the first sixth, ms": median(p50_ms[:settled]),
+        "p50 of the last sixth, ms": median(p50_ms[-settled:]),
+        "p99 of the first sixth, ms": median(p99_ms[:settled]),
+        "p99 of the last sixth, ms": median(p99_ms[-settled:]),
+        "memory in the second sixth, MB": before,
+        "memory in the last sixth, MB": median(memory_mb[-settled:]),
+        "memory: drift": drift,
+        "log: largest in the first half, MB": max(watched.log_mb[:half]),
+        "log: largest in the second half, MB": max(watched.log_mb[half:]),
+        "database, MB": size_mb,
+    }
+    if recorded != sent:
+        faults.append(f"{recorded} batches are recorded of {sent}")
+    if drift > MOST_DRIFT:
+        faults.append(f"memory has grown by {drift:.1%}")
+    if max(watched.log_mb) > MOST_LOG_MB:
+        faults.append(f"the log has grown to {max(watched.log_mb):.0f} MB")
+    curves = {"memory, MB": memory_mb, "p99, ms": p99_ms, "posts a second": rates}
+    return Report("soak", figures, not faults, faults, curves)
