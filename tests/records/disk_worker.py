@@ -36,9 +36,12 @@ def main(database, file, faults, seed):
     waiting = iter(lines)
     for _ in range(int(faults)):
         before = disk.faulty_failed()
-        # A single write or a disk that stays full for a while, at any write of a commit.
+        # A single write or a disk that stays full for a while, at any write of a commit, at its
+        # sync, or commits later, where a checkpoint may be at work.
         error = draw.choice((errno.ENOSPC, errno.EIO))
-        disk.faulty_fail(draw.randrange(12), draw.choice((1, 1, 3, 25)), error)
+        disk.faulty_fail(
+            draw.randrange(draw.choice((12, 60, 400))), draw.choice((1, 1, 3, 25)), error
+        )
         while disk.faulty_failed() == before:
             chunk = [submission_from_json(line) for line in islice(waiting, 3)]
             assert chunk, "the batches ended before the disk failed"
