@@ -128,8 +128,8 @@ def _normalise(q):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def quest(b, r, weights, start, q):  # type: ignore[no-untyped-def]
-    """Wahba's attitude by QUEST (Shuster & Oh 1981) into q.
+def quest(b, r, weights, start, q, room):  # type: ignore[no-untyped-def]
+    """Wahba's attitude by QUEST (Shuster & Oh 1981) into q; `room` (3, 3, 3) is written to.
 
     `start` is a rough quaternion: its largest component tells by which half
     turn to rotate the reference vectors first, so that the scalar part of what
@@ -145,7 +145,6 @@ def quest(b, r, weights, start, q):  # type: ignore[no-untyped-def]
     total = 0.0
     for k in range(len(weights)):
         total += weights[k]
-    room = np.empty((4, 3, 3))
     profile = room[0]  # B = sum of a b r^T
     profile[:] = 0.0
     for k in range(len(weights)):
@@ -257,19 +256,31 @@ def inverse_symmetric(m, out):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, error_model="numpy")
 def _polish(b, r, weights, q, room):  # type: ignore[no-untyped-def]
     a, matrix, inverse = room[0], room[1], room[2]
-    p = np.empty_like(r)
     for _ in range(POLISHING_STEPS):
         to_matrix(q, a)
         g0 = g1 = g2 = 0.0
+        m00 = m01 = m02 = m11 = m12 = m22 = 0.0
         for k in range(len(weights)):
-            for i in range(3):
-                p[k, i] = a[i, 0] * r[k, 0] + a[i, 1] * r[k, 1] + a[i, 2] * r[k, 2]
+            p0 = a[0, 0] * r[k, 0] + a[0, 1] * r[k, 1] + a[0, 2] * r[k, 2]
+            p1 = a[1, 0] * r[k, 0] + a[1, 1] * r[k, 1] + a[1, 2] * r[k, 2]
+            p2 = a[2, 0] * r[k, 0] + a[2, 1] * r[k, 1] + a[2, 2] * r[k, 2]
             # b x p, written with the residual b - p so that it keeps its digits.
-            d0, d1, d2 = b[k, 0] - p[k, 0], b[k, 1] - p[k, 1], b[k, 2] - p[k, 2]
-            g0 += weights[k] * (d1 * p[k, 2] - d2 * p[k, 1])
-            g1 += weights[k] * (d2 * p[k, 0] - d0 * p[k, 2])
-            g2 += weights[k] * (d0 * p[k, 1] - d1 * p[k, 0])
-        information(p, weights, matrix)
+            d0, d1, d2 = b[k, 0] - p0, b[k, 1] - p1, b[k, 2] - p2
+            g0 += weights[k] * (d1 * p2 - d2 * p1)
+            g1 += weights[k] * (d2 * p0 - d0 * p2)
+            g2 += weights[k] * (d0 * p1 - d1 * p0)
+            # As in `information`.
+            w = weights[k]
+            m00 = m00 + w - w * p0 * p0
+            m11 = m11 + w - w * p1 * p1
+            m22 = m22 + w - w * p2 * p2
+            m01 -= w * p0 * p1
+            m02 -= w * p0 * p2
+            m12 -= w * p1 * p2
+        matrix[0, 0], matrix[1, 1], matrix[2, 2] = m00, m11, m22
+        matrix[0, 1] = matrix[1, 0] = m01
+        matrix[0, 2] = matrix[2, 0] = m02
+        matrix[1, 2] = matrix[2, 1] = m12
         if not inverse_symmetric(matrix, inverse):
             return
         e0 = 0.5 * (inverse[0, 0] * g0 + inverse[0, 1] * g1 + inverse[0, 2] * g2)
@@ -299,13 +310,13 @@ def solve(b, r, sigma_rad, worst_rad, quaternions, covariance, squares, sums):  
     leaves an axis worse than `worst_rad`.
     """
     n = len(b)
-    weights = np.empty(n)
+    weights, room = np.empty(n), np.empty((3, 3, 3))
     for k in range(n):
         weights[k] = 1.0 / (sigma_rad[k] * sigma_rad[k])
     first, second, sine = widest_pair(b, r, weights)
     if sine <= LEAST_SINE:
         return False
-    matrix = np.empty((3, 3))
+    matrix, attitude = room[0], room[1]
     information(b, weights, matrix)
     if not inverse_symmetric(matrix, covariance):
         return False
@@ -320,16 +331,17 @@ def solve(b, r, sigma_rad, worst_rad, quaternions, covariance, squares, sums):  
     )
     if m00 <= 0.0 or minor <= 0.0 or determinant <= 0.0:
         return False
-    attitude = np.empty((3, 3))
     triad(b[first], b[second], r[first], r[second], attitude)
     to_quaternion(attitude, quaternions[0])
     # The widest pair may be of coarse stars; TRIAD of the firmest is near the optimum.
-    start = quaternions[0].copy()
+    start = np.empty(4)
     anchor, other = _firmest_pair(b, r, weights)
-    if anchor != other:
+    if anchor == other:
+        start[:] = quaternions[0]
+    else:
         triad(b[anchor], b[other], r[anchor], r[other], attitude)
         to_quaternion(attitude, start)
-    quest(b, r, weights, start, quaternions[1])
+    quest(b, r, weights, start, quaternions[1], room)
     for method in range(2):
         to_matrix(quaternions[method], attitude)
         for k in range(n):

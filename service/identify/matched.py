@@ -95,7 +95,7 @@ def _match_and_fit(  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def matched_vectors(  # type: ignore[no-untyped-def]
     direction_body, sigma_rad, star, catalog_direction, velocity, sun_distance_au
 ):
@@ -109,14 +109,21 @@ def matched_vectors(  # type: ignore[no-untyped-def]
     for k in range(len(star)):
         if star[k] >= 0:
             count += 1
-    observed, reference = np.empty((count, 3)), np.empty((count, 3))
+    # One array, and number by number: to make arrays and to cut them takes longer than the rest.
+    both = np.empty((2, count, 3))
+    observed, reference = both[0], both[1]
     sigma = np.empty(count)
+    at_rest = velocity[0] == 0.0 and velocity[1] == 0.0 and velocity[2] == 0.0
     at = 0
     for k in range(len(star)):
-        if star[k] >= 0:
-            observed[at] = direction_body[k]
+        row = star[k]
+        if row >= 0:
+            for i in range(3):
+                observed[at, i] = direction_body[k, i]
+                reference[at, i] = catalog_direction[row, i]
             sigma[at] = sigma_rad[k]
-            aberrate(catalog_direction[star[k]], velocity, sun_distance_au, reference[at])
+            if not at_rest:
+                aberrate(catalog_direction[row], velocity, sun_distance_au, reference[at])
             at += 1
     return observed, reference, sigma
 
