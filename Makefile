@@ -12,6 +12,9 @@ PYTEST_ARGS ?=
 # Processes that share the tests between them, a file to each at a time; 0 for one after another
 WORKERS ?= 2
 BENCH_ARGS ?=
+# What comes to the database only after it was checked, or in a browser, is the same over both
+OVER_POSTGRESQL = --database postgresql -m "not torture" tests/web \
+	$(addprefix --ignore tests/web/test_,bad_input.py any_input.py console_in_browser.py)
 # From the environment: TEST_POSTGRESQL_URL, a scratch database for the PostgreSQL tests, which
 # are skipped without it, e.g. postgresql+psycopg://user@127.0.0.1:5432/test
 
@@ -51,6 +54,12 @@ test: $(DEV)
 	@$(BIN)/python -m service.warm
 	@echo "== tests"
 	@$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile $(PYTEST_ARGS)
+ifeq ($(strip $(PYTEST_ARGS)),)
+	@if [ -n "$$TEST_POSTGRESQL_URL" ]; then \
+		echo "== the interface and its pages over PostgreSQL"; \
+		$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile $(OVER_POSTGRESQL); \
+	fi
+endif
 
 torture: $(DEV)
 	@echo "== torture: kills, failing disks and odd input at full size; hours"

@@ -2,6 +2,7 @@
 
 pytest --seed 7           other random draws, for hypothesis as well
 pytest --batches 2000     batches per mission held against the plain implementation
+pytest --database postgresql tests/web     the interface and its pages over PostgreSQL
 pytest --torture          tests of kills, failing disks and odd input at full size, not a fiftieth
 
 Every test that asks for `database` runs on SQLite and on PostgreSQL, which takes
@@ -13,6 +14,7 @@ import faulthandler
 import os
 import tomllib
 import uuid
+from contextlib import ExitStack, contextmanager
 
 import hypothesis
 import numpy as np
@@ -58,6 +60,12 @@ def pytest_addoption(parser):
         help="batches per mission held against the plain implementation",
     )
     parser.addoption(
+        "--database",
+        choices=("sqlite", "postgresql"),
+        default="sqlite",
+        help="what the tests of pages and of the interface keep their records in",
+    )
+    parser.addoption(
         "--torture", action="store_true", help="kills, failing disks, odd input: at full size"
     )
 
@@ -72,6 +80,16 @@ def pytest_configure(config):
     else:
         hypothesis.settings.load_profile("seeded")
         hypothesis.core.global_force_seed = seed
+
+
+def pytest_collection_modifyitems(config, items):
+    """With a --database of their own choice, only tests that keep something in it."""
+    if config.getoption("--database") == "sqlite":
+        return
+    chosen = [item for item in items if "chosen_database" in item.fixturenames]
+    others = [item for item in items if "chosen_database" not in item.fixturenames]
+    config.hook.pytest_deselected(items=others)
+    items[:] = chosen
 
 
 def pytest_runtest_setup(item):
@@ -144,6 +162,27 @@ def empty_database(request, tmp_path):
     if request.param == "sqlite":
         yield f"sqlite:///{tmp_path / 'acquire.db'}"
         return
+    with _postgresql_schema() as url:
+        yield url
+
+
+@pytest.fixture(scope="session")
+def chosen_database(request, tmp_path_factory):
+    """Gives the URLs of databases of the kind that --database names, up to date."""
+    with ExitStack() as schemas:
+
+        def fresh():
+            if request.config.getoption("--database") == "sqlite":
+                return f"sqlite:///{tmp_path_factory.mktemp('chosen') / 'acquire.db'}"
+            url = schemas.enter_context(_postgresql_schema())
+            upgrade(url)
+            return url
+
+        yield fresh
+
+
+@contextmanager
+def _postgresql_schema():
     server = os.environ.get("TEST_POSTGRESQL_URL")
     if not server:
         pytest.skip("TEST_POSTGRESQL_URL names no PostgreSQL database to test on")

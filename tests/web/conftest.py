@@ -23,10 +23,9 @@ Json = dict[str, Any]
 
 
 @pytest.fixture(scope="session")
-def operations(tmp_path_factory: pytest.TempPathFactory) -> Operations:
-    """The real operations over a new SQLite file; the server closes them."""
-    path: Path = tmp_path_factory.mktemp("web") / "acquire.db"
-    return Operations.open(Settings(database=f"sqlite:///{path}"))
+def operations(chosen_database: Callable[[], str]) -> Operations:
+    """The real operations over a new database; the server closes them."""
+    return Operations.open(Settings(database=chosen_database()))
 
 
 @pytest.fixture(scope="session")

@@ -29,8 +29,8 @@ KNOWN_AGAIN_S = 1.3
 class Guarded:
     """A service of its own with tokens of every kind."""
 
-    def __init__(self, folder):
-        self.settings = Settings(database=f"sqlite:///{folder / 'guarded.db'}")
+    def __init__(self, database):
+        self.settings = Settings(database=database)
         self.operations = Operations.open(self.settings)
         self._ids = Ulids()
 
@@ -57,8 +57,8 @@ class Guarded:
 
 
 @pytest.fixture(scope="module")
-def guarded(tmp_path_factory):
-    service = Guarded(tmp_path_factory.mktemp("guarded"))
+def guarded(chosen_database):
+    service = Guarded(chosen_database())
     service.all = service.token("all", "read", "submit", "operate")
     service.expired = service.token("expired", "read", "submit", "operate", days=-1)
     service.revoked = service.token("revoked", "read", "submit", "operate")
@@ -266,8 +266,8 @@ def test_the_database_holds_nothing_that_could_be_used(guarded):
     assert tokens.PREFIX not in kept
 
 
-def test_access_is_open_on_loopback_until_the_first_token_is_made(tmp_path):
-    service = Guarded(tmp_path)
+def test_access_is_open_on_loopback_until_the_first_token_is_made(chosen_database):
+    service = Guarded(chosen_database())
     with Server(create_app(service.operations)) as url, httpx.Client(base_url=url) as client:
         assert client.get("/api/v1/session").json()["name"] == "local"
         service.token("first", "read")

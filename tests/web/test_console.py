@@ -26,9 +26,8 @@ HOSTILE = "<script>alert(1)</script>\"'><img src=x onerror=alert(2)>{{7*7}}\u202
 
 
 @pytest.fixture(scope="module")
-def empty(tmp_path_factory):
-    path = tmp_path_factory.mktemp("empty") / "acquire.db"
-    operations = Operations.open(Settings(database=f"sqlite:///{path}"))
+def empty(chosen_database):
+    operations = Operations.open(Settings(database=chosen_database()))
     with Server(create_app(operations)) as address, httpx.Client(base_url=address) as client:
         yield client
 

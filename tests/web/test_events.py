@@ -72,8 +72,8 @@ def service(database):
 
 
 @pytest.fixture
-def database(tmp_path):
-    return f"sqlite:///{tmp_path / 'events.db'}"
+def database(chosen_database):
+    return chosen_database()
 
 
 def send(address, batches, **changed):
