@@ -19,29 +19,35 @@ from collections import Counter
 from itertools import islice
 from pathlib import Path
 
+from sqlalchemy import event
+
 from service.errors import Busy
 from service.observe.wire import submission_from_json
 from service.operations import Operations
 from service.settings import Settings
 
 PATIENCE_S = 60.0
+WITHIN = (60, 40, 6)
+"""Calls among which one fails, of each kind that `faulty_disk.c` tells apart."""
+LOG_PAGES = 60
+"""A checkpoint every few batches: as it is served there is one in hundreds."""
 
 
 def main(database, file, faults, seed):
     disk, draw = ctypes.CDLL(None), random.Random(int(seed))
     disk.faulty_struck.restype = ctypes.c_char_p
     operations = Operations.open(Settings(database=database))
+    event.listen(operations.store._writing, "begin", _checkpoint_often)
     lines = Path(file).read_bytes().splitlines()
     acknowledged, told_busy, kinds, reads_failed = {}, 0, Counter(), 0
     waiting = iter(lines)
     for _ in range(int(faults)):
         before = disk.faulty_failed()
-        # A single write or a disk that stays full for a while, at any write of a commit, at its
-        # sync, or commits later, where a checkpoint may be at work.
+        # A single call or a disk that stays so for a while: in a commit, at its end, or where a
+        # checkpoint takes the log over into the file.
         error = draw.choice((errno.ENOSPC, errno.EIO))
-        disk.faulty_fail(
-            draw.randrange(draw.choice((12, 60, 400))), draw.choice((1, 1, 3, 25)), error
-        )
+        kind, within = draw.choice(tuple(enumerate(WITHIN)))
+        disk.faulty_fail(kind, draw.randrange(within), draw.choice((1, 1, 3, 25)), error)
         while disk.faulty_failed() == before:
             chunk = [submission_from_json(line) for line in islice(waiting, 3)]
             assert chunk, "the batches ended before the disk failed"
@@ -61,7 +67,7 @@ def main(database, file, faults, seed):
                 acknowledged[each.id] = hashlib.sha256(each.body).hexdigest()
         call, place = disk.faulty_struck().decode().split(" ", 1)
         kinds[f"{call} {Path(place).name} {errno.errorcode[error]}"] += 1
-    disk.faulty_fail(0, 0, 0)
+    disk.faulty_fail(0, 0, 0, 0)
     rest = [submission_from_json(line) for line in waiting]
     for each in operations.submit_many(rest):
         acknowledged[each.id] = hashlib.sha256(each.body).hexdigest()
@@ -75,6 +81,10 @@ def main(database, file, faults, seed):
         "reads_failed": reads_failed,
     }
     print(json.dumps(told))
+
+
+def _checkpoint_often(connection):
+    connection.connection.execute(f"PRAGMA wal_autocheckpoint = {LOG_PAGES}")
 
 
 if __name__ == "__main__":

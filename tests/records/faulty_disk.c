@@ -1,11 +1,12 @@
 /* Lets writes to one folder fail on demand: preloaded, it stands before the C library.
  *
  * FAULTY_FOLDER names the folder, absolute.  From Python:
- *   ctypes.CDLL(None).faulty_fail(after, count, errno)   the write after `after` more, and the
- *                                                        following ones, `count` in all
- *   ctypes.CDLL(None).faulty_calls()                     writes so far
- *   ctypes.CDLL(None).faulty_failed()                    of these, how many were made to fail
- *   ctypes.CDLL(None).faulty_struck()                    the first of them: its call and its file
+ *   ctypes.CDLL(None).faulty_fail(kind, after, count, errno)
+ *                                       the call of a kind after `after` more, and the following
+ *                                       ones, `count` in all; 0: what writes to a log, 1: to any
+ *                                       other file, 2: what waits for the disk
+ *   ctypes.CDLL(None).faulty_failed()   how many calls were made to fail so far
+ *   ctypes.CDLL(None).faulty_struck()   the first of the latest: its call and its file
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -17,18 +18,21 @@
 #include <sys/types.h>
 #include <unistd.h>
 
-static atomic_long calls, failed, first = -1, last = -1;
-static atomic_int error;
+enum { LOG, FILE_ITSELF, SYNC, KINDS };
+
+static atomic_long calls[KINDS], failed, first = -1, last = -1;
+static atomic_int wanted, error;
 static char struck[4200];
 
-long faulty_calls(void) { return calls; }
 long faulty_failed(void) { return failed; }
 const char *faulty_struck(void) { return struck; }
 
-void faulty_fail(long after, long count, int number) {
+void faulty_fail(int kind, long after, long count, int number) {
+    first = last = -1;
+    wanted = kind;
     error = number;
-    last = calls + after + count;
-    first = calls + after + 1;
+    last = calls[kind] + after + count;
+    first = calls[kind] + after + 1;
 }
 
 static int fails(int fd, const char *call) {
@@ -38,9 +42,11 @@ static int fails(int fd, const char *call) {
     snprintf(link, sizeof link, "/proc/self/fd/%d", fd);
     ssize_t length = readlink(link, path, sizeof path - 1);
     if (length < 0 || strncmp(path, folder, strlen(folder)) != 0) return 0;
-    long number = ++calls;
-    if (number < first || number > last) return 0;
     path[length] = 0;
+    int is_log = length > 4 && strcmp(path + length - 4, "-wal") == 0;
+    int kind = strstr(call, "sync") ? SYNC : is_log ? LOG : FILE_ITSELF;
+    long number = ++calls[kind];
+    if (kind != wanted || number < first || number > last) return 0;
     if (number == first) snprintf(struck, sizeof struck, "%s %s", call, path);
     ++failed;
     errno = error;

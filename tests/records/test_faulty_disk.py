@@ -63,6 +63,9 @@ def test_whatever_write_fails_nothing_acknowledged_is_lost_and_writing_resumes(
     # A checkpoint that fails comes again by itself: not every fault is noticed by who sends.
     assert (told["struck"], told["reads_failed"]) == (faults, 0)
     assert told["told_busy"] > 0
+    if faults == FAULTS:
+        struck = " ".join(told["kinds"])
+        assert all(each in struck for each in ("acquire.db-wal", "acquire.db ", "sync"))
     operations = Operations.open(Settings(database=database))
     try:
         assert_whole(operations, told["acknowledged"])
