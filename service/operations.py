@@ -225,6 +225,9 @@ class Operations:
         with self.reading() as connection:
             connection.exec_driver_sql("SELECT 1")
 
+    def stop_warming(self) -> None:
+        """Let nobody wait for what is not ready yet, where that can be helped: not here."""
+
     def _look_where_they_look(self) -> None:
         """Build what the next batch of each live spacecraft will most likely ask for.
 

@@ -47,7 +47,6 @@ ASKED = (
     "compare",
     "drop_zones",
     "overlay",
-    "ready",
     "replay_processes",
     "set_limit",
     "shelve",
@@ -107,6 +106,7 @@ class Front(Operations):
         self._loop: asyncio.AbstractEventLoop | None = None
         self._transport: asyncio.Transport | None = None
         self._closing = False
+        self._getting_ready = 0
 
     # ---- the loop ------------------------------------------------------------------------------
 
@@ -160,6 +160,20 @@ class Front(Operations):
         )
         self._loop.call_soon_threadsafe(self._send_call, number, packed(call), done)
         return done.result()
+
+    def ready(self) -> None:
+        """Return once the backend is warm; raises as it does."""
+        self._getting_ready += 1
+        try:
+            self.ask("ready")
+        finally:
+            self._getting_ready -= 1
+
+    def stop_warming(self) -> None:
+        """End a backend that is getting ready and asked for nothing else: it may take minutes."""
+        if self._getting_ready and self._getting_ready == len(self._waiting):
+            self._closing = True
+            self._backend.process.kill()
 
     def _send_call(self, number: int, call: bytes, done: "Future[Any]") -> None:
         self._waiting[number] = done

@@ -74,6 +74,7 @@ def create_app(operations: Operations, limits: Limits = DEFAULT_LIMITS) -> FastA
             yield
         finally:
             await app.state.live.close()
+            operations.stop_warming()
             # The handlers' own threads may all be at work still.
             own = anyio.CapacityLimiter(1)
             await anyio.to_thread.run_sync(warming.join, limiter=own)

@@ -125,6 +125,28 @@ needs_proc = pytest.mark.skipif(
 )
 
 
+def test_told_to_stop_while_it_compiles_it_does_not_finish_that_first(tmp_path):
+    """As at the first start after an installation, which takes minutes."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "service.cli", "serve", "--port", str(port)]
+    command += ["--database", f"sqlite:///{tmp_path / 'acquire.db'}"]
+    nothing_compiled = {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, env=os.environ | nothing_compiled, start_new_session=True
+    )
+    try:
+        url = f"http://127.0.0.1:{port}"
+        _until(lambda: httpx.get(f"{url}/livez").status_code == 200, process)
+        assert httpx.get(f"{url}/readyz").status_code == 503
+        process.terminate()
+        _, told = process.communicate(timeout=30)
+    finally:
+        process.kill()
+        process.wait()
+    assert (process.returncode, b"Traceback" in told) in ((0, False), (-signal.SIGTERM, False))
+
+
 @needs_proc
 def test_without_the_front_the_backend_ends_at_once(served):
     _, process = served
