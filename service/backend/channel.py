@@ -68,11 +68,15 @@ class Channel:
             return []
         try:
             return self._received(socket.MSG_DONTWAIT)
-        except (BlockingIOError, EOFError):
-            # Of an end whoever receives is told.
+        except (OSError, EOFError):
+            # Nothing is there, or nobody any more: of that whoever receives is told.
             return []
         finally:
             self._receiving.release()
+
+    def hang_up(self) -> None:
+        """Receive no more: who waits for a message is told that there will be none."""
+        self._line.shutdown(socket.SHUT_RD)
 
     def _received(self, flags: int) -> list[Any]:
         count = self._line.recv_into(self._piece, 0, flags)

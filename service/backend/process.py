@@ -83,8 +83,9 @@ class Backend:
                 if batches := self._sorted(self._channel.receive()):
                     self._operations.take_all_here(batches, self._more)
         except (EOFError, OSError):
-            # The front is gone, and with it everybody who waits for an answer.
-            os._exit(1)
+            if not self._over:
+                # The front is gone, and with it everybody who waits for an answer.
+                os._exit(1)
         self._operations.close()
         self._threads.shutdown()
         self._tell()
@@ -101,6 +102,8 @@ class Backend:
                     batches.append(Asked(sent, key, partial(self._settle, number), caller))
             elif isinstance(message, Close):
                 self._over = True
+                # Another thread may have heard it than the one that waits for more.
+                self._channel.hang_up()
             else:
                 self._threads.submit(self._call, message)
         return batches

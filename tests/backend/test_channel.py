@@ -4,6 +4,7 @@ import pickle
 import socket
 import tempfile
 import threading
+import time
 
 import pytest
 from hypothesis import given
@@ -78,3 +79,47 @@ def test_every_error_arrives_as_it_was():
         assert type(again) is type(error)
         assert str(again) == str(error)
         assert vars(again) == vars(error)
+
+
+def test_what_is_there_is_taken_without_waiting_and_by_one_thread_at_a_time():
+    here, there = socket.socketpair()
+    with here, there:
+        channel, other = Channel(here), Channel(there)
+        assert channel.arrived() == []
+        other.send("one")
+        other.send("two")
+        assert channel.arrived() == ["one", "two"]
+        received = []
+        waiting = threading.Thread(target=lambda: received.extend(channel.receive()))
+        waiting.start()
+        while not channel._receiving.locked():
+            time.sleep(0.001)
+        assert channel.arrived() == []
+        other.send("three")
+        waiting.join()
+        assert received == ["three"]
+        there.close()
+        assert channel.arrived() == []
+
+
+def test_who_waits_is_told_when_another_thread_hangs_up():
+    here, there = socket.socketpair()
+    with here, there:
+        channel, told = Channel(here), []
+
+        def wait():
+            try:
+                channel.receive()
+            except EOFError:
+                told.append("over")
+
+        waiting = threading.Thread(target=wait)
+        waiting.start()
+        while not channel._receiving.locked():
+            time.sleep(0.001)
+        channel.hang_up()
+        waiting.join(10)
+        assert told == ["over"]
+        # What is to be said can still be said.
+        channel.send("goodbye")
+        assert Channel(there).receive() == ["goodbye"]
