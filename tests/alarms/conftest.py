@@ -1,5 +1,5 @@
 """Databases and batches as the records' own tests have them."""
 
-from tests.records.conftest import database, empty_database, make, opened, operations
+from tests.records.conftest import make, opened, operations
 
-__all__ = ["database", "empty_database", "make", "opened", "operations"]
+__all__ = ["make", "opened", "operations"]

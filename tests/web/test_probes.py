@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import httpx
 from prometheus_client.parser import text_string_to_metric_families
+from sqlalchemy import text
 
 from service.operations import Operations
 from service.settings import Settings
@@ -14,10 +15,10 @@ from tests.web.serving import Server
 
 
 def samples(client):
-    text = client.get("/metrics").text
+    told = client.get("/metrics").text
     return {
         (sample.name, *sorted(sample.labels.items())): sample.value
-        for family in text_string_to_metric_families(text)
+        for family in text_string_to_metric_families(told)
         for sample in family.samples
     }
 
@@ -79,8 +80,8 @@ def test_two_apps_share_no_counter(client, tmp_path):
 def test_a_fault_of_ours_is_logged_and_says_nothing_of_what_is_inside(tmp_path, caplog):
     operations = Operations.open(Settings(database=f"sqlite:///{tmp_path}/gone.db"))
     with Server(create_app(operations)) as address:
-        with operations.store.writer._engine.begin() as connection:
-            connection.exec_driver_sql("ALTER TABLE runs RENAME TO elsewhere")
+        rename = text("ALTER TABLE runs RENAME TO elsewhere")
+        operations.change(lambda connection: connection.execute(rename).close())
         with httpx.Client(base_url=address) as client:
             answer = client.get("/api/v1/runs")
             assert client.get("/livez").status_code == 200, "on the same connection"
