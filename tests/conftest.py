@@ -183,6 +183,7 @@ def chosen_database(request, tmp_path_factory):
 
 @contextmanager
 def _postgresql_schema():
+    """A schema of its own; skips where no server is named, for SQLite needs none. CI names one."""
     server = os.environ.get("TEST_POSTGRESQL_URL")
     if not server:
         pytest.skip("TEST_POSTGRESQL_URL names no PostgreSQL database to test on")

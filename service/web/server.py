@@ -20,7 +20,7 @@ MAX_FILES = 4096
 
 START_FAILED = 3
 TURN_S = 0.001
-"""How long a thread keeps others waiting that want to go on: a post changes threads four times."""
+"""How long a thread keeps others waiting that want to go on, such as the one that speaks HTTP."""
 GRACE_S = 10
 """How long running requests may still take when the server is told to stop."""
 UNREAD_S = 60

@@ -88,6 +88,7 @@ class Answers:
             assert status < 500 or status == 503, status
             check_answer(sent.method, URL(sent.url), status, headers, lambda: response.content)
         except Exception as error:
+            # Whatever is wrong is told at the end, each kind of it once: the rest is still asked.
             fault = f"{error!r:.2000}\n{case.as_curl_command():.2000}"
             self.faults.setdefault((case.operation.label, type(error), status), fault)
 
