@@ -98,6 +98,8 @@ log = logging.getLogger(__name__)
 
 ALL_RUNS = "*"
 MAX_REPLAYS = 8
+REHEARSALS = 8
+"""So often a batch is rehearsed at the start: the interpreter settles on how it runs code."""
 """Each keeps a thread and a file of its own; those that come later may come again."""
 REPLAY_RETRY_S = 30
 
@@ -231,15 +233,17 @@ class Operations:
     def _look_where_they_look(self) -> None:
         """Build what the next batch of each live spacecraft will most likely ask for.
 
-        A batch of each is rehearsed, all but kept, under a name that it does not have.
+        A batch of each is rehearsed, all but kept, under a name that it does not have; where
+        there are few, more than once: what runs for the first times is slow.
         """
         with self.reading() as connection:
             inputs = latest_inputs(connection)
         for text in inputs:
             try:
                 sent = submission_from_json(text)
-                batch = dataclasses.replace(sent.batch, batch=self._ids.new())
-                self._intake.rehearse(dataclasses.replace(sent, batch=batch))
+                for _ in range(1 + REHEARSALS // len(inputs)):
+                    batch = dataclasses.replace(sent.batch, batch=self._ids.new())
+                    self._intake.rehearse(dataclasses.replace(sent, batch=batch))
             except Exception as error:
                 # One that cannot be run any more is no reason not to start.
                 log.warning("the latest batch of a spacecraft could not be rehearsed: %s", error)

@@ -1,5 +1,6 @@
 """The app, put together in one place."""
 
+import asyncio
 import logging
 import threading
 from collections.abc import AsyncIterator
@@ -20,6 +21,7 @@ from service.web.live import Live
 from service.web.metrics import Metrics
 from service.web.middleware import AroundRequests
 from service.web.reference import add_reference
+from service.web.rehearsal import rehearse
 from service.web.routes import (
     access,
     advice,
@@ -67,7 +69,8 @@ def create_app(operations: Operations, limits: Limits = DEFAULT_LIMITS) -> FastA
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         anyio.to_thread.current_default_thread_limiter().total_tokens = WORKER_THREADS
         await operations.attach()
-        warming = threading.Thread(target=_warm_up, args=(operations,), name="warm-up")
+        here = asyncio.get_running_loop()
+        warming = threading.Thread(target=_warm_up, args=(app, operations, here), name="warm-up")
         warming.start()
         await app.state.live.start()
         try:
@@ -121,9 +124,10 @@ def bare_app() -> FastAPI:
     return app
 
 
-def _warm_up(operations: Operations) -> None:
+def _warm_up(app: FastAPI, operations: Operations, loop: asyncio.AbstractEventLoop) -> None:
     try:
         operations.ready()
+        asyncio.run_coroutine_threadsafe(rehearse(app), loop).result()
     except Exception as error:
         # Whoever asks /readyz is told, and the next call tries again.
         log.warning("not ready yet: %s", error)

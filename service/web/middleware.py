@@ -16,6 +16,7 @@ from service.settings import is_loopback
 from service.web.access import guard
 from service.web.errors import Kind, answer_to, our_fault, problem
 from service.web.metrics import Metrics
+from service.web.rehearsal import REHEARSAL
 
 NOT_HERE = Kind(421, "This is another host's", "not-this-host")
 
@@ -95,7 +96,8 @@ class AroundRequests:
                 raise
             await our_fault(Request(inner), error)(inner, receive, sent)
         finally:
-            self.metrics.count_request(inner, status, time.perf_counter() - started)
+            if REHEARSAL not in inner:
+                self.metrics.count_request(inner, status, time.perf_counter() - started)
 
     async def _note(self, scope: Scope, status: int) -> None:
         state = scope.get("state", {})

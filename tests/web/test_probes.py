@@ -1,5 +1,6 @@
 """Probes and metrics; the answer to a fault of ours."""
 
+import asyncio
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -11,6 +12,7 @@ from sqlalchemy import text
 from service.operations import Operations
 from service.settings import Settings
 from service.web.app import create_app
+from service.web.rehearsal import rehearse
 from tests.web.serving import Server
 
 
@@ -75,6 +77,18 @@ def test_two_apps_share_no_counter(client, tmp_path):
     operations = Operations.open(Settings(database=f"sqlite:///{tmp_path}/other.db"))
     with Server(create_app(operations)) as address, httpx.Client(base_url=address) as other:
         assert stars(samples(other), "unique") == 0
+
+
+def test_the_rehearsal_before_the_first_client_reaches_the_records_door_and_is_not_counted(
+    tmp_path,
+):
+    operations = Operations.open(Settings(database=f"sqlite:///{tmp_path}/rehearsed.db"))
+    app = create_app(operations)
+    try:
+        assert asyncio.run(rehearse(app)) == 422
+        assert b'route="/api/v1/batches"' not in app.state.metrics.text()
+    finally:
+        operations.close()
 
 
 def test_a_fault_of_ours_is_logged_and_says_nothing_of_what_is_inside(tmp_path, caplog):
