@@ -11,8 +11,8 @@ import logging
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
-from contextlib import ExitStack
-from functools import wraps
+from contextlib import ExitStack, suppress
+from functools import partial, wraps
 from typing import Any
 
 from service.backend.asked import (
@@ -64,6 +64,9 @@ ASKED = (
 
 RESTART_S = 5
 """How long a backend may take until it is there again, for those who ask meanwhile."""
+
+PAUSE_S, LONGEST_PAUSE_S = 1.0, 30.0
+"""Before a backend is started again that could not open its database: twice as long each time."""
 
 log = logging.getLogger(__name__)
 
@@ -229,24 +232,34 @@ class Front(Operations):
             self._backend.process.kill()
             self._backend.process.wait()
             self._files.close()
-            # From this thread, which lasts: the backend ends with the thread that starts it.
-            started = start_backend(self.settings)
-            threading.Thread(
-                target=self._go_on, args=(started,), name="restart", daemon=True
-            ).start()
+            self._restart(PAUSE_S)
         self._give_up(list(self._waiting))
 
-    def _go_on(self, started: Started) -> None:
+    def _restart(self, pause_s: float) -> None:
+        """Start another backend; where it cannot be used, again after a pause, then a longer one.
+
+        From the loop's thread, which lasts: a backend ends with the thread that starts it.
+        """
+        if not self._closing:
+            started = start_backend(self.settings)
+            go_on = partial(self._go_on, started, pause_s)
+            threading.Thread(target=go_on, name="restart", daemon=True).start()
+
+    def _go_on(self, started: Started, pause_s: float) -> None:
         """Go on with another backend, once it has opened its operations and is warm."""
+        assert self._loop is not None
         try:
             _handshake(started)
         except AcquisitionError as error:
-            log.error("it could not be started: %s", error)
+            log.error("it could not be started, and is in %g s again: %s", pause_s, error)
+            longer_s = min(2.0 * pause_s, LONGEST_PAUSE_S)
+            self._loop.call_soon_threadsafe(self._loop.call_later, pause_s, self._restart, longer_s)
             return
-        assert self._loop is not None
         self._backend, self._files = started, Files(started.files)
         asyncio.run_coroutine_threadsafe(self._connect(), self._loop).result()
-        self.ready()
+        # Whoever asks for it meanwhile warms it, or is told what is wrong.
+        with suppress(AcquisitionError):
+            self.ready()
 
     def close(self) -> None:
         """Let the backend finish what it has taken, and wait until it has ended."""

@@ -209,6 +209,36 @@ def test_a_backend_that_dies_is_replaced_and_nothing_acknowledged_is_lost(served
     assert len(recorded) == len(acknowledged)
 
 
+@needs_proc
+def test_a_backend_that_finds_its_database_unusable_is_tried_again_until_it_is_not(
+    served, sky, missions, tmp_path
+):
+    url, process = served
+
+    def post(name):
+        body = samples.batch(sky, missions, name)
+        head = {"Content-Type": "application/json"}
+        return httpx.post(f"{url}/api/v1/batches", content=body, headers=head, timeout=60)
+
+    assert post("before").status_code == 201
+    aside = tmp_path / "aside"
+    aside.mkdir()
+    files = list(tmp_path.glob("acquire.db*"))
+    for each in files:
+        each.rename(aside / each.name)
+    database = tmp_path / "acquire.db"
+    database.write_text("this is no database" * 100)
+    os.kill(_backend_of(process), signal.SIGKILL)
+    _until(lambda: b"could not be started" in (tmp_path / "log").read_bytes(), process)
+    assert post("meanwhile").status_code == 503
+    assert httpx.get(f"{url}/readyz").status_code == 503
+    database.unlink()
+    for each in files:
+        (aside / each.name).rename(each)
+    _until(lambda: post("after").status_code in (200, 201), process)
+    assert len(_recorded(url)) == 2
+
+
 def _recorded(url):
     """The ids of all that is recorded."""
     ids, cursor = [], None
