@@ -29,7 +29,8 @@ from service.imaging.frame import FrameLimits
 from service.missions.mission import SHIPPED_FOLDER, load_missions, read_mission
 from service.observe.compressed import unpacked_lines
 from service.observe.csv_rows import write_csv
-from service.observe.formats import MAX_LINE_BYTES, read_lines
+from service.observe.formats import read_lines
+from service.observe.lines import MAX_LINE_BYTES
 from service.observe.wire import BatchIn, submission_from_json
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass

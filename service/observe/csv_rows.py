@@ -27,7 +27,7 @@ from service.observe.csv_cells import (
     number_cells,
     star_of,
 )
-from service.observe.formats import Line
+from service.observe.lines import Line
 from service.observe.wire import BatchIn
 
 MAX_ROWS = MAX_STARS_PER_TRACKER * MAX_TRACKERS

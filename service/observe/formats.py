@@ -6,31 +6,16 @@ handed on with its fault, and the next lines follow: what to make of it is the
 caller's choice.  A file that makes no sense as a whole raises `BadFile`.
 """
 
-import codecs
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Literal
 
 from service.errors import BadFile, Fault
-
-MAX_LINE_BYTES = 1 << 20
+from service.observe.csv_rows import batches_of_rows
+from service.observe.lines import Line, physical_lines
 
 Form = Literal["ndjson", "csv"]
-
-
-@dataclass(frozen=True)
-class Line:
-    """A batch as JSON, or the fault that stands in its place.
-
-    `number` counts lines from one; a batch of a CSV file has that of its first
-    row, a fault that of the line where it lies.
-    """
-
-    number: int
-    body: bytes | None
-    fault: Fault | None = None
 
 
 def form_of(path: Path) -> Form:
@@ -47,33 +32,9 @@ def read_lines(source: Path | BinaryIO, form: Form | None = None) -> Iterator[Li
     """
     with _opened(source) as stream:
         if (form or (form_of(source) if isinstance(source, Path) else "ndjson")) == "csv":
-            # Only files of that form need the reader, and it needs this module.
-            from service.observe.csv_rows import batches_of_rows
-
             yield from batches_of_rows(physical_lines(stream))
         else:
             yield from physical_lines(stream)
-
-
-def physical_lines(stream: BinaryIO) -> Iterator[Line]:
-    """The lines of a stream without their ends; blank ones are counted and left out.
-
-    A line beyond `MAX_LINE_BYTES` is passed over without being held.
-    """
-    number = 0
-    while raw := stream.readline(MAX_LINE_BYTES + 1):
-        number += 1
-        if number == 1:
-            raw = raw.removeprefix(codecs.BOM_UTF8)
-        if len(raw) > MAX_LINE_BYTES and not raw.endswith(b"\n"):
-            length = len(raw)
-            while raw and not raw.endswith(b"\n"):
-                raw = stream.readline(MAX_LINE_BYTES)
-                length += len(raw)
-            message = f"is longer than {MAX_LINE_BYTES} bytes"
-            yield Line(number, None, Fault(f"line {number}", message, f"{length} bytes"))
-        elif raw.strip():
-            yield Line(number, raw.rstrip(b"\r\n"))
 
 
 @contextmanager

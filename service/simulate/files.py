@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from service.errors import BadFile, Fault
+from service.observe.csv_rows import write_csv
 from service.observe.formats import form_of
+from service.observe.wire import BatchIn
 from service.simulate.telemetry import Drawn
 
 
@@ -34,9 +36,6 @@ def write_pass(drawn: Iterable[Drawn], telemetry: Path) -> int:
         truth = stack.enter_context(_appearing(truth_path(telemetry)))
         out = stack.enter_context(_appearing(telemetry))
         if form_of(telemetry) == "csv":
-            from service.observe.csv_rows import write_csv
-            from service.observe.wire import BatchIn
-
             write_csv((BatchIn.model_validate_json(json.dumps(each)) for each in batches()), out)
         else:
             out.writelines(_line(each) for each in batches())

@@ -10,12 +10,14 @@ from scipy.stats import binomtest, poisson
 
 from service.errors import BadInput
 from service.simulate.ptp import claims, tables
-from service.simulate.ptp.command import CASES, TITLES, run_ptp
-from service.simulate.ptp.comparison import ALGORITHMS, COMPARED, Case, compare, databases
+from service.simulate.ptp.case import Case
+from service.simulate.ptp.command import CASES, run_ptp
+from service.simulate.ptp.comparison import ALGORITHMS, COMPARED, compare, databases
 from service.simulate.ptp.plots import draw
 from service.simulate.ptp.printed import the_ptp_paper
 from service.simulate.ptp.rivals.liebe import features
 from service.simulate.ptp.rivals.planar_triangle import area_and_moment, area_and_moment_sigma
+from service.simulate.ptp.tables import TITLES
 from service.simulate.ptp.tally import COLUMNS, Rate, Tally
 from service.simulate.scenes import Conditions, SceneSky, draw_scenes
 from service.vectors import angle_between_deg, unit

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from service.errors import BadBatch, BadFile
 from service.observe.csv_cells import COLUMNS
 from service.observe.csv_rows import write_csv
-from service.observe.formats import MAX_LINE_BYTES, Line, read_lines
+from service.observe.formats import read_lines
+from service.observe.lines import MAX_LINE_BYTES, Line
 from service.observe.wire import BatchIn, submission_from_json
 
 HEADER = "spacecraft,batch,time,q1,q2,q3,qc,tracker,x,y,z,magnitude"

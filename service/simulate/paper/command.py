@@ -8,18 +8,17 @@ from typing import Any, TextIO
 
 from service.errors import BadInput, Fault
 from service.missions.mission import Identifier
-from service.simulate.paper import tables, time_tables
+from service.simulate.paper.document import document
 from service.simulate.paper.experiments import run_experiments
 from service.simulate.paper.plots import draw
 from service.simulate.paper.printed import the_paper
+from service.simulate.paper.report import PAPER_IDENTIFIER, PROPORTIONS, report
+from service.simulate.paper.tables import TITLES
 from service.simulate.paper.tally import AMBIGUOUS, CORRECT, MISIDENTIFIED, UNMATCHED, Tally
-from service.simulate.paper.timings import measure
 
-PAPER_IDENTIFIER: Identifier = "starid"
 ZONE_IDENTIFIERS: tuple[Identifier, ...] = ("starid", "verified")
 """The identifiers that look in a zone, as the paper's does."""
 DEFAULT_STARS = 20_000
-TIMES, PROPORTIONS = (11, 12), (13, 14)
 
 
 def run_paper(
@@ -50,8 +49,6 @@ def run_paper(
     if plots is not None:
         draw([tally for tally in tallies if tally.identifier == PAPER_IDENTIFIER], plots)
     if report_path is not None:
-        from service.simulate.paper.document import document
-
         text = document(tallies, seeds, plots or report_path.parent, report_path)
         report_path.write_text(text, encoding="utf-8")
         print(report_path, file=out)
@@ -68,7 +65,7 @@ def _checked(
     table: int | None, stars: int, seeds: Sequence[int], identifiers: Sequence[Identifier]
 ) -> Sequence[int]:
     faults = []
-    if table is not None and table not in tables.TITLES:
+    if table is not None and table not in TITLES:
         faults.append(Fault("table", "must be from 2 to 14", str(table)))
     if stars < 1:
         faults.append(Fault("stars", "must be at least 1", str(stars)))
@@ -80,46 +77,7 @@ def _checked(
     ]
     if faults:
         raise BadInput(faults)
-    return list(tables.TITLES) if table is None else [table]
-
-
-def report(
-    tallies: Sequence[Tally], identifier: Identifier, wanted: Sequence[int], seed: int
-) -> str:
-    """The tables of one identifier as Markdown."""
-    mine = [tally for tally in tallies if tally.identifier == identifier]
-    parts = [f"## Tables of Fink & Shoup 1994 by the identifier `{identifier}`"]
-    is_paper = identifier == PAPER_IDENTIFIER
-    if mine and is_paper:
-        parts.append(
-            "Not identified: ambiguous or unmatched. A printed run is inside when distance² "
-            "<= 5.99. `!`: other than the reference."
-        )
-    for number in wanted:
-        chosen = [tally for tally in mine if tally.run.number == number]
-        if chosen:
-            shown = tables.rates(chosen) if is_paper else tables.improvements(chosen)
-            parts += [tables.heading(number), shown]
-    if mine:
-        parts.append(tables.summary(mine) if is_paper else tables.improvement_summary(mine))
-    # Tables 13 and 14 are of the zones of 11 and 12, measured once for both.
-    measured = {
-        number: [
-            (case, measure(case, seed, identifier))
-            for case in the_paper().times
-            if case.table == str(number)
-        ]
-        for number, shares in zip(TIMES, PROPORTIONS, strict=True)
-        if {number, shares} & set(wanted)
-    }
-    for number in wanted:
-        if number in TIMES:
-            parts += [tables.heading(number), time_tables.times(measured[number])]
-        elif number in PROPORTIONS:
-            written = time_tables.proportions(measured[number - 2])
-            note = "`!`: the zone holds more pairs than the approximation bounds."
-            parts += [tables.heading(number), written, note]
-    return "\n\n".join(parts) + "\n"
+    return list(TITLES) if table is None else [table]
 
 
 def rows_of(tallies: Sequence[Tally]) -> list[dict[str, Any]]:

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from service.missions.mission import Identifier
-from service.simulate.paper.command import PAPER_IDENTIFIER, report
 from service.simulate.paper.plots import PICTURES, PLACES
 from service.simulate.paper.region import differences, is_inside
+from service.simulate.paper.report import PAPER_IDENTIFIER, report
 from service.simulate.paper.tables import TITLES
 from service.simulate.paper.tally import Tally
 

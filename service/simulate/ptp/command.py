@@ -3,38 +3,25 @@
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
 
-import numpy as np
-import numpy.typing as npt
-
 from service.errors import BadInput, Fault
-from service.simulate.ptp import claims, tables
+from service.simulate.ptp.case import Case
 from service.simulate.ptp.comparison import (
     COMPARED,
     OF_THE_PAPER,
-    Case,
-    Database,
     compare,
     databases,
     stars_in_fields,
 )
-from service.simulate.ptp.plots import Drawn, draw
-from service.simulate.ptp.printed import the_ptp_paper
-from service.simulate.ptp.tally import Tally
+from service.simulate.ptp.document import document
+from service.simulate.ptp.found import Found
+from service.simulate.ptp.plots import draw
+from service.simulate.ptp.tables import TITLES, section
 
 DEFAULT_SCENES = 10_000
 SLAVES = ("PTP, 3 slaves", "PTP", "PTP, 5 slaves", "PTP, 6 slaves")
-TITLES: Mapping[str, str] = {
-    "ptp-5": "Table 5. The number of slave stars, no noise",
-    "ptp-6": "Table 6. The algorithms compared, 1 px and 0.5 mag of noise",
-    "figure-10": "Figure 10. Stars in the field of view",
-    "figure-11": "Figure 11. Rate against the stars in the field, 0.5 px",
-    "figure-12": "Figure 12. Rate against the noise of position",
-    "figure-13": "Figure 13. Rate against the noise of magnitude, stars lost and added",
-}
 ALL = "ptp"
 """Names every table and figure together."""
 
@@ -48,23 +35,6 @@ CASES: Mapping[str, Sequence[Case]] = {
         Case("figure-13", OF_THE_PAPER, 0.0, mag) for mag in (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
     ],
 }
-
-
-@dataclass(frozen=True)
-class Found:
-    """What was measured: tallies by table, the counts of Figure 10, the databases."""
-
-    scenes: int
-    seed: int
-    tallies: Mapping[str, Sequence[Tally]]
-    stars: npt.NDArray[np.int64] | None = None
-    databases: Sequence[Database] = field(default_factory=tuple)
-
-    @property
-    def drawn(self) -> Drawn:
-        """The figures, for the plots."""
-        figures: Drawn = {} if self.stars is None else {"figure-10": self.stars}
-        return figures | {name: tallies for name, tallies in self.tallies.items() if tallies}
 
 
 def run_ptp(
@@ -91,8 +61,6 @@ def run_ptp(
     if plots is not None:
         draw(found.drawn, plots)
     if report_path is not None:
-        from service.simulate.ptp.document import document
-
         report_path.write_text(document(found, plots or report_path.parent, report_path), "utf-8")
         print(report_path, file=out)
     else:
@@ -125,27 +93,6 @@ def measured(wanted: Sequence[str], scenes: int, seed: int, processes: int | Non
         stars_in_fields(scenes, seed) if "figure-10" in wanted else None,
         databases(list(names)),
     )
-
-
-def section(found: Found, name: str) -> str:
-    """A table or figure with its heading, and what the paper claims of it that cannot be."""
-    tallies, paper = found.tallies[name], the_ptp_paper()
-    if name == "ptp-5":
-        shown = tables.table_5(tallies, found.databases)
-    elif name == "ptp-6":
-        shown = tables.table_6(tallies, found.databases)
-    elif name == "figure-10":
-        assert found.stars is not None
-        shown = tables.figure_10(found.stars)
-    elif name == "figure-11":
-        shown = tables.figure_11(tallies)
-    elif name == "figure-12":
-        shown = tables.line_table(tallies, "position_px", "px", paper.figure_12)
-    else:
-        shown = tables.line_table(tallies, "magnitude_sigma_mag", "mag", paper.figure_13)
-    note = claims.NOT_REPRODUCED.get(name)
-    parts = [f"### {TITLES[name]}", shown, *([note] if note else [])]
-    return "\n\n".join(parts)
 
 
 def rows_of(found: Found) -> list[dict[str, Any]]:

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from tqdm import tqdm
 
 from service.identify.ptp import explained
+from service.simulate.ptp.case import LIMIT_MAG, Case
 from service.simulate.ptp.rivals.liebe import build_liebe
 from service.simulate.ptp.rivals.p_vector import build_p_vector
 from service.simulate.ptp.rivals.planar_triangle import build_planar_triangle
@@ -38,36 +39,9 @@ ALGORITHMS: Mapping[str, Build] = {
 }
 OF_THE_PAPER = ("PTP", "P-vector", "planar triangle")
 COMPARED = (*OF_THE_PAPER, "Liebe's triangles", "pyramid")
-LIMIT_MAG = 6.0
 SIGMA_FLOOR_PX = 0.25
 """What algorithms are told where there is no noise: a range of nothing would find nothing."""
 SCENES_A_TASK = 50
-
-
-@dataclass(frozen=True)
-class Case:
-    """One condition and the algorithms that see its fields.
-
-    `adds`: noise of magnitude lifts stars fainter than the limit into the field
-    as well as it drops brighter ones; without it the sky ends at the limit.
-    """
-
-    name: str
-    algorithms: tuple[str, ...]
-    position_px: float
-    magnitude_sigma_mag: float = 0.0
-    adds: bool = True
-    fewest: int = 6
-
-    @property
-    def conditions(self) -> Conditions:
-        """The same for the simulator."""
-        return Conditions(
-            position_px=self.position_px,
-            magnitude_sigma_mag=self.magnitude_sigma_mag,
-            limit_mag=LIMIT_MAG,
-            fewest=self.fewest,
-        )
 
 
 @dataclass(frozen=True)

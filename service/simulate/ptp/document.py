@@ -8,7 +8,7 @@ import numpy as np
 from service.missions.mission import RunCatalogSettings
 from service.simulate.paper.tables import markdown
 from service.simulate.ptp import tables
-from service.simulate.ptp.command import TITLES, Found, section
+from service.simulate.ptp.found import Found
 from service.simulate.ptp.printed import the_ptp_paper
 from service.sky.catalog import load_embedded
 from service.sky.run_catalog import build_run_catalog
@@ -82,12 +82,12 @@ def document(found: Found, plots: Path, file: Path) -> str:
         "## Tables and figures",
         tables.RATES,
     ]
-    for name in TITLES:
+    for name in tables.TITLES:
         if name in found.tallies:
             picture = plots / f"ptp-{name}.svg"
             link = os.path.relpath(picture, file.parent)
-            parts.append(section(found, name))
-            parts += [f"![{TITLES[name]}]({link})"] if picture.exists() else []
+            parts.append(tables.section(found, name))
+            parts += [f"![{tables.TITLES[name]}]({link})"] if picture.exists() else []
     return "\n\n".join(part.strip() for part in parts) + "\n"
 
 

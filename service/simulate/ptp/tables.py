@@ -1,14 +1,25 @@
 """The paper's tables and figures as Markdown, its numbers beside ours."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from service.simulate.paper.tables import markdown
+from service.simulate.ptp import claims
 from service.simulate.ptp.comparison import Database
+from service.simulate.ptp.found import Found
 from service.simulate.ptp.printed import Ends, the_ptp_paper
 from service.simulate.ptp.tally import Tally
+
+TITLES: Mapping[str, str] = {
+    "ptp-5": "Table 5. The number of slave stars, no noise",
+    "ptp-6": "Table 6. The algorithms compared, 1 px and 0.5 mag of noise",
+    "figure-10": "Figure 10. Stars in the field of view",
+    "figure-11": "Figure 11. Rate against the stars in the field, 0.5 px",
+    "figure-12": "Figure 12. Rate against the noise of position",
+    "figure-13": "Figure 13. Rate against the noise of magnitude, stars lost and added",
+}
 
 MB = 1e6
 STARS_IN_FIELD = ((3, 3), (4, 4), (5, 5), (6, 6), (7, 7), (8, 8), (9, 10), (11, 15), (16, 99))
@@ -21,6 +32,27 @@ RATES = (
     "misnamed. The paper does not say when it counts a field as identified. Times are medians of "
     "this machine."
 )
+
+
+def section(found: Found, name: str) -> str:
+    """A table or figure with its heading, and what the paper claims of it that cannot be."""
+    tallies, paper = found.tallies[name], the_ptp_paper()
+    if name == "ptp-5":
+        shown = table_5(tallies, found.databases)
+    elif name == "ptp-6":
+        shown = table_6(tallies, found.databases)
+    elif name == "figure-10":
+        assert found.stars is not None
+        shown = figure_10(found.stars)
+    elif name == "figure-11":
+        shown = figure_11(tallies)
+    elif name == "figure-12":
+        shown = line_table(tallies, "position_px", "px", paper.figure_12)
+    else:
+        shown = line_table(tallies, "magnitude_sigma_mag", "mag", paper.figure_13)
+    note = claims.NOT_REPRODUCED.get(name)
+    parts = [f"### {TITLES[name]}", shown, *([note] if note else [])]
+    return "\n\n".join(parts)
 
 
 def table_5(tallies: Sequence[Tally], databases: Sequence[Database]) -> str:

@@ -3,13 +3,12 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-if TYPE_CHECKING:
-    from service.simulate.ptp.comparison import Case
+from service.simulate.ptp.case import Case
 
 COLUMNS = ("stars", "named", "named_right", "unique", "unique_right", "own_us", "check_us")
 """Of a field: stars; those that the algorithm names, those named rightly; after the check likewise;
@@ -56,7 +55,7 @@ class Tally:
     *wrong*: after the check some star has a name that is not its own.
     """
 
-    case: "Case"
+    case: Case
     algorithm: str
     rows: npt.NDArray[np.int64]
 
