@@ -1,10 +1,9 @@
 """Whether the probabilities mean what they say: of stars claimed at p a share p is right.
 
-python -m benchmarks.calibration           every condition by itself
-python -m benchmarks.calibration --quick   small samples
+python -m benchmarks calibration           every condition by itself
+python -m benchmarks calibration --quick   small samples
 """
 
-import sys
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -209,8 +208,3 @@ def _draw(found: list[Reliability], pictures: Folder) -> None:
 
 
 SECTION = Section("What a probability is worth", write)
-
-if __name__ == "__main__":
-    from benchmarks.__main__ import main
-
-    sys.exit(main(["calibration", *sys.argv[1:]]))
