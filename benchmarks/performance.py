@@ -55,7 +55,7 @@ ABOUT = {
         "same server and framework whose route parses the same body and answers a small JSON. "
         "Bounds: 0.35 of the no-op's rate at 16 connections; bulk 0.5 of parsing and inserting "
         "alone; p99 of single posts beside bulk under 3 times its idle value; ready within 3 s of "
-        "the start of the process, the first request at most 1.25 times the hundredth after the "
+        "the start of the process, the first request at most 1.5 times the hundredth after the "
         "same pause (medians of some starts; in a row, caches warm, it is quicker). Processor time "
         "and memory are those of all processes of the service, what they share counted each time."
     ),

@@ -22,9 +22,6 @@ from service.errors import BadConfiguration
 BUSY_TIMEOUT_MS = 10_000
 WRITER_CACHE_KIB = 32_768
 """Of pages: the inner ones of every index are read with each batch."""
-LOG_PAGES = 500
-"""Of the write-ahead log, 2 MB, before they go to where they belong.  The group that brings that
-about waits for it, 5 ms; for 16 MB it is 20, and nothing is gained."""
 MAX_POSTGRESQL_READERS = 16
 """A server allows a hundred connections as it comes; whoever finds none free waits for one."""
 
@@ -63,11 +60,9 @@ def writing_engine(url: URL) -> Engine:
     _check_place(Path(url.database or ""))
     engine = create_engine(url, poolclass=QueuePool, pool_size=1, max_overflow=0)
     # What a savepoint may have to take back is kept in memory: a file would be made for each.
-    kept = (
-        f"wal_autocheckpoint = {LOG_PAGES}",
-        "temp_store = MEMORY",
-        f"cache_size = -{WRITER_CACHE_KIB}",
-    )
+    kept = ("temp_store = MEMORY", f"cache_size = -{WRITER_CACHE_KIB}")
+    # The log goes into the file after a thousand pages, as SQLite has it: whoever writes waits for
+    # that, of four thousand 20 ms, and nothing is gained.
     _set_up_sqlite(
         engine, "journal_mode = WAL", "synchronous = FULL", *kept, begin="BEGIN IMMEDIATE"
     )
