@@ -207,9 +207,9 @@ class Front(Operations):
             self._finish(message.number, message.error, message.value)
 
     def _finish(self, number: int, error: Exception | None, value: Any) -> None:
-        done = self._waiting.pop(number)
-        if done.done():
-            return  # whoever asked has gone
+        done = self._waiting.pop(number, None)
+        if done is None or done.done():
+            return  # whoever asked has gone, or was told that the backend has
         if error is not None:
             done.set_exception(error)
         else:

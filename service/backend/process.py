@@ -109,6 +109,8 @@ class Backend:
         return batches
 
     def _settle(self, number: int, outcome: Answered | Exception) -> None:
+        if isinstance(outcome, Exception):
+            outcome = _portable(outcome)
         with self._lock:
             self._outcomes.append((number, outcome))
 
@@ -151,7 +153,7 @@ def _portable(error: Exception) -> Exception:
     """An error that the front can be told; what cannot be packed is logged here, and named."""
     if isinstance(error, AcquisitionError):
         return error
-    log.exception("a call failed")
+    log.error("a call failed", exc_info=error)
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:

@@ -34,7 +34,7 @@ MAX_LISTED = 100
 MAX_FAULTS_KEPT = 3
 """Of one line: they are written anew with every chunk that adds to them, and read as a whole."""
 MAX_TEXT_KEPT = 300
-BUSY_PAUSE_S = 0.5
+BUSY_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
 PROGRESS_S = 0.2
 """Between two notes of how far a replay is: each is a transaction, and told to all who listen."""
 
@@ -136,6 +136,7 @@ class Replay:
         self._errors: list[Row] = []
         self._errors_changed = False
         self._noting: Future[None] | None = None
+        self._noted = True
         self._ahead: deque[_Begun] = deque()
         self._written: _Begun | None = None
         self._saved_s = 0.0
@@ -204,10 +205,19 @@ class Replay:
                 close: Callable[[], Any] | None = getattr(lines, "close", None)
                 if close is not None:
                     close()
-                self._save(state=state, finished=self._now())
-                self._require_noted()
+                self._conclude(state)
             finally:
                 self._over.set()
+
+    def _conclude(self, state: str) -> None:
+        """Note how it ended, as often as it takes: nothing else would say that it is over."""
+        pause_s = BUSY_PAUSE_S
+        while True:
+            self._save(state=state, finished=self._now())
+            self._require_noted()
+            if self._noted or self._stopping.wait(pause_s):
+                return
+            pause_s = min(2.0 * pause_s, LONGEST_PAUSE_S)
 
     def _worked_through(self, lines: Iterable[bytes]) -> str:
         """The state in the end; while a chunk is written, those after it are computed."""
@@ -318,7 +328,7 @@ class Replay:
             events.note(connection, "replay", state, run=state["run"])
 
         self._require_noted()
-        self._errors_changed = False
+        self._errors_changed, self._noted = False, True
         try:
             self._noting = self._store.writer.change(save)
         except AcquisitionError as error:
@@ -337,6 +347,8 @@ class Replay:
     def _not_noted(self, error: Exception) -> None:
         # The next chunk says how far it is; the batches themselves are recorded.
         self._errors_changed = True
+        # Where nothing is written any more, the next start says that it was interrupted.
+        self._noted = isinstance(error, Stopping)
         log.warning("progress of replay %s not noted: %s", self._row["id"], error)
 
 

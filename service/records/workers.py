@@ -123,7 +123,8 @@ class Workers(Generic[Task, Found]):
             if self._closing:
                 raise Stopping("the service is stopping")
             self._orders.append(order)
-            self._changed.notify()
+            # One alone might be a thread that waits until it may start a worker again.
+            self._changed.notify_all()
         return order.done
 
     def close(self) -> None:

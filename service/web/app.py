@@ -72,8 +72,8 @@ def create_app(operations: Operations, limits: Limits = DEFAULT_LIMITS) -> FastA
         here = asyncio.get_running_loop()
         warming = threading.Thread(target=_warm_up, args=(app, operations, here), name="warm-up")
         warming.start()
-        await app.state.live.start()
         try:
+            await app.state.live.start()
             yield
         finally:
             await app.state.live.close()

@@ -69,8 +69,8 @@ class Live:
     async def close(self) -> None:
         """Stop following."""
         self.stop()
-        self._operations.unlisten(self._on_commit)
         if self._task is not None:
+            self._operations.unlisten(self._on_commit)
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
 

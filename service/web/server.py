@@ -23,6 +23,8 @@ TURN_S = 0.001
 """How long a thread keeps others waiting that want to go on, such as the one that speaks HTTP."""
 GRACE_S = 10
 """How long running requests may still take when the server is told to stop."""
+HEAD_S = 30
+"""So long may a client be silent between two requests, or be at the head of one."""
 UNREAD_S = 60
 """An answer of which so long nothing was read is given up: it takes memory until it is gone."""
 
@@ -63,9 +65,42 @@ def serve(settings: Settings, started: Started | None = None) -> None:
 
 
 class Connection(HttpToolsProtocol):
-    """A connection that ends where its client leaves an answer unread; uvicorn would keep both."""
+    """A connection that ends where its client sends no whole head, or leaves an answer unread.
+
+    uvicorn would keep both: it counts the seconds between two requests alone, and
+    no longer as soon as a byte arrives.  Bodies have deadlines of their own.
+    """
 
     _looking: asyncio.TimerHandle | None = None
+    _waiting: asyncio.TimerHandle | None = None
+    _no_head_since_s: float | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """A client is there."""
+        super().connection_made(transport)
+        self._no_head_since_s = self.loop.time()
+        self._waiting = self.loop.call_later(HEAD_S, self._look_for_head)
+
+    def on_headers_complete(self) -> None:
+        """A request has begun, and its handler says how long it may take."""
+        super().on_headers_complete()
+        self._no_head_since_s = None
+
+    def on_response_complete(self) -> None:
+        """The next request may come; of some of them the head is there already."""
+        super().on_response_complete()
+        if self.cycle.response_complete:
+            self._no_head_since_s = self.loop.time()
+
+    def _look_for_head(self) -> None:
+        # One timer a connection: to set one for every request would be felt.
+        waited_s = 0.0
+        if self._no_head_since_s is not None:
+            waited_s = self.loop.time() - self._no_head_since_s
+        if waited_s >= HEAD_S:
+            self.transport.abort()
+        else:
+            self._waiting = self.loop.call_later(HEAD_S - waited_s, self._look_for_head)
 
     def pause_writing(self) -> None:
         """More is to be sent than the client takes off."""
@@ -80,6 +115,8 @@ class Connection(HttpToolsProtocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """There is nobody any more."""
         self._look_no_more()
+        if self._waiting is not None:
+            self._waiting.cancel()
         super().connection_lost(exc)
 
     def _look_again(self) -> None:

@@ -2,6 +2,7 @@
 
 import inspect
 import os
+import pickle
 import signal
 import socket
 import subprocess
@@ -14,6 +15,7 @@ import httpx
 import pytest
 
 from service.backend.front import ASKED, Front
+from service.backend.process import Backend
 from service.operations import Operations
 from tests.records import samples
 
@@ -68,6 +70,18 @@ def test_every_method_is_read_here_or_asked_of_the_backend():
     own = {name for name in vars(Front) if name in public} - set(ASKED)
     assert public - READ_HERE - NOT_OVER_HTTP - set(ASKED) == own
     assert not READ_HERE & set(ASKED)
+
+
+def test_an_error_that_cannot_be_packed_is_told_in_words():
+    class Tied(Exception):
+        def __init__(self):
+            super().__init__(threading.Lock())
+
+    backend = Backend(None, None, None)
+    backend._settle(7, Tied())
+    ((number, error),) = backend._outcomes
+    assert (number, type(error)) == (7, RuntimeError)
+    assert "Tied" in str(pickle.loads(pickle.dumps(error)))
 
 
 @pytest.fixture

@@ -64,6 +64,34 @@ def test_lines_that_can_be_closed_are_closed_at_the_end(operations, lines):
     assert file.closed
 
 
+def test_that_a_replay_is_over_is_noted_once_the_database_can_be_written_again(
+    operations, lines, monkeypatch
+):
+    monkeypatch.setattr("service.records.replays.BUSY_PAUSE_S", 0.01)
+    change, refused = operations.store.writer.change, []
+
+    def refuse(change):
+        refused.append(change)
+        raise Busy("the database cannot be written now")
+
+    class Closed:
+        """Nothing can be written from the moment when the lines are closed, for a while."""
+
+        def __iter__(self):
+            return iter(lines)
+
+        def close(self):
+            monkeypatch.setattr(
+                operations.store.writer,
+                "change",
+                lambda made: refuse(made) if len(refused) < 3 else change(made),
+            )
+
+    replay = finished(operations, operations.start_replay(Closed(), "pass-1"))
+    assert len(refused) == 3
+    assert (replay["state"], replay["lines"]["done"]) == ("done", 10)
+
+
 def test_the_first_thousand_errors_are_kept_and_all_are_counted(operations):
     replay = finished(operations, operations.start_replay([b"{\n"] * 1200, "pass-1"))
     assert replay["lines"]["refused"] == 1200

@@ -6,9 +6,11 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import httpx
+import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from sqlalchemy import text
 
+from service.errors import Stopping
 from service.operations import Operations
 from service.settings import Settings
 from service.web.app import create_app
@@ -89,6 +91,27 @@ def test_the_rehearsal_before_the_first_client_reaches_the_records_door_and_is_n
         assert b'route="/api/v1/batches"' not in app.state.metrics.text()
     finally:
         operations.close()
+
+
+def test_where_the_records_cannot_be_followed_it_does_not_start_and_ends(tmp_path, monkeypatch):
+    operations = Operations.open(Settings(database=f"sqlite:///{tmp_path}/unread.db"))
+    operations.ready()
+    app = create_app(operations)
+
+    def unreadable():
+        raise RuntimeError("there is nothing to follow")
+
+    monkeypatch.setattr(operations, "last_event", unreadable)
+
+    async def start():
+        async with app.router.lifespan_context(app):
+            raise AssertionError("it started")
+
+    with pytest.raises(RuntimeError, match="nothing to follow"):
+        asyncio.run(start())
+    assert not [thread for thread in threading.enumerate() if thread.name == "warm-up"]
+    with pytest.raises(Stopping):
+        operations.store.writer.require()
 
 
 def test_a_fault_of_ours_is_logged_and_says_nothing_of_what_is_inside(tmp_path, caplog):

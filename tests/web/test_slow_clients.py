@@ -232,3 +232,69 @@ def test_an_answer_is_given_up_when_nothing_of_it_is_read_but_not_where_it_is_re
         assert read_all(slow, pause_s=0.01) == LONG
         assert time.monotonic() - begun > 1.5
         assert 0 < read_all(deaf, pause_s=0.0) < LONG
+
+
+def closed_after_s(connection, every_s=0.1, byte=b"x"):
+    """How long the server keeps a connection over which a byte comes now and then."""
+    begun = time.monotonic()
+    connection.settimeout(every_s)
+    while time.monotonic() - begun < 30.0:
+        try:
+            connection.sendall(byte)
+            if not connection.recv(1 << 16):
+                break
+        except TimeoutError:
+            continue
+        except OSError:
+            break
+    return time.monotonic() - begun
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        "",
+        "GET /livez HTTP/1.1\r\nX-Long: ",
+        "GET /livez HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\nGET /li",
+        # Refused by its length, and the rest comes byte by byte.
+        HEAD.replace("100000", "99999999"),
+    ],
+    ids=["nothing", "a head", "a second head", "a body that was refused"],
+)
+def test_a_client_that_trickles_where_a_head_should_come_is_let_go(address, monkeypatch, sent):
+    monkeypatch.setattr("service.web.server.HEAD_S", 0.8)
+    url = httpx.URL(address)
+    with socket.create_connection((url.host, url.port)) as connection:
+        connection.sendall(sent.encode())
+        if not sent:
+            connection.settimeout(10.0)
+            begun = time.monotonic()
+            assert connection.recv(1) == b""
+            assert time.monotonic() - begun < 8.0
+        else:
+            assert 0.5 < closed_after_s(connection) < 8.0
+
+
+def test_a_client_that_asks_now_and_then_is_kept(address, monkeypatch):
+    monkeypatch.setattr("service.web.server.HEAD_S", 0.8)
+    url = httpx.URL(address)
+    with socket.create_connection((url.host, url.port), timeout=10) as connection:
+        for _ in range(8):
+            connection.sendall(b"GET /livez HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+            assert connection.recv(1 << 16).startswith(b"HTTP/1.1 200")
+            time.sleep(0.3)
+
+
+def test_a_request_may_take_longer_than_the_next_head(address, monkeypatch):
+    """Here a body that comes slowly: it has deadlines of its own."""
+    monkeypatch.setattr("service.web.server.HEAD_S", 0.5)
+    url = httpx.URL(address)
+    with socket.create_connection((url.host, url.port), timeout=30) as connection:
+        connection.sendall(
+            b"POST /api/v1/batches HTTP/1.1\r\nHost: 127.0.0.1\r\n"
+            b"Content-Type: application/json\r\nContent-Length: 10\r\n\r\n"
+        )
+        for _ in range(10):
+            time.sleep(0.2)
+            connection.sendall(b" ")
+        assert connection.recv(1 << 16).startswith(b"HTTP/1.1 400")
