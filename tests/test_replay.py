@@ -6,11 +6,12 @@ import re
 import socket
 import threading
 import time
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import count
 
 import pytest
 
-from service.errors import BadFile, BadInput, Busy
+from service.errors import BadFile, BadInput, Busy, NotAdmitted, NotAllowed, NotFound
 from service.observe.csv_rows import write_csv
 from service.observe.wire import BatchIn
 from service.operations import Operations
@@ -151,6 +152,45 @@ def test_a_service_that_is_not_there_is_named_before_anything_is_read(run, tmp_p
         port = free.getsockname()[1]
     with pytest.raises(Busy, match=r"no service answers at .*acquire serve"):
         replay_in_bulk(f"http://127.0.0.1:{port}", [], run, print, print)
+
+
+@pytest.mark.parametrize(
+    ("status", "kind"), [(401, NotAdmitted), (403, NotAllowed), (404, NotFound)]
+)
+def test_who_may_not_follow_a_replay_is_told_so_at_once(status, kind, run, tmp_path):
+    """In the service's own words, not that it no longer answers."""
+
+    class Refusing(BaseHTTPRequestHandler):
+        def do_POST(self):
+            while size := int(self.rfile.readline(), 16):
+                self.rfile.read(size + 2)
+            self.rfile.readline()
+            self.answer(202, {})
+
+        def do_GET(self):
+            self.answer(status, {"detail": "in its own words"})
+
+        def answer(self, status, told):
+            body = json.dumps(told).encode()
+            self.send_response(status)
+            self.send_header("Location", "/api/v1/replays/1")
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *given):
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Refusing) as server:
+        threading.Thread(target=server.serve_forever).start()
+        began = time.monotonic()
+        url, files = f"http://127.0.0.1:{server.server_port}", [written(tmp_path / "a", [{}])]
+        try:
+            with pytest.raises(kind, match="in its own words"):
+                replay_in_bulk(url, files, run, print, print)
+        finally:
+            server.shutdown()
+    assert time.monotonic() - began < 10
 
 
 def test_bad_lines_are_told_by_number_and_field_and_the_rest_goes_on(

@@ -12,7 +12,15 @@ from typing import Any
 
 import httpx
 
-from service.errors import BadInput, Busy, Fault, NotAdmitted, NotAllowed, problem_of_faults
+from service.errors import (
+    BadInput,
+    Busy,
+    Fault,
+    NotAdmitted,
+    NotAllowed,
+    NotFound,
+    problem_of_faults,
+)
 from service.observe.formats import read_lines
 from service.replay.items import Item, Outcome, Problem, Report
 from service.replay.over_http import PATIENCE_S, checked_url, shown_error
@@ -68,7 +76,8 @@ def replay_in_bulk(
     `progress` is given the state of the replay now and then, and at the end;
     `report` every refused line, those beyond the first thousand without their
     place.  Raises `BadInput`, `NotAdmitted`, `NotAllowed` for what the service
-    refuses, and `Busy` where it does not answer or stopped before the end.
+    refuses, `NotFound` where it knows the replay no more, and `Busy` where it
+    does not answer or stopped before the end.
     """
     lines = _Lines(files, report)
     shown = {} if token is None else {"Authorization": f"Bearer {token}"}
@@ -97,14 +106,19 @@ def _begin(client: httpx.Client, url: str, query: dict[str, str], lines: _Lines)
         ) from None
     if response.status_code == 202:
         return str(response.headers["Location"])
+    _require_let_in(response, url)
     detail = str(_problem(response)["detail"])
+    if response.status_code >= 500:
+        raise Busy(f"{url}: {detail}")
+    raise BadInput(Fault("replay", detail))
+
+
+def _require_let_in(response: httpx.Response, url: str) -> None:
+    detail = str(_problem(response)["detail"]) if response.is_error else ""
     if response.status_code == 401:
         raise NotAdmitted(f"{url} asks for a token ({detail}): set ACQUIRE_TOKEN")
     if response.status_code == 403:
         raise NotAllowed(f"{url}: {detail}")
-    if response.status_code >= 500:
-        raise Busy(f"{url}: {detail}")
-    raise BadInput(Fault("replay", detail))
 
 
 def _followed(client: httpx.Client, url: str, place: str, progress: Callable[[Told], None]) -> Told:
@@ -118,6 +132,10 @@ def _followed(client: httpx.Client, url: str, place: str, progress: Callable[[To
                 if state["state"] != "running":
                     return state
                 give_up = time.monotonic() + PATIENCE_S
+            # None of these becomes another answer by asking again.
+            _require_let_in(response, url)
+            if response.status_code == 404:
+                raise NotFound(f"{url}: {_problem(response)['detail']}")
         except httpx.TransportError:
             pass
         if time.monotonic() > give_up:
