@@ -69,7 +69,7 @@ from service.records.comparing import Pair, compare
 from service.records.comparison import compare_runs
 from service.records.draft import Answered, Row
 from service.records.events import Event
-from service.records.ids import Ulids, is_ulid
+from service.records.ids import Ulids, is_ulid, lone_ulid
 from service.records.intake import Asked, Intake, Observer, Recorded
 from service.records.looking import neighbours, recorded_batch, recorded_mission
 from service.records.pages import Page, Stretch
@@ -922,7 +922,8 @@ class Operations:
         spacecraft `check` raises an `AcquisitionError` is refused with it.  With `alarms`
         limits are held against the run (see `watch_run`).
         """
-        row = {"id": self._ids.new(), "run": _run_name(run), "name": name, "lines_total": total}
+        # Whoever knows the id may ask for the progress.
+        row = {"id": lone_ulid(), "run": _run_name(run), "name": name, "lines_total": total}
         replay = Replay(self.store, self._bulk, lambda: utc_now().text, row, check)
         with self._replays_lock:
             if self._closing:

@@ -37,6 +37,11 @@ class Ulids:
         return "".join([_PAIRS[value >> shift & 1023] for shift in _SHIFTS])
 
 
+def lone_ulid() -> str:
+    """An identifier that is next to no other, so that nobody finds it from one of their own."""
+    return Ulids().new()
+
+
 def is_ulid(text: str) -> bool:
     """Whether a text has the form of an identifier made here."""
     return len(text) == LENGTH and all(letter in _ALPHABET for letter in text)

@@ -171,9 +171,12 @@ class Live:
 
 
 def _concerns(event: Event, run: str | None, spacecraft: str | None) -> bool:
-    """What names no run or no spacecraft concerns everybody."""
+    """What names no run concerns every run; of a replay only who asks for all spacecraft is told.
+
+    It names none, its lines may be about any, and its id lets one ask for their faults.
+    """
     return (event.run is None or run is None or event.run == run) and (
-        event.spacecraft is None or spacecraft is None or event.spacecraft == spacecraft
+        spacecraft is None or event.spacecraft == spacecraft
     )
 
 

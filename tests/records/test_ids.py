@@ -3,7 +3,7 @@
 import time
 from concurrent.futures import ThreadPoolExecutor
 
-from service.records.ids import Ulids, is_ulid
+from service.records.ids import Ulids, is_ulid, lone_ulid
 
 
 def test_they_rise_strictly_also_within_a_millisecond():
@@ -20,6 +20,14 @@ def test_they_begin_with_the_time_in_milliseconds():
     for letter in made[:10]:
         read = read * 32 + alphabet.index(letter)
     assert before <= read <= after
+
+
+def test_a_lone_one_is_not_found_by_counting_up_from_another(monkeypatch):
+    """Also within a millisecond, where others of one maker are neighbours."""
+    monkeypatch.setattr(time, "time_ns", lambda: 1_000_000_000)
+    made = [lone_ulid() for _ in range(1_000)]
+    assert all(is_ulid(each) for each in made)
+    assert len({each[:20] for each in made}) == 1_000
 
 
 def test_threads_never_get_the_same():

@@ -151,6 +151,23 @@ def test_a_listener_hears_of_its_run_and_spacecraft_alone(database, drawn):
         assert [(d["run"], d["spacecraft"]) for kind, _, d in found[1:]] == [("mine", "XTE")]
 
 
+def test_of_replays_nobody_hears_who_asks_for_one_spacecraft(database, drawn):
+    """The lines may be about any, and a replay's id lets one ask what was wrong with them."""
+    with service(database) as address:
+        everything, xte = Listener(address), Listener(address, spacecraft="XTE")
+        with httpx.Client(base_url=address, timeout=60, trust_env=False) as client:
+            client.post(
+                "/api/v1/replays?run=mine",
+                content=json.dumps(drawn("SOHO", 1)[0]),
+                headers={"Content-Type": "application/x-ndjson"},
+            ).raise_for_status()
+        for count in range(2, 6):
+            if any(d.get("state") == "done" for _, _, d in everything.wait_for(count)):
+                break
+        send(address, drawn("XTE", 1))
+        assert [kind for kind, _, _ in xte.wait_for(2)] == ["hello", "batches"]
+
+
 def test_a_gap_longer_than_what_is_kept_says_reset(database, drawn, monkeypatch):
     monkeypatch.setattr(records, "KEPT", 3)
     monkeypatch.setattr(records, "PRUNED_EVERY", 1)
