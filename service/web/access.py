@@ -36,12 +36,20 @@ class Policy:
     `result` of the path, or in the `body`, which the handler itself checks
     with `Caller.require`; `every` is for tokens that are bound to none, and
     `nothing` for what is about no spacecraft, or where the handler shows a
-    caller no other's.  `open` asks for no token.
+    caller no other's.  `or_scope` will do as well as the scope.  `open` asks
+    for no token.  `noted` is what changes more than records of the caller's own.
     """
 
     scope: Scope
     about: About = "every"
+    or_scope: Scope | None = None
     open: bool = False
+    noted: bool = False
+
+    @property
+    def scopes(self) -> tuple[Scope, ...]:
+        """Those of which one is needed."""
+        return (self.scope,) if self.or_scope is None else (self.scope, self.or_scope)
 
 
 READ, SUBMIT, OPERATE = Policy("read"), Policy("submit"), Policy("operate")
@@ -75,8 +83,10 @@ POLICIES: Mapping[str, Policy] = {
     "list_runs": READ,
     "start_replay": Policy("submit", "body"),
     "list_replays": READ,
-    "get_replay": READ,
-    "watch_run": Policy("submit", "nothing"),
+    # Its id can be known only from having started it, or from somebody who may read everything:
+    # see `lone_ulid`.
+    "get_replay": Policy("read", "nothing", or_scope="submit"),
+    "watch_run": Policy("submit", noted=True),
     "compare": Policy("read", "body"),
     "list_limits": Policy("read", "path"),
     "get_limit": Policy("read", "path"),
@@ -115,8 +125,8 @@ _THREADS = CapacityLimiter(8)
 async def guard(request: Request) -> None:
     """Let a request through to its handler, or raise what it lacks.
 
-    What a caller with the scope `operate` changes is noted once it is answered
-    (`service.web.middleware`).
+    What a caller with the scope `operate` changes, and what a policy says is
+    `noted`, is noted once it is answered (`service.web.middleware`).
     """
     route = request.scope["route"]
     policy = POLICIES.get(route.name)
@@ -144,10 +154,10 @@ async def guard(request: Request) -> None:
         _refuse_other_sites(request)
     request.state.caller = caller
     operations.access.take_turn(caller)
-    require_scope(caller, policy.scope)
+    require_scope(caller, *policy.scopes)
     if caller.spacecraft is not None:
         await _require_own(request, operations, caller, policy.about)
-    if policy.scope == "operate" and request.method not in SAFE_METHODS:
+    if (policy.scope == "operate" or policy.noted) and request.method not in SAFE_METHODS:
         request.state.changes = route.name
 
 
@@ -160,12 +170,19 @@ async def _caller(request: Request) -> Caller:
 Asking = Annotated[Caller, Depends(_caller)]
 
 
-def require_scope(caller: Caller, scope: Scope) -> None:
-    """Raise `NotAllowed` unless a caller has a scope."""
-    if scope not in caller.scopes:
+def require_scope(caller: Caller, *scopes: Scope) -> None:
+    """Raise `NotAllowed` unless a caller has one of the scopes."""
+    if caller.scopes.isdisjoint(scopes):
         raise NotAllowed(
-            f"{caller.name} may {', '.join(sorted(caller.scopes))}; this needs the scope {scope}"
+            f"{caller.name} may {', '.join(sorted(caller.scopes))}; "
+            f"this needs the scope {' or '.join(scopes)}"
         )
+
+
+def require_unbound(caller: Caller) -> None:
+    """Raise `NotAllowed` where a caller is bound to spacecraft."""
+    if caller.spacecraft is not None:
+        raise NotAllowed(f"{caller.name} is bound to spacecraft, and this is about all of them")
 
 
 def bearer(request: Request) -> str | None:
@@ -214,4 +231,4 @@ async def _require_own(
             # As if it were not there: ids of others are not to be tried out.
             raise NotFound(f"there is no batch with the id {id[:80]!r}")
     elif about == "every":
-        raise NotAllowed(f"{caller.name} is bound to spacecraft, and this is about all of them")
+        require_unbound(caller)

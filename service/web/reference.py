@@ -155,6 +155,8 @@ def _finish(operation: dict[str, Any]) -> None:
     if not policy.open:
         operation["security"] = [{"token": []}, {"session": []}, {}]
         operation["x-scope"] = policy.scope
+        if policy.or_scope is not None:
+            operation["x-scope-or"] = policy.or_scope
         operation["responses"] = dict(
             sorted({**guarded_responses(), **operation["responses"]}.items())
         )

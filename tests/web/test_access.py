@@ -6,14 +6,15 @@ import time
 
 import httpx
 import pytest
+from fastapi.routing import APIRoute
 
 from service.operations import Operations
 from service.records import tokens
 from service.records.ids import Ulids
 from service.settings import Settings
 from service.times import shifted, utc_now
-from service.web.access import COOKIE, POLICIES
-from service.web.app import create_app
+from service.web.access import COOKIE, POLICIES, guard
+from service.web.app import ROUTERS, bare_app, create_app
 from tests.web.serving import Server
 
 PLACES = {
@@ -22,6 +23,8 @@ PLACES = {
     "run": "pass-7",
     "quantity": "ambiguous_share",
 }
+OPEN_BESIDE_THE_ROUTES = {"/static", "/api/v1/openapi.json"}
+"""What `docs/access.md` says is open, of what no policy is asked about."""
 KNOWN_AGAIN_S = 1.3
 """A little more than what is known of a token is believed for."""
 
@@ -87,6 +90,23 @@ def asked(client, method, path, **more):
         return response
 
 
+def ended(client, path, headers):
+    """A replay's progress when it is over, as its caller is told."""
+    for _ in range(400):
+        answer = client.get(path, headers=headers)
+        assert answer.status_code == 200, answer.text
+        if answer.json()["state"] != "running":
+            return answer.json()
+        time.sleep(0.05)
+    raise AssertionError(answer.text)
+
+
+def replay_begun(client, token, lines, query="run=bound"):
+    headers = shown(token) | {"Content-Type": "application/x-ndjson"}
+    content = "\n".join(json.dumps(each) for each in lines)
+    return client.post(f"/api/v1/replays?{query}", content=content, headers=headers)
+
+
 def requests_of(routes):
     """A request to every route: its name, method and a path that fits."""
     for route in routes:
@@ -98,6 +118,21 @@ def requests_of(routes):
 def test_every_route_has_a_policy_and_every_policy_a_route(guarded):
     """A new route without one would be refused to everybody; an old policy would mislead."""
     assert {route.name for route in guarded.routes} == set(POLICIES)
+
+
+def test_what_stands_beside_the_guarded_routes_is_known_to_be_open(guarded, anybody):
+    """Whatever is added to the app itself never comes to the guard, which asks for a policy."""
+    beside = set()
+    for each in bare_app().router.routes:
+        if getattr(each, "original_router", None) in ROUTERS:
+            assert guard in [asked.dependency for asked in each.include_context.dependencies]
+        else:
+            beside.add(each.path)
+    assert beside == OPEN_BESIDE_THE_ROUTES
+    # Routes of any other kind have no dependencies, so the guard would not be asked.
+    assert all(isinstance(each, APIRoute) for each in guarded.routes)
+    for path in ("/static/console.css", "/static/sign-in.js", "/api/v1/openapi.json"):
+        assert anybody.get(path).status_code == 200, path
 
 
 def test_without_a_good_token_nothing_but_the_open_routes_answers(guarded, anybody):
@@ -124,7 +159,8 @@ def test_a_token_without_the_scope_is_refused_by_every_route(guarded, anybody):
             continue
         for scope, token in guarded.of_scope.items():
             response = asked(anybody, method, path, headers=shown(token))
-            assert (response.status_code == 403) == (scope != policy.scope), (name, scope)
+            refused = response.status_code == 403
+            assert refused == (scope not in policy.scopes), (name, scope)
             assert response.status_code < 500, (name, scope)
 
 
@@ -158,21 +194,46 @@ def test_a_bound_token_submits_reads_and_replays_its_own_spacecraft_alone(guarde
     listed = anybody.get("/api/v1/spacecraft", headers=shown(guarded.swas)).json()["items"]
     assert [each["name"] for each in listed] == ["SWAS"]
 
-    lines = "\n".join(json.dumps(each) for each in (swas, xte, swas | {"batch": "another"}))
-    begun = anybody.post(
-        "/api/v1/replays?run=bound",
-        content=lines,
-        headers=shown(guarded.swas) | {"Content-Type": "application/x-ndjson"},
-    )
+    begun = replay_begun(anybody, guarded.swas, (swas, xte, swas | {"batch": "another"}))
     assert begun.status_code == 202
-    for _ in range(200):
-        state = anybody.get(begun.headers["Location"], headers=shown(guarded.all)).json()
-        if state["state"] != "running":
-            break
-        time.sleep(0.05)
+    state = ended(anybody, begun.headers["Location"], shown(guarded.swas))
     assert (state["lines"]["done"], state["lines"]["refused"]) == (3, 1)
     assert [each["line"] for each in state["errors"]] == [2]
     assert "SWAS, not about XTE" in state["errors"][0]["problem"]["detail"]
+
+
+def test_whoever_may_start_a_replay_may_follow_it(guarded, anybody, drawn):
+    """With `submit` alone too; the list of all replays is not theirs to read."""
+    submitting = guarded.of_scope["submit"]
+    begun = replay_begun(anybody, submitting, drawn("XTE", 2), "run=followed")
+    assert ended(anybody, begun.headers["Location"], shown(submitting))["counts"]["new"] == 2
+    assert anybody.get("/api/v1/replays", headers=shown(submitting)).status_code == 403
+    assert anybody.get("/api/v1/replays", headers=shown(guarded.swas)).status_code == 403
+    operating = shown(guarded.of_scope["operate"])
+    refused = anybody.get(begun.headers["Location"], headers=operating)
+    assert "needs the scope read or submit" in refused.json()["detail"]
+
+
+def test_a_bound_token_has_no_alarms_of_a_run_switched(guarded, anybody, drawn):
+    """The run may hold batches of every spacecraft; who is bound to none may, and it is noted."""
+    bound, unbound = shown(guarded.swas), shown(guarded.of_scope["submit"])
+    for alarms in (True, False):
+        body = {"alarms": alarms}
+        assert anybody.put("/api/v1/runs/all", json=body, headers=bound).status_code == 403
+    batches = drawn("SWAS", 1)
+    refused = replay_begun(anybody, guarded.swas, batches, "run=all&alarms=true")
+    assert (refused.status_code, "all of them" in refused.json()["detail"]) == (403, True)
+
+    begun = replay_begun(anybody, guarded.of_scope["submit"], batches, "run=all&alarms=true")
+    ended(anybody, begun.headers["Location"], unbound)
+    body = {"alarms": False}
+    assert anybody.put("/api/v1/runs/all", json=body, headers=unbound).status_code == 200
+    listed = anybody.get("/api/v1/audit?limit=2", headers=shown(guarded.all)).json()["items"]
+    assert [(each["who"], each["action"], each["about"]) for each in listed] == [
+        ("submit", "watch_run", "/api/v1/runs/all"),
+        ("submit", "start_replay", "/api/v1/replays?run=all&alarms=true"),
+    ]
+    assert json.loads(listed[0]["body"]) == body
 
 
 def test_revoking_a_token_holds_within_a_second(guarded, anybody):

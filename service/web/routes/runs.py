@@ -10,7 +10,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.observe.wire import BatchIn, RunName, Wire
-from service.web.access import Asking
+from service.web.access import Asking, require_unbound
 from service.web.bodies import (
     MAX_JSON_BYTES,
     JsonBody,
@@ -59,8 +59,12 @@ class Sent:
     body: Spooled
 
 
-async def _telemetry(request: Request, query: ReplayQuery) -> Sent:
+async def _telemetry(request: Request, query: ReplayQuery, caller: Asking) -> Sent:
     # Asks for the query first, so that no gigabyte is taken in only to refuse its run.
+    if query.alarms:
+        # As `watch_run`: the run may hold batches of every spacecraft.
+        require_unbound(caller)
+        request.state.changes = request.scope["route"].name
     return Sent(query.run, query.alarms, await ndjson_body(request))
 
 
