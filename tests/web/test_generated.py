@@ -5,7 +5,6 @@ Every answer must be one that the description knows, and never a fault of ours.
 
 import json
 import sys
-import time
 import traceback
 from collections import Counter
 
@@ -19,6 +18,7 @@ from schemathesis import GenerationMode
 
 from tests.scale import size
 from tests.web.conformance import FILE, check_answer
+from tests.web.serving import served
 
 REQUESTS, SEQUENCES = 100_000, 10_000
 STEPS = 6
@@ -59,13 +59,10 @@ settled = hypothesis.settings(
 
 
 @pytest.fixture(scope="module")
-def ready(client):
-    """The server's address, its kernels compiled."""
-    for _ in range(3000):
-        if client.get("/readyz").status_code == 200:
-            return str(client.base_url)
-        time.sleep(0.1)
-    raise AssertionError("the service does not become ready")
+def ready(chosen_database):
+    """The address of the service as it is served, in its two processes, ready."""
+    with served(chosen_database()) as (_, url):
+        yield url
 
 
 class Answers:
