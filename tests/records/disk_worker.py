@@ -40,6 +40,13 @@ def main(database, file, faults, seed):
     event.listen(operations.store._writing, "begin", _checkpoint_often)
     lines = Path(file).read_bytes().splitlines()
     acknowledged, told_busy, kinds, reads_failed = {}, 0, Counter(), 0
+
+    def in_bulk(texts):
+        return operations.submit_many([submission_from_json(text) for text in texts])
+
+    def one_by_one(texts):
+        return [each.result() for each in [operations.take(text) for text in texts]]
+
     waiting = iter(lines)
     for _ in range(int(faults)):
         before = disk.faulty_failed()
@@ -49,12 +56,14 @@ def main(database, file, faults, seed):
         kind, within = draw.choice(tuple(enumerate(WITHIN)))
         disk.faulty_fail(kind, draw.randrange(within), draw.choice((1, 1, 3, 25)), error)
         while disk.faulty_failed() == before:
-            chunk = [submission_from_json(line) for line in islice(waiting, 3)]
+            chunk = list(islice(waiting, 3))
             assert chunk, "the batches ended before the disk failed"
+            # Each by a writer of its own: the thread for changes, and whoever holds the group.
+            send = draw.choice((in_bulk, one_by_one))
             give_up = time.monotonic() + PATIENCE_S
             while True:
                 try:
-                    answers = operations.submit_many(chunk)
+                    answers = send(chunk)
                     break
                 except Busy:
                     told_busy += 1
@@ -68,8 +77,7 @@ def main(database, file, faults, seed):
         call, place = disk.faulty_struck().decode().split(" ", 1)
         kinds[f"{call} {Path(place).name} {errno.errorcode[error]}"] += 1
     disk.faulty_fail(0, 0, 0, 0)
-    rest = [submission_from_json(line) for line in waiting]
-    for each in operations.submit_many(rest):
+    for each in in_bulk(waiting):
         acknowledged[each.id] = hashlib.sha256(each.body).hexdigest()
     operations.close()
     told = {
