@@ -15,6 +15,7 @@ from service.errors import BadFile, BadInput, Busy, NotAdmitted, NotAllowed, Not
 from service.observe.csv_rows import write_csv
 from service.observe.wire import BatchIn
 from service.operations import Operations
+from service.records.replays import mark_interrupted
 from service.replay.in_bulk import replay_in_bulk
 from service.replay.in_process import replay_in_process
 from service.replay.items import Pace, items_of, run_name
@@ -145,6 +146,27 @@ def test_files_sent_as_a_whole_come_to_the_same_and_bad_lines_keep_their_place(
     assert f"{first}:9: spacecraft: there is no such" in told
     for name in ("new", "replayed", "refused", "attitudes", "stars"):
         assert getattr(tally, name) == getattr(inside, name), name
+
+
+def test_a_replay_that_a_starting_process_calls_interrupted_is_followed_to_its_end(
+    missions, sky, run, tmp_path
+):
+    many = [each.batch for each in draw_pass(missions["XTE"], sky, Pass(1_000, 5))]
+    operations, states = opened(tmp_path), []
+
+    def call_interrupted(state):
+        if state["state"] == "running":
+            # What a process does with the replays that it finds at work when it opens the database.
+            operations.change(lambda connection: mark_interrupted(connection, state["started"]))
+        states.append(state["state"])
+
+    with Server(create_app(operations)) as url:
+        files = [written(tmp_path / "many.ndjson", many)]
+        replay_in_bulk(url, files, run, print, call_interrupted)
+        recorded = operations.runs()
+    assert states[-1] == "done"
+    assert "interrupted" in states
+    assert [each["batches"] for each in recorded if each["run"] == run] == [len(many)]
 
 
 def test_a_service_that_is_not_there_is_named_before_anything_is_read(run, tmp_path):

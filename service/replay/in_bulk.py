@@ -29,6 +29,9 @@ ROUTE = "/api/v1/replays"
 NDJSON = {"Content-Type": "application/x-ndjson"}
 TIMEOUT = httpx.Timeout(120.0, connect=5.0)
 PAUSE_S = 0.25
+SURE_S = 5.0
+"""A process that starts says of every replay that it was interrupted; one that another process is
+still at says otherwise with its next lines."""
 
 Told = dict[str, Any]
 
@@ -123,13 +126,16 @@ def _require_let_in(response: httpx.Response, url: str) -> None:
 
 def _followed(client: httpx.Client, url: str, place: str, progress: Callable[[Told], None]) -> Told:
     give_up = time.monotonic() + PATIENCE_S
+    running_s = time.monotonic()
     while True:
         try:
             response = client.get(place)
             if response.status_code == 200:
                 state: Told = response.json()
                 progress(state)
-                if state["state"] != "running":
+                if state["state"] == "running":
+                    running_s = time.monotonic()
+                elif state["state"] != "interrupted" or time.monotonic() - running_s > SURE_S:
                     return state
                 give_up = time.monotonic() + PATIENCE_S
             # None of these becomes another answer by asking again.
