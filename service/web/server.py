@@ -75,6 +75,7 @@ class Connection(HttpToolsProtocol):
     _waiting: asyncio.TimerHandle | None = None
     _no_head_since_s: float | None = None
 
+    # uvicorn narrows what asyncio's protocol takes, and ignores that as well.
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """A client is there."""
         super().connection_made(transport)
