@@ -5,9 +5,11 @@
 
 The service runs as it is served, over SQLite with synchronous=FULL.  What it
 can do is measured first, at 16 connections; then batches come at 70 % of that,
-each at its time, while a page is read every second.  Every minute the waiting
-times are taken, and the memory of all processes; every second the size of the
-write-ahead log.  At the end the records are counted.
+each at its time, while a page is read every second.  Each batch was observed a
+second after the one before: the history grows by weeks.  Every minute the
+waiting times are taken, the memory of all processes, and an answer is looked
+at; every second the size of the write-ahead log.  At the end the records are
+counted.
 """
 
 import json
@@ -16,14 +18,16 @@ import threading
 import urllib.request
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from datetime import datetime, timedelta
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 from benchmarks.load import drive, request
-from benchmarks.posts import API, CONNECTIONS, Telemetry, telemetry
+from benchmarks.posts import API, CONNECTIONS, RIGHT, Telemetry, telemetry
 from benchmarks.report import Report
 from benchmarks.serving import Served, service
+from service.simulate.stretches import DEFAULT_START
 
 SHARE = 0.7
 SLICES, SLICE_S = 60, 60.0
@@ -32,7 +36,8 @@ PROBES, PROBED = 3, 3_000
 SETTLED = 1 / 6
 """After so much of the time the memory is what it should stay."""
 MOST_DRIFT, MOST_LOG_MB = 0.05, 64.0
-_NAME = b"soak-NAME"
+_NAME, _TIME = b"soak-NAME", b"soak-TIME"
+_FIRST = datetime.fromisoformat(DEFAULT_START)
 
 
 @dataclass
@@ -45,15 +50,13 @@ class _Watched:
 
 def _bodies(pass_: Telemetry, first: int, count: int) -> Iterator[bytes]:
     """Requests of batches with names of their own; made as they are needed."""
-    templates = [
-        json.dumps(
-            drawn.batch | {"options": {"identifier": "starid"}, "batch": _NAME.decode()}
-        ).encode()
-        for drawn in pass_.drawn
-    ]
+    # Weeks later the same stars stand within an arcsecond of each other where they stood.
+    own = {"options": {"identifier": "starid"}, "batch": _NAME.decode(), "time": _TIME.decode()}
+    templates = [json.dumps(drawn.batch | own).encode() for drawn in pass_.drawn]
     for number in range(first, first + count):
+        time = (_FIRST + timedelta(seconds=number)).strftime("%Y-%m-%dT%H:%M:%SZ").encode()
         body = templates[number % len(templates)].replace(_NAME, b"soak-%d" % number)
-        yield request(f"{API}/batches", body)
+        yield request(f"{API}/batches", body.replace(_TIME, time))
 
 
 def _watch(served: Served, log: Path, watched: _Watched, over: threading.Event) -> None:
@@ -75,7 +78,7 @@ def run(quick: bool, seed: int) -> Report:
     pass_ = telemetry(seed)
     slices, slice_s = (QUICK_SLICES, QUICK_SLICE_S) if quick else (SLICES, SLICE_S)
     faults: list[str] = []
-    sent = 0
+    sent = right = seen = 0
     watched, over = _Watched(), threading.Event()
     rates: list[float] = []
     p50_ms: list[float] = []
@@ -102,6 +105,9 @@ def run(quick: bool, seed: int) -> Report:
                 sent += count
                 if set(driven.statuses) != {201}:
                     faults.append(f"there were answers {dict(driven.statuses)}")
+                answer = json.loads(driven.last)
+                got, of = pass_.right(int(answer["batch"].rpartition("-")[2]), answer)
+                right, seen = right + got, seen + of
                 rates.append(driven.per_second)
                 p50_ms.append(driven.percentile_ms(50.0))
                 p99_ms.append(driven.percentile_ms(99.0))
@@ -121,6 +127,7 @@ def run(quick: bool, seed: int) -> Report:
         "posts a second": median(rates),
         "posts in all": sent,
         "recorded": recorded,
+        "stars named rightly, of those looked at": right / seen,
         "overviews read meanwhile": watched.reads,
         "p50 of the first sixth, ms": median(p50_ms[:settled]),
         "p50 of the last sixth, ms": median(p50_ms[-settled:]),
@@ -135,6 +142,8 @@ def run(quick: bool, seed: int) -> Report:
     }
     if recorded != sent:
         faults.append(f"{recorded} batches are recorded of {sent}")
+    if right < RIGHT * seen:
+        faults.append(f"{right} stars of {seen} are named rightly")
     if drift > MOST_DRIFT:
         faults.append(f"memory has grown by {drift:.1%}")
     if max(watched.log_mb) > MOST_LOG_MB:

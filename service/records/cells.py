@@ -1,41 +1,39 @@
 """Sums and extremes over a stretch of time, read as coarsely as asked and yet exact at both ends.
 
-A cell is a day, an hour or a single batch, with the columns of a rollup.  Whole
-days and hours come from the rollups; what a stretch cuts off at its ends is
-made up of smaller cells, down to the batches themselves.
+A cell is a day, an hour or a part of one, with the columns of a rollup.  Whole
+days and hours come from the rollups; smaller cells, and what a stretch cuts
+off at its ends, are summed up by the database from the batches themselves.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
-from sqlalchemy import Connection, Select, Table, bindparam, select
+from sqlalchemy import BigInteger, Connection, Select, Table, bindparam, select
 
 from service.records.draft import Row
+from service.records.summing import COLUMNS, SUMMED
 from service.records.tables import (
     COUNTS,
-    MAXIMA,
-    MEASURED,
-    MINIMA,
-    SHARES,
-    SUMS,
-    VALUES,
     results,
     rollups_daily,
     rollups_hourly,
 )
 from service.times import DAY_S, HOUR_S, UNIX_DAY, Utc, bucket_start, unix_seconds
-from service.vectors import Vector
+from service.vectors import Matrix, Vector
 
-Level = Literal["batch", "hour", "day"]
+Level = Literal["hour", "day"]
 Columns = dict[str, Vector]
-"""`unix_s`, the cell's beginning, `width_s`, zero of a batch, and the columns of a rollup."""
+"""`unix_s`, at which each cell begins, and columns of a rollup."""
+Names = tuple[str, ...]
+"""Of columns of a rollup."""
 
-_COARSE: dict[Level, tuple[Table, int, Level]] = {
-    "hour": (rollups_hourly, HOUR_S, "batch"),
-    "day": (rollups_daily, DAY_S, "hour"),
+_COARSE: dict[Level, tuple[Table, int]] = {
+    "hour": (rollups_hourly, HOUR_S),
+    "day": (rollups_daily, DAY_S),
 }
-_NAMES = (*COUNTS, *SUMS, *MINIMA, *MAXIMA)
 
 
 @dataclass(frozen=True)
@@ -48,23 +46,73 @@ class Span:
     end: Utc
 
 
-def read_cells(connection: Connection, span: Span, level: Level) -> Columns:
+def read_cells(connection: Connection, span: Span, level: Level, names: Names = COLUMNS) -> Columns:
     """The cells of a span, in order of time; those without a batch are left out."""
-    if span.start.tai_ns >= span.end.tai_ns:
-        return _of_batches([])
-    if level == "batch":
-        return _of_batches(_batches(connection, span))
-    table, width_s, finer = _COARSE[level]
+    table, width_s = _COARSE[level]
     first, last = (_at_or_after(span.start, width_s), span.end.bucket(width_s))
-    if first >= last:
-        return read_cells(connection, span, finer)
+    if first > last:
+        return _finer(connection, span, level, names)
     begin, end = bucket_start(first, width_s), bucket_start(last, width_s)
-    parts = [
-        read_cells(connection, replace(span, end=begin), finer),
-        _whole(connection, span, table, width_s, first, last),
-        read_cells(connection, replace(span, start=end), finer),
-    ]
+    return _joined(
+        [
+            _finer(connection, replace(span, end=begin), level, names),
+            _whole(connection, span, table, names, first, last),
+            _finer(connection, replace(span, start=end), level, names),
+        ]
+    )
+
+
+def _finer(connection: Connection, span: Span, level: Level, names: Names) -> Columns:
+    """Cells of less than an hour or day, which the span does not fill or leave."""
+    if level == "day":
+        return read_cells(connection, span, "hour", names)
+    return read_steps(connection, span, HOUR_S, names)
+
+
+def read_steps(connection: Connection, span: Span, width_s: int, names: Names = COLUMNS) -> Columns:
+    """Cells of so much of a UTC day each, summed up by the database from the batches.
+
+    The width divides a day.  However many batches there are, no more is held
+    of them than a row for each cell.
+    """
+    parts = [_steps_of([], span.start, width_s, names)]
+    day, begin = span.start.bucket(DAY_S), span.start
+    while begin.tai_ns < span.end.tai_ns:
+        # Each day by itself: between two of them there may be a leap second.
+        midnight, next_midnight = bucket_start(day, DAY_S), bucket_start(day + 1, DAY_S)
+        end = next_midnight if next_midnight.tai_ns < span.end.tai_ns else span.end
+        asked = _asked(replace(span, start=begin, end=end)) | {
+            "midnight_ns": midnight.tai_ns,
+            "width_ns": width_s * 10**9,
+        }
+        rows = connection.execute(_steps_query(names), asked).all()
+        parts.append(_steps_of(rows, midnight, width_s, names))
+        day, begin = day + 1, end
+    return _joined(parts)
+
+
+@cache
+def _steps_query(names: Names) -> Select[Any]:
+    since_ns = results.c.time_ns - bindparam("midnight_ns", type_=BigInteger)
+    step = (since_ns // bindparam("width_ns", type_=BigInteger)).label("step")
+    query = select(step, *(SUMMED[name] for name in names))
+    return query.where(*_IN_SPAN).group_by(step).order_by(step)
+
+
+def _steps_of(rows: Sequence[Any], midnight: Utc, width_s: int, names: Names) -> Columns:
+    read = _table(rows, names)
+    begin_ns = midnight.tai_ns + read[0].astype(np.int64) * width_s * 10**9
+    return {"unix_s": unix_seconds(begin_ns), **dict(zip(names, read[1:], strict=True))}
+
+
+def _joined(parts: Sequence[Columns]) -> Columns:
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _table(rows: Sequence[Any], names: Names) -> Matrix:
+    """Rows as columns, the key's first."""
+    # As tuples: numpy would ask each of SQLAlchemy's rows for more than its values.
+    return np.array([tuple(row) for row in rows], dtype=float).reshape(-1, 1 + len(names)).T
 
 
 def totals(cells: Columns) -> Row:
@@ -77,11 +125,12 @@ def _at_or_after(moment: Utc, width_s: int) -> int:
     return number + (bucket_start(number, width_s).tai_ns < moment.tai_ns)
 
 
-def _stretch_of(table: Table) -> Select[Any]:
+@cache
+def _whole_query(table: Table, names: Names) -> Select[Any]:
     """The rows of a rollup in a stretch; made once, for to make it takes longer than to run it."""
     columns = table.c
     return (
-        select(columns.bucket, *(columns[name] for name in _NAMES))
+        select(columns.bucket, *(columns[name] for name in names))
         .where(
             columns.spacecraft == bindparam("spacecraft"),
             columns.run == bindparam("run"),
@@ -93,78 +142,31 @@ def _stretch_of(table: Table) -> Select[Any]:
     )
 
 
-_STRETCHES = {table: _stretch_of(table) for table in (rollups_hourly, rollups_daily)}
-
-
 def _whole(
-    connection: Connection, span: Span, table: Table, width_s: int, first: int, last: int
+    connection: Connection, span: Span, table: Table, names: Names, first: int, last: int
 ) -> Columns:
     asked = {"spacecraft": span.spacecraft, "run": span.run, "first": first, "last": last}
-    # As tuples: numpy would ask each of SQLAlchemy's rows for more than its values.
-    rows = [tuple(row) for row in connection.execute(_STRETCHES[table], asked).all()]
-    read = np.array(rows, dtype=float).reshape(-1, 1 + len(_NAMES)).T
-    unix_s = read[0] * width_s - UNIX_DAY * DAY_S
+    read = _table(connection.execute(_whole_query(table, names), asked).all(), names)
+    width_s = DAY_S if table is rollups_daily else HOUR_S
     return {
-        "unix_s": unix_s,
-        "width_s": np.full(len(unix_s), float(width_s)),
-        **dict(zip(_NAMES, read[1:], strict=True)),
+        "unix_s": read[0] * width_s - UNIX_DAY * DAY_S,
+        **dict(zip(names, read[1:], strict=True)),
     }
 
 
-_BATCHES = (
-    select(
-        *(results.c[name] for name in ("time_ns", "status", "unique", "ambiguous", "unmatched")),
-        *(results.c[name] for name in MEASURED),
-    )
-    .where(
-        results.c.current,
-        results.c.spacecraft == bindparam("spacecraft"),
-        results.c.run == bindparam("run"),
-        results.c.time_ns >= bindparam("start_ns"),
-        results.c.time_ns < bindparam("end_ns"),
-    )
-    .order_by(results.c.time_ns)
+_IN_SPAN = (
+    results.c.current,
+    results.c.spacecraft == bindparam("spacecraft"),
+    results.c.run == bindparam("run"),
+    results.c.time_ns >= bindparam("start_ns"),
+    results.c.time_ns < bindparam("end_ns"),
 )
 
 
-def _batches(connection: Connection, span: Span) -> list[Any]:
-    asked = {
+def _asked(span: Span) -> Row:
+    return {
         "spacecraft": span.spacecraft,
         "run": span.run,
         "start_ns": span.start.tai_ns,
         "end_ns": span.end.tai_ns,
     }
-    return list(connection.execute(_BATCHES, asked).all())
-
-
-def _of_batches(rows: list[Any]) -> Columns:
-    """Cells of one batch each; NaN stands for what a batch has not."""
-    columns = list(zip(*rows, strict=True)) if rows else [()] * (5 + len(MEASURED))
-    time_ns, status, *numbers = columns
-    unique, ambiguous, unmatched, *measured = (np.array(each, dtype=float) for each in numbers)
-    observed = unique + ambiguous + unmatched
-    values = dict(zip(MEASURED, measured, strict=True))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        values["residual_ratio"] = np.where(
-            values["predicted_rms_arcsec"] > 0,
-            values["residual_rms_arcsec"] / values["predicted_rms_arcsec"],
-            np.nan,
-        )
-        shares = dict(zip(SHARES, (ambiguous / observed, unmatched / observed), strict=True))
-    cells: Columns = {
-        "unix_s": unix_seconds(np.array(time_ns, dtype=np.int64)),
-        "width_s": np.zeros(len(rows)),
-        "batches": np.ones(len(rows)),
-        "observed": observed,
-        "unique": unique,
-        "ambiguous": ambiguous,
-        "unmatched": unmatched,
-        "solved": np.array([each is not None for each in status], dtype=float),
-        "suspect": np.array([each == "suspect" for each in status], dtype=float),
-    }
-    for name in VALUES:
-        cells[f"{name}_n"] = (~np.isnan(values[name])).astype(float)
-        cells[f"{name}_sum"] = np.nan_to_num(values[name])
-    for name, value in (shares | values).items():
-        cells[f"{name}_min"] = cells[f"{name}_max"] = value
-    return cells

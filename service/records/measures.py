@@ -6,13 +6,10 @@ from typing import Any
 import numpy as np
 
 from service.acquire import Acquisition
-from service.records.tables import COUNTS, MAXIMA, MEASURED, MINIMA, SUMS
+from service.records.tables import COUNTS, MAXIMA, MINIMA, SUMS
 from service.vectors import separation_deg
 
 Row = dict[str, Any]
-
-COUNTED = ("observed", "unique", "ambiguous", "unmatched", "status", *MEASURED)
-"""The columns of a result that `contribution` looks at."""
 
 
 def measures_of(acquisition: Acquisition) -> Row:

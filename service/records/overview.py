@@ -9,12 +9,12 @@ from sqlalchemy import Connection, func, select
 from service.missions.mission import Mission
 from service.records.ahead import LIVE
 from service.records.alarms import active_alarms, summary
-from service.records.cells import Columns, Span, read_cells, totals
+from service.records.cells import Columns, Span, read_cells, read_steps, totals
 from service.records.draft import Row
 from service.records.histories import live_state
-from service.records.tables import COUNTS, results, rollups_daily, rollups_hourly, runs
+from service.records.tables import COUNTS, rollups_daily, rollups_hourly, runs
 from service.records.trends import latest_time
-from service.times import DAY_S, HOUR_S, Utc, parse_utc, shifted, unix_seconds
+from service.times import DAY_S, HOUR_S, Utc, parse_utc, shifted
 
 STEPS = {HOUR_S: 120, DAY_S: 1800}
 """The buckets of a sparkline: two minutes in an hour, half an hour in a day."""
@@ -79,8 +79,8 @@ def sigma_arcsec(covariance_arcsec2: list[list[float]]) -> list[float]:
 
 def _cells(connection: Connection, span: Span, width_s: int) -> tuple[int, Columns]:
     if width_s > HOUR_S and _about(connection, span) > MAX_BATCHES_READ:
-        return HOUR_S, read_cells(connection, span, "hour")
-    return STEPS[width_s], _steps(connection, span, STEPS[width_s])
+        return HOUR_S, read_cells(connection, span, "hour", COUNTS)
+    return STEPS[width_s], read_steps(connection, span, STEPS[width_s], COUNTS)
 
 
 def _about(connection: Connection, span: Span) -> int:
@@ -93,36 +93,6 @@ def _about(connection: Connection, span: Span) -> int:
         table.bucket <= span.end.bucket(HOUR_S),
     )
     return int(connection.execute(query).scalar() or 0)
-
-
-def _steps(connection: Connection, span: Span, step_s: int) -> Columns:
-    """Counts in steps from the span's start, summed in the database from its index alone."""
-    columns = results.c
-    step = (columns.time_ns - span.start.tai_ns) // (step_s * 10**9)
-    solved = func.count(columns.status)
-    suspect = func.sum((columns.status == "suspect").cast(columns.unique.type))
-    stars = [func.sum(columns[name]) for name in ("unique", "ambiguous", "unmatched")]
-    query = (
-        select(step.label("step"), func.count(), *stars, solved, suspect)
-        .where(
-            columns.current,
-            columns.spacecraft == span.spacecraft,
-            columns.run == span.run,
-            columns.time_ns >= span.start.tai_ns,
-            columns.time_ns < span.end.tai_ns,
-        )
-        .group_by(step)
-        .order_by(step)
-    )
-    rows = [[int(each or 0) for each in row] for row in connection.execute(query)]
-    read = np.array(rows, dtype=float).reshape(-1, 7).T
-    number, found, unique, ambiguous, unmatched, solved_n, suspect_n = read
-    counts = (found, unique + ambiguous + unmatched, unique, ambiguous, unmatched)
-    begin_ns = span.start.tai_ns + (number * step_s * 1e9).astype(np.int64)
-    return {
-        "unix_s": unix_seconds(begin_ns),
-        **dict(zip(COUNTS, (*counts, solved_n, suspect_n), strict=True)),
-    }
 
 
 def _sparkline(cells: Columns, step_s: int) -> Row:

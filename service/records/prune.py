@@ -87,7 +87,7 @@ def _of_an_hour(spacecraft: str, run: str, hour: int, before: Utc) -> Callable[[
         ids = list(connection.scalars(chosen))
         for first in range(0, len(ids), _AT_ONCE):
             _delete(connection, ids[first : first + _AT_ONCE])
-        rollups.renew_hour(connection, (spacecraft, run, hour))
+        rollups.renew(connection, [(spacecraft, run, hour)])
         return len(ids)
 
     return change

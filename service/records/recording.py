@@ -126,7 +126,8 @@ def _insert(connection: Connection, fresh: Sequence[tuple[Draft, bytes]]) -> Non
         if draft.batch is None:
             if draft.result["current"]:
                 _supersede(connection, draft)
-                adopted.append(draft.buckets)
+                where = draft.buckets
+                adopted.append((where.spacecraft, where.run, where.hour))
             _insert_results(connection, [(draft, body)])
     rollups.renew(connection, adopted)
     watch(connection, [draft for draft, _ in firsts])

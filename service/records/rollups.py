@@ -11,8 +11,9 @@ from typing import Literal
 from sqlalchemy import ColumnElement, Connection, Table, and_, delete, select, update
 
 from service.records.draft import Buckets, Row
-from service.records.measures import COUNTED, contribution, merge
+from service.records.measures import contribution, merge
 from service.records.statements import add_rollups
+from service.records.summing import SUMMED
 from service.records.tables import COUNTS, batches, results, rollups_daily, rollups_hourly
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, parse_utc
 
@@ -27,12 +28,11 @@ _KEY = ("spacecraft", "run", "bucket")
 class _Trend:
     table: Table
     width_s: int
-    field: str
 
 
 _TRENDS: dict[Bucket, _Trend] = {
-    "hour": _Trend(rollups_hourly, HOUR_S, "hour"),
-    "day": _Trend(rollups_daily, DAY_S, "day"),
+    "hour": _Trend(rollups_hourly, HOUR_S),
+    "day": _Trend(rollups_daily, DAY_S),
 }
 
 
@@ -49,49 +49,55 @@ def add(connection: Connection, new: Iterable[tuple[Buckets, Row]]) -> None:
         add_rollups(connection, table, [_keyed(key, found[key]) for key in sorted(found)])
 
 
-def renew(connection: Connection, changed: Iterable[Buckets]) -> None:
-    """Count anew the hours and days in which a current result was replaced by another.
+def renew(connection: Connection, hours: Iterable[Key]) -> None:
+    """Count hours anew in which a current result was replaced or taken out, and their days.
 
-    An extreme that is gone cannot be subtracted.  The row is locked before the
-    results are read: what another process adds is then either in both or comes
-    after.
+    An extreme that is gone cannot be subtracted.  A row is locked before what it
+    is made of is read: what another process adds is then either in both or comes
+    after.  Where nothing is left of an hour or a day, its row goes too.
     """
-    buckets = list(changed)
-    for trend in _TRENDS.values():
-        for spacecraft, run, number in sorted(
-            {(each.spacecraft, each.run, getattr(each, trend.field)) for each in buckets}
-        ):
-            place = _place(trend.table, (spacecraft, run, number))
-            connection.execute(select(trend.table.c.bucket).where(place).with_for_update())
-            row = _counted(connection, trend, (spacecraft, run, number))
-            connection.execute(update(trend.table).where(place).values(row or {}))
+    # Hours before days, and each in order: as `add` does it.
+    changed = sorted(set(hours))
+    for key in changed:
+        _put_back(connection, rollups_hourly, key, _of_hour(connection, key))
+    for spacecraft, run, day in sorted({(key[0], key[1], key[2] // 24) for key in changed}):
+        row = _of_day(connection, (spacecraft, run, day))
+        _put_back(connection, rollups_daily, (spacecraft, run, day), row)
 
 
-def renew_hour(connection: Connection, key: Key) -> None:
-    """Count an hour anew from which results were taken out, and its day from its hours.
-
-    Where nothing is left of either, its row goes too.  The rows are locked
-    before anything is read, the hour before the day, as everywhere.
-    """
+def _of_hour(connection: Connection, key: Key) -> Row | None:
+    """What the current results of an hour come to."""
+    _lock(connection, rollups_hourly, key)
     spacecraft, run, hour = key
-    counted = _counted(connection, _TRENDS["hour"], _locked(connection, rollups_hourly, key))
-    _put_back(connection, rollups_hourly, key, counted)
-    day = _locked(connection, rollups_daily, (spacecraft, run, hour // 24))
-    hours = select(rollups_hourly).where(
+    query = select(*SUMMED.values()).where(
+        results.c.current,
+        results.c.spacecraft == spacecraft,
+        results.c.run == run,
+        results.c.time_ns >= bucket_start(hour, HOUR_S).tai_ns,
+        results.c.time_ns < bucket_start(hour + 1, HOUR_S).tai_ns,
+    )
+    row = dict(connection.execute(query).mappings().one())
+    return row if row["batches"] else None
+
+
+def _of_day(connection: Connection, key: Key) -> Row | None:
+    """What the hours of a day come to."""
+    _lock(connection, rollups_daily, key)
+    spacecraft, run, day = key
+    query = select(rollups_hourly).where(
         rollups_hourly.c.spacecraft == spacecraft,
         rollups_hourly.c.run == run,
-        rollups_hourly.c.bucket >= 24 * day[2],
-        rollups_hourly.c.bucket < 24 * (day[2] + 1),
+        rollups_hourly.c.bucket >= 24 * day,
+        rollups_hourly.c.bucket < 24 * (day + 1),
     )
     found: Rollups = {}
-    for row in connection.execute(hours.order_by(rollups_hourly.c.bucket)).mappings():
-        _put(found, day, {name: row[name] for name in row if name not in _KEY})
-    _put_back(connection, rollups_daily, day, found.get(day))
+    for row in connection.execute(query.order_by(rollups_hourly.c.bucket)).mappings():
+        _put(found, key, {name: row[name] for name in row if name not in _KEY})
+    return found.get(key)
 
 
-def _locked(connection: Connection, table: Table, key: Key) -> Key:
+def _lock(connection: Connection, table: Table, key: Key) -> None:
     connection.execute(select(table.c.bucket).where(_place(table, key)).with_for_update())
-    return key
 
 
 def _put_back(connection: Connection, table: Table, key: Key, row: Row | None) -> None:
@@ -99,21 +105,6 @@ def _put_back(connection: Connection, table: Table, key: Key, row: Row | None) -
     connection.execute(
         delete(table).where(place) if row is None else update(table).where(place).values(row)
     )
-
-
-def _counted(connection: Connection, trend: _Trend, key: Key) -> Row | None:
-    start, end = (bucket_start(key[2] + ahead, trend.width_s).tai_ns for ahead in (0, 1))
-    query = select(*(results.c[name] for name in COUNTED)).where(
-        results.c.current,
-        results.c.spacecraft == key[0],
-        results.c.run == key[1],
-        results.c.time_ns >= start,
-        results.c.time_ns < end,
-    )
-    found: Rollups = {}
-    for result in connection.execute(query).mappings():
-        _put(found, key, contribution(dict(result)))
-    return found.get(key)
 
 
 def _put(found: Rollups, key: Key, row: Row) -> None:

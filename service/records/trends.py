@@ -9,20 +9,21 @@ import numpy.typing as npt
 from sqlalchemy import Connection, select
 
 from service.alarms.quantities import QUANTITIES, QuantityName
-from service.records.cells import Columns, Level, Span, read_cells, totals
+from service.records.cells import Columns, Span, read_cells, read_steps, totals
 from service.records.draft import Row
 from service.records.measures import contribution
 from service.records.pages import Stretch, newest, newest_first
-from service.records.tables import batches, results
+from service.records.tables import COUNTS, batches, results
 from service.times import DAY_S, HOUR_S, Utc, parse_utc, shifted, unix_seconds, utc_now
 from service.vectors import Vector
 
 Integers = npt.NDArray[np.intp]
 
 Strategy = Literal["minmax", "latest"]
+Source = Literal["batch", "hour", "day"]
 MAX_SIZE = 1_500
-MAX_BATCHES_READ = 5_000
-"""Of one answer; a stretch with more is drawn from rollups, hours at the finest."""
+MAX_BATCHES_SUMMED = 20_000
+"""Of one answer; a stretch of hours with more is drawn from rollups, hours at the finest."""
 MAX_HOURS_READ = 1_500
 """Of one answer; a stretch with more is drawn from days at the finest."""
 
@@ -67,9 +68,12 @@ def history(
     about |= {"start": span.start.text, "end": span.end.text}
     if asked.strategy == "latest":
         return about | _latest(connection, span, asked)
-    width_s, level = _resolution(connection, span, asked.size)
-    cells = read_cells(connection, span, level)
-    return about | {"bucket_s": width_s, "source": level, **_thinned(cells, span, width_s, asked)}
+    width_s, source = _resolution(connection, span, asked.size)
+    if source == "batch":
+        cells = read_steps(connection, span, width_s)
+    else:
+        cells = read_cells(connection, span, source)
+    return about | {"bucket_s": width_s, "source": source, **_thinned(cells, span, width_s, asked)}
 
 
 def latest_time(
@@ -93,7 +97,7 @@ def _span(
     return span if span.start.tai_ns <= end.tai_ns else replace(span, end=span.start)
 
 
-def _resolution(connection: Connection, span: Span, size: int) -> tuple[int, Level]:
+def _resolution(connection: Connection, span: Span, size: int) -> tuple[int, Source]:
     """The narrowest buckets that are not more than asked for, and what they are read from."""
     first_s, end_s = unix_seconds([span.start.tai_ns, span.end.tai_ns]).tolist()
     width_s = next((w for w in WIDTHS_S if _buckets(first_s, end_s, w) <= size), 0)
@@ -101,13 +105,17 @@ def _resolution(connection: Connection, span: Span, size: int) -> tuple[int, Lev
         # Longer than the widest of them: as many months of thirty days as it takes.
         width_s = WIDTHS_S[-1] * (1 + int((end_s - first_s) / (WIDTHS_S[-1] * max(size - 1, 0.5))))
     if width_s < HOUR_S:
-        cells = read_cells(connection, span, "hour") if end_s - first_s > HOUR_S else None
-        if cells is None or totals(cells)["batches"] <= MAX_BATCHES_READ:
+        if end_s - first_s <= HOUR_S or _batches(connection, span) <= MAX_BATCHES_SUMMED:
             return width_s, "batch"
         width_s = HOUR_S
     if width_s < DAY_S and end_s - first_s > MAX_HOURS_READ * HOUR_S:
         width_s = DAY_S
     return width_s, "day" if width_s >= DAY_S else "hour"
+
+
+def _batches(connection: Connection, span: Span) -> int:
+    found: int = totals(read_cells(connection, span, "hour", COUNTS))["batches"]
+    return found
 
 
 def _buckets(first_s: float, end_s: float, width_s: int) -> int:

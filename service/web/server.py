@@ -25,6 +25,9 @@ GRACE_S = 10
 """How long running requests may still take when the server is told to stop."""
 HEAD_S = 30
 """So long may a client be silent between two requests, or be at the head of one."""
+PASSED_BY_S = 0.005
+"""Between two pieces, of 256 KiB at most, of a body that was refused.  It is taken off to its end,
+for many clients look for an answer only then, but at 50 MB/s and not as fast as they can send."""
 UNREAD_S = 60
 """An answer of which so long nothing was read is given up: it takes memory until it is gone."""
 
@@ -72,6 +75,7 @@ class Connection(HttpToolsProtocol):
     """
 
     _looking: asyncio.TimerHandle | None = None
+    _passing_by: asyncio.TimerHandle | None = None
     _waiting: asyncio.TimerHandle | None = None
     _no_head_since_s: float | None = None
 
@@ -86,6 +90,13 @@ class Connection(HttpToolsProtocol):
         """A request has begun, and its handler says how long it may take."""
         super().on_headers_complete()
         self._no_head_since_s = None
+
+    def on_body(self, body: bytes) -> None:
+        """A piece of a body, perhaps of one that is answered already."""
+        super().on_body(body)
+        if self.cycle.response_complete and not self.flow.read_paused:
+            self.flow.pause_reading()
+            self._passing_by = self.loop.call_later(PASSED_BY_S, self.flow.resume_reading)
 
     def on_response_complete(self) -> None:
         """The next request may come; of some of them the head is there already."""
@@ -116,8 +127,9 @@ class Connection(HttpToolsProtocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """There is nobody any more."""
         self._look_no_more()
-        if self._waiting is not None:
-            self._waiting.cancel()
+        for each in (self._waiting, self._passing_by):
+            if each is not None:
+                each.cancel()
         super().connection_lost(exc)
 
     def _look_again(self) -> None:

@@ -68,19 +68,19 @@ def expected(rows, start, end, width_s, name):
     begin_s=st.integers(-100, 8000),
     length_s=st.integers(1, 6 * 3600),
     size=st.sampled_from([1, 2, 5, 30, 300]),
-    at_most=st.sampled_from([1, 5000]),
+    at_most=st.sampled_from([1, 20_000]),
 )
 def test_thinning_out_keeps_the_least_and_greatest_of_every_bucket(
     operations, drawn, begin_s, length_s, size, at_most
 ):
-    """Read from batches and from rollups alike, whatever hour the ends cut through."""
+    """Summed from batches and read from rollups alike, whatever hour the ends cut through."""
     run = f"r{next(RUNS)}"
     rows = rows_of(operations, drawn, run)
     put(operations, rows)
     start = shifted(START, begin_s)
     end = shifted(start, length_s)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trends, "MAX_BATCHES_READ", at_most)
+        patch.setattr(trends, "MAX_BATCHES_SUMMED", at_most)
         shown = operations.history("XTE", run=run, start=start, end=end, size=size)
     assert len(shown["unix_s"]) <= size or shown["bucket_s"] == 3600
     for name in TRENDS:
@@ -100,20 +100,42 @@ def test_thinning_out_keeps_the_least_and_greatest_of_every_bucket(
             assert mean == (None if correct is None else pytest.approx(correct))
 
 
-def test_days_hours_and_batches_make_up_the_same_sums(operations):
+@pytest.mark.parametrize("midnight_s", [12_600, 0, 200_000])
+def test_days_hours_and_their_parts_make_up_the_same_sums(operations, midnight_s):
+    """Wherever the stretch lies, a leap second in it or not, and of a single result as of many."""
+    start = shifted(START, 12_600 - midnight_s)
     rows = [
-        result_row(operations, shifted(START, 3000 * k), ambiguous=k % 3, unique=5 - k % 3)
+        result_row(operations, shifted(start, 3000 * k + 0.5), ambiguous=k % 3, unique=5 - k % 3)
         for k in range(150)
     ]
     put(operations, rows)
-    span = cells.Span("XTE", "live", shifted(START, 2500), shifted(START, 360_000))
+    for begin_s, end_s in ((2500, 360_000), (4000, 5000), (0, 12_601), (3000.5, 6000.5)):
+        span = cells.Span("XTE", "live", shifted(start, begin_s), shifted(start, end_s))
+        with operations.store.reading() as connection:
+            found = [cells.read_cells(connection, span, each) for each in ("hour", "day")]
+            found += [cells.read_steps(connection, span, each) for each in (60, 1800, 86_400)]
+        inside = [row for _, row in rows if span.start.tai_ns <= row["time_ns"] < span.end.tai_ns]
+        for each in found:
+            counts = cells.totals(each)
+            assert counts["batches"] == len(inside)
+            assert counts["observed"] == 5 * len(inside)
+            assert counts["ambiguous"] == sum(row["ambiguous"] for row in inside)
+            assert counts["solved"] == len(inside)
+
+
+def test_a_dense_stretch_is_read_in_as_many_rows_as_it_shows(operations):
+    """An hour of a thousand batches a second must not be held in memory, nor sent."""
+    rows = [result_row(operations, shifted(START, k / 10), ambiguous=k % 2) for k in range(3000)]
+    put(operations, rows)
     with operations.store.reading() as connection:
-        found = [
-            cells.totals(cells.read_cells(connection, span, each))
-            for each in ("batch", "hour", "day")
-        ]
-    assert found[0] == found[1] == found[2]
-    assert found[0]["batches"] == 119
+        span = cells.Span("XTE", "live", START, shifted(START, 300))
+        assert len(cells.read_steps(connection, span, 60)["batches"]) == 5
+        assert len(cells.read_cells(connection, span, "day")["batches"]) == 1
+    shown = operations.history("XTE", start=START, end=shifted(START, 300), size=5)
+    assert shown["batches"] == [600] * 5
+    item = next(each for each in operations.overview()["items"] if each["name"] == "XTE")
+    assert sum(item["sparkline_hour"]["batches"]) == 3000
+    assert len(item["sparkline_hour"]["batches"]) == 3
 
 
 def test_a_year_is_read_from_days_and_a_month_from_hours(operations):
