@@ -542,7 +542,10 @@ class Operations:
         end: Utc | None = None,
         bucket: rollups.Bucket = "hour",
     ) -> list[Row]:
-        """Stars by outcome over all observed ones, in UTC hours or days by batch time."""
+        """Stars by outcome over all observed ones, in UTC hours or days by batch time.
+
+        Raises `BadInput` for a stretch with too many of them.
+        """
         mission_named(self.missions, name)
         with self.reading() as connection:
             return rollups.rates(

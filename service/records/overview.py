@@ -18,7 +18,7 @@ from service.times import DAY_S, HOUR_S, Utc, parse_utc, shifted
 
 STEPS = {HOUR_S: 120, DAY_S: 1800}
 """The buckets of a sparkline: two minutes in an hour, half an hour in a day."""
-MAX_BATCHES_READ = 10_000
+MAX_BATCHES_SUMMED = 10_000
 """Of a day; where there are more, its sparkline is hourly."""
 _TICK_S = 1e-6
 
@@ -78,7 +78,7 @@ def sigma_arcsec(covariance_arcsec2: list[list[float]]) -> list[float]:
 
 
 def _cells(connection: Connection, span: Span, width_s: int) -> tuple[int, Columns]:
-    if width_s > HOUR_S and _about(connection, span) > MAX_BATCHES_READ:
+    if width_s > HOUR_S and _about(connection, span) > MAX_BATCHES_SUMMED:
         return HOUR_S, read_cells(connection, span, "hour", COUNTS)
     return STEPS[width_s], read_steps(connection, span, STEPS[width_s], COUNTS)
 

@@ -10,6 +10,7 @@ from typing import Literal
 
 from sqlalchemy import ColumnElement, Connection, Table, and_, delete, select, update
 
+from service.errors import BadInput, Fault
 from service.records.draft import Buckets, Row
 from service.records.measures import contribution, merge
 from service.records.statements import add_rollups
@@ -22,6 +23,8 @@ Key = tuple[str, str, int]
 """(spacecraft, run, bucket)."""
 Rollups = dict[Key, Row]
 _KEY = ("spacecraft", "run", "bucket")
+MAX_RATES = 20_000
+"""Of one answer: two years of hours, or half a century of days."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +135,10 @@ def rates(
     end: Utc | None,
     bucket: Bucket,
 ) -> list[Row]:
-    """The buckets that begin at or after `start`'s own and before `end`, oldest first."""
+    """The buckets that begin at or after `start`'s own and before `end`, oldest first.
+
+    Raises `BadInput` where there are more than `MAX_RATES`.
+    """
     trend = _TRENDS[bucket]
     table = trend.table
     query = select(table.c.bucket, *(table.c[name] for name in COUNTS)).where(
@@ -145,7 +151,12 @@ def rates(
         # A bucket that begins just where the range ends lies outside it.
         last -= bucket_start(last, trend.width_s).tai_ns == end.tai_ns
         query = query.where(table.c.bucket <= last)
-    rows = connection.execute(query.order_by(table.c.bucket)).mappings()
+    rows = connection.execute(query.order_by(table.c.bucket).limit(MAX_RATES + 1)).mappings().all()
+    if len(rows) > MAX_RATES:
+        given = "nothing" if start is None else start.text
+        shorter = "ask for a shorter stretch" + (", or for days" if bucket == "hour" else "")
+        wrong = f"from then on more than {MAX_RATES} {bucket}s hold batches: {shorter}"
+        raise BadInput(Fault("start", wrong, given))
     return [
         {"start": bucket_start(row["bucket"], trend.width_s).text}
         | {name: row[name] for name in COUNTS}

@@ -35,7 +35,7 @@ def test_the_day_is_the_same_from_hours_as_from_batches(operations, monkeypatch)
     rows = [result_row(operations, shifted(START, 317.0 * k), ambiguous=k % 4) for k in range(400)]
     put(operations, rows)
     from_batches = item(operations)["last_day"]
-    monkeypatch.setattr("service.records.overview.MAX_BATCHES_READ", 0)
+    monkeypatch.setattr("service.records.overview.MAX_BATCHES_SUMMED", 0)
     assert item(operations)["last_day"] == from_batches
 
 

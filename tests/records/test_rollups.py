@@ -4,7 +4,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from service.errors import BadInput
 from service.observe.wire import OptionsIn
+from service.records import rollups
 from service.times import parse_utc
 from tests.records.recount import assert_equal_to_a_recount
 from tests.records.samples import KINDS
@@ -106,3 +108,15 @@ def test_a_range_takes_the_buckets_it_touches(operations, make, start, end, hour
     given_range = {"start": start and parse_utc(start), "end": end and parse_utc(end)}
     shown = operations.rates("XTE", **given_range)
     assert [int(each["start"][11:13]) for each in shown] == hours
+
+
+def test_a_stretch_with_more_buckets_than_an_answer_holds_is_refused(operations, make, monkeypatch):
+    for hour in range(3):
+        operations.submit(make(f"b{hour}", after_s=3600 * hour))
+    monkeypatch.setattr(rollups, "MAX_RATES", 3)
+    assert len(operations.rates("XTE")) == 3
+    monkeypatch.setattr(rollups, "MAX_RATES", 2)
+    with pytest.raises(BadInput, match=r"start: .* more than 2 hours hold batches: .* or for days"):
+        operations.rates("XTE")
+    assert len(operations.rates("XTE", start=parse_utc("1996-01-10T13:00:00Z"))) == 2
+    assert len(operations.rates("XTE", bucket="day")) == 1
