@@ -25,9 +25,9 @@ GRACE_S = 10
 """How long running requests may still take when the server is told to stop."""
 HEAD_S = 30
 """So long may a client be silent between two requests, or be at the head of one."""
-PASSED_BY_S = 0.005
-"""Between two pieces, of 256 KiB at most, of a body that was refused.  It is taken off to its end,
-for many clients look for an answer only then, but at 50 MB/s and not as fast as they can send."""
+PASSED_BY_PER_S = 50e6
+"""Bytes of a body that was refused.  It is taken off to its end, for many clients look for an
+answer only then; as fast as several can send it, that would keep a processor from all others."""
 UNREAD_S = 60
 """An answer of which so long nothing was read is given up: it takes memory until it is gone."""
 
@@ -76,6 +76,7 @@ class Connection(HttpToolsProtocol):
 
     _looking: asyncio.TimerHandle | None = None
     _passing_by: asyncio.TimerHandle | None = None
+    _owed_s = 0.0
     _waiting: asyncio.TimerHandle | None = None
     _no_head_since_s: float | None = None
 
@@ -94,9 +95,22 @@ class Connection(HttpToolsProtocol):
     def on_body(self, body: bytes) -> None:
         """A piece of a body, perhaps of one that is answered already."""
         super().on_body(body)
-        if self.cycle.response_complete and not self.flow.read_paused:
-            self.flow.pause_reading()
-            self._passing_by = self.loop.call_later(PASSED_BY_S, self.flow.resume_reading)
+        if self.cycle.response_complete:
+            self._pass_by(len(body) / PASSED_BY_PER_S)
+
+    def _pass_by(self, seconds: float) -> None:
+        """Read nothing for so long, and do not count that as the client's silence."""
+        self._owed_s += seconds
+        if self._no_head_since_s is not None:
+            self._no_head_since_s += seconds
+        if self._passing_by is not None:
+            self._passing_by.cancel()
+        self.flow.pause_reading()
+        self._passing_by = self.loop.call_later(self._owed_s, self._read_on)
+
+    def _read_on(self) -> None:
+        self._owed_s, self._passing_by = 0.0, None
+        self.flow.resume_reading()
 
     def on_response_complete(self) -> None:
         """The next request may come; of some of them the head is there already."""
