@@ -160,9 +160,11 @@ def unix_seconds(tai_ns: npt.ArrayLike) -> npt.NDArray[np.float64]:
     tai = np.asarray(tai_ns, dtype=np.int64)
     begin, number = _leap_seconds()
     place = np.searchsorted(begin, tai, side="right") - 1
-    midnight = _UNIX_J2000_S + begin * 1e-9 - number
-    following = np.append(midnight[1:], np.inf)
-    unix_s = _UNIX_J2000_S + tai * 1e-9 - number[place]
+    # Whole seconds by themselves: a moment at the beginning of one shall not fall before it.
+    midnight = _UNIX_J2000_S + begin // 10**9 - number
+    following = np.append(midnight[1:].astype(float), np.inf)
+    whole, rest_ns = np.divmod(tai, 10**9)
+    unix_s = (_UNIX_J2000_S + whole - number[place]) + rest_ns * 1e-9
     return np.asarray(np.minimum(unix_s, np.nextafter(following[place], 0.0)))
 
 

@@ -11,7 +11,7 @@ from functools import cache
 from typing import Any, Literal
 
 import numpy as np
-from sqlalchemy import BigInteger, Connection, Select, Table, bindparam, select
+from sqlalchemy import BigInteger, Connection, Select, Table, bindparam, case, select
 
 from service.records.draft import Row
 from service.records.summing import COLUMNS, SUMMED
@@ -29,6 +29,8 @@ Columns = dict[str, Vector]
 """`unix_s`, at which each cell begins, and columns of a rollup."""
 Names = tuple[str, ...]
 """Of columns of a rollup."""
+MAX_BATCHES_SUMMED = 10_000
+"""Of a stretch of hours, for one answer; one with more is shown by the hour at the finest."""
 
 _COARSE: dict[Level, tuple[Table, int]] = {
     "hour": (rollups_hourly, HOUR_S),
@@ -84,6 +86,7 @@ def read_steps(connection: Connection, span: Span, width_s: int, names: Names = 
         asked = _asked(replace(span, start=begin, end=end)) | {
             "midnight_ns": midnight.tai_ns,
             "width_ns": width_s * 10**9,
+            "last": DAY_S // width_s - 1,
         }
         rows = connection.execute(_steps_query(names), asked).all()
         parts.append(_steps_of(rows, midnight, width_s, names))
@@ -94,7 +97,10 @@ def read_steps(connection: Connection, span: Span, width_s: int, names: Names = 
 @cache
 def _steps_query(names: Names) -> Select[Any]:
     since_ns = results.c.time_ns - bindparam("midnight_ns", type_=BigInteger)
-    step = (since_ns // bindparam("width_ns", type_=BigInteger)).label("step")
+    number = since_ns // bindparam("width_ns", type_=BigInteger)
+    # A leap second is of the step that it ends, as of its hour and day.
+    last = bindparam("last", type_=BigInteger)
+    step = case((number > last, last), else_=number).label("step")
     query = select(step, *(SUMMED[name] for name in names))
     return query.where(*_IN_SPAN).group_by(step).order_by(step)
 

@@ -9,7 +9,7 @@ from sqlalchemy import Connection, func, select
 from service.missions.mission import Mission
 from service.records.ahead import LIVE
 from service.records.alarms import active_alarms, summary
-from service.records.cells import Columns, Span, read_cells, read_steps, totals
+from service.records.cells import MAX_BATCHES_SUMMED, Columns, Span, read_cells, read_steps, totals
 from service.records.draft import Row
 from service.records.histories import live_state
 from service.records.tables import COUNTS, rollups_daily, rollups_hourly, runs
@@ -18,8 +18,6 @@ from service.times import DAY_S, HOUR_S, Utc, parse_utc, shifted
 
 STEPS = {HOUR_S: 120, DAY_S: 1800}
 """The buckets of a sparkline: two minutes in an hour, half an hour in a day."""
-MAX_BATCHES_SUMMED = 10_000
-"""Of a day; where there are more, its sparkline is hourly."""
 _TICK_S = 1e-6
 
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from sqlalchemy import Connection, select
 
 from service.alarms.quantities import QUANTITIES, QuantityName
-from service.records.cells import Columns, Span, read_cells, read_steps, totals
+from service.records.cells import MAX_BATCHES_SUMMED, Columns, Span, read_cells, read_steps, totals
 from service.records.draft import Row
 from service.records.measures import contribution
 from service.records.pages import Stretch, newest, newest_first
@@ -22,8 +22,6 @@ Integers = npt.NDArray[np.intp]
 Strategy = Literal["minmax", "latest"]
 Source = Literal["batch", "hour", "day"]
 MAX_SIZE = 1_500
-MAX_BATCHES_SUMMED = 20_000
-"""Of one answer; a stretch of hours with more is drawn from rollups, hours at the finest."""
 MAX_HOURS_READ = 1_500
 """Of one answer; a stretch with more is drawn from days at the finest."""
 

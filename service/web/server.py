@@ -76,7 +76,7 @@ class Connection(HttpToolsProtocol):
 
     _looking: asyncio.TimerHandle | None = None
     _passing_by: asyncio.TimerHandle | None = None
-    _owed_s = 0.0
+    _read_until_s = _read_on_s = 0.0
     _waiting: asyncio.TimerHandle | None = None
     _no_head_since_s: float | None = None
 
@@ -100,16 +100,18 @@ class Connection(HttpToolsProtocol):
 
     def _pass_by(self, seconds: float) -> None:
         """Read nothing for so long, and do not count that as the client's silence."""
-        self._owed_s += seconds
-        if self._no_head_since_s is not None:
-            self._no_head_since_s += seconds
-        if self._passing_by is not None:
+        if self._passing_by is None:
+            self._read_until_s = self._read_on_s = self.loop.time()
+            self.flow.pause_reading()
+        else:
             self._passing_by.cancel()
-        self.flow.pause_reading()
-        self._passing_by = self.loop.call_later(self._owed_s, self._read_on)
+        self._read_on_s += seconds
+        self._passing_by = self.loop.call_at(self._read_on_s, self._read_on)
 
     def _read_on(self) -> None:
-        self._owed_s, self._passing_by = 0.0, None
+        self._passing_by = None
+        if self._no_head_since_s is not None:
+            self._no_head_since_s += self.loop.time() - self._read_until_s
         self.flow.resume_reading()
 
     def on_response_complete(self) -> None:

@@ -25,7 +25,7 @@ class Load:
         self._port, self._template = port, template
         self._names = _Locked(f"batch-{number}" for number in count())
         self._again = deque()
-        self._stopping = threading.Event()
+        self._stopping, self._given_up = threading.Event(), threading.Event()
         self._faults = []
         self._threads = [threading.Thread(target=self._send) for _ in range(CLIENTS)]
         for thread in self._threads:
@@ -33,20 +33,22 @@ class Load:
 
     def stop(self):
         """Send what is still to be sent again, then nothing more."""
-        self.end()
+        self._stopping.set()
         for thread in self._threads:
             thread.join()
         assert not self._faults, self._faults[0]
 
-    def end(self):
-        """Send nothing new from now on."""
-        self._stopping.set()
+    def give_up(self):
+        """Send nothing more."""
+        self._given_up.set()
 
     def _count(self, met):
         with self._counting:
             self.met[met] += 1
 
     def _next(self):
+        if self._given_up.is_set():
+            return None
         try:
             return self._again.popleft()
         except IndexError:

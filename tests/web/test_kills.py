@@ -64,7 +64,7 @@ def test_a_server_killed_under_load_loses_tears_and_doubles_nothing(
             server = serve()
         load.stop()
     finally:
-        load.end()
+        load.give_up()
         server.terminate()
         server.wait()
 

@@ -59,10 +59,7 @@ def list_attitudes(
     **described({200: Gives("The buckets that hold batches.", RateList)}, problems=(404,)),
 )
 def list_rates(name: Name, query: Annotated[RatesQuery, InQuery()], operations: Held) -> Response:
-    """Stars by outcome over all observed stars, in buckets by batch time.
-
-    A stretch with more than twenty thousand of them is refused.
-    """
+    """Stars by outcome over all observed stars, in at most 20,000 buckets by batch time."""
     return json_response({"items": operations.rates(name, **query.asked())})
 
 
