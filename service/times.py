@@ -131,7 +131,10 @@ def _tai_less_utc_s(day: date) -> int:
 def bucket_start(number: int, width_s: int) -> Utc:
     """The moment at which hour or day `number` (see `Utc.bucket`) begins."""
     days, hour = (number, 0) if width_s == DAY_S else divmod(number, 24)
-    return _from_fields(date.fromordinal(days + _MJD_ZERO), hour, 0, 0.0)
+    day = date.fromordinal(days + _MJD_ZERO)
+    found = _from_fields(day, hour, 0, 0.0)
+    vars(found)["_fields"] = day, hour, 0, 0, 0
+    return found
 
 
 def utc_now() -> Utc:

@@ -76,6 +76,12 @@ def test_hours_and_days_are_counted_in_utc_and_found_again(moment):
     hour = moment.replace(minute=0, second=0, microsecond=0)
     assert bucket_start(utc.bucket(3600), 3600) == parse_utc(text_of(hour, 0))
     assert bucket_start(utc.bucket(86400), 86400) == parse_utc(text_of(hour.replace(hour=0), 0))
+    begin = bucket_start(utc.bucket(3600), 3600)
+    # Known by its fields, it is what ERFA makes of the same date.
+    assert (begin.text, begin.tai_ns) == (
+        Utc(begin.jd1, begin.jd2).text,
+        Utc(begin.jd1, begin.jd2).tai_ns,
+    )
     since_mjd_zero = moment.replace(tzinfo=UTC) - datetime(1858, 11, 17, tzinfo=UTC)
     assert utc.bucket(3600) == since_mjd_zero // timedelta(hours=1)
 

@@ -151,16 +151,18 @@ def rates(
         # A bucket that begins just where the range ends lies outside it.
         last -= bucket_start(last, trend.width_s).tai_ns == end.tai_ns
         query = query.where(table.c.bucket <= last)
-    rows = connection.execute(query.order_by(table.c.bucket).limit(MAX_RATES + 1)).mappings().all()
+    rows = connection.execute(query.order_by(table.c.bucket).limit(MAX_RATES + 1)).all()
     if len(rows) > MAX_RATES:
         given = "nothing" if start is None else start.text
         shorter = "ask for a shorter stretch" + (", or for days" if bucket == "hour" else "")
         wrong = f"from then on more than {MAX_RATES} {bucket}s hold batches: {shorter}"
         raise BadInput(Fault("start", wrong, given))
     return [
-        {"start": bucket_start(row["bucket"], trend.width_s).text}
-        | {name: row[name] for name in COUNTS}
-        for row in rows
+        {
+            "start": bucket_start(number, trend.width_s).text,
+            **dict(zip(COUNTS, counts, strict=True)),
+        }
+        for number, *counts in rows
     ]
 
 
