@@ -65,9 +65,9 @@ ABOUT = {
     ),
     "soak": (
         "What the service can do at 16 connections is measured, then batches come for an hour at "
-        "70 % of that, each at its time, while a page is read every second. Bounds: the memory of "
-        "all its processes in the last sixth at most 5 % above that in the second, the write-ahead "
-        "log under 64 MB, every batch recorded."
+        "70 % of that, each at its time, while a page is read every second. Each was observed a "
+        "second after the one before. Bounds: the memory of all its processes in the last sixth at "
+        "most 5 % above that in the second, the write-ahead log under 64 MB, every batch recorded."
     ),
 }
 
