@@ -1,5 +1,6 @@
 """The demonstration: from nothing to a table against truth, the same the second time."""
 
+import random
 import re
 import signal
 import socket
@@ -17,9 +18,15 @@ from service.simulate.score_table import table
 
 
 def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+    """A port for later; below those that outgoing connections are given meanwhile."""
+    while True:
+        port = random.randrange(20_000, 32_000)
+        with socket.socket() as probe:
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return port
 
 
 def demo(folder, *arguments, port=None):
@@ -81,9 +88,14 @@ def test_it_keeps_serving_until_it_is_told_to_stop_and_takes_its_server_with_it(
     command += ["--port", str(port), "--batches", "3"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as running:
         assert running.stdout is not None
-        told_so_far = list(
-            iter(running.stdout.readline, f"Serving on http://127.0.0.1:{port} until Ctrl-C.\n")
-        )
+        told_so_far = []
+        for line in running.stdout:
+            told_so_far.append(line)
+            if line == f"Serving on http://127.0.0.1:{port} until Ctrl-C.\n":
+                break
+        else:
+            # It has ended: to wait for more would be to wait for ever.
+            pytest.fail(f"it ended by itself: {running.wait()}, after {told_so_far}")
         assert any("curl -s 'http://127.0.0.1:" in line for line in told_so_far)
         url = f"http://127.0.0.1:{port}"
         assert httpx.get(f"{url}/livez", trust_env=False).status_code == 200
