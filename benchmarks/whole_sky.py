@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from itertools import count
 
 import numpy as np
+from msgspec import structs
 from tqdm import tqdm
 
 from benchmarks.report import Report
@@ -59,7 +60,7 @@ def measured(views: int, seed: int, step: Callable[[int], object] = int) -> Foun
         (view,) = draw_zone(world, number, mission, catalog, rng)
         if len(view.star) < STARS:
             continue
-        batch = replace(batch_of(view, run, mission, "verified"), a_priori=nothing)
+        batch = structs.replace(batch_of(view, run, mission, "verified"), a_priori=nothing)
         found = acquire(batch, mission, sky).trackers[0].identification
         same = found.star == view.star
         right += int((found.unique & same).sum())

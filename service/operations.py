@@ -1,6 +1,5 @@
 """The one object that every door holds: web, replay, simulator and scripts go through it."""
 
-import dataclasses
 import gc
 import hashlib
 import json
@@ -15,6 +14,7 @@ from contextlib import AbstractContextManager, ExitStack
 from functools import partial
 from typing import IO, TypeVar
 
+from msgspec import structs
 from pydantic import TypeAdapter, ValidationError
 from sqlalchemy import Connection
 
@@ -242,8 +242,8 @@ class Operations:
             try:
                 sent = submission_from_json(text)
                 for _ in range(1 + REHEARSALS // len(inputs)):
-                    batch = dataclasses.replace(sent.batch, batch=self._ids.new())
-                    self._intake.rehearse(dataclasses.replace(sent, batch=batch))
+                    batch = structs.replace(sent.batch, batch=self._ids.new())
+                    self._intake.rehearse(structs.replace(sent, batch=batch))
             except Exception as error:
                 # One that cannot be run any more is no reason not to start.
                 log.warning("the latest batch of a spacecraft could not be rehearsed: %s", error)

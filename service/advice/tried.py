@@ -5,12 +5,12 @@ variant.  A change is that of the share of stars left ambiguous or unmatched,
 batch by batch beside the same identifier with the present settings.
 """
 
-import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from msgspec import structs
 
 from service.acquire import Acquisition
 from service.advice.intervals import Z95, Interval
@@ -36,9 +36,9 @@ class Variant:
         """The batch with these settings in place of its own."""
         options = batch.options
         tolerances = {**options.tolerances, **self.tolerances}
-        return dataclasses.replace(
+        return structs.replace(
             batch,
-            options=dataclasses.replace(options, identifier=self.identifier, tolerances=tolerances),
+            options=structs.replace(options, identifier=self.identifier, tolerances=tolerances),
         )
 
 

@@ -6,14 +6,15 @@ from typing import Any
 
 from service.errors import AcquisitionError
 from service.missions.mission import Mission
+from service.observe.wire import Checked
 from service.records.draft import Answered
 from service.records.intake import Recorded
 from service.records.tokens import Caller
 from service.settings import Settings
 from service.times import Utc
 
-Take = tuple[int, bytes, str | None, Caller | None]
-"""A batch that is to be taken: its number, as it was sent, its key, and who is bound to theirs."""
+Take = tuple[int, bytes | Checked, str | None, Caller | None]
+"""A batch that is to be taken: its number, checked or as sent, its key, who is bound to theirs."""
 Outcome = tuple[int, Answered | Exception]
 """What became of what was asked under a number."""
 

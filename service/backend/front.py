@@ -29,6 +29,7 @@ from service.backend.asked import (
 from service.backend.channel import Channel, Files, Unpacker, packed
 from service.backend.start import Started, start_backend
 from service.errors import AcquisitionError, BadConfiguration, Busy, Stopping
+from service.observe.wire import checked_from_json
 from service.operations import Operations
 from service.records.access import Access
 from service.records.draft import Answered
@@ -67,6 +68,9 @@ RESTART_S = 5
 
 PAUSE_S, LONGEST_PAUSE_S = 1.0, 30.0
 """Before a backend is started again that could not open its database: twice as long each time."""
+
+CHECKED_HERE_BYTES = 16_384
+"""A longer batch takes more than half a millisecond to check, and everybody would wait for it."""
 
 log = logging.getLogger(__name__)
 
@@ -130,7 +134,11 @@ class Front(Operations):
     async def answered(
         self, sent: bytes, idempotency_key: str | None = None, caller: Caller | None = None
     ) -> Answered:
-        """What became of a batch; those that are asked for in one turn of the loop go together."""
+        """What became of a batch; those that are asked for in one turn of the loop go together.
+
+        What is wrong with its form is said here, and nobody else is troubled with it.
+        """
+        batch = checked_from_json(sent) if len(sent) <= CHECKED_HERE_BYTES else sent
         loop = asyncio.get_running_loop()
         number = next(self._numbers)
         done: asyncio.Future[Answered] = loop.create_future()
@@ -139,7 +147,7 @@ class Front(Operations):
             loop.call_soon(self._send_takes)
         # Who is bound to no spacecraft need not be known there.
         bound = caller if caller is not None and caller.spacecraft is not None else None
-        self._takes.append((number, sent, idempotency_key, bound))
+        self._takes.append((number, batch, idempotency_key, bound))
         return await done
 
     def _send_takes(self) -> None:

@@ -1,7 +1,8 @@
 """A batch of observed stars as the core sees it: arrays, units in the names."""
 
-from dataclasses import dataclass, field
 from typing import Literal
+
+from msgspec import Struct
 
 from service.missions.mission import Identifier, Solver
 from service.times import Utc
@@ -13,23 +14,20 @@ MAX_TRACKERS = 16
 Aberration = Literal["to_correct", "applied_upstream", "ignore"]
 
 
-@dataclass(frozen=True)
-class QuaternionPrior:
+class QuaternionPrior(Struct, frozen=True, eq=False):
     """An a priori attitude: inertial to body, scalar last, of norm one."""
 
     quaternion: Vector
 
 
-@dataclass(frozen=True)
-class BoresightPrior:
+class BoresightPrior(Struct, frozen=True):
     """An a priori direction of the spacecraft's boresight, roll unknown (cap missions)."""
 
     ra_deg: float
     dec_deg: float
 
 
-@dataclass(frozen=True)
-class SunPointedPrior:
+class SunPointedPrior(Struct, frozen=True):
     """The pole is on the Sun, roll unknown (band missions).
 
     `sun_vector` is inertial, spacecraft to Sun; without it the Sun is taken
@@ -43,19 +41,17 @@ class SunPointedPrior:
 APriori = QuaternionPrior | BoresightPrior | SunPointedPrior
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(Struct, frozen=True):
     """What a batch or a what-if asks to be done otherwise than its mission says."""
 
     identifier: Identifier | None = None
     solver: Solver | None = None
-    tests: dict[str, bool] = field(default_factory=dict)
-    tolerances: dict[str, float] = field(default_factory=dict)
+    tests: dict[str, bool] = {}
+    tolerances: dict[str, float] = {}
     zone_grid_deg: float | None = None
 
 
-@dataclass(frozen=True)
-class TrackerStars:
+class TrackerStars(Struct, frozen=True, eq=False):
     """The stars of one tracker, in the order observed.
 
     Angles as measured: `vector` rows are unit vectors in tracker axes, NaN
@@ -76,8 +72,7 @@ class TrackerStars:
         return len(self.magnitude_mag)
 
 
-@dataclass(frozen=True)
-class ObservationBatch:
+class ObservationBatch(Struct, frozen=True, eq=False):
     """One batch: who, when, the a priori attitude, and the stars of each tracker.
 
     Without `a_priori` it is lost in space.

@@ -7,10 +7,9 @@ same words.  The pydantic models are also what `openapi.yaml` shows.
 import hashlib
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
 
-import numpy as np
+from msgspec import Struct
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -29,16 +28,12 @@ from service.observe.batch import (
     MAX_TRACKERS,
     Aberration,
     APriori,
-    BoresightPrior,
     ObservationBatch,
     Options,
-    QuaternionPrior,
-    SunPointedPrior,
-    TrackerStars,
 )
+from service.observe.canonical import batch_from_canonical, prior_from_canonical
 from service.observe.frame_record import FrameRecord
 from service.times import parse_utc
-from service.vectors import Vector, read_only, unit
 
 NORM_TOLERANCE = 1e-3
 MAX_FAULTS_SHOWN = 20
@@ -237,89 +232,29 @@ class BatchIn(Wire):
     ]
     options: OptionsIn = OptionsIn()
 
-    def to_batch(self) -> ObservationBatch:
-        """The batch as the core takes it."""
-        return ObservationBatch(
-            spacecraft=self.spacecraft,
-            batch=self.batch,
-            run=self.run,
-            time=parse_utc(self.time),
-            a_priori=(
-                None
-                if self.a_priori is None
-                else prior_of(self.a_priori, self.sun_vector, self.position_km)
-            ),
-            body_rates_deg_per_s=_array(self.body_rates_deg_per_s),
-            velocity_km_per_s=_optional_array(self.velocity_km_per_s),
-            aberration=self.aberration,
-            observations=tuple(_tracker_stars(each) for each in self.observations),
-            options=self.options.to_options(),
-            position_km=_optional_array(self.position_km),
-        )
+
+def prior_of(prior: APrioriIn) -> APriori:
+    """The a priori knowledge as the core takes it."""
+    return prior_from_canonical(prior.model_dump_json(exclude_defaults=True))
 
 
-def prior_of(
-    prior: APrioriIn,
-    sun_vector: Iterable[float] | None = None,
-    position_km: Iterable[float] | None = None,
-) -> APriori:
-    """The a priori knowledge as the core takes it; the Sun's direction may stand beside it too."""
-    if isinstance(prior, QuaternionIn):
-        # By plain numbers: numpy takes as long for four as for a thousand.
-        norm = math.sqrt(sum(part * part for part in prior.quaternion))
-        return QuaternionPrior(_array([part / norm for part in prior.quaternion]))
-    if isinstance(prior, BoresightIn):
-        return BoresightPrior(prior.boresight.ra_deg, prior.boresight.dec_deg)
-    sun = prior.sun_vector or sun_vector
-    return SunPointedPrior(
-        None if sun is None else read_only(unit(np.array(sun))),
-        _optional_array(prior.position_km or position_km),
-    )
-
-
-def _array(values: Iterable[Any]) -> Vector:
-    return read_only(np.array(values, np.float64))
-
-
-def _optional_array(values: Iterable[float] | None) -> Vector | None:
-    return None if values is None else _array(values)
-
-
-_NO_VECTOR = (math.nan, math.nan, math.nan)
-
-
-def _tracker_stars(tracker: TrackerIn) -> TrackerStars:
-    stars = tracker.stars
-    vector = np.array([star.vector or _NO_VECTOR for star in stars], np.float64).reshape(-1, 3)
-    # A number that is absent becomes NaN by numpy's reading of None.
-    numbers = _array(
-        [
-            [star.h_deg for star in stars],
-            [star.v_deg for star in stars],
-            [star.magnitude for star in stars],
-            [star.time_offset_s for star in stars],
-            [star.sigma_arcsec for star in stars],
-        ]
-    )
-    return TrackerStars(
-        tracker=tracker.tracker,
-        # Each has a norm near one, or is NaN: nothing is divided by zero.
-        vector=read_only(vector / np.sqrt((vector * vector).sum(axis=1, keepdims=True))),
-        angles_deg=numbers[:2].T,
-        magnitude_mag=numbers[2],
-        time_offset_s=numbers[3],
-        sigma_arcsec=numbers[4],
-    )
-
-
-@dataclass(frozen=True)
-class Submission:
-    """A batch that passed every check of its form, with the text that identifies it.
+class Checked(Struct, frozen=True):
+    """A batch that passed every check of its form.
 
     `text` is its canonical JSON, defaults left out: what is recorded and run
     again.  `fingerprint` is the digest of that text, so that white space and
-    the order of keys do not make another body.  A batch that was made of a frame
-    has the fingerprint of the frame and of what was told with it.
+    the order of keys do not make another body.
+    """
+
+    text: str
+    fingerprint: str
+
+
+class Submission(Struct, frozen=True, eq=False):
+    """A batch and the text that identifies it; see `Checked`.
+
+    A batch that was made of a frame has the fingerprint of the frame and of what
+    was told with it.
     """
 
     batch: ObservationBatch
@@ -328,8 +263,8 @@ class Submission:
     frame: FrameRecord | None = None
 
 
-def submission_from_json(body: bytes | str, run: str | None = None) -> Submission:
-    """Read one batch; `run`, where given, takes the place of the batch's own.
+def checked_from_json(body: bytes | str, run: str | None = None) -> Checked:
+    """Check one batch; `run`, where given, takes the place of the batch's own.
 
     Raises `BadBatch` with every fault, each naming field and value.
     """
@@ -337,13 +272,28 @@ def submission_from_json(body: bytes | str, run: str | None = None) -> Submissio
         model = BatchIn.model_validate_json(body)
     except ValidationError as error:
         raise BadBatch(faults_of(error)) from None
-    return submission_from_model(model if run is None else model.model_copy(update={"run": run}))
+    return checked_from_model(model if run is None else model.model_copy(update={"run": run}))
+
+
+def checked_from_model(model: BatchIn) -> Checked:
+    """What a model stands for that is already checked."""
+    text = model.model_dump_json(exclude_defaults=True)
+    return Checked(text, hashlib.sha256(text.encode()).hexdigest())
+
+
+def submission_from_json(body: bytes | str, run: str | None = None) -> Submission:
+    """Read one batch, as `checked_from_json` does."""
+    return submission_from_checked(checked_from_json(body, run))
 
 
 def submission_from_model(model: BatchIn) -> Submission:
     """The submission of a model that is already checked."""
-    text = model.model_dump_json(exclude_defaults=True)
-    return Submission(model.to_batch(), text, hashlib.sha256(text.encode()).hexdigest())
+    return submission_from_checked(checked_from_model(model))
+
+
+def submission_from_checked(checked: Checked) -> Submission:
+    """The submission of a batch that was checked here or elsewhere."""
+    return Submission(batch_from_canonical(checked.text), checked.text, checked.fingerprint)
 
 
 def tolerances_from_text(texts: Iterable[str], field: str) -> TolerancesIn:

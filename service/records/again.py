@@ -1,10 +1,10 @@
 """Recorded batches, ready to run again: one, or a sample of many."""
 
-import dataclasses
 import json
 from dataclasses import dataclass
 
 import numpy as np
+from msgspec import structs
 from sqlalchemy import Connection, bindparam, func, select
 
 from service.observe.batch import ObservationBatch
@@ -41,7 +41,7 @@ def batch_again(input: str, own: str, options: OptionsIn | None = None) -> Obser
     """
     batch = submission_from_json(input).batch
     merged = merged_options(json.loads(own), options or OptionsIn())
-    return dataclasses.replace(batch, options=merged.to_options())
+    return structs.replace(batch, options=merged.to_options())
 
 
 def merged_options(own: Row, options: OptionsIn) -> OptionsIn:

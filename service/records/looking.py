@@ -1,7 +1,5 @@
 """Looking closer at one result: its batch as the core sees it, and what is next to it in time."""
 
-import dataclasses
-
 import msgspec
 from sqlalchemy import Connection, select
 
@@ -19,7 +17,7 @@ def recorded_batch(connection: Connection, id: str) -> tuple[ObservationBatch, R
     row = one_result(connection, id)
     options = OptionsIn.model_validate_json(row["options"]).to_options()
     batch = submission_from_json(row["input"]).batch
-    return dataclasses.replace(batch, options=options), msgspec.json.decode(row["answer"])
+    return msgspec.structs.replace(batch, options=options), msgspec.json.decode(row["answer"])
 
 
 def recorded_mission(connection: Connection, digest: str) -> Mission:

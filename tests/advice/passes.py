@@ -5,6 +5,7 @@ import tomllib
 from dataclasses import dataclass
 
 import numpy as np
+from msgspec import structs
 
 from service.acquire import acquire
 from service.advice.advice import advise
@@ -57,7 +58,7 @@ def evidence_from(mission, sky, batches):
     parts = []
     for number, batch in enumerate(batches):
         options = batch.options.__class__(identifier="verified")
-        again = batch.__class__(**{**vars(batch), "options": options})
+        again = structs.replace(batch, options=options)
         parts.append(evidence_of(number, acquire(again, mission.within_zones, sky)))
     return gathered(parts)
 

@@ -1,9 +1,8 @@
 """The field-of-view rotation: what it measures, and what the switch does to batches."""
 
-import dataclasses
-
 import numpy as np
 import pytest
+from msgspec import structs
 
 from service.acquire import acquire, choices_of
 from service.identify.fov_rotation import rotation_rad
@@ -61,12 +60,12 @@ def views(sky, missions, world, rng):
 
 def outcomes(view, run, mission, sky, tolerance_deg=10.0, **tests):
     batch = batch_of(view, run, mission, "starid")
-    options = dataclasses.replace(
+    options = structs.replace(
         batch.options,
         tests={**batch.options.tests, **tests},
         tolerances={"fov_rotation_deg": tolerance_deg},
     )
-    found = acquire(dataclasses.replace(batch, options=options), mission, sky)
+    found = acquire(structs.replace(batch, options=options), mission, sky)
     return found.trackers[0].identification
 
 
@@ -122,8 +121,8 @@ def test_where_the_roll_is_unknown_no_rotation_is_compared(sky, missions, rng):
     mission, seen = views(sky, missions, "cap_forest", rng)
     run = next(run for run in the_paper().runs if run.world == "cap_forest")
     batch = batch_of(seen[0], run, mission, "starid")
-    options = dataclasses.replace(batch.options, tests={"fov_rotation": True})
-    known = dataclasses.replace(batch, options=options)
-    unknown = dataclasses.replace(known, a_priori=BoresightPrior(265.6, -28.917))
+    options = structs.replace(batch.options, tests={"fov_rotation": True})
+    known = structs.replace(batch, options=options)
+    unknown = structs.replace(known, a_priori=BoresightPrior(265.6, -28.917))
     assert choices_of(known, mission).tests.fov_rotation is True
     assert choices_of(unknown, mission).tests.fov_rotation is False

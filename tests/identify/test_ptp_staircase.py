@@ -1,10 +1,10 @@
 """The identifier `ptp` in the staircase: a batch of the paper's camera, the a priori ignored."""
 
-import dataclasses
 import json
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from service.acquire import acquire
 from service.missions.mission import Mission, parse_mission
@@ -110,7 +110,7 @@ def test_the_a_priori_changes_no_star(scenes, mission, sky):
 def test_the_identifier_can_be_asked_for_in_a_batch(scenes, missions, sky):
     """For a shipped mission, whose own identifier is another."""
     body = batch_of(scenes[0], true_prior(scenes[0]), options={"identifier": "ptp"})
-    moved = dataclasses.replace(body, spacecraft="XTE")
+    moved = structs.replace(body, spacecraft="XTE")
     found = acquire(moved, missions["XTE"], sky)
     assert found.choices.identifier == "ptp"
     assert np.isnan(found.trackers[0].identification.probability).all()

@@ -6,6 +6,7 @@ from dataclasses import replace
 import erfa
 import numpy as np
 import pytest
+from msgspec import structs
 from scipy.stats import multivariate_normal
 
 from service.acquire import acquire
@@ -171,7 +172,7 @@ def spurious(count):
             side = unit(np.cross(centre, rng.normal(size=3)))
             vector[k] = math.cos(away) * centre + math.sin(away) * side
             truth[k] = -1
-        return replace(batch, observations=(replace(stars, vector=vector),))
+        return structs.replace(batch, observations=(structs.replace(stars, vector=vector),))
 
     return spoil
 
