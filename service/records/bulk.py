@@ -27,7 +27,7 @@ Check = Callable[[str], None]
 
 def work(bench: Bench, lines: Lines) -> list[Found]:
     """What a worker makes of some lines."""
-    return found_in(lines, bench.draft_or_error)
+    return found_in(lines, bench.drafts_or_errors)
 
 
 LATELY_S = 0.5
@@ -90,7 +90,7 @@ class Bulk:
 
     def compute_here(self, lines: Lines) -> list[Found]:
         """The same in this process, which nobody who posts one by one shall feel."""
-        return found_in(lines, self.draft_here)
+        return found_in(lines, lambda fresh: [self.draft_here(each) for each in fresh])
 
     def draft_here(self, submission: Submission) -> Draft | AcquisitionError:
         """One of them, when nobody waits."""

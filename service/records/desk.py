@@ -17,11 +17,13 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from service.acquire import Acquisition
 from service.errors import AcquisitionError, Busy, Stopping
 from service.observe.wire import Submission
 from service.records.draft import Answered, Draft
 from service.records.identity import Identity, identity_of
 from service.records.writer import RETRY_AFTER_S
+from service.times import Utc, utc_now
 
 MAX_WAITING = 2_000
 TAKEN_AT_ONCE = 64
@@ -50,6 +52,7 @@ class Order:
     read: Callable[[], Submission]
     key: str | None
     settle: Callable[[Outcome], object]
+    received: Utc = field(default_factory=utc_now)
     since_s: float = field(default_factory=time.monotonic)
     _submission: Submission | None = None
 
@@ -72,12 +75,16 @@ class Desk:
     def __init__(
         self,
         look_up: Callable[[Sequence[Order]], Found],
-        draft: Callable[[Submission, str | None], Draft],
+        acquire: Callable[[Order], Acquisition],
+        draft: Callable[[Order, Acquisition], Draft],
         write: Callable[[Sequence[Draft]], Sequence[Outcome]],
         threads: int,
     ) -> None:
-        """`look_up` finds what is stored, `draft` computes, `write` records and waits for that."""
-        self._look_up, self._draft, self._write = look_up, draft, write
+        """`look_up` finds what is stored, `acquire` computes, `draft` says what is to be kept.
+
+        `write` records that, and waits until it is.
+        """
+        self._look_up, self._acquire, self._draft, self._write = look_up, acquire, draft, write
         self._new: deque[Order] = deque()
         self._ready: deque[Order] = deque()
         self._at_work: dict[Identity, list[Order]] = {}
@@ -278,7 +285,7 @@ class Desk:
     def _compute(self) -> None:
         """Compute what is ready for a while, and have it recorded."""
         began_s = time.monotonic()
-        computed: list[tuple[Order, Draft]] = []
+        acquired: list[tuple[Order, Acquisition]] = []
         while True:
             with self._changed:
                 if not self._ready or time.monotonic() - began_s > HANDED_ON_S:
@@ -289,17 +296,24 @@ class Desk:
             try:
                 if time.monotonic() - order.since_s > WAIT_S:
                     raise Busy("every processor is at work on other batches", RETRY_AFTER_S)
-                computed.append((order, self._draft(order.submission, order.key)))
+                acquired.append((order, self._acquire(order)))
             except Exception as error:
                 self._finish([order], [error])
-        if not computed:
+        # Whoever does one thing many times finds its code in the processor's cache.
+        drafted: list[tuple[Order, Draft]] = []
+        for order, acquisition in acquired:
+            try:
+                drafted.append((order, self._draft(order, acquisition)))
+            except Exception as error:
+                self._finish([order], [error])
+        if not drafted:
             return
         self._moved_s = time.monotonic()
         try:
-            outcomes: Sequence[Outcome] = self._write([draft for _, draft in computed])
+            outcomes: Sequence[Outcome] = self._write([draft for _, draft in drafted])
         except Exception as error:
-            outcomes = [error] * len(computed)
-        self._finish([order for order, _ in computed], outcomes)
+            outcomes = [error] * len(drafted)
+        self._finish([order for order, _ in drafted], outcomes)
 
     def _finish(self, orders: Sequence[Order], outcomes: Sequence[Outcome]) -> None:
         with self._changed:

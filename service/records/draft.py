@@ -12,6 +12,7 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import msgspec
+from msgspec import Struct, structs
 
 from service.acquire import Acquisition
 from service.missions.mission import Identifier, Solver
@@ -25,8 +26,7 @@ from service.times import DAY_S, HOUR_S, Utc
 Row = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Answered:
+class Answered(Struct, frozen=True):
     """An answer as it is stored and sent; `replayed` where it was stored before this request."""
 
     id: str | None
@@ -35,8 +35,7 @@ class Answered:
     replayed: bool
 
 
-@dataclass(frozen=True)
-class Buckets:
+class Buckets(Struct, frozen=True):
     """Where in the trends a result counts: spacecraft, run, and the hour and day of its batch."""
 
     spacecraft: str
@@ -236,7 +235,7 @@ def options_text(acquisition: Acquisition) -> str:
     options = acquisition.batch.options
     if not (options.tests or options.tolerances):
         return _few_options(options.identifier, options.solver, options.zone_grid_deg)
-    return _options_text(vars(options))
+    return _options_text(structs.asdict(options))
 
 
 @lru_cache(maxsize=256, typed=True)

@@ -5,6 +5,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
+from msgspec import Struct
 from sqlalchemy import Connection, insert
 
 from service.errors import Conflict, KeyReused, shown_value
@@ -38,8 +39,7 @@ _BY_KEY = "SELECT key, result_id, fingerprint FROM idempotency_keys WHERE key IN
 _ANSWERS = "SELECT id, answer FROM results WHERE id IN "
 
 
-@dataclass(frozen=True)
-class Taken:
+class Taken(Struct, frozen=True):
     """The result that holds an identity or a key, and the fingerprint of its body."""
 
     result_id: str

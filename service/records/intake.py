@@ -4,17 +4,23 @@ import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 
 import msgspec
+from msgspec import Struct
 from sqlalchemy import Connection
 
 from service.acquire import Acquisition
 from service.errors import AcquisitionError, BadBatch, Busy, Fault, shown_value
 from service.missions.mission import Mission, mission_named
 from service.observe.batch import ObservationBatch
-from service.observe.wire import OptionsIn, Submission, submission_from_json
+from service.observe.wire import (
+    Checked,
+    OptionsIn,
+    Submission,
+    submission_from_checked,
+    submission_from_json,
+)
 from service.records.again import batch_again
 from service.records.answer import answer_of
 from service.records.bench import Bench
@@ -50,8 +56,7 @@ Answers = list[Answered | AcquisitionError]
 COUNTED = ("observed", "unique", "ambiguous", "unmatched")
 
 
-@dataclass(frozen=True)
-class Recorded:
+class Recorded(Struct, frozen=True, eq=False):
     """A batch that is newly recorded, as observers are told of it."""
 
     spacecraft: str
@@ -65,14 +70,13 @@ class Recorded:
 Observer = Callable[[Recorded], None]
 
 
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """A batch as it was sent, in JSON or read already, and who is called with its outcome.
+class Asked(Struct, frozen=True, eq=False):
+    """A batch as it was sent, in JSON, checked or read already, and who is called with its outcome.
 
     `caller`, where given, must be allowed to ask about its spacecraft.
     """
 
-    sent: bytes | Submission
+    sent: bytes | Checked | Submission
     key: str | None
     settle: Callable[[Answered | Exception], object]
     caller: Caller | None = None
@@ -91,7 +95,8 @@ class Intake:
         self._running = Running()
         self._desk = Desk(
             self._stored_orders,
-            self._bench.draft,
+            self._acquired,
+            self._draft,
             partial(self._written, tell=False),
             self._bench.processors,
         )
@@ -173,7 +178,7 @@ class Intake:
     def draft_of_many(self, submission: Submission) -> Draft | AcquisitionError:
         """The draft of one of many, as soon as nobody waits who came with a single one."""
         self.let_pass()
-        return self._bench.draft_or_error(submission)
+        return self._bench.drafts_or_errors([submission])[0]
 
     @property
     def idle_s(self) -> float:
@@ -281,6 +286,12 @@ class Intake:
     def _write(self, drafts: Sequence[Draft]) -> Answers:
         return _decided(self._written(drafts))
 
+    def _acquired(self, order: Order) -> Acquisition:
+        return self._bench.acquired(order.submission)
+
+    def _draft(self, order: Order, acquisition: Acquisition) -> Draft:
+        return self._bench.draft_of(order.submission, acquisition, order.key, order.received)
+
     def _written(self, drafts: Sequence[Draft], tell: bool = True) -> Results:
         """What became of each draft, when all are recorded."""
         if not drafts:
@@ -323,7 +334,8 @@ class Intake:
 
 
 def _orders(asked: Sequence[Asked]) -> list[Order]:
-    return [Order(partial(_read, each), each.key, each.settle) for each in asked]
+    received = utc_now()
+    return [Order(partial(_read, each), each.key, each.settle, received) for each in asked]
 
 
 def _hand(drafts: Sequence[Draft]) -> None:
@@ -343,8 +355,13 @@ def _decided(outcomes: Results) -> Answers:
 
 
 def _read(asked: Asked) -> Submission:
-    sent = asked.sent
-    submission = sent if isinstance(sent, Submission) else submission_from_json(sent)
+    match asked.sent:
+        case Submission() as submission:
+            pass
+        case Checked() as checked:
+            submission = submission_from_checked(checked)
+        case sent:
+            submission = submission_from_json(sent)
     if asked.caller is not None:
         asked.caller.require(submission.batch.spacecraft)
     if asked.key is not None:

@@ -38,28 +38,38 @@ class Refused:
 
 
 Found = Draft | Seen | Refused
-Drafting = Callable[[Submission], Draft | AcquisitionError]
+Drafting = Callable[[Sequence[Submission]], Sequence[Draft | AcquisitionError]]
 
 
 def found_in(lines: Lines, draft: Drafting) -> list[Found]:
-    """What each line comes to, in order."""
-    return [
-        _found(text, lines.run, draft, place in lines.known)
-        for place, text in enumerate(lines.texts)
+    """What each line comes to, in order; `draft` is given all that are to be computed."""
+    read = [_read(text, lines.run) for text in lines.texts]
+    fresh = [
+        each
+        for place, each in enumerate(read)
+        if isinstance(each, Submission) and place not in lines.known
     ]
+    drafted = iter(draft(fresh))
+    found: list[Found] = []
+    for place, each in enumerate(read):
+        if isinstance(each, Refused):
+            found.append(each)
+        elif place in lines.known:
+            found.append(Seen(identity_of(each.batch), each.fingerprint))
+        else:
+            match next(drafted):
+                case AcquisitionError() as error:
+                    found.append(Refused(each.batch.spacecraft, error))
+                case made:
+                    found.append(made)
+    return found
 
 
-def _found(text: bytes, run: str, draft: Drafting, is_known: bool) -> Found:
+def _read(text: bytes, run: str) -> Submission | Refused:
     try:
-        submission = submission_from_json(text, run=run)
+        return submission_from_json(text, run=run)
     except AcquisitionError as error:
         return Refused(None, error)
-    if is_known:
-        return Seen(identity_of(submission.batch), submission.fingerprint)
-    drafted = draft(submission)
-    if isinstance(drafted, AcquisitionError):
-        return Refused(submission.batch.spacecraft, drafted)
-    return drafted
 
 
 _Name = Annotated[str, msgspec.Meta(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\x7f]+\Z")]

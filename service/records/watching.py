@@ -152,23 +152,29 @@ class _Watch:
             self._board.observe(SILENCE, None, None, Point(0.0, *_moment(batch)), now)
 
     def _alert(self) -> list[tuple[QuantityName, LimitSettings]]:
-        """The quantities whose alarms a batch may raise or must meet; the others are done with.
+        """The quantities that a batch may bring out of limits or back; the others are done with.
 
         Most are in limits all the time, and judging each batch by itself takes
-        as long as recording it.
+        as long as recording it.  An alarm that is back in limits meets the latest
+        value alone: of those before it nothing would be kept.
         """
         alert = []
         for name, limits in self._limits.items():
             samples = [
-                sample
+                (sample, draft)
                 for draft in self._drafts
                 if (sample := _sample(name, draft.contribution, draft.result["time_ns"]))
             ]
             if not samples:
                 continue
             window = self._windows.setdefault(name, Window())
-            if self._board.has(name) or not window.pass_over(samples, limits):
+            if self._board.is_out(name) or not window.pass_over([s for s, _ in samples], limits):
                 alert.append((name, limits))
+            elif self._board.has(name) and (value := window.value(limits)) is not None:
+                latest = samples[-1][1].batch
+                assert latest is not None
+                point = Point(value, *_moment(latest))
+                self._board.observe(name, None, None, point, latest["received"])
         return alert
 
     def _judge(self, draft: Draft, alert: Sequence[tuple[QuantityName, LimitSettings]]) -> None:
@@ -207,6 +213,10 @@ class Board:
     def has(self, quantity: str) -> bool:
         """Whether a quantity has an active alarm."""
         return quantity in self._alarms
+
+    def is_out(self, quantity: str) -> bool:
+        """Whether a quantity has an active alarm and is out of limits."""
+        return self.has(quantity) and self._alarms[quantity]["current_severity"] is not None
 
     def observe(
         self,

@@ -24,11 +24,12 @@ def make(sky, missions):
     return ordered
 
 
-def opened(draft):
-    """A desk where nothing is stored before, and a draft is its own answer."""
+def opened(acquire):
+    """A desk where nothing is stored before, and what is acquired is its own answer."""
     return Desk(
         look_up=lambda orders: [None] * len(orders),
-        draft=draft,
+        acquire=acquire,
+        draft=lambda order, acquisition: acquisition,
         write=lambda drafts: list(drafts),
         threads=2,
     )
@@ -41,7 +42,7 @@ def test_who_brings_batches_works_through_them_and_what_came_meanwhile(make):
         settled.append((outcome, threading.current_thread()))
 
     came = [[make("third", note)], []]
-    desk = opened(lambda submission, key: submission.batch.batch)
+    desk = opened(lambda order: order.submission.batch.batch)
     desk.take_here([make("first", note), make("second", note)], lambda: came.pop(0) if came else [])
     assert settled == [(name, threading.current_thread()) for name in ("first", "second", "third")]
     desk.close()
@@ -57,10 +58,11 @@ def test_what_comes_while_one_batch_takes_long_is_asked_for_and_answered_by_anot
         if len(answered) == quick:
             over.set()
 
-    def draft(submission, key):
-        if submission.batch.batch == "long":
+    def acquire(order):
+        name = order.submission.batch.batch
+        if name == "long":
             assert over.wait(PATIENCE_S)
-        return submission.batch.batch
+        return name
 
     names = iter(f"quick {number}" for number in range(quick))
 
@@ -70,7 +72,7 @@ def test_what_comes_while_one_batch_takes_long_is_asked_for_and_answered_by_anot
         name = next(names, None) if at_it else None
         return [make(name, settle)] if name else []
 
-    desk = opened(draft)
+    desk = opened(acquire)
     began_s = time.monotonic()
     desk.take_here([make("long", answered.append), make("quick", settle)], more)
     desk.close()
@@ -81,13 +83,13 @@ def test_a_repeat_of_what_took_long_is_looked_at_when_that_is_done_whoever_is_th
     """Nobody brings anything any more when it is over."""
     answered, begun, brought = [], threading.Event(), threading.Event()
 
-    def draft(submission, key):
+    def acquire(order):
         if not begun.is_set():
             begun.set()
             assert brought.wait(PATIENCE_S)
-        return submission.batch.batch
+        return order.submission.batch.batch
 
-    desk = opened(draft)
+    desk = opened(acquire)
     first = threading.Thread(
         target=desk.take_here, args=([make("same", answered.append)], list), daemon=True
     )
@@ -105,7 +107,7 @@ def test_a_repeat_of_what_took_long_is_looked_at_when_that_is_done_whoever_is_th
 
 def test_those_that_are_too_many_are_refused_at_once(make):
     outcomes = []
-    desk = opened(lambda submission, key: submission.batch.batch)
+    desk = opened(lambda order: order.submission.batch.batch)
     order = make("one", outcomes.append)
     orders = [Order(order.read, None, outcomes.append) for _ in range(MAX_WAITING + 3)]
     desk.take_here(orders, list)

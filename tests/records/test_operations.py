@@ -228,10 +228,12 @@ def test_whoever_finds_every_processor_taken_for_long_is_told_to_come_again(
     operations, make, monkeypatch
 ):
     monkeypatch.setattr(bench, "PROCESSOR_WAIT_S", 0.01)
-    monkeypatch.setattr(operations._intake._bench, "_free", threading.BoundedSemaphore(1))
-    with operations._intake._bench._free:
-        with pytest.raises(Busy, match="processor"):
-            operations.submit(make())
-        with pytest.raises(Busy, match="processor"):
-            operations.submit_many([make()])
+    free = operations._intake._bench._free
+    taken = [free.get() for _ in range(operations._intake._bench.processors)]
+    with pytest.raises(Busy, match="processor"):
+        operations.submit(make())
+    with pytest.raises(Busy, match="processor"):
+        operations.submit_many([make()])
+    for each in taken:
+        free.put(each)
     assert not operations.submit(make()).replayed
