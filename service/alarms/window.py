@@ -38,11 +38,17 @@ class Window:
         """Take one batch's part and judge the latest; None while there are too few of them."""
         insort(self.samples, sample)
         del self.samples[: -limits.minimum_count]
+        value = self.value(limits)
+        if value is None:
+            return None
+        return Judged(value, self.judge(value, self.samples[-1][0], limits))
+
+    def value(self, limits: LimitSettings) -> float | None:
+        """What the latest amount to; None while there are too few of them."""
         if len(self.samples) < limits.minimum_count:
             return None
         _, parts, wholes = zip(*self.samples, strict=True)
-        value = sum(parts) / sum(wholes)
-        return Judged(value, self.judge(value, self.samples[-1][0], limits))
+        return float(sum(parts) / sum(wholes))
 
     def pass_over(self, samples: Sequence[Sample], limits: LimitSettings) -> bool:
         """Take many batches' parts at once, if none of them could change how bad it is.
