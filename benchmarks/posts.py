@@ -9,13 +9,15 @@ the JSON and answers a small JSON (`benchmarks.no_op`).  Every answer is looked
 at: each post is recorded, new, and its stars are named as the pass drew them.
 """
 
+import itertools
 import json
 import tempfile
 import threading
 import time
 import urllib.request
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -27,13 +29,14 @@ from service.missions.mission import load_missions
 from service.observe.wire import submission_from_json
 from service.operations import Operations
 from service.settings import Settings
-from service.simulate.stretches import NO_TROUBLES, Pass
+from service.simulate.stretches import DEFAULT_START, NO_TROUBLES, Pass
 from service.simulate.telemetry import Drawn, draw_pass
 from service.sky.catalog import load_embedded
 from service.sky.shelf import Shelf
 from service.sky.view import Sky
 
 API = "/api/v1"
+FIRST = datetime.fromisoformat(DEFAULT_START)
 CONNECTIONS = 16
 POSTS, QUICK_POSTS = 6_000, 800
 BULK, QUICK_BULK = 30_000, 3_000
@@ -53,14 +56,20 @@ class Telemetry:
     """Batches of a pass, and the star ids that are true of each."""
 
     drawn: Sequence[Drawn]
+    _seconds: Iterator[int] = field(default_factory=itertools.count)
 
     def bodies(self, count: int, tag: str) -> list[bytes]:
         """So many bodies, each under a name of its own."""
         return [self.body(k, f"{tag}-{k}") for k in range(count)]
 
     def body(self, k: int, name: str) -> bytes:
-        """One body, under a name."""
-        own = {"options": {"identifier": "starid"}, "batch": name}
+        """One body, under a name and dated a second after the one before it.
+
+        A tracker's batches come in order of their times.  A day later the same stars
+        stand within an arcsecond of each other where they stood.
+        """
+        time = (FIRST + timedelta(seconds=next(self._seconds))).strftime("%Y-%m-%dT%H:%M:%SZ")
+        own = {"options": {"identifier": "starid"}, "batch": name, "time": time}
         return json.dumps(self._of(k).batch | own).encode()
 
     def _of(self, k: int) -> Drawn:

@@ -18,16 +18,15 @@ import threading
 import urllib.request
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from datetime import datetime, timedelta
+from datetime import timedelta
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 from benchmarks.load import drive, request
-from benchmarks.posts import API, CONNECTIONS, RIGHT, Telemetry, telemetry
+from benchmarks.posts import API, CONNECTIONS, FIRST, RIGHT, Telemetry, telemetry
 from benchmarks.report import Report
 from benchmarks.serving import Served, service
-from service.simulate.stretches import DEFAULT_START
 
 SHARE = 0.7
 SLICES, SLICE_S = 60, 60.0
@@ -37,7 +36,6 @@ SETTLED = 1 / 6
 """After so much of the time the memory is what it should stay."""
 MOST_DRIFT, MOST_LOG_MB = 0.05, 64.0
 _NAME, _TIME = b"soak-NAME", b"soak-TIME"
-_FIRST = datetime.fromisoformat(DEFAULT_START)
 
 
 @dataclass
@@ -54,7 +52,7 @@ def _bodies(pass_: Telemetry, first: int, count: int) -> Iterator[bytes]:
     own = {"options": {"identifier": "starid"}, "batch": _NAME.decode(), "time": _TIME.decode()}
     templates = [json.dumps(drawn.batch | own).encode() for drawn in pass_.drawn]
     for number in range(first, first + count):
-        time = (_FIRST + timedelta(seconds=number)).strftime("%Y-%m-%dT%H:%M:%SZ").encode()
+        time = (FIRST + timedelta(seconds=number)).strftime("%Y-%m-%dT%H:%M:%SZ").encode()
         body = templates[number % len(templates)].replace(_NAME, b"soak-%d" % number)
         yield request(f"{API}/batches", body.replace(_TIME, time))
 
