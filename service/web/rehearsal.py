@@ -1,18 +1,31 @@
 """A post before the first client's: what runs for the first time takes ten times as long."""
 
+import json
+
 from starlette.types import ASGIApp, Message, Scope
 
 REHEARSAL = "service.rehearsal"
 """Stands in the scope of a request that is nobody's, and that is not counted."""
 
-_PATH, _BODY = "/api/v1/batches", b"{}"
+_PATH = "/api/v1/batches"
+# Nothing is wrong with its form, but no spacecraft can have a name with a space in it.
+_STARS = [{"vector": [0.0, 0.01 * k, 0.999], "magnitude": 5.0} for k in range(5)]
+_BATCH = {
+    "spacecraft": "no spacecraft",
+    "batch": "rehearsal",
+    "time": "2000-01-01T00:00:00Z",
+    "a_priori": {"quaternion": [0.0, 0.0, 0.0, 1.0]},
+    "velocity_km_per_s": [7.5, 0.0, 0.0],
+    "observations": [{"tracker": "1", "stars": _STARS}],
+}
+_BODY = json.dumps(_BATCH).encode()
 
 
 async def rehearse(app: ASGIApp) -> int:
-    """Send the app an empty batch; gives the status of its answer.
+    """Send the app a batch of nobody's; gives the status of its answer.
 
-    It goes all the way to the backend and is refused there; where tokens are
-    asked for, at the door.
+    It is checked, goes all the way to the backend and is refused there; where
+    tokens are asked for, at the door.
     """
     head = (
         ("host", "localhost"),

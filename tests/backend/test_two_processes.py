@@ -1,6 +1,7 @@
 """The service in two processes: what each does, and what becomes of one without the other."""
 
 import inspect
+import json
 import os
 import pickle
 import signal
@@ -9,12 +10,13 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import httpx
 import pytest
 
-from service.backend.front import ASKED, Front
+from service.backend.front import ASKED, CHECKED_HERE_BYTES, Front
 from service.backend.process import Backend
 from service.operations import Operations
 from tests.records import samples
@@ -168,6 +170,36 @@ def test_without_the_front_the_backend_ends_at_once(served):
     process.kill()
     process.wait()
     _until(lambda: _parent_of(backend) is None, seconds=10)
+
+
+@needs_proc
+def test_what_is_wrong_with_the_form_of_a_batch_is_said_without_the_backend(served, sky, missions):
+    """A long batch is checked there, where nobody else waits for it; the words are the same."""
+    url, process = served
+    good = json.loads(samples.batch(sky, missions, "good"))
+    wrong = good | {"time": "yesterday"}
+    star = good["observations"][0]["stars"][0]
+    many = 2 * CHECKED_HERE_BYTES // len(json.dumps(star))
+    long = wrong | {"observations": [good["observations"][0] | {"stars": [star] * many}]}
+
+    def post(body):
+        return httpx.post(f"{url}/api/v1/batches", json=body, timeout=60)
+
+    def faults(answer):
+        assert answer.status_code == 422, answer.text
+        return [each for each in answer.json()["errors"] if each["field"] == "time"]
+
+    with ThreadPoolExecutor(2) as threads:
+        os.kill(_backend_of(process), signal.SIGSTOP)
+        try:
+            later = [threads.submit(post, body) for body in (good, long)]
+            told = faults(post(wrong))
+            assert not any(each.done() for each in later)
+        finally:
+            os.kill(_backend_of(process), signal.SIGCONT)
+        taken, checked_there = (each.result() for each in later)
+    assert taken.status_code == 201
+    assert faults(checked_there) == told
 
 
 @needs_proc

@@ -1,6 +1,7 @@
 """Probes and metrics; the answer to a fault of ours."""
 
 import asyncio
+import math
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -88,6 +89,7 @@ def test_the_rehearsal_before_the_first_client_reaches_the_records_door_and_is_n
     app = create_app(operations)
     try:
         assert asyncio.run(rehearse(app)) == 422
+        assert math.isfinite(operations._intake.idle_s), "nothing came to the desk"
         assert b'route="/api/v1/batches"' not in app.state.metrics.text()
     finally:
         operations.close()
