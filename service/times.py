@@ -104,7 +104,7 @@ class Utc:
         """The same moment in Terrestrial Time, two-part Julian date."""
         day = self._fields[0]
         if self.jd1 == _midnight_jd(day) and _length_s(day) == DAY_S:
-            # What `utctai` comes to on a day like any other, in a tenth of the time.
+            # What `utctai` comes to on a day like any other, in less time.
             tai1, tai2 = self.jd1, self.jd2 + _tai_less_utc_s(day) / DAY_S
         else:
             tai1, tai2 = map(float, ufunc.utctai(self.jd1, self.jd2)[:2])

@@ -35,7 +35,7 @@ class Bench:
         self.sky = sky
         self.ids = Ulids()
         self.processors = max(2, os.cpu_count() or 1)
-        # What waits in it for whoever computes: a queue of C takes a tenth of a semaphore's time.
+        # What waits in it for whoever computes: a queue in C is quicker than a semaphore.
         self._free: SimpleQueue[None] = SimpleQueue()
         for _ in range(self.processors):
             self._free.put(None)
@@ -68,7 +68,7 @@ class Bench:
         """The draft of each of many, or what is wrong with that one alone.
 
         All are acquired before the first draft is made: whoever does one thing many
-        times finds its code in the processor's cache, and takes a tenth less for all.
+        times finds its code in the processor's cache.
         """
         acquired = [self._or_error(each, partial(self.acquired, each)) for each in submissions]
         return [
