@@ -11,7 +11,7 @@ from functools import cache
 from typing import Any, Literal
 
 import numpy as np
-from sqlalchemy import BigInteger, Connection, Select, Table, bindparam, case, select
+from sqlalchemy import BigInteger, Connection, Select, Table, bindparam, case, func, select
 
 from service.records.draft import Row
 from service.records.summing import COLUMNS, SUMMED
@@ -46,6 +46,18 @@ class Span:
     run: str
     start: Utc
     end: Utc
+
+
+def batches_about(connection: Connection, span: Span) -> int:
+    """The batches of all hours that a span touches: at least as many as it holds."""
+    table = rollups_hourly.c
+    query = select(func.sum(table.batches)).where(
+        table.spacecraft == span.spacecraft,
+        table.run == span.run,
+        table.bucket >= span.start.bucket(HOUR_S),
+        table.bucket <= span.end.bucket(HOUR_S),
+    )
+    return int(connection.execute(query).scalar() or 0)
 
 
 def read_cells(connection: Connection, span: Span, level: Level, names: Names = COLUMNS) -> Columns:

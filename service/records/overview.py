@@ -4,15 +4,23 @@ import math
 from collections.abc import Iterable
 
 import numpy as np
-from sqlalchemy import Connection, func, select
+from sqlalchemy import Connection, select
 
 from service.missions.mission import Mission
 from service.records.ahead import LIVE
 from service.records.alarms import active_alarms, summary
-from service.records.cells import MAX_BATCHES_SUMMED, Columns, Span, read_cells, read_steps, totals
+from service.records.cells import (
+    MAX_BATCHES_SUMMED,
+    Columns,
+    Span,
+    batches_about,
+    read_cells,
+    read_steps,
+    totals,
+)
 from service.records.draft import Row
 from service.records.histories import live_state
-from service.records.tables import COUNTS, rollups_daily, rollups_hourly, runs
+from service.records.tables import COUNTS, rollups_daily, runs
 from service.records.trends import latest_time
 from service.times import DAY_S, HOUR_S, Utc, parse_utc, shifted
 
@@ -76,21 +84,9 @@ def sigma_arcsec(covariance_arcsec2: list[list[float]]) -> list[float]:
 
 
 def _cells(connection: Connection, span: Span, width_s: int) -> tuple[int, Columns]:
-    if width_s > HOUR_S and _about(connection, span) > MAX_BATCHES_SUMMED:
+    if width_s > HOUR_S and batches_about(connection, span) > MAX_BATCHES_SUMMED:
         return HOUR_S, read_cells(connection, span, "hour", COUNTS)
     return STEPS[width_s], read_steps(connection, span, STEPS[width_s], COUNTS)
-
-
-def _about(connection: Connection, span: Span) -> int:
-    """The batches of all hours that a span touches."""
-    table = rollups_hourly.c
-    query = select(func.sum(table.batches)).where(
-        table.spacecraft == span.spacecraft,
-        table.run == span.run,
-        table.bucket >= span.start.bucket(HOUR_S),
-        table.bucket <= span.end.bucket(HOUR_S),
-    )
-    return int(connection.execute(query).scalar() or 0)
 
 
 def _sparkline(cells: Columns, step_s: int) -> Row:

@@ -9,11 +9,18 @@ import numpy.typing as npt
 from sqlalchemy import Connection, select
 
 from service.alarms.quantities import QUANTITIES, QuantityName
-from service.records.cells import MAX_BATCHES_SUMMED, Columns, Span, read_cells, read_steps, totals
+from service.records.cells import (
+    MAX_BATCHES_SUMMED,
+    Columns,
+    Span,
+    batches_about,
+    read_cells,
+    read_steps,
+)
 from service.records.draft import Row
 from service.records.measures import contribution
 from service.records.pages import Stretch, newest, newest_first
-from service.records.tables import COUNTS, batches, results
+from service.records.tables import batches, results
 from service.times import DAY_S, HOUR_S, Utc, parse_utc, shifted, unix_seconds, utc_now
 from service.vectors import Vector
 
@@ -103,17 +110,12 @@ def _resolution(connection: Connection, span: Span, size: int) -> tuple[int, Sou
         # Longer than the widest of them: as many months of thirty days as it takes.
         width_s = WIDTHS_S[-1] * (1 + int((end_s - first_s) / (WIDTHS_S[-1] * max(size - 1, 0.5))))
     if width_s < HOUR_S:
-        if end_s - first_s <= HOUR_S or _batches(connection, span) <= MAX_BATCHES_SUMMED:
+        if end_s - first_s <= HOUR_S or batches_about(connection, span) <= MAX_BATCHES_SUMMED:
             return width_s, "batch"
         width_s = HOUR_S
     if width_s < DAY_S and end_s - first_s > MAX_HOURS_READ * HOUR_S:
         width_s = DAY_S
     return width_s, "day" if width_s >= DAY_S else "hour"
-
-
-def _batches(connection: Connection, span: Span) -> int:
-    found: int = totals(read_cells(connection, span, "hour", COUNTS))["batches"]
-    return found
 
 
 def _buckets(first_s: float, end_s: float, width_s: int) -> int:
