@@ -69,8 +69,8 @@ RESTART_S = 5
 PAUSE_S, LONGEST_PAUSE_S = 1.0, 30.0
 """Before a backend is started again that could not open its database: twice as long each time."""
 
-CHECKED_HERE_BYTES = 16_384
-"""A longer batch takes more than half a millisecond to check, and everybody would wait for it."""
+CHECKED_HERE_BYTES, CHECKED_HERE_OBJECTS = 4_096, 64
+"""More than thirty stars; for what takes longer to check, right or wrong, everybody would wait."""
 
 log = logging.getLogger(__name__)
 
@@ -138,7 +138,7 @@ class Front(Operations):
 
         What is wrong with its form is said here, and nobody else is troubled with it.
         """
-        batch = checked_from_json(sent) if len(sent) <= CHECKED_HERE_BYTES else sent
+        batch = checked_from_json(sent) if _is_soon_checked(sent) else sent
         loop = asyncio.get_running_loop()
         number = next(self._numbers)
         done: asyncio.Future[Answered] = loop.create_future()
@@ -317,6 +317,10 @@ class _Line(asyncio.Protocol):
 
     def connection_lost(self, error: Exception | None) -> None:
         self._front.lost()
+
+
+def _is_soon_checked(sent: bytes) -> bool:
+    return len(sent) <= CHECKED_HERE_BYTES and sent.count(b"{") <= CHECKED_HERE_OBJECTS
 
 
 def _restarting() -> Busy:

@@ -42,7 +42,8 @@ class Bench:
 
     def draft(self, submission: Submission, key: str | None = None) -> Draft:
         """The draft of a submission; raises `BadBatch` for what does not fit its mission."""
-        return self.draft_of(submission, self.acquired(submission), key)
+        received = utc_now()
+        return self.draft_of(submission, self.acquired(submission), received, key)
 
     def acquired(self, submission: Submission) -> Acquisition:
         """What a submission comes to, all but recorded; raises as `draft` does."""
@@ -53,11 +54,10 @@ class Bench:
         self,
         submission: Submission,
         acquisition: Acquisition,
+        received: Utc,
         key: str | None = None,
-        received: Utc | None = None,
     ) -> Draft:
-        """The draft of what was acquired; `received` is when it came, now where nothing is said."""
-        received = received or utc_now()
+        """The draft of what was acquired of a submission that was received at a moment."""
         return submission_draft(
             submission, acquisition, id=self.ids.new(), received=received, key=key
         )
@@ -70,11 +70,12 @@ class Bench:
         All are acquired before the first draft is made: whoever does one thing many
         times finds its code in the processor's cache.
         """
+        received = utc_now()
         acquired = [self._or_error(each, partial(self.acquired, each)) for each in submissions]
         return [
             found
             if isinstance(found, AcquisitionError)
-            else self._or_error(each, partial(self.draft_of, each, found))
+            else self._or_error(each, partial(self.draft_of, each, found, received))
             for each, found in zip(submissions, acquired, strict=True)
         ]
 

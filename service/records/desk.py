@@ -291,7 +291,6 @@ class Desk:
                 if not self._ready or time.monotonic() - began_s > HANDED_ON_S:
                     break
                 order = self._ready.popleft()
-                self._moved_s = time.monotonic()
             self._moved_s = time.monotonic()
             try:
                 if time.monotonic() - order.since_s > WAIT_S:
@@ -302,6 +301,7 @@ class Desk:
         # Whoever does one thing many times finds its code in the processor's cache.
         drafted: list[tuple[Order, Draft]] = []
         for order, acquisition in acquired:
+            self._moved_s = time.monotonic()
             try:
                 drafted.append((order, self._draft(order, acquisition)))
             except Exception as error:

@@ -290,7 +290,7 @@ class Intake:
         return self._bench.acquired(order.submission)
 
     def _draft(self, order: Order, acquisition: Acquisition) -> Draft:
-        return self._bench.draft_of(order.submission, acquisition, order.key, order.received)
+        return self._bench.draft_of(order.submission, acquisition, order.received, order.key)
 
     def _written(self, drafts: Sequence[Draft], tell: bool = True) -> Results:
         """What became of each draft, when all are recorded."""

@@ -14,7 +14,7 @@ from service.operations import Operations
 from service.records import bench, intake
 from service.records.tables import metadata
 from service.settings import Settings
-from service.times import parse_utc
+from service.times import parse_utc, utc_now
 from tests.records.samples import KINDS, QUATERNION, without_accidents
 
 
@@ -222,6 +222,26 @@ def test_a_fault_of_ours_in_one_batch_keeps_no_other_from_being_recorded(
     assert isinstance(second, AcquisitionError)
     assert "inside" not in str(second)
     assert "batch b2 failed" in caplog.text
+
+
+def test_a_batch_was_received_before_it_was_worked_on_however_long_that_took(
+    operations, make, monkeypatch
+):
+    table = operations._intake._bench
+    acquire = table.acquire
+    begun = []
+
+    def slow(batch, mission):
+        begun.append(utc_now().tai_ns)
+        time.sleep(0.02)
+        return acquire(batch, mission)
+
+    monkeypatch.setattr(table, "acquire", slow)
+    made = [table.draft(make("alone")), *table.drafts_or_errors([make("one"), make("other")])]
+    operations.submit(make("at the desk"))
+    (told,) = (each for each in operations.batches().items if each["batch"] == "at the desk")
+    received = [each.received_ns for each in made] + [parse_utc(told["received"]).tai_ns]
+    assert all(came <= later for came, later in zip(received, begun, strict=True))
 
 
 def test_whoever_finds_every_processor_taken_for_long_is_told_to_come_again(
