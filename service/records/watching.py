@@ -113,8 +113,7 @@ class _Watch:
             insert_missing(connection, watches, [fresh])
             self._row = _locked(connection, spacecraft, run)
         assert self._row is not None
-        kept = msgspec.json.decode(self._row["state"])
-        self._windows = {name: Window.from_json(each) for name, each in kept.items()}
+        self._windows = _windows(spacecraft, run, self._row["state"])
         self._board = Board(connection, spacecraft, run)
 
     def look(self) -> None:
@@ -137,6 +136,7 @@ class _Watch:
         latest["received"] = received
         kept = {name: window.to_json() for name, window in self._windows.items()}
         latest["state"] = msgspec.json.encode(kept).decode()
+        _remember(latest["spacecraft"], self._run, latest["state"], self._windows)
         place = {"of_spacecraft": latest["spacecraft"], "of_run": self._run}
         _KEEP.run(self._connection, [place | {name: latest[name] for name in _KEPT}])
         self._board.save()
@@ -189,6 +189,27 @@ class _Watch:
                 bound = judged.severity and limits.bound(judged.severity, judged.value)
                 now = draft.batch["received"]
                 self._board.observe(name, judged.severity, bound, point, now)
+
+
+# The windows as this process last wrote them, and their text: where that is still what is kept,
+# they need not be made of it again.
+_LATEST: dict[tuple[str, str], tuple[str, dict[str, Window]]] = {}
+_REMEMBERED = 64
+
+
+def _windows(spacecraft: str, run: str, state: str) -> dict[str, Window]:
+    """The windows that a text keeps; nobody else has them."""
+    text, windows = _LATEST.pop((spacecraft, run), ("", {}))
+    if text == state:
+        return windows
+    kept = msgspec.json.decode(state)
+    return {name: Window.from_json(each) for name, each in kept.items()}
+
+
+def _remember(spacecraft: str, run: str, state: str, windows: dict[str, Window]) -> None:
+    if len(_LATEST) >= _REMEMBERED:
+        _LATEST.clear()
+    _LATEST[spacecraft, run] = state, windows
 
 
 def _mission(connection: Connection, draft: Draft) -> Mission:

@@ -3,10 +3,12 @@
 import json
 
 import pytest
+from sqlalchemy import select, update
 
 from service.alarms.limits import LimitSettings
 from service.errors import NotFound, NotNow
 from service.observe.wire import OptionsIn, submission_from_json
+from service.records.tables import watches
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
 from service.times import shifted, utc_now
@@ -118,6 +120,48 @@ def test_many_at_once_raise_what_they_would_raise_one_by_one(opened, tight, make
     for which in ("raised", "worst", "latest"):
         assert one[which]["time"] == many[which]["time"]
         assert one[which]["value"] == many[which]["value"]
+
+
+def test_back_in_limits_an_alarm_meets_the_latest_of_many_as_it_would_meet_each(
+    opened, tight, make
+):
+    """Most alarms wait for somebody while all is well again, and then nothing is judged twice."""
+    send(tight, make, ["spurious"] * 3 + ["good"] * 6)
+    together = opened()
+    together.set_limit("SWAS", "unmatched_share", TIGHT, who="jb", comment="the same")
+    kinds = ["spurious"] * 3 + ["good"] * 6
+    others = [
+        make(f"s{k}", kind=kind, after_s=30.0 * k, spacecraft="SWAS")
+        for k, kind in enumerate(kinds)
+    ]
+    together.submit_many(others[:5])
+    together.submit_many(others[5:])
+
+    def told(spacecraft):
+        alarm = only(tight, spacecraft=spacecraft)
+        values = {
+            name: alarm[name] and alarm[name]["value"] for name in ("raised", "worst", "latest")
+        }
+        times = {
+            name: alarm[name] and alarm[name]["time"] for name in ("raised", "worst", "latest")
+        }
+        return values, times, alarm["in_limits"], actions(tight, alarm)
+
+    assert told("SWAS") == told("XTE")
+    assert told("XTE")[0]["latest"] == 0.0
+
+
+def test_what_another_process_kept_of_the_latest_values_is_gone_on_with(tight, make):
+    send(tight, make, ["good", "good"])
+
+    def forget(connection):
+        connection.execute(update(watches).values(state="{}"))
+
+    tight.store.writer.change(forget).result()
+    send(tight, make, ["good"], start=2)
+    with tight.reading() as connection:
+        kept = json.loads(connection.scalar(select(watches.c.state)))
+    assert len(kept["unmatched_share"]["samples"]) == 1
 
 
 def test_alarms_watch_live_batches_and_a_run_when_asked(tight, make):
