@@ -22,7 +22,7 @@ from benchmarks.bare import bare_many, bare_one, room_for
 from benchmarks.report import Report
 from service.attitude.kernels import solve
 from service.attitude.solve import WORST_AXIS_DEG
-from service.identify.matched import attitude_of, matched_vectors
+from service.identify.matched import attitude_of, match
 from service.identify.pair_tests import cast_votes, count_votes
 from service.identify.starid import (
     Sighting,
@@ -177,7 +177,7 @@ def service_many(
 ) -> None:
     """The service's kernels over many batches, as `identify_by_votes` and `attitude_of` do."""
     votes, voted, counts, edges, outcome, highest, second = room[:7]
-    quaternions, covariance, squares, sums = room[7:]
+    quaternions, covariance, squares, sums, b, r, s = room[7:]
     still = np.zeros(3)
     for k in range(len(observed)):
         votes[:] = 0
@@ -185,12 +185,11 @@ def service_many(
         # mypy takes what comes as a tuple for one argument.
         cast_votes(observed[k], mag[k], boresights[k], *given, votes, voted, counts, edges)  # type: ignore[call-arg]
         count_votes(votes, voted, counts, rows, outcome, star[k], highest, second)
-        b, r, s = matched_vectors(body[k], sigma, star[k], direction, still, 1.0)
+        n = match(body[k], sigma, star[k], direction, still, 1.0, b, r, s)
         q[k] = np.nan
-        if len(b) >= 2:
-            n = len(b)
+        if n >= 2:
             part = squares if n == squares.shape[1] else squares[:, :n].copy()
-            if solve(b, r, s, worst, quaternions, covariance, part, sums):
+            if solve(b[:n], r[:n], s[:n], worst, quaternions, covariance, part, sums):
                 q[k] = quaternions[1]
 
 
@@ -243,6 +242,9 @@ def compare(mission: Mission, views: Views) -> tuple[dict[str, float], list[str]
         np.empty((3, 3)),
         np.empty((2, n)),
         np.empty((2, 2)),
+        np.empty((n, 3)),
+        np.empty((n, 3)),
+        np.empty(n),
     )
     worst = math.radians(WORST_AXIS_DEG)
     rows = np.arange(stars)

@@ -109,15 +109,34 @@ def matched_vectors(  # type: ignore[no-untyped-def]
     for k in range(len(star)):
         if star[k] >= 0:
             count += 1
-    # One array, and number by number: to make arrays and to cut them takes longer than the rest.
+    # One array: to make arrays and to cut them takes longer than the rest.
     both = np.empty((2, count, 3))
     observed, reference = both[0], both[1]
     sigma = np.empty(count)
+    given = direction_body, sigma_rad, star, catalog_direction, velocity, sun_distance_au
+    match(*given, observed, reference, sigma)
+    return observed, reference, sigma
+
+
+@njit(cache=True, error_model="numpy")
+def match(  # type: ignore[no-untyped-def]
+    direction_body,
+    sigma_rad,
+    star,
+    catalog_direction,
+    velocity,
+    sun_distance_au,
+    observed,
+    reference,
+    sigma,
+):
+    """`matched_vectors` into arrays that have room for them; how many there are."""
     at_rest = velocity[0] == 0.0 and velocity[1] == 0.0 and velocity[2] == 0.0
     at = 0
     for k in range(len(star)):
         row = star[k]
         if row >= 0:
+            # Number by number, as is quickest.
             for i in range(3):
                 observed[at, i] = direction_body[k, i]
                 reference[at, i] = catalog_direction[row, i]
@@ -125,7 +144,7 @@ def matched_vectors(  # type: ignore[no-untyped-def]
             if not at_rest:
                 aberrate(catalog_direction[row], velocity, sun_distance_au, reference[at])
             at += 1
-    return observed, reference, sigma
+    return at
 
 
 @njit(cache=True, nogil=True)
