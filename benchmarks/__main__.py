@@ -102,6 +102,7 @@ def _keep(reports: Sequence[Report], seed: int, quick: bool) -> None:
             "faults": each.faults,
             "figures": each.figures,
             "curves": each.curves,
+            "record": kept["record"],
         }
     path.write_text(json.dumps(kept, indent=2, ensure_ascii=False) + "\n", "utf-8")
 

@@ -116,6 +116,8 @@ def write() -> None:
                 continue
             found = kept["benchmarks"][name]
             parts += ["", f"## {title}", "", ABOUT[name], ""]
+            apart = [f"{each} {value}" for each, value in found["record"].items() - machine.items()]
+            parts += [f"Measured apart: {', '.join(sorted(apart))}.", ""] if apart else []
             parts += [f"- **Out of bounds:** {fault}" for fault in found["faults"]]
             parts += [""] if found["faults"] else []
             if name == "kernels":
