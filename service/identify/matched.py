@@ -119,17 +119,17 @@ def matched_vectors(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def match(  # type: ignore[no-untyped-def]
-    direction_body,
-    sigma_rad,
-    star,
-    catalog_direction,
-    velocity,
-    sun_distance_au,
-    observed,
-    reference,
-    sigma,
-):
+def match(
+    direction_body: Vector,
+    sigma_rad: Vector,
+    star: Integers,
+    catalog_direction: Vector,
+    velocity: Vector,
+    sun_distance_au: float,
+    observed: Vector,
+    reference: Vector,
+    sigma: Vector,
+) -> int:
     """`matched_vectors` into arrays that have room for them; how many there are."""
     at_rest = velocity[0] == 0.0 and velocity[1] == 0.0 and velocity[2] == 0.0
     at = 0

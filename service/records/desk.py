@@ -305,6 +305,7 @@ class Desk:
             try:
                 drafted.append((order, self._draft(order, acquisition)))
             except Exception as error:
+                # Whatever is wrong with one, it is told, and the others are recorded.
                 self._finish([order], [error])
         if not drafted:
             return
