@@ -18,6 +18,7 @@ from tqdm import tqdm
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
 from service.attitude import kernels
+from service.attitude.solve import WORST_AXIS_RAD, room_to_fit
 from service.vectors import ARCSEC_PER_RADIAN
 
 Array = npt.NDArray[np.float64]
@@ -26,7 +27,6 @@ CASES = 1_000_000
 QUICK_CASES = 20_000
 BLOCK = 5_000
 BOUND_EPS = 30.0 * float(np.finfo(float).eps)
-WORST_AXIS_RAD = math.radians(1.0)
 
 
 @dataclass(frozen=True)
@@ -129,13 +129,10 @@ def agreement(cases: Cases) -> Agreement:
     count, stars = cases.sigma.shape
     quaternions, triads = np.empty((count, 4)), np.empty((count, 4))
     solved = np.zeros(count, bool)
-    two, covariance = np.empty((2, 4)), np.empty((3, 3))
-    squares, sums = np.empty((2, stars)), np.empty((2, 2))
+    room = room_to_fit(stars)
     for k in range(count):
-        solved[k] = kernels.solve(
-            cases.b[k], cases.r[k], cases.sigma[k], WORST_AXIS_RAD, two, covariance, squares, sums
-        )
-        triads[k], quaternions[k] = two
+        solved[k] = kernels.fit(cases.b[k], cases.r[k], cases.sigma[k], WORST_AXIS_RAD, 1, *room)
+        triads[k], quaternions[k] = room[0][:2]
     least = np.linalg.eigvalsh(information(cases))[:, 0]
     worst = 1.0 / np.sqrt(np.maximum(least, 1e-300))
     # Within a thousandth of the bound either verdict is rounding.

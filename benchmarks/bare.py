@@ -1,8 +1,9 @@
 """Bare kernels: the same work as the service's, and nothing else.
 
 Arrays are ready and of one type, every array that is written to is given, no
-test can be switched off, no option is looked at.  What the service's kernels
-take beyond this is what settings, exact zones on a grid and warnings cost.
+test can be switched off, no option is looked at, no reference is counted.  What
+the service's kernels take beyond this is what settings, exact zones on a grid
+and warnings cost.
 """
 
 import math
@@ -10,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from service.uncounted import borrowing
 from service.vectors import Matrix, Vector
 
 Integers = npt.NDArray[np.int32]
@@ -19,14 +20,14 @@ Arrays = tuple[Any, ...]
 """Of several types, in the order in which the first line of a kernel unpacks them."""
 
 
-@njit(nogil=True, error_model="numpy", fastmath=False)
+@borrowing
 def _angle(a: Vector, b: Vector) -> float:
     x, y, z = a[0] - b[0], a[1] - b[1], a[2] - b[2]
     half = 0.5 * math.sqrt(x * x + y * y + z * z)
     return 2.0 * math.asin(min(1.0, half))
 
 
-@njit(nogil=True, error_model="numpy")
+@borrowing
 def bare_votes(
     observed: Vector,
     observed_mag: Vector,
@@ -130,7 +131,7 @@ def bare_votes(
             votes[i, touched[k]] = 0
 
 
-@njit(nogil=True, error_model="numpy")
+@borrowing
 def bare_attitude(
     b: Vector, r: Vector, weight: Vector, turned: Vector, matrix: Matrix, q: Vector
 ) -> None:
@@ -220,7 +221,7 @@ def bare_attitude(
         q[i] /= norm
 
 
-@njit(nogil=True, error_model="numpy")
+@borrowing
 def _frame(a: Vector, b: Vector, rows: Matrix) -> None:
     x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
     norm = math.sqrt(x * x + y * y + z * z)
@@ -234,7 +235,7 @@ def _frame(a: Vector, b: Vector, rows: Matrix) -> None:
     )
 
 
-@njit(nogil=True, error_model="numpy")
+@borrowing
 def bare_one(
     observed: Vector,
     mag: Vector,
@@ -273,7 +274,9 @@ def bare_one(
     count = 0
     for i in range(len(star)):
         if star[i] >= 0:
-            b[count], r[count], w[count] = body[i], direction[star[i]], weight[i]
+            w[count] = weight[i]
+            for k in range(3):
+                b[count, k], r[count, k] = body[i, k], direction[star[i], k]
             count += 1
     if count < 2:
         return False
@@ -281,7 +284,7 @@ def bare_one(
     return True
 
 
-@njit(nogil=True, error_model="numpy")
+@borrowing
 def bare_many(
     observed: Vector,
     mag: Vector,

@@ -177,19 +177,20 @@ def service_many(
 ) -> None:
     """The service's kernels over many batches, as `identify_by_votes` and `attitude_of` do."""
     votes, voted, counts, edges, outcome, highest, second = room[:7]
-    quaternions, covariance, squares, sums, b, r, s = room[7:]
+    quaternions, covariance, squares, sums, b, r, s, w, inner = room[7:]
     still = np.zeros(3)
     for k in range(len(observed)):
         votes[:] = 0
         counts[:] = 0
-        # mypy takes what comes as a tuple for one argument.
-        cast_votes(observed[k], mag[k], boresights[k], *given, votes, voted, counts, edges)  # type: ignore[call-arg]
+        cast_votes(observed[k], mag[k], boresights[k], *given, votes, voted, counts, edges)
         count_votes(votes, voted, counts, rows, outcome, star[k], highest, second)
         n = match(body[k], sigma, star[k], direction, still, 1.0, b, r, s)
         q[k] = np.nan
         if n >= 2:
+            for i in range(n):
+                w[i] = 1.0 / (s[i] * s[i])
             part = squares if n == squares.shape[1] else squares[:, :n].copy()
-            if solve(b[:n], r[:n], s[:n], worst, quaternions, covariance, part, sums):
+            if solve(b[:n], r[:n], w[:n], worst, quaternions, covariance, part, sums, inner):
                 q[k] = quaternions[1]
 
 
@@ -238,13 +239,15 @@ def compare(mission: Mission, views: Views) -> tuple[dict[str, float], list[str]
         np.zeros(n, np.int32),
         np.empty((0, 4), np.int32),
         *(np.empty((3, n), np.int64)),
-        np.empty((2, 4)),
+        np.empty((3, 4)),
         np.empty((3, 3)),
         np.empty((2, n)),
         np.empty((2, 2)),
         np.empty((n, 3)),
         np.empty((n, 3)),
         np.empty(n),
+        np.empty(n),
+        np.empty((3, 3, 3)),
     )
     worst = math.radians(WORST_AXIS_DEG)
     rows = np.arange(stars)

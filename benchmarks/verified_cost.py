@@ -157,8 +157,7 @@ def many_votes(
     for k in range(len(observed)):
         votes[:] = 0
         counts[:] = 0
-        # mypy takes what comes as a tuple for one argument.
-        cast_votes(observed[k], magnitude[k], boresight, *given, votes, voted, counts, edges)  # type: ignore[call-arg]
+        cast_votes(observed[k], magnitude[k], boresight, *given, votes, voted, counts, edges)
         count_votes(votes, voted, counts, star_of, outcome, star[k], highest, second)
 
 

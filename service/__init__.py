@@ -7,7 +7,14 @@ from pathlib import Path
 __version__ = "0.1.0"
 
 
-KERNELS = ("attitude", "identify", "observe/correct.py", "sky", "simulate/ptp/rivals")
+KERNELS = (
+    "attitude",
+    "identify",
+    "observe/correct.py",
+    "sky",
+    "simulate/ptp/rivals",
+    "uncounted.py",
+)
 """Where compiled code and what it takes in stands: folders, whole, and files."""
 
 

@@ -10,6 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
+from service.uncounted import borrowing
 from service.vectors import ARCSEC_PER_RADIAN
 
 NEWTON_STEPS = 30
@@ -18,7 +19,7 @@ LEAST_SINE = 1e-12
 """Below this two vectors stand in one line."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@borrowing
 def _sine(a, b):  # type: ignore[no-untyped-def]
     x = a[1] * b[2] - a[2] * b[1]
     y = a[2] * b[0] - a[0] * b[2]
@@ -26,7 +27,7 @@ def _sine(a, b):  # type: ignore[no-untyped-def]
     return math.sqrt(x * x + y * y + z * z)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@borrowing
 def widest_pair(b, r, weights):  # type: ignore[no-untyped-def]
     """The two rows with the largest sine between them, the smaller sigma first, and that sine.
 
@@ -44,7 +45,7 @@ def widest_pair(b, r, weights):  # type: ignore[no-untyped-def]
     return first, second, widest
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@borrowing
 def _firmest_pair(b, r, weights):  # type: ignore[no-untyped-def]
     """The finest star, and the one that best fixes the turn about it by weight times sine^2."""
     first, second, firmest = 0, 0, 0.0
@@ -58,7 +59,7 @@ def _firmest_pair(b, r, weights):  # type: ignore[no-untyped-def]
     return first, second
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@borrowing
 def _triad_frame(anchor, other):  # type: ignore[no-untyped-def]
     """The second and third axis of the frame whose first is the anchor."""
     x = anchor[1] * other[2] - anchor[2] * other[1]
@@ -74,7 +75,7 @@ def _triad_frame(anchor, other):  # type: ignore[no-untyped-def]
     return (x, y, z), third
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@borrowing
 def triad(b1, b2, r1, r2, attitude):  # type: ignore[no-untyped-def]
     """The matrix that takes r1 to b1 exactly and r2 into the plane of b1 and b2 (Black 1964)."""
     body2, body3 = _triad_frame(b1, b2)
@@ -84,7 +85,7 @@ def triad(b1, b2, r1, r2, attitude):  # type: ignore[no-untyped-def]
             attitude[i, j] = b1[i] * r1[j] + body2[i] * inertial2[j] + body3[i] * inertial3[j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@borrowing
 def to_matrix(q, a):  # type: ignore[no-untyped-def]
     """A(q) into a (3, 3)."""
     q1, q2, q3, qc = q[0], q[1], q[2], q[3]
@@ -99,7 +100,7 @@ def to_matrix(q, a):  # type: ignore[no-untyped-def]
     a[2, 2] = -q1 * q1 - q2 * q2 + q3 * q3 + qc * qc
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@borrowing
 def to_quaternion(a, q):  # type: ignore[no-untyped-def]
     """The quaternion of an attitude matrix, qc >= 0, by Shepperd's largest component."""
     trace = a[0, 0] + a[1, 1] + a[2, 2]
@@ -118,7 +119,7 @@ def to_quaternion(a, q):  # type: ignore[no-untyped-def]
     _normalise(q)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@borrowing
 def _normalise(q):  # type: ignore[no-untyped-def]
     norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     if q[3] < 0.0:
@@ -127,7 +128,7 @@ def _normalise(q):  # type: ignore[no-untyped-def]
         q[i] /= norm
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@borrowing
 def quest(b, r, weights, start, q, room):  # type: ignore[no-untyped-def]
     """Wahba's attitude by QUEST (Shuster & Oh 1981) into q; `room` (3, 3, 3) is written to.
 
@@ -145,34 +146,36 @@ def quest(b, r, weights, start, q, room):  # type: ignore[no-untyped-def]
     total = 0.0
     for k in range(len(weights)):
         total += weights[k]
-    profile = room[0]  # B = sum of a b r^T
-    profile[:] = 0.0
+    # B = sum of a b r^T, number by number: sums in arrays would wait for memory.
+    b00 = b01 = b02 = b10 = b11 = b12 = b20 = b21 = b22 = 0.0
+    sign0 = 1.0 if turn == 3 or turn == 0 else -1.0
+    sign1 = 1.0 if turn == 3 or turn == 1 else -1.0
+    sign2 = 1.0 if turn == 3 or turn == 2 else -1.0
     for k in range(len(weights)):
         share = weights[k] / total
-        for j in range(3):
-            reference = r[k, j] if turn == 3 or turn == j else -r[k, j]
-            for i in range(3):
-                profile[i, j] += share * b[k, i] * reference
-    sigma = profile[0, 0] + profile[1, 1] + profile[2, 2]
-    s = room[1]
-    for i in range(3):
-        for j in range(3):
-            s[i, j] = profile[i, j] + profile[j, i]
-    z0 = profile[1, 2] - profile[2, 1]
-    z1 = profile[2, 0] - profile[0, 2]
-    z2 = profile[0, 1] - profile[1, 0]
-    c00 = s[1, 1] * s[2, 2] - s[1, 2] * s[2, 1]
-    c11 = s[0, 0] * s[2, 2] - s[0, 2] * s[2, 0]
-    c22 = s[0, 0] * s[1, 1] - s[0, 1] * s[1, 0]
+        o0, o1, o2 = share * b[k, 0], share * b[k, 1], share * b[k, 2]
+        r0, r1, r2 = sign0 * r[k, 0], sign1 * r[k, 1], sign2 * r[k, 2]
+        b00 += o0 * r0
+        b01 += o0 * r1
+        b02 += o0 * r2
+        b10 += o1 * r0
+        b11 += o1 * r1
+        b12 += o1 * r2
+        b20 += o2 * r0
+        b21 += o2 * r1
+        b22 += o2 * r2
+    sigma = b00 + b11 + b22
+    s00, s11, s22 = 2.0 * b00, 2.0 * b11, 2.0 * b22
+    s01, s02, s12 = b01 + b10, b02 + b20, b12 + b21
+    z0, z1, z2 = b12 - b21, b20 - b02, b01 - b10
+    c00 = s11 * s22 - s12 * s12
+    c11 = s00 * s22 - s02 * s02
+    c22 = s00 * s11 - s01 * s01
     kappa = c00 + c11 + c22
-    det = (
-        s[0, 0] * c00
-        - s[0, 1] * (s[1, 0] * s[2, 2] - s[1, 2] * s[2, 0])
-        + s[0, 2] * (s[1, 0] * s[2, 1] - s[1, 1] * s[2, 0])
-    )
-    sz0 = s[0, 0] * z0 + s[0, 1] * z1 + s[0, 2] * z2
-    sz1 = s[1, 0] * z0 + s[1, 1] * z1 + s[1, 2] * z2
-    sz2 = s[2, 0] * z0 + s[2, 1] * z1 + s[2, 2] * z2
+    det = s00 * c00 - s01 * (s01 * s22 - s12 * s02) + s02 * (s01 * s12 - s11 * s02)
+    sz0 = s00 * z0 + s01 * z1 + s02 * z2
+    sz1 = s01 * z0 + s11 * z1 + s12 * z2
+    sz2 = s02 * z0 + s12 * z1 + s22 * z2
     zz = z0 * z0 + z1 * z1 + z2 * z2
     zsz = z0 * sz0 + z1 * sz1 + z2 * sz2
     zssz = sz0 * sz0 + sz1 * sz1 + sz2 * sz2
@@ -194,9 +197,9 @@ def quest(b, r, weights, start, q, room):  # type: ignore[no-untyped-def]
     alpha = largest * largest - sigma * sigma + kappa
     beta = largest - sigma
     gamma = (largest + sigma) * alpha - det
-    x0 = alpha * z0 + beta * sz0 + s[0, 0] * sz0 + s[0, 1] * sz1 + s[0, 2] * sz2
-    x1 = alpha * z1 + beta * sz1 + s[1, 0] * sz0 + s[1, 1] * sz1 + s[1, 2] * sz2
-    x2 = alpha * z2 + beta * sz2 + s[2, 0] * sz0 + s[2, 1] * sz1 + s[2, 2] * sz2
+    x0 = alpha * z0 + beta * sz0 + s00 * sz0 + s01 * sz1 + s02 * sz2
+    x1 = alpha * z1 + beta * sz1 + s01 * sz0 + s11 * sz1 + s12 * sz2
+    x2 = alpha * z2 + beta * sz2 + s02 * sz0 + s12 * sz1 + s22 * sz2
     if turn == 0:
         q[0], q[1], q[2], q[3] = gamma, -x2, x1, -x0
     elif turn == 1:
@@ -206,12 +209,13 @@ def quest(b, r, weights, start, q, room):  # type: ignore[no-untyped-def]
     else:
         q[0], q[1], q[2], q[3] = x0, x1, x2, gamma
     _normalise(q)
-    if not _loss(b, r, weights, q, s) <= _loss(b, r, weights, start, s):
-        q[:] = start
+    if not _loss(b, r, weights, q, room[0]) <= _loss(b, r, weights, start, room[0]):
+        for i in range(4):
+            q[i] = start[i]
     _polish(b, r, weights, q, room)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@borrowing
 def _loss(b, r, weights, q, a):  # type: ignore[no-untyped-def]
     """Wahba's loss; `a` (3, 3) is written to."""
     to_matrix(q, a)
@@ -223,18 +227,25 @@ def _loss(b, r, weights, q, a):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@borrowing
 def information(vectors, weights, matrix):  # type: ignore[no-untyped-def]
     """Sum of sigma^-2 (I - v v^T): the inverse of the covariance, in rad^-2."""
-    matrix[:] = 0.0
+    m00 = m01 = m02 = m11 = m12 = m22 = 0.0
     for k in range(len(weights)):
-        for i in range(3):
-            matrix[i, i] += weights[k]
-            for j in range(3):
-                matrix[i, j] -= weights[k] * vectors[k, i] * vectors[k, j]
+        w, v0, v1, v2 = weights[k], vectors[k, 0], vectors[k, 1], vectors[k, 2]
+        m00 = m00 + w - w * v0 * v0
+        m11 = m11 + w - w * v1 * v1
+        m22 = m22 + w - w * v2 * v2
+        m01 -= w * v0 * v1
+        m02 -= w * v0 * v2
+        m12 -= w * v1 * v2
+    matrix[0, 0], matrix[1, 1], matrix[2, 2] = m00, m11, m22
+    matrix[0, 1] = matrix[1, 0] = m01
+    matrix[0, 2] = matrix[2, 0] = m02
+    matrix[1, 2] = matrix[2, 1] = m12
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@borrowing
 def inverse_symmetric(m, out):  # type: ignore[no-untyped-def]
     """The inverse of a symmetric (3, 3); False where it has none."""
     c00 = m[1, 1] * m[2, 2] - m[1, 2] * m[1, 2]
@@ -253,7 +264,7 @@ def inverse_symmetric(m, out):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@borrowing
 def _polish(b, r, weights, q, room):  # type: ignore[no-untyped-def]
     a, matrix, inverse = room[0], room[1], room[2]
     for _ in range(POLISHING_STEPS):
@@ -301,18 +312,16 @@ def _polish(b, r, weights, q, room):  # type: ignore[no-untyped-def]
             return
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def solve(b, r, sigma_rad, worst_rad, quaternions, covariance, squares, sums):  # type: ignore[no-untyped-def]
-    """TRIAD into row 0 of `quaternions` (2, 4), QUEST into row 1, the covariance (3, 3) in rad^2.
+@borrowing
+def solve(b, r, weights, worst_rad, quaternions, covariance, squares, sums, room):  # type: ignore[no-untyped-def]
+    """TRIAD into row 0 of `quaternions` (3, 4), QUEST into row 1, the covariance (3, 3) in rad^2.
 
     `squares` (2, n) gets the squared residuals |b - A r|^2 of either, `sums`
     (2, 2) their sum and their sum in units of sigma^2.  False where the geometry
-    leaves an axis worse than `worst_rad`.
+    leaves an axis worse than `worst_rad`.  Row 2 of `quaternions` gets the start
+    of QUEST; `room` (3, 3, 3) is written to.
     """
     n = len(b)
-    weights, room = np.empty(n), np.empty((3, 3, 3))
-    for k in range(n):
-        weights[k] = 1.0 / (sigma_rad[k] * sigma_rad[k])
     first, second, sine = widest_pair(b, r, weights)
     if sine <= LEAST_SINE:
         return False
@@ -334,10 +343,11 @@ def solve(b, r, sigma_rad, worst_rad, quaternions, covariance, squares, sums):  
     triad(b[first], b[second], r[first], r[second], attitude)
     to_quaternion(attitude, quaternions[0])
     # The widest pair may be of coarse stars; TRIAD of the firmest is near the optimum.
-    start = np.empty(4)
+    start = quaternions[2]
     anchor, other = _firmest_pair(b, r, weights)
     if anchor == other:
-        start[:] = quaternions[0]
+        for i in range(4):
+            start[i] = quaternions[0, i]
     else:
         triad(b[anchor], b[other], r[anchor], r[other], attitude)
         to_quaternion(attitude, start)
@@ -370,18 +380,26 @@ def fit(b, r, sigma_rad, worst_rad, chosen, quaternions, matrices, residual):  #
     residuals in arcsec.
     """
     n = len(b)
-    squares, sums = np.empty((2, n)), np.empty((2, 2))
+    weights, squares, sums, room = (
+        np.empty(n),
+        np.empty((2, n)),
+        np.empty((2, 2)),
+        np.empty((3, 3, 3)),
+    )
+    variance = 0.0
+    for k in range(n):
+        square = sigma_rad[k] * sigma_rad[k]
+        weights[k] = 1.0 / square
+        variance += square
     covariance, told = matrices[1], quaternions[2]
-    if not solve(b, r, sigma_rad, worst_rad, quaternions, covariance, squares, sums):
+    if not solve(b, r, weights, worst_rad, quaternions, covariance, squares, sums, room):
         return False
     to_matrix(quaternions[chosen], matrices[0])
     for i in range(3):
         for j in range(3):
             covariance[i, j] *= ARCSEC_PER_RADIAN * ARCSEC_PER_RADIAN
-    variance = 0.0
     for k in range(n):
         residual[k] = math.sqrt(squares[chosen, k]) * ARCSEC_PER_RADIAN
-        variance += sigma_rad[k] * sigma_rad[k]
     apart = along = 0.0
     for i in range(4):
         apart += (quaternions[0, i] - quaternions[1, i]) ** 2

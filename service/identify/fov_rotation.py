@@ -11,50 +11,72 @@ the turned boresight, between the pole and where the turn would put it.
 
 import math
 
-import numpy as np
-from numba import njit
+from service.uncounted import borrowing
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def rotation_rad(first, second, a, b, boresight, axis, is_band):  # type: ignore[no-untyped-def]
     """The rotation about the boresight, 0 to pi, if `first` is candidate `a` and `second` is `b`.
 
-    All are unit vectors (3,), inertial through the a priori attitude.
+    All are unit vectors, inertial through the a priori attitude, of whose arrays
+    the first three numbers are read.  It is worked out in plain numbers, so that
+    it neither allocates nor can fail.
     """
-    observed, candidate = np.empty((3, 3)), np.empty((3, 3))
-    _frame(first, second, observed)
-    _frame(a, b, candidate)
-    turned = candidate.T @ (observed @ boresight)
+    observed, candidate = _frame(first, second), _frame(a, b)
+    looking = boresight[0], boresight[1], boresight[2]
+    turned = _carried(looking, observed, candidate)
     if is_band:
-        expected, found = axis, candidate.T @ (observed @ axis)
+        pole = axis[0], axis[1], axis[2]
+        expected, found = pole, _carried(pole, observed, candidate)
     else:
         # What lies across the boresight, carried the short way to where the boresight comes.
-        across = observed[1] - (observed[1] @ boresight) * boresight
-        share = (across @ turned) / (1.0 + boresight @ turned)
-        expected = across - share * (boresight + turned)
-        found = candidate.T @ (observed @ across)
-    sine = _triple(turned, expected, found)
-    cosine = expected @ found - (expected @ turned) * (found @ turned)
+        across = _less(observed[1], _dot(observed[1], looking), looking)
+        share = _dot(across, turned) / (1.0 + _dot(looking, turned))
+        middle = looking[0] + turned[0], looking[1] + turned[1], looking[2] + turned[2]
+        expected = _less(across, share, middle)
+        found = _carried(across, observed, candidate)
+    sine = _dot(turned, _cross(expected, found))
+    cosine = _dot(expected, found) - _dot(expected, turned) * _dot(found, turned)
     return abs(math.atan2(sine, cosine))
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _frame(first, second, out):  # type: ignore[no-untyped-def]
-    """Rows: the middle of two unit vectors, the direction from one to the other, their normal."""
-    out[0] = first + second
-    out[1] = second - first
-    out[0] /= math.sqrt(out[0] @ out[0])
-    out[1] /= math.sqrt(out[1] @ out[1])
-    out[2, 0] = out[0, 1] * out[1, 2] - out[0, 2] * out[1, 1]
-    out[2, 1] = out[0, 2] * out[1, 0] - out[0, 0] * out[1, 2]
-    out[2, 2] = out[0, 0] * out[1, 1] - out[0, 1] * out[1, 0]
+@borrowing
+def _frame(first, second):  # type: ignore[no-untyped-def]
+    """The middle of two unit vectors, the direction from one to the other, and their normal."""
+    middle = first[0] + second[0], first[1] + second[1], first[2] + second[2]
+    along = second[0] - first[0], second[1] - first[1], second[2] - first[2]
+    middle, along = _unit(middle), _unit(along)
+    return middle, along, _cross(middle, along)
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _triple(u, v, w):  # type: ignore[no-untyped-def]
-    """The triple product u . (v x w)."""
+@borrowing
+def _carried(v, observed, candidate):  # type: ignore[no-untyped-def]
+    """The vector, turned as the observed frame is turned to the candidate's."""
+    x, y, z = _dot(observed[0], v), _dot(observed[1], v), _dot(observed[2], v)
+    one, two, three = candidate
     return (
-        u[0] * (v[1] * w[2] - v[2] * w[1])
-        + u[1] * (v[2] * w[0] - v[0] * w[2])
-        + u[2] * (v[0] * w[1] - v[1] * w[0])
+        x * one[0] + y * two[0] + z * three[0],
+        x * one[1] + y * two[1] + z * three[1],
+        x * one[2] + y * two[2] + z * three[2],
     )
+
+
+@borrowing
+def _unit(v):  # type: ignore[no-untyped-def]
+    norm = math.sqrt(_dot(v, v))
+    return v[0] / norm, v[1] / norm, v[2] / norm
+
+
+@borrowing
+def _less(v, share, w):  # type: ignore[no-untyped-def]
+    return v[0] - share * w[0], v[1] - share * w[1], v[2] - share * w[2]
+
+
+@borrowing
+def _dot(v, w):  # type: ignore[no-untyped-def]
+    return v[0] * w[0] + v[1] * w[1] + v[2] * w[2]
+
+
+@borrowing
+def _cross(v, w):  # type: ignore[no-untyped-def]
+    return v[1] * w[2] - v[2] * w[1], v[2] * w[0] - v[0] * w[2], v[0] * w[1] - v[1] * w[0]

@@ -16,6 +16,7 @@ from service.attitude.solve import (
     tracker_fits,
 )
 from service.identify.identification import Integers
+from service.uncounted import borrowing
 from service.vectors import Vector
 
 SUN_SCHWARZSCHILD_AU = 1.97412574336e-8
@@ -118,7 +119,7 @@ def matched_vectors(  # type: ignore[no-untyped-def]
     return observed, reference, sigma
 
 
-@njit(cache=True, error_model="numpy")
+@borrowing
 def match(
     direction_body: Vector,
     sigma_rad: Vector,
@@ -147,7 +148,7 @@ def match(
     return at
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def aberrate(natural, velocity, sun_distance_au, apparent):  # type: ignore[no-untyped-def]
     """The apparent direction of a natural one, by the formula of ERFA's `ab`.
 
@@ -155,7 +156,8 @@ def aberrate(natural, velocity, sun_distance_au, apparent):  # type: ignore[no-u
     """
     speed2 = velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2
     if speed2 == 0.0:
-        apparent[:] = natural
+        for i in range(3):
+            apparent[i] = natural[i]
         return
     inverse_lorentz = math.sqrt(1.0 - speed2)
     along = natural[0] * velocity[0] + natural[1] * velocity[1] + natural[2] * velocity[2]

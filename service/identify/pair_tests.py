@@ -13,6 +13,7 @@ from numba import njit
 from service.identify.fov_rotation import rotation_rad
 from service.identify.identification import Outcome
 from service.sky.pairs import separation_rad
+from service.uncounted import borrowing
 
 UNMATCHED, UNIQUE, AMBIGUOUS = (int(outcome) for outcome in Outcome)
 
@@ -23,7 +24,7 @@ _SINGLE = 1e-6
 _ROUNDING = 1e-14
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@borrowing
 def cast_votes(  # type: ignore[no-untyped-def]
     observed,  # (n, 3) unit vectors, inertial through the a priori attitude
     observed_magnitude,  # (n,) NaN: the magnitude tests pass the star by
@@ -174,26 +175,10 @@ def cast_votes(  # type: ignore[no-untyped-def]
                     # Of both orders, where nothing told one, that which turns little stays.
                     along, against = order >= 0, order <= 0
                     if along:
-                        turn = rotation_rad(
-                            observed[i],
-                            observed[j],
-                            star[a, :3],
-                            star[b, :3],
-                            boresight,
-                            axis,
-                            is_band,
-                        )
+                        turn = _rotation(observed, i, j, star, a, b, boresight, axis, is_band)
                         along = turn <= rotation_tolerance
                     if against:
-                        turn = rotation_rad(
-                            observed[i],
-                            observed[j],
-                            star[b, :3],
-                            star[a, :3],
-                            boresight,
-                            axis,
-                            is_band,
-                        )
+                        turn = _rotation(observed, i, j, star, b, a, boresight, axis, is_band)
                         against = turn <= rotation_tolerance
                     if not (along or against):
                         continue
@@ -216,7 +201,13 @@ def cast_votes(  # type: ignore[no-untyped-def]
                         kept += 1
 
 
-@njit(cache=True, nogil=True, inline="always")
+@borrowing
+def _rotation(observed, i, j, star, a, b, boresight, axis, is_band):  # type: ignore[no-untyped-def]
+    """`rotation_rad` of rows; where `cast_votes` cut them out, it would count references."""
+    return rotation_rad(observed[i], observed[j], star[a], star[b], boresight, axis, is_band)
+
+
+@borrowing
 def _vote(i, row, votes, voted, counts):  # type: ignore[no-untyped-def]
     if votes[i, row] == 0:
         voted[i, counts[i]] = row
@@ -305,7 +296,7 @@ def polar_angles(zone_polar, stars, all_inside, switches):  # type: ignore[no-un
     return polar
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def count_votes(votes, voted, counts, star_of, outcome, star, highest, second):  # type: ignore[no-untyped-def]
     """Per observed star: outcome, the winner's `star_of` (-1: none) and the two highest tallies.
 
@@ -333,7 +324,7 @@ def count_votes(votes, voted, counts, star_of, outcome, star, highest, second): 
     return any_tie
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def name_rivals(votes, star_of, outcome, highest, rivals):  # type: ignore[no-untyped-def]
     """Into `rivals` (R, n) the `star_of` of who share an ambiguous star's highest tally, then -1.
 

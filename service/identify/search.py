@@ -22,8 +22,8 @@ from service.identify.hypotheses import log_sum
 from service.identify.scan import most_of, scan
 from service.identify.scene import MAX_SEEDS, PREDICTION_GATE, scratch_for, with_magnitude
 from service.identify.two_stars import MAX_WORK, two_stars
-from service.identify.uncounted import uncounted
 from service.sky.pairs import separation_rad
+from service.uncounted import uncounted
 
 SHORT_PAIR_RAD = math.radians(0.35)
 CHANCE_PER_STAR, CHANCE_MARGIN = math.log(3.0), 12.0

@@ -156,7 +156,7 @@ def _tally_groups(given: tuple[Any, ...], star_of: Rows, found: Integers) -> tup
     given = with_polar_angles(given)
     shape = len(given[0]), len(star_of)
     votes, voted, counts, edges = _room_for_votes(shape, 0)
-    cast_votes(*given, votes, voted, counts, edges)  # type: ignore[call-arg]
+    cast_votes(*given, votes, voted, counts, edges)
     cast = int(votes.sum()) // 2
     bounded = cast > MAX_EDGES
     if not bounded:

@@ -27,8 +27,8 @@ from service.identify.lost_in_space.room import (
 )
 from service.identify.lost_in_space.search import enter, search
 from service.identify.lost_in_space.seen import Field, Points
-from service.identify.uncounted import uncounted
 from service.sky.sky_index import SkyIndex, index_in
+from service.uncounted import uncounted
 from service.vectors import Matrix, Vector
 
 Rows = npt.NDArray[np.int64]
