@@ -20,8 +20,20 @@ def borrowing(kernel: Callable[..., Any]) -> Any:
     Without numba's runtime it cannot make an array either: one that tries to
     does not compile.  Never for what returns an array.
     """
-    compiled: Any = njit  # whose stubs do not have `_nrt`, by which numba says it
-    return compiled(kernel, cache=True, nogil=True, error_model="numpy", _nrt=False)
+    return _compiled(kernel, error_model="numpy", _nrt=False)
+
+
+def owning(kernel: Callable[..., Any]) -> Any:
+    """Compile what makes arrays although a kernel that borrows calls it.
+
+    It would be compiled as its caller is, had it not said so itself.
+    """
+    return _compiled(kernel, _nrt=True)
+
+
+def _compiled(kernel: Callable[..., Any], **options: Any) -> Any:
+    compile_it: Any = njit  # whose stubs do not have `_nrt`, by which numba says it
+    return compile_it(kernel, cache=True, nogil=True, **options)
 
 
 def _uncounted(_: Any, held: Any) -> Any:

@@ -20,7 +20,8 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from service.uncounted import borrowing
 
 CLUTTER_SPAN_MAG = 6.0
 POSITION_SCALES = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
@@ -61,13 +62,13 @@ def _table_of_clutter() -> npt.NDArray[np.float64]:
 _LOG_CLUTTER = _table_of_clutter()
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def log_beta(a, b):  # type: ignore[no-untyped-def]
     """Logarithm of Euler's beta function."""
     return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def log_clutter(clutter, stars):  # type: ignore[no-untyped-def]
     """Log probability that just these are clutter."""
     if clutter <= _FEW and stars <= _FEW:
@@ -75,7 +76,7 @@ def log_clutter(clutter, stars):  # type: ignore[no-untyped-def]
     return log_beta(clutter + BETA_CLUTTER, stars + BETA_STAR) - _LOG_BETA_OF_NONE
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def log_prior(angle, kind):  # type: ignore[no-untyped-def]
     """Log density of an attitude, per cubed radian of rotation, at an angle from the presumed one.
 
@@ -97,12 +98,12 @@ def log_prior(angle, kind):  # type: ignore[no-untyped-def]
 
 # Tables are filled by the plain functions, so that an import compiles nothing.
 LOG_PRIOR_AT_BEST = np.array(
-    [log_prior.py_func(0.0, kind) for kind in (PRIOR_ROTATION, PRIOR_DIRECTION)]  # type: ignore[no-untyped-call]
+    [log_prior.py_func(0.0, kind) for kind in (PRIOR_ROTATION, PRIOR_DIRECTION)]
 )
 """The largest log density of an attitude, by the kind of prior."""
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def log_positions(stars, square, log_det, reference_sigma_rad):  # type: ignore[no-untyped-def]
     """The attitude and the positions: Laplace's integral, averaged over the scales of noise."""
     largest = -math.inf
@@ -120,16 +121,11 @@ def log_positions(stars, square, log_det, reference_sigma_rad):  # type: ignore[
     return 1.5 * _LOG_2PI - 0.5 * log_det + largest + math.log(total / len(POSITION_SCALES))
 
 
-_LOG_EXACT = np.array(
-    [
-        log_positions.py_func(count, 0.0, 0.0, 1.0)  # type: ignore[no-untyped-call]
-        for count in range(_FEW + 1)
-    ]
-)
+_LOG_EXACT = np.array([log_positions.py_func(count, 0.0, 0.0, 1.0) for count in range(_FEW + 1)])
 """By the number of stars, for a sigma of one radian; another adds a multiple of its logarithm."""
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def log_exact_positions(stars, reference_sigma_rad):  # type: ignore[no-untyped-def]
     """The attitude and the positions without residuals and det N: the most they weigh."""
     if stars <= _FEW:
@@ -137,7 +133,7 @@ def log_exact_positions(stars, reference_sigma_rad):  # type: ignore[no-untyped-
     return log_positions(stars, 0.0, 0.0, reference_sigma_rad)
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def log_magnitudes(count, total_mag, square_mag2):  # type: ignore[no-untyped-def]
     """The magnitudes of `count` stars: sum and sum of squares of observed minus catalog."""
     if count == 0:
@@ -160,21 +156,16 @@ def log_magnitudes(count, total_mag, square_mag2):  # type: ignore[no-untyped-de
     return shared + largest + math.log(total / (2 * len(MAGNITUDE_SCALES_MAG)))
 
 
-_LOG_EQUAL = np.array(
-    [
-        log_magnitudes.py_func(count, 0.0, 0.0)  # type: ignore[no-untyped-call]
-        for count in range(_FEW + 1)
-    ]
-)
+_LOG_EQUAL = np.array([log_magnitudes.py_func(count, 0.0, 0.0) for count in range(_FEW + 1)])
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def log_equal_magnitudes(count):  # type: ignore[no-untyped-def]
     """The magnitudes of `count` stars that are all as the catalog has them: the most they weigh."""
     return _LOG_EQUAL[count] if count <= _FEW else log_magnitudes(count, 0.0, 0.0)
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def log_null(count, with_magnitude):  # type: ignore[no-untyped-def]
     """The rival that always stands in the denominator: no real star at all, or a single one.
 

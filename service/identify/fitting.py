@@ -7,19 +7,19 @@ A hypothesis is `match` (n,): for every observed star the row of a zone star,
 import math
 
 import numpy as np
-from numba import njit
 
 from service.attitude.kernels import inverse_symmetric, triad
 from service.identify import evidence
 from service.identify.evidence import PRIOR_ROTATION
 from service.identify.scene import with_magnitude
 from service.sky.pairs import separation_rad
+from service.uncounted import borrowing
 
 LEAST_SINE2 = 4e-10
 """Of the angle between the widest pair, four times its squared sine: 2 arcsec."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@borrowing
 def fit(seen, stars, match, scratch, steps):  # type: ignore[no-untyped-def]
     """Fit T to a hypothesis: TRIAD on the widest pair, then Gauss-Newton steps.
 
@@ -97,7 +97,7 @@ def fit(seen, stars, match, scratch, steps):  # type: ignore[no-untyped-def]
     return count, square, math.log(det)
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def _determinant(m):  # type: ignore[no-untyped-def]
     """Of a symmetric (3, 3)."""
     return (
@@ -107,7 +107,7 @@ def _determinant(m):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def turn(t, e0, e1, e2):  # type: ignore[no-untyped-def]
     """T becomes exp(-[e x]) T, by the quaternion (e/2, 1) so that it stays orthonormal."""
     norm = 1.0 / math.sqrt(1.0 + 0.25 * (e0 * e0 + e1 * e1 + e2 * e2))
@@ -125,7 +125,7 @@ def turn(t, e0, e1, e2):  # type: ignore[no-untyped-def]
         )
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def prior_angle(t, axis, kind):  # type: ignore[no-untyped-def]
     """The angle that the prior weighs: T's total rotation, or the tilt that it gives the axis."""
     if kind == PRIOR_ROTATION:
@@ -138,7 +138,7 @@ def prior_angle(t, axis, kind):  # type: ignore[no-untyped-def]
     return 2.0 * math.asin(min(1.0, 0.5 * math.sqrt(chord2)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@borrowing
 def weigh(seen, stars, match, scratch):  # type: ignore[no-untyped-def]
     """The log weight of a hypothesis, fitted; see `fit`."""
     count, square, log_det = fit(seen, stars, match, scratch, 1)
@@ -147,7 +147,7 @@ def weigh(seen, stars, match, scratch):  # type: ignore[no-untyped-def]
     return log_weight_of(seen, stars, match, scratch.t, count, square, log_det)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@borrowing
 def weigh_without(seen, stars, match, k, square, scratch):  # type: ignore[no-untyped-def]
     """The log weight of a hypothesis, already fitted in `scratch`, when star k of it is clutter.
 
@@ -187,12 +187,14 @@ def weigh_without(seen, stars, match, k, square, scratch):  # type: ignore[no-un
     e1 = inverse[1, 0] * g0 + inverse[1, 1] * g1 + inverse[1, 2] * g2
     e2 = inverse[2, 0] * g0 + inverse[2, 1] * g1 + inverse[2, 2] * g2
     left = square - w * (d0 * d0 + d1 * d1 + d2 * d2) - (g0 * e0 + g1 * e1 + g2 * e2)
-    turned[:] = t
+    for i in range(3):
+        for j in range(3):
+            turned[i, j] = t[i, j]
     turn(turned, -e0, -e1, -e2)
     return log_weight_of(seen, stars, match, turned, count, max(left, 0.0), math.log(det))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@borrowing
 def log_weight_of(seen, stars, match, t, count, square, log_det):  # type: ignore[no-untyped-def]
     """The log weight of a hypothesis of `count` stars from its fit."""
     compared = clutter = 0
@@ -222,7 +224,7 @@ def log_weight_of(seen, stars, match, t, count, square, log_det):  # type: ignor
     )
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def most_log(seen, stars, count, compared):  # type: ignore[no-untyped-def]
     """What a hypothesis of `count` stars can weigh at most, but for det N.
 

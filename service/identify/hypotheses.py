@@ -13,6 +13,7 @@ from service.identify import evidence
 from service.identify.fitting import fit, log_weight_of, weigh, weigh_without
 from service.identify.scene import within
 from service.sky.star_buckets import nearest
+from service.uncounted import borrowing, owning
 
 MATCH_GATE = 34.0
 """In sigmas: how far a star may lie from where a hypothesis's attitude puts it."""
@@ -27,7 +28,7 @@ RIVAL_PROBABILITY = 1e-3
 """A star at least this likely is named among the rivals of one that is not unique."""
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def known(match, ledger, count, table):  # type: ignore[no-untyped-def]
     """Whether the ledger holds this hypothesis."""
     if count <= FEW:
@@ -43,7 +44,7 @@ def known(match, ledger, count, table):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def _same(match, ledger, h):  # type: ignore[no-untyped-def]
     """Whether hypothesis h of the ledger names the same stars."""
     for k in range(len(match)):  # noqa: SIM110 - compiled, without a generator
@@ -52,7 +53,7 @@ def _same(match, ledger, h):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def _hash(match):  # type: ignore[no-untyped-def]
     """A number that scatters hypotheses, also those that differ in one star."""
     hashed = 0
@@ -61,7 +62,7 @@ def _hash(match):  # type: ignore[no-untyped-def]
     return hashed ^ (hashed >> 17)
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def _enter(ledger, h, table):  # type: ignore[no-untyped-def]
     """Write where the ledger has hypothesis h into the table by hash."""
     at = _hash(ledger[h]) & (len(table) - 1)
@@ -70,7 +71,7 @@ def _enter(ledger, h, table):  # type: ignore[no-untyped-def]
     table[at] = h
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def part_of(match, whole):  # type: ignore[no-untyped-def]
     """Whether every star of a match is the same in another."""
     apart = 0
@@ -79,14 +80,20 @@ def part_of(match, whole):  # type: ignore[no-untyped-def]
     return apart == 0
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def log_sum(a, b):  # type: ignore[no-untyped-def]
     """ln(e^a + e^b)."""
     top = max(a, b)
     return top if top == -math.inf else top + math.log(math.exp(a - top) + math.exp(b - top))
 
 
-@njit(cache=True, nogil=True)
+@owning
+def _smallest(values, at):  # type: ignore[no-untyped-def]
+    """The value before which so many are smaller."""
+    return np.partition(values, at)[at]
+
+
+@borrowing
 def keep(match, value, ledger, log_weight, count, rest, table, range_kept, leader):  # type: ignore[no-untyped-def]
     """Keep a weighed hypothesis, the heaviest also as the `leader` (n,).
 
@@ -98,16 +105,19 @@ def keep(match, value, ledger, log_weight, count, rest, table, range_kept, leade
         return count, log_sum(rest, value)
     if value > range_kept[1]:
         range_kept[1] = value
-        leader[:] = match
+        for k in range(len(match)):
+            leader[k] = match[k]
     if count == len(log_weight):
         quarter = count // 4
-        floor = range_kept[0] = np.partition(log_weight, quarter)[quarter]
+        floor = range_kept[0] = _smallest(log_weight, quarter)
         stay = 0
         for h in range(count):
             if log_weight[h] <= floor and h - stay <= quarter:
                 rest = log_sum(rest, log_weight[h])
                 continue
-            ledger[stay], log_weight[stay] = ledger[h], log_weight[h]
+            for k in range(len(match)):
+                ledger[stay, k] = ledger[h, k]
+            log_weight[stay] = log_weight[h]
             stay += 1
         count = stay
         table[:] = -1
@@ -115,7 +125,9 @@ def keep(match, value, ledger, log_weight, count, rest, table, range_kept, leade
             _enter(ledger, h, table)
         if value <= floor:
             return count, log_sum(rest, value)
-    ledger[count], log_weight[count] = match, value
+    for k in range(len(match)):
+        ledger[count, k] = match[k]
+    log_weight[count] = value
     if count > FEW:
         _enter(ledger, count, table)
     elif count == FEW:
@@ -125,7 +137,7 @@ def keep(match, value, ledger, log_weight, count, rest, table, range_kept, leade
     return count + 1, rest
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def consider(seen, stars, match, scratch, ledger, log_weight, count, rest, best):  # type: ignore[no-untyped-def]
     """Fit a hypothesis, match all stars anew at its attitude, weigh it and what stands next to it.
 
@@ -183,7 +195,7 @@ def consider(seen, stars, match, scratch, ledger, log_weight, count, rest, best)
     return count, rest, best, work, not misfit
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def _names(match, row):  # type: ignore[no-untyped-def]
     """Whether a match has this zone star."""
     for one in match:  # noqa: SIM110 - compiled, without a generator
@@ -192,7 +204,7 @@ def _names(match, row):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def _neighbours_are_rare(seen, stars):  # type: ignore[no-untyped-def]
     """Whether chance hardly ever puts a star of the zone within the widest scale of noise.
 

@@ -19,6 +19,7 @@ from service.identify.scene import PREDICTION_GATE, polar_difference, with_magni
 from service.identify.two_stars import MAX_WORK
 from service.sky.star_buckets import nearest
 from service.sky.star_voxels import level_for, star_within_reach
+from service.uncounted import borrowing
 
 MAX_THIRDS = 8
 """So many stars, those that a pair fixes best, are tried with it where all together do not fit."""
@@ -28,7 +29,7 @@ HOPED = 12.0
 """A hypothesis of all stars is hoped to be lighter than it could be by no more than this."""
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def most_of(count, seen, stars, most):  # type: ignore[no-untyped-def]
     """What so many stars can weigh at most, but for det N, worked out once in a search."""
     if np.isnan(most[count]):
@@ -297,7 +298,7 @@ def _nearest_to_predicted(stars, scratch, a, b, k, taken):  # type: ignore[no-un
     return one if one >= 0 and within(one, stars) else -1
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def _half_log_det(seen, i, j, order, others):  # type: ignore[no-untyped-def]
     """The least of 1/2 ln det N of stars i and j and one of the others; more stars only add."""
     least = math.inf
@@ -321,7 +322,7 @@ def _half_log_det(seen, i, j, order, others):  # type: ignore[no-untyped-def]
     return 0.5 * math.log(max(least, 1e-30))
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def _test(scratch, others, at):  # type: ignore[no-untyped-def]
     """How one of the others in order is predicted, and its level of voxels, -1 where none tells."""
     if at >= others:
@@ -346,7 +347,7 @@ def _missing(voxels, test, u0, u1, u2, v0, v1, v2, w0, w1, w2):  # type: ignore[
     )
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def _fewest(seen, stars, others, lost, best, most):  # type: ignore[no-untyped-def]
     """The fewest stars with which a candidate matters beside the best.
 
@@ -358,7 +359,7 @@ def _fewest(seen, stars, others, lost, best, most):  # type: ignore[no-untyped-d
     return fewest
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def _predictors(seen, group_of, i, j, scratch):  # type: ignore[no-untyped-def]
     """Write every star of other groups as alpha V_i + beta V_j + gamma V_i x V_j.
 

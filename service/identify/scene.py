@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from service.sky.pairs import separation_rad
+from service.uncounted import borrowing
 
 MAX_HYPOTHESES = 2048
 """Kept of a search, a power of two; lighter ones are only added up."""
@@ -144,7 +145,7 @@ def scratch_for(n):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def with_magnitude(seen):  # type: ignore[no-untyped-def]
     """How many of the observed stars have a magnitude."""
     count = 0
@@ -154,7 +155,7 @@ def with_magnitude(seen):  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def within(row, stars):  # type: ignore[no-untyped-def]
     """Whether a zone star lies within the exact bounds."""
     if stars.polar[row] < 0.0:
@@ -176,7 +177,7 @@ def log_density(direction, axis, least, most):  # type: ignore[no-untyped-def]
     return math.log(max(inside, 1) / area)
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def polar_difference(seen, i, j, tilt):  # type: ignore[no-untyped-def]
     """The angle of star i to the axis less that of star j, and how far noise and a tilt move it.
 

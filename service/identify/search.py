@@ -23,7 +23,7 @@ from service.identify.scan import most_of, scan
 from service.identify.scene import MAX_SEEDS, PREDICTION_GATE, scratch_for, with_magnitude
 from service.identify.two_stars import MAX_WORK, two_stars
 from service.sky.pairs import separation_rad
-from service.uncounted import uncounted
+from service.uncounted import borrowing, owning
 
 SHORT_PAIR_RAD = math.radians(0.35)
 CHANCE_PER_STAR, CHANCE_MARGIN = math.log(3.0), 12.0
@@ -43,11 +43,9 @@ def search(seen, stars, pairs, exhaustive, ledger, log_weight):  # type: ignore[
     return search_in(scratch, seen, stars, pairs, exhaustive, ledger, log_weight)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@borrowing
 def search_in(scratch, seen, stars, pairs, exhaustive, ledger, log_weight):  # type: ignore[no-untyped-def]
     """As `search`, in the arrays of `scratch_for`, which a caller with many views makes once."""
-    seen, stars, pairs = uncounted(seen), uncounted(stars), uncounted(pairs)
-    scratch, ledger, log_weight = uncounted(scratch), uncounted(ledger), uncounted(log_weight)
     n = len(seen.observed)
     scratch.most[:] = np.nan
     scratch.range_kept[:] = -math.inf
@@ -127,7 +125,7 @@ def search_in(scratch, seen, stars, pairs, exhaustive, ledger, log_weight):  # t
     )
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def _most_unseen(  # type: ignore[no-untyped-def]
     seen, stars, groups, group, first_pair, last_pair, separation, scratch
 ):
@@ -151,7 +149,7 @@ def _most_unseen(  # type: ignore[no-untyped-def]
     return most_of(count, seen, stars, scratch.most) - math.log(sine) + math.log(max(candidates, 1))
 
 
-@njit(cache=True, nogil=True)
+@owning
 def _choose_seeds(magnitude, seeds):  # type: ignore[no-untyped-def]
     """The stars whose pairs are scanned: all, or the brightest; those without a magnitude last."""
     if len(magnitude) <= MAX_SEEDS:
@@ -162,7 +160,7 @@ def _choose_seeds(magnitude, seeds):  # type: ignore[no-untyped-def]
     seeds[:] = np.sort(ranked[:MAX_SEEDS])
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def _candidates(seen, seeds, pairs, first, last, separation):  # type: ignore[no-untyped-def]
     """Per pair of seeds the range of candidate pairs by separation, and the separation."""
     s = len(seeds)
@@ -176,7 +174,7 @@ def _candidates(seen, seeds, pairs, first, last, separation):  # type: ignore[no
             separation[x, y] = angle
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def _first_at(angle, pairs):  # type: ignore[no-untyped-def]
     """The first pair not closer than an angle."""
     k = min(max(int(angle * pairs.bins_per_rad), 0), len(pairs.bin_start) - 1)
@@ -188,7 +186,7 @@ def _first_at(angle, pairs):  # type: ignore[no-untyped-def]
     return at
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def _cheapest(group, first, last, separation, cost):  # type: ignore[no-untyped-def]
     """The two groups whose cross pairs cost least to scan.
 

@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from service.identify import evidence
 from service.identify.evidence import PRIOR_ROTATION
@@ -11,12 +10,13 @@ from service.identify.fitting import most_log, weigh
 from service.identify.hypotheses import NEGLIGIBLE, keep, known, log_sum
 from service.identify.scene import polar_difference, within
 from service.sky.pairs import separation_rad
+from service.uncounted import borrowing
 
 MAX_WORK = 20_000_000
 """Stars looked up and fitted, at most, for one tracker: a second or two."""
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def two_stars(  # type: ignore[no-untyped-def]
     seen,
     stars,
@@ -111,7 +111,7 @@ def two_stars(  # type: ignore[no-untyped-def]
     return count, rest, work, False
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def _farthest(least, kind):  # type: ignore[no-untyped-def]
     """The largest angle, to a thousandth, at which the prior's logarithm reaches so much."""
     low, high = 0.0, math.pi
