@@ -40,8 +40,9 @@ TITLES = {
 }
 ABOUT = {
     "kernels": (
-        "`many` runs the compiled kernels over batches of one zone in one compiled loop, `one` "
-        "calls them from Python batch by batch as the service does. The bare kernels "
+        "`many` runs the compiled kernels over batches of one zone in one compiled loop, all that "
+        "they write to given; `one` calls them from Python batch by batch as the service does, "
+        "which makes it for each. The bare kernels "
         "(`benchmarks/bare.py`) do the same work with every array ready and nothing that can be "
         "switched off; they name the same stars and find the same quaternions. At most 1.5 times "
         "the bare kernel in many, at most 3 in single calls in a cap, and for the pairs at most "

@@ -18,15 +18,17 @@ def borrowing(kernel: Callable[..., Any]) -> Any:
     """Compile a kernel that counts nothing, since its caller holds all that it is given.
 
     Without numba's runtime it cannot make an array either: one that tries to
-    does not compile.  Never for what returns an array.
+    does not compile.  Only for what returns no array, and calls nothing that
+    returns one: nobody would ever let go of it.
     """
     return _compiled(kernel, error_model="numpy", _nrt=False)
 
 
 def owning(kernel: Callable[..., Any]) -> Any:
-    """Compile what makes arrays although a kernel that borrows calls it.
+    """Compile what makes arrays for itself although a kernel that borrows calls it.
 
-    It would be compiled as its caller is, had it not said so itself.
+    It would be compiled as its caller is, had it not said so itself.  It
+    returns numbers alone, as that does.
     """
     return _compiled(kernel, _nrt=True)
 

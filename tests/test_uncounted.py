@@ -9,12 +9,11 @@ from numba.core.errors import NumbaError
 
 from service.attitude.kernels import information, quest
 from service.identify.fov_rotation import rotation_rad
-from service.uncounted import borrowing
+from service.uncounted import borrowing, uncounted
 from service.vectors import unit
 
 
-def test_what_borrows_leaves_the_counts_of_its_caller_alone() -> None:
-    rng = np.random.default_rng(8)
+def test_what_borrows_leaves_the_counts_of_its_caller_alone(rng):
     vectors, weights = unit(rng.normal(size=(5, 3))), np.ones(5)
     quaternion, room, start = np.empty(4), np.empty((3, 3, 3)), np.array([0.0, 0.0, 0.0, 1.0])
     held = (vectors, weights, quaternion, room, start)
@@ -26,9 +25,9 @@ def test_what_borrows_leaves_the_counts_of_its_caller_alone() -> None:
     assert [sys.getrefcount(array) for array in held] == before
 
 
-def test_what_is_made_by_who_calls_outlives_what_borrows() -> None:
+def test_what_its_caller_made_is_there_as_long_as_it_runs():
     @borrowing
-    def total(rows):  # type: ignore[no-untyped-def]
+    def total(rows):
         found = 0.0
         for row in rows:
             for value in row:
@@ -36,19 +35,20 @@ def test_what_is_made_by_who_calls_outlives_what_borrows() -> None:
         return found
 
     @njit
-    def of_new_arrays(n):  # type: ignore[no-untyped-def]
+    def of_new_arrays(n):
         found = 0.0
         for k in range(n):
             made = np.full((3, 4), float(k))
-            found += total(made) - total(made[1:])
+            lent = uncounted(made)
+            found += total(made) - total(lent[1:])
         return found
 
     assert of_new_arrays(1_000) == sum(4.0 * k for k in range(1_000))
 
 
-def test_what_borrows_cannot_make_an_array() -> None:
+def test_what_borrows_cannot_make_an_array():
     @borrowing
-    def makes(n):  # type: ignore[no-untyped-def]
+    def makes(n):
         return np.empty(n)[0]
 
     with pytest.raises(NumbaError):

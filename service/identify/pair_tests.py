@@ -1,7 +1,7 @@
 """STARID, steps 1 to 10: which candidate pairs survive, and the votes that they cast.
 
 Source: Fink & Shoup 1994, sections 2.1 and 2.2.  The names of the paper stand
-in the comments.  The kernel allocates little, holds no state and releases the
+in the comments.  The kernel allocates nothing, holds no state and releases the
 interpreter's lock.
 """
 
@@ -175,10 +175,14 @@ def cast_votes(  # type: ignore[no-untyped-def]
                     # Of both orders, where nothing told one, that which turns little stays.
                     along, against = order >= 0, order <= 0
                     if along:
-                        turn = _rotation(observed, i, j, star, a, b, boresight, axis, is_band)
+                        turn = rotation_rad(
+                            observed[i], observed[j], star[a], star[b], boresight, axis, is_band
+                        )
                         along = turn <= rotation_tolerance
                     if against:
-                        turn = _rotation(observed, i, j, star, b, a, boresight, axis, is_band)
+                        turn = rotation_rad(
+                            observed[i], observed[j], star[b], star[a], boresight, axis, is_band
+                        )
                         against = turn <= rotation_tolerance
                     if not (along or against):
                         continue
@@ -199,12 +203,6 @@ def cast_votes(  # type: ignore[no-untyped-def]
                         edges[kept, 0], edges[kept, 1] = i, b
                         edges[kept, 2], edges[kept, 3] = j, a
                         kept += 1
-
-
-@borrowing
-def _rotation(observed, i, j, star, a, b, boresight, axis, is_band):  # type: ignore[no-untyped-def]
-    """`rotation_rad` of rows; where `cast_votes` cut them out, it would count references."""
-    return rotation_rad(observed[i], observed[j], star[a], star[b], boresight, axis, is_band)
 
 
 @borrowing

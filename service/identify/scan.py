@@ -388,7 +388,7 @@ def _predictors(seen, group_of, i, j, scratch):  # type: ignore[no-untyped-def]
         alpha = (di - cosine * dj) / sine2
         beta = (dj - cosine * di) / sine2
         gamma = (v[0] * c0 + v[1] * c1 + v[2] * c2) / sine2
-        parts[k] = alpha, beta, gamma
+        parts[k, 0], parts[k, 1], parts[k, 2] = alpha, beta, gamma
         spread = (
             sigma_rad[k] ** 2
             + (alpha**2 + gamma**2) * sigma_rad[i] ** 2

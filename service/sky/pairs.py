@@ -12,6 +12,7 @@ import numpy.typing as npt
 from numba import njit
 
 from service.errors import BadInput, Fault
+from service.uncounted import borrowing
 from service.vectors import Vector, read_only
 
 Indices = npt.NDArray[np.int32]
@@ -95,7 +96,7 @@ def build_pairs(direction: Vector, separation_max_deg: float) -> PairIndex:
     return PairIndex(read_only(separation), read_only(rows), read_only(bin_start), bins_per_rad)
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def separation_rad(a, b):  # type: ignore[no-untyped-def]
     """Angle in radians between two unit vectors, accurate from zero to a half turn."""
     dx, dy, dz = a[0] - b[0], a[1] - b[1], a[2] - b[2]

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from service.uncounted import borrowing
 from service.vectors import Vector, read_only
 
 CELL = 0.004
@@ -71,7 +71,7 @@ def build_star_buckets(direction: Vector) -> StarBuckets:
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@borrowing
 def cells_about(x, y, z, gate):  # type: ignore[no-untyped-def]
     """The face of a direction and the block of cells within `gate` radians of it.
 
@@ -97,7 +97,7 @@ def cells_about(x, y, z, gate):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@borrowing
 def nearest(px, py, pz, gate, start, rows, direction, used, taken):  # type: ignore[no-untyped-def]
     """The two stars nearest to a direction within `gate` radians, -1 where there is none.
 

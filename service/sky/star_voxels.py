@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from service.uncounted import borrowing
 from service.vectors import Vector, read_only
 
 REACH_RAD = 4.5e-4 * 2.0 ** (0.5 * np.arange(7))
@@ -33,7 +34,7 @@ def build_star_voxels(direction: Vector) -> Bits:
     return read_only(bits)
 
 
-@njit(cache=True, nogil=True)
+@borrowing
 def level_for(gate):  # type: ignore[no-untyped-def]
     """The finest level that reaches as far as a gate in radians, -1 where none does."""
     for level in range(len(REACH_RAD)):
