@@ -55,6 +55,7 @@ def _uncounted(_: Any, held: Any) -> Any:
                 value = builder.insert_value(value, freed, at)
         return value
 
+    # numba gives `signature` no types.
     return signature(held, held), generate  # type: ignore[no-untyped-call]
 
 

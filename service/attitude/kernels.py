@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from service.uncounted import borrowing
-from service.vectors import ARCSEC_PER_RADIAN
+from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector
 
 NEWTON_STEPS = 30
 POLISHING_STEPS = 10
@@ -313,7 +313,17 @@ def _polish(b, r, weights, q, room):  # type: ignore[no-untyped-def]
 
 
 @borrowing
-def solve(b, r, weights, worst_rad, quaternions, covariance, squares, sums, room):  # type: ignore[no-untyped-def]
+def solve(
+    b: Vector,
+    r: Vector,
+    weights: Vector,
+    worst_rad: float,
+    quaternions: Vector,
+    covariance: Matrix,
+    squares: Vector,
+    sums: Vector,
+    room: Vector,
+) -> bool:
     """TRIAD into row 0 of `quaternions` (3, 4), QUEST into row 1, the covariance (3, 3) in rad^2.
 
     `squares` (2, n) gets the squared residuals |b - A r|^2 of either, `sums`

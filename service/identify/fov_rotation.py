@@ -12,10 +12,22 @@ the turned boresight, between the pole and where the turn would put it.
 import math
 
 from service.uncounted import borrowing
+from service.vectors import Vector
+
+Triple = tuple[float, float, float]
+Frame = tuple[Triple, Triple, Triple]
 
 
 @borrowing
-def rotation_rad(first, second, a, b, boresight, axis, is_band):  # type: ignore[no-untyped-def]
+def rotation_rad(
+    first: Vector,
+    second: Vector,
+    a: Vector,
+    b: Vector,
+    boresight: Vector,
+    axis: Vector,
+    is_band: bool,
+) -> float:
     """The rotation about the boresight, 0 to pi, if `first` is candidate `a` and `second` is `b`.
 
     All are unit vectors, inertial through the a priori attitude, of whose arrays
@@ -41,7 +53,7 @@ def rotation_rad(first, second, a, b, boresight, axis, is_band):  # type: ignore
 
 
 @borrowing
-def _frame(first, second):  # type: ignore[no-untyped-def]
+def _frame(first: Vector, second: Vector) -> Frame:
     """The middle of two unit vectors, the direction from one to the other, and their normal."""
     middle = first[0] + second[0], first[1] + second[1], first[2] + second[2]
     along = second[0] - first[0], second[1] - first[1], second[2] - first[2]
@@ -50,7 +62,7 @@ def _frame(first, second):  # type: ignore[no-untyped-def]
 
 
 @borrowing
-def _carried(v, observed, candidate):  # type: ignore[no-untyped-def]
+def _carried(v: Triple, observed: Frame, candidate: Frame) -> Triple:
     """The vector, turned as the observed frame is turned to the candidate's."""
     x, y, z = _dot(observed[0], v), _dot(observed[1], v), _dot(observed[2], v)
     one, two, three = candidate
@@ -62,21 +74,21 @@ def _carried(v, observed, candidate):  # type: ignore[no-untyped-def]
 
 
 @borrowing
-def _unit(v):  # type: ignore[no-untyped-def]
+def _unit(v: Triple) -> Triple:
     norm = math.sqrt(_dot(v, v))
     return v[0] / norm, v[1] / norm, v[2] / norm
 
 
 @borrowing
-def _less(v, share, w):  # type: ignore[no-untyped-def]
+def _less(v: Triple, share: float, w: Triple) -> Triple:
     return v[0] - share * w[0], v[1] - share * w[1], v[2] - share * w[2]
 
 
 @borrowing
-def _dot(v, w):  # type: ignore[no-untyped-def]
+def _dot(v: Triple, w: Triple) -> float:
     return v[0] * w[0] + v[1] * w[1] + v[2] * w[2]
 
 
 @borrowing
-def _cross(v, w):  # type: ignore[no-untyped-def]
+def _cross(v: Triple, w: Triple) -> Triple:
     return v[1] * w[2] - v[2] * w[1], v[2] * w[0] - v[0] * w[2], v[0] * w[1] - v[1] * w[0]

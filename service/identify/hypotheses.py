@@ -14,6 +14,7 @@ from service.identify.fitting import fit, log_weight_of, weigh, weigh_without
 from service.identify.scene import within
 from service.sky.star_buckets import nearest
 from service.uncounted import borrowing, owning
+from service.vectors import Vector
 
 MATCH_GATE = 34.0
 """In sigmas: how far a star may lie from where a hypothesis's attitude puts it."""
@@ -88,9 +89,10 @@ def log_sum(a, b):  # type: ignore[no-untyped-def]
 
 
 @owning
-def _smallest(values, at):  # type: ignore[no-untyped-def]
+def _smallest(values: Vector, at: int) -> float:
     """The value before which so many are smaller."""
-    return np.partition(values, at)[at]
+    found: float = np.partition(values, at)[at]
+    return found
 
 
 @borrowing
