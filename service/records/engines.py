@@ -22,6 +22,8 @@ from service.errors import BadConfiguration
 BUSY_TIMEOUT_MS = 10_000
 WRITER_CACHE_KIB = 32_768
 """Of pages: the inner ones of every index are read with each batch."""
+TO_WRITE, TO_READ = "BEGIN IMMEDIATE", "BEGIN"
+"""How SQLite begins a transaction of the one connection that writes, and of a reader."""
 MAX_POSTGRESQL_READERS = 16
 """A server allows a hundred connections as it comes; whoever finds none free waits for one."""
 
@@ -63,9 +65,7 @@ def writing_engine(url: URL) -> Engine:
     kept = ("temp_store = MEMORY", f"cache_size = -{WRITER_CACHE_KIB}")
     # The log goes into the file after a thousand pages, as SQLite has it: whoever writes waits for
     # that, of four thousand 20 ms, and nothing is gained.
-    _set_up_sqlite(
-        engine, "journal_mode = WAL", "synchronous = FULL", *kept, begin="BEGIN IMMEDIATE"
-    )
+    _set_up_sqlite(engine, "journal_mode = WAL", "synchronous = FULL", *kept, begin=TO_WRITE)
     return engine
 
 
@@ -79,7 +79,7 @@ def reading_engine(url: URL) -> Engine:
         engine = _postgresql(url, pool_size=MAX_POSTGRESQL_READERS, max_overflow=0)
         return engine.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
     engine = create_engine(url, poolclass=QueuePool, pool_size=0)
-    _set_up_sqlite(engine, "query_only = ON", begin="BEGIN")
+    _set_up_sqlite(engine, "query_only = ON", begin=TO_READ)
     return engine
 
 
@@ -111,55 +111,127 @@ def _set_up_sqlite(engine: Engine, *pragmas: str, begin: str) -> None:
 
     @event.listens_for(engine, "begin")
     def _begun(connection: Connection) -> None:
-        # To the driver itself: by way of SQLAlchemy it takes ten times as long.
-        with reported(connection, begin) as driver:
-            driver.execute(begin)
+        # Where `Kept` has begun, SQLAlchemy takes part in what is going on.
+        if not driver_of(connection).in_transaction:
+            _tell(connection, begin)
 
 
-@contextmanager
-def reported(connection: Connection, sql: str) -> Iterator[sqlite3.Connection]:
-    """The driver's connection; what it says against a statement is raised as SQLAlchemy would."""
+def driver_of(connection: Connection) -> sqlite3.Connection:
+    """The driver's connection to SQLite."""
     driver = connection.connection.driver_connection
     assert isinstance(driver, sqlite3.Connection)
-    try:
-        yield driver
-    except sqlite3.Error as error:
-        raise DBAPIError.instance(
-            sql, None, error, sqlite3.Error, dialect=connection.dialect
-        ) from error
+    return driver
+
+
+class reported:  # noqa: N801 - it stands where a function that gives a context would
+    """What SQLite's driver says against a statement is raised as SQLAlchemy would."""
+
+    __slots__ = ("_connection", "_sql")
+
+    def __init__(self, connection: Connection, sql: str) -> None:
+        self._connection, self._sql = connection, sql
+
+    def __enter__(self) -> sqlite3.Connection:
+        return driver_of(self._connection)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: object
+    ) -> None:
+        if isinstance(error, sqlite3.Error):
+            raise DBAPIError.instance(
+                self._sql, None, error, sqlite3.Error, dialect=self._connection.dialect
+            ) from error
+
+
+def _tell(connection: Connection, sql: str) -> None:
+    with reported(connection, sql) as driver:
+        driver.execute(sql)
+
+
+class TakenBack(Exception):
+    """Ends a transaction that is to leave nothing behind, and with which nothing is wrong."""
 
 
 class Kept:
     """A connection to SQLite that stays open between its transactions, one at a time.
 
     To take one out of a pool and put it back takes as long as to look a batch
-    up.  A connection to a server comes from the pool each time, which sees
-    whether it is still there.
+    up, and so do SQLAlchemy's own steps about a transaction: SQLite's driver is
+    told by itself when one begins and ends.  A connection to a server comes from
+    the pool each time, which sees whether it is still there.
     """
 
-    def __init__(self, engine: Engine) -> None:
+    def __init__(self, engine: Engine, begin: str) -> None:
+        """`begin` is SQLite's statement for it."""
         self._engine = engine
+        self._begin = begin
+        self._is_sqlite = engine.dialect.name == "sqlite"
         self._lock = threading.Lock()
         self._open: Connection | None = None
 
     @contextmanager
     def transaction(self) -> Iterator[Connection]:
-        """A transaction, committed at the end; after an error the connection is given up."""
+        """A transaction, committed at the end; after an error the connection is given up.
+
+        After `TakenBack` it is not: nothing is wrong with it.
+        """
+        with self._given() as connection:
+            self._start(connection)
+            try:
+                yield connection
+            except TakenBack:
+                self._end(connection, "ROLLBACK")
+                raise
+            self._end(connection, "COMMIT")
+
+    @contextmanager
+    def looking(self) -> Iterator[Connection]:
+        """A connection to read by; on SQLite each statement of `prepared` sees its own moment."""
+        with self._given() as connection:
+            if not self._is_sqlite:
+                connection.begin()
+            yield connection
+            # SQLAlchemy begins one for what it is asked itself.
+            if connection.in_transaction():
+                connection.rollback()
+
+    @contextmanager
+    def _given(self) -> Iterator[Connection]:
         with self._lock:
             connection = self._open or self._engine.connect()
             self._open = None
             try:
-                with connection.begin():
-                    yield connection
+                yield connection
+            except TakenBack:
+                self._keep(connection)
+                raise
             except BaseException:
                 # The next transaction shall not inherit what this one broke.
                 connection.invalidate()
                 connection.close()
                 raise
-            if self._engine.dialect.name == "sqlite":
-                self._open = connection
-            else:
-                connection.close()
+            self._keep(connection)
+
+    def _keep(self, connection: Connection) -> None:
+        if self._is_sqlite:
+            self._open = connection
+        else:
+            connection.close()
+
+    def _start(self, connection: Connection) -> None:
+        if self._is_sqlite:
+            _tell(connection, self._begin)
+        else:
+            connection.begin()
+
+    def _end(self, connection: Connection, how: str) -> None:
+        # On SQLite SQLAlchemy takes part once it was asked for something.
+        if not connection.in_transaction():
+            _tell(connection, how)
+        elif how == "COMMIT":
+            connection.commit()
+        else:
+            connection.rollback()
 
     def close(self) -> None:
         """Give the connection back."""

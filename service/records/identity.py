@@ -1,10 +1,10 @@
 """Who was first: which batches and Idempotency-Keys are recorded, and with what body."""
 
-import json
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
 from msgspec import Struct
 from sqlalchemy import Connection, insert
 
@@ -101,7 +101,7 @@ def look_up(
 
 
 def _rows(connection: Connection, sql: str, wanted: Collection[object]) -> Iterable[Any]:
-    return execute(connection, sql, {"wanted": json.dumps(list(wanted))})
+    return execute(connection, sql, {"wanted": msgspec.json.encode(list(wanted)).decode()})
 
 
 def remember_key(connection: Connection, identity: Identity, key: str, taken: Taken) -> None:

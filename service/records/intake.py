@@ -249,10 +249,16 @@ class Intake:
                 _holder(registry, each.identity, each.key, each.submission.fingerprint)
                 for each in orders
             ]
-            repeats = {each.result_id for each in holders if isinstance(each, Taken)}
-            stored = stored_answers(connection, repeats)
+        repeats = {each.result_id for each in holders if isinstance(each, Taken)}
+        stored: Mapping[str, bytes] = {}
+        if repeats:
+            with self._store.reading() as connection:
+                stored = stored_answers(connection, repeats)
         found: list[Answered | AcquisitionError | None] = []
         for order, holder in zip(orders, holders, strict=True):
+            if isinstance(holder, Taken) and holder.result_id not in stored:
+                # It was pruned in between: the batch is as new as any other.
+                holder = None
             if not isinstance(holder, Taken):
                 found.append(holder)
                 continue

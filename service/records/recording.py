@@ -25,6 +25,9 @@ from service.records.watching import watch
 
 Outcome = Answered | AcquisitionError
 
+_RUNS = "runs"
+"""Where a connection remembers the runs that it has inserted."""
+
 
 def register(connection: Connection, mission_rows: Sequence[Row], catalog_row: Row) -> None:
     """Note the settings and the catalog that results will name, unless they are known already."""
@@ -48,7 +51,7 @@ def watch_run(connection: Connection, run: str, watched: bool, now: str) -> None
     connection.execute(update(runs).where(runs.c.name == run).values(alarms=watched))
 
 
-def record(connection: Connection, drafts: Sequence[Draft]) -> list[Outcome]:
+def record(connection: Connection, drafts: Sequence[Draft], unseen: bool = False) -> list[Outcome]:
     """Record what is new among the drafts; one outcome each, in order.
 
     Look, then insert: a submission that is already there, in the tables or
@@ -56,12 +59,17 @@ def record(connection: Connection, drafts: Sequence[Draft]) -> list[Outcome]:
     key is taken by another body gets the error.  On PostgreSQL another process
     may still insert between the two: then an `IntegrityError` is raised, and
     to call again is to look again.
+
+    Who looked a moment ago, and found none of them, calls them `unseen`: the
+    tables are not asked again.  If something came meanwhile the same error is raised.
     """
-    registry = look_up(
-        connection,
-        {draft.identity for draft in drafts if draft.batch is not None},
-        {draft.key for draft in drafts if draft.key is not None},
-    )
+    registry = Registry()
+    if not unseen:
+        registry = look_up(
+            connection,
+            {draft.identity for draft in drafts if draft.batch is not None},
+            {draft.key for draft in drafts if draft.key is not None},
+        )
     keys_before = set(registry.keys)
     holders: list[Taken | AcquisitionError] = [_holder(draft, registry) for draft in drafts]
     fresh = [
@@ -69,7 +77,7 @@ def record(connection: Connection, drafts: Sequence[Draft]) -> list[Outcome]:
         for draft, holder in zip(drafts, holders, strict=True)
         if isinstance(holder, Taken) and holder.result_id == draft.id
     ]
-    _insert(connection, fresh)
+    _insert(connection, fresh, unseen)
     insert_all(
         connection,
         idempotency_keys,
@@ -104,18 +112,22 @@ def _holder(draft: Draft, registry: Registry) -> Taken | AcquisitionError:
     return taken
 
 
-def _insert(connection: Connection, fresh: Sequence[tuple[Draft, bytes]]) -> None:
+def _insert(connection: Connection, fresh: Sequence[tuple[Draft, bytes]], unseen: bool) -> None:
     # Sorted, so that two processes that insert the same batches do not wait in a circle.
     firsts = sorted(
         ((draft, body) for draft, body in fresh if draft.batch is not None),
         key=lambda each: each[0].identity,
     )
     names = {draft.answer["run"]: draft.batch["received"] for draft, _ in firsts if draft.batch}
+    # A run that is not there after all keeps its batches from being inserted.
+    known: set[str] = connection.info.setdefault(_RUNS, set())
+    missing = [name for name in sorted(names) if not unseen or name not in known]
     insert_missing(
         connection,
         runs,
-        [{"name": name, "created": names[name], "alarms": False} for name in sorted(names)],
+        [{"name": name, "created": names[name], "alarms": False} for name in missing],
     )
+    known.update(missing)
     insert_all(connection, batches, [draft.batch for draft, _ in firsts if draft.batch])
     insert_all(connection, frames, [draft.frame for draft, _ in firsts if draft.frame])
     _insert_results(connection, firsts)
@@ -156,10 +168,12 @@ def _tell(connection: Connection, fresh: Sequence[Draft]) -> None:
 
 
 def _insert_results(connection: Connection, drafts: Sequence[tuple[Draft, bytes]]) -> None:
-    rows = [draft.result | {"answer": body.decode()} for draft, body in drafts]
+    # In order of their ids, which rise: each goes to the end of its table.
+    in_order = sorted(drafts, key=lambda each: each[0].id)
+    rows = [draft.result | {"answer": body.decode()} for draft, body in in_order]
     insert_all(connection, results, rows)
-    insert_all(connection, star_results, [row for draft, _ in drafts for row in draft.stars])
-    insert_all(connection, solutions, [d.solution for d, _ in drafts if d.solution is not None])
+    insert_all(connection, star_results, [row for draft, _ in in_order for row in draft.stars])
+    insert_all(connection, solutions, [d.solution for d, _ in in_order if d.solution is not None])
 
 
 def _supersede(connection: Connection, draft: Draft) -> None:

@@ -10,7 +10,7 @@ from sqlalchemy.exc import DBAPIError, TimeoutError
 
 from service.errors import Busy
 from service.records.database import bring_up_to_date, require_up_to_date
-from service.records.engines import Kept, database_url, reading_engine, writing_engine
+from service.records.engines import TO_READ, Kept, database_url, reading_engine, writing_engine
 from service.records.transaction import may_pass
 from service.records.writer import RETRY_AFTER_S, Writer
 
@@ -27,7 +27,7 @@ class Readers:
         """Nothing is connected yet; raises `BadConfiguration` for what is no database's URL."""
         self.url = database_url(database)
         self._readers = reading_engine(self.url)
-        self._glances = Kept(self._readers)
+        self._glances = Kept(self._readers, TO_READ)
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
@@ -40,8 +40,11 @@ class Readers:
 
     @contextmanager
     def glancing(self) -> Iterator[Connection]:
-        """`reading` for a moment, again and again: others who glance wait for it."""
-        with _reported(), self._glances.transaction() as connection:
+        """`reading` for one statement of those that are prepared: others who glance wait for it.
+
+        What another one gives may be of another moment.
+        """
+        with _reported(), self._glances.looking() as connection:
             yield connection
 
     def close(self) -> None:

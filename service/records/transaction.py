@@ -19,6 +19,7 @@ from sqlalchemy.exc import (
 
 from service.records import events
 from service.records.draft import Draft
+from service.records.engines import TakenBack
 from service.records.prepared import execute
 from service.records.recording import Outcome, record
 
@@ -41,16 +42,45 @@ class Job:
         return len(self.drafts) or 1
 
 
+def transact_at_once(connection: Connection, jobs: Sequence[Job]) -> list[Any]:
+    """`transact` where there is nothing but drafts of what is new, in all likelihood.
+
+    Nothing is looked up again, and there is no savepoint, for which SQLite keeps what
+    every page was before.  Raises `TakenBack` where something failed: what is called
+    after that is `transact`.
+    """
+    if any(job.change for job in jobs):
+        return transact(connection, jobs)
+    try:
+        with events.numbered(connection):
+            return _shared_out(connection, record(connection, _drafts(jobs), unseen=True), jobs)
+    except Exception as error:
+        if is_of_the_database(error):
+            raise
+        raise TakenBack from error
+
+
 def transact(connection: Connection, jobs: Sequence[Job]) -> list[Any]:
     """One outcome for each job: a result, or the error that concerns it alone."""
     with events.numbered(connection):
-        recorded = iter(_record(connection, [draft for job in jobs for draft in job.drafts]))
-        return [
-            [next(recorded) for _ in job.drafts]
-            if job.change is None
-            else _change(connection, job.change)
-            for job in jobs
-        ]
+        return _shared_out(connection, _record(connection, _drafts(jobs)), jobs)
+
+
+def _drafts(jobs: Sequence[Job]) -> list[Draft]:
+    return [draft for job in jobs for draft in job.drafts]
+
+
+def _shared_out(
+    connection: Connection, recorded: Sequence[Outcome | Exception], jobs: Sequence[Job]
+) -> list[Any]:
+    """To each job what was recorded of its drafts, or what its change comes to."""
+    outcomes = iter(recorded)
+    return [
+        [next(outcomes) for _ in job.drafts]
+        if job.change is None
+        else _change(connection, job.change)
+        for job in jobs
+    ]
 
 
 def _record(connection: Connection, drafts: Sequence[Draft]) -> Results:

@@ -20,8 +20,14 @@ from sqlalchemy.exc import DBAPIError
 
 from service.errors import Busy, Stopping
 from service.records.draft import Draft
-from service.records.engines import Kept
-from service.records.transaction import Job, Results, is_of_the_database, transact
+from service.records.engines import TO_WRITE, Kept, TakenBack
+from service.records.transaction import (
+    Job,
+    Results,
+    is_of_the_database,
+    transact,
+    transact_at_once,
+)
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +46,7 @@ class Writer:
     """Writes what is queued, from one thread over one connection."""
 
     def __init__(self, engine: Engine, max_queued: int = MAX_QUEUED) -> None:
-        self._connection = Kept(engine)
+        self._connection = Kept(engine, TO_WRITE)
         self._max_queued = max_queued
         self._queue: deque[Job] = deque()
         self._patient: deque[Job] = deque()
@@ -171,8 +177,12 @@ class Writer:
 
     def _write(self, jobs: Sequence[Job], attempt: int = 1) -> list[Any]:
         try:
-            with self._connection.transaction() as connection:
-                return transact(connection, jobs)
+            try:
+                with self._connection.transaction() as connection:
+                    return transact_at_once(connection, jobs)
+            except TakenBack:
+                with self._connection.transaction() as connection:
+                    return transact(connection, jobs)
         except BaseException as error:
             crossed = getattr(getattr(error, "orig", None), "sqlstate", None) in _CROSSED
             if not crossed or attempt == MAX_ATTEMPTS:

@@ -24,6 +24,7 @@ from sqlalchemy import event
 from service.errors import Busy
 from service.observe.wire import submission_from_json
 from service.operations import Operations
+from service.records.engines import driver_of
 from service.settings import Settings
 
 PATIENCE_S = 60.0
@@ -37,7 +38,9 @@ def main(database, file, faults, seed):
     disk, draw = ctypes.CDLL(None), random.Random(int(seed))
     disk.faulty_struck.restype = ctypes.c_char_p
     operations = Operations.open(Settings(database=database))
-    event.listen(operations.store._writing, "begin", _checkpoint_often)
+    # The connection that is open, and those that come after a failure.
+    operations.store.writer.change(lambda c: _checkpoint_often(driver_of(c))).result()
+    event.listen(operations.store._writing, "connect", _checkpoint_often)
     lines = Path(file).read_bytes().splitlines()
     acknowledged, told_busy, kinds, reads_failed = {}, 0, Counter(), 0
 
@@ -91,8 +94,8 @@ def main(database, file, faults, seed):
     print(json.dumps(told))
 
 
-def _checkpoint_often(connection):
-    connection.connection.execute(f"PRAGMA wal_autocheckpoint = {LOG_PAGES}")
+def _checkpoint_often(driver, _record=None):
+    driver.execute(f"PRAGMA wal_autocheckpoint = {LOG_PAGES}")
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from sqlalchemy import event, func, insert, select
+from sqlalchemy import func, insert, select
 from sqlalchemy.exc import IntegrityError, OperationalError
 
 from service.errors import Busy, Stopping
@@ -34,6 +34,19 @@ def held_up(writer):
     return go_on
 
 
+def before_commit(store, monkeypatch, act):
+    """Have `act` called with the writer's connection before each of its commits."""
+    kept = store.writer._connection
+    end = kept._end
+
+    def acting(connection, how):
+        if how == "COMMIT":
+            act(connection)
+        end(connection, how)
+
+    monkeypatch.setattr(kept, "_end", acting)
+
+
 def new_run(name):
     return lambda connection: connection.execute(insert(runs).values(name=name, created="now"))
 
@@ -43,9 +56,9 @@ def names(store):
         return sorted(connection.scalars(select(runs.c.name)))
 
 
-def test_what_waits_together_is_committed_together(store):
+def test_what_waits_together_is_committed_together(store, monkeypatch):
     commits = []
-    event.listen(store._writing, "commit", commits.append)
+    before_commit(store, monkeypatch, commits.append)
     go_on = held_up(store.writer)
     waiting = [store.writer.change(new_run(f"run{i:02d}")) for i in range(20)]
     go_on.set()
@@ -131,16 +144,15 @@ def test_closing_writes_what_is_queued_and_refuses_the_rest(store):
 
 
 def test_a_commit_that_fails_reaches_everyone_who_waits_and_writing_goes_on(
-    operations, make, caplog
+    operations, make, caplog, monkeypatch
 ):
     """The hook stands for a disk that fails at COMMIT: nothing of the transaction is kept."""
     operations.submit(make("b0"))
-    engine = operations.store._writing
 
     def fail(_connection):
         raise OperationalError("COMMIT", {}, Exception("disk I/O error"))
 
-    event.listen(engine, "commit", fail)
+    before_commit(operations.store, monkeypatch, fail)
     with ThreadPoolExecutor(8) as threads:
         waiting = [threads.submit(operations.submit, make(f"b{i}")) for i in range(8)]
         errors = [each.exception(30) for each in waiting]
@@ -149,25 +161,26 @@ def test_a_commit_that_fails_reaches_everyone_who_waits_and_writing_goes_on(
     assert "disk" not in str(errors[1]), "what is inside is for the log alone"
     assert "disk I/O error" in caplog.text
     assert len(operations.batches().items) == 1
-    event.remove(engine, "commit", fail)
+    monkeypatch.undo()
     assert not any(operations.submit(make(f"b{i}")).replayed for i in range(1, 8))
     assert len(operations.batches().items) == 8
 
 
 @pytest.mark.parametrize("empty_database", ["sqlite"], indirect=True)
 def test_a_full_disk_loses_nothing_acknowledged_and_writing_resumes_with_room(
-    operations, make, caplog
+    operations, make, caplog, monkeypatch
 ):
     """SQLite's own bound on the file gives the error of a full disk, wherever it strikes."""
-    engine = operations.store._writing
-    limit = {"pages": 0}
+    kept, limit = operations.store.writer._connection, {"pages": 0}
+    start = kept._start
 
     def bound(connection):
+        start(connection)
         connection.connection.execute(f"PRAGMA max_page_count = {limit['pages']}")
 
     with operations.store.reading() as connection:
         used = connection.exec_driver_sql("PRAGMA page_count").scalar()
-    event.listen(engine, "begin", bound)
+    monkeypatch.setattr(kept, "_start", bound)
     acknowledged, refused = [], []
     for index in range(60):
         limit["pages"] = used + index  # a little more room each time
