@@ -33,7 +33,7 @@ from service.observe.wire import checked_from_json
 from service.operations import Operations
 from service.records.access import Access
 from service.records.draft import Answered
-from service.records.intake import Observer
+from service.records.intake import Observer, Recorded
 from service.records.store import Readers
 from service.records.tokens import Caller
 from service.settings import is_loopback
@@ -138,7 +138,10 @@ class Front(Operations):
 
         What is wrong with its form is said here, and nobody else is troubled with it.
         """
-        batch = checked_from_json(sent) if _is_soon_checked(sent) else sent
+        batch: bytes | tuple[str, str] = sent
+        if _is_soon_checked(sent):
+            checked = checked_from_json(sent)
+            batch = checked.text, checked.fingerprint
         loop = asyncio.get_running_loop()
         number = next(self._numbers)
         done: asyncio.Future[Answered] = loop.create_future()
@@ -205,10 +208,12 @@ class Front(Operations):
         """Pass on what the backend says."""
         if isinstance(message, Told):
             for observer in self._observers:
-                for recorded in message.recorded:
-                    observer(recorded)
-            for number, outcome in message.outcomes:
-                self._finish(number, outcome if isinstance(outcome, Exception) else None, outcome)
+                for fields in message.recorded:
+                    observer(Recorded(*fields))
+            for number, id, body, replayed in message.answered:
+                self._finish(number, None, Answered(id, body, replayed))
+            for number, error in message.failed:
+                self._finish(number, error, None)
             for listener in self._listeners:
                 listener()
         elif isinstance(message, Gave):

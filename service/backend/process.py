@@ -14,9 +14,12 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
-from service.backend.asked import Call, Close, Gave, Open, Opened, Outcome, Refused, Takes, Told
+from msgspec import structs
+
+from service.backend.asked import Call, Close, Gave, Open, Opened, Refused, Takes, Told
 from service.backend.channel import Channel, Files, Handed
 from service.errors import AcquisitionError
+from service.observe.wire import Checked
 from service.operations import Operations
 from service.records.draft import Answered
 from service.records.intake import Asked, Recorded
@@ -69,14 +72,12 @@ class Backend:
         self._files = files
         self._threads = ThreadPoolExecutor(THREADS, "call")
         self._lock = threading.Lock()
-        self._recorded: list[Recorded] = []
-        self._outcomes: list[Outcome] = []
-        self._news = False
+        self._telling = Told([], [], [], news=False)
         self._over = False
 
     def serve(self) -> None:
         """Do what is asked until the front says that it is over, or is gone."""
-        self._operations.observers.append(self._recorded.append)
+        self._operations.observers.append(self._note)
         self._operations.listen(self._tell_news)
         try:
             while not self._over:
@@ -99,7 +100,8 @@ class Backend:
         for message in messages:
             if isinstance(message, Takes):
                 for number, sent, key, caller in message.batches:
-                    batches.append(Asked(sent, key, partial(self._settle, number), caller))
+                    known = sent if isinstance(sent, bytes) else Checked(*sent)
+                    batches.append(Asked(known, key, partial(self._settle, number), caller))
             elif isinstance(message, Close):
                 self._over = True
                 # Another thread may have heard it than the one that waits for more.
@@ -108,23 +110,28 @@ class Backend:
                 self._threads.submit(self._call, message)
         return batches
 
-    def _settle(self, number: int, outcome: Answered | Exception) -> None:
-        if isinstance(outcome, Exception):
-            outcome = _portable(outcome)
+    def _note(self, recorded: Recorded) -> None:
         with self._lock:
-            self._outcomes.append((number, outcome))
+            self._telling.recorded.append(structs.astuple(recorded))
+
+    def _settle(self, number: int, outcome: Answered | Exception) -> None:
+        with self._lock:
+            if isinstance(outcome, Exception):
+                self._telling.failed.append((number, _portable(outcome)))
+            else:
+                told = (number, outcome.id, outcome.body, outcome.replayed)
+                self._telling.answered.append(told)
 
     def _tell_news(self) -> None:
-        self._news = True
+        with self._lock:
+            self._telling.news = True
         self._tell()
 
     def _tell(self) -> None:
         """Tell the front what there is to tell, all at once."""
         with self._lock:
-            told = Told(self._recorded[:], self._outcomes, self._news)
-            del self._recorded[: len(told.recorded)]
-            self._outcomes, self._news = [], False
-        if told.recorded or told.outcomes or told.news:
+            told, self._telling = self._telling, Told([], [], [], news=False)
+        if told.recorded or told.answered or told.failed or told.news:
             self._channel.send(told)
 
     def _call(self, asked: Call) -> None:

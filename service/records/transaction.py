@@ -2,9 +2,8 @@
 
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Connection
@@ -30,11 +29,10 @@ MAX_LOOKS = 5
 
 @dataclass
 class Job:
-    """Drafts to record, or another change to make; and who waits for it."""
+    """Drafts to record, or another change to make."""
 
     drafts: Sequence[Draft] = ()
     change: Callable[[Connection], Any] | None = None
-    done: "Future[Any]" = field(default_factory=Future)
 
     @property
     def weight(self) -> int:

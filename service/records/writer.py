@@ -13,6 +13,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from sqlalchemy import Connection, Engine
@@ -42,14 +43,21 @@ RETRY_AFTER_S = 5
 _CROSSED = ("40001", "40P01")
 
 
+@dataclass
+class Awaited(Job):
+    """A job, and what whoever waits for it is told by."""
+
+    done: "Future[Any]" = field(default_factory=Future)
+
+
 class Writer:
     """Writes what is queued, from one thread over one connection."""
 
     def __init__(self, engine: Engine, max_queued: int = MAX_QUEUED) -> None:
         self._connection = Kept(engine, TO_WRITE)
         self._max_queued = max_queued
-        self._queue: deque[Job] = deque()
-        self._patient: deque[Job] = deque()
+        self._queue: deque[Awaited] = deque()
+        self._patient: deque[Awaited] = deque()
         self._has_waited = False
         self._queued = 0
         self._closing = False
@@ -70,26 +78,30 @@ class Writer:
         error that kept this draft, and no other, from being recorded.  Where
         the database itself fails, the future raises `Busy`.
         """
-        return self._put(Job(drafts=drafts), self._patient if patient else self._queue)
+        return self._put(Awaited(drafts), self._patient if patient else self._queue)
 
     def record_here(self, drafts: Sequence[Draft], tell: bool = True) -> Results:
         """`record`, in the thread that asks, as soon as nothing else is being written.
 
         Without `tell` those who listen for commits hear of it from who asks.
         """
-        job = Job(drafts=drafts)
-        job.done.set_running_or_notify_cancel()
+        jobs = [Job(drafts)]
+        failure = None
         with self._turn:
             self.require()
-            self._settle([job])
+            try:
+                results: Results = self._write(jobs)[0]
+            except Exception as error:
+                failure = _failed(jobs, error)
         if tell:
             self._tell()
-        results: Results = job.done.result()
+        if failure is not None:
+            raise failure
         return results
 
     def change(self, change: Callable[[Connection], T]) -> "Future[T]":
         """Queue another change, which is kept whole or not at all, and may be made twice over."""
-        return self._put(Job(change=change), self._queue)
+        return self._put(Awaited(change=change), self._queue)
 
     def require(self) -> None:
         """Raise `Stopping` unless what is queued will be written."""
@@ -105,7 +117,7 @@ class Writer:
         self._thread.join()
         self._connection.close()
 
-    def _put(self, job: Job, queue: deque[Job]) -> "Future[Any]":
+    def _put(self, job: Awaited, queue: deque[Awaited]) -> "Future[Any]":
         # A request that is given up does not take its record back.
         job.done.set_running_or_notify_cancel()
         with self._changed:
@@ -119,7 +131,7 @@ class Writer:
             self._changed.notify()
         return job.done
 
-    def _take(self) -> list[Job]:
+    def _take(self) -> list[Awaited]:
         """What is written next, in one transaction; nothing when all is over."""
         with self._changed:
             while not (self._queue or self._patient) and not self._closing:
@@ -151,13 +163,13 @@ class Writer:
             for job in left:
                 job.done.set_exception(Stopping("the writer has ended"))
 
-    def _settle(self, jobs: Sequence[Job]) -> None:
+    def _settle(self, jobs: Sequence[Awaited]) -> None:
         try:
             outcomes = self._write(jobs)
         except BaseException as error:
-            log.error("%d pieces of work could not be written: %s", len(jobs), _logged(error))
+            told = _failed(jobs, error)
             for job in jobs:
-                job.done.set_exception(_told(error))
+                job.done.set_exception(told)
             if not isinstance(error, Exception):
                 raise
             return
@@ -188,6 +200,12 @@ class Writer:
             if not crossed or attempt == MAX_ATTEMPTS:
                 raise
         return self._write(jobs, attempt + 1)
+
+
+def _failed(jobs: Sequence[Job], error: BaseException) -> Exception:
+    """Log what kept work from being written; what those who wait are told of it."""
+    log.error("%d pieces of work could not be written: %s", len(jobs), _logged(error))
+    return _told(error)
 
 
 def _logged(error: BaseException) -> object:
