@@ -105,6 +105,12 @@ class LimitSettings(_Strict):
             if self.enabled
         )
 
+    @cached_property
+    def calm(self) -> tuple[float, float]:
+        """The least and the greatest value that is out of no bound; infinite without one."""
+        lows, highs = ([level[k] for level in self._levels] for k in (1, 2))
+        return max(lows, default=-math.inf), min(highs, default=math.inf)
+
     def passed(self, value: float) -> list[Severity]:
         """The severities whose bounds a value is out of that was in them so far, worst last."""
         return [s for s, low, high in self._levels if value < low or value > high]

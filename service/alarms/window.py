@@ -33,9 +33,12 @@ class Window:
 
     samples: list[Sample] = field(default_factory=list)
     since_ns: dict[Severity, int] = field(default_factory=dict)
+    _calm: LimitSettings | None = field(default=None, compare=False, repr=False)
+    """The limits that each of the samples is known to be in by itself."""
 
     def add(self, sample: Sample, limits: LimitSettings) -> Judged | None:
         """Take one batch's part and judge the latest; None while there are too few of them."""
+        self._calm = None
         insort(self.samples, sample)
         del self.samples[: -limits.minimum_count]
         value = self.value(limits)
@@ -59,18 +62,23 @@ class Window:
         if self.since_ns:
             return False
         count = limits.minimum_count
+        if self._calm is limits and _each_within(samples, limits):
+            self.samples = sorted([*self.samples, *samples])[-count:]
+            return True
         if len(self.samples) >= count:
             # What is older than all that is judged takes no place.
             samples = [each for each in samples if each > self.samples[0]]
         taken = [*self.samples, *samples]
         in_order = sorted(taken)
         # In whatever order they come, a mean lies between the least and the greatest.
-        calm = _all_within([part / whole for _, part, whole in taken], limits) or (
+        each_within = _each_within(taken, limits)
+        calm = each_within or (
             taken == in_order
             and _all_within(_judged_values(taken, count, len(self.samples)), limits)
         )
         if calm:
             self.samples = in_order[-count:]
+            self._calm = limits if each_within else None
         return calm
 
     def judge(self, value: float, time_ns: int, limits: LimitSettings) -> Severity | None:
@@ -96,8 +104,13 @@ class Window:
         return cls([tuple(each) for each in kept["samples"]], since_ns)
 
 
+def _each_within(samples: Sequence[Sample], limits: LimitSettings) -> bool:
+    return _all_within([part / whole for _, part, whole in samples], limits)
+
+
 def _all_within(values: Sequence[float], limits: LimitSettings) -> bool:
-    return not values or not (limits.passed(min(values)) or limits.passed(max(values)))
+    low, high = limits.calm
+    return not values or (low <= min(values) and max(values) <= high)
 
 
 def _judged_values(samples: Sequence[Sample], count: int, known: int) -> list[float]:

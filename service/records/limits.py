@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 from sqlalchemy import Connection, bindparam, insert, select, update
@@ -28,7 +29,7 @@ _HOLDING = prepared(
 def limits_of(connection: Connection, mission: Mission) -> Limits:
     """The limits that hold for a spacecraft: its own in place of the shipped ones."""
     own = {
-        row["quantity"]: LimitSettings.model_validate_json(row["settings"])
+        row["quantity"]: _read(row["settings"])
         for row in _holding(connection, mission.name)
         if row["settings"] is not None
     }
@@ -37,6 +38,12 @@ def limits_of(connection: Connection, mission: Mission) -> Limits:
         # Asked for with every batch; a process meets few missions.
         shipped = _SHIPPED[mission.digest] = default_limits(mission)
     return {**shipped, **own}
+
+
+@lru_cache(maxsize=256)
+def _read(settings: str) -> LimitSettings:
+    # Of one text always the same object: who knows a window to be in these limits knows it again.
+    return LimitSettings.model_validate_json(settings)
 
 
 def list_limits(connection: Connection, mission: Mission) -> list[Row]:

@@ -6,10 +6,11 @@ neither.  The row of a watch is locked, so that of several processes one after
 the other looks.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import msgspec
+from msgspec import Struct
 from sqlalchemy import Connection, bindparam, insert, select, update
 
 from service.alarms import latch
@@ -113,7 +114,8 @@ class _Watch:
             insert_missing(connection, watches, [fresh])
             self._row = _locked(connection, spacecraft, run)
         assert self._row is not None
-        self._windows = _windows(spacecraft, run, self._row["state"])
+        self._seen = _LATEST.pop((spacecraft, run), _NOTHING_SEEN)
+        self._windows = self._seen.windows_of(self._row["state"])
         self._board = Board(connection, spacecraft, run)
 
     def look(self) -> None:
@@ -121,14 +123,15 @@ class _Watch:
         assert self._row is not None
         alert = self._alert()
         latest = dict(self._row)
-        received, received_ns = latest["received"], parse_utc(latest["received"]).tai_ns
+        received, received_ns = latest["received"], self._seen.ns_of(latest["received"])
         for draft in self._drafts:
             assert draft.batch is not None
             since_ns = draft.received_ns - received_ns
             if self._run != LIVE:
                 since_ns = draft.batch["time_ns"] - latest["time_ns"]
             self._mind_the_gap(since_ns * 1e-9, draft.batch)
-            self._judge(draft, alert)
+            if alert:
+                self._judge(draft, alert)
             if draft.batch["time_ns"] >= latest["time_ns"]:
                 latest |= _latest_of(draft.batch)
             if draft.received_ns > received_ns:
@@ -136,13 +139,16 @@ class _Watch:
         latest["received"] = received
         kept = {name: window.to_json() for name, window in self._windows.items()}
         latest["state"] = msgspec.json.encode(kept).decode()
-        _remember(latest["spacecraft"], self._run, latest["state"], self._windows)
+        seen = _Seen(latest["state"], self._windows, received, received_ns)
+        _remember(latest["spacecraft"], self._run, seen)
         place = {"of_spacecraft": latest["spacecraft"], "of_run": self._run}
         _KEEP.run(self._connection, [place | {name: latest[name] for name in _KEPT}])
         self._board.save()
 
     def _mind_the_gap(self, gap_s: float, batch: Row) -> None:
         """Silence: live by the clock, elsewhere by the batches' own time; over with this batch."""
+        if gap_s <= self._limits[SILENCE].calm[1] and not self._board.has(SILENCE):
+            return
         severity, bound = silence(self._limits, gap_s)
         now = batch["received"]
         if severity is not None:
@@ -159,28 +165,33 @@ class _Watch:
         value alone: of those before it nothing would be kept.
         """
         alert = []
+        new = [(draft.result["time_ns"], draft.contribution) for draft in self._drafts]
         for name, limits in self._limits.items():
-            samples = [
-                (sample, draft)
-                for draft in self._drafts
-                if (sample := _sample(name, draft.contribution, draft.result["time_ns"]))
-            ]
+            sample_of = _SAMPLE_OF[name]
+            samples = [sample for each in new if (sample := sample_of(*each))]
             if not samples:
                 continue
             window = self._windows.setdefault(name, Window())
-            if self._board.is_out(name) or not window.pass_over([s for s, _ in samples], limits):
+            if self._board.is_out(name) or not window.pass_over(samples, limits):
                 alert.append((name, limits))
             elif self._board.has(name) and (value := window.value(limits)) is not None:
-                latest = samples[-1][1].batch
-                assert latest is not None
-                point = Point(value, *_moment(latest))
-                self._board.observe(name, None, None, point, latest["received"])
+                point = Point(value, *_moment(self._latest_with(name)))
+                self._board.observe(name, None, None, point, self._latest_with(name)["received"])
         return alert
+
+    def _latest_with(self, name: QuantityName) -> Row:
+        """The latest batch that has a value of a quantity."""
+        sample_of = _SAMPLE_OF[name]
+        return next(
+            draft.batch
+            for draft in reversed(self._drafts)
+            if draft.batch and sample_of(draft.result["time_ns"], draft.contribution)
+        )
 
     def _judge(self, draft: Draft, alert: Sequence[tuple[QuantityName, LimitSettings]]) -> None:
         assert draft.batch is not None
         for name, limits in alert:
-            sample = _sample(name, draft.contribution, draft.result["time_ns"])
+            sample = _SAMPLE_OF[name](draft.result["time_ns"], draft.contribution)
             judged = sample and self._windows[name].add(sample, limits)
             if not judged:
                 continue
@@ -191,25 +202,38 @@ class _Watch:
                 self._board.observe(name, judged.severity, bound, point, now)
 
 
-# The windows as this process last wrote them, and their text: where that is still what is kept,
-# they need not be made of it again.
-_LATEST: dict[tuple[str, str], tuple[str, dict[str, Window]]] = {}
+class _Seen(Struct):
+    """A watch as this process last wrote it.
+
+    Where that is still what is kept, it need not be made of its text again.
+    """
+
+    state: str
+    windows: dict[str, Window]
+    received: str
+    received_ns: int
+
+    def windows_of(self, state: str) -> dict[str, Window]:
+        """The windows that a text keeps."""
+        if self.state == state:
+            return self.windows
+        kept = msgspec.json.decode(state)
+        return {name: Window.from_json(each) for name, each in kept.items()}
+
+    def ns_of(self, received: str) -> int:
+        """A moment of receipt as `Utc.tai_ns`."""
+        return self.received_ns if self.received == received else parse_utc(received).tai_ns
+
+
+_NOTHING_SEEN = _Seen("", {}, "", 0)
+_LATEST: dict[tuple[str, str], _Seen] = {}
 _REMEMBERED = 64
 
 
-def _windows(spacecraft: str, run: str, state: str) -> dict[str, Window]:
-    """The windows that a text keeps; nobody else has them."""
-    text, windows = _LATEST.pop((spacecraft, run), ("", {}))
-    if text == state:
-        return windows
-    kept = msgspec.json.decode(state)
-    return {name: Window.from_json(each) for name, each in kept.items()}
-
-
-def _remember(spacecraft: str, run: str, state: str, windows: dict[str, Window]) -> None:
+def _remember(spacecraft: str, run: str, seen: _Seen) -> None:
     if len(_LATEST) >= _REMEMBERED:
         _LATEST.clear()
-    _LATEST[spacecraft, run] = state, windows
+    _LATEST[spacecraft, run] = seen
 
 
 def _mission(connection: Connection, draft: Draft) -> Mission:
@@ -351,19 +375,35 @@ def _shelved_until(now: Utc) -> Any:
     )
 
 
-def _sample(name: QuantityName, parts: Row, time_ns: int) -> Sample | None:
-    """What one batch adds to the window of a quantity; None where it has none of it."""
+def _sampling(name: QuantityName) -> Callable[[int, Row], Sample | None]:
+    """What makes of a batch's time and contribution its sample of a quantity; None without one."""
+
+    def share_of_stars(time_ns: int, parts: Row) -> Sample | None:
+        whole = parts["observed"]
+        return (time_ns, parts[column], whole) if whole else None
+
+    def suspect(time_ns: int, parts: Row) -> Sample:
+        return time_ns, parts["suspect"], 1
+
+    def without_attitude(time_ns: int, parts: Row) -> Sample:
+        return time_ns, 1 - parts["solved"], 1
+
+    def value(time_ns: int, parts: Row) -> Sample | None:
+        return (time_ns, parts[total], 1) if parts[count] else None
+
+    column, total, count = name.removesuffix("_share"), f"{name}_sum", f"{name}_n"
     match QUANTITIES[name].of:
         case "stars":
-            whole = parts["observed"]
-            return (time_ns, parts[name.removesuffix("_share")], whole) if whole else None
+            return share_of_stars
         case "batches":
-            hit = parts["suspect"] if name == "suspect_share" else 1 - parts["solved"]
-            return time_ns, hit, 1
+            return suspect if name == "suspect_share" else without_attitude
         case "value":
-            return (time_ns, parts[f"{name}_sum"], 1) if parts[f"{name}_n"] else None
+            return value
         case _:
-            return None
+            return lambda time_ns, parts: None
+
+
+_SAMPLE_OF = {name: _sampling(name) for name in QUANTITIES}
 
 
 def _locked(connection: Connection, spacecraft: str, run: str) -> Row | None:
