@@ -46,7 +46,8 @@ class Order:
     """One submission, what its client calls it, and who is called with what became of it.
 
     It comes as it was sent, and is read where it is worked on: `read` gives the
-    submission, or raises what is wrong with it.
+    submission, or raises what is wrong with it.  Once it is drafted the submission
+    is let go, and its name stays.
     """
 
     read: Callable[[], Submission]
@@ -55,6 +56,7 @@ class Order:
     received: Utc = field(default_factory=utc_now)
     since_s: float = field(default_factory=time.monotonic)
     _submission: Submission | None = None
+    _identity: Identity | None = None
 
     @property
     def submission(self) -> Submission:
@@ -66,7 +68,14 @@ class Order:
     @property
     def identity(self) -> Identity:
         """What is unique among submissions."""
-        return identity_of(self.submission.batch)
+        if self._identity is None:
+            self._identity = identity_of(self.submission.batch)
+        return self._identity
+
+    def let_go(self) -> None:
+        """Need the submission no more: its memory is still in the processor's cache."""
+        _ = self.identity
+        self._submission = None
 
 
 class Desk:
@@ -285,7 +294,7 @@ class Desk:
     def _compute(self) -> None:
         """Compute what is ready for a while, and have it recorded."""
         began_s = time.monotonic()
-        acquired: list[tuple[Order, Acquisition]] = []
+        acquired: deque[tuple[Order, Acquisition]] = deque()
         while True:
             with self._changed:
                 if not self._ready or time.monotonic() - began_s > HANDED_ON_S:
@@ -300,10 +309,12 @@ class Desk:
                 self._finish([order], [error])
         # Whoever does one thing many times finds its code in the processor's cache.
         drafted: list[tuple[Order, Draft]] = []
-        for order, acquisition in acquired:
+        while acquired:
+            order, acquisition = acquired.popleft()
             self._moved_s = time.monotonic()
             try:
                 drafted.append((order, self._draft(order, acquisition)))
+                order.let_go()
             except Exception as error:
                 # Whatever is wrong with one, it is told, and the others are recorded.
                 self._finish([order], [error])

@@ -15,7 +15,7 @@ import msgspec
 from msgspec import Struct, structs
 
 from service.acquire import Acquisition
-from service.missions.mission import Identifier, Solver
+from service.missions.mission import Identifier, Mission, Solver
 from service.observe.frame_record import FrameRecord
 from service.observe.wire import Submission
 from service.records.ahead import AHEAD_NS, LIVE
@@ -57,11 +57,13 @@ class Draft:
     """A result that is computed and not yet recorded.
 
     `batch` is the row of a first submission and None for a what-if.  `answer`
-    lacks the time that recording took.  `acquisition` is None where another
-    process made it.
+    lacks the time that recording took.  `mission` is None where another process
+    made it.
     """
 
-    acquisition: Acquisition | None
+    mission: Mission | None
+    identity: tuple[str, str, str]
+    """(spacecraft, run, batch): what is unique among submissions."""
     answer: Row
     batch: Row | None
     result: Row
@@ -85,11 +87,6 @@ class Draft:
     def contribution(self) -> Row:
         """What the result is to the trends and to what is watched."""
         return contribution(self.result)
-
-    @property
-    def identity(self) -> tuple[str, str, str]:
-        """(spacecraft, run, batch): what is unique among submissions."""
-        return self.answer["spacecraft"], self.answer["run"], self.answer["batch"]
 
     def finish(self) -> bytes:
         """The answer's JSON; `timings_us.record` is its share of the time since it was handed on.
@@ -176,7 +173,8 @@ def _draft(
     )
     solution = _solution_row(acquisition, answer, result["id"])
     return Draft(
-        acquisition,
+        acquisition.mission,
+        (batch.spacecraft, batch.run, batch.batch),
         answer,
         batch_row,
         result,

@@ -238,8 +238,8 @@ def _remember(spacecraft: str, run: str, seen: _Seen) -> None:
 
 def _mission(connection: Connection, draft: Draft) -> Mission:
     """The mission that a draft was made with; one from another process brings its digest alone."""
-    if draft.acquisition is not None:
-        return draft.acquisition.mission
+    if draft.mission is not None:
+        return draft.mission
     query = select(missions.c.settings).where(missions.c.digest == draft.result["mission_digest"])
     return Mission.model_validate_json(connection.execute(query).scalar_one())
 

@@ -270,5 +270,5 @@ def _packed(found: object) -> bytes:
     """One find by itself, so that to unpack many keeps nobody waiting for long."""
     if isinstance(found, Draft):
         # Zones and run catalogs stay where they are.
-        found.acquisition = None
+        found.mission = None
     return pickle.dumps(found, pickle.HIGHEST_PROTOCOL)
