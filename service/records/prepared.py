@@ -33,6 +33,7 @@ class Prepared:
         """`make` is given the module of a dialect, whose `insert` knows of conflicts."""
         self._make = make
         self._ready: dict[str, tuple[str, tuple[str, ...]]] = {}
+        self._of_many: dict[int, str] = {}
 
     def run(self, connection: Connection, rows: Sequence[Row]) -> None:
         """Run the statement with the values of every row, by name."""
@@ -56,17 +57,24 @@ class Prepared:
             self.run(connection, rows)
             return
         sql, names = self._sql("sqlite")
-        one_more = ", (" + ", ".join("?" * len(names)) + ")"
         values = list(map(itemgetter(*names), rows))
         done = 0
         with reported(connection, sql) as driver:
             for count in ROWS_AT_ONCE:
-                many = sql + one_more * (count - 1)
                 while len(values) - done >= count:
                     part = values[done : done + count]
-                    driver.execute(many, list(chain.from_iterable(part)))
+                    driver.execute(self._many(count), list(chain.from_iterable(part)))
                     done += count
             driver.executemany(sql, values[done:])
+
+    def _many(self, count: int) -> str:
+        """The statement of so many rows; always the same object, whose hash is known."""
+        many = self._of_many.get(count)
+        if many is None:
+            sql, names = self._sql("sqlite")
+            one_more = ", (" + ", ".join("?" * len(names)) + ")"
+            many = self._of_many[count] = sql + one_more * (count - 1)
+        return many
 
     def read(self, connection: Connection, values: Row) -> list[Row]:
         """The rows that the statement gives."""

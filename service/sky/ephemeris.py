@@ -14,7 +14,9 @@ import numpy.typing as npt
 from erfa import ufunc
 
 from service.times import Utc
-from service.vectors import Vector, read_only, unit_of
+from service.vectors import Vector, unit_of
+
+Triple = tuple[float, float, float]
 
 KM_PER_AU = erfa.DAU / 1000.0
 LIGHT_AU_PER_DAY = erfa.DAYSEC / erfa.AULT
@@ -25,30 +27,31 @@ _STEPS_PER_DAY = 32
 """Between so close places a cubic follows epv00 within 0.03 m and 1e-8 m/s."""
 
 
+# By plain numbers: numpy takes longer for six than Python does.
 @lru_cache(maxsize=64)
-def _earth(time: Utc) -> tuple[Vector, float]:
-    """Earth from the Sun in au and its barycentric velocity in c (6,), and the Sun's distance."""
+def _earth(time: Utc) -> tuple[Triple, Triple, float]:
+    """Earth from the Sun in au, its barycentric velocity in c, and the Sun's distance in au."""
     tt1, tt2 = time.tt
     whole = (tt1 - erfa.DJ00) * _STEPS_PER_DAY
     number = math.floor(whole + tt2 * _STEPS_PER_DAY)
-    x = (whole - number) + tt2 * _STEPS_PER_DAY
+    at = (whole - number) + tt2 * _STEPS_PER_DAY
     # Lagrange's weights for steps -1, 0, 1 and 2.
-    before, after, beyond = x + 1.0, x - 1.0, x - 2.0
-    weights = (
-        -x * after * beyond / 6.0,
-        before * after * beyond / 2.0,
-        -before * x * beyond / 2.0,
-        before * x * after / 6.0,
-    )
-    earth = read_only(np.dot(weights, _about(number)))
-    x, y, z, *_ = earth.tolist()
-    return earth, math.hypot(x, y, z)
+    before, after, beyond = at + 1.0, at - 1.0, at - 2.0
+    a = -at * after * beyond / 6.0
+    b = before * after * beyond / 2.0
+    c = -before * at * beyond / 2.0
+    d = before * at * after / 6.0
+    x, y, z, u, v, w = [a * p + b * q + c * r + d * s for p, q, r, s in _about(number)]
+    return (x, y, z), (u, v, w), math.hypot(x, y, z)
 
 
 @lru_cache(maxsize=256)
-def _about(number: int) -> Vector:
-    """Earth (4, 6) at the steps from one before to two after a numbered one."""
-    return np.stack([_at(number + step) for step in (-1, 0, 1, 2)])
+def _about(number: int) -> list[list[float]]:
+    """Earth's six numbers, each at the steps from one before to two after a numbered one."""
+    numbers: list[list[float]] = np.stack(
+        [_at(number + step) for step in (-1, 0, 1, 2)], axis=1
+    ).tolist()
+    return numbers
 
 
 @lru_cache(maxsize=1024)
@@ -66,17 +69,16 @@ def observer_velocity(time: Utc, velocity_km_per_s: npt.ArrayLike | None) -> Vec
     Earth's velocity with the spacecraft's geocentric one added; Earth's alone
     where the latter is None.
     """
-    velocity = _earth(time)[0][3:]
+    u, v, w = _earth(time)[1]
     if velocity_km_per_s is None:
-        # Of one kind with the sum below: kernels are compiled for either.
-        return velocity.copy()
-    total: Vector = velocity + np.divide(velocity_km_per_s, LIGHT_KM_PER_S)
-    return total
+        return np.array((u, v, w))
+    x, y, z = np.asarray(velocity_km_per_s).tolist()
+    return np.array((u + x / LIGHT_KM_PER_S, v + y / LIGHT_KM_PER_S, w + z / LIGHT_KM_PER_S))
 
 
 def sun_distance_au(time: Utc) -> float:
     """Distance from Earth to the Sun in astronomical units: near enough for a spacecraft's."""
-    return _earth(time)[1]
+    return _earth(time)[2]
 
 
 def apparent(directions: npt.ArrayLike, velocity_c: Vector, time: Utc) -> Vector:
@@ -87,7 +89,7 @@ def apparent(directions: npt.ArrayLike, velocity_c: Vector, time: Utc) -> Vector
 
 def sun_direction(time: Utc, position_km: npt.ArrayLike | None) -> Vector:
     """Unit vector (3,) from the spacecraft to the Sun, from Earth where no position is given."""
-    sun_km = _earth(time)[0][:3] * -KM_PER_AU
+    sun_km = np.array(_earth(time)[0]) * -KM_PER_AU
     return unit_of(sun_km if position_km is None else sun_km - np.asarray(position_km))
 
 
