@@ -102,26 +102,36 @@ def test_the_value_does_not_depend_on_the_order_in_which_batches_come(samples, c
 
 
 @given(
-    st.lists(st.tuples(st.integers(0, 40), st.floats(-2, 1.5)), max_size=40),
+    st.lists(
+        st.tuples(
+            st.lists(st.tuples(st.integers(0, 40), st.floats(-2, 1.5)), max_size=15), st.booleans()
+        ),
+        max_size=8,
+    ),
     st.integers(1, 6),
-    st.integers(0, 40),
     st.sampled_from([0, 25]),
 )
-def test_what_is_passed_over_would_have_been_in_limits_one_by_one(values, count, first, duration_s):
-    settings = limits(watch={"low": -1.0, "high": 1.0}, minimum_count=count, duration_s=duration_s)
-    samples = [(time * S, value, 1) for time, value in values]
+def test_what_is_passed_over_would_have_been_in_limits_one_by_one(groups, count, duration_s):
+    """Group after group, whatever order they come in, and where the limits are set anew between."""
+    wide, narrow = (
+        limits(watch={"low": -size, "high": size}, minimum_count=count, duration_s=duration_s)
+        for size in (1.4, 1.0)
+    )
     one_by_one, together = Window(), Window()
-    for each in samples[:first]:
-        one_by_one.add(each, settings)
-        together.add(each, settings)
-    before = together.to_json()
-    if together.pass_over(samples[first:], settings):
-        judged = [one_by_one.add(each, settings) for each in samples[first:]]
-        assert not any(each and each.severity for each in judged)
-        assert not one_by_one.since_ns
+    for values, is_wide in groups:
+        settings = wide if is_wide else narrow
+        samples = [(time * S, value, 1) for time, value in values]
+        before = together.to_json()
+        passed = together.pass_over(samples, settings)
+        judged = [one_by_one.add(each, settings) for each in samples]
+        if passed:
+            assert not any(each and each.severity for each in judged)
+            assert not one_by_one.since_ns
+        else:
+            assert together.to_json() == before
+            for each in samples:
+                together.add(each, settings)
         assert together.to_json() == one_by_one.to_json()
-    else:
-        assert together.to_json() == before
 
 
 def test_what_stays_well_in_limits_is_passed_over():

@@ -5,15 +5,16 @@ from pathlib import Path
 
 import pytest
 from alembic import command
-from sqlalchemy import create_engine, event, inspect, make_url, text
+from sqlalchemy import create_engine, event, inspect, make_url, select, text
 from sqlalchemy.exc import DBAPIError, OperationalError
 
 from service.errors import BadConfiguration, Busy
 from service.operations import Operations
 from service.records import database as migrations
 from service.records.engines import database_url, writing_engine
+from service.records.prepared import execute
 from service.records.store import Store
-from service.records.tables import metadata
+from service.records.tables import batches, metadata
 from service.settings import Settings
 
 
@@ -179,6 +180,24 @@ def test_a_database_out_of_reach_is_busy_and_the_reason_is_for_the_log_alone(ope
     assert "secret" not in str(busy.value)
     assert "user secret" in caplog.text
     assert operations.runs() == []
+
+
+@pytest.mark.parametrize("empty_database", ["sqlite"], indirect=True)
+def test_who_has_glanced_holds_no_moment_and_the_log_can_begin_anew(operations, make):
+    """By a prepared statement, and by one that SQLAlchemy opens a transaction for."""
+    operations.submit(make("b1"))
+    with operations.store.glancing() as connection:
+        assert execute(connection, "SELECT batch FROM batches") == [("b1",)]
+        assert connection.scalars(select(batches.c.batch)).all() == ["b1"]
+    operations.submit(make("b2"))
+    with operations.store.glancing() as connection:
+        assert len(execute(connection, "SELECT batch FROM batches")) == 2
+    other = sqlite3.connect(operations.store.url.database)
+    try:
+        busy, _, _ = other.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
+    finally:
+        other.close()
+    assert not busy
 
 
 @pytest.mark.parametrize("empty_database", ["sqlite"], indirect=True)

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from sqlalchemy import func, select
+from sqlalchemy.exc import IntegrityError
 
 from service.errors import BadBatch, BadInput, Conflict, KeyReused
 from service.observe.wire import OptionsIn, submission_from_json
@@ -160,6 +161,39 @@ def test_of_fifty_concurrent_batches_under_one_key_one_is_recorded(operations, m
     assert len(errors) == REPEATS - 1
     assert all(isinstance(error, KeyReused) for error in errors)
     assert count(operations, results) == count(operations, idempotency_keys) == 1
+
+
+def test_what_was_recorded_between_look_and_transaction_is_found(operations, make):
+    """A draft is new when it is looked up; what came since then is noticed all the same."""
+    bench = operations._intake._bench
+    key = "of another body"
+    sent = [make(f"b{i}") for i in range(6)]
+    changed = make("b2", after_s=3600.0)
+    drafts = [bench.draft(each) for each in (sent[0], sent[1], changed, sent[3])]
+    drafts += [bench.draft(sent[4], key), bench.draft(sent[5])]
+    first = [operations.submit(each) for each in (sent[1], sent[2])]
+    operations.submit(make("b6"), key)
+    new, repeat, conflict, neighbour, reused, last = operations.store.writer.record_here(drafts)
+    assert [each.replayed for each in (new, neighbour, last)] == [False, False, False]
+    assert (repeat.id, repeat.body, repeat.replayed) == (first[0].id, first[0].body, True)
+    assert isinstance(conflict, Conflict)
+    assert isinstance(reused, KeyReused)
+    assert count(operations, results) == 6
+    assert count(operations, idempotency_keys) == 1
+    with operations.store.reading() as connection:
+        assert_equal_to_a_recount(connection)
+
+
+def test_a_run_whose_making_was_taken_back_is_made_with_the_next_of_its_batches(operations, make):
+    """Which runs there are is remembered with the connection, whatever became of them."""
+    bench = operations._intake._bench
+    bad = bench.draft(make("b1", run="another"))
+    bad.result["mission_digest"] = "sha256:of nothing that is there"
+    (refused,) = operations.store.writer.record_here([bad])
+    assert isinstance(refused, IntegrityError)
+    assert [each["run"] for each in operations.runs()] == []
+    assert not operations.submit(make("b2", run="another")).replayed
+    assert [each["run"] for each in operations.runs()] == ["another"]
 
 
 def test_two_services_on_one_database_record_a_batch_once(opened, make):
