@@ -115,12 +115,14 @@ class Backend:
             self._telling.recorded.append(structs.astuple(recorded))
 
     def _settle(self, number: int, outcome: Answered | Exception) -> None:
-        with self._lock:
-            if isinstance(outcome, Exception):
-                self._telling.failed.append((number, _portable(outcome)))
-            else:
-                told = (number, outcome.id, outcome.body, outcome.replayed)
-                self._telling.answered.append(told)
+        if isinstance(outcome, Exception):
+            failed = (number, _portable(outcome))
+            with self._lock:
+                self._telling.failed.append(failed)
+        else:
+            answered = (number, outcome.id, outcome.body, outcome.replayed)
+            with self._lock:
+                self._telling.answered.append(answered)
 
     def _tell_news(self) -> None:
         with self._lock:

@@ -1,7 +1,7 @@
 """Where submissions that come one by one are worked through, together with what came meanwhile.
 
-One thread at a time takes what waits: it is read, looked up in one reading of
-the database, computed batch by batch, recorded in one transaction, and
+One thread at a time takes what waits: it is read, looked up by one statement,
+computed batch by batch, recorded in one transaction, and
 answered, all together.  To pass a batch from thread to thread costs more than
 to compute it, and so does waking a thread: whoever submits may work through
 what it brought by itself.  Another thread looks from time to time, and steps in
@@ -73,7 +73,7 @@ class Order:
         return self._identity
 
     def let_go(self) -> None:
-        """Need the submission no more: its memory is still in the processor's cache."""
+        """Need the submission no more, so that the next is made in memory that is at hand."""
         _ = self.identity
         self._submission = None
 
@@ -313,11 +313,13 @@ class Desk:
             order, acquisition = acquired.popleft()
             self._moved_s = time.monotonic()
             try:
-                drafted.append((order, self._draft(order, acquisition)))
-                order.let_go()
+                draft = self._draft(order, acquisition)
             except Exception as error:
                 # Whatever is wrong with one, it is told, and the others are recorded.
                 self._finish([order], [error])
+                continue
+            drafted.append((order, draft))
+            order.let_go()
         if not drafted:
             return
         self._moved_s = time.monotonic()

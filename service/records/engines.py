@@ -9,12 +9,12 @@ refused at once, whatever the busy timeout.
 import sqlite3
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url
-from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
+from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError, SQLAlchemyError
 from sqlalchemy.pool import QueuePool
 
 from service.errors import BadConfiguration
@@ -113,7 +113,7 @@ def _set_up_sqlite(engine: Engine, *pragmas: str, begin: str) -> None:
     def _begun(connection: Connection) -> None:
         # Where `Kept` has begun, SQLAlchemy takes part in what is going on.
         if not driver_of(connection).in_transaction:
-            _tell(connection, begin)
+            _by_driver(connection, begin)
 
 
 def driver_of(connection: Connection) -> sqlite3.Connection:
@@ -124,7 +124,10 @@ def driver_of(connection: Connection) -> sqlite3.Connection:
 
 
 class reported:  # noqa: N801 - it stands where a function that gives a context would
-    """What SQLite's driver says against a statement is raised as SQLAlchemy would."""
+    """What SQLite's driver says against a statement is raised as SQLAlchemy would.
+
+    A class, since there is one about every statement: `contextmanager` takes three times as long.
+    """
 
     __slots__ = ("_connection", "_sql")
 
@@ -143,7 +146,7 @@ class reported:  # noqa: N801 - it stands where a function that gives a context 
             ) from error
 
 
-def _tell(connection: Connection, sql: str) -> None:
+def _by_driver(connection: Connection, sql: str) -> None:
     with reported(connection, sql) as driver:
         driver.execute(sql)
 
@@ -179,10 +182,15 @@ class Kept:
             self._start(connection)
             try:
                 yield connection
+                self._end(connection, keep=True)
             except TakenBack:
-                self._end(connection, "ROLLBACK")
+                self._end(connection, keep=False)
                 raise
-            self._end(connection, "COMMIT")
+            except BaseException:
+                # Closed while an answer is half read, a connection would keep its lock.
+                with suppress(SQLAlchemyError):
+                    self._end(connection, keep=False)
+                raise
 
     @contextmanager
     def looking(self) -> Iterator[Connection]:
@@ -220,15 +228,15 @@ class Kept:
 
     def _start(self, connection: Connection) -> None:
         if self._is_sqlite:
-            _tell(connection, self._begin)
+            _by_driver(connection, self._begin)
         else:
             connection.begin()
 
-    def _end(self, connection: Connection, how: str) -> None:
+    def _end(self, connection: Connection, *, keep: bool) -> None:
         # On SQLite SQLAlchemy takes part once it was asked for something.
         if not connection.in_transaction():
-            _tell(connection, how)
-        elif how == "COMMIT":
+            _by_driver(connection, "COMMIT" if keep else "ROLLBACK")
+        elif keep:
             connection.commit()
         else:
             connection.rollback()

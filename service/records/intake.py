@@ -239,6 +239,8 @@ class Intake:
 
     def _stored_orders(self, orders: Sequence[Order]) -> list[Answered | AcquisitionError | None]:
         """What is stored of each: the answer, the error of whose place is taken, or nothing."""
+        # Identities before keys, each as of its moment: what is recorded in between is found by its
+        # key, or seems new, and then the transaction finds it.
         with self._store.glancing() as connection:
             registry = look_up(
                 connection,

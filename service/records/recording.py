@@ -26,7 +26,9 @@ from service.records.watching import watch
 Outcome = Answered | AcquisitionError
 
 _RUNS = "runs"
-"""Where a connection remembers the runs that it has inserted."""
+"""Where a connection remembers the runs that it has inserted, or found there."""
+_REMEMBERED = 1_000
+"""Runs: their names are the clients' own."""
 
 
 def register(connection: Connection, mission_rows: Sequence[Row], catalog_row: Row) -> None:
@@ -60,8 +62,9 @@ def record(connection: Connection, drafts: Sequence[Draft], unseen: bool = False
     may still insert between the two: then an `IntegrityError` is raised, and
     to call again is to look again.
 
-    Who looked a moment ago, and found none of them, calls them `unseen`: the
-    tables are not asked again.  If something came meanwhile the same error is raised.
+    Who expects none of them to be there, having looked, calls them `unseen`: the
+    tables are not asked.  Where one is there after all the same error is raised, for
+    identities and keys are unique.
     """
     registry = Registry()
     if not unseen:
@@ -119,8 +122,11 @@ def _insert(connection: Connection, fresh: Sequence[tuple[Draft, bytes]], unseen
         key=lambda each: each[0].identity,
     )
     names = {draft.answer["run"]: draft.batch["received"] for draft, _ in firsts if draft.batch}
-    # A run that is not there after all keeps its batches from being inserted.
+    # Also those of a transaction that was taken back.  The foreign key then refuses their batches,
+    # and `transact`, to which nothing is `unseen`, inserts the run.
     known: set[str] = connection.info.setdefault(_RUNS, set())
+    if len(known) > _REMEMBERED:
+        known.clear()
     missing = [name for name in sorted(names) if not unseen or name not in known]
     insert_missing(
         connection,

@@ -40,9 +40,9 @@ class Readers:
 
     @contextmanager
     def glancing(self) -> Iterator[Connection]:
-        """`reading` for one statement of those that are prepared: others who glance wait for it.
+        """`reading` by prepared statements, each of which may see another moment.
 
-        What another one gives may be of another moment.
+        Others who glance wait for it.
         """
         with _reported(), self._glances.looking() as connection:
             yield connection

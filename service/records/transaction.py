@@ -1,5 +1,6 @@
 """One transaction of the writer: much work at once, and no failure reaches its neighbours."""
 
+import logging
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -26,6 +27,8 @@ Results = list[Outcome | Exception]
 
 MAX_LOOKS = 5
 
+log = logging.getLogger(__name__)
+
 
 @dataclass
 class Job:
@@ -41,20 +44,19 @@ class Job:
 
 
 def transact_at_once(connection: Connection, jobs: Sequence[Job]) -> list[Any]:
-    """`transact` where there is nothing but drafts of what is new, in all likelihood.
+    """`transact` of drafts alone that are new, in all likelihood.
 
     Nothing is looked up again, and there is no savepoint, for which SQLite keeps what
-    every page was before.  Raises `TakenBack` where something failed: what is called
-    after that is `transact`.
+    every page was before.  Raises `TakenBack` where something failed that is no trouble of
+    the database itself: what is called after that is `transact`.
     """
-    if any(job.change for job in jobs):
-        return transact(connection, jobs)
     try:
         with events.numbered(connection):
             return _shared_out(connection, record(connection, _drafts(jobs), unseen=True), jobs)
     except Exception as error:
         if is_of_the_database(error):
             raise
+        log.debug("a transaction is made again, with care: %s", type(error).__name__)
         raise TakenBack from error
 
 

@@ -147,7 +147,8 @@ class _Watch:
 
     def _mind_the_gap(self, gap_s: float, batch: Row) -> None:
         """Silence: live by the clock, elsewhere by the batches' own time; over with this batch."""
-        if gap_s <= self._limits[SILENCE].calm[1] and not self._board.has(SILENCE):
+        low_s, high_s = self._limits[SILENCE].calm
+        if low_s <= gap_s <= high_s and not self._board.has(SILENCE):
             return
         severity, bound = silence(self._limits, gap_s)
         now = batch["received"]

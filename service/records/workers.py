@@ -269,6 +269,6 @@ def _end_with_parent() -> None:
 def _packed(found: object) -> bytes:
     """One find by itself, so that to unpack many keeps nobody waiting for long."""
     if isinstance(found, Draft):
-        # Zones and run catalogs stay where they are.
+        # The digest names it, and settings of a mission are many.
         found.mission = None
     return pickle.dumps(found, pickle.HIGHEST_PROTOCOL)

@@ -13,6 +13,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -92,7 +93,8 @@ class Writer:
             try:
                 results: Results = self._write(jobs)[0]
             except Exception as error:
-                failure = _failed(jobs, error)
+                _log(jobs, error)
+                failure = _told(error)
         if tell:
             self._tell()
         if failure is not None:
@@ -167,9 +169,9 @@ class Writer:
         try:
             outcomes = self._write(jobs)
         except BaseException as error:
-            told = _failed(jobs, error)
+            _log(jobs, error)
             for job in jobs:
-                job.done.set_exception(told)
+                job.done.set_exception(_told(error))
             if not isinstance(error, Exception):
                 raise
             return
@@ -189,12 +191,11 @@ class Writer:
 
     def _write(self, jobs: Sequence[Job], attempt: int = 1) -> list[Any]:
         try:
-            try:
-                with self._connection.transaction() as connection:
+            if all(job.change is None for job in jobs):
+                with suppress(TakenBack), self._connection.transaction() as connection:
                     return transact_at_once(connection, jobs)
-            except TakenBack:
-                with self._connection.transaction() as connection:
-                    return transact(connection, jobs)
+            with self._connection.transaction() as connection:
+                return transact(connection, jobs)
         except BaseException as error:
             crossed = getattr(getattr(error, "orig", None), "sqlstate", None) in _CROSSED
             if not crossed or attempt == MAX_ATTEMPTS:
@@ -202,15 +203,10 @@ class Writer:
         return self._write(jobs, attempt + 1)
 
 
-def _failed(jobs: Sequence[Job], error: BaseException) -> Exception:
-    """Log what kept work from being written; what those who wait are told of it."""
-    log.error("%d pieces of work could not be written: %s", len(jobs), _logged(error))
-    return _told(error)
-
-
-def _logged(error: BaseException) -> object:
-    """What the log says: of the database's own errors the cause, without the values it was sent."""
-    return error.orig if isinstance(error, DBAPIError) else repr(error)
+def _log(jobs: Sequence[Job], error: BaseException) -> None:
+    """Of the database's own errors the log has the cause, without the values it was sent."""
+    cause = error.orig if isinstance(error, DBAPIError) else repr(error)
+    log.error("%d pieces of work could not be written: %s", len(jobs), cause)
 
 
 def _told(error: BaseException) -> Exception:

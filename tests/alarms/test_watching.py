@@ -255,6 +255,20 @@ def test_live_silence_is_an_alarm_that_the_next_batch_ends(operations, make, mon
     assert actions(operations, silent) == ["raised", "escalated", "returned"]
 
 
+def test_a_low_bound_of_silence_is_held_as_well(operations, make):
+    """Batches that come too close after each other."""
+    settings = {"watch": {"low": 5.0}, "minimum_count": 1, "duration_s": 0.0}
+    limits = LimitSettings.model_validate(settings)
+    operations.set_limit("XTE", "silence_s", limits, who="jb", comment=None)
+    operations.watch_run("r")
+    for k, after_s in enumerate((0.0, 30.0, 31.0)):
+        operations.submit(make(f"b{k}", run="r", after_s=after_s))
+    alarm = only(operations, run="r")
+    assert alarm["quantity"] == "silence_s"
+    # The first follows upon itself, and each batch ends the silence before it.
+    assert actions(operations, alarm) == ["raised", "returned", "left_again", "returned"]
+
+
 def test_in_a_run_silence_is_a_gap_in_the_batches_own_time(operations, make):
     operations.watch_run("r")
     operations.submit(make("b1", run="r"))

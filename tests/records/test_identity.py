@@ -10,8 +10,10 @@ from sqlalchemy.exc import IntegrityError
 
 from service.errors import BadBatch, BadInput, Conflict, KeyReused
 from service.observe.wire import OptionsIn, submission_from_json
+from service.records.prune import prune
 from service.records.statements import COPIED_FROM
 from service.records.tables import batches, idempotency_keys, metadata, results, star_results
+from service.times import utc_now
 from tests.records.recount import assert_equal_to_a_recount
 
 REPEATS = 50
@@ -182,6 +184,24 @@ def test_what_was_recorded_between_look_and_transaction_is_found(operations, mak
     assert count(operations, idempotency_keys) == 1
     with operations.store.reading() as connection:
         assert_equal_to_a_recount(connection)
+
+
+def test_a_repeat_of_what_is_pruned_at_the_same_moment_is_recorded_anew(
+    operations, make, monkeypatch
+):
+    store = operations.store
+    reading = store.reading
+    first = operations.submit(make("b1"))
+
+    def after_pruning():
+        monkeypatch.undo()
+        prune(store, utc_now())
+        return reading()
+
+    monkeypatch.setattr(store, "reading", after_pruning)
+    again = operations.submit(make("b1"))
+    assert (again.replayed, again.id == first.id) == (False, False)
+    assert count(operations, results) == 1
 
 
 def test_a_run_whose_making_was_taken_back_is_made_with_the_next_of_its_batches(operations, make):

@@ -4,7 +4,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from sqlalchemy import func, insert, select
+from sqlalchemy import func, insert, select, text
 from sqlalchemy.exc import IntegrityError, OperationalError
 
 from service.errors import Busy, Stopping
@@ -39,10 +39,10 @@ def before_commit(store, monkeypatch, act):
     kept = store.writer._connection
     end = kept._end
 
-    def acting(connection, how):
-        if how == "COMMIT":
+    def acting(connection, *, keep):
+        if keep:
             act(connection)
-        end(connection, how)
+        end(connection, keep=keep)
 
     monkeypatch.setattr(kept, "_end", acting)
 
@@ -102,6 +102,23 @@ def test_one_change_that_fails_spoils_none_of_its_neighbours(store):
     assert names(store) == ["a", "b", "c"]
 
 
+@pytest.mark.parametrize("empty_database", ["sqlite"], indirect=True)
+def test_a_change_that_fails_with_an_answer_half_read_keeps_no_lock(store):
+    """Closed like that, SQLite's connection would live on for as long as the answer does."""
+    half_read = []
+
+    def fail(connection):
+        half_read.append(connection.execute(text("SELECT name FROM sqlite_master")))
+        half_read[0].fetchone()
+        connection.execute(insert(runs).values(name="lost", created="now"))
+        raise OperationalError("SELECT", {}, Exception("disk I/O error"))
+
+    store.writer.change(new_run("before")).result(30)
+    assert isinstance(store.writer.change(fail).exception(30), Busy)
+    store.writer.change(new_run("after")).result(5)
+    assert names(store) == ["after", "before"]
+
+
 def test_one_draft_that_cannot_be_kept_spoils_none_of_its_neighbours(operations, make):
     go_on = held_up(operations.store.writer)
     drafts = [operations._intake._bench.draft(make(name)) for name in ("b1", "b2", "b3")]
@@ -146,7 +163,7 @@ def test_closing_writes_what_is_queued_and_refuses_the_rest(store):
 def test_a_commit_that_fails_reaches_everyone_who_waits_and_writing_goes_on(
     operations, make, caplog, monkeypatch
 ):
-    """The hook stands for a disk that fails at COMMIT: nothing of the transaction is kept."""
+    """What is put in stands for a disk that fails at COMMIT: nothing of the transaction is kept."""
     operations.submit(make("b0"))
 
     def fail(_connection):
