@@ -81,7 +81,7 @@ def test_an_error_that_cannot_be_packed_is_told_in_words():
 
     backend = Backend(None, None, None)
     backend._settle(7, Tied())
-    ((number, error),) = backend._outcomes
+    ((number, error),) = backend._telling.failed
     assert (number, type(error)) == (7, RuntimeError)
     assert "Tied" in str(pickle.loads(pickle.dumps(error)))
 
