@@ -123,10 +123,10 @@ def driver_of(connection: Connection) -> sqlite3.Connection:
     return driver
 
 
-class reported:  # noqa: N801 - it stands where a function that gives a context would
+class Reported:
     """What SQLite's driver says against a statement is raised as SQLAlchemy would.
 
-    A class, since there is one about every statement: `contextmanager` takes three times as long.
+    A class, since there is one about every statement, and `contextmanager` takes longer.
     """
 
     __slots__ = ("_connection", "_sql")
@@ -147,7 +147,7 @@ class reported:  # noqa: N801 - it stands where a function that gives a context 
 
 
 def _by_driver(connection: Connection, sql: str) -> None:
-    with reported(connection, sql) as driver:
+    with Reported(connection, sql) as driver:
         driver.execute(sql)
 
 

@@ -16,7 +16,7 @@ from typing import Any
 from sqlalchemy import Connection, Executable
 from sqlalchemy.dialects import postgresql, sqlite
 
-from service.records.engines import reported
+from service.records.engines import Reported
 
 Row = dict[str, Any]
 
@@ -44,7 +44,7 @@ class Prepared:
             connection.exec_driver_sql(sql, list(rows))
             return
         take = itemgetter(*names)
-        with reported(connection, sql) as driver:
+        with Reported(connection, sql) as driver:
             driver.executemany(sql, map(take, rows) if len(names) > 1 else zip(map(take, rows)))
 
     def insert(self, connection: Connection, rows: Sequence[Row]) -> None:
@@ -59,7 +59,7 @@ class Prepared:
         sql, names = self._sql("sqlite")
         values = list(map(itemgetter(*names), rows))
         done = 0
-        with reported(connection, sql) as driver:
+        with Reported(connection, sql) as driver:
             for count in ROWS_AT_ONCE:
                 while len(values) - done >= count:
                     part = values[done : done + count]
@@ -82,7 +82,7 @@ class Prepared:
         if connection.dialect.name != "sqlite":
             found = connection.exec_driver_sql(sql, values)
             return [dict(row) for row in found.mappings()]
-        with reported(connection, sql) as driver:
+        with Reported(connection, sql) as driver:
             cursor = driver.execute(sql, [values[name] for name in names])
             rows = cursor.fetchall()
             return [dict(zip(_names(cursor), row, strict=True)) for row in rows]
@@ -108,7 +108,7 @@ def execute(connection: Connection, sql: str, values: Row | None = None) -> list
     if connection.dialect.name != "sqlite":
         result = connection.exec_driver_sql(sql, values or {})
         return [tuple(row) for row in result] if result.returns_rows else []
-    with reported(connection, sql) as driver:
+    with Reported(connection, sql) as driver:
         return driver.execute(sql, values or {}).fetchall()
 
 

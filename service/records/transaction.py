@@ -54,6 +54,7 @@ def transact_at_once(connection: Connection, jobs: Sequence[Job]) -> list[Any]:
         with events.numbered(connection):
             return _shared_out(connection, record(connection, _drafts(jobs), unseen=True), jobs)
     except Exception as error:
+        # Whatever is wrong with one draft: made again with savepoints, it spoils no other.
         if is_of_the_database(error):
             raise
         log.debug("a transaction is made again, with care: %s", type(error).__name__)

@@ -176,8 +176,9 @@ class _Watch:
             if self._board.is_out(name) or not window.pass_over(samples, limits):
                 alert.append((name, limits))
             elif self._board.has(name) and (value := window.value(limits)) is not None:
-                point = Point(value, *_moment(self._latest_with(name)))
-                self._board.observe(name, None, None, point, self._latest_with(name)["received"])
+                latest = self._latest_with(name)
+                point = Point(value, *_moment(latest))
+                self._board.observe(name, None, None, point, latest["received"])
         return alert
 
     def _latest_with(self, name: QuantityName) -> Row:

@@ -93,6 +93,7 @@ class Writer:
             try:
                 results: Results = self._write(jobs)[0]
             except Exception as error:
+                # Whatever it is, it is logged, and raised in the words for those who wait.
                 _log(jobs, error)
                 failure = _told(error)
         if tell:
