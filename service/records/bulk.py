@@ -32,7 +32,7 @@ def work(bench: Bench, lines: Lines) -> list[Found]:
 
 LATELY_S = 0.5
 """Whoever posts one by one may post again for so long after the last."""
-LINES, FEW_LINES = 128, 8
+LINES, FEW_LINES = 64, 8
 """Of a chunk: the more, the less each costs; but a single post waits for one chunk at most."""
 
 

@@ -1,13 +1,14 @@
 """A record in the making: everything of a result but the last number of its answer.
 
 The rows are taken from the answer itself, so that what a list or a trend says
-cannot differ from what the client was told.
+cannot differ from what the client was told.  Whoever drafts puts the answer into
+JSON as well: a worker's answer comes to whoever writes as one text and not as a
+hundred small objects.
 """
 
 import json
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -24,6 +25,13 @@ from service.records.measures import contribution, measures_of
 from service.times import DAY_S, HOUR_S, Utc
 
 Row = dict[str, Any]
+
+STARS = ("observed", "unique", "ambiguous", "unmatched")
+"""What is counted of a result's stars."""
+
+_RECORD = b'"record":%b'
+_NOT_RECORDED = _RECORD % b"null"
+"""Of `timings_us`; within a text of the client's there would be a backslash before its quotes."""
 
 
 class Answered(Struct, frozen=True):
@@ -44,27 +52,25 @@ class Buckets(Struct, frozen=True):
     day: int
 
 
-@dataclass(frozen=True)
-class Handed:
+class Handed(Struct, frozen=True):
     """When drafts were handed to the writer, and how many together."""
 
     ns: int
     drafts: int
 
 
-@dataclass
-class Draft:
+class Draft(Struct, eq=False, dict=True):
     """A result that is computed and not yet recorded.
 
-    `batch` is the row of a first submission and None for a what-if.  `answer`
-    lacks the time that recording took.  `mission` is None where another process
-    made it.
+    `batch` is the row of a first submission and None for a what-if.  `answer` is its
+    JSON and lacks the time that recording took.  `mission` is None where another
+    process made it.
     """
 
     mission: Mission | None
     identity: tuple[str, str, str]
     """(spacecraft, run, batch): what is unique among submissions."""
-    answer: Row
+    answer: bytes
     batch: Row | None
     result: Row
     stars: list[Row]
@@ -78,10 +84,19 @@ class Draft:
     """Of a live batch: dated so far ahead that its time cannot be believed."""
     handed: Handed | None = None
 
+    def __reduce__(self) -> tuple[type["Draft"], tuple[Any, ...]]:
+        # To another process without what stands first, the settings of its mission: they are many.
+        return Draft, (None, *structs.astuple(self)[1:])
+
     @property
     def id(self) -> str:
         """The result's id."""
         return str(self.result["id"])
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Its stars: observed, and of them unique, ambiguous and unmatched."""
+        return {name: self.result[name] for name in STARS}
 
     @cached_property
     def contribution(self) -> Row:
@@ -94,10 +109,11 @@ class Draft:
         Of many drafts in one transaction none is recorded before the last, so
         that the whole time would be counted once for each.
         """
-        if self.handed is not None:
-            waited_ns = time.perf_counter_ns() - self.handed.ns
-            self.answer["timings_us"]["record"] = waited_ns // (1000 * self.handed.drafts)
-        return msgspec.json.encode(self.answer)
+        if self.handed is None:
+            return self.answer
+        waited_ns = time.perf_counter_ns() - self.handed.ns
+        taken = _RECORD % (b"%d" % (waited_ns // (1000 * self.handed.drafts)))
+        return self.answer.replace(_NOT_RECORDED, taken, 1)
 
 
 def submission_draft(
@@ -175,7 +191,7 @@ def _draft(
     return Draft(
         acquisition.mission,
         (batch.spacecraft, batch.run, batch.batch),
-        answer,
+        msgspec.json.encode(answer),
         batch_row,
         result,
         stars,

@@ -53,8 +53,6 @@ log = logging.getLogger(__name__)
 
 Answers = list[Answered | AcquisitionError]
 
-COUNTED = ("observed", "unique", "ambiguous", "unmatched")
-
 
 class Recorded(Struct, frozen=True, eq=False):
     """A batch that is newly recorded, as observers are told of it."""
@@ -330,7 +328,7 @@ class Intake:
             return
         recorded = Recorded(
             *draft.identity,
-            counts={name: draft.result[name] for name in COUNTED},
+            counts=draft.counts,
             has_attitude=draft.solution is not None,
         )
         for observer in self.observers:

@@ -7,15 +7,13 @@ import msgspec
 from sqlalchemy import Connection, Select, select
 
 from service.errors import NotFound, shown_value
-from service.records.draft import Row
+from service.records.draft import STARS, Row
 from service.records.measures import residual_ratio
 from service.records.pages import Page, Stretch, newest_first, page_of
 from service.records.tables import batches, frames, missions, results
 
 OutcomeName = Literal["unique", "ambiguous", "unmatched"]
 Status = Literal["good", "suspect", "none"]
-
-_COUNTS = ("observed", "unique", "ambiguous", "unmatched")
 
 
 def list_batches(
@@ -124,7 +122,7 @@ def summary_of(row: Any) -> Row:
     return {
         **{name: row[name] for name in taken},
         "options": json.loads(row["options"]),
-        "counts": {name: row[name] for name in _COUNTS},
+        "counts": {name: row[name] for name in STARS},
         "status": row["status"],
         "reason": row["reason"],
         "measures": measured(row),

@@ -121,7 +121,7 @@ def _insert(connection: Connection, fresh: Sequence[tuple[Draft, bytes]], unseen
         ((draft, body) for draft, body in fresh if draft.batch is not None),
         key=lambda each: each[0].identity,
     )
-    names = {draft.answer["run"]: draft.batch["received"] for draft, _ in firsts if draft.batch}
+    names = {draft.identity[1]: draft.batch["received"] for draft, _ in firsts if draft.batch}
     # Also those of a transaction that was taken back.  The foreign key then refuses their batches,
     # and `transact`, to which nothing is `unseen`, inserts the run.
     known: set[str] = connection.info.setdefault(_RUNS, set())
@@ -165,9 +165,10 @@ def _tell(connection: Connection, fresh: Sequence[Draft]) -> None:
             events.note(connection, "adopted", about, run=run, spacecraft=spacecraft)
     for (run, spacecraft), drafts in new.items():
         latest = max(drafts, key=lambda draft: int(draft.result["time_ns"]))
-        shown = ("id", "batch", "time", "reason", "counts")
-        newest = {name: latest.answer[name] for name in shown}
-        newest["status"] = latest.result["status"]
+        assert latest.batch is not None
+        newest: Row = {name: latest.batch[name] for name in ("id", "batch", "time")}
+        newest |= {name: latest.result[name] for name in ("status", "reason")}
+        newest["counts"] = latest.counts
         note: Row = {"spacecraft": spacecraft, "run": run, "batches": len(drafts)}
         note["latest"] = newest
         events.note(connection, "batches", note, run=run, spacecraft=spacecraft)

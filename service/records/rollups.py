@@ -44,9 +44,9 @@ def add(connection: Connection, new: Iterable[tuple[Buckets, Row]]) -> None:
     hourly: Rollups = {}
     daily: Rollups = {}
     for buckets, part in new:
-        _put(hourly, (buckets.spacecraft, buckets.run, buckets.hour), dict(part))
+        _put(hourly, (buckets.spacecraft, buckets.run, buckets.hour), part)
     for (spacecraft, run, hour), row in hourly.items():
-        _put(daily, (spacecraft, run, hour // 24), dict(row))
+        _put(daily, (spacecraft, run, hour // 24), row)
     for table, found in ((rollups_hourly, hourly), (rollups_daily, daily)):
         # In one order everywhere, so that two writers wait for each other but never cross.
         add_rollups(connection, table, [_keyed(key, found[key]) for key in sorted(found)])
@@ -114,7 +114,8 @@ def _put(found: Rollups, key: Key, row: Row) -> None:
     if key in found:
         merge(found[key], row)
     else:
-        found[key] = row
+        # A copy: what is merged into it belongs to nobody else.
+        found[key] = dict(row)
 
 
 def _place(table: Table, key: Key) -> ColumnElement[bool]:

@@ -28,7 +28,6 @@ from typing import Any, Generic, TypeVar
 from service.errors import BadConfiguration, Stopping
 from service.missions.mission import Mission
 from service.records.bench import Bench
-from service.records.draft import Draft
 from service.sky.catalog import open_catalog
 from service.sky.shelf import Shelf
 from service.sky.view import Sky
@@ -39,6 +38,8 @@ NICENESS = 10
 PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0
 """Before a worker is started in place of one that died before it was ready: twice as long each."""
 IDLE_S = 600.0
+PACKED_TOGETHER = 8
+"""Finds of a worker."""
 
 _CONTEXT = multiprocessing.get_context("spawn")
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -209,7 +210,7 @@ class Workers(Generic[Task, Found]):
                 order = self._orders.popleft()
             try:
                 line.send(order.task)
-                found = [pickle.loads(each) for each in line.recv()]
+                found = [each for some in line.recv() for each in pickle.loads(some)]
             except Exception as error:
                 # Whoever waits is told in any case; then the worker is given up.
                 order.done.set_exception(WorkerLost(f"a worker died ({error!r})"))
@@ -256,7 +257,7 @@ def _serve(line: Connection, equipment: Equipment, work: "Work[Any, Any]") -> No
         line.send(None)
         while True:
             task = line.recv()
-            line.send([_packed(each) for each in work(bench, task)])
+            line.send(_packed(work(bench, task)))
 
 
 def _end_with_parent() -> None:
@@ -266,9 +267,9 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _packed(found: object) -> bytes:
-    """One find by itself, so that to unpack many keeps nobody waiting for long."""
-    if isinstance(found, Draft):
-        # The digest names it, and settings of a mission are many.
-        found.mission = None
-    return pickle.dumps(found, pickle.HIGHEST_PROTOCOL)
+def _packed(found: Sequence[object]) -> list[bytes]:
+    """A few together, which share their names; so few that to unpack them keeps nobody waiting."""
+    return [
+        pickle.dumps(found[first : first + PACKED_TOGETHER], pickle.HIGHEST_PROTOCOL)
+        for first in range(0, len(found), PACKED_TOGETHER)
+    ]

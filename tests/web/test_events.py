@@ -96,8 +96,14 @@ def test_a_batch_is_told_of_when_it_is_recorded(database, drawn):
         kind, number, data = told
         assert (kind, number) == ("batches", hello[2]["last"] + 1)
         assert (data["spacecraft"], data["run"], data["batches"]) == ("XTE", "live", 1)
-        assert data["latest"]["batch"] == batch["batch"]
-        assert data["latest"]["time"] == batch["time"]
+        with httpx.Client(base_url=address, timeout=60, trust_env=False) as client:
+            record = client.get(f"/api/v1/batches/{data['latest']['id']}").json()
+        answer = record["answer"]
+        assert answer["batch"] == batch["batch"]
+        assert data["latest"] == {
+            "status": answer["attitude"]["status"],
+            **{name: answer[name] for name in ("id", "batch", "time", "reason", "counts")},
+        }
 
 
 def test_who_was_away_is_told_of_everything_in_between_and_of_nothing_twice(database, drawn):
