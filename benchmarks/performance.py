@@ -58,9 +58,10 @@ ABOUT = {
         "Each batch is dated a second after the one before. Bounds: 0.35 of the no-op's rate at 16 "
         "connections; bulk 0.5 of parsing and inserting "
         "alone; p99 of single posts beside bulk under 3 times its idle value; ready within 3 s of "
-        "the start of the process, the first request at most 1.5 times the hundredth after the "
-        "same pause (medians of some starts; in a row, caches warm, it is quicker). Processor time "
-        "and memory are those of all processes of the service, what they share counted each time."
+        "the start of the process, the first request longer than later ones after the "
+        "same pause by no more than two posts in a row take (medians of some starts). "
+        "Processor time and memory are those of all processes of the service, what they share "
+        "counted each time."
     ),
     "stored": (
         "A database filled by `benchmarks.fill_database`, then batches recorded in earnest and "

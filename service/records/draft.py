@@ -29,8 +29,8 @@ Row = dict[str, Any]
 STARS = ("observed", "unique", "ambiguous", "unmatched")
 """What is counted of a result's stars."""
 
-_RECORD = b'"record":%b'
-_NOT_RECORDED = _RECORD % b"null"
+_RECORD = b'"record":'
+_NOT_RECORDED = _RECORD + b"null"
 """Of `timings_us`; within a text of the client's there would be a backslash before its quotes."""
 
 
@@ -112,8 +112,8 @@ class Draft(Struct, eq=False, dict=True):
         if self.handed is None:
             return self.answer
         waited_ns = time.perf_counter_ns() - self.handed.ns
-        taken = _RECORD % (b"%d" % (waited_ns // (1000 * self.handed.drafts)))
-        return self.answer.replace(_NOT_RECORDED, taken, 1)
+        head, _, tail = self.answer.rpartition(_NOT_RECORDED)
+        return b"%b%b%d%b" % (head, _RECORD, waited_ns // (1000 * self.handed.drafts), tail)
 
 
 def submission_draft(
