@@ -234,7 +234,7 @@ def _rows(
 
 
 def _rollups(drawn: dict[str, Floats], bucket: npt.NDArray[np.int64]) -> Iterator[dict[str, Any]]:
-    """The rollup of every bucket in a chunk (see `service.records.measures.contribution`)."""
+    """The rollup of every bucket in a chunk (see `service.records.measures.rolled_up`)."""
     numbers, first = np.unique(bucket, return_index=True)
     columns: dict[str, Any] = {"bucket": numbers.tolist()}
     columns["batches"] = np.diff([*first.tolist(), len(bucket)]).tolist()

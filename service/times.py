@@ -41,6 +41,7 @@ _TEXT = re.compile(
     r"T(?P<hour>\d{2}):(?P<minute>\d{2}):(?P<second>\d{2})(?P<fraction>\.\d{1,9})?Z?",
     re.ASCII,
 )
+_TWO_DIGITS = [f"{number:02d}" for number in range(61)]
 T = TypeVar("T")
 _FORMS = "UTC as 1996-01-10T12:00:00.000Z or 1996-010T12:00:00.000Z"
 
@@ -83,8 +84,9 @@ class Utc:
     def text(self) -> str:
         """Calendar text with at least three and at most nine decimals, ending in Z."""
         day, hour, minute, second, nanoseconds = self._fields
-        decimals = f"{nanoseconds:09d}".rstrip("0").ljust(3, "0")
-        return f"{day.isoformat()}T{hour:02d}:{minute:02d}:{second:02d}.{decimals}Z"
+        decimals = f"{nanoseconds:09d}".rstrip("0").ljust(3, "0") if nanoseconds else "000"
+        clock = f"{_TWO_DIGITS[hour]}:{_TWO_DIGITS[minute]}:{_TWO_DIGITS[second]}"
+        return f"{day.isoformat()}T{clock}.{decimals}Z"
 
     @property
     def day_of_year(self) -> int:
@@ -216,26 +218,27 @@ def _read(text: str) -> Utc:
     match = _TEXT.fullmatch(text)
     if match is None:
         raise ValueError(f"must be {_FORMS}")
-    year, hour, minute, second = (int(match[n]) for n in ("year", "hour", "minute", "second"))
+    years, months, days, days_of_year, hours, minutes, seconds, fraction = match.groups("")
+    year, hour, minute, second = int(years), int(hours), int(minutes), int(seconds)
     if not FIRST_YEAR <= year <= LAST_YEAR:
         raise ValueError(f"the year must be from {FIRST_YEAR} to {LAST_YEAR}")
     if hour > 23 or minute > 59 or second > 60:
         raise ValueError("there is no such time of day")
     try:
-        if match["doy"]:
-            day = date(year, 1, 1) + timedelta(days=int(match["doy"]) - 1)
+        if days_of_year:
+            day = date(year, 1, 1) + timedelta(days=int(days_of_year) - 1)
         else:
-            day = date(year, int(match["month"]), int(match["day"]))
+            day = date(year, int(months), int(days))
     except ValueError:
         raise ValueError("there is no such day") from None
     if day.year != year:
         raise ValueError("there is no such day of the year")
     if second == 60 and not ((hour, minute) == (23, 59) and _length_s(day) > DAY_S):
         raise ValueError("there is no leap second at that time")
-    fraction = match["fraction"] or ".0"
-    moment = _from_fields(day, hour, minute, second + float(fraction))
+    moment = _from_fields(day, hour, minute, second + float(fraction or 0.0))
     # What was read need not be worked out again from the Julian date, which has it to 1e-11 s.
-    vars(moment)["_fields"] = day, hour, minute, second, int(fraction[1:].ljust(9, "0"))
+    nanoseconds = int(fraction[1:].ljust(9, "0"))
+    vars(moment)["_fields"] = day, hour, minute, second, nanoseconds
     return moment
 
 

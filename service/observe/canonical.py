@@ -136,8 +136,9 @@ def _prior_of(prior: Prior, sun_vector: Triple | None, position_km: Triple | Non
     """The a priori knowledge as the core takes it; the Sun's direction may stand beside it too."""
     if prior.quaternion is not None:
         # By plain numbers: numpy takes as long for four as for a thousand.
-        norm = math.sqrt(sum([part * part for part in prior.quaternion]))
-        return QuaternionPrior(_array([part / norm for part in prior.quaternion]))
+        q1, q2, q3, qc = prior.quaternion
+        norm = math.sqrt(q1 * q1 + q2 * q2 + q3 * q3 + qc * qc)
+        return QuaternionPrior(_array((q1 / norm, q2 / norm, q3 / norm, qc / norm)))
     if prior.boresight is not None:
         return BoresightPrior(prior.boresight.ra_deg, prior.boresight.dec_deg)
     sun = prior.sun_vector or sun_vector
@@ -149,29 +150,31 @@ def _prior_of(prior: Prior, sun_vector: Triple | None, position_km: Triple | Non
 
 def _tracker_stars(tracker: Tracker) -> TrackerStars:
     stars = tracker.stars
-    numbers = _array(
-        [
-            [star.h_deg for star in stars],
-            [star.v_deg for star in stars],
-            [star.magnitude for star in stars],
-            [star.time_offset_s for star in stars],
-            [star.sigma_arcsec for star in stars],
-        ]
-    )
+    vectors: list[float] = []
+    for star in stars:
+        x, y, z = star.vector
+        # The norm is near one, or NaN: nothing is divided by zero.
+        norm = math.sqrt(x * x + y * y + z * z)
+        vectors += (x / norm, y / norm, z / norm)
+    # All in one block, of which each array is a part: to make one takes longer than to fill it.
+    numbers = [
+        *vectors,
+        *[star.h_deg for star in stars],
+        *[star.v_deg for star in stars],
+        *[star.magnitude for star in stars],
+        *[star.time_offset_s for star in stars],
+        *[star.sigma_arcsec for star in stars],
+    ]
+    n = len(stars)
+    block = read_only(np.fromiter(numbers, np.float64, len(numbers)))
     return TrackerStars(
         tracker=tracker.tracker,
-        vector=_array([_normalised(*star.vector) for star in stars]).reshape(-1, 3),
-        angles_deg=numbers[:2].T,
-        magnitude_mag=numbers[2],
-        time_offset_s=numbers[3],
-        sigma_arcsec=numbers[4],
+        vector=block[: 3 * n].reshape(n, 3),
+        angles_deg=block[3 * n : 5 * n].reshape(2, n).T,
+        magnitude_mag=block[5 * n : 6 * n],
+        time_offset_s=block[6 * n : 7 * n],
+        sigma_arcsec=block[7 * n :],
     )
-
-
-def _normalised(x: float, y: float, z: float) -> Triple:
-    # The norm is near one, or NaN: nothing is divided by zero.
-    norm = math.sqrt(x * x + y * y + z * z)
-    return x / norm, y / norm, z / norm
 
 
 def _array(values: Any) -> Vector:

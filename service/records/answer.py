@@ -13,6 +13,7 @@ from service.vectors import ra_dec_of
 
 FRAME = "EME2000"
 WORDS = {int(outcome): outcome.word for outcome in Outcome}
+_AMBIGUOUS = int(Outcome.AMBIGUOUS)
 
 
 @dataclass(frozen=True)
@@ -89,9 +90,10 @@ def star_rows(acquisition: Acquisition) -> list[StarRow]:
 
 def rows_of_stars(answer: dict[str, Any]) -> list[dict[str, Any]]:
     """`star_rows` as rows of the table, from the answer itself."""
+    id = answer["id"]
     return [
         {
-            "result_id": answer["id"],
+            "result_id": id,
             "tracker": tracker["tracker"],
             "position": position,
             "outcome": star["outcome"],
@@ -150,14 +152,15 @@ def _stars(result: TrackerResult, run_catalog: RunCatalog) -> list[dict[str, Any
             "votes": votes,
             "runner_up": second,
         }
-        if outcome == Outcome.AMBIGUOUS or found.rivals[k]:
+        if outcome == _AMBIGUOUS or found.rivals[k]:
             star["rivals"] = [_star_id(run_catalog, rival) for rival in found.rivals[k]]
             if found.rival_probability:
                 star["rival_probabilities"] = list(found.rival_probability[k])
-        star["probability"] = _number(probability)
-        star["residual_arcsec"] = _number(residual)
+        # NaN, which is not equal to itself, is no number of JSON.
+        star["probability"] = probability if probability == probability else None
+        star["residual_arcsec"] = residual if residual == residual else None
         flags = ["outside_field_of_view"] if outside else []
-        if math.isnan(mag):
+        if mag != mag:
             flags.append("no_magnitude")
         if row >= 0 and rows.count(row) > 1:
             flags.append("same_star_twice")
@@ -191,7 +194,7 @@ def _attitude(solution: AttitudeSolution) -> dict[str, Any]:
 
 
 def _star_id(run_catalog: RunCatalog, row: int) -> str | None:
-    return None if row < 0 else str(run_catalog.star_id[row])
+    return None if row < 0 else run_catalog.star_id[row]
 
 
 def _number(value: float) -> float | None:

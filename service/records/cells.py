@@ -14,9 +14,10 @@ import numpy as np
 from sqlalchemy import BigInteger, Connection, Select, Table, bindparam, case, func, select
 
 from service.records.draft import Row
-from service.records.summing import COLUMNS, SUMMED
+from service.records.summing import SUMMED
 from service.records.tables import (
     COUNTS,
+    ROLLED_UP,
     results,
     rollups_daily,
     rollups_hourly,
@@ -60,7 +61,9 @@ def batches_about(connection: Connection, span: Span) -> int:
     return int(connection.execute(query).scalar() or 0)
 
 
-def read_cells(connection: Connection, span: Span, level: Level, names: Names = COLUMNS) -> Columns:
+def read_cells(
+    connection: Connection, span: Span, level: Level, names: Names = ROLLED_UP
+) -> Columns:
     """The cells of a span, in order of time; those without a batch are left out."""
     table, width_s = _COARSE[level]
     first, last = (_at_or_after(span.start, width_s), span.end.bucket(width_s))
@@ -83,7 +86,9 @@ def _finer(connection: Connection, span: Span, level: Level, names: Names) -> Co
     return read_steps(connection, span, HOUR_S, names)
 
 
-def read_steps(connection: Connection, span: Span, width_s: int, names: Names = COLUMNS) -> Columns:
+def read_steps(
+    connection: Connection, span: Span, width_s: int, names: Names = ROLLED_UP
+) -> Columns:
     """Cells of so much of a UTC day each, summed up by the database from the batches.
 
     The width divides a day.  However many batches there are, no more is held

@@ -9,7 +9,7 @@ hundred small objects.
 import json
 import time
 from collections.abc import Mapping
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import msgspec
@@ -21,7 +21,7 @@ from service.observe.frame_record import FrameRecord
 from service.observe.wire import Submission
 from service.records.ahead import AHEAD_NS, LIVE
 from service.records.answer import answer_of, rows_of_stars
-from service.records.measures import contribution, measures_of
+from service.records.measures import measures_of
 from service.times import DAY_S, HOUR_S, Utc
 
 Row = dict[str, Any]
@@ -59,7 +59,7 @@ class Handed(Struct, frozen=True):
     drafts: int
 
 
-class Draft(Struct, eq=False, dict=True):
+class Draft(Struct, eq=False):
     """A result that is computed and not yet recorded.
 
     `batch` is the row of a first submission and None for a what-if.  `answer` is its
@@ -97,11 +97,6 @@ class Draft(Struct, eq=False, dict=True):
     def counts(self) -> dict[str, int]:
         """Its stars: observed, and of them unique, ambiguous and unmatched."""
         return {name: self.result[name] for name in STARS}
-
-    @cached_property
-    def contribution(self) -> Row:
-        """What the result is to the trends and to what is watched."""
-        return contribution(self.result)
 
     def finish(self) -> bytes:
         """The answer's JSON; `timings_us.record` is its share of the time since it was handed on.
@@ -270,12 +265,21 @@ def _solution_row(acquisition: Acquisition, answer: Row, result_id: str) -> Row 
     attitude, solution = answer["attitude"], acquisition.solution
     if attitude is None or solution is None:
         return None
-    q, p = attitude["quaternion"], attitude["covariance_arcsec2"]
+    q1, q2, q3, qc = attitude["quaternion"]
+    (p11, p12, p13), (_, p22, p23), (_, _, p33) = attitude["covariance_arcsec2"]
     return {
         "result_id": result_id,
-        **dict(zip(("q1", "q2", "q3", "qc"), q, strict=True)),
+        "q1": q1,
+        "q2": q2,
+        "q3": q3,
+        "qc": qc,
         "frame": attitude["frame"],
-        **{f"p{i + 1}{j + 1}": p[i][j] for i in range(3) for j in range(i, 3)},
+        "p11": p11,
+        "p12": p12,
+        "p13": p13,
+        "p22": p22,
+        "p23": p23,
+        "p33": p33,
         "residual_rms_arcsec": attitude["residual_rms_arcsec"],
         "predicted_rms_arcsec": solution.predicted_rms_arcsec,
         "taste": attitude["taste"],

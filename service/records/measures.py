@@ -1,12 +1,15 @@
 """What is measured of one result: what trends are drawn of and limits are held against."""
 
 import math
+from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
 
 from service.acquire import Acquisition
-from service.records.tables import COUNTS, MAXIMA, MINIMA, SUMS
+from service.records.tables import COUNTS, MAXIMA, MINIMA, ROLLED_UP, SUMS, VALUES
 from service.vectors import separation_deg
 
 Row = dict[str, Any]
@@ -62,34 +65,38 @@ def residual_ratio(row: Row) -> float | None:
     return None if rms is None or not predicted else float(rms / predicted)
 
 
-def contribution(result: Row) -> Row:
-    """What one current result is to the trends: the columns of a rollup of it alone."""
-    observed, status = result["observed"], result["status"]
-    values = {
-        "residual_rms_arcsec": result["residual_rms_arcsec"],
-        "predicted_rms_arcsec": result["predicted_rms_arcsec"],
-        "residual_ratio": residual_ratio(result),
-        "magnitude_offset_mag": result["magnitude_offset_mag"],
-        "a_priori_angle_deg": result["a_priori_angle_deg"],
-    }
-    shares = {
-        "ambiguous_share": result["ambiguous"] / observed if observed else None,
-        "unmatched_share": result["unmatched"] / observed if observed else None,
-    }
-    row: Row = {
-        "batches": 1,
-        "observed": observed,
-        "unique": result["unique"],
-        "ambiguous": result["ambiguous"],
-        "unmatched": result["unmatched"],
-        "solved": int(status is not None),
-        "suspect": int(status == "suspect"),
-    }
-    for name, value in values.items():
-        row[f"{name}_n"], row[f"{name}_sum"] = int(value is not None), value or 0.0
-    for name, value in (shares | values).items():
-        row[f"{name}_min"] = row[f"{name}_max"] = value
-    return row
+VALUE_OF: Mapping[str, Callable[[Row], float | None]] = {
+    name: residual_ratio if name == "residual_ratio" else itemgetter(name) for name in VALUES
+}
+"""What gives a result's value by name, None where it has none."""
+
+
+def rolled_up(results: Sequence[Row]) -> Row:
+    """What current results are to the trends: the columns of a rollup of them."""
+    observed = [row["observed"] for row in results]
+    status = [row["status"] for row in results]
+    counts = (
+        len(results),
+        sum(observed),
+        sum([row["unique"] for row in results]),
+        sum([row["ambiguous"] for row in results]),
+        sum([row["unmatched"] for row in results]),
+        len(status) - status.count(None),
+        status.count("suspect"),
+    )
+    shares = [
+        [row[name] / row["observed"] for row in results if row["observed"]]
+        for name in ("ambiguous", "unmatched")
+    ]
+    values = [
+        [value for value in map(of, results) if value is not None] for of in VALUE_OF.values()
+    ]
+    sums = chain.from_iterable((len(there), sum(there, 0.0)) for there in values)
+    extremes = shares + values
+    least = [min(there, default=None) for there in extremes]
+    most = [max(there, default=None) for there in extremes]
+    # In the order of the columns: to put their names together takes longer than all of this.
+    return dict(zip(ROLLED_UP, (*counts, *sums, *least, *most), strict=True))
 
 
 def merge(into: Row, row: Row) -> None:

@@ -137,7 +137,7 @@ def _insert(connection: Connection, fresh: Sequence[tuple[Draft, bytes]], unseen
     insert_all(connection, batches, [draft.batch for draft, _ in firsts if draft.batch])
     insert_all(connection, frames, [draft.frame for draft, _ in firsts if draft.frame])
     _insert_results(connection, firsts)
-    rollups.add(connection, ((draft.buckets, draft.contribution) for draft, _ in firsts))
+    rollups.add(connection, ((draft.buckets, draft.result) for draft, _ in firsts))
     # What-ifs go one by one: of two that are adopted, the second supersedes the first.
     adopted = []
     for draft, body in fresh:

@@ -12,7 +12,7 @@ from sqlalchemy import ColumnElement, Connection, Table, and_, delete, select, u
 
 from service.errors import BadInput, Fault
 from service.records.draft import Buckets, Row
-from service.records.measures import contribution, merge
+from service.records.measures import merge, rolled_up
 from service.records.statements import add_rollups
 from service.records.summing import SUMMED
 from service.records.tables import COUNTS, batches, results, rollups_daily, rollups_hourly
@@ -40,11 +40,12 @@ _TRENDS: dict[Bucket, _Trend] = {
 
 
 def add(connection: Connection, new: Iterable[tuple[Buckets, Row]]) -> None:
-    """Add contributions of new current results to the hours and days that they belong to."""
-    hourly: Rollups = {}
+    """Add new current results, rows of theirs, to the hours and days that they belong to."""
+    of_hour: dict[Key, list[Row]] = {}
+    for buckets, result in new:
+        of_hour.setdefault((buckets.spacecraft, buckets.run, buckets.hour), []).append(result)
+    hourly = {key: rolled_up(found) for key, found in of_hour.items()}
     daily: Rollups = {}
-    for buckets, part in new:
-        _put(hourly, (buckets.spacecraft, buckets.run, buckets.hour), part)
     for (spacecraft, run, hour), row in hourly.items():
         _put(daily, (spacecraft, run, hour // 24), row)
     for table, found in ((rollups_hourly, hourly), (rollups_daily, daily)):
@@ -184,5 +185,5 @@ def recount(connection: Connection, bucket: Bucket) -> Rollups:
     query = select(results, batches.c.time).join_from(results, batches).where(results.c.current)
     for row in connection.execute(query).mappings():
         key = row["spacecraft"], row["run"], parse_utc(row["time"]).bucket(width_s)
-        _put(found, key, contribution(dict(row)))
+        _put(found, key, rolled_up([dict(row)]))
     return found

@@ -1,7 +1,7 @@
 """The columns of a rollup, summed up by the database over current results.
 
-What `measures.contribution` and `measures.merge` make of results one by one;
-of many it is made where they are, and one row is read instead of thousands.
+What `measures.rolled_up` makes of results that are at hand; of many it is made where
+they are, and one row is read instead of thousands.
 The index of current results has every column that is asked for.
 """
 
@@ -10,10 +10,7 @@ from typing import Any
 
 from sqlalchemy import BigInteger, ColumnElement, Double, case, func
 
-from service.records.tables import COUNTS, MAXIMA, MINIMA, SHARES, SUMS, VALUES, results
-
-COLUMNS = (*COUNTS, *SUMS, *MINIMA, *MAXIMA)
-"""The columns of a rollup without its key."""
+from service.records.tables import SHARES, VALUES, results
 
 _OF = results.c
 _OBSERVED = _OF.unique + _OF.ambiguous + _OF.unmatched

@@ -256,6 +256,8 @@ VALUES = (
 SUMS = tuple(f"{name}_{part}" for name in VALUES for part in ("n", "sum"))
 MINIMA = tuple(f"{name}_min" for name in (*SHARES, *VALUES))
 MAXIMA = tuple(f"{name}_max" for name in (*SHARES, *VALUES))
+ROLLED_UP = (*COUNTS, *SUMS, *MINIMA, *MAXIMA)
+"""The columns of a rollup without its key."""
 
 
 def _rollup(name: str) -> Table:

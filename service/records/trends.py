@@ -18,7 +18,7 @@ from service.records.cells import (
     read_steps,
 )
 from service.records.draft import Row
-from service.records.measures import contribution
+from service.records.measures import rolled_up
 from service.records.pages import Stretch, newest, newest_first
 from service.records.tables import batches, results
 from service.times import DAY_S, HOUR_S, Utc, parse_utc, shifted, unix_seconds, utc_now
@@ -228,7 +228,7 @@ def _of_batches(rows: Sequence[Any], asked: Asked) -> Row:
 
 def value_of(result: Any, name: QuantityName) -> float | None:
     """What one batch's current result has of a quantity."""
-    row = contribution(result)
+    row = rolled_up([result])
     match QUANTITIES[name].of:
         case "batches" if name == "no_attitude_share":
             return float(1 - row["solved"])

@@ -24,6 +24,7 @@ from service.records.alarms import change, note
 from service.records.draft import Draft, Row
 from service.records.ids import Ulids
 from service.records.limits import limits_of
+from service.records.measures import VALUE_OF
 from service.records.prepared import prepared
 from service.records.statements import insert_missing
 from service.records.tables import alarms, batches, missions, runs, watches
@@ -122,21 +123,23 @@ class _Watch:
         """Look at every batch in order of time, and keep what was found."""
         assert self._row is not None
         alert = self._alert()
-        latest = dict(self._row)
-        received, received_ns = latest["received"], self._seen.ns_of(latest["received"])
+        row, newest = self._row, None
+        latest_ns, received = row["time_ns"], row["received"]
+        received_ns = self._seen.ns_of(received)
         for draft in self._drafts:
-            assert draft.batch is not None
+            batch = draft.batch
+            assert batch is not None
             since_ns = draft.received_ns - received_ns
             if self._run != LIVE:
-                since_ns = draft.batch["time_ns"] - latest["time_ns"]
-            self._mind_the_gap(since_ns * 1e-9, draft.batch)
+                since_ns = batch["time_ns"] - latest_ns
+            self._mind_the_gap(since_ns * 1e-9, batch)
             if alert:
                 self._judge(draft, alert)
-            if draft.batch["time_ns"] >= latest["time_ns"]:
-                latest |= _latest_of(draft.batch)
+            if batch["time_ns"] >= latest_ns:
+                newest, latest_ns = batch, batch["time_ns"]
             if draft.received_ns > received_ns:
-                received, received_ns = draft.batch["received"], draft.received_ns
-        latest["received"] = received
+                received, received_ns = batch["received"], draft.received_ns
+        latest = row | (_latest_of(newest) if newest else {}) | {"received": received}
         kept = {name: window.to_json() for name, window in self._windows.items()}
         latest["state"] = msgspec.json.encode(kept).decode()
         seen = _Seen(latest["state"], self._windows, received, received_ns)
@@ -166,10 +169,10 @@ class _Watch:
         value alone: of those before it nothing would be kept.
         """
         alert = []
-        new = [(draft.result["time_ns"], draft.contribution) for draft in self._drafts]
+        new = [draft.result for draft in self._drafts]
         for name, limits in self._limits.items():
             sample_of = _SAMPLE_OF[name]
-            samples = [sample for each in new if (sample := sample_of(*each))]
+            samples = [sample for each in new if (sample := sample_of(each))]
             if not samples:
                 continue
             window = self._windows.setdefault(name, Window())
@@ -187,13 +190,13 @@ class _Watch:
         return next(
             draft.batch
             for draft in reversed(self._drafts)
-            if draft.batch and sample_of(draft.result["time_ns"], draft.contribution)
+            if draft.batch and sample_of(draft.result)
         )
 
     def _judge(self, draft: Draft, alert: Sequence[tuple[QuantityName, LimitSettings]]) -> None:
         assert draft.batch is not None
         for name, limits in alert:
-            sample = _SAMPLE_OF[name](draft.result["time_ns"], draft.contribution)
+            sample = _SAMPLE_OF[name](draft.result)
             judged = sample and self._windows[name].add(sample, limits)
             if not judged:
                 continue
@@ -377,23 +380,24 @@ def _shelved_until(now: Utc) -> Any:
     )
 
 
-def _sampling(name: QuantityName) -> Callable[[int, Row], Sample | None]:
-    """What makes of a batch's time and contribution its sample of a quantity; None without one."""
+def _sampling(name: QuantityName) -> Callable[[Row], Sample | None]:
+    """What makes of a batch's result its sample of a quantity; None without one."""
 
-    def share_of_stars(time_ns: int, parts: Row) -> Sample | None:
-        whole = parts["observed"]
-        return (time_ns, parts[column], whole) if whole else None
+    def share_of_stars(result: Row) -> Sample | None:
+        whole = result["observed"]
+        return (result["time_ns"], result[part], whole) if whole else None
 
-    def suspect(time_ns: int, parts: Row) -> Sample:
-        return time_ns, parts["suspect"], 1
+    def suspect(result: Row) -> Sample:
+        return result["time_ns"], int(result["status"] == "suspect"), 1
 
-    def without_attitude(time_ns: int, parts: Row) -> Sample:
-        return time_ns, 1 - parts["solved"], 1
+    def without_attitude(result: Row) -> Sample:
+        return result["time_ns"], int(result["status"] is None), 1
 
-    def value(time_ns: int, parts: Row) -> Sample | None:
-        return (time_ns, parts[total], 1) if parts[count] else None
+    def value(result: Row) -> Sample | None:
+        found = VALUE_OF[name](result)
+        return None if found is None else (result["time_ns"], found, 1)
 
-    column, total, count = name.removesuffix("_share"), f"{name}_sum", f"{name}_n"
+    part = name.removesuffix("_share")
     match QUANTITIES[name].of:
         case "stars":
             return share_of_stars
@@ -402,7 +406,7 @@ def _sampling(name: QuantityName) -> Callable[[int, Row], Sample | None]:
         case "value":
             return value
         case _:
-            return lambda time_ns, parts: None
+            return lambda result: None
 
 
 _SAMPLE_OF = {name: _sampling(name) for name in QUANTITIES}

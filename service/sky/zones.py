@@ -200,7 +200,8 @@ def _counts_within(direction, axis, least, most, pair_rows):  # type: ignore[no-
             inside[row] = least <= separation_rad(r, axis) <= most
         stars += inside[row]
     for k in range(pair_rows.shape[1]):
-        pairs += inside[pair_rows[0, k]] & inside[pair_rows[1, k]]
+        # Unsigned: a row that might be counted from the end takes as long to look at again.
+        pairs += inside[np.uint64(pair_rows[0, k])] & inside[np.uint64(pair_rows[1, k])]
     return stars, pairs
 
 

@@ -3,7 +3,6 @@
 from service.records import rollups
 from service.records.draft import Buckets
 from service.records.ids import Ulids
-from service.records.measures import contribution
 from service.records.statements import insert_all, insert_missing
 from service.records.tables import batches, results, runs
 from service.times import DAY_S, HOUR_S, parse_utc
@@ -64,7 +63,7 @@ def put(operations, rows):
         )
         insert_all(connection, batches, [batch for batch, _ in rows])
         insert_all(connection, results, [result for _, result in rows])
-        rollups.add(connection, [(_buckets(batch), contribution(result)) for batch, result in rows])
+        rollups.add(connection, [(_buckets(batch), result) for batch, result in rows])
 
     operations.store.writer.change(write).result()
 
