@@ -59,7 +59,7 @@ ABOUT = {
         "connections; bulk 0.5 of parsing and inserting "
         "alone; p99 of single posts beside bulk under 3 times its idle value; ready within 3 s of "
         "the start of the process, the first request longer than later ones after the "
-        "same pause by no more than two posts in a row take (medians of some starts). "
+        "same pause by no more than 1.5 posts in a row take (medians of some starts). "
         "Processor time and memory are those of all processes of the service, what they share "
         "counted each time."
     ),

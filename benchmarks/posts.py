@@ -47,7 +47,7 @@ GAP_S = 0.02
 """Between the posts of a connection, where waits and not rates are measured."""
 CHUNK = 250
 LEAST_OF_NO_OP, LEAST_OF_CEILING, MOST_WAIT, MOST_READY_S = 0.35, 0.5, 3.0, 3.0
-MOST_FIRST = 2.0
+MOST_FIRST = 1.5
 """Posts in a row that the first may take longer than later ones after the same pause.
 
 No share of theirs: a processor that slept makes them take 1.3 ms at one time and 3 at another.

@@ -62,9 +62,9 @@ class Handed(Struct, frozen=True):
 class Draft(Struct, eq=False):
     """A result that is computed and not yet recorded.
 
-    `batch` is the row of a first submission and None for a what-if.  `answer` is its
-    JSON and lacks the time that recording took.  `mission` is None where another
-    process made it.
+    `batch` is the row of a first submission and None for a what-if.  `answer` is JSON
+    and lacks the time that recording took.  `mission` is None where another process
+    made the draft.
     """
 
     mission: Mission | None
@@ -108,6 +108,7 @@ class Draft(Struct, eq=False):
             return self.answer
         waited_ns = time.perf_counter_ns() - self.handed.ns
         head, _, tail = self.answer.rpartition(_NOT_RECORDED)
+        assert head
         return b"%b%b%d%b" % (head, _RECORD, waited_ns // (1000 * self.handed.drafts), tail)
 
 

@@ -38,8 +38,8 @@ NICENESS = 10
 PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0
 """Before a worker is started in place of one that died before it was ready: twice as long each."""
 IDLE_S = 600.0
-PACKED_TOGETHER = 8
-"""Finds of a worker."""
+PACKED_TOGETHER, MOST_BYTES = 8, 65_536
+"""Finds of a worker, unless they are larger than so."""
 
 _CONTEXT = multiprocessing.get_context("spawn")
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -268,8 +268,13 @@ def _end_with_parent() -> None:
 
 
 def _packed(found: Sequence[object]) -> list[bytes]:
-    """A few together, which share their names; so few that to unpack them keeps nobody waiting."""
-    return [
-        pickle.dumps(found[first : first + PACKED_TOGETHER], pickle.HIGHEST_PROTOCOL)
-        for first in range(0, len(found), PACKED_TOGETHER)
-    ]
+    """A few together, which share their names; large ones alone, for unpacking holds up others."""
+    packs = []
+    for first in range(0, len(found), PACKED_TOGETHER):
+        some = found[first : first + PACKED_TOGETHER]
+        pack = pickle.dumps(some, pickle.HIGHEST_PROTOCOL)
+        if len(pack) <= MOST_BYTES:
+            packs.append(pack)
+        else:
+            packs += [pickle.dumps([each], pickle.HIGHEST_PROTOCOL) for each in some]
+    return packs

@@ -6,6 +6,7 @@ import pickle
 import pytest
 from msgspec import structs
 
+from service.records.workers import MOST_BYTES, PACKED_TOGETHER, _packed
 from tests.records import samples
 
 
@@ -25,11 +26,23 @@ def test_a_draft_comes_from_another_process_whole_but_for_its_mission(draft, kin
 
 
 def test_drafts_that_come_together_are_small(draft):
-    """What they are made of has one name for all of them, and a mission's settings stay behind."""
-    together = [draft(f"b{k}", after_s=60.0 * k) for k in range(8)]
-    size = len(pickle.dumps(together, pickle.HIGHEST_PROTOCOL))
-    # Of one by itself it would be half as much again.
-    assert size < 1.4 * sum(len(each.answer) + len(each.batch["input"]) for each in together)
+    """What they are made of has one name for all of them."""
+    together = [draft(f"b{k}", after_s=60.0 * k) for k in range(2 * PACKED_TOGETHER)]
+    packs = _packed(together)
+    assert [len(pickle.loads(pack)) for pack in packs] == [PACKED_TOGETHER] * 2
+    alone = sum(len(pack) for each in together for pack in _packed([each]))
+    assert sum(map(len, packs)) < 0.95 * alone
+
+
+def test_what_is_large_comes_alone():
+    large = [b"x" * MOST_BYTES, b"y", b"z" * MOST_BYTES]
+    packs = _packed([*large, *[b"small"] * PACKED_TOGETHER])
+    assert [pickle.loads(pack) for pack in packs[:3]] == [[each] for each in large]
+    assert [each for pack in packs for each in pickle.loads(pack)] == [
+        *large,
+        *[b"small"] * PACKED_TOGETHER,
+    ]
+    assert max(len(pickle.loads(pack)) for pack in packs) > 1
 
 
 @pytest.mark.parametrize("name", ['"record":null', '{"timings_us":{"record":null}}', "\\"])
