@@ -24,8 +24,12 @@ WRITER_CACHE_KIB = 32_768
 """Of pages: the inner ones of every index are read with each batch."""
 TO_WRITE, TO_READ = "BEGIN IMMEDIATE", "BEGIN"
 """How SQLite begins a transaction of the one connection that writes, and of a reader."""
-MAX_POSTGRESQL_READERS = 16
-"""A server allows a hundred connections as it comes; whoever finds none free waits for one."""
+MAX_READERS = 16
+"""At once in a process; whoever finds none free waits for one.
+
+PostgreSQL allows a hundred connections as it comes; of SQLite each keeps two megabytes
+of pages, and whoever computes beside it a page of answers.
+"""
 
 _DRIVERS = {
     "sqlite": "sqlite",
@@ -72,13 +76,13 @@ def writing_engine(url: URL) -> Engine:
 def reading_engine(url: URL) -> Engine:
     """The engine of the readers, none of which can write.
 
-    As many connections are kept as were ever in use at once: to open one costs
-    more than a dozen reads.
+    As many connections are kept as were ever in use at once, up to `MAX_READERS`: to
+    open one costs more than a dozen reads.
     """
     if url.drivername != "sqlite":
-        engine = _postgresql(url, pool_size=MAX_POSTGRESQL_READERS, max_overflow=0)
+        engine = _postgresql(url, pool_size=MAX_READERS, max_overflow=0)
         return engine.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
-    engine = create_engine(url, poolclass=QueuePool, pool_size=0)
+    engine = create_engine(url, poolclass=QueuePool, pool_size=MAX_READERS, max_overflow=0)
     _set_up_sqlite(engine, "query_only = ON", begin=TO_READ)
     return engine
 
