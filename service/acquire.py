@@ -5,16 +5,35 @@ Pure: an answer depends on the batch, the mission and the catalog alone.  Not
 finding a star is a result; only bad input raises.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from time import perf_counter_ns as clock_ns
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import replace
 
 from service import __version__
 from service.attitude.solution import AttitudeSolution, NoAttitude
-from service.identify.identification import Identification, Outcome, not_known, nothing_known
+from service.attitude.solve import taste_bound
+from service.identify.groups import (
+    Mask,
+    log_weight_of_group,
+    may_be_a_group,
+    of_all,
+    part_of,
+    share_of,
+    shared,
+)
+from service.identify.identification import (
+    Identification,
+    Integers,
+    Outcome,
+    not_known,
+    nothing_known,
+)
 from service.identify.lost_in_space.finder import find_attitude
 from service.identify.lost_in_space.solver import FEWEST_POINTS
 from service.identify.matched import attitude_of
@@ -46,6 +65,7 @@ from service.sky.view import Sky
 from service.sky.zones import Aim, Zone, counts_within
 from service.vectors import (
     Vector,
+    attitude_error_arcsec,
     quaternion_from_matrix,
     read_only,
     separation_deg,
@@ -58,6 +78,8 @@ IDENTIFIERS: Mapping[Identifier, Callable[[Sighting], Identification]] = {
     # About the attitude that was found in the whole sky.
     "lost_in_space": identify_verified,
 }
+WITH_HYPOTHESES: frozenset[Identifier] = frozenset({"verified", "lost_in_space"})
+"""Identifiers that weigh hypotheses, so that two groups of stars can be told apart and weighed."""
 WITHOUT_PRIOR: frozenset[Identifier] = frozenset({"ptp"})
 """Identifiers that look in the whole sky, and are given its guide database."""
 
@@ -125,10 +147,26 @@ class Provenance(Struct, frozen=True, eq=False, gc=False):
     version: str
 
 
+class RivalAttitude(Struct, frozen=True, eq=False, gc=False):
+    """A second attitude, which explains a group of stars that the first one leaves unexplained.
+
+    `star` (n,) of every tracker are rows of the run catalog, -1 for stars that are
+    not in its group.  `probability` is its share of the two; `angle_deg` the
+    rotation between them.
+    """
+
+    solution: AttitudeSolution
+    star: tuple[Integers, ...]
+    probability: float
+    angle_deg: float
+
+
 class Acquisition(Struct, frozen=True, eq=False, gc=False):
     """Everything that came of one batch.
 
-    `solution` is None where `reason` says why; never an older attitude.
+    `solution` is None where `reason` says why; never an older attitude.  Where a
+    `rival` is named, the stars that the solution leaves unexplained have an
+    attitude of their own, and the solution is suspect.
     `presumed` is what the batch's a priori knowledge says, None without any.
     `counts` are of the stars observed, and of them unique, ambiguous and unmatched.
     """
@@ -142,6 +180,7 @@ class Acquisition(Struct, frozen=True, eq=False, gc=False):
     trackers: tuple[TrackerResult, ...]
     counts: dict[str, int]
     solution: AttitudeSolution | None
+    rival: RivalAttitude | None
     reason: NoAttitude | None
     warnings: tuple[str, ...]
     timings_us: Mapping[str, int]
@@ -160,6 +199,24 @@ class _Look(Struct, frozen=True, eq=False, gc=False):
     def good(self) -> bool:
         """Whether there is an attitude that its own residuals do not speak against."""
         return isinstance(self.solved, AttitudeSolution) and not self.solved.suspect
+
+
+class _Found(Struct, frozen=True, eq=False, gc=False):
+    """What was found for some stars of a batch: which way, the look about it, or why there is none.
+
+    `explained` (n,) of every tracker marks the stars of the likeliest hypothesis.
+    """
+
+    path: Path
+    looked: _Look | None
+    refusal: NoAttitude | None
+    warnings: list[str]
+    explained: tuple[Mask, ...]
+
+    @property
+    def good(self) -> bool:
+        """Whether there is an attitude that its own residuals do not speak against."""
+        return self.looked is not None and self.looked.good
 
 
 class _Clock:
@@ -195,41 +252,21 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
 
     clock = _Clock()
     run_catalog = sky.run_catalog(mission, batch.time)
-
-    def look(about: Presumed) -> _Look:
-        return _look(
-            mission, choices, corrected, about, velocity_c, sun_au, run_catalog, sky, clock
-        )
-
-    path = Path.LOST_IN_SPACE
-    looked = refusal = None
-    warnings: list[str] = []
-    if presumed is not None and choices.identifier != "lost_in_space":
-        path, looked = Path.ZONE, look(presumed)
-        warnings += presumed.warnings
-        if _falls_back(looked, choices, mission, corrected):
-            path = Path.ZONE_THEN_LOST_IN_SPACE
-    if path is not Path.ZONE:
-        found = find_attitude(corrected, velocity_c, run_catalog, mission, sky)
-        clock.end("identify")
-        refusal = found.refusal
-        if found.attitude is not None:
-            quaternion = QuaternionPrior(read_only(quaternion_from_matrix(found.attitude)))
-            again = look(presumed_attitude(quaternion, batch.time, mission, batch.position_km))
-            # What the zone gave stands unless the whole sky gives better.
-            if looked is None or again.good:
-                looked = again
-                warnings = list(again.presumed.warnings)
-        elif looked is not None:
-            warnings.append(f"lost_in_space_refused: {refusal}")
-        if found.bounded:
-            warnings.append("work_bound_hit: the search in the whole sky ended at its bound")
+    search = _Search(batch, mission, choices, presumed, velocity_c, sun_au, run_catalog, sky, clock)
+    found, rival = search.find_groups(corrected)
+    path, looked, refusal, warnings = found.path, found.looked, found.refusal, found.warnings
 
     solved = looked.solved if looked is not None else refusal
     solution = solved if isinstance(solved, AttitudeSolution) else None
     trackers = _tracker_results(corrected, looked, solution)
     warnings += _warnings(
-        batch, mission, trackers, presumed, None if looked is None else looked.presumed, solution
+        batch,
+        mission,
+        trackers,
+        presumed,
+        None if looked is None else looked.presumed,
+        solution,
+        rival,
     )
     return Acquisition(
         batch=batch,
@@ -241,6 +278,7 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
         trackers=trackers,
         counts=_counts(trackers),
         solution=solution,
+        rival=rival,
         reason=solved if isinstance(solved, NoAttitude) else None,
         warnings=tuple(warnings),
         timings_us={step: ns // 1000 for step, ns in clock.ns.items()},
@@ -254,57 +292,182 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
     )
 
 
-def _look(
-    mission: Mission,
-    choices: Choices,
-    corrected: Sequence[CorrectedObservations],
-    presumed: Presumed,
-    velocity_c: Vector,
-    sun_au: float,
-    run_catalog: RunCatalog,
-    sky: Sky,
-    clock: _Clock,
-) -> _Look:
-    """Zones about a presumed attitude, identities, and the attitude that they give."""
-    places = [
-        _place(each, index, presumed, mission, choices, run_catalog, sky)
-        for index, each in enumerate(corrected)
-    ]
-    sightings = [
-        _sighting(
-            each,
-            presumed,
-            velocity_c,
-            aim,
-            zone,
-            choices.rules,
-            sky.guide(run_catalog, each.tracker.field_of_view_radius_deg)
-            if choices.identifier in WITHOUT_PRIOR
-            else None,
+@dataclass(frozen=True)
+class _Search:
+    """The search for what the stars of one batch are, all of them or a part."""
+
+    batch: ObservationBatch
+    mission: Mission
+    choices: Choices
+    presumed: Presumed | None
+    velocity_c: Vector
+    sun_au: float
+    run_catalog: RunCatalog
+    sky: Sky
+    clock: _Clock
+
+    def find_groups(
+        self, corrected: tuple[CorrectedObservations, ...]
+    ) -> tuple[_Found, RivalAttitude | None]:
+        """What the stars are; where two groups have each an attitude, the other one as the rival.
+
+        The stars that the answer leaves unexplained are acquired by themselves, the
+        same way.  Where nothing good was found for all, so are those of the
+        likeliest hypothesis: two groups of like weight leave every star ambiguous.
+        """
+        found = self.find(corrected)
+        left = [~mask for mask in found.explained]
+        if self.choices.identifier not in WITH_HYPOTHESES or not may_be_a_group(left):
+            return found, None
+        other = self.find(part_of(corrected, left))
+        if not other.good:
+            return found, None
+        if not found.good:
+            first = self.find(part_of(corrected, found.explained))
+            if not first.good:
+                return found, None
+            found = _of_all(first, found.explained)
+        return self._weighed(corrected, found, _of_all(other, left))
+
+    def _weighed(
+        self, corrected: tuple[CorrectedObservations, ...], one: _Found, other: _Found
+    ) -> tuple[_Found, RivalAttitude]:
+        """The heavier of two groups as the answer, the lighter as its rival."""
+        weights = self._log_weight(corrected, one), self._log_weight(corrected, other)
+        if weights[0] < weights[1]:
+            one, other, weights = other, one, weights[::-1]
+        first, second = one.looked, other.looked
+        assert first is not None and second is not None
+        solution, rival = first.solved, second.solved
+        assert isinstance(solution, AttitudeSolution) and isinstance(rival, AttitudeSolution)
+        stars = tuple(each.star for each in second.identifications)
+        share = share_of(*weights, sum(int((rows >= 0).sum()) for rows in stars))
+        apart_arcsec = attitude_error_arcsec(rival.matrix, solution.matrix)
+        identifications = [
+            shared(mine, its, share)
+            for mine, its in zip(first.identifications, second.identifications, strict=True)
+        ]
+        looked = replace(
+            first, identifications=identifications, solved=replace(solution, suspect=True)
         )
-        for each, (aim, zone, _) in zip(corrected, places, strict=True)
-    ]
-    clock.end("zone")
-    identify = IDENTIFIERS[choices.identifier]
-    identifications = [identify(sighting) for sighting in sightings]
-    clock.end("identify")
-    solved = _solve(choices, corrected, identifications, run_catalog, velocity_c, sun_au)
-    clock.end("solve")
-    return _Look(presumed, places, identifications, solved)
+        angle_deg = math.hypot(*apart_arcsec) / 3600.0
+        return replace(one, looked=looked), RivalAttitude(rival, stars, 1.0 - share, angle_deg)
+
+    def _log_weight(self, corrected: tuple[CorrectedObservations, ...], found: _Found) -> float:
+        """How much all stars weigh under the attitude of one group, up to a common constant.
+
+        Beside an a priori attitude; without one, about the attitude that was found.
+        """
+        looked = found.looked
+        assert looked is not None
+        presumed = looked.presumed if self.presumed is None else self.presumed
+        return sum(
+            log_weight_of_group(
+                self._sighting(each, presumed, aim, zone), identification.star, self.run_catalog
+            )
+            for each, (aim, zone, _), identification in zip(
+                corrected, looked.places, looked.identifications, strict=True
+            )
+        )
+
+    def find(self, corrected: tuple[CorrectedObservations, ...]) -> _Found:
+        """What these stars are: about the a priori attitude, else in the whole sky."""
+        presumed, path = self.presumed, Path.LOST_IN_SPACE
+        looked = refusal = None
+        warnings: list[str] = []
+        explained: tuple[Mask, ...] | None = None
+        if presumed is not None and self.choices.identifier != "lost_in_space":
+            path, looked = Path.ZONE, self.look(corrected, presumed)
+            warnings += presumed.warnings
+            if self._falls_back(corrected, looked):
+                path = Path.ZONE_THEN_LOST_IN_SPACE
+        if path is not Path.ZONE:
+            found = find_attitude(
+                corrected, self.velocity_c, self.run_catalog, self.mission, self.sky
+            )
+            self.clock.end("identify")
+            refusal, explained = found.refusal, found.explained
+            if found.attitude is not None:
+                quaternion = QuaternionPrior(read_only(quaternion_from_matrix(found.attitude)))
+                again = self.look(
+                    corrected,
+                    presumed_attitude(
+                        quaternion, self.batch.time, self.mission, self.batch.position_km
+                    ),
+                )
+                # What the zone gave stands unless the whole sky gives better.
+                if looked is None or again.good:
+                    looked = again
+                    warnings = list(again.presumed.warnings)
+            elif looked is not None:
+                warnings.append(f"lost_in_space_refused: {refusal}")
+            if found.bounded:
+                warnings.append("work_bound_hit: the search in the whole sky ended at its bound")
+        if looked is not None:
+            explained = tuple(each.explained for each in looked.identifications)
+        assert explained is not None
+        return _Found(path, looked, refusal, warnings, explained)
+
+    def look(self, corrected: Sequence[CorrectedObservations], about: Presumed) -> _Look:
+        """Zones about a presumed attitude, identities, and the attitude that they give."""
+        places = [
+            _place(each, index, about, self.mission, self.choices, self.run_catalog, self.sky)
+            for index, each in enumerate(corrected)
+        ]
+        sightings = [
+            self._sighting(each, about, aim, zone)
+            for each, (aim, zone, _) in zip(corrected, places, strict=True)
+        ]
+        self.clock.end("zone")
+        identify = IDENTIFIERS[self.choices.identifier]
+        identifications = [identify(sighting) for sighting in sightings]
+        self.clock.end("identify")
+        solved = _solve(
+            self.choices,
+            corrected,
+            identifications,
+            self.run_catalog,
+            self.velocity_c,
+            self.sun_au,
+        )
+        self.clock.end("solve")
+        return _Look(about, places, identifications, solved)
+
+    def _sighting(
+        self, corrected: CorrectedObservations, about: Presumed, aim: Aim, zone: Zone
+    ) -> Sighting:
+        guide = None
+        if self.choices.identifier in WITHOUT_PRIOR:
+            guide = self.sky.guide(self.run_catalog, corrected.tracker.field_of_view_radius_deg)
+        return _sighting(corrected, about, self.velocity_c, aim, zone, self.choices.rules, guide)
+
+    def _falls_back(self, corrected: Sequence[CorrectedObservations], looked: _Look) -> bool:
+        """Whether an answer about the a priori attitude is so poor that the whole sky is asked."""
+        return (
+            not looked.good
+            and self.choices.identifier == "verified"
+            and self.mission.lost_in_space_fallback
+            and any(len(each.magnitude_mag) >= FEWEST_POINTS for each in corrected)
+        )
 
 
-def _falls_back(
-    looked: _Look,
-    choices: Choices,
-    mission: Mission,
-    corrected: Sequence[CorrectedObservations],
-) -> bool:
-    """Whether an answer about the a priori attitude is so poor that the whole sky is asked."""
-    return (
-        not looked.good
-        and choices.identifier == "verified"
-        and mission.lost_in_space_fallback
-        and any(len(each.magnitude_mag) >= FEWEST_POINTS for each in corrected)
+def _of_all(found: _Found, masks: Sequence[Mask]) -> _Found:
+    """What was found for a part of the stars, as of all, the others unmatched."""
+    looked = found.looked
+    assert looked is not None and isinstance(looked.solved, AttitudeSolution)
+    every = np.concatenate(masks)
+    residual = np.full(len(every), np.nan)
+    residual[every] = looked.solved.residual_arcsec
+    return replace(
+        found,
+        looked=replace(
+            looked,
+            identifications=[
+                of_all(each, mask) for each, mask in zip(looked.identifications, masks, strict=True)
+            ],
+            solved=replace(looked.solved, residual_arcsec=read_only(residual)),
+        ),
+        explained=tuple(masks),
     )
 
 
@@ -469,6 +632,7 @@ def _warnings(
     presumed: Presumed | None,
     looked_about: Presumed | None,
     solution: AttitudeSolution | None,
+    rival: RivalAttitude | None,
 ) -> list[str]:
     warnings = []
     if batch.options.tests:
@@ -487,6 +651,12 @@ def _warnings(
     attitude = looked_about.attitude if solution is None else solution.matrix
     if solution is not None:
         warnings += _doubts(solution, mission, presumed)
+    if rival is not None:
+        stars = sum(int((star >= 0).sum()) for star in rival.star)
+        warnings.append(
+            f"rival_attitude: {stars} stars that this attitude leaves unexplained have one of "
+            f"their own, {rival.angle_deg:.3f} deg away, with probability {rival.probability:.3g}"
+        )
     for each in trackers:
         tracker, aim = each.corrected.tracker, each.aim
         if aim is not None and aim.reaches_past(
@@ -495,6 +665,11 @@ def _warnings(
             warnings.append(
                 f"field_of_view_past_zone_edge: the field of view of {tracker.name} reaches past "
                 "the edge of its zone; stars beyond it cannot be identified"
+            )
+        if each.identification.mirrored:
+            warnings.append(
+                f"mirrored_field: the stars of {tracker.name} fit better in a mirror: one of its "
+                "axes may have the wrong sign, or two are exchanged"
             )
         if each.identification.bounded:
             warnings.append(
@@ -509,7 +684,7 @@ def _warnings(
 def _doubts(solution: AttitudeSolution, mission: Mission, presumed: Presumed | None) -> list[str]:
     """What speaks against an attitude: its own residuals, and the a priori knowledge."""
     doubts = []
-    if solution.suspect:
+    if solution.taste > taste_bound(solution.degrees_of_freedom):
         doubts.append(
             f"attitude_suspect: residuals of {solution.residual_rms_arcsec:.1f} arcsec rms "
             f"where {solution.predicted_rms_arcsec:.1f} are expected: a star is misidentified "

@@ -30,6 +30,8 @@ MAGNITUDE_SCALES_MAG = np.array([0.1, 0.2, 0.4, 0.8, 1.6, 3.2])
 OFFSET_SIGMA_MAG = 0.5
 """A constant offset of the observed magnitudes is none at all or normal with this sigma."""
 BETA_CLUTTER, BETA_STAR = 0.5, 4.5
+LOG_TWO_STARS = -math.log(3.0)
+"""Two stars alone are held to longer odds: nothing but their separation tells them from chance."""
 ROTATION_SCALES_DEG = np.array([0.05, 0.3, 2.0, 10.0, 45.0])
 """Heavy tails: the a priori attitude is off by a normal deviate of one of these, all alike."""
 TILT_SCALES_DEG = np.array([0.05, 0.2, 1.0, 4.0, 15.0])

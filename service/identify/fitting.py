@@ -217,6 +217,7 @@ def log_weight_of(seen, stars, match, t, count, square, log_det):  # type: ignor
         evidence.log_prior(prior_angle(t, seen.prior_axis, kind), kind)
         + evidence.log_positions(count, square, log_det, seen.reference_sigma)
         + log_relative
+        + (evidence.LOG_TWO_STARS if count == 2 else 0.0)
         + evidence.log_magnitudes(compared, total, total2)
         + evidence.log_clutter(len(match) - count, count)
         - clutter * evidence.LOG_CLUTTER_SPAN

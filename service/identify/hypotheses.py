@@ -25,6 +25,8 @@ FEW = 32
 """Hypotheses that are looked through one by one; of more there is a table by hash."""
 NEAR_SIGMAS, NEAR_MAG, RARE = 3.0, 0.5, -6.0
 """How near a matched star lies that is not tried as clutter, where chance neighbours are rare."""
+LEAST_GROUP = 3
+"""So many stars that one attitude leaves unexplained may have another attitude of their own."""
 RIVAL_PROBABILITY = 1e-3
 """A star at least this likely is named among the rivals of one that is not unique."""
 
@@ -79,6 +81,19 @@ def part_of(match, whole):  # type: ignore[no-untyped-def]
     for k in range(len(match)):
         apart += match[k] >= 0 and match[k] != whole[k]
     return apart == 0
+
+
+@borrowing
+def leaves_a_group(match):  # type: ignore[no-untyped-def]
+    """Whether a match leaves so many stars unexplained that another attitude may explain them.
+
+    A reflection doubles every star, and a slew halves them: chance explains
+    neither half, so that the first hypothesis beyond chance is not the only one.
+    """
+    unexplained = 0
+    for row in match:
+        unexplained += row < 0
+    return unexplained >= LEAST_GROUP
 
 
 @borrowing

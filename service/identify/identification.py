@@ -39,7 +39,9 @@ class Identification(Struct, frozen=True, eq=False, gc=False):
     NaN where the identifier gives none, is that of the winner, of an ambiguous
     star's first rival, or that an unmatched star is none of the catalog's.
     `bounded`: the search ended at the most work allowed, and what it did not
-    see may rival.
+    see may rival.  `hypothesis` is the likeliest star of each under one attitude,
+    -1 where that explains none, and None where the identifier weighs no
+    hypotheses.  `mirrored`: a mirror image of the field fits the sky better.
     """
 
     outcome: Integers
@@ -50,6 +52,13 @@ class Identification(Struct, frozen=True, eq=False, gc=False):
     probability: Vector
     rival_probability: tuple[tuple[float, ...], ...] = ()
     bounded: bool = False
+    hypothesis: Integers | None = None
+    mirrored: bool = False
+
+    @property
+    def explained(self) -> npt.NDArray[np.bool_]:
+        """Mask of the stars that the likeliest hypothesis, or a unique winner, explains."""
+        return np.asarray((self.star if self.hypothesis is None else self.hypothesis) >= 0)
 
     @property
     def unique(self) -> npt.NDArray[np.bool_]:

@@ -12,6 +12,7 @@ from service.identify.hypotheses import (
     NEGLIGIBLE,
     consider,
     known,
+    leaves_a_group,
     log_sum,
     part_of,
 )
@@ -60,7 +61,7 @@ def scan(  # type: ignore[no-untyped-def]
     """Try every candidate pair in the place of observed stars i and j, either way round.
 
     Where an axis is presumed, those go first that agree with it, and the others
-    not at all once the best is heavier than `enough`.  A candidate is left as
+    not at all once the best is heavier than `enough` and leaves no group of stars.  A candidate is left as
     soon as the stars that it may still match cannot make it matter; the most
     that all those can weigh goes to the rest.  How many stars matter depends on
     the best, which is not known at first: what is found with a hope that it did
@@ -110,7 +111,8 @@ def scan(  # type: ignore[no-untyped-def]
         for m in range(3, others + 3):
             if light[m]:
                 rest = log_sum(rest, most_of(m, seen, stars, most) - lost + math.log(light[m]))
-        if not by_axis or best > enough or work >= MAX_WORK:
+        settled = best > enough and not leaves_a_group(scratch.leader)
+        if not by_axis or settled or work >= MAX_WORK:
             break
     return count, rest, best, work
 

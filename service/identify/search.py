@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 
 from service.identify import evidence
-from service.identify.hypotheses import log_sum
+from service.identify.hypotheses import leaves_a_group, log_sum
 from service.identify.scan import most_of, scan
 from service.identify.scene import MAX_SEEDS, PREDICTION_GATE, scratch_for, with_magnitude
 from service.identify.two_stars import MAX_WORK, two_stars
@@ -31,6 +31,8 @@ CHANCE_PER_STAR, CHANCE_MARGIN = math.log(3.0), 12.0
 
 Only after a whole observed pair: the stars of an empty sky may stand so evenly
 that a half turn matches four of them, and it is found first as often as not.
+And only where it leaves so few stars unexplained that no other attitude can
+explain them: see `leaves_a_group`.
 """
 SETTLED = 10.0
 """Exhaustive, stop once all that was not seen is lighter than the best by this, in logarithms."""
@@ -93,7 +95,7 @@ def search_in(scratch, seen, stars, pairs, exhaustive, ledger, log_weight):  # t
                     best,
                     work,
                 )
-                if best > enough and not exhaustive:
+                if best > enough and not (exhaustive or leaves_a_group(scratch.leader)):
                     return count, rest, work, False
                 if work >= MAX_WORK:
                     return count, rest, work, True

@@ -14,10 +14,17 @@ from msgspec import Struct
 from numba import njit
 
 from service.identify.evidence import PRIOR_DIRECTION, PRIOR_ROTATION
-from service.identify.hypotheses import marginals
+from service.identify.hypotheses import log_sum, marginals
 from service.identify.identification import Identification, Integers, Outcome
-from service.identify.scene import MAX_HYPOTHESES, Pairs, Seen, Stars, log_density
-from service.identify.search import search
+from service.identify.mirror import (
+    LOG_MIRRORED,
+    gained_by_mirror,
+    in_a_mirror,
+    may_be_mirrored,
+    reflect,
+)
+from service.identify.scene import MAX_HYPOTHESES, Pairs, Seen, Stars, log_density, scratch_for
+from service.identify.search import search_in
 from service.identify.starid import MAX_RIVALS, Sighting, identify_by_votes
 from service.vectors import Vector, separation_deg
 
@@ -32,6 +39,8 @@ class Posterior(Struct, frozen=True, eq=False, gc=False):
     `star` is the likeliest zone row, -1 where there is none, and `probability`
     its share; `none` that of no star of the zone.  `rivals` (n, R) are zone rows
     by falling probability, `rival_probability` (n, R), -1 beyond the last.
+    `hypothesis` (n,) are the rows of the heaviest hypothesis, -1 for a star that
+    it leaves unexplained.  `mirrored`: a mirror image of the field fits better.
     """
 
     star: Integers
@@ -39,7 +48,9 @@ class Posterior(Struct, frozen=True, eq=False, gc=False):
     none: Vector
     rivals: Integers
     rival_probability: npt.NDArray[np.float64]
+    hypothesis: Integers
     bounded: bool
+    mirrored: bool
 
 
 def posterior_of(sighting: Sighting, exhaustive: bool = False) -> Posterior:
@@ -47,10 +58,13 @@ def posterior_of(sighting: Sighting, exhaustive: bool = False) -> Posterior:
     n = len(sighting.direction)
     star, probability = np.empty(n, np.int64), np.empty((2, n))
     rivals, likely = np.empty((n, MAX_RIVALS), np.int64), np.empty((n, MAX_RIVALS))
-    found = star, probability, rivals, likely
+    hypothesis = np.empty(n, np.int64)
+    found = star, probability, rivals, likely, hypothesis
     # mypy takes what comes as a tuple for one argument.
-    bounded = _weigh(*_scene_arguments(sighting), exhaustive, *found)  # type: ignore[call-arg]
-    return Posterior(star, probability[0], probability[1], rivals, likely, bounded)
+    bounded, mirrored = _weigh(*_scene_arguments(sighting), sighting.boresight, exhaustive, *found)  # type: ignore[call-arg]
+    return Posterior(
+        star, probability[0], probability[1], rivals, likely, hypothesis, bounded, mirrored
+    )
 
 
 def identify_verified(sighting: Sighting) -> Identification:
@@ -83,6 +97,8 @@ def identify_verified(sighting: Sighting) -> Identification:
         rival_probability=tuple(likely),
         probability=probability,
         bounded=found.bounded,
+        hypothesis=np.where(found.hypothesis >= 0, star_of[found.hypothesis], -1),
+        mirrored=found.mirrored,
     )
 
 
@@ -206,18 +222,20 @@ def _weigh(  # type: ignore[no-untyped-def]
     bins_per_rad,
     polar_difference,
     off_axis,
+    boresight,
     exhaustive,
     star,
     probability,  # (2, n) of the likeliest star, and of none
     rivals,
     likely,
+    hypothesis,  # (n,) the zone stars of the heaviest hypothesis
 ):
-    """Search and marginals of a scene in one call; whether the search was bounded."""
+    """Search and marginals of a scene; whether the search was bounded, and the field mirrored."""
     n = len(observed)
     star[:], probability[0], probability[1] = -1, 0.0, 1.0
-    rivals[:], likely[:] = -1, 0.0
+    rivals[:], likely[:], hypothesis[:] = -1, 0.0, -1
     if n < 2 or len(direction) < 2:
-        return False
+        return False, False
     seen, stars, pairs = _scene(
         observed,
         observed_magnitude,
@@ -242,6 +260,16 @@ def _weigh(  # type: ignore[no-untyped-def]
         off_axis,
     )
     ledger, log_weight = np.empty((MAX_HYPOTHESES, n), np.int32), np.empty(MAX_HYPOTHESES)
-    count, rest, _, bounded = search(seen, stars, pairs, exhaustive, ledger, log_weight)
+    scratch = scratch_for(n)
+    count, rest, _, bounded = search_in(scratch, seen, stars, pairs, exhaustive, ledger, log_weight)
+    hypothesis[:] = scratch.leader
+    heaviest = scratch.range_kept[1]
+    mirrored = False
+    if may_be_mirrored(seen, hypothesis, heaviest):
+        image = np.empty((n, 3))
+        reflect(observed, boresight, image)
+        gained = gained_by_mirror(seen, in_a_mirror(seen, image), stars, pairs, scratch)
+        mirrored = gained > 0.0
+        rest = log_sum(rest, heaviest + gained + LOG_MIRRORED)
     marginals(ledger, log_weight, count, rest, star, probability[0], probability[1], rivals, likely)
-    return bounded
+    return bounded, mirrored

@@ -4,8 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from service.acquire import Acquisition, TrackerResult
-from service.attitude.solution import AttitudeSolution
+from service.acquire import Acquisition, RivalAttitude, TrackerResult
 from service.identify.identification import Outcome
 from service.sky.run_catalog import RunCatalog
 from service.sky.zones import Aim
@@ -53,7 +52,7 @@ def answer_of(
             _tracker_answer(each, acquisition.run_catalog) for each in acquisition.trackers
         ],
         "counts": acquisition.counts,
-        "attitude": None if acquisition.solution is None else _attitude(acquisition.solution),
+        "attitude": _attitude(acquisition),
         "reason": None if acquisition.reason is None else str(acquisition.reason),
         "warnings": list(acquisition.warnings),
         "timings_us": {**acquisition.timings_us, "record": None},
@@ -169,7 +168,10 @@ def _stars(result: TrackerResult, run_catalog: RunCatalog) -> list[dict[str, Any
     return stars
 
 
-def _attitude(solution: AttitudeSolution) -> dict[str, Any]:
+def _attitude(acquisition: Acquisition) -> dict[str, Any] | None:
+    solution, rival = acquisition.solution, acquisition.rival
+    if solution is None:
+        return None
     attitude: dict[str, Any] = {
         "quaternion": solution.quaternion.tolist(),
         "frame": FRAME,
@@ -190,7 +192,19 @@ def _attitude(solution: AttitudeSolution) -> dict[str, Any]:
             for fit in solution.trackers
         ]
         attitude["outlier"] = next((fit.tracker for fit in solution.trackers if fit.outlier), None)
+    if rival is not None:
+        attitude["rival"] = _rival(rival, acquisition.run_catalog)
     return attitude
+
+
+def _rival(rival: RivalAttitude, run_catalog: RunCatalog) -> dict[str, Any]:
+    return {
+        "quaternion": rival.solution.quaternion.tolist(),
+        "covariance_arcsec2": rival.solution.covariance_arcsec2.tolist(),
+        "probability": rival.probability,
+        "angle_deg": rival.angle_deg,
+        "stars": [[_star_id(run_catalog, row) for row in rows.tolist()] for rows in rival.star],
+    }
 
 
 def _star_id(run_catalog: RunCatalog, row: int) -> str | None:

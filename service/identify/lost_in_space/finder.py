@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from service.attitude.solution import NoAttitude
 from service.identify.lost_in_space.solver import FieldOfView, LostInSpace
@@ -27,12 +28,14 @@ COLOR_SIGMA_MAG = 0.3
 class Found:
     """An attitude (3, 3), inertial to body, or why there is none.
 
-    `bounded`: a search ended at its bound on the work.
+    `bounded`: a search ended at its bound on the work.  `explained` (n,) of every
+    tracker marks the stars of the likeliest attitude, also of one that is refused.
     """
 
     attitude: Matrix | None
     refusal: NoAttitude | None
     bounded: bool
+    explained: tuple[npt.NDArray[np.bool_], ...]
 
 
 def find_attitude(
@@ -47,8 +50,10 @@ def find_attitude(
     The refusal is that of the tracker with the most stars.
     """
     refusals: list[NoAttitude | None] = []
+    explained = [np.zeros(len(each.magnitude_mag), np.bool_) for each in corrected]
     bounded = False
-    for each in sorted(corrected, key=lambda one: -len(one.magnitude_mag)):
+    for place in sorted(range(len(corrected)), key=lambda one: -len(corrected[one].magnitude_mag)):
+        each = corrected[place]
         tracker = each.tracker
         field = field_of(tracker)
         index = sky.index(mission, run_catalog, field.radius_deg)
@@ -59,10 +64,12 @@ def find_attitude(
             velocity_c,
         )
         bounded |= result.bounded
+        explained[place] = result.star >= 0
         if result.attitude is not None:
-            return Found(tracker.body_from_tracker @ result.attitude, None, bounded)
+            attitude = tracker.body_from_tracker @ result.attitude
+            return Found(attitude, None, bounded, tuple(explained))
         refusals.append(result.refusal)
-    return Found(None, refusals[0], bounded)
+    return Found(None, refusals[0], bounded, tuple(explained))
 
 
 def field_of(tracker: Tracker) -> FieldOfView:

@@ -94,6 +94,19 @@ class TrackerFitOut(Shape):
     outlier: bool
 
 
+class RivalOut(Shape):
+    """A second attitude, of a group of stars that the first one leaves unexplained."""
+
+    quaternion: Quaternion
+    covariance_arcsec2: Covariance
+    probability: float = Field(description="Its share of the two.")
+    angle_deg: float = Field(description="The rotation between the two attitudes.")
+    stars: list[list[str | None]] = Field(
+        description="Of every tracker its stars in the order observed; null for a star that is "
+        "not in the group."
+    )
+
+
 class AttitudeOut(Shape):
     """An attitude with all that tells how far to trust it."""
 
@@ -105,12 +118,19 @@ class AttitudeOut(Shape):
     predicted_rms_arcsec: float
     taste: float = Field(description="Weighted sum of squares; about chi-square.")
     degrees_of_freedom: Count
-    status: Status = Field(description="`suspect`: `taste` is beyond its 99.9 % point.")
+    status: Status = Field(
+        description="`suspect`: `taste` is beyond its 99.9 % point, or there is a `rival`."
+    )
     triad: Quaternion
     quest: Quaternion
     triad_quest_angle_arcsec: float
     trackers: list[TrackerFitOut] = Field(default=[], description="Where there are several.")
     outlier: str | None = Field(default=None, description="The tracker that disagrees.")
+    rival: RivalOut | None = Field(
+        default=None,
+        description="Where two groups of stars have each an attitude of their own, the less "
+        "likely one.",
+    )
 
 
 class TimingsOut(Shape):
