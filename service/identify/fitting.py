@@ -212,12 +212,15 @@ def log_weight_of(seen, stars, match, t, count, square, log_det):  # type: ignor
         compared += 1
         total += difference
         total2 += difference * difference
+    of_two = 0.0
+    if count == 2:
+        of_two = evidence.log_of_two(square, compared, total2, seen.reference_sigma)
     kind = seen.prior_kind
     return (
         evidence.log_prior(prior_angle(t, seen.prior_axis, kind), kind)
         + evidence.log_positions(count, square, log_det, seen.reference_sigma)
         + log_relative
-        + (evidence.LOG_TWO_STARS if count == 2 else 0.0)
+        + of_two
         + evidence.log_magnitudes(compared, total, total2)
         + evidence.log_clutter(len(match) - count, count)
         - clutter * evidence.LOG_CLUTTER_SPAN
@@ -234,10 +237,14 @@ def most_log(seen, stars, count, compared):  # type: ignore[no-untyped-def]
     """
     n = len(seen.observed)
     clutter = with_magnitude(seen) - compared
+    of_two = 0.0
+    if count == 2:
+        of_two = evidence.log_of_two(0.0, compared, 0.0, seen.reference_sigma)
     return (
         evidence.LOG_PRIOR_AT_BEST[seen.prior_kind]
         + evidence.log_exact_positions(count, seen.reference_sigma)
         + evidence.log_equal_magnitudes(compared)
+        + of_two
         + evidence.log_clutter(n - count, count)
         - clutter * evidence.LOG_CLUTTER_SPAN
         - count * stars.log_density
