@@ -434,7 +434,7 @@ def _expected_square(b, weights, p, chosen, first, second):  # type: ignore[no-u
     total = 0.0
     for k in range(len(weights)):
         variance = 1.0 / weights[k]
-        if chosen == TRIAD and (k == first or k == second):
+        if chosen == TRIAD and k in (first, second):
             total += variance
             continue
         across = trace
