@@ -196,10 +196,8 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
     clock = _Clock()
     run_catalog = sky.run_catalog(mission, batch.time)
 
-    def look(about: Presumed) -> _Look:
-        return _look(
-            mission, choices, corrected, about, velocity_c, sun_au, run_catalog, sky, clock
-        )
+    def look(about: Presumed, stars: Sequence[CorrectedObservations] = corrected) -> _Look:
+        return _look(mission, choices, stars, about, velocity_c, sun_au, run_catalog, sky, clock)
 
     path = Path.LOST_IN_SPACE
     looked = refusal = None
@@ -215,11 +213,12 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: Sky) -> Acquisition:
         refusal = found.refusal
         if found.attitude is not None:
             quaternion = QuaternionPrior(read_only(quaternion_from_matrix(found.attitude)))
-            again = look(presumed_attitude(quaternion, batch.time, mission, batch.position_km))
+            about = presumed_attitude(quaternion, batch.time, mission, batch.position_km)
+            again = look(about, found.corrected)
             # What the zone gave stands unless the whole sky gives better.
             if looked is None or again.good:
                 looked = again
-                warnings = list(again.presumed.warnings)
+                warnings = [*again.presumed.warnings, *found.warnings]
         elif looked is not None:
             warnings.append(f"lost_in_space_refused: {refusal}")
         if found.bounded:
