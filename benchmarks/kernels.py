@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from benchmarks.bare import bare_many, bare_one, room_for
 from benchmarks.report import Report
-from service.attitude.kernels import solve
+from service.attitude.kernels import QUEST, solve
 from service.attitude.solve import WORST_AXIS_DEG
 from service.identify.matched import attitude_of, match
 from service.identify.pair_tests import cast_votes, count_votes
@@ -190,7 +190,8 @@ def service_many(
             for i in range(n):
                 w[i] = 1.0 / (s[i] * s[i])
             part = squares if n == squares.shape[1] else squares[:, :n].copy()
-            if solve(b[:n], r[:n], w[:n], worst, quaternions, covariance, part, sums, inner):
+            given = b[:n], r[:n], w[:n], worst, QUEST
+            if solve(*given, quaternions, covariance, part, sums, inner):
                 q[k] = quaternions[1]
 
 
@@ -242,7 +243,7 @@ def compare(mission: Mission, views: Views) -> tuple[dict[str, float], list[str]
         np.empty((3, 4)),
         np.empty((3, 3)),
         np.empty((2, n)),
-        np.empty((2, 2)),
+        np.empty((2, 3)),
         np.empty((n, 3)),
         np.empty((n, 3)),
         np.empty(n),

@@ -38,6 +38,14 @@ from service.vectors import (
 
 QUICK_SHARE = 0.05
 FIVE = Conditions(position_px=0.1, radius_deg=4.0, brightest=5, fewest=5)
+WITHOUT_MAGNITUDES = "no magnitudes"
+UNCALIBRATED_MAG = {
+    "magnitudes off 1.5": 1.5,
+    "magnitudes off 2": 2.0,
+    "magnitudes off 5": 5.0,
+    "magnitudes without zero point": -17.5,
+}
+"""Offsets.  The last is -2.5 log10 of counts, 10^5 of which a star of V 5 gives."""
 MOMENT = "2000-01-01T12:00:00Z"
 WIDEST_PRIOR_DEG = 3.0
 
@@ -105,6 +113,11 @@ CONDITIONS: Mapping[str, Condition] = {
     "sigma told double": Condition(sigma=2.0, alone=True),
     "focal length off 0.2 %": Condition(change=_focal),
     "magnitudes off 0.7": Condition(offset_mag=0.7, alone=True),
+    WITHOUT_MAGNITUDES: Condition(share=0.25, offset_mag=math.nan, alone=True),
+    **{
+        name: Condition(share=0.25, offset_mag=offset_mag, alone=True)
+        for name, offset_mag in UNCALIBRATED_MAG.items()
+    },
 }
 
 
@@ -231,4 +244,11 @@ def _staircase(conditions: Conditions, prior_deg: float) -> Solver:
     )
 
 
-__all__ = ["CONDITIONS", "QUICK_SHARE", "Condition", "solvers_of"]
+__all__ = [
+    "CONDITIONS",
+    "QUICK_SHARE",
+    "UNCALIBRATED_MAG",
+    "WITHOUT_MAGNITUDES",
+    "Condition",
+    "solvers_of",
+]

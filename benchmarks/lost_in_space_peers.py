@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from service.identify.lost_in_space.finder import search_sky
 from service.identify.lost_in_space.solver import FieldOfView, LostInSpace
 from service.simulate.scenes import Camera, Scene
 from service.sky.run_catalog import RunCatalog
@@ -57,8 +58,8 @@ def ours(
             scene.magnitude_mag + offset_mag,
             scene.sigma_rad * sigma,
         ),
-        lambda told: solver.solve(*told),
-        lambda result: result.attitude,
+        lambda told: search_sky(solver, *told),
+        lambda search: search.result.attitude,
     )
 
 

@@ -390,7 +390,7 @@ class _Search:
             if found.attitude is not None:
                 quaternion = QuaternionPrior(read_only(quaternion_from_matrix(found.attitude)))
                 again = self.look(
-                    corrected,
+                    found.corrected,
                     presumed_attitude(
                         quaternion, self.batch.time, self.mission, self.batch.position_km
                     ),
@@ -398,7 +398,7 @@ class _Search:
                 # What the zone gave stands unless the whole sky gives better.
                 if looked is None or again.good:
                     looked = again
-                    warnings = list(again.presumed.warnings)
+                    warnings = [*again.presumed.warnings, *found.warnings]
             elif looked is not None:
                 warnings.append(f"lost_in_space_refused: {refusal}")
             if found.bounded:

@@ -125,6 +125,40 @@ def test_without_magnitudes_it_is_found_as_well(drawn, missions, sky):
     assert right >= len(drawn) - 1
 
 
+@pytest.mark.parametrize("offset_mag", [0.0, 1.5, 2.0, 5.0, -17.5])
+@pytest.mark.parametrize("identifier", ["verified", "starid"])
+def test_magnitudes_off_by_any_constant_do_no_harm_and_the_answer_tells_it(
+    drawn, missions, sky, offset_mag, identifier
+):
+    right = without = told = 0
+    for each in drawn:
+        body = json.loads(json.dumps({**each.batch, **LOST, "options": {"identifier": identifier}}))
+        stars = body["observations"][0]["stars"]
+        for star in stars:
+            star["magnitude"] += offset_mag
+        found = acquired(body, missions["XTE"], sky)
+        good = found.solution is not None and not found.solution.suspect
+        right += good and error_arcsec(found, each.truth) < 60.0
+        warned = [text for text in found.warnings if text.startswith("magnitudes_not_used")]
+        for text in warned:
+            told += 1
+            assert float(text.split()[-2]) == pytest.approx(offset_mag, abs=0.5)
+        # The answer shows the magnitudes as they were sent.
+        seen = found.trackers[0].corrected.magnitude_mag
+        assert seen.tolist() == [star["magnitude"] for star in stars]
+        for star in stars:
+            del star["magnitude"]
+        found = acquired(body, missions["XTE"], sky)
+        good = found.solution is not None and not found.solution.suspect
+        without += good and error_arcsec(found, each.truth) < 60.0
+        assert not any(text.startswith("magnitudes_not_used") for text in found.warnings)
+    assert right >= without >= len(drawn) - 2
+    if offset_mag == 0.0:
+        assert told == 0
+    if abs(offset_mag) >= 2.0:
+        assert told >= right
+
+
 def test_of_two_trackers_one_finds_the_attitude_for_both(drawn, missions, sky):
     """A second tracker that looks along body Y sees two stars, which alone say nothing."""
     settings = missions["XTE"].model_dump(mode="json")

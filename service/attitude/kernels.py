@@ -17,6 +17,8 @@ NEWTON_STEPS = 30
 POLISHING_STEPS = 10
 LEAST_SINE = 1e-12
 """Below this two vectors stand in one line."""
+TRIAD, QUEST = 0, 1
+"""Rows of the quaternions that are solved for."""
 
 
 @borrowing
@@ -31,14 +33,15 @@ def _sine(a, b):  # type: ignore[no-untyped-def]
 def widest_pair(b, r, weights):  # type: ignore[no-untyped-def]
     """The two rows with the largest sine between them, the smaller sigma first, and that sine.
 
-    Passed over are two stars that were given one identity: their references
-    span no plane.
+    The sine is that of the references, which have no noise: the pair that is
+    widest as observed is too wide on average.  Two stars that were given one
+    identity have a sine of zero.
     """
     first, second, widest = 0, 1, 0.0
-    for i in range(len(b) - 1):
-        for j in range(i + 1, len(b)):
-            sine = _sine(b[i], b[j])
-            if sine > widest and _sine(r[i], r[j]) > LEAST_SINE:
+    for i in range(len(r) - 1):
+        for j in range(i + 1, len(r)):
+            sine = _sine(r[i], r[j])
+            if sine > widest and _sine(b[i], b[j]) > LEAST_SINE:
                 first, second, widest = i, j, sine
     if weights[second] > weights[first]:
         first, second = second, first
@@ -83,6 +86,35 @@ def triad(b1, b2, r1, r2, attitude):  # type: ignore[no-untyped-def]
     for i in range(3):
         for j in range(3):
             attitude[i, j] = b1[i] * r1[j] + body2[i] * inertial2[j] + body3[i] * inertial3[j]
+
+
+@borrowing
+def triad_covariance(b1, b2, variance1, variance2, covariance):  # type: ignore[no-untyped-def]
+    """The covariance (3, 3) of `triad`, about the body axes, to first order (Shuster & Oh 1981).
+
+    The noise of b1 along both its tangent axes and that of b2 across the plane
+    enter; that of b2 in the plane does not.
+    """
+    cosine = b1[0] * b2[0] + b1[1] * b2[1] + b1[2] * b2[2]
+    sine2 = _sine(b1, b2) ** 2
+    along, beside = (variance2 - variance1) / sine2, variance1 * cosine / sine2
+    for i in range(3):
+        for j in range(3):
+            covariance[i, j] = along * b1[i] * b1[j] + beside * (b1[i] * b2[j] + b2[i] * b1[j])
+        covariance[i, i] += variance1
+
+
+@borrowing
+def within(p, largest):  # type: ignore[no-untyped-def]
+    """Whether no axis of a covariance (3, 3) has more than the largest variance allowed.
+
+    That is where I - P / largest is positive definite.
+    """
+    a, b, c = 1.0 - p[0, 0] / largest, 1.0 - p[1, 1] / largest, 1.0 - p[2, 2] / largest
+    d, e, f = p[0, 1] / largest, p[0, 2] / largest, p[1, 2] / largest
+    minor = a * b - d * d
+    det = a * (b * c - f * f) - d * (d * c + f * e) - e * (d * f + b * e)
+    return a > 0.0 and minor > 0.0 and det > 0.0
 
 
 @borrowing
@@ -318,18 +350,21 @@ def solve(
     r: Vector,
     weights: Vector,
     worst_rad: float,
+    chosen: int,
     quaternions: Vector,
     covariance: Matrix,
     squares: Vector,
     sums: Vector,
     room: Vector,
 ) -> bool:
-    """TRIAD into row 0 of `quaternions` (3, 4), QUEST into row 1, the covariance (3, 3) in rad^2.
+    """TRIAD into row 0 of `quaternions` (3, 4), QUEST into row 1.
 
+    `covariance` (3, 3) gets that of the method in row `chosen`, in rad^2.
     `squares` (2, n) gets the squared residuals |b - A r|^2 of either, `sums`
-    (2, 2) their sum and their sum in units of sigma^2.  False where the geometry
-    leaves an axis worse than `worst_rad`.  Row 2 of `quaternions` gets the start
-    of QUEST; `room` (3, 3, 3) is written to.
+    (2, 3) their sum, their sum in units of sigma^2 and, in row `chosen`, the
+    expectation of the first.  False where the geometry leaves the chosen
+    attitude an axis worse than `worst_rad`.  Row 2 of `quaternions` gets the
+    start of QUEST; `room` (3, 3, 3) is written to.
     """
     n = len(b)
     first, second, sine = widest_pair(b, r, weights)
@@ -350,6 +385,12 @@ def solve(
     )
     if m00 <= 0.0 or minor <= 0.0 or determinant <= 0.0:
         return False
+    if chosen == TRIAD:
+        triad_covariance(
+            b[first], b[second], 1.0 / weights[first], 1.0 / weights[second], covariance
+        )
+        if not within(covariance, worst_rad * worst_rad):
+            return False
     triad(b[first], b[second], r[first], r[second], attitude)
     to_quaternion(attitude, quaternions[0])
     # The widest pair may be of coarse stars; TRIAD of the firmest is near the optimum.
@@ -376,7 +417,32 @@ def solve(
             plain += squares[method, k]
             weighted += squares[method, k] * weights[k]
         sums[method, 0], sums[method, 1] = plain, weighted
+    sums[chosen, 2] = _expected_square(b, weights, covariance, chosen, first, second)
     return True
+
+
+@borrowing
+def _expected_square(b, weights, p, chosen, first, second):  # type: ignore[no-untyped-def]
+    """The expectation of the sum of squared residuals at an attitude of covariance `p`.
+
+    A residual is the star's own noise and, across the star, the attitude's
+    error.  QUEST's error takes as much from the sum as it would add to that of
+    a star that it was not solved from.  TRIAD leaves its pair the difference
+    between the separations observed and referred to, and others both parts.
+    """
+    trace = p[0, 0] + p[1, 1] + p[2, 2]
+    total = 0.0
+    for k in range(len(weights)):
+        variance = 1.0 / weights[k]
+        if chosen == TRIAD and k in (first, second):
+            total += variance
+            continue
+        across = trace
+        for i in range(3):
+            for j in range(3):
+                across -= b[k, i] * p[i, j] * b[k, j]
+        total += 2.0 * variance + (across if chosen == TRIAD else -across)
+    return max(total, 0.0)
 
 
 @njit(cache=True, error_model="numpy")
@@ -384,25 +450,26 @@ def fit(b, r, sigma_rad, worst_rad, chosen, quaternions, matrices, residual):  #
     """All that `solve` gives, in one call and in the units that are shown; whether there is any.
 
     `quaternions` (3, 4) gets those of TRIAD and QUEST and, of the method in row
-    `chosen`, the rms residual, what the covariance predicts of that, TASTE, and
-    the angle between both attitudes, angles in arcsec.  `matrices` (2, 3, 3)
-    gets the chosen attitude and the covariance in arcsec^2, `residual` (n,) the
-    residuals in arcsec.
+    `chosen`, the rms residual and what the covariance predicts of that, then
+    QUEST's TASTE and the angle between both attitudes, angles in arcsec.
+    `matrices` (2, 3, 3) gets the chosen attitude and the covariance in arcsec^2,
+    `residual` (n,) the residuals in arcsec.
+
+    TASTE is QUEST's whichever method is chosen: at the optimal attitude alone
+    the weighted sum of squares is chi-square with 2 n - 3 degrees of freedom.
     """
     n = len(b)
     weights, squares, sums, room = (
         np.empty(n),
         np.empty((2, n)),
-        np.empty((2, 2)),
+        np.empty((2, 3)),
         np.empty((3, 3, 3)),
     )
-    variance = 0.0
     for k in range(n):
-        square = sigma_rad[k] * sigma_rad[k]
-        weights[k] = 1.0 / square
-        variance += square
+        weights[k] = 1.0 / (sigma_rad[k] * sigma_rad[k])
     covariance, told = matrices[1], quaternions[2]
-    if not solve(b, r, weights, worst_rad, quaternions, covariance, squares, sums, room):
+    given = b, r, weights, worst_rad, chosen
+    if not solve(*given, quaternions, covariance, squares, sums, room):
         return False
     to_matrix(quaternions[chosen], matrices[0])
     for i in range(3):
@@ -416,8 +483,7 @@ def fit(b, r, sigma_rad, worst_rad, chosen, quaternions, matrices, residual):  #
         along += (quaternions[0, i] + quaternions[1, i]) ** 2
     half = 0.5 * math.sqrt(min(apart, along))
     told[0] = math.sqrt(sums[chosen, 0] / n) * ARCSEC_PER_RADIAN
-    # Of the 2 n measured angles the attitude takes up three.
-    told[1] = math.sqrt(variance / n * (2 * n - 3) / n) * ARCSEC_PER_RADIAN
-    told[2] = sums[chosen, 1]
+    told[1] = math.sqrt(sums[chosen, 2] / n) * ARCSEC_PER_RADIAN
+    told[2] = sums[QUEST, 1]
     told[3] = 4.0 * math.asin(min(1.0, half)) * ARCSEC_PER_RADIAN
     return True

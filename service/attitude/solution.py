@@ -36,12 +36,13 @@ class AttitudeSolution(Struct, frozen=True, eq=False, gc=False):
 
     `quaternion` is the chosen method's and `matrix` (3, 3) that of it: body
     components = matrix @ inertial components.  `triad` and `quest` stand side by
-    side with the angle between them.  `covariance_arcsec2` (3, 3) is of the small
-    rotation about the body axes.  `residual_arcsec` has one row a vector, the
-    angle between the observed direction and the predicted one, NaN where there
-    is no reference to predict it from.  `taste` is the weighted sum of squares,
-    about chi-square with 2N - 3 degrees of freedom; beyond its 99.9 % point the
-    solution is suspect.
+    side with the angle between them.  `covariance_arcsec2` (3, 3) is the chosen
+    method's, of the small rotation about the body axes.  `residual_arcsec` has
+    one row a vector, the angle between the observed direction and the one that
+    the chosen attitude predicts, NaN where there is no reference to predict it
+    from.  `taste` is the weighted sum of squares at QUEST's attitude whichever
+    method is chosen, about chi-square with 2N - 3 degrees of freedom; beyond its
+    99.9 % point the solution is suspect.
     """
 
     quaternion: Vector

@@ -2,7 +2,7 @@
 
 Quaternions are scalar last, inertial to body; the covariance is of the small
 rotation about the body axes.  TASTE (Shuster) is the weighted sum of squared
-residuals.
+residuals of QUEST's attitude.
 """
 
 import math
@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from service.attitude import kernels
 from service.attitude.solution import AttitudeSolution, NoAttitude, TrackerFit
-from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector
+from service.vectors import Matrix, Vector, matrix_from_quaternion
 
 WORST_AXIS_DEG = 1.0
 WORST_AXIS_RAD = math.radians(WORST_AXIS_DEG)
@@ -36,8 +36,8 @@ def solve_attitude(
 
     `observed` (N, 3) is in body axes, `reference` (N, 3) inertial, sigma one
     standard deviation per tangent axis in radians; `tracker_of` (N,) says which of
-    `trackers` saw each.  `method` (`quest` or `triad`) chooses whose quaternion
-    and residuals are the solution's.
+    `trackers` saw each.  `method` (`quest` or `triad`) chooses whose quaternion,
+    covariance and residuals are the solution's.
     """
     n = len(observed)
     if n < 2:
@@ -49,7 +49,7 @@ def solve_attitude(
     fits: tuple[TrackerFit, ...] = ()
     if len(trackers) > 1:
         suspect = is_suspect(room[0], n)
-        fits = tracker_fits(observed, reference, sigma_rad, room[2], suspect, tracker_of, trackers)
+        fits = tracker_fits(observed, reference, sigma_rad, room[0], suspect, tracker_of, trackers)
     return solution_of(*room, n, method, fits)
 
 
@@ -129,13 +129,17 @@ def tracker_fits(
     observed: Vector,
     reference: Vector,
     sigma_rad: Vector,
-    residual_arcsec: Vector,
+    quaternions: Vector,
     suspect: bool,
     tracker_of: npt.NDArray[np.int64],
     trackers: tuple[str, ...],
 ) -> tuple[TrackerFit, ...]:
-    """Each tracker's share of TASTE, and whether it is the one that does not agree."""
-    weighted = (residual_arcsec / (sigma_rad * ARCSEC_PER_RADIAN)) ** 2
+    """Each tracker's share of TASTE, and whether it is the one that does not agree.
+
+    `quaternions` (3, 4) is as `kernels.fit` wrote it.
+    """
+    quest = matrix_from_quaternion(quaternions[kernels.QUEST])
+    weighted = np.sum((observed - reference @ quest.T) ** 2, axis=1) / sigma_rad**2
     stars = np.bincount(tracker_of, minlength=len(trackers))
     taste = np.bincount(tracker_of, weights=weighted, minlength=len(trackers))
     outlier = _outlier(observed, reference, sigma_rad, tracker_of) if suspect else -1

@@ -49,15 +49,14 @@ def attitude_of(
         return NoAttitude.FEWER_THAN_TWO_UNIQUE_STARS
     if tracker_of is None:
         return solution_of(*room, matched, method)
-    named = star >= 0
     observed, reference, sigma = matched_vectors(*given)
     fits = tracker_fits(
         observed,
         reference,
         sigma,
-        room[2][named],
+        room[0],
         is_suspect(room[0], matched),
-        tracker_of[named],
+        tracker_of[star >= 0],
         trackers,
     )
     return solution_of(*room, matched, method, fits)

@@ -72,7 +72,7 @@ def test_triad_takes_the_widest_pair_and_holds_the_finer_star_exactly(rng):
     inertial = field_of_stars(rng, [1.0, 2.0, -0.5], 4.0, 6)
     sigma = np.array([3.0, 1.0, 2.0, 5.0, 4.0, 6.0])
     body = seen(rng, truth, inertial, 200.0)
-    cosines = body @ body.T
+    cosines = inertial @ inertial.T
     i, j = np.unravel_index(np.argmin(cosines), cosines.shape)
     anchor, other = (i, j) if sigma[i] < sigma[j] else (j, i)
 
@@ -98,7 +98,16 @@ def test_the_chosen_method_s_quaternion_and_residuals_are_the_solution_s(method,
     expected = np.linalg.norm(body - inertial @ attitude.T, axis=1) * ARCSEC
     assert solution.residual_arcsec == pytest.approx(expected, abs=1e-6)
     assert solution.residual_rms_arcsec == pytest.approx(np.sqrt(np.mean(expected**2)))
-    assert solution.taste == pytest.approx(np.sum((expected / 3.0) ** 2))
+
+
+@pytest.mark.parametrize("method", ["quest", "triad"])
+def test_taste_is_that_of_the_optimal_attitude_whichever_is_chosen(method, rng):
+    inertial = field_of_stars(rng, rng.normal(size=3), 4.0, 5)
+    body = seen(rng, random_attitude(rng), inertial, 3.0)
+    solution = solved(body, inertial, 3.0, method=method)
+    apart = body - inertial @ matrix_from_quaternion(solution.quest).T
+    assert solution.taste == pytest.approx(np.sum((apart * ARCSEC / 3.0) ** 2))
+    assert solution.degrees_of_freedom == 7
 
 
 def test_the_angle_between_triad_and_quest_is_that_of_the_turn_between_them(rng):

@@ -30,6 +30,14 @@ def test_an_axis_worse_than_a_degree_is_no_attitude(share, answered, sigma_arcse
         assert solution is NoAttitude.DEGENERATE_GEOMETRY
 
 
+def test_the_covariance_that_is_told_decides_whether_an_axis_is_too_poor():
+    """The widest pair has a star of 400 arcsec, which TRIAD rests upon and QUEST does not."""
+    stars = np.vstack([rotation([0.0, 1.0, 0.0], deg) @ STAR[0] for deg in (0.0, 1.0, 4.0)])
+    sigma = np.array([2.0, 2.0, 400.0])
+    assert isinstance(solved(stars, stars, sigma), AttitudeSolution)
+    assert solved(stars, stars, sigma, method="triad") is NoAttitude.DEGENERATE_GEOMETRY
+
+
 def test_stars_in_one_place_are_degenerate():
     many = np.repeat(STAR, 5, axis=0)
     assert solved(many, many, 2.0) is NoAttitude.DEGENERATE_GEOMETRY

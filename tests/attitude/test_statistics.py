@@ -4,16 +4,18 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from service.attitude.solve import taste_bound
+from service.attitude.solve import METHODS, taste_bound
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion
 from tests.attitude.cases import field_of_stars, random_attitude, seen, solved
 from tests.reference.batches import rotation
 
 DRAWS = 3000
+MANY = 20_000
 
 
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(("stars", "radius_deg"), [(2, 4.0), (5, 4.0), (5, 60.0)])
-def test_errors_and_taste_are_distributed_as_they_are_predicted(stars, radius_deg, rng):
+def test_errors_and_taste_are_distributed_as_they_are_predicted(stars, radius_deg, method, rng):
     """Mean of e^T P^-1 e near 3 and of TASTE near 2N - 3, their tails as chi-square's.
 
     Bounds are five standard errors: a sound program fails about once in ten thousand seeds.
@@ -27,7 +29,7 @@ def test_errors_and_taste_are_distributed_as_they_are_predicted(stars, radius_de
         while np.min(np.linalg.norm(inertial - inertial[0], axis=1)[1:]) < 0.005:
             inertial = field_of_stars(rng, rng.normal(size=3), radius_deg, stars)
         sigma = rng.uniform(1.0, 6.0, size=stars)
-        solution = solved(seen(rng, truth, inertial, sigma), inertial, sigma)
+        solution = solved(seen(rng, truth, inertial, sigma), inertial, sigma, method=method)
         error = attitude_error_arcsec(matrix_from_quaternion(solution.quaternion), truth)
         squares[k] = error @ np.linalg.solve(solution.covariance_arcsec2, error)
         tastes[k] = solution.taste
@@ -38,6 +40,46 @@ def test_errors_and_taste_are_distributed_as_they_are_predicted(stars, radius_de
     # 14.16 is the 99.73 % point for three degrees of freedom.
     for share, expected in ((squares > 14.16, 0.0027), (tastes > taste_bound(freedom), 0.001)):
         assert share.mean() == pytest.approx(expected, abs=5 * np.sqrt(expected / DRAWS))
+
+
+SCENES = {
+    "coarse and fine star": ([(0.0, 0.0), (5.0, 0.0)], [9.0, 2.0]),
+    "star a right angle away": ([(0.0, 0.0), (90.0, 0.0)], [2.0, 5.0]),
+    "star beyond a right angle": ([(0.0, 0.0), (130.0, 0.0)], [4.0, 3.0]),
+    "narrow field": ([(0.0, 0.0), (0.05, 0.01), (0.02, 0.05)], [2.0, 3.0, 1.0]),
+    "two widest pairs alike": ([(0.0, 0.0), (2.0, 0.0), (0.0, 2.0), (2.0, 2.0)], [3.0] * 4),
+    "coarse stars apart": ([(-3.0, 0.0), (3.0, 0.0), (0.0, 2.0), (1.0, -2.0)], [8.0, 12.0, 2, 1]),
+}
+"""Places in degrees of longitude and latitude, and sigmas in arcsec."""
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", SCENES)
+def test_of_given_stars_the_errors_scatter_as_the_covariance_of_the_method_says(name, method, rng):
+    """The bounds are more than four standard errors wide."""
+    places, sigma = SCENES[name]
+    longitude, latitude = np.radians(np.array(places)).T
+    inertial = np.column_stack(
+        [
+            np.cos(latitude) * np.cos(longitude),
+            np.cos(latitude) * np.sin(longitude),
+            np.sin(latitude),
+        ]
+    )
+    truth = random_attitude(rng)
+    squares, residuals = np.empty(MANY), np.empty(MANY)
+    errors = np.empty((MANY, 3))
+    for k in range(MANY):
+        solution = solved(seen(rng, truth, inertial, sigma), inertial, sigma, method=method)
+        errors[k] = attitude_error_arcsec(matrix_from_quaternion(solution.quaternion), truth)
+        squares[k] = errors[k] @ np.linalg.solve(solution.covariance_arcsec2, errors[k])
+        residuals[k] = (solution.residual_rms_arcsec / solution.predicted_rms_arcsec) ** 2
+    assert 2.9 < squares.mean() < 3.1
+    assert (squares > 14.16).mean() <= 0.0045
+    # No axis is biased: the mean error is zero within its own noise.
+    mean = errors.mean(axis=0)
+    assert MANY * mean @ np.linalg.solve(np.cov(errors.T), mean) < chi2.isf(1e-5, 3)
+    assert residuals.mean() == pytest.approx(1.0, abs=0.06)
 
 
 def test_the_covariance_is_the_inverse_of_the_information_in_body_axes(rng):
@@ -72,7 +114,7 @@ class TestOutlier:
 
     BORESIGHTS = ((1.0, 0.0, 0.0), (-0.3, 0.9, 0.2), (0.0, -0.2, 1.0))
 
-    def solution(self, rng, counts, misaligned, arcsec):
+    def solution(self, rng, counts, misaligned, arcsec, method="quest"):
         truth = random_attitude(rng)
         body, inertial, trackers = [], [], []
         for k, count in enumerate(counts):
@@ -85,7 +127,7 @@ class TestOutlier:
             body.append(seen(rng, truth, stars, 2.0) @ turn.T)
             inertial.append(stars)
             trackers += [k] * count
-        return solved(np.vstack(body), np.vstack(inertial), 2.0, trackers)
+        return solved(np.vstack(body), np.vstack(inertial), 2.0, trackers, method)
 
     @pytest.mark.parametrize("counts", [(5, 5, 5), (8, 3, 3), (3, 3, 8), (2, 12, 2)])
     @pytest.mark.parametrize("misaligned", [0, 1, 2])
@@ -100,8 +142,9 @@ class TestOutlier:
             ]
         assert named >= 55
 
-    def test_trackers_that_agree_have_no_outlier_and_share_the_taste(self, rng):
-        solution = self.solution(rng, (4, 5, 6), None, 0.0)
+    @pytest.mark.parametrize("method", METHODS)
+    def test_trackers_that_agree_have_no_outlier_and_share_the_taste(self, method, rng):
+        solution = self.solution(rng, (4, 5, 6), None, 0.0, method)
         if not solution.suspect:
             assert not any(fit.outlier for fit in solution.trackers)
         assert [fit.stars for fit in solution.trackers] == [4, 5, 6]

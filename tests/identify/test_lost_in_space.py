@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from service.attitude.solution import NoAttitude
+from service.identify.lost_in_space.finder import magnitude_offset, search_sky
 from service.identify.lost_in_space.matching import nearest_stars
 from service.identify.lost_in_space.solver import FieldOfView, LostInSpace
 from service.missions.mission import RunCatalogSettings
@@ -310,16 +311,28 @@ def scene_of(case):
     real_sky_cases() is None,
     reason=f"the real images' centroids are not here: name the folder of cases.json in {REAL_SKY}",
 )
+@pytest.mark.parametrize("magnitudes", ["unknown", "raw", 0.0, 1.5, 2.0, 5.0])
 @pytest.mark.parametrize("number", range(8))
-def test_real_images_of_the_sky_are_found(number):
+def test_real_images_of_the_sky_are_found_whatever_their_magnitudes(number, magnitudes):
+    """`raw` is -2.5 log10 of the brightness; a number is its offset from the catalog's."""
     case = real_sky_cases()[number]
     settings = RunCatalogSettings(magnitude_limit_mag=7.0, merge_within_arcsec=40.0)
     run_catalog = build_run_catalog(load_embedded(), settings, 2019.5)
     scene = scene_of(case)
     field = FieldOfView(math.degrees(math.atan(math.hypot(512, 384) / case["focal_px"])))
     solver = LostInSpace(build_sky_index(run_catalog, 7.0, field.radius_deg), field)
-    result = solver.solve(scene.direction, np.full(len(scene.star), np.nan), scene.sigma_rad)
+    magnitude_mag = np.full(len(scene.star), np.nan)
+    plain = solver.solve(scene.direction, magnitude_mag, scene.sigma_rad)
+    if magnitudes == "raw":
+        magnitude_mag = scene.magnitude_mag
+    elif magnitudes != "unknown":
+        zero_mag = magnitude_offset(plain, scene.magnitude_mag, solver.index)
+        magnitude_mag = scene.magnitude_mag - zero_mag + magnitudes
+    search = search_sky(solver, scene.direction, magnitude_mag, scene.sigma_rad)
+    result = search.result
     assert result.attitude is not None, result.refusal
+    if magnitudes in ("raw", 5.0):
+        assert not search.magnitudes_used
     boresight_deg, rotation_deg = scene.off_from(result.attitude)
     assert boresight_deg < 0.05
     assert rotation_deg < 0.2

@@ -5,6 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
+from service.attitude.kernels import within
 from service.identify.lost_in_space import weighing
 from service.identify.lost_in_space.matching import LARGEST_GATE_RAD, nearest_stars
 from service.identify.lost_in_space.search import SAME_ATTITUDE_RAD
@@ -45,22 +46,9 @@ def judge(ledger, count):  # type: ignore[no-untyped-def]
     log_odds = math.log(same / others)
     if others > weighing.DOUBT * (same + others):
         return best, log_odds, DOUBTFUL
-    if not _within(covariances[best], LARGEST_SIGMA_RAD**2):
+    if not within(covariances[best], LARGEST_SIGMA_RAD**2):
         return best, log_odds, DEGENERATE
     return best, log_odds, FOUND
-
-
-@njit(cache=True, nogil=True)
-def _within(p, largest):  # type: ignore[no-untyped-def]
-    """Whether no axis of a covariance (3, 3) has more than the largest variance allowed.
-
-    That is where I - P / largest is positive definite.
-    """
-    a, b, c = 1.0 - p[0, 0] / largest, 1.0 - p[1, 1] / largest, 1.0 - p[2, 2] / largest
-    d, e, f = p[0, 1] / largest, p[0, 2] / largest, p[1, 2] / largest
-    minor = a * b - d * d
-    det = a * (b * c - f * f) - d * (d * c + f * e) - e * (d * f + b * e)
-    return a > 0.0 and minor > 0.0 and det > 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
