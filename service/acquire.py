@@ -20,7 +20,7 @@ from service.identify.lost_in_space.solver import FEWEST_POINTS
 from service.identify.matched import attitude_of
 from service.identify.presumed import Presumed, aim_of, presumed_attitude
 from service.identify.ptp import identify_ptp
-from service.identify.starid import Sighting, identify_by_votes
+from service.identify.starid import MAX_RIVALS, Sighting, identify_by_votes
 from service.identify.verify import identify_verified
 from service.missions.mission import (
     TESTS_OF_ROLL,
@@ -499,6 +499,11 @@ def _warnings(
         if each.identification.bounded:
             warnings.append(
                 f"work_bound_hit: the search for the stars of {tracker.name} ended at its bound"
+            )
+        if each.identification.rivals_cut:
+            warnings.append(
+                f"rivals_cut: lists of rivals of {tracker.name} end at {MAX_RIVALS}; "
+                f"stars with more rivals: {each.identification.rivals_cut}"
             )
         stars = [row for row in each.identification.star.tolist() if row >= 0]
         if len(set(stars)) < len(stars):
