@@ -39,7 +39,7 @@ from service.identify.lost_in_space.solver import FEWEST_POINTS
 from service.identify.matched import attitude_of
 from service.identify.presumed import Presumed, aim_of, presumed_attitude
 from service.identify.ptp import identify_ptp
-from service.identify.starid import Sighting, identify_by_votes
+from service.identify.starid import MAX_RIVALS, Sighting, identify_by_votes
 from service.identify.verify import identify_verified
 from service.missions.mission import (
     TESTS_OF_ROLL,
@@ -337,9 +337,11 @@ class _Search:
         if weights[0] < weights[1]:
             one, other, weights = other, one, weights[::-1]
         first, second = one.looked, other.looked
-        assert first is not None and second is not None
+        assert first is not None
+        assert second is not None
         solution, rival = first.solved, second.solved
-        assert isinstance(solution, AttitudeSolution) and isinstance(rival, AttitudeSolution)
+        assert isinstance(solution, AttitudeSolution)
+        assert isinstance(rival, AttitudeSolution)
         stars = tuple(each.star for each in second.identifications)
         share = share_of(*weights, sum(int((rows >= 0).sum()) for rows in stars))
         apart_arcsec = attitude_error_arcsec(rival.matrix, solution.matrix)
@@ -454,7 +456,8 @@ class _Search:
 def _of_all(found: _Found, masks: Sequence[Mask]) -> _Found:
     """What was found for a part of the stars, as of all, the others unmatched."""
     looked = found.looked
-    assert looked is not None and isinstance(looked.solved, AttitudeSolution)
+    assert looked is not None
+    assert isinstance(looked.solved, AttitudeSolution)
     every = np.concatenate(masks)
     residual = np.full(len(every), np.nan)
     residual[every] = looked.solved.residual_arcsec
@@ -674,6 +677,11 @@ def _warnings(
         if each.identification.bounded:
             warnings.append(
                 f"work_bound_hit: the search for the stars of {tracker.name} ended at its bound"
+            )
+        if each.identification.rivals_cut:
+            warnings.append(
+                f"rivals_cut: lists of rivals of {tracker.name} end at {MAX_RIVALS}; "
+                f"stars with more rivals: {each.identification.rivals_cut}"
             )
         stars = [row for row in each.identification.star.tolist() if row >= 0]
         if len(set(stars)) < len(stars):

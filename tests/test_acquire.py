@@ -56,10 +56,17 @@ class TestByHand:
     TRUTH = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
 
     @pytest.fixture
-    def small_sky(self, tmp_path):
-        path = tmp_path / "four.csv"
-        path.write_text("\n".join(["id,ra_deg,dec_deg,magnitude", *self.STARS]) + "\n")
-        return Sky(import_csv(path), Shelf(1 << 20))
+    def sky_of(self, tmp_path):
+        def made(*stars):
+            path = tmp_path / f"{len(stars)}.csv"
+            path.write_text("\n".join(["id,ra_deg,dec_deg,magnitude", *stars]) + "\n")
+            return Sky(import_csv(path), Shelf(1 << 20))
+
+        return made
+
+    @pytest.fixture
+    def small_sky(self, sky_of):
+        return sky_of(*self.STARS)
 
     def batch(self, seen=SEEN, off_deg=1.0, **other):
         half = math.radians(90.0 + off_deg) / 2.0
@@ -151,6 +158,43 @@ class TestByHand:
         assert [row.star_id for row in star_rows(found)][2:] == ["C 3", "C 3"]
         assert any("same_star_twice" in warning for warning in found.warnings)
 
+    def test_a_star_is_unique_from_a_probability_of_999_in_1000(self, sky_of, missions):
+        """One star moved away step by step: from certain to improbable, through all between."""
+        sky = sky_of(*self.STARS, "E 5,90.5,1,4.5", "F 6,89.2,-0.7,3.6")
+        found = []
+        for off_arcsec in np.arange(0.0, 100.0, 2.0):
+            seen = (*self.SEEN, (0.5 + off_arcsec / 3600.0, 1.0, 4.5), (-0.8, -0.7, 3.6))
+            body = self.batch(seen, options={"identifier": "verified"})
+            answer = answer_of(acquire(read(body), missions["XTE"].within_zones, sky), id="1")
+            found += answer["observations"][0]["stars"]
+        assert all((each["outcome"] == "unique") == (each["star"] is not None) for each in found)
+        named = [each["probability"] for each in found if each["outcome"] == "unique"]
+        ambiguous = [each["probability"] for each in found if each["outcome"] == "ambiguous"]
+        assert min(named) >= 0.999
+        assert max(ambiguous) < 0.999
+        # Without such a one the bound would not have been put to the test.
+        assert any(each > 0.99 for each in ambiguous)
+
+    def test_a_list_of_rivals_that_was_cut_is_told(self, sky_of, missions):
+        """Pairs of one separation all over the zone: any of their stars may be the two seen."""
+        for pairs, told in ((10, False), (11, True)):
+            places = [(87.0 + k % 4 * 1.3, -4.0 + k // 4 * 2.3) for k in range(pairs)]
+            sky = sky_of(
+                *(f"P {ra}{dec},{ra},{dec},4" for ra, dec in places),
+                *(f"Q {ra}{dec},{ra},{dec + 0.5},4" for ra, dec in places),
+            )
+            for identifier in ("starid", "verified"):
+                options = {"identifier": identifier, "tests": {"cross_product": False}}
+                body = self.batch(((0.0, 0.0, 4.0), (0.5, 0.0, 4.0)), options=options)
+                body["a_priori"] = {"boresight": {"ra_deg": 89.0, "dec_deg": 0.0}}
+                answer = answer_of(acquire(read(body), missions["XTE"].within_zones, sky), id="1")
+                rivals = [star["rivals"] for star in answer["observations"][0]["stars"]]
+                assert [len(each) for each in rivals] == [20, 20]
+                warned = [each for each in answer["warnings"] if each.startswith("rivals_cut: ")]
+                assert len(warned) == told
+                if told:
+                    assert "STARTRACKER_1 end at 20; stars with more rivals: 2" in warned[0]
+
     def test_a_field_past_the_zone_s_edge_is_told(self, small_sky, missions):
         for off_deg, told in ((6.0, False), (7.0, True)):
             found = acquire(read(self.batch(off_deg=off_deg)), missions["XTE"], small_sky)
@@ -173,6 +217,34 @@ class TestByHand:
         assert [row.star_id for row in rows] == ["A 1", "B 2", "C 3", None]
         assert rows[3].residual_arcsec is None
         assert {row.tracker for row in rows} == {"STARTRACKER_1"}
+
+
+def test_a_zone_of_another_run_catalog_is_never_used(sky, missions):
+    """One mission name, one shelf: a catalog of another limit and of another epoch."""
+    mission = missions["XTE"]
+    settings = mission.model_dump()
+    settings["catalog"]["magnitude_limit_mag"] = 4.0
+    brighter = Mission.model_validate(settings)
+    prior = {"boresight": {"ra_deg": 83.6, "dec_deg": -1.0}}
+    stars = [{"h_deg": 0.0, "v_deg": 0.0}, {"h_deg": 1.0, "v_deg": 0.0}]
+    body = {
+        "spacecraft": "XTE",
+        "batch": "zones",
+        "a_priori": prior,
+        "observations": [{"tracker": "STARTRACKER_1", "stars": stars}],
+    }
+    shared = Sky(sky.catalog, Shelf(64 << 20))
+    catalogs = set()
+    for its_mission, year in ((mission, 1995), (brighter, 1995), (mission, 1975), (mission, 1995)):
+        batch = read({**body, "time": f"{year}-06-01T00:00:00.000Z"})
+        alone = acquire(batch, its_mission, Sky(sky.catalog, Shelf(64 << 20)))
+        found = acquire(batch, its_mission, shared)
+        catalogs.add(found.provenance.run_catalog)
+        (zone,), (expected,) = ([each.zone for each in one.trackers] for one in (found, alone))
+        assert zone.run_catalog == found.provenance.run_catalog
+        assert zone.direction.tolist() == expected.direction.tolist()
+        assert without_clock(answer_of(found, id="1")) == without_clock(answer_of(alone, id="1"))
+    assert len(catalogs) == 3
 
 
 class TestFit:

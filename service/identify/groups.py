@@ -23,7 +23,7 @@ from service.identify.starid import Sighting
 from service.identify.verify import UNIQUE_PROBABILITY
 from service.observe.correct import CorrectedObservations
 from service.sky.run_catalog import RunCatalog
-from service.vectors import Vector, read_only
+from service.vectors import read_only
 
 Mask = npt.NDArray[np.bool_]
 

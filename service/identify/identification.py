@@ -38,6 +38,7 @@ class Identification(Struct, frozen=True, eq=False, gc=False):
     all that are likely enough, by falling `rival_probability`.  `probability`,
     NaN where the identifier gives none, is that of the winner, of an ambiguous
     star's first rival, or that an unmatched star is none of the catalog's.
+    `rivals_cut` counts the stars with more rivals than are listed.
     `bounded`: the search ended at the most work allowed, and what it did not
     see may rival.  `hypothesis` is the likeliest star of each under one attitude,
     -1 where that explains none, and None where the identifier weighs no
@@ -51,6 +52,7 @@ class Identification(Struct, frozen=True, eq=False, gc=False):
     rivals: tuple[tuple[int, ...], ...]
     probability: Vector
     rival_probability: tuple[tuple[float, ...], ...] = ()
+    rivals_cut: int = 0
     bounded: bool = False
     hypothesis: Integers | None = None
     mirrored: bool = False

@@ -162,12 +162,11 @@ def cast_votes(  # type: ignore[no-untyped-def]
                     d0, d1, d2 = n0 * norm + c0, n1 * norm + c1, n2 * norm + c2
                     against = d0 * d0 + d1 * d1 + d2 * d2 <= cross_square * square
                     if order == 0:
-                        if along:
-                            order = 1
-                        elif against:
-                            order = -1
-                        else:
+                        if not (along or against):
                             continue
+                        # Beyond 90 deg both may pass: the order stays open, both pairings vote.
+                        if along != against:
+                            order = 1 if along else -1
                     elif not (along if order == 1 else against):
                         continue
 

@@ -61,11 +61,11 @@ def scan(  # type: ignore[no-untyped-def]
     """Try every candidate pair in the place of observed stars i and j, either way round.
 
     Where an axis is presumed, those go first that agree with it, and the others
-    not at all once the best is heavier than `enough` and leaves no group of stars.  A candidate is left as
-    soon as the stars that it may still match cannot make it matter; the most
-    that all those can weigh goes to the rest.  How many stars matter depends on
-    the best, which is not known at first: what is found with a hope that it did
-    not fulfil is looked through again.
+    not at all once the best is heavier than `enough` and leaves no group of stars.
+    A candidate is left as soon as the stars that it may still match cannot make it
+    matter; the most that all those can weigh goes to the rest.  How many stars
+    matter depends on the best, which is not known at first: what is found with a
+    hope that it did not fulfil is looked through again.
     """
     others, sine2 = _predictors(seen, group_of, i, j, scratch)
     if sine2 <= 0.0 or others == 0:

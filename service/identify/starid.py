@@ -31,6 +31,7 @@ Tallies = npt.NDArray[np.int32]
 Rows = npt.NDArray[np.int32]
 
 MAX_RIVALS = 20
+"""The most rivals listed for a star; the identifiers look for one more, to tell a cut list."""
 _RIVALS = 4
 """The row of what `tally` finds below which the rivals stand."""
 MAX_COMPARISONS = 30_000_000
@@ -74,7 +75,7 @@ def identify_by_votes(sighting: Sighting) -> Identification:
     if n * (n - 1) // 2 * pairs > MAX_COMPARISONS:
         _refuse_endless(sighting)
     given = votes_arguments(sighting)
-    found = np.empty((_RIVALS + MAX_RIVALS, n), np.int64)
+    found = np.empty((_RIVALS + MAX_RIVALS + 1, n), np.int64)
     bounded = False
     if sighting.rules.tests.match_groups:
         any_tie, bounded = _tally_groups(given, zone.star, found)
@@ -89,6 +90,7 @@ def identify_by_votes(sighting: Sighting) -> Identification:
         runner_up=found[3],
         rivals=_rivals(found) if any_tie else ((),) * n,
         probability=not_known(n),
+        rivals_cut=int(np.count_nonzero(found[-1] >= 0)) if any_tie else 0,
         bounded=bounded,
     )
 
@@ -179,4 +181,6 @@ def _room_for_votes(shape: tuple[int, int], edges: int) -> tuple[Tallies, ...]:
 
 def _rivals(found: Integers) -> tuple[tuple[int, ...], ...]:
     """The stars that share the highest tally of each ambiguous star, brightest first."""
-    return tuple(tuple(row for row in rivals if row >= 0) for rivals in found[_RIVALS:].T.tolist())
+    return tuple(
+        tuple(row for row in rivals if row >= 0) for rivals in found[_RIVALS:-1].T.tolist()
+    )

@@ -38,8 +38,8 @@ class Posterior(Struct, frozen=True, eq=False, gc=False):
 
     `star` is the likeliest zone row, -1 where there is none, and `probability`
     its share; `none` that of no star of the zone.  `rivals` (n, R) are zone rows
-    by falling probability, `rival_probability` (n, R), -1 beyond the last.
-    `hypothesis` (n,) are the rows of the heaviest hypothesis, -1 for a star that
+    by falling probability, `rival_probability` (n, R), -1 beyond the last; one more
+    than an answer lists.  `hypothesis` (n,) are the rows of the heaviest hypothesis, -1 for a star that
     it leaves unexplained.  `mirrored`: a mirror image of the field fits better.
     """
 
@@ -57,11 +57,13 @@ def posterior_of(sighting: Sighting, exhaustive: bool = False) -> Posterior:
     """Weigh the hypotheses of a sighting; `exhaustive`: go on after one that outweighs chance."""
     n = len(sighting.direction)
     star, probability = np.empty(n, np.int64), np.empty((2, n))
-    rivals, likely = np.empty((n, MAX_RIVALS), np.int64), np.empty((n, MAX_RIVALS))
+    sought = MAX_RIVALS + 1
+    rivals, likely = np.empty((n, sought), np.int64), np.empty((n, sought))
     hypothesis = np.empty(n, np.int64)
     found = star, probability, rivals, likely, hypothesis
+    given = *_scene_arguments(sighting), sighting.boresight, exhaustive
     # mypy takes what comes as a tuple for one argument.
-    bounded, mirrored = _weigh(*_scene_arguments(sighting), sighting.boresight, exhaustive, *found)  # type: ignore[call-arg]
+    bounded, mirrored = _weigh(*given, *found)  # type: ignore[call-arg]
     return Posterior(
         star, probability[0], probability[1], rivals, likely, hypothesis, bounded, mirrored
     )
@@ -76,6 +78,7 @@ def identify_verified(sighting: Sighting) -> Identification:
     probability = np.empty(n)
     rivals: list[tuple[int, ...]] = [()] * n
     likely: list[tuple[float, ...]] = [()] * n
+    rivals_cut = 0
     columns = zip(found.star.tolist(), found.probability.tolist(), found.none.tolist(), strict=True)
     for k, (row, chance, none) in enumerate(columns):
         if chance >= UNIQUE_PROBABILITY:
@@ -86,6 +89,8 @@ def identify_verified(sighting: Sighting) -> Identification:
         outcome[k] = _UNMATCHED if unmatched else _AMBIGUOUS
         probability[k] = none if unmatched else chance
         in_question = found.rivals[k] >= 0
+        rivals_cut += int(in_question[MAX_RIVALS])
+        in_question[MAX_RIVALS] = False
         rivals[k] = tuple(star_of[found.rivals[k][in_question]].tolist())
         likely[k] = tuple(found.rival_probability[k][in_question].tolist())
     return Identification(
@@ -96,6 +101,7 @@ def identify_verified(sighting: Sighting) -> Identification:
         rivals=tuple(rivals),
         rival_probability=tuple(likely),
         probability=probability,
+        rivals_cut=rivals_cut,
         bounded=found.bounded,
         hypothesis=np.where(found.hypothesis >= 0, star_of[found.hypothesis], -1),
         mirrored=found.mirrored,

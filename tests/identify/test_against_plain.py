@@ -129,6 +129,18 @@ def test_the_paper_s_world_agrees_with_the_geometry_tests_off(name, rng, mission
 
 
 @pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("tests", [{}, {"match_groups": True}, {"fov_rotation": True}])
+def test_cross_product_tolerances_above_90_deg_agree(name, tests, rng, mission_files, sky, request):
+    """Where both orders of a pair pass, it votes for both pairings; groups are made of either."""
+    count = request.config.getoption("--batches") // 12
+    judge = Judge(mission_files[name], sky)
+    for tolerance_deg in (91.0, 120.0, 180.0):
+        options = {"tests": tests, "tolerances": {"cross_product_deg": tolerance_deg}}
+        judge.hold_many(rng, count, stars=5, options=options, error_deg=100.0)
+    agreed(judge.comparison, 3 * count)
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_the_grid_of_the_shelf_changes_no_answer(name, rng, mission_files, sky):
     judge = Judge(mission_files[name], sky)
     attitudes = batches.prior_attitudes(rng, mission_files[name], 8)

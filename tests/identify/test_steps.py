@@ -81,7 +81,8 @@ def test_every_surviving_candidate_pair_votes_again():
 def test_rivals_are_named_brightest_first():
     sky = at((0, 0), (-1, 0), (1, 0))
     catalog = run_catalog(sky, [3.0, 5.0, 4.0])
-    found = words(identify(catalog, sky[:2], [None, None], cross_product_deg=180.0), catalog)
+    limits = {"cross_product_deg": 180.0, "magnitude_mag": 1.0}
+    found = words(identify(catalog, sky[:2], [3.0, 4.5], **limits), catalog)
     assert found[1] == ("ambiguous", ("STAR 2", "STAR 1"), 1, 1)
 
 
@@ -154,8 +155,23 @@ class TestCap:
         assert self.turned(159.9, cross_product_deg=20.0).star.tolist() == [-1, -1]
         assert self.turned(160.1, cross_product_deg=20.0).star.tolist() == [1, 0]
 
-    def test_beyond_90_the_first_order_that_fits_is_taken(self):
-        assert self.turned(120.0, cross_product_deg=130.0).star.tolist() == [0, 1]
+    def test_beyond_90_a_pair_votes_for_both_orders_where_both_pass(self):
+        for angle_deg in (60.1, 90.0, 119.9):
+            found = words(self.turned(angle_deg, cross_product_deg=120.0))
+            assert found == [("ambiguous", ("STAR 0", "STAR 1"), 1, 1)] * 2
+        # One order's angle beyond the tolerance: the other order alone.
+        assert self.turned(59.9, cross_product_deg=120.0).star.tolist() == [0, 1]
+        assert self.turned(120.1, cross_product_deg=120.0).star.tolist() == [1, 0]
+
+    def test_beyond_90_an_order_told_by_the_magnitudes_votes_alone(self):
+        found = self.turned(100.0, (3.0, 4.0), cross_product_deg=120.0)
+        assert named(found, CATALOG) == [("unique", "STAR 0", 1, 0), ("unique", "STAR 1", 1, 0)]
+
+    def test_a_tolerance_of_180_is_as_good_as_no_test(self):
+        for angle_deg in (0.0, 100.0, 180.0):
+            observed = (rotation(STARS[0], angle_deg) @ STARS.T).T
+            widest = identify(CATALOG, observed, [None] * 3, cross_product_deg=180.0)
+            assert words(widest) == words(identify(CATALOG, observed, [None] * 3, tests=ALL_OFF))
 
     def test_an_order_told_by_the_magnitudes_is_confirmed_or_refuted_alone(self):
         assert self.turned(89.9, (3.0, 4.0)).star.tolist() == [0, 1]
@@ -217,6 +233,14 @@ class TestBand:
     def test_a_level_pair_passes_the_second_tolerance_by(self):
         sunk = (rotation([0, 1, 0], 3.0) @ self.LEVEL.T).T
         assert self.seen(self.LEVEL, sunk, pole_angle_deg=0.1).votes.tolist() == [1, 1]
+
+    def test_a_level_pair_votes_for_both_orders_where_both_pass(self):
+        # The pair's own axis tilted by 100 deg; its colatitudes stay within both tolerances.
+        sky = at((0, 0), (0.1, 0))
+        tilted = (rotation([1, 0, 0], 100.0) @ sky.T).T
+        found = self.seen(sky, tilted, cross_product_deg=120.0)
+        assert [len(rivals) for rivals in found.rivals] == [2, 2]
+        assert self.seen(sky, tilted, cross_product_deg=90.0).star.tolist() == [1, 0]
 
     def test_with_the_pole_off_the_cross_products_alone_decide(self):
         off = Switches(pole=False)

@@ -99,6 +99,18 @@ def test_pictures_and_arrays_hold_the_same_counts(counts):
         assert np.array_equal(read(file.getvalue()).counts, counts)
 
 
+@pytest.mark.parametrize("kind", [np.int32, np.float32])
+def test_a_picture_of_32_bits_has_no_known_full_scale(counts, kind):
+    """A camera of 16 bits may fill it to 65,535, one of 32 bits beyond: nothing tells which."""
+    values = counts.astype(kind)
+    values[0, :2] = 65535, 2**31 - 128
+    file = io.BytesIO()
+    Image.fromarray(values).save(file, "TIFF")
+    frame = read(file.getvalue())
+    assert np.array_equal(frame.counts, values.astype(np.float64))
+    assert frame.full_scale == math.inf
+
+
 def test_the_digest_is_that_of_the_file(counts):
     import hashlib
 

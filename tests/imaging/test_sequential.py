@@ -113,6 +113,22 @@ def test_the_fourth_order_image_tells_the_squares(rng):
     assert found == pytest.approx([a, b, a * a, a * b, b * b], abs=6e-4)
 
 
+def test_each_row_of_five_is_the_second_order_expansion_of_the_image(rng):
+    """Phi(u + a, v + b) less Phi(u, v), at every point by itself, written out here in full."""
+
+    def image(u, v):
+        M, L, J, Q, R, T = (getattr(QUARTIC, name) for name in "MLJQRT")
+        return M * u**2 + 2 * J * u * v + L * v**2 + Q * u**4 + R * v**4 + T * u**2 * v**2
+
+    u, v = points(rng, 50)
+    rows = QUARTIC.rows_of_five(u, v)
+    for turn in np.arange(0.0, np.pi, 0.3):
+        a, b = 1e-3 * np.cos(turn), 1e-3 * np.sin(turn)
+        expected = image(u + a, v + b) - image(u, v)
+        # What is left is of third order: a few times 1e-9; one term of a row is 1e-7 or more.
+        assert rows @ [a, b, a * a, a * b, b * b] == pytest.approx(expected, abs=1e-8)
+
+
 def test_the_differenced_form_is_unbiased_with_its_factor_two(rng):
     """Without the two, 6.21 gives twice the truth; a background of any height cancels."""
     u, v = points(rng, 40_000)
@@ -172,6 +188,21 @@ def test_the_stop_rule_sees_an_image_that_is_not_the_hump(rng):
     wrong = batch(hump.rows(1.5 * u, 1.5 * v), values, 0.02**2)
     assert not rule.says(hump, wrong).consistent
     assert StopRule(0.01, inconsistency_sigmas=None).says(hump, wrong).consistent
+
+
+def test_the_stop_rule_asks_for_both_sigmas(rng):
+    """Points along one axis tell that axis alone; then, points along the other."""
+    level = Hump(peak=1.0, M=-1.0, L=-1.3)
+    rule = StopRule(required_sigma=0.01)
+    along, aside = rng.uniform(-1.0, 1.0, 400), rng.uniform(-0.01, 0.01, 400)
+    for first, second in (((along, aside), (aside, along)), ((aside, along), (along, aside))):
+        estimate = diffuse([1.0] * 3)
+        for told, (u, v) in ((False, first), (True, second)):
+            values = level.remainder(u, v, measured(rng, level, u, v, 0.1, -0.1, 0.02))
+            estimate = estimate.replayed(level.rows(u, v), values, 0.02**2)
+            assert min(estimate.sigma[:2]) < 0.01
+            assert (max(estimate.sigma[:2]) < 0.01) == told
+            assert rule.says(level, estimate).done == told
 
 
 def test_re_centring_with_the_true_slopes_removes_the_bias(rng):

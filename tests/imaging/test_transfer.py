@@ -150,6 +150,23 @@ def test_a_plate_that_depends_on_the_colour_is_given_as_a_function():
     assert image.intensity[8, 8] < 0.05 * image.intensity.max()
 
 
+@pytest.mark.parametrize("photons", [False, True])
+def test_colours_add_by_their_energy_or_by_their_number_of_photons(photons):
+    """Two colours of equal power against their Airy discs; a photon of red has less energy."""
+    wavelength = np.array([800e-9, 400e-9])
+    light = Spectrum(omega_of(wavelength), np.array([1.0, 1.0]))
+    pupil = disc(200, DIAMETER_M / 200, RADIUS_M)
+    image = image_of(pupil, light, 0.2 * LASER_M / DIAMETER_M, 5, photons=photons)
+    weight = wavelength if photons else np.ones(2)
+    # An image holds the open area whatever the colour, so that its peak goes with 1 / lambda².
+    discs = [
+        airy(np.abs(image.angles_rad), RADIUS_M, colour) * (math.pi * RADIUS_M**2 / colour) ** 2
+        for colour in wavelength
+    ]
+    expected = weight @ np.array(discs) / weight.sum()
+    assert image.intensity[5] == pytest.approx(expected, abs=2e-3 * expected.max())
+
+
 @pytest.mark.parametrize(
     ("width", "fill", "within"),
     [(0.02, 2.6e-4, 0.02), (0.05, 1.6e-3, 0.03), (0.1, 5.9e-3, 0.03), (0.2, 1.67e-2, 0.02)],

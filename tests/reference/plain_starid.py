@@ -387,11 +387,11 @@ def pair_survives(
             return False, 0
         CRSSEN = 180.0 - CRSSEP
         if LORD == 0:
-            if CRSSEP <= settings.CROSSMAX:
-                return True, 1
-            if CRSSEN <= settings.CROSSMAX:
-                return True, -1
-            return False, 0
+            forward, reversed_ = CRSSEP <= settings.CROSSMAX, CRSSEN <= settings.CROSSMAX
+            # Both only beyond 90 deg: the ambiguous geometry of section 2, which leaves LORD open.
+            if forward and reversed_:
+                return True, 0
+            return forward or reversed_, 1 if forward else -1 if reversed_ else 0
         if (CRSSEP if LORD == 1 else CRSSEN) > settings.CROSSMAX:
             return False, 0
     return True, LORD

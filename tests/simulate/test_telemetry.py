@@ -16,8 +16,8 @@ from service.observe.wire import submission_from_json
 from service.simulate.files import read_objects, truth_path, write_pass
 from service.simulate.orbits import HaloOrbit, orbit_of
 from service.simulate.real_sky import real_sky
-from service.simulate.sightings import anywhere, measured_angles_deg, shaken
-from service.simulate.stretches import NO_TROUBLES, Pass, Trouble, Troubles
+from service.simulate.sightings import Scene, Seen, anywhere, measured_angles_deg, shaken
+from service.simulate.stretches import NO_TROUBLES, Pass, Stretch, Trouble, Troubles
 from service.simulate.telemetry import draw_pass
 from service.sky.ephemeris import apparent, observer_velocity, sun_direction
 from service.times import parse_utc, shifted
@@ -192,6 +192,37 @@ def test_a_star_shifts_with_the_year_and_two_that_are_close_are_one(missions, sk
     # Even motion cancels; the Sun stands at right angles to the star at all three times.
     swing_arcsec = np.linalg.norm(before - 2.0 * between + after) * ARCSEC_PER_RADIAN
     assert swing_arcsec == pytest.approx(4 * 0.742, rel=0.05)
+
+
+class TailFirst(np.random.Generator):
+    """Draws as numpy does, but the first normal deviates lie so far out as is never seen."""
+
+    extremes = ((9.0, 0.5, -7.0, -0.5), (-6.1, 6.1))
+
+    def __init__(self):
+        super().__init__(np.random.PCG64(1))
+        self.left = [np.array(each) for each in self.extremes]
+
+    def normal(self, loc=0.0, scale=1.0, size=None):
+        fits = self.left and size == len(self.left[0]) and np.isscalar(scale) and scale == 1.0
+        return self.left.pop(0) if fits else super().normal(loc, scale, size)
+
+
+@pytest.mark.parametrize("kind", ["nominal", "magnitude_error"])
+def test_magnitude_errors_end_at_six_sigmas(missions, sky, kind):
+    """RCMAG, 0.6 mag for a tracker with 0.1: an error beyond it is drawn again."""
+    mission, time = missions["XTE"], parse_utc("1999-07-15T08:00:00Z")
+    (tracker,), rng = mission.trackers, TailFirst()
+    real = real_sky(sky.catalog, mission.catalog, sky.run_catalog(mission, time))
+    still, stretch = np.zeros(3), Stretch(kind, 0.5)
+    scene = Scene(mission, real, time, still, still, "ignore", still, stretch, rng)
+    direction = np.tile([0.0, 0.0, 1.0], (4, 1))
+    seen = Seen(tracker, direction, np.zeros(4), np.full(4, 5.0), np.arange(4))
+    sigma_mag = 0.5 if kind == "magnitude_error" else tracker.magnitude_sigma_mag
+    errors = [star["magnitude"] - 5.0 for star in scene.measured(seen, as_angles=False)]
+    assert not rng.left
+    assert errors[1::2] == pytest.approx([0.5 * sigma_mag, -0.5 * sigma_mag], abs=1e-3)
+    assert max(map(abs, errors)) <= 6.0 * sigma_mag
 
 
 def test_the_turning_of_the_body_is_in_the_measurements(missions, sky, seed):

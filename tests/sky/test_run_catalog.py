@@ -11,7 +11,6 @@ from service.missions.mission import RunCatalogSettings
 from service.sky.blending import merge
 from service.sky.catalog import import_csv, load_embedded
 from service.sky.run_catalog import (
-    UNKNOWN_COLOR_BV_MAG,
     build_run_catalog,
     export_csv,
     export_rejected_csv,
@@ -213,15 +212,23 @@ def test_proper_motion_goes_to_the_epoch(catalog):
 
 
 def test_the_color_polynomial_makes_the_instrument_magnitude(tmp_path):
-    """V + c0 + c1 (B-V) + c2 (B-V)^2; an unknown colour counts as the stated one."""
+    """V + c0 + c1 (B-V) + c2 (B-V)^2; an unknown colour counts as 0.6."""
     catalog = site_catalog(tmp_path, "A 1,10,0,5,1.5", "A 2,20,0,5,", columns=",color_bv_mag")
     assert instrument_magnitude(catalog, ()) is catalog.magnitude_v_mag
     found = instrument_magnitude(catalog, (0.1, -0.4, 0.05))
-    expected = [5 + 0.1 - 0.4 * b + 0.05 * b * b for b in (1.5, UNKNOWN_COLOR_BV_MAG)]
+    expected = [5 + 0.1 - 0.4 * b + 0.05 * b * b for b in (1.5, 0.6)]
     np.testing.assert_allclose(found, expected, rtol=1e-14)
     run = run_of(catalog, color_polynomial_mag=(0.1, -0.4, 0.05))
     assert run.star_id == ("A 1", "A 2")
     assert run.magnitude_mag[0] == found[0]
+
+
+def test_an_unknown_color_is_taken_for_the_catalog_s_usual_one(tmp_path, catalog):
+    """Near the median of the embedded catalog, and the Sun's own 0.65."""
+    unknown = site_catalog(tmp_path, "A 1,10,0,5,", columns=",color_bv_mag")
+    (color,) = instrument_magnitude(unknown, (0.0, 1.0)) - 5.0
+    assert color == pytest.approx(np.nanmedian(catalog.color_bv_mag), abs=0.15)
+    assert color == pytest.approx(0.65, abs=0.1)
 
 
 def test_variables_and_uncertain_positions_are_rejected_with_their_reason(catalog):

@@ -89,9 +89,17 @@ def test_the_shelf_s_zone_holds_every_star_of_the_exact_one(seed, aim, grid_deg)
 def test_aims_of_one_grid_cell_share_a_zone_and_others_do_not():
     catalog, shelf = sky(3), Shelf(1 << 20)
 
-    def zone(ra_deg, dec_deg, mission="X", most_deg=10.66, separation_deg=8.0, grid_deg=1.0):
+    def zone(
+        ra_deg,
+        dec_deg,
+        mission="X",
+        most_deg=10.66,
+        separation_deg=8.0,
+        grid_deg=1.0,
+        stars=catalog,
+    ):
         aim = Aim("cap", from_ra_dec(ra_deg, dec_deg), 0.0, most_deg)
-        return zone_for(shelf, mission, catalog, aim, separation_deg, grid_deg)
+        return zone_for(shelf, mission, stars, aim, separation_deg, grid_deg)
 
     first, cached = zone(83.1, -2.4)
     assert not cached
@@ -102,6 +110,7 @@ def test_aims_of_one_grid_cell_share_a_zone_and_others_do_not():
         zone(83.1, -2.4, most_deg=11.0),
         zone(83.1, -2.4, separation_deg=4.0),
         zone(83.1, -2.4, grid_deg=0.0),
+        zone(83.1, -2.4, stars=sky(4)),
     ):
         assert other[0] is not first
         assert not other[1]

@@ -225,6 +225,30 @@ def pass_of(client, operations, run):
     return [each.id for each in operations.submit_many(lines)]
 
 
+@pytest.mark.parametrize(("angle", "sign"), [("h", 1), ("h", -1), ("v", 1), ("v", -1)])
+def test_residual_arrows_point_from_the_predicted_place_to_where_a_star_was_seen(
+    client, post, drawn, run, angle, sign
+):
+    """One star is moved by 30 arcsec, ten sigmas; h is to the right in the picture, v upwards."""
+    body = drawn("XTE", 1, angles_share=1.0)[0]
+    stars = body["observations"][0]["stars"]
+    stars[0][f"{angle}_deg"] += sign * 30.0 / 3600.0
+    answer = post(body | {"batch": f"moved {angle} {sign}", "run": run}).json()
+    moved = answer["observations"][0]["stars"][0]
+    assert moved["outcome"] == "unique"
+    assert moved["residual_arcsec"] > 15.0
+    page = Markup(client.get(f"/batches/{answer['id']}").text)
+    lines = [
+        [float(told[name]) for name in ("x1", "y1", "x2", "y2")]
+        for tag, told in page.elements
+        if tag == "line" and told.get("class") == "arrow"
+    ]
+    ways = [(x2 - x1, y1 - y2) for x1, y1, x2, y2 in lines]
+    right, up = max(ways, key=lambda way: math.hypot(*way))
+    expected = (sign, 0.0) if angle == "h" else (0.0, sign)
+    assert (right, up) == pytest.approx([70.0 * each for each in expected], abs=25.0)
+
+
 def test_stars_named_by_an_answer_stand_where_they_were_seen(operations, client, run):
     for each in pass_of(client, operations, run):
         for tracker in operations.star_field(each)["trackers"]:

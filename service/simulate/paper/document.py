@@ -27,6 +27,8 @@ How the paper was read, where it leaves a choice:
   cap body X is the tracker's boresight, in a band it is the pole and Z the boresight;
 - where the magnitudes of a pair do not tell its order, no magnitude is compared at all;
 - where the angles to the pole tell the order, no cross product follows;
+- where both orders of a pair pass the cross product, which needs a CAPMAX or BANMAX above 90 deg,
+  a vote is cast for each pairing;
 - one vote is enough; the paper's "ambiguous" counts stars without any vote;
 - the prototype read "all stars down to" a magnitude: of a double only components that bright are
   merged. The service lets fainter ones add their light, as a tracker sees it
