@@ -131,6 +131,12 @@ def state_of(text: str) -> tuple[str, Record | None] | None:
     return (match["state"], read_record(match["record"] or "")) if match else None
 
 
+def has_record(text: str) -> bool:
+    """Whether a section says which code it was measured with."""
+    state = state_of(text)
+    return state is not None and state[1] is not None
+
+
 def stale(sections: Mapping[str, str], known: Mapping[str, Section]) -> list[str]:
     """The sections that were measured with other code than today's, or do not say with which."""
     old = []

@@ -40,7 +40,7 @@ from benchmarks import (
     zone_counts,
 )
 from benchmarks.record import record_of
-from benchmarks.sections import Section, framed, kept, out_of_bounds, stale
+from benchmarks.sections import Section, framed, has_record, kept, out_of_bounds, stale
 from service import __version__
 
 SECTIONS: Mapping[str, Section] = {
@@ -74,6 +74,14 @@ def page(sections: Mapping[str, str]) -> str:
         if doubtful
         else "Everything is within its bounds."
     )
+    unrecorded = [name for name, text in sections.items() if not has_record(text)]
+    older = (
+        f"""
+Measured before records and bounds were kept, and to be made anew: {", ".join(unrecorded)}.
+"""
+        if unrecorded
+        else ""
+    )
     here = [name for name in SECTIONS if name in sections]
     contents = "\n".join(f"- {_link(SECTIONS[name].title)}" for name in here)
     body = "\n".join(sections[name] for name in here)
@@ -90,7 +98,7 @@ changed since then. It is run before a release, and is no part of `make check`.
 
 Where a figure is a count of random events, its bound is the one that chance alone passes once in
 10,000 times.
-
+{older}
 {contents}
 
 {body}"""
