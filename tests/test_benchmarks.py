@@ -8,6 +8,8 @@ import pytest
 from benchmarks import aberration, consistency, covariance, lost_in_space, performance
 from benchmarks.__main__ import main
 from benchmarks.bounds import equal, share_as_expected
+from benchmarks.lost_in_space_conditions import CONDITIONS
+from benchmarks.lost_in_space_document import LEAST_RIGHT
 from benchmarks.record import read_record
 from benchmarks.sections import Section, Written, bounds_shown, kept, stale, state_of
 from benchmarks.verification import SECTIONS, TARGET, remake
@@ -77,6 +79,11 @@ def test_one_section_is_made_anew_and_the_others_are_kept(tmp_path, monkeypatch,
     drawn["figure"] = "second"
     assert remake(["one"], True, seed, page)
     assert "Everything is within its bounds." in page.read_text("utf-8")
+
+
+def test_every_condition_of_lost_in_space_with_an_answer_has_a_bound():
+    for name, condition in CONDITIONS.items():
+        assert not condition.real or name in LEAST_RIGHT, name
 
 
 def test_a_section_without_bounds_is_not_within_its_bounds():
