@@ -30,7 +30,7 @@ DEV = $(VENV)/.installed-dev
 # The steps of `make check` run one after another, also under -j.
 .NOTPARALLEL:
 .PHONY: help run test torture check format-check lint types floors migrations-check openapi-check \
-	format lock bench openapi clean
+	format lock bench stale openapi clean
 
 help:
 	@echo "make run      set up, serve on http://$(HOST):$(PORT), replay sample telemetry, print a table"
@@ -39,6 +39,7 @@ help:
 	@echo "make check    tests, format, lint, types, import floors, migrations, openapi.yaml"
 	@echo "make format   format the code and mend what the linter can"
 	@echo "make bench    measure speed, write docs/performance.md; BENCH_ARGS=--all for all benchmarks"
+	@echo "make stale    name the measured sections of the documents that are older than the code"
 	@echo "make openapi  write openapi.yaml anew"
 	@echo "make lock     resolve the dependencies anew (needs the package index)"
 	@echo "make clean    remove .venv and everything that was built or cached"
@@ -98,6 +99,10 @@ format: $(DEV)
 
 bench: $(DEV)
 	@$(BIN)/python -m benchmarks --write $(BENCH_ARGS)
+
+# Before a release; not part of `make check`, because measuring everything again takes hours.
+stale: $(DEV)
+	@$(BIN)/python -m benchmarks.verification --check
 
 # Written beside and then moved: a failure leaves the old file.
 openapi: $(DEV)

@@ -10,13 +10,14 @@ The exit code is 1 where a result is out of its bounds.
 import argparse
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from benchmarks import (
     aberration,
     attitude_against_svd,
     calibration,
     centroids,
+    consistency,
     covariance,
     frames,
     imaging_claims,
@@ -35,6 +36,7 @@ from benchmarks import (
     whole_sky,
     zone_counts,
 )
+from benchmarks.record import SERVICE, record_of
 from benchmarks.report import Report
 
 BENCHMARKS: dict[str, Callable[[bool, int], Report]] = {
@@ -42,6 +44,7 @@ BENCHMARKS: dict[str, Callable[[bool, int], Report]] = {
     "staircase": staircase.run,
     "aberration": aberration.run,
     "covariance": covariance.run,
+    "consistency": consistency.run,
     "attitude_against_svd": attitude_against_svd.run,
     "plain_reference": plain_reference.run,
     "paper_runs": paper_runs.run,
@@ -81,17 +84,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     by_default = [
         name for name in (BENCHMARKS if asked.all else OF_SPEED) if name not in BY_NAME_ALONE
     ]
+    code = {}
     for name in asked.names or by_default:
+        # Before the measurement, which takes minutes: the code may be edited meanwhile.
+        code[name] = str(record_of(SERVICE))
         report = BENCHMARKS[name](asked.quick, asked.seed)
         print(report.text(), flush=True)
         reports.append(report)
     if asked.write:
-        _keep([each for each in reports if each.name in OF_SPEED], asked.seed, asked.quick)
+        _keep([each for each in reports if each.name in OF_SPEED], asked.seed, asked.quick, code)
         performance.write()
     return 0 if all(report.passed for report in reports) else 1
 
 
-def _keep(reports: Sequence[Report], seed: int, quick: bool) -> None:
+def _keep(reports: Sequence[Report], seed: int, quick: bool, code: Mapping[str, str]) -> None:
     """Put figures into the results beside those of the other benchmarks."""
     path = performance.RESULTS
     kept = json.loads(path.read_text("utf-8")) if path.exists() else {"benchmarks": {}}
@@ -99,10 +105,11 @@ def _keep(reports: Sequence[Report], seed: int, quick: bool) -> None:
     for each in reports:
         kept["benchmarks"][each.name] = {
             "within_bounds": each.passed,
-            "faults": each.faults,
-            "figures": each.figures,
-            "curves": each.curves,
+            "bounds": [bound.as_json() for bound in each.bounds],
+            "figures": dict(each.figures),
+            "curves": dict(each.curves),
             "record": kept["record"],
+            "code": code[each.name],
         }
     path.write_text(json.dumps(kept, indent=2, ensure_ascii=False) + "\n", "utf-8")
 

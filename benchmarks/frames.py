@@ -27,8 +27,10 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from benchmarks.bounds import Bound, at_least, at_most, between
+from benchmarks.record import CORE, IMAGING, record_of
 from benchmarks.report import Report
-from benchmarks.sections import table
+from benchmarks.sections import bounds_table, table
 from service.acquire import Acquisition, acquire
 from service.errors import NotAvailable
 from service.imaging.detect import detect, detection_kernel
@@ -69,6 +71,9 @@ DETECTION_MOST = 1.5
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "frames.md"
 PICTURE = Path(__file__).parent.parent / "docs" / "images" / "overlay.png"
+
+
+SOURCES = (*CORE, *IMAGING, "service/simulate/frames.py", "service/simulate/frame_files.py")
 
 
 @dataclass
@@ -284,7 +289,7 @@ def _ratio_to_sep(frame: Frame, camera: Camera) -> float:
 
 def _report(found: Sequence[Measured]) -> Report:
     figures: dict[str, Any] = {"frames": len(found)}
-    faults: list[str] = []
+    bounds: list[Bound] = []
     stars = sum(each.stars for each in found)
     hidden = sum(each.hidden for each in found)
     missed = sum(len(each.missed) for each in found)
@@ -297,7 +302,7 @@ def _report(found: Sequence[Measured]) -> Report:
         "stars in batches": sum(each.used for each in found),
         "of these hot pixels, cosmic rays or noise": sum(each.false for each in found),
     }
-    _require(faults, complete >= COMPLETE_LEAST, f"complete to {complete:.2%} only")
+    bounds.append(at_least("share of the stars found", complete, COMPLETE_LEAST))
     placed = np.array([star for each in found for star in each.placed])
     errors = np.sqrt((placed[:, :2] ** 2).mean())
     figures |= {
@@ -306,15 +311,15 @@ def _report(found: Sequence[Measured]) -> Report:
         "the same, central 68.3 %": float(np.quantile(np.abs(placed[:, :2]), 0.6827)),
         "their magnitude's error, rms": float(np.sqrt((placed[:, 2] ** 2).mean())),
     }
-    _require(faults, SPREAD[0] <= errors <= SPREAD[1], f"errors are {errors:.2f} sigma")
+    bounds.append(between("their place's error over its sigma, rms", float(errors), *SPREAD))
     for prior in found[0].solved:
-        _add_attitudes(figures, faults, prior, [each.solved[prior] for each in found])
-    _add_times(figures, faults, found)
-    return Report("frames", figures, not faults, faults)
+        _add_attitudes(figures, bounds, prior, [each.solved[prior] for each in found])
+    _add_times(figures, bounds, found)
+    return Report("frames", figures, bounds)
 
 
 def _add_attitudes(
-    figures: dict[str, Any], faults: list[str], prior: str, solved: Sequence[Solved]
+    figures: dict[str, Any], bounds: list[Bound], prior: str, solved: Sequence[Solved]
 ) -> None:
     count = len(solved)
     good = [each for each in solved if each.attitude and not each.suspect]
@@ -330,8 +335,8 @@ def _add_attitudes(
             f"{sum(each.unique for each in solved):,}, {sum(each.misnamed for each in solved)}"
         ),
     }
-    _require(faults, right >= RIGHT_LEAST, f"{about}: right in {right:.2%}")
-    _require(faults, wrong == 0, f"{about}: {wrong} wrong attitudes")
+    bounds.append(at_least(f"{about}: good attitude, and right, share", right, RIGHT_LEAST))
+    bounds.append(at_most(f"{about}: good attitude, and wrong", wrong, 0))
     if good:
         normalised = np.array([each.normalised for each in good])
         spread = np.sqrt((normalised**2).mean(axis=0))
@@ -346,37 +351,35 @@ def _add_attitudes(
         }
         # Of a thousand values of chi-square with three degrees the mean scatters by 2.6 %.
         slack = 4.0 * math.sqrt(2.0 / 3.0 / len(good))
-        within = SPREAD[0] ** 2 - slack <= square <= SPREAD[1] ** 2 + slack
-        _require(faults, within, f"{about}: e^T P^-1 e is {square:.2f} times what it should be")
+        within = SPREAD[0] ** 2 - slack, SPREAD[1] ** 2 + slack
+        bounds.append(between(f"{about}: e^T P^-1 e over 3", square, *within))
     figures[f"{about}: identify, median ms"] = (
         float(np.median([each.identify_us for each in solved])) / 1000.0
     )
 
 
-def _add_times(figures: dict[str, Any], faults: list[str], found: Sequence[Measured]) -> None:
+def _add_times(figures: dict[str, Any], bounds: list[Bound], found: Sequence[Measured]) -> None:
     for step in ("read", "detect", "centroid"):
         median = float(np.median([each.steps_us[step] for each in found])) / 1000.0
         figures[f"{step}, median ms"] = median
     ratios = [each.ratio for each in found if each.ratio is not None]
     ratio = float(np.median(ratios))
     figures["detection over SEP's own on the same frame"] = ratio
-    _require(faults, ratio <= DETECTION_MOST, f"detection takes {ratio:.2f} times SEP's own")
-
-
-def _require(faults: list[str], holds: bool, fault: str) -> None:
-    if not holds:
-        faults.append(fault)
+    bounds.append(at_most("detection over SEP's own on the same frame", ratio, DETECTION_MOST))
 
 
 def document(report: Report, seed: int) -> str:
     """docs/frames.md."""
     verdict = "Everything is within its bounds." if report.passed else "**Out of bounds.**"
     lost = ", and once more lost in space" if f"prior {PRIORS[1]}: none" in report.figures else ""
-    faults = "".join(f"\n- {fault}" for fault in report.faults)
+    record = record_of(SOURCES)
     return f"""# Frames
 
 Written by `python -m benchmarks.frames --frames {report.figures["frames"]} --seed {seed} --write`;
-its figures are not edited by hand. {verdict}{faults}
+its figures are not edited by hand. {verdict}
+
+{record.sentence} Seed {seed}.
+<!-- {record} -->
 
 Each frame is drawn from the real sky as the shipped mission IMAGER sees it: 1024 x 1024 pixels of
 35 arcsec, 10 deg a side. Every star of the catalog shines, to V 9, at its own place and time, with
@@ -394,6 +397,8 @@ hundred sigmas, and far less than any false star would move it by. A *good* one 
 calls good.
 
 {table(("", "figure"), report.figures.items())}
+
+{bounds_table(report.bounds)}
 
 ![A frame with its stars, their names and residual arrows](images/overlay.png)
 

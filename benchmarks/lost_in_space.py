@@ -25,8 +25,9 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from benchmarks.bounds import faults_of
 from benchmarks.lost_in_space_conditions import CONDITIONS, QUICK_SHARE, Condition, solvers_of
-from benchmarks.lost_in_space_document import document, faults_of, section_text, shown_rows
+from benchmarks.lost_in_space_document import SOURCES, bounds_of, document, section_text, shown_rows
 from benchmarks.lost_in_space_rows import Count, Row, row_of
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written
@@ -72,23 +73,23 @@ def run(quick: bool, seed: int) -> Report:
     """The service's own solver in every condition, held to its bounds; no peers, no clock."""
     scenes = OWN_QUICK_SCENES if quick else OWN_SCENES
     rows = measured(list(CONDITIONS), scenes, seed, with_peers=False)
-    faults = faults_of(rows)
+    bounds = bounds_of(rows)
     figures = {
         f"{row.condition}: right, wrong, none of {row.scenes:,}": (
             f"{row.right:,}, {row.wrong:,}, {row.none:,}"
         )
         for row in rows
     }
-    return Report("lost_in_space", figures, not faults, faults)
+    return Report("lost_in_space", figures, bounds)
 
 
 def _write(quick: bool, seed: int) -> Written:
     scenes = int(OWN_SCENES * QUICK_SHARE) if quick else OWN_SCENES
     rows = measured(list(CONDITIONS), scenes, seed, with_peers=False)
-    return Written(section_text(rows), not faults_of(rows))
+    return Written(section_text(rows), bounds_of(rows))
 
 
-SECTION = Section("Lost in space", _write)
+SECTION = Section("Lost in space", _write, SOURCES)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -121,7 +122,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name, svg in pictures.items():
             (TARGET.parent / "plots" / name).write_text(svg, encoding="utf-8")
         print(f"wrote {TARGET.name} and {len(pictures)} plots")
-    faults = faults_of(rows)
+    faults = faults_of(bounds_of(rows))
     for fault in faults:
         print(f"! {fault}")
     return 1 if faults else 0

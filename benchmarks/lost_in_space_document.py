@@ -6,16 +6,29 @@ import platform
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from benchmarks.bounds import Bound, at_least, at_most, faults_of
 from benchmarks.lost_in_space_conditions import UNCALIBRATED_MAG, WITHOUT_MAGNITUDES
 from benchmarks.lost_in_space_rows import Row, interval, more_often
+from benchmarks.record import CORE, SIMULATOR, record_of
 
 OURS = ("lost_in_space", "staircase, a priori")
+SOURCES = (
+    *CORE,
+    *SIMULATOR,
+    *(f"benchmarks/lost_in_space{part}.py" for part in ("_conditions", "_peers", "_rows")),
+)
 LEAST_RIGHT = {
+    "0 px": 0.995,
+    "0.5 px": 0.993,
     "1 px": 0.990,
     "2 px": 0.983,
     "five brightest": 0.998,
+    "five, prior 0.05 deg": 0.999,
+    "five, prior 0.3 deg": 0.999,
     "five, prior 1 deg": 0.999,
     "five, prior 3 deg": 0.999,
+    "ten and 0 spurious": 0.998,
+    "ten and 2 spurious": 0.998,
     "ten and 5 spurious": 0.998,
     "ten and 10 spurious": 0.998,
     "sigma told half": 0.98,
@@ -23,8 +36,10 @@ LEAST_RIGHT = {
     "focal length off 0.2 %": 0.98,
     "magnitudes off 0.7": 0.98,
     WITHOUT_MAGNITUDES: 0.98,
+    **dict.fromkeys(UNCALIBRATED_MAG, 0.98),
 }
-LEAST_RIGHT_OF_SIX = {"1 px": 0.999}
+LEAST_RIGHT_OF_SIX, LEAST_OF_SIX = {"1 px": 0.999}, 0.998
+"""Of the fields with six stars or more; the second where a condition has none of its own."""
 MOST_WRONG = {"1 px": 1 / 40_000, "2 px": 2 / 20_000, "random points": 1e-4, "mirrored": 0.0}
 """Shares; one wrong more is allowed for in any sample that is smaller than one in the share."""
 FEWER = {(name, WITHOUT_MAGNITUDES) for name in UNCALIBRATED_MAG}
@@ -33,37 +48,37 @@ SIGNIFICANT = 0.05
 PLOTTED = ("0 px", "0.5 px", "1 px", "2 px")
 
 
-def faults_of(rows: Sequence[Row]) -> list[str]:
-    """What of the service's own rows is surely out of bounds: beyond 95 % of luck."""
-    faults = []
+def bounds_of(rows: Sequence[Row]) -> list[Bound]:
+    """The bounds of the service's own rows; out of them is what is so beyond 95 % of luck."""
+    bounds = []
     for row in rows:
         if row.solver not in OURS:
             continue
         where = f"{row.condition}: {row.solver}"
         if (least := LEAST_RIGHT.get(row.condition)) is not None:
-            faults += _too_few(f"{where}: right", row.right, row.scenes, least)
-        if (least := LEAST_RIGHT_OF_SIX.get(row.condition)) is not None:
-            faults += _too_few(f"{where}: right of six", row.right_of_six, row.six, least)
+            bounds.append(_share_at_least(f"{where}: right", row.right, row.scenes, least))
+            if row.six:
+                least = LEAST_RIGHT_OF_SIX.get(row.condition, LEAST_OF_SIX)
+                label = f"{where}: right of those with six stars"
+                bounds.append(_share_at_least(label, row.right_of_six, row.six, least))
         allowed = math.ceil(MOST_WRONG.get(row.condition, 1e-4) * row.scenes)
-        if row.wrong > allowed:
-            faults.append(f"{where}: {row.wrong} wrong of {row.scenes:,}, at most {allowed}")
+        bounds.append(at_most(f"{where}: wrong of {row.scenes:,}", row.wrong, allowed))
         for other in rows:
             # The same scenes.
-            if (
-                (row.condition, other.condition) in FEWER
-                and row.scenes == other.scenes
-                and row.right < other.right
-            ):
-                faults.append(f"{where}: {row.right:,} right, {other.condition}: {other.right:,}")
-            if other.condition == row.condition and more_often(row, other) < SIGNIFICANT:
-                faults.append(f"{where}: wrong significantly more often than {other.solver}")
-    return faults
+            if (row.condition, other.condition) in FEWER and row.scenes == other.scenes:
+                label = f"{where}: right, beside {other.right:,} of {other.condition}"
+                bounds.append(at_least(label, row.right, other.right))
+            if other.condition == row.condition and other is not row:
+                chance = more_often(row, other)
+                label = f"{where}: chance that it is wrong so much more often than {other.solver}"
+                bounds.append(at_least(label, chance, SIGNIFICANT))
+    return bounds
 
 
-def _too_few(what: str, hits: int, of: int, least: float) -> list[str]:
-    if of and interval(hits, of)[1] < least:
-        return [f"{what} {hits / of:.2%} of {of:,}, at least {least:.1%}"]
-    return []
+def _share_at_least(what: str, hits: int, of: int, least: float) -> Bound:
+    """The upper end of the share's 95 % interval is not below the bound."""
+    measured = f"{hits / of:.2%} of {of:,}" if of else "none"
+    return Bound(what, measured, f"at least {least:.1%}", of > 0 and interval(hits, of)[1] >= least)
 
 
 def shown_rows(rows: Iterable[Row]) -> str:
@@ -125,7 +140,7 @@ def document(rows: Sequence[Row], scenes: int, seed: int, turn: int) -> tuple[st
         "lost-in-space-rates.svg": _plot(rows, "rates"),
         "lost-in-space-times.svg": _plot(rows, "times"),
     }
-    faults = faults_of(rows)
+    faults = faults_of(bounds_of(rows))
     verdict = (
         "Everything is within its bounds."
         if not faults
@@ -136,6 +151,9 @@ def document(rows: Sequence[Row], scenes: int, seed: int, turn: int) -> tuple[st
 Written by `python -m benchmarks.lost_in_space --scenes {scenes} --seed {seed} --write` in an
 environment with the extra `peers`; its figures are not edited by hand. Python
 {platform.python_version()}. {verdict}
+
+{record_of(SOURCES).sentence} Seed {seed}, {scenes:,} scenes at one pixel.
+<!-- {record_of(SOURCES)} -->
 
 ## What is asked
 

@@ -15,7 +15,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from benchmarks.sections import table
+from benchmarks.bounds import Bound
+from benchmarks.record import SERVICE, digest_of, read_record
+from benchmarks.sections import bounds_table, table
 from service import __version__
 from service.simulate.drawing import Folder, pictures_in
 
@@ -28,7 +30,9 @@ PACKAGES = ("fastapi", "uvicorn", "pydantic", "msgspec", "sqlalchemy", "numpy", 
 INTRODUCTION = (
     "Written by `make bench`; its figures are not edited by hand. Times move with the machine "
     "and with what else runs on it; the ratios are of things measured in turn in one run, and "
-    "the answers of every one are checked. Bounds that do not hold are marked."
+    "the answers of every one are checked. Each part ends with its bounds, of which those that do "
+    "not hold are marked, and with the commit that it was measured at. `python -m "
+    "benchmarks.verification --check` names the parts that were measured with other code."
 )
 TITLES = {
     "kernels": "Kernels: votes, TRIAD and QUEST; pairs of stars",
@@ -44,10 +48,8 @@ ABOUT = {
         "they write to given; `one` calls them from Python batch by batch as the service does, "
         "which makes it for each. The bare kernels "
         "(`benchmarks/bare.py`) do the same work with every array ready and nothing that can be "
-        "switched off; they name the same stars and find the same quaternions. At most 1.5 times "
-        "the bare kernel in many, at most 3 in single calls in a cap, and for the pairs at most "
-        "1.5 times a bare k-d tree query, whose pairs must be the same and which neither works "
-        "out separations nor sorts."
+        "switched off; they name the same stars and find the same quaternions. The bare k-d tree "
+        "query, whose pairs must be the same, neither works out separations nor sorts."
     ),
     "staircase": "Single calls of the core without records; see `benchmarks/staircase.py`.",
     "verified_cost": "Compiled loops over views of the paper's runs, in one thread.",
@@ -101,6 +103,19 @@ def record(seed: int, quick: bool) -> dict[str, Any]:
     }
 
 
+def stale() -> list[str]:
+    """The benchmarks of speed that were measured with other code than today's."""
+    kept = json.loads(RESULTS.read_text("utf-8"))["benchmarks"] if RESULTS.exists() else {}
+    today, old = digest_of(SERVICE), []
+    for name in TITLES:
+        record = read_record(kept.get(name, {}).get("code", ""))
+        if record is None:
+            old.append(f"{name}: no record of the code that it was measured with")
+        elif record.sources != today:
+            old.append(f"{name}: measured at commit {record.commit}; its sources have changed")
+    return old
+
+
 def write() -> None:
     """Write the page and its pictures."""
     kept = json.loads(RESULTS.read_text("utf-8"))
@@ -120,8 +135,6 @@ def write() -> None:
             parts += ["", f"## {title}", "", ABOUT[name], ""]
             apart = [f"{each} {value}" for each, value in found["record"].items() - machine.items()]
             parts += [f"Measured apart: {', '.join(sorted(apart))}.", ""] if apart else []
-            parts += [f"- **Out of bounds:** {fault}" for fault in found["faults"]]
-            parts += [""] if found["faults"] else []
             if name == "kernels":
                 parts += [*_kernels(found["figures"], folder), ""]
             else:
@@ -132,7 +145,12 @@ def write() -> None:
             if name == "soak":
                 _soak_picture(found["curves"], folder)
                 parts += ["![An hour](plots/performance-soak.svg)", ""]
-            parts.append(f"Again: `python -m benchmarks {name}`.")
+            bounds = [Bound(**each) for each in found.get("bounds", [])]
+            parts += [bounds_table(bounds), ""] if bounds else []
+            parts += [] if bounds else ["Measured before its bounds were recorded.", ""]
+            record = read_record(found.get("code", ""))
+            told = f"{record.sentence} " if record else ""
+            parts.append(f"{told}Again: `python -m benchmarks {name}`.")
     TARGET.write_text("\n".join(parts) + "\n", "utf-8")
 
 

@@ -1,31 +1,39 @@
-"""What a benchmark gives back: figures by name, and whether they are within bounds."""
+"""What a benchmark gives back: figures by name, and the bounds that they were held against."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
+
+from benchmarks.bounds import Bound, faults_of, shown
 
 
 @dataclass(frozen=True)
 class Report:
-    """Figures in the order in which they are shown; `faults` says what is out of bounds.
+    """Figures in the order in which they are shown, and their bounds.
 
     `curves` are drawn rather than shown: values by name, one for each step of a run.
     """
 
     name: str
-    figures: dict[str, Any]
-    passed: bool
-    faults: list[str] = field(default_factory=list)
-    curves: dict[str, list[float]] = field(default_factory=dict)
+    figures: Mapping[str, Any]
+    bounds: Sequence[Bound]
+    curves: Mapping[str, list[float]] = field(default_factory=dict)
+
+    @property
+    def passed(self) -> bool:
+        """Whether there are bounds, and every figure is within its own."""
+        return bool(self.bounds) and not self.faults
+
+    @property
+    def faults(self) -> list[str]:
+        """The bounds that do not hold, in words."""
+        return faults_of(self.bounds)
 
     def text(self) -> str:
         """The report as it is printed."""
         lines = [f"{self.name}: {'within bounds' if self.passed else 'OUT OF BOUNDS'}"]
         lines += [f"  {name:<52} {shown(value)}" for name, value in self.figures.items()]
-        return "\n".join(lines + [f"  ! {fault}" for fault in self.faults])
-
-
-def shown(value: object) -> str:
-    """A figure as text: whole numbers grouped, others to four digits."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return str(value)
-    return f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
+        lines += [
+            f"  {'=' if b.holds else '!'} {b.figure}: {b.measured} ({b.asked})" for b in self.bounds
+        ]
+        return "\n".join(lines)

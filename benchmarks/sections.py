@@ -1,51 +1,72 @@
 """Sections of docs/verification.md: what a benchmark writes, and how the page keeps it.
 
-A section stands between two comments.  The first tells its seed, its size and
-whether it is within its bounds, so that one section can be remade and the
-others kept as they are:
+A section stands between two comments.  The first tells its seed, its size,
+whether it is within its bounds and which code it was measured with, so that one
+section can be remade and the others kept as they are:
 
-    <!-- section covariance; seed 7; full size; within bounds -->
+    <!-- section covariance; seed 7; full size; within bounds; commit ...; sources ...; ... -->
     ...
     <!-- end of covariance -->
 """
 
+import inspect
 import re
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from benchmarks.report import shown
+from benchmarks.bounds import Bound, shown
+from benchmarks.record import CORE, ROOT, SIMULATOR, Record, digest_of, read_record
 from service.simulate.drawing import Folder, pictures_in
 
 _KEPT = re.compile(
-    r"<!-- section (?P<name>[\w-]+); seed (?P<seed>\d+); (?P<size>[^;]+); (?P<state>[^;]+) -->\n"
+    r"<!-- section (?P<name>[\w-]+); seed (?P<seed>\d+); (?P<size>[^;]+); "
+    r"(?P<state>[^;]+?)(?:; (?P<record>commit [^>]+))? -->\n"
     r"(?P<text>.*?)\n<!-- end of (?P=name) -->\n",
     re.DOTALL,
 )
 _WITHIN, _OUT = "within bounds", "out of bounds"
+BOUNDS_HEAD = ("figure", "measured", "bound", "")
 
 
 @dataclass(frozen=True)
 class Written:
-    """What a section says, in Markdown without its heading, and whether it is within bounds.
+    """What a section says, in Markdown without its heading, and the bounds of its figures.
 
     `pictures` are SVG texts by file name; the page finds them in its folder `plots`.
     `pages` are other Markdown pages by file name, which stand beside it.
     """
 
     text: str
-    passed: bool
+    bounds: Sequence[Bound]
     pictures: Mapping[str, str] = field(default_factory=dict)
     pages: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def passed(self) -> bool:
+        """Whether there are bounds, and every figure is within its own."""
+        return bool(self.bounds) and all(each.holds for each in self.bounds)
 
 
 @dataclass(frozen=True)
 class Section:
-    """A section of the page.  `write` is given whether samples are small, and the seed."""
+    """A section of the page.  `write` is given whether samples are small, and the seed.
+
+    `sources` are the files and folders that its figures depend on, beside the
+    module of `write` itself.
+    """
 
     title: str
     write: Callable[[bool, int], Written]
+    sources: tuple[str, ...] = (*CORE, *SIMULATOR)
+
+    @property
+    def all_sources(self) -> tuple[str, ...]:
+        """The sources with the module that measures."""
+        module = Path(inspect.getfile(self.write)).resolve()
+        own = (str(module.relative_to(ROOT)),) if module.is_relative_to(ROOT) else ()
+        return (*self.sources, *own)
 
 
 def pictures_of(salt: str, paint: Callable[[Folder], None]) -> dict[str, str]:
@@ -55,19 +76,39 @@ def pictures_of(salt: str, paint: Callable[[Folder], None]) -> dict[str, str]:
         return {path.name: path.read_text(encoding="utf-8") for path in pictures.written}
 
 
-def framed(name: str, title: str, written: Written, quick: bool, seed: int) -> str:
+def framed(name: str, title: str, written: Written, quick: bool, seed: int, record: Record) -> str:
     """A section made anew, between its comments."""
     size = "small samples" if quick else "full size"
     state = _WITHIN if written.passed else _OUT
     doubt = "" if written.passed else "**Some of these figures are out of bounds.**\n\n"
     return (
-        f"<!-- section {name}; seed {seed}; {size}; {state} -->\n"
+        f"<!-- section {name}; seed {seed}; {size}; {state}; {record} -->\n"
         f"## {title}\n\n"
         f"{written.text.strip()}\n\n"
+        f"{bounds_table(written.bounds)}\n\n"
         f"{doubt}"
-        f"Seed {seed}, {size}; again: `python -m benchmarks.verification --only {name}`.\n"
+        f"{record.sentence} Seed {seed}, {size}; again:\n"
+        f"`python -m benchmarks.verification --only {name}`.\n"
         f"<!-- end of {name} -->\n"
     )
+
+
+def bounds_table(bounds: Iterable[Bound]) -> str:
+    """Every bound in a row; those that do not hold are marked."""
+    return table(
+        BOUNDS_HEAD,
+        [
+            (each.figure, each.measured, each.asked, "holds" if each.holds else "**does not hold**")
+            for each in bounds
+        ],
+    )
+
+
+def bounds_shown(text: str) -> int:
+    """How many bounds a section or a part of a page shows."""
+    head = table(BOUNDS_HEAD, [])
+    _, found, rest = text.partition(head + "\n")
+    return len(rest.partition("\n\n")[0].splitlines()) if found else 0
 
 
 def kept(page: str) -> dict[str, str]:
@@ -82,6 +123,31 @@ def out_of_bounds(sections: Mapping[str, str]) -> list[str]:
         for name, text in sections.items()
         if (match := _KEPT.match(text)) and match["state"] == _OUT
     ]
+
+
+def state_of(text: str) -> tuple[str, Record | None] | None:
+    """What a section says of itself: its state and its record; None for another text."""
+    match = _KEPT.match(text)
+    return (match["state"], read_record(match["record"] or "")) if match else None
+
+
+def has_record(text: str) -> bool:
+    """Whether a section says which code it was measured with."""
+    state = state_of(text)
+    return state is not None and state[1] is not None
+
+
+def stale(sections: Mapping[str, str], known: Mapping[str, Section]) -> list[str]:
+    """The sections that were measured with other code than today's, or do not say with which."""
+    old = []
+    for name, section in known.items():
+        state = state_of(sections.get(name, ""))
+        record = state[1] if state else None
+        if record is None:
+            old.append(f"{name}: no record of the code that it was measured with")
+        elif record.sources != digest_of(section.all_sources):
+            old.append(f"{name}: measured at commit {record.commit}; its sources have changed")
+    return old
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]], numbers: int = 0) -> str:

@@ -3,13 +3,19 @@
     python -m benchmarks.verification                        every section, an hour or two
     python -m benchmarks.verification --quick                small samples, to see that it works
     python -m benchmarks.verification --only sky,covariance  these anew, the others as they are
+    python -m benchmarks.verification --check                measure nothing: which are stale?
 
 A section is a module of `benchmarks` with its `SECTION`, listed in `SECTIONS`.
 The exit code is 1 where the page has a section out of its bounds.
+
+`--check` names the sections of docs/verification.md and of docs/performance.md
+whose source files have changed since they were measured, and exits with 1 if there
+are any.  It belongs before a release: a change of the code need not wait for hours
+of measurement, so `make check` looks only whether every section has its record and
+its bounds.
 """
 
 import argparse
-import platform
 import re
 import sys
 from collections.abc import Mapping, Sequence
@@ -20,10 +26,12 @@ from benchmarks import (
     attitude_against_svd,
     calibration,
     centroids,
+    consistency,
     covariance,
     imaging_claims,
     lost_in_space,
     paper_runs,
+    performance,
     plain_reference,
     ptp,
     spurious,
@@ -31,7 +39,8 @@ from benchmarks import (
     whole_sky,
     zone_counts,
 )
-from benchmarks.sections import Section, framed, kept, out_of_bounds
+from benchmarks.record import record_of
+from benchmarks.sections import Section, framed, has_record, kept, out_of_bounds, stale
 from service import __version__
 
 SECTIONS: Mapping[str, Section] = {
@@ -45,6 +54,7 @@ SECTIONS: Mapping[str, Section] = {
     "lost_in_space": lost_in_space.SECTION,
     "attitude": attitude_against_svd.SECTION,
     "covariance": covariance.SECTION,
+    "consistency": consistency.SECTION,
     "aberration": aberration.SECTION,
     "imaging": imaging_claims.SECTION,
     "centroids": centroids.SECTION,
@@ -64,17 +74,31 @@ def page(sections: Mapping[str, str]) -> str:
         if doubtful
         else "Everything is within its bounds."
     )
+    unrecorded = [name for name, text in sections.items() if not has_record(text)]
+    older = (
+        f"""
+Measured before records and bounds were kept, and to be made anew: {", ".join(unrecorded)}.
+"""
+        if unrecorded
+        else ""
+    )
     here = [name for name in SECTIONS if name in sections]
     contents = "\n".join(f"- {_link(SECTIONS[name].title)}" for name in here)
     body = "\n".join(sections[name] for name in here)
     return f"""# Verification
 
 Written by `python -m benchmarks.verification`; its figures are not edited by hand.
-Version {__version__}, Python {platform.python_version()}. {verdict}
+Version {__version__}. {verdict}
 
 Every section is also a test: `make test` runs the same comparisons on smaller samples, and
-`python -m benchmarks --all` prints them.
+`python -m benchmarks --all` prints them. Each ends with its bounds and with the commit, the library
+versions and the seed that it was measured with; sections may have been measured at different
+commits. `python -m benchmarks.verification --check` names the sections whose source files have
+changed since then. It is run before a release, and is no part of `make check`.
 
+Where a figure is a count of random events, its bound is the one that chance alone passes once in
+10,000 times.
+{older}
 {contents}
 
 {body}"""
@@ -90,11 +114,13 @@ def remake(names: Sequence[str], quick: bool, seed: int, output: Path) -> bool:
     """Make these sections of the page anew, keep the others; whether all are within bounds."""
     sections: dict[str, str] = {}
     for name in names:
+        # Before the measurement, which takes minutes: the code may be edited meanwhile.
+        record = record_of(SECTIONS[name].all_sources)
         written = SECTIONS[name].write(quick, seed)
         # Read only now: writing a section takes minutes, and another may have been made meanwhile.
         here = kept(output.read_text(encoding="utf-8")) if output.exists() else {}
         sections = {name: text for name, text in here.items() if name in SECTIONS}
-        sections[name] = framed(name, SECTIONS[name].title, written, quick, seed)
+        sections[name] = framed(name, SECTIONS[name].title, written, quick, seed, record)
         output.parent.mkdir(parents=True, exist_ok=True)
         if written.pictures:
             plots = output.parent / "plots"
@@ -108,6 +134,17 @@ def remake(names: Sequence[str], quick: bool, seed: int, output: Path) -> bool:
     return not out_of_bounds(sections)
 
 
+def check(output: Path) -> int:
+    """Print the stale sections of the page and of docs/performance.md; 1 if there are any."""
+    page = kept(output.read_text(encoding="utf-8")) if output.exists() else {}
+    found = [f"{output.name}: {each}" for each in stale(page, SECTIONS)]
+    found += [f"{performance.TARGET.name}: {each}" for each in performance.stale()]
+    for each in found:
+        print(each)
+    print(f"{len(found)} stale sections" if found else "no section is stale")
+    return 1 if found else 0
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.verification",
@@ -116,6 +153,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--quick", action="store_true", help="small samples")
     parser.add_argument("--seed", type=int, default=DEFAULT_SEED)
+    parser.add_argument("--check", action="store_true", help="name the stale sections")
     parser.add_argument("--output", type=Path, default=TARGET)
     parser.add_argument(
         "--only",
@@ -127,6 +165,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     names = asked.only.split(",")
     if unknown := [name for name in names if name not in SECTIONS]:
         parser.error(f"no such section: {', '.join(unknown)}")
+    if asked.check:
+        return check(asked.output)
     passed = remake(names, asked.quick, asked.seed, asked.output)
     print(f"wrote {asked.output}{'' if passed else ': some figures are out of bounds'}")
     return 0 if passed else 1

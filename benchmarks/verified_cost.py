@@ -18,6 +18,7 @@ import numpy.typing as npt
 from numba import njit
 from tqdm import tqdm
 
+from benchmarks.bounds import Bound, at_least, at_most
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
 from service.acquire import acquire
@@ -42,6 +43,7 @@ VIEWS_PER_ZONE = 100
 """In one call of a kernel, so that what the call itself costs does not count."""
 REPEATS = 9
 VOTES, EXHAUSTIVE, EARLY = "votes", "exhaustive", "early stop"
+LEAST_NAMED = {VOTES: 0.95, EXHAUSTIVE: 0.998, EARLY: 0.998}
 
 
 @dataclass(frozen=True)
@@ -52,10 +54,19 @@ class Place:
     run: str
     most: dict[str, tuple[float, float]]
 
+    @property
+    def prior_error(self) -> str:
+        """How far the a priori attitude is off about body Z, Y and X."""
+        run = next(r for r in the_paper().runs if (r.table, r.run) == (self.table, self.run))
+        return ", ".join(
+            f"{each / 3600.0:g}°" if each >= 3600.0 else f'{each:g}"'
+            for each in run.rotation_arcsec
+        )
+
 
 PLACES = {
-    "random cap": Place("2", 'psi60"', {EXHAUSTIVE: (8.0, 4.0)}),
-    "random band": Place("3", "0.1,0.1,0.1", {}),
+    "random cap": Place("2", 'psi60"', {EXHAUSTIVE: (8.0, 4.0), EARLY: (6.0, 5.0)}),
+    "random band": Place("3", "0.1,0.1,0.1", {EXHAUSTIVE: (40.0, 4.0), EARLY: (12.0, 1.5)}),
     "band forest": Place("10F", "nominal", {EXHAUSTIVE: (120.0, 4.0), EARLY: (25.0, 1.0)}),
 }
 
@@ -246,17 +257,27 @@ def everywhere(quick: bool, seed: int) -> dict[str, Cost]:
     }
 
 
-def faults_of(costs: dict[str, Cost]) -> list[str]:
-    """What costs too much in time and in times the votes, or is named wrongly."""
-    faults = [
-        f"{name}: {cost.wrong} stars named wrongly" for name, cost in costs.items() if cost.wrong
-    ]
+def bounds_of(costs: dict[str, Cost]) -> list[Bound]:
+    """Time, or times the votes; stars named rightly and wrongly."""
+    bounds = []
+    for name, cost in costs.items():
+        bounds.append(at_most(f"{name}: stars named wrongly", cost.wrong, 0))
+        bounds += [
+            at_least(f"{name}, {kernel}: share named rightly", share, LEAST_NAMED[kernel])
+            for kernel, share in cost.named.items()
+        ]
     for name, place in PLACES.items():
         for kernel, (most_us, most_times) in place.most.items():
             spent, votes = costs[name].least_us[kernel], costs[name].least_us[VOTES]
-            if spent > most_us and spent > most_times * votes:
-                faults.append(f"{name}, {kernel}: {spent:.1f} us, {spent / votes:.1f} votes")
-    return faults
+            bounds.append(
+                Bound(
+                    f"{name}, {kernel}",
+                    f"{spent:.1f} µs, {spent / votes:.2f} times the votes",
+                    f"at most {most_us:g} µs, or {most_times:g} times the votes",
+                    spent <= most_us or spent <= most_times * votes,
+                )
+            )
+    return bounds
 
 
 def run(quick: bool, seed: int) -> Report:
@@ -270,8 +291,7 @@ def run(quick: bool, seed: int) -> Report:
         for name, cost in costs.items()
         for kernel, spent in cost.least_us.items()
     }
-    faults = faults_of(costs)
-    return Report("verified_cost", figures, not faults, faults)
+    return Report("verified_cost", figures, bounds_of(costs))
 
 
 def write(quick: bool, seed: int) -> Written:
@@ -280,6 +300,7 @@ def write(quick: bool, seed: int) -> Written:
     rows = [
         (
             name,
+            PLACES[name].prior_error,
             f"{cost.least_us[VOTES]:.1f}",
             *(
                 f"{cost.least_us[kernel]:.1f} ({cost.least_us[kernel] / cost.least_us[VOTES]:.2f})"
@@ -292,19 +313,20 @@ def write(quick: bool, seed: int) -> Written:
         for name, cost in costs.items()
     ]
     head = (
-        "place", VOTES, EXHAUSTIVE, EARLY, "votes: named rightly", "verified", "wrong",
+        "place", "a priori off by", VOTES, EXHAUSTIVE, EARLY, "votes: named rightly", "verified",
+        "wrong",
     )  # fmt: skip
-    faults = faults_of(costs)
     text = f"""
 Microseconds of five stars in a warm zone, one thread, many views in one compiled loop, and in
 brackets how many times what the votes cost in the same run. *Exhaustive* goes on until nothing that
 was not seen could matter; the *early stop*, which the service uses, ends after the first observed
-pair whose best hypothesis chance does not explain. On a quiet machine at most 8 in a random cap and
-120 in the forest exhaustively, 25 there with the early stop; or at most 4, 4 and 1 times the votes.
+pair whose best hypothesis chance does not explain. The bounds in microseconds are for a quiet
+machine; on a slower one the times of the votes count. The stars named rightly of the columns are
+by votes and with the early stop.
 
 {table(head, rows, numbers=6)}
 """
-    return Written(text, not faults)
+    return Written(text, bounds_of(costs))
 
 
 SECTION = Section("What verifying costs", write)

@@ -16,7 +16,7 @@ from scipy.stats import beta
 from service.acquire import acquire
 from service.identify.identification import Identification
 from service.missions.mission import Band, Identifier, Mission
-from service.simulate.motion import tilted
+from service.simulate.motion import random_axis, tilted
 from service.simulate.paper.printed import Run, World, the_paper
 from service.simulate.paper.views import EPOCH, View, batch_of, draw_zone, paper_mission
 from service.sky.catalog import load_embedded
@@ -43,12 +43,23 @@ ERRORS = {
 }
 
 
+PRIOR_ERRORS = {
+    ("nominal", "XTE"): '42", 42", 60"',
+    ("nominal", "SOHO"): "6', 6', 180°",
+    ("serious", "XTE"): '100°, 40", 60"',
+    ("serious", "SOHO"): "3°, 3°, 3°",
+}
+"""The rotations of `ERRORS` as a table names them."""
+
+
 @dataclass(frozen=True)
 class Condition:
     """How views are drawn and spoilt: in which worlds of the paper, with which errors.
 
     A view has `stars` stars, or any number from `stars` to `most_stars`;
-    `spurious` of them stand anywhere in the field.  The share `missing` of the
+    `spurious` of them stand anywhere in the field.  With `prior_off_deg` the a
+    priori attitude is off about any axis by an angle drawn evenly up to so many
+    degrees, instead of by the fixed angles of `errors`.  The share `missing` of the
     run catalog is withheld from the identifier.  Unless `merged`, the catalog
     and the sky have every component of a double by itself.
     """
@@ -61,6 +72,15 @@ class Condition:
     missing: float = 0.0
     offset_mag: float = 0.0
     merged: bool = True
+    prior_off_deg: float | None = None
+
+    @property
+    def prior_error(self) -> str:
+        """How far the a priori attitude is off, as a table names it."""
+        if self.prior_off_deg is not None:
+            return f"0 to {self.prior_off_deg:g}° about any axis"
+        missions = dict.fromkeys(the_paper().worlds[world].mission for world in self.worlds)
+        return "; ".join(PRIOR_ERRORS[self.errors, mission] for mission in missions)
 
 
 @dataclass(frozen=True)
@@ -164,7 +184,13 @@ def _drawn(
         for view in draw_zone(world, zone, mission, catalog, rng, most):
             stars = int(rng.integers(condition.stars, most + 1))
             if len(view.star) >= stars:
-                yield _spoilt(_cut(view, stars), condition, mission, rng), run, mission
+                spoilt = _spoilt(_cut(view, stars), condition, mission, rng)
+                if condition.prior_off_deg is None:
+                    yield spoilt, run, mission
+                else:
+                    off_arcsec = rng.uniform(0.0, 3600.0 * condition.prior_off_deg)
+                    phi, theta, psi = (off_arcsec * random_axis(rng)).tolist()
+                    yield spoilt, replace(run, rotation_arcsec=(phi, theta, psi)), mission
 
 
 def _mission(name: str, merged: bool) -> Mission:

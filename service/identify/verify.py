@@ -39,8 +39,9 @@ class Posterior(Struct, frozen=True, eq=False, gc=False):
     `star` is the likeliest zone row, -1 where there is none, and `probability`
     its share; `none` that of no star of the zone.  `rivals` (n, R) are zone rows
     by falling probability, `rival_probability` (n, R), -1 beyond the last; one more
-    than an answer lists.  `hypothesis` (n,) are the rows of the heaviest hypothesis, -1 for a star that
-    it leaves unexplained.  `mirrored`: a mirror image of the field fits better.
+    than an answer lists.  `hypothesis` (n,) are the rows of the heaviest
+    hypothesis, -1 for a star that it leaves unexplained.  `mirrored`: a mirror
+    image of the field fits better.
     """
 
     star: Integers
