@@ -34,6 +34,13 @@ def browser(tmp_path_factory):
         yield browser
 
 
+@pytest.fixture
+def online_again(browser):
+    """Whatever a test found, the browser is online for the next one."""
+    yield
+    browser.call("Network.emulateNetworkConditions", **OFFLINE | {"offline": False})
+
+
 @pytest.fixture(scope="module")
 def other_browser(tmp_path_factory):
     with Browser(tmp_path_factory.mktemp("other")) as browser:
@@ -286,7 +293,7 @@ RAW = ("Failed to fetch", "NetworkError", "Load failed", "Unexpected token")
 
 
 def test_where_the_service_does_not_answer_people_are_told_what_to_do(
-    browser, address, client, drawn, full_run
+    browser, address, client, drawn, online_again
 ):
     """On every page that asks for something: what happened, and what to do."""
     run = f"away-{next(_numbers)}"
