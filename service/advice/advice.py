@@ -47,7 +47,8 @@ class Advice:
     """Everything that a sample of batches says of a mission's settings.
 
     `refused` counts batches that no longer fit the mission, the first reason
-    beside it; `sampled` those that gave evidence.
+    beside it; `sampled` those that gave evidence.  `by_votes` says whether any
+    of these is identified by votes, which alone ask for the tolerances.
     """
 
     mission: Mission
@@ -60,6 +61,7 @@ class Advice:
     magnitudes: tuple[MagnitudeFinding, ...]
     alignment: tuple[AlignmentFinding, ...]
     tried: tuple[Tried, ...]
+    by_votes: bool
 
 
 def advise(
@@ -103,6 +105,9 @@ def advise(
         tried=tuple(_tried(mission, tolerances, seen, run, own or {}, pace)),
         refused=seen.refused,
         refusal=seen.refusal,
+        by_votes=any(
+            (batch.options.identifier or mission.identifier) == "starid" for batch, *_ in seen.cases
+        ),
     )
 
 

@@ -19,6 +19,7 @@ from service.identify.matched import attitude_of
 from service.missions.mission import Band
 from service.observe.batch import BoresightPrior
 from service.sky.ephemeris import sun_distance_au
+from service.times import Utc
 from service.vectors import Matrix, Vector, angle_between_deg, unit
 
 
@@ -58,7 +59,7 @@ _Columns = TypeVar("_Columns", Stars, Pairs)
 
 @dataclass(frozen=True)
 class Fit:
-    """One tracker's own attitude in one batch: its quaternion, covariance, and how well it fits."""
+    """One tracker's own attitude in one batch: its quaternion, covariance, fit and time."""
 
     batch: int
     tracker: int
@@ -66,6 +67,7 @@ class Fit:
     covariance_arcsec2: Matrix
     taste: float
     degrees_of_freedom: int
+    time: Utc
 
 
 @dataclass(frozen=True)
@@ -125,6 +127,7 @@ def evidence_of(batch: int, acquisition: Acquisition) -> Evidence:
                     solution.covariance_arcsec2,
                     solution.taste,
                     solution.degrees_of_freedom,
+                    acquisition.batch.time,
                 )
             )
     return Evidence(_joined(Stars, stars), _joined(Pairs, pairs), tuple(fits))

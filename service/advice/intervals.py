@@ -84,20 +84,20 @@ def quantile(values: Vector, cluster: Clusters, share: float) -> Interval:
     )
 
 
-def median(values: Vector) -> Interval:
+def median(values: Vector, confidence: float = 0.95) -> Interval:
     """The median of independent values (n,), by the sign test: exact whatever they are drawn from.
 
-    Infinite bounds below six values, of which no two bound it with 95 %.
+    Infinite bounds where no two of the values bound it with that confidence (95 %: below six).
     """
     from scipy.stats import binom
 
     n = len(values)
     ordered = np.sort(values)
     at = float(np.median(values))
-    if n < 6:
+    # The true median lies outside the k-th values from either end with at most the rest.
+    k = int(binom.ppf((1.0 - confidence) / 2.0, n, 0.5))
+    if k < 1:
         return Interval(at, -math.inf, math.inf)
-    # The true median lies outside the k-th values from either end with at most 5 %.
-    k = int(binom.ppf(0.025, n, 0.5))
     return Interval(at, float(ordered[k - 1]), float(ordered[n - k]))
 
 

@@ -91,12 +91,19 @@ def as_row(advice: Advice) -> Row:
             for each, words in alignment
         ],
         "tried": [_tried(each) for each in advice.tried],
-        "changes": [
-            {"table": change.table, "tracker": change.tracker, "line": change.line}
-            for each in said
-            for change in each.changes
-        ],
+        "changes": _changes(said),
     }
+
+
+def _changes(said: Iterable[Said]) -> list[Row]:
+    """The lines to write, a key of a table once: trackers may share one."""
+    lines: dict[tuple[str, str | None, str], Row] = {}
+    for change in (change for each in said for change in each.changes):
+        key = change.table, change.tracker, change.line.partition(" = ")[0]
+        lines.setdefault(
+            key, {"table": change.table, "tracker": change.tracker, "line": change.line}
+        )
+    return list(lines.values())
 
 
 def _words(said: Said) -> Row:
@@ -187,7 +194,7 @@ def _table(tried: Iterable[Mapping[str, Any]]) -> list[str]:
 def changes_text(row: Mapping[str, Any]) -> list[str]:
     """The lines for the mission file, under the tables that they belong to."""
     if not row["changes"]:
-        return ["Nothing in the mission file needs to change."]
+        return [no_changes_text(row)]
     lines = [f"To change in the mission file of {row['spacecraft']}:"]
     place = None
     for each in sorted(row["changes"], key=lambda c: (c["table"], c["tracker"] or "")):
@@ -200,3 +207,14 @@ def changes_text(row: Mapping[str, Any]) -> list[str]:
             )
         lines.append(f"  {each['line']}")
     return lines
+
+
+def no_changes_text(row: Mapping[str, Any]) -> str:
+    """What there is to say where no line of the mission file is to be changed."""
+    findings = (row[kind] for kind in ("tolerances", "noise", "magnitudes", "alignment"))
+    actions = {each["action"] for found in findings for each in found}
+    if actions - {"keep", "wait"}:
+        return "No line of the mission file mends what was found: each sentence says what to do."
+    if "wait" in actions:
+        return "Nothing in the mission file is to be changed by what was seen so far."
+    return "Nothing in the mission file needs to change."

@@ -9,6 +9,7 @@ import numpy as np
 from service.advice.evidence import Evidence, Fit, Stars
 from service.advice.intervals import Interval, fitted, intervals, median, quantile
 from service.missions.mission import Mission, Tracker
+from service.times import Utc
 from service.vectors import (
     ARCSEC_PER_RADIAN,
     Vector,
@@ -23,19 +24,27 @@ CERTAIN_CHI2 = 16.266
 """The 99.9 % point of chi-square with three degrees of freedom."""
 CLOSE = 0.2
 """A sigma that is right within a fifth needs no change."""
+CERTAIN = 0.999
+"""Of the intervals that tell whether noise changed: several stretches are looked at."""
 
 Verdict = Literal["too_small", "fits", "too_large", "no_verdict"]
 
 
 @dataclass(frozen=True)
 class NoiseFinding:
-    """A tracker's noise: one standard deviation per tangent axis, beside the mission's."""
+    """A tracker's noise: one standard deviation per tangent axis, beside the mission's.
+
+    Where it changed, all this is of the latest batches alone, from `since` on;
+    `before_arcsec` is the noise of those before, else None.
+    """
 
     tracker: str
     now_arcsec: float
     sigma_arcsec: Interval | None
     batches: int
     verdict: Verdict
+    before_arcsec: Interval | None = None
+    since: Utc | None = None
 
 
 @dataclass(frozen=True)
@@ -79,7 +88,9 @@ def noise_findings(mission: Mission, evidence: Evidence) -> list[NoiseFinding]:
     TASTE over the square of the true noise is chi-square with 2N - 3 degrees of
     freedom, so that TASTE over the median of that distribution has the square of
     the noise, in units of the sigmas, for its own median, batch by batch.  The
-    median over batches does not mind a few bad ones.
+    median over batches does not mind a few bad ones.  For the same reason it does
+    not show a tracker that began to fail: the latest batches are held against
+    those before, and speak for the tracker where they differ.
     """
     return [_noise(tracker, index, evidence) for index, tracker in enumerate(mission.trackers)]
 
@@ -88,16 +99,45 @@ def _noise(tracker: Tracker, index: int, evidence: Evidence) -> NoiseFinding:
     fits = [fit for fit in evidence.fits if fit.tracker == index]
     if len(fits) < LEAST_BATCHES:
         return NoiseFinding(tracker.name, tracker.sigma_arcsec, None, len(fits), "no_verdict")
-    ratio = median(_squared_noise(fits))
-    sigma = Interval(*(math.sqrt(x) for x in (ratio.value, ratio.low, ratio.high)))
-    sigma = sigma.scaled(tracker.sigma_arcsec)
+    fits.sort(key=lambda fit: fit.time.tai_ns)
+    squared = _squared_noise(fits)
+    latest = _changed(squared)
+    now, before = squared[-latest:], squared[:-latest]
+    sigma = _sigma(now, tracker)
     return NoiseFinding(
         tracker.name,
         tracker.sigma_arcsec,
         sigma,
-        len(fits),
+        latest,
         _size_verdict(tracker.sigma_arcsec, sigma),
+        _sigma(before, tracker) if len(before) else None,
+        fits[-latest].time if len(before) else None,
     )
+
+
+def _sigma(squared: Vector, tracker: Tracker) -> Interval:
+    ratio = median(squared)
+    # Of fewer than six values the median is not bounded, below not by zero either.
+    bounds = (max(each, 0.0) for each in (ratio.value, ratio.low, ratio.high))
+    return Interval(*map(math.sqrt, bounds)).scaled(tracker.sigma_arcsec)
+
+
+def _changed(squared: Vector) -> int:
+    """How many of the latest batches show another noise than those before; all if none do.
+
+    The fewest that do so with certainty: of a noise that grows all the time they
+    are nearest to what it is now.
+    """
+    count = len(squared)
+    latest = LEAST_BATCHES
+    while 2 * latest <= count:
+        before, now = (median(part, CERTAIN) for part in (squared[:-latest], squared[-latest:]))
+        apart = now.low > before.high or now.high < before.low
+        less, more = sorted((now.value, before.value))
+        if apart and more > (1.0 + CLOSE) ** 2 * less:
+            return latest
+        latest *= 2
+    return count
 
 
 def _squared_noise(fits: list[Fit]) -> Vector:

@@ -28,7 +28,11 @@ class Change:
 
 @dataclass(frozen=True)
 class Said:
-    """What is to be done about a finding, in words, with the lines that do it."""
+    """What is to be done about a finding, in words, with the lines that do it.
+
+    Every line is to be written as it stands: where the words say that it
+    changes nothing, or that something else comes first, there is none.
+    """
 
     action: Action
     text: str
@@ -70,20 +74,27 @@ def said_of_tolerance(finding: ToleranceFinding, advice: Advice) -> Said:
                 text + " Part of it is the offset of the magnitudes: correct that first, "
                 "then ask again.",
             )
-        return _changed("widen", text, finding, advice.mission)
+        if name == "separation_deg" and any(n.before_arcsec for n in advice.noise):
+            return Said(
+                "wait",
+                text + " The noise changed meanwhile: see to that first, then ask again of a "
+                "stretch in which it holds.",
+            )
+        return _changed("widen", text, finding, advice)
     text = f"{start} is wide: {kept} {needed}, and {now} is far more than that. {effect}"
     if not _gains(present, with_it):
         return Said("keep", text + " Nothing certain is gained by less: leave it as it is.")
     if name in _APRIORI:
         text += " That holds while the a priori attitude stays as good as in this sample."
-    return _changed("tighten", text, finding, advice.mission)
+    return _changed("tighten", text, finding, advice)
 
 
-def _changed(action: Action, text: str, finding: ToleranceFinding, mission: Mission) -> Said:
-    if mission.identifier != "starid":
-        text += (
-            f" {mission.name} identifies by {mission.identifier}, which does not ask for it: "
-            "the change is for votes alone."
+def _changed(action: Action, text: str, finding: ToleranceFinding, advice: Advice) -> Said:
+    if not advice.by_votes:
+        return Said(
+            "keep",
+            f"{text} {advice.mission.name} identifies by {advice.mission.identifier}, which does "
+            f"not ask for it: leave it as it is. By votes it should be {finding.recommended:g}.",
         )
     line = f"{finding.tolerance.name} = {finding.recommended:g}"
     change = Change("tolerances", None, f"{line:<32} # {finding.symbol}, was {finding.now:g}")
@@ -130,6 +141,11 @@ def said_of_noise(finding: NoiseFinding) -> Said:
         return Said("wait", _too_few(start, finding.batches, "an attitude of its own"))
     found = f"{_with_bounds(finding.sigma_arcsec, 'arcsec')} per tangent axis"
     now = f"{finding.now_arcsec:.2f}″"
+    if finding.before_arcsec is not None and finding.since is not None:
+        found += (
+            f" in the latest {finding.batches} batches, since {finding.since.text}, and was "
+            f"{_with_bounds(finding.before_arcsec, 'arcsec')} before"
+        )
     if finding.verdict == "fits":
         return Said("keep", f"{start} is {found}: the mission's {now} fits.")
     ratio = finding.sigma_arcsec.value / finding.now_arcsec
@@ -139,10 +155,17 @@ def said_of_noise(finding: NoiseFinding) -> Said:
         if finding.verdict == "too_small"
         else "attitudes are given as worse than they are, and misnamed stars pass unnoticed"
     )
+    text = f"{start} is {found}, {ratio:.2f} times the mission's {now}, which is {told}: {follows}."
+    if finding.before_arcsec is not None and finding.since is not None:
+        return Said(
+            "correct",
+            f"{text} Look at the tracker first: no sigma holds while its noise changes. Once it "
+            f"is steady, ask again of a stretch that begins after {finding.since.text}.",
+        )
     line = f"sigma_arcsec = {finding.sigma_arcsec.value:.3g}"
     return Said(
         "correct",
-        f"{start} is {found}, {ratio:.2f} times the mission's {now}, which is {told}: {follows}.",
+        text,
         (Change("trackers", finding.tracker, f"{line:<32} # was {finding.now_arcsec:g}"),),
     )
 

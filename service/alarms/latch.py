@@ -15,10 +15,10 @@ noted of it; nothing is changed in place.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, Literal
 
-from service.alarms.limits import Severity
+from service.alarms.limits import LimitSettings, Severity
+from service.alarms.window import Point
 from service.errors import NotNow
 
 State = Literal["open", "acknowledged", "shelved", "cleared"]
@@ -40,15 +40,6 @@ Changes = dict[str, Any]
 Step = tuple[Changes, list[Action]]
 
 
-@dataclass(frozen=True)
-class Point:
-    """A judged value, with the batch and the time that it is of."""
-
-    value: float
-    time: str
-    batch_id: str | None
-
-
 def state_of(alarm: Alarm, now: str) -> State:
     """The state of an alarm at a moment; moments are UTC texts of one form."""
     if alarm["cleared_at"] is not None:
@@ -58,15 +49,17 @@ def state_of(alarm: Alarm, now: str) -> State:
     return "open" if alarm["acknowledged_at"] is None else "acknowledged"
 
 
-def raised(severity: Severity, bound: float, point: Point, now: str) -> Step:
-    """A new alarm."""
+def raised(
+    severity: Severity, limits: LimitSettings, point: Point, now: str, worst: Point | None = None
+) -> Step:
+    """A new alarm; `worst` is the worst value since it went out of limits, if not this one."""
     columns = {
         "severity": severity.word,
         "current_severity": severity.word,
         "raised_at": now,
-        "bound": bound,
+        "bound": limits.bound(severity, point.value),
         **_at("raised", point),
-        **_at("worst", point),
+        **_at("worst", worst or point),
         **_at("latest", point),
         "returned_at": None,
         "acknowledged_at": None,
@@ -80,11 +73,18 @@ def raised(severity: Severity, bound: float, point: Point, now: str) -> Step:
 
 
 def observed(
-    alarm: Alarm, severity: Severity | None, bound: float | None, point: Point, now: str
+    alarm: Alarm,
+    severity: Severity | None,
+    limits: LimitSettings,
+    point: Point,
+    now: str,
+    worst: Point | None = None,
 ) -> Step:
-    """An active alarm meets a new value, which is out of limits by a severity or back in them."""
+    """An active alarm meets a new value, which is out of limits by a severity or back in them.
+
+    `worst` is the worst value since it went out of them, if not this one.
+    """
     was = _severity(alarm["current_severity"])
-    worst = Severity[alarm["severity"].upper()]
     changes: Changes = _at("latest", point)
     if severity is None:
         if was is None:
@@ -92,13 +92,12 @@ def observed(
         changes |= {"current_severity": None, "returned_at": now}
         return _cleared(alarm, changes, ["returned"], now)
     changes |= {"current_severity": severity.word, "returned_at": None}
-    # Beyond the bound on the side that the alarm was raised on.
-    outward = 1.0 if alarm["worst_value"] >= alarm["bound"] else -1.0
-    if outward * (point.value - alarm["worst_value"]) > 0:
-        changes |= _at("worst", point)
+    worst = worst or point
+    if limits.beyond(severity, worst.value) > limits.beyond(severity, alarm["worst_value"]):
+        changes |= _at("worst", worst)
     actions: list[Action] = []
-    if severity > worst:
-        changes |= {"severity": severity.word, "bound": bound} | _at("worst", point)
+    if severity > Severity[alarm["severity"].upper()]:
+        changes |= {"severity": severity.word, "bound": limits.bound(severity, point.value)}
         changes |= {"acknowledged_at": None, "acknowledged_by": None}
         actions = ["escalated"]
     elif was is None:

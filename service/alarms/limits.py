@@ -115,6 +115,13 @@ class LimitSettings(_Strict):
         """The severities whose bounds a value is out of that was in them so far, worst last."""
         return [s for s, low, high in self._levels if value < low or value > high]
 
+    def beyond(self, severity: Severity, value: float) -> float:
+        """How far a value lies beyond the bounds of a severity; below zero inside them."""
+        bounds = self.bounds(severity)
+        above = -math.inf if bounds.high is None else value - bounds.high
+        below = -math.inf if bounds.low is None else bounds.low - value
+        return max(above, below)
+
     def bound(self, severity: Severity, value: float) -> float:
         """The bound that a value is out of."""
         bounds = self.bounds(severity)

@@ -14,10 +14,9 @@ from msgspec import Struct
 from sqlalchemy import Connection, bindparam, insert, select, update
 
 from service.alarms import latch
-from service.alarms.latch import Point
 from service.alarms.limits import LimitSettings, Severity
 from service.alarms.quantities import QUANTITIES, QuantityName
-from service.alarms.window import Sample, Window
+from service.alarms.window import Moment, Point, Sample, Window
 from service.missions.mission import Mission
 from service.records.ahead import LIVE
 from service.records.alarms import change, note
@@ -27,7 +26,7 @@ from service.records.limits import limits_of
 from service.records.measures import VALUE_OF
 from service.records.prepared import prepared
 from service.records.statements import insert_missing
-from service.records.tables import alarms, batches, missions, runs, watches
+from service.records.tables import alarms, batches, missions, results, runs, watches
 from service.times import Utc, parse_utc, shifted
 
 _IDS = Ulids()
@@ -129,14 +128,16 @@ class _Watch:
         for draft in self._drafts:
             batch = draft.batch
             assert batch is not None
-            since_ns = draft.received_ns - received_ns
-            if self._run != LIVE:
-                since_ns = batch["time_ns"] - latest_ns
-            self._mind_the_gap(since_ns * 1e-9, batch)
+            gap_ns = batch["time_ns"] - latest_ns
+            if gap_ns >= 0:
+                newest, latest_ns = batch, batch["time_ns"]
+            # In a run an older batch that comes late follows upon none.
+            if self._run == LIVE or gap_ns >= 0:
+                since_ns = draft.received_ns - received_ns if self._run == LIVE else gap_ns
+                moment = _moment(newest) if newest else (row["time"], row["batch_id"])
+                self._mind_the_gap(since_ns * 1e-9, moment, batch["received"])
             if alert:
                 self._judge(draft, alert)
-            if batch["time_ns"] >= latest_ns:
-                newest, latest_ns = batch, batch["time_ns"]
             if draft.received_ns > received_ns:
                 received, received_ns = batch["received"], draft.received_ns
         latest = row | (_latest_of(newest) if newest else {}) | {"received": received}
@@ -148,18 +149,20 @@ class _Watch:
         _KEEP.run(self._connection, [place | {name: latest[name] for name in _KEPT}])
         self._board.save()
 
-    def _mind_the_gap(self, gap_s: float, batch: Row) -> None:
-        """Silence: live by the clock, elsewhere by the batches' own time; over with this batch."""
+    def _mind_the_gap(self, gap_s: float, latest: Moment, now: str) -> None:
+        """Silence: live by the clock, elsewhere by the batches' own time; over with this batch.
+
+        `latest` is the latest batch, which this one is if it does not come late.
+        """
         low_s, high_s = self._limits[SILENCE].calm
         if low_s <= gap_s <= high_s and not self._board.has(SILENCE):
             return
-        severity, bound = silence(self._limits, gap_s)
-        now = batch["received"]
+        limits = self._limits[SILENCE]
+        severity = silence(self._limits, gap_s)
         if severity is not None:
-            point = Point(gap_s, batch["time"], batch["id"])
-            self._board.observe(SILENCE, severity, bound, point, now)
+            self._board.observe(SILENCE, severity, limits, Point(gap_s, *latest), now)
         if self._board.has(SILENCE):
-            self._board.observe(SILENCE, None, None, Point(0.0, *_moment(batch)), now)
+            self._board.observe(SILENCE, None, limits, Point(0.0, *latest), now)
 
     def _alert(self) -> list[tuple[QuantityName, LimitSettings]]:
         """The quantities that a batch may bring out of limits or back; the others are done with.
@@ -179,9 +182,9 @@ class _Watch:
             if self._board.is_out(name) or not window.pass_over(samples, limits):
                 alert.append((name, limits))
             elif self._board.has(name) and (value := window.value(limits)) is not None:
-                latest = self._latest_with(name)
-                point = Point(value, *_moment(latest))
-                self._board.observe(name, None, None, point, latest["received"])
+                batch = self._latest_with(name)
+                point = Point(value, *self._latest_moment(batch, window.samples[-1][0]))
+                self._board.observe(name, None, limits, point, batch["received"])
         return alert
 
     def _latest_with(self, name: QuantityName) -> Row:
@@ -193,18 +196,40 @@ class _Watch:
             if draft.batch and sample_of(draft.result)
         )
 
+    def _latest_moment(self, batch: Row, latest_ns: int) -> Moment:
+        """The moment of the latest batch of a window: of this one, unless it comes late."""
+        if batch["time_ns"] >= latest_ns:
+            return _moment(batch)
+        query = (
+            select(batches.c.time, batches.c.id)
+            .join_from(results, batches, results.c.batch_id == batches.c.id)
+            .where(
+                results.c.spacecraft == batch["spacecraft"],
+                results.c.run == batch["run"],
+                results.c.time_ns == latest_ns,
+                results.c.current,
+            )
+            .order_by(batches.c.id.desc())
+            .limit(1)
+        )
+        found = self._connection.execute(query).first()
+        # It may have been pruned.
+        return (found[0], found[1]) if found else _moment(batch)
+
     def _judge(self, draft: Draft, alert: Sequence[tuple[QuantityName, LimitSettings]]) -> None:
         assert draft.batch is not None
         for name, limits in alert:
             sample = _SAMPLE_OF[name](draft.result)
-            judged = sample and self._windows[name].add(sample, limits)
-            if not judged:
+            if sample is None:
                 continue
-            if judged.severity is not None or self._board.has(name):
-                point = Point(judged.value, *_moment(draft.batch))
-                bound = judged.severity and limits.bound(judged.severity, judged.value)
+            window = self._windows[name]
+            latest_ns = window.samples[-1][0] if window.samples else 0
+            moment = self._latest_moment(draft.batch, latest_ns)
+            judged = window.add(sample, limits, moment)
+            if judged and (judged.severity is not None or self._board.has(name)):
+                point = Point(judged.value, *moment)
                 now = draft.batch["received"]
-                self._board.observe(name, judged.severity, bound, point, now)
+                self._board.observe(name, judged.severity, limits, point, now, judged.worst)
 
 
 class _Seen(Struct):
@@ -272,21 +297,22 @@ class Board:
         self,
         quantity: str,
         severity: Severity | None,
-        bound: float | None,
+        limits: LimitSettings,
         point: Point,
         now: str,
+        worst: Point | None = None,
     ) -> None:
         """Let a quantity's alarm meet a new value, or raise one."""
         alarm = self._alarms.get(quantity)
         if alarm is None:
-            if severity is not None and bound is not None:
-                columns, actions = latch.raised(severity, bound, point, now)
+            if severity is not None:
+                columns, actions = latch.raised(severity, limits, point, now, worst)
                 alarm = {"id": _IDS.new(), "quantity": quantity, **self._place, **columns}
                 self._connection.execute(insert(alarms), alarm)
                 note(self._connection, alarm, actions, now)
                 self._alarms[quantity] = alarm
             return
-        changes, actions = latch.observed(alarm, severity, bound, point, now)
+        changes, actions = latch.observed(alarm, severity, limits, point, now, worst)
         if actions:
             pending = self._latest.pop(quantity, {})
             alarm = change(self._connection, alarm, pending | changes, actions, now)
@@ -309,13 +335,10 @@ class Board:
             self._latest.clear()
 
 
-def silence(
-    limits: Mapping[QuantityName, LimitSettings], gap_s: float
-) -> tuple[Severity | None, float | None]:
-    """How bad a silence is, and the bound that it is beyond."""
-    settings = limits[SILENCE]
-    passed = settings.passed(gap_s)
-    return (passed[-1], settings.bound(passed[-1], gap_s)) if passed else (None, None)
+def silence(limits: Mapping[QuantityName, LimitSettings], gap_s: float) -> Severity | None:
+    """How bad a silence is."""
+    passed = limits[SILENCE].passed(gap_s)
+    return passed[-1] if passed else None
 
 
 def sweep(connection: Connection, missions: Mapping[str, Mission], now: Utc) -> None:
@@ -326,10 +349,11 @@ def sweep(connection: Connection, missions: Mapping[str, Mission], now: Utc) -> 
             continue
         board = Board(connection, spacecraft, LIVE)
         gap_s = _seconds(row["received"], now.text)
-        severity, bound = silence(limits_of(connection, missions[spacecraft]), gap_s)
+        limits = limits_of(connection, missions[spacecraft])
+        severity = silence(limits, gap_s)
         if severity is not None:
             point = Point(gap_s, row["time"], row["batch_id"])
-            board.observe(SILENCE, severity, bound, point, now.text)
+            board.observe(SILENCE, severity, limits[SILENCE], point, now.text)
             board.save()
     over = connection.execute(_shelved_until(now).with_for_update()).mappings().all()
     for alarm in map(dict, over):
@@ -353,7 +377,7 @@ def _silent(connection: Connection, missions: Mapping[str, Mission], now: Utc) -
         if mission is None:
             continue
         gap_s = _seconds(received, now.text)
-        severity, _ = silence(limits_of(connection, mission), gap_s)
+        severity = silence(limits_of(connection, mission), gap_s)
         if severity is None:
             continue
         noted = select(alarms.c.current_severity).where(
@@ -422,7 +446,7 @@ def _latest_of(batch: Row) -> Row:
     return {name: batch[column] for name, column in names.items()}
 
 
-def _moment(batch: Row) -> tuple[str, str]:
+def _moment(batch: Row) -> Moment:
     return batch["time"], batch["id"]
 
 

@@ -23,16 +23,18 @@ from service.observe.wire import faults_of
 from service.web.errors import NotJson
 
 JSON = "application/json"
+BINARY = "application/octet-stream"
 FRAMES = (
     "application/fits",
     "image/fits",
     "image/tiff",
     "image/png",
     "application/x-npy",
-    "application/octet-stream",
+    BINARY,
 )
 """A frame's file; what it is, its first bytes say."""
-NDJSON = ("application/x-ndjson", "application/ndjson", "application/jsonl")
+NDJSON = ("application/x-ndjson", "application/ndjson", "application/jsonl", BINARY)
+"""The last is what generated clients can send: most know no type of lines."""
 
 MAX_JSON_BYTES = 2 << 20
 """Ten thousand stars still fit, so that their number is what is complained of."""

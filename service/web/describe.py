@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import BaseModel
 from starlette.responses import Response
 
-from service.web.bodies import FRAMES, JSON, NDJSON
+from service.web.bodies import BINARY, FRAMES, JSON, NDJSON
 from service.web.errors import MEDIA_TYPE as PROBLEM_JSON
 
 SCHEMAS = "#/components/schemas/"
@@ -63,6 +63,7 @@ _PROBLEMS = {
 }
 READING_JSON = (400, 408, 413, 415)
 READING_NDJSON = READING_FRAME = (408, 413, 415)
+_BINARY = {"type": "string", "format": "binary"}
 _RETRY_AFTER = {"Retry-After": {"description": "Seconds.", "schema": {"type": "string"}}}
 _WHO = {"WWW-Authenticate": {"description": "Bearer.", "schema": {"type": "string"}}}
 _HEADERS: Mapping[int, Any] = {
@@ -76,14 +77,14 @@ GUARDED = (401, 403, 429)
 
 @dataclass(frozen=True)
 class Gives:
-    """One answer of a route that is not a problem; without a shape it is plain text."""
+    """One answer of a route that is not a problem; without a shape it is plain text or bytes."""
 
     description: str
     shape: type[BaseModel] | None = None
     headers: Mapping[str, Any] = field(default_factory=dict)
     media_type: str = JSON
     also: str | None = None
-    """Another media type that it can be asked for in, as plain text."""
+    """Another media type that it can be asked for in, as plain text or bytes."""
 
 
 def described(
@@ -102,11 +103,12 @@ def described(
         problems = (*problems, *READING_JSON)
     if lines_of is not None:
         description = f"A `{lines_of.__name__}` a line."
-        content = {NDJSON[0]: {"schema": {"type": "string", "description": description}}}
+        lines = {"schema": _BINARY | {"description": description}}
+        content = dict.fromkeys((NDJSON[0], BINARY), lines)
         extra["requestBody"] = {"required": True, "content": content}
         problems = (*problems, *READING_NDJSON)
     if frame:
-        file = {"schema": {"type": "string", "format": "binary"}}
+        file = {"schema": _BINARY}
         extra["requestBody"] = {"required": True, "content": dict.fromkeys(FRAMES, file)}
         problems = (*problems, *READING_FRAME)
     if parameters:
@@ -137,14 +139,18 @@ def _ref(shape: type[BaseModel]) -> dict[str, str]:
 
 
 def _answer(gives: Gives) -> dict[str, Any]:
-    schema = {"type": "string"} if gives.shape is None else _ref(gives.shape)
+    schema = _plain(gives.media_type) if gives.shape is None else _ref(gives.shape)
     answer: dict[str, Any] = {"description": gives.description}
     if gives.headers:
         answer["headers"] = dict(gives.headers)
     answer["content"] = {gives.media_type: {"schema": schema}}
     if gives.also is not None:
-        answer["content"][gives.also] = {"schema": {"type": "string"}}
+        answer["content"][gives.also] = {"schema": _plain(gives.also)}
     return answer
+
+
+def _plain(media_type: str) -> dict[str, str]:
+    return {"type": "string"} if media_type.startswith("text/") else _BINARY
 
 
 def _problem(description: str) -> dict[str, Any]:

@@ -1,5 +1,7 @@
 """Telemetry with known faults is flown, and the advice finds just these."""
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -17,6 +19,7 @@ from service.vectors import (
     angle_between_deg,
     matrix_from_quaternion,
     rotate_about,
+    unit,
 )
 from tests.advice.passes import (
     advice_from,
@@ -52,6 +55,62 @@ def test_the_noise_of_a_tracker_is_found(sky, missions, seed, factor, verdict):
     assert noise.verdict == verdict
     lines = [change.line for change in said_of_noise(noise).changes]
     assert [line.split(" = ")[0] for line in lines] == ["sigma_arcsec"] * (verdict != "fits")
+
+
+def worn(mission, begin, batches, factor):
+    """A change of each batch in turn: noise that grows from a part of a pass on, to a multiple."""
+    rng, number = np.random.default_rng(5), itertools.count()
+    sigma_rad = mission.trackers[0].sigma_arcsec / ARCSEC_PER_RADIAN
+
+    def change(body):
+        part = max(0.0, (next(number) / batches - begin) / (1.0 - begin))
+        more = sigma_rad * np.sqrt((1.0 + (factor - 1.0) * part) ** 2 - 1.0)
+        for star in stars_of(body):
+            star["vector"] = unit(np.array(star["vector"]) + rng.normal(0.0, more, 3)).tolist()
+
+    return change
+
+
+@pytest.mark.parametrize("begin", [0.8, 0.5])
+def test_a_tracker_whose_noise_grows_does_not_fit_and_no_sigma_is_advised(
+    sky, missions, seed, begin
+):
+    """Over the whole pass the median is that of the good batches, or of neither."""
+    mission, batches = missions["XTE"], 200
+    pass_ = flown(
+        mission, sky, batches, seed, change=worn(mission, begin, batches, 5.0), angles_share=0.0
+    )
+    row = as_row(advice_from(mission, sky, pass_.batches[::-1]))
+    (noise,) = row["noise"]
+    assert noise["verdict"] == "too_small"
+    assert noise["action"] == "correct"
+    assert noise["sigma_arcsec"]["value"] > 3 * mission.trackers[0].sigma_arcsec
+    assert noise["batches"] < batches / 2
+    assert "Look at the tracker first" in noise["text"]
+    assert row["changes"] == []
+    about = {"spacecraft": "XTE", "run": "r", "first": "a", "last": "b", "batches_in_range": 200}
+    text = as_text(about | row)
+    assert "Nothing in the mission file needs to change" not in text
+    assert "sigma_arcsec =" not in text
+
+
+def test_noise_that_was_large_before_and_fits_now_is_left_alone(sky, missions, seed):
+    mission, batches = missions["XTE"], 150
+    rng, number = np.random.default_rng(5), itertools.count()
+    sigma_rad = mission.trackers[0].sigma_arcsec / ARCSEC_PER_RADIAN
+
+    def change(body):
+        more = 3.0 * sigma_rad if next(number) < 90 else 0.0
+        for star in stars_of(body):
+            star["vector"] = unit(np.array(star["vector"]) + rng.normal(0.0, more, 3)).tolist()
+
+    pass_ = flown(mission, sky, batches, seed, change=change, angles_share=0.0)
+    (noise,) = noise_findings(mission, evidence_from(mission, sky, pass_.batches))
+    assert noise.verdict == "fits"
+    assert near(noise.sigma_arcsec, mission.trackers[0].sigma_arcsec)
+    said = said_of_noise(noise)
+    assert (said.action, said.changes) == ("keep", ())
+    assert "before" in said.text
 
 
 def test_an_offset_and_a_scale_of_the_magnitudes_are_found(sky, missions, seed):
@@ -147,6 +206,47 @@ def test_the_tolerance_that_is_advised_is_no_longer_too_tight(sky, seed):
     advised = finding(mission, evidence, "separation_deg").recommended
     mended = mission_like(tolerances={"separation_deg": advised})
     assert finding(mended, evidence, "separation_deg").verdict == "fits"
+
+
+@pytest.mark.parametrize("identifier", ["verified", "starid"])
+def test_a_tolerance_is_changed_only_where_the_identifier_asks_for_it(sky, seed, identifier):
+    """No line stands in the box that the sentence below takes back."""
+    mission = mission_like(tolerances={"separation_deg": 0.001})
+    mission = mission.model_copy(update={"identifier": identifier})
+    pass_ = flown(mission, sky, 60, seed)
+    row = as_row(advice_from(mission, sky, pass_.batches))
+    found = next(each for each in row["tolerances"] if each["tolerance"] == "separation_deg")
+    keys = [each["line"].partition(" = ")[0] for each in row["changes"]]
+    assert found["verdict"] == "too_tight"
+    assert found["recommended"] > 0.001
+    if identifier == "starid":
+        assert (found["action"], "separation_deg" in keys) == ("widen", True)
+    else:
+        assert (found["action"], "separation_deg" in keys) == ("keep", False)
+        assert "leave it as it is" in found["text"]
+
+
+def test_a_tolerance_that_growing_noise_makes_too_tight_waits(sky, seed):
+    mission = mission_like().model_copy(update={"identifier": "starid"})
+    pass_ = flown(mission, sky, 150, seed, change=worn(mission, 0.6, 150, 8.0), angles_share=0.0)
+    row = as_row(advice_from(mission, sky, pass_.batches))
+    found = next(each for each in row["tolerances"] if each["tolerance"] == "separation_deg")
+    assert (found["verdict"], found["action"]) == ("too_tight", "wait")
+    keys = {each["line"].partition(" = ")[0] for each in row["changes"]}
+    assert not keys & {"separation_deg", "sigma_arcsec"}
+
+
+def test_two_trackers_with_the_same_offset_give_one_line(sky, seed):
+    """A key that stands in a table twice is no TOML."""
+
+    def fainter(body):
+        for star in stars_of(body):
+            star["magnitude"] += 0.35
+
+    mission = mission_like(second_tracker={})
+    row = as_row(advice_from(mission, sky, flown(mission, sky, 40, seed, change=fainter).batches))
+    lines = [each["line"] for each in row["changes"] if each["table"] == "catalog"]
+    assert [line.partition(" = ")[0] for line in lines] == ["color_polynomial_mag"]
 
 
 def test_a_magnitude_tolerance_that_is_too_tight_is_found(sky, seed):
@@ -270,6 +370,7 @@ def test_where_time_runs_out_fewer_batches_are_looked_at_and_the_answer_says_so(
 def test_the_text_can_be_acted_upon(sky, seed):
     """Every change stands under its table, as TOML that a mission file takes."""
     mission = mission_like(tolerances={"separation_deg": 0.001})
+    mission = mission.model_copy(update={"identifier": "starid"})
     pass_ = flown(mission, sky, 60, seed, troubles=NO_TROUBLES)
     advice = advice_from(mission, sky, pass_.batches)
     about = {"spacecraft": "XTE", "run": "r", "first": "a", "last": "b", "batches_in_range": 99}

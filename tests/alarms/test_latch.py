@@ -8,10 +8,17 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from service.alarms import latch
-from service.alarms.latch import Point
-from service.alarms.limits import Severity
+from service.alarms.limits import LimitSettings, Severity
+from service.alarms.window import Point
 from service.errors import NotNow
 
+LIMITS = LimitSettings.model_validate(
+    {
+        "watch": {"low": -0.2, "high": 5.0},
+        "warning": {"low": -0.3, "high": 6.0},
+        "critical": {"low": -0.6, "high": 7.0},
+    }
+)
 SEVERITIES = st.sampled_from([None, *Severity])
 
 
@@ -52,12 +59,12 @@ class Latch(RuleBasedStateMachine):
         if self.alarm is None or self.alarm["cleared_at"] is not None:
             if severity is not None:
                 self.alarm = None
-                assert self.apply(latch.raised(severity, 5.0, point, now)) == ["raised"]
+                assert self.apply(latch.raised(severity, LIMITS, point, now)) == ["raised"]
                 self.worst = self.out = severity
                 self.seen_at_worst, self.shelf_end = False, None
             return
         was = self.out
-        actions = self.apply(latch.observed(self.alarm, severity, 5.0, point, now))
+        actions = self.apply(latch.observed(self.alarm, severity, LIMITS, point, now))
         self.out = severity
         if severity is not None and severity > self.worst:
             self.worst, self.seen_at_worst = severity, False
@@ -131,19 +138,28 @@ TestLatch = Latch.TestCase
 
 
 def test_unacknowledged_it_stays_however_long_it_is_back_in_limits():
-    point = Point(1.0, "2026-01-01T00:00:00.000Z", "b")
-    alarm, _ = latch.raised(Severity.WARNING, 0.5, point, point.time)
+    point = Point(6.5, "2026-01-01T00:00:00.000Z", "b")
+    alarm, _ = latch.raised(Severity.WARNING, LIMITS, point, point.time)
     for _ in range(50):
-        changes, _ = latch.observed(alarm, None, None, Point(0.0, point.time, "b"), point.time)
+        changes, _ = latch.observed(alarm, None, LIMITS, Point(0.0, point.time, "b"), point.time)
         alarm = {**alarm, **changes}
     assert latch.state_of(alarm, point.time) == "open"
 
 
 def test_the_worst_value_is_the_one_furthest_out_on_its_side():
     now = "2026-01-01T00:00:00.000Z"
-    alarm, _ = latch.raised(Severity.WATCH, -0.2, Point(-0.25, now, "a"), now)
+    alarm, _ = latch.raised(Severity.WATCH, LIMITS, Point(-0.25, now, "a"), now)
     for value in (-0.22, -0.4, -0.21):
-        step = latch.observed(alarm, Severity.WATCH, -0.2, Point(value, now, str(value)), now)
+        step = latch.observed(alarm, Severity.WATCH, LIMITS, Point(value, now, str(value)), now)
         alarm = {**alarm, **step[0]}
     assert alarm["worst_value"] == -0.4
     assert alarm["latest_value"] == -0.21
+
+
+def test_on_the_other_side_the_value_that_is_further_beyond_its_bound_is_the_worst():
+    now = "2026-01-01T00:00:00.000Z"
+    alarm, _ = latch.raised(Severity.WATCH, LIMITS, Point(-0.25, now, "a"), now)
+    for value in (5.04, 5.5, -0.4):
+        step = latch.observed(alarm, Severity.WATCH, LIMITS, Point(value, now, str(value)), now)
+        alarm = {**alarm, **step[0]}
+    assert alarm["worst_value"] == 5.5

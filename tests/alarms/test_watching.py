@@ -5,7 +5,7 @@ import json
 import pytest
 from sqlalchemy import select, update
 
-from service.alarms.limits import LimitSettings
+from service.alarms.limits import Bounds, LimitSettings
 from service.errors import NotFound, NotNow
 from service.observe.wire import OptionsIn, submission_from_json
 from service.records.tables import watches
@@ -320,6 +320,120 @@ def test_what_happens_to_alarms_and_limits_is_told(tight, make):
         ("alarm", "open"),
         ("alarm", "acknowledged"),
     ]
+
+
+STEEP = LimitSettings.model_validate(
+    {
+        "warning": {"high": 0.15},
+        "critical": {"high": 0.3},
+        "minimum_count": 1,
+        "duration_s": 60,
+        "hysteresis": 0.12,
+    }
+)
+"""Of the unmatched share: out after a minute, and out until it is 0.12 inside the bound."""
+
+
+def send_stars(operations, make, stars, start=0, **wanted):
+    """Batches with one false star among so many, 30 s apart: each share is one over the stars."""
+    for k, count in enumerate(stars, start=start):
+        body = make(f"b{k}", kind="spurious", stars=count, after_s=30.0 * k, **wanted)
+        operations.submit(body)
+
+
+def test_an_escalation_keeps_the_worst_value_that_was_seen(operations, make):
+    """The share passes the critical bound once; a minute later it is within the hysteresis."""
+    operations.set_limit("XTE", "unmatched_share", STEEP, who="jb", comment=None)
+    send_stars(operations, make, [5, 5, 5, 3, 4, 4])
+    alarm = only(operations)
+    assert actions(operations, alarm) == ["raised", "escalated"]
+    assert alarm["latest"]["value"] == pytest.approx(1 / 4)
+    assert alarm["worst"]["value"] == pytest.approx(1 / 3)
+    assert alarm["worst"]["time"] == make(after_s=90).batch.time.text
+    # The side of the bound is that of the worst value: a smaller share is never a worse one.
+    send_stars(operations, make, [5, 4], start=6)
+    assert only(operations)["worst"]["value"] == pytest.approx(1 / 3)
+
+
+def test_the_worst_value_of_a_new_alarm_lies_beyond_its_bound(operations, make):
+    """The value that passed the bound counts, not the one at which the minute was over."""
+    limits = STEEP.model_copy(update={"critical": Bounds()})
+    operations.set_limit("XTE", "unmatched_share", limits, who="jb", comment=None)
+    send_stars(operations, make, [3, 8, 8])
+    alarm = only(operations)
+    assert (alarm["raised"]["value"], alarm["raised"]["bound"]) == (pytest.approx(1 / 8), 0.15)
+    assert alarm["worst"]["value"] == pytest.approx(1 / 3)
+    assert alarm["worst"]["time"] == make(after_s=0).batch.time.text
+    assert operations.batch(alarm["worst"]["batch_id"])["answer"]["batch"] == "b0"
+    send_stars(operations, make, [8, 7], start=3)
+    assert only(operations)["worst"]["value"] == pytest.approx(1 / 3)
+    send_stars(operations, make, [2], start=5)
+    # Neither of two stars is identified where one is false.
+    assert only(operations)["worst"]["value"] == 1.0
+
+
+def test_a_bound_that_was_widened_is_out_only_beyond_it(operations, make):
+    """The hysteresis is of a bound that was passed; a value inside a new one is in limits."""
+    at_once = STEEP.model_copy(update={"critical": Bounds(), "duration_s": 0.0})
+    operations.set_limit("XTE", "unmatched_share", at_once, who="jb", comment=None)
+    send_stars(operations, make, [5])
+    assert not only(operations)["in_limits"]
+    wider = at_once.model_copy(update={"warning": Bounds(high=0.25)})
+    operations.set_limit("XTE", "unmatched_share", wider, who="jb", comment=None)
+    send_stars(operations, make, [5], start=1)
+    assert only(operations)["in_limits"]
+
+
+@pytest.mark.parametrize("kind", ["good", "spurious"])
+def test_an_older_batch_that_comes_late_does_not_become_the_latest(tight, make, kind):
+    """Out of limits or back in them: the latest batch is the one of the latest time."""
+    later = "spurious" if kind == "spurious" else "good"
+    send(tight, make, ["spurious", "spurious", "spurious", later, later], start=10)
+    before = only(tight)
+    send(tight, make, [kind], start=3)
+    assert only(tight)["latest"] == before["latest"]
+    # One that takes a place among the latest two changes their value, and not their time.
+    tight.submit(make("between", kind="good", after_s=30.0 * 13.5))
+    after = only(tight)["latest"]
+    assert after["time"] == before["latest"]["time"] == make(after_s=30.0 * 14).batch.time.text
+    assert after["batch_id"] == before["latest"]["batch_id"]
+    assert after["value"] == pytest.approx(0.1 if kind == "spurious" else 0.0)
+
+
+def test_an_alarm_that_a_late_batch_raises_is_of_the_latest_batch(tight, make):
+    """The value is that of the latest two, whichever came first."""
+    tight.submit(make("new", kind="spurious", after_s=300))
+    tight.submit(make("old", kind="spurious", after_s=30))
+    alarm = only(tight)
+    for which in ("raised", "worst", "latest"):
+        assert alarm[which]["time"] == make(after_s=300).batch.time.text
+        assert tight.batch(alarm[which]["batch_id"])["answer"]["batch"] == "new"
+
+
+def test_an_older_batch_ends_a_silence_without_becoming_the_latest(operations, make, monkeypatch):
+    send(operations, make, ["good"], start=5)
+    began = utc_now()
+    monkeypatch.setattr("service.operations.utc_now", lambda: shifted(began, 2 * 3600))
+    assert operations.sweep()
+    before = only(operations)["latest"]
+    monkeypatch.undo()
+    send(operations, make, ["good"])
+    found = only(operations)
+    assert found["in_limits"]
+    assert found["latest"]["time"] == before["time"]
+
+
+def test_an_older_batch_of_a_run_is_no_gap_of_less_than_nothing(operations, make):
+    settings = {"watch": {"low": 5.0}, "minimum_count": 1, "duration_s": 0.0}
+    limits = LimitSettings.model_validate(settings)
+    operations.set_limit("XTE", "silence_s", limits, who="jb", comment=None)
+    operations.watch_run("r")
+    operations.submit(make("b1", run="r"))
+    cleared = operations.acknowledge(only(operations, run="r")["id"], "jb")
+    assert cleared["state"] == "cleared"
+    operations.submit(make("b2", run="r", after_s=600))
+    operations.submit(make("b3", run="r", after_s=300))
+    assert operations.alarms(run="r").items == []
 
 
 # ---- the sample telemetry ------------------------------------------------------------------------

@@ -1,8 +1,13 @@
 """Advice over HTTP and as a page."""
 
+import html
+import re
+from urllib.parse import parse_qs
+
 import httpx
 import pytest
 
+from service.times import parse_utc
 from tests.web.markup import Markup
 
 API = "/api/v1"
@@ -69,4 +74,72 @@ def test_the_page_of_nothing_says_so(address):
 
 def test_the_front_page_leads_there(address, full_run):
     text = httpx.get(f"{address}/", params={"run": full_run}).text
-    assert f'href="/advice/XTE?run={full_run}"' in text
+    link = advice_link(text)
+    assert link["run"] == [full_run]
+
+
+def advice_link(text):
+    """The query of the page's link to the advice for XTE."""
+    (link,) = set(re.findall(r'href="/advice/XTE\?([^"]*)"', text))
+    return parse_qs(html.unescape(link))
+
+
+@pytest.mark.parametrize("page", ["/", "/spacecraft/XTE"])
+def test_the_link_to_the_advice_asks_for_the_day_up_to_the_latest_batch(address, full_run, page):
+    text = httpx.get(f"{address}{page}", params={"run": full_run}).text
+    link = advice_link(text)
+    start, end = (parse_utc(link[name][0]) for name in ("start", "end"))
+    assert (end.tai_ns - start.tai_ns) / 1e9 == pytest.approx(86400)
+    answer = httpx.get(f"{address}/advice/XTE", params=link, timeout=60)
+    assert "20 of 20 batches run again" in answer.text
+
+
+def test_the_link_asks_for_the_stretch_that_the_page_of_a_spacecraft_shows(address, full_run):
+    stretch = {"start": "1999-03-01T00:00:00.000Z", "end": "1999-03-01T00:02:00.000Z"}
+    text = httpx.get(f"{address}/spacecraft/XTE", params=stretch | {"run": full_run}).text
+    link = advice_link(text)
+    assert {name: link[name][0] for name in stretch} == stretch
+
+
+def test_the_page_has_a_form_for_the_range_the_sample_and_what_to_try(address, full_run):
+    """Its fields hold what was asked for, and sent as they are they ask for the same again."""
+    asked = {
+        "run": full_run,
+        "start": "1999-060T00:00:00Z",
+        "end": "1999-060T00:02:00Z",
+        "sample": "3",
+        "tolerance": "separation_deg=0.01",
+    }
+    text = httpx.get(f"{address}/advice/XTE", params=asked, timeout=60).text
+    fields = {
+        attributes["name"]: attributes.get("value", "")
+        for tag, attributes in Markup(text).elements
+        if tag == "input" and attributes.get("name")
+    }
+    assert fields == asked | {
+        "start": "1999-03-01T00:00:00.000Z",
+        "end": "1999-03-01T00:02:00.000Z",
+    }
+    again = httpx.get(f"{address}/advice/XTE", params=fields, timeout=60)
+    assert again.status_code == 200
+    assert "3 of " in again.text
+    assert "separation_deg = 0.01, asked for" in again.text
+    (link,) = re.findall(r'href="(/api/v1/spacecraft/XTE/advice\?[^"]*)"', text)
+    advice = httpx.get(f"{address}{html.unescape(link)}", timeout=60).json()
+    assert advice["batches_sampled"] == 3
+    assert advice["last"] < "1999-03-01T00:02:00.000Z"
+
+
+def test_fields_of_the_form_that_are_left_empty_ask_for_nothing(address, full_run):
+    asked = {"run": full_run, "start": "", "end": "", "sample": "5", "tolerance": ""}
+    answer = httpx.get(f"{address}/advice/XTE", params=asked, timeout=60)
+    assert answer.status_code == 200
+    assert "5 of 20 batches run again" in answer.text
+
+
+def test_no_line_is_boxed_that_a_sentence_takes_back(client, full_run):
+    """SOHO is identified by verified stars, for which no tolerance matters."""
+    advice = client.get(f"{API}/spacecraft/SOHO/advice", params={"run": full_run}).json()
+    changed = {each["line"].partition(" = ")[0] for each in advice["changes"]}
+    assert not changed & {each["tolerance"] for each in advice["tolerances"]}
+    assert {each["action"] for each in advice["tolerances"]} <= {"keep", "wait"}

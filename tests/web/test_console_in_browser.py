@@ -3,7 +3,7 @@
 import json
 import re
 import time
-from itertools import count
+from itertools import combinations, count
 from pathlib import Path
 
 import httpx
@@ -32,6 +32,13 @@ _numbers = count(1)
 def browser(tmp_path_factory):
     with Browser(tmp_path_factory.mktemp("profile")) as browser:
         yield browser
+
+
+@pytest.fixture
+def online_again(browser):
+    """Whatever a test found, the browser is online for the next one."""
+    yield
+    browser.call("Network.emulateNetworkConditions", **OFFLINE | {"offline": False})
 
 
 @pytest.fixture(scope="module")
@@ -241,6 +248,181 @@ def test_dropped_in_the_middle_of_a_stream_of_batches_nothing_is_missed(
     rows = browser.run("document.querySelectorAll('#list tbody tr').length")
     assert rows == len(passed)
     browser.complaints.clear()
+
+
+def test_the_page_of_a_spacecraft_without_batches_works_and_shows_the_first_one(
+    browser, address, client, batch
+):
+    """No script fails, and with the first batch its charts come."""
+    run = f"first-{next(_numbers)}"
+    browser.open(f"{address}/spacecraft/XTE?run={run}")
+    shows(browser, f"No batches of XTE in run {run}")
+    browser.wait(lambda: browser.run(CONNECTED))
+    assert browser.complaints == []
+    client.post("/api/v1/batches", json=batch | {"run": run}).raise_for_status()
+    shows(browser, batch["batch"])
+    browser.wait(lambda: browser.run(DRAWN))
+    assert browser.complaints == []
+
+
+def test_the_menu_of_runs_has_the_batches_that_the_page_has(browser, address, client, drawn):
+    """Also those of another run; and a run that is chosen from it then is shown."""
+    run, other = f"menu-{next(_numbers)}", f"menu-{next(_numbers)}"
+    first, second = drawn("XTE", 2, seed=11)
+    client.post("/api/v1/batches", json=first | {"run": run}).raise_for_status()
+    browser.open(f"{address}/?run={run}")
+    browser.wait(lambda: browser.run(CONNECTED))
+    menu = "[...document.querySelectorAll('#run option')].map(each => each.textContent)"
+    assert f"{run} (1)" in browser.run(menu)
+    client.post("/api/v1/batches", json=first | {"run": other}).raise_for_status()
+    client.post("/api/v1/batches", json=second | {"run": run}).raise_for_status()
+    browser.wait(lambda: {f"{run} (2)", f"{other} (1)"} <= set(browser.run(menu)))
+    assert browser.run("document.getElementById('run').value") == run
+    browser.run(
+        f"(menu => {{ menu.value = {json.dumps(other)};"
+        "menu.dispatchEvent(new Event('change', {bubbles: true})); })"
+        "(document.getElementById('run'))"
+    )
+    browser.wait(lambda: f"run={other}" in browser.run("location.search"))
+    shows(browser, first["batch"])
+    assert browser.complaints == []
+
+
+RAW = ("Failed to fetch", "NetworkError", "Load failed", "Unexpected token")
+"""What browsers call a request without an answer, and an answer that is no JSON."""
+
+
+def test_where_the_service_does_not_answer_people_are_told_what_to_do(
+    browser, address, client, drawn, online_again
+):
+    """On every page that asks for something: what happened, and what to do."""
+    run = f"away-{next(_numbers)}"
+    first, second = drawn("XTE", 2, seed=12)
+    answer = client.post("/api/v1/batches", json=first | {"run": run}).json()
+
+    def offline(is_offline):
+        browser.call("Network.emulateNetworkConditions", **OFFLINE | {"offline": is_offline})
+
+    def told(selector, *words):
+        browser.wait(lambda: "does not answer" in text(browser, selector))
+        said = text(browser, selector)
+        assert not [each for each in RAW if each in said], said
+        assert all(each in said for each in ("check that it runs", *words)), said
+
+    browser.open(f"{address}/spacecraft/XTE?run={run}")
+    browser.wait(lambda: browser.run(DRAWN))
+    browser.wait(lambda: browser.run(CONNECTED))
+    offline(True)
+    click(browser, "[data-key='+']")
+    told("#charts-status", "Not shown")
+    browser.run("document.dispatchEvent(new CustomEvent('drawn'))")
+    told("#charts-status", "The trends could not be read")
+    offline(False)
+
+    browser.open(f"{address}/batches/{answer['id']}")
+    browser.wait(lambda: browser.run(CONNECTED))
+    offline(True)
+    browser.run("document.getElementById('try').requestSubmit()")
+    told("#try-status", "Not tried")
+    offline(False)
+
+    browser.open(f"{address}/runs?run={run}")
+    browser.wait(lambda: browser.run(CONNECTED))
+    offline(True)
+    click(browser, "[data-watch]")
+    told("#told", "Not done")
+    offline(False)
+
+    browser.open(f"{address}/batches?run={run}")
+    browser.wait(lambda: browser.run(CONNECTED))
+    # The stream goes on, and the page itself is not given.
+    browser.run("window.fetch = () => Promise.reject(new TypeError('Failed to fetch')); 0")
+    client.post("/api/v1/batches", json=second | {"run": run}).raise_for_status()
+    told("#connection", "Not up to date", "tried again")
+    browser.open(f"{address}/about")
+    browser.complaints.clear()
+
+
+WRITTEN = """(() => {
+  window.written = [];
+  const fillText = CanvasRenderingContext2D.prototype.fillText;
+  CanvasRenderingContext2D.prototype.fillText = function (text, x, y, ...rest) {
+    const size = this.measureText(text), at = this.getTransform().transformPoint({x, y});
+    const chart = this.canvas.closest("[data-chart]")?.dataset.chart;
+    const isLimit = /^(watch|warning|critical)/.test(text);
+    // A limit belongs into the plot, a tick's label onto the canvas.
+    const plot = this.canvas.parentElement.querySelector(".u-over");
+    const s = devicePixelRatio, top = isLimit && plot ? plot.offsetTop * s : 0;
+    const bottom = isLimit && plot ? top + plot.offsetHeight * s : this.canvas.height;
+    window.written.push({
+      chart, text, isLimit,
+      left: at.x - size.actualBoundingBoxLeft,
+      right: this.canvas.width - at.x - size.actualBoundingBoxRight,
+      top: at.y - size.actualBoundingBoxAscent - top,
+      bottom: bottom - at.y - size.actualBoundingBoxDescent,
+    });
+    return fillText.call(this, text, x, y, ...rest);
+  };
+})()"""
+
+
+@pytest.mark.parametrize("width", [1440, 400])
+@pytest.mark.parametrize(
+    ("start", "end"),
+    [
+        ("1999-03-01T00:00:00.000Z", "1999-03-01T00:10:00.000Z"),
+        ("1999-02-28T00:20:00.000Z", "1999-03-01T00:20:00.000Z"),
+        ("1999-03-01T00:00:00.000Z", "1999-03-01T00:00:40.000Z"),
+        ("1998-03-01T00:00:00.000Z", "1999-03-02T00:00:00.000Z"),
+    ],
+    ids=["minutes", "day", "seconds", "year"],
+)
+def test_no_label_of_a_chart_is_cut_off(browser, address, client, drawn, width, start, end):
+    """Neither those of limits near the top nor those at the ends of the axes."""
+    run = f"labels-{width}"
+    for each in drawn("XTE", 20, seed=4):
+        client.post("/api/v1/batches", json=each | {"run": run}).raise_for_status()
+    added = browser.call("Page.addScriptToEvaluateOnNewDocument", source=WRITTEN)
+    try:
+        query = {"run": run, "start": start, "end": end}
+        browser.open(str(httpx.URL(f"{address}/spacecraft/XTE", params=query)), width=width)
+        browser.wait(lambda: browser.run(DRAWN))
+        written = browser.run("written")
+    finally:
+        browser.call("Page.removeScriptToEvaluateOnNewDocument", **added)
+    assert {"stars", "magnitude"} <= {each["chart"] for each in written}
+    assert any(each["isLimit"] for each in written)
+    sides = ("left", "right", "top", "bottom")
+    cut = [each for each in written if min(each[side] for side in sides) < 0]
+    assert cut == []
+
+
+@pytest.mark.parametrize(("spacecraft", "stars"), [("SOHO", 12), ("SOHO", 40), ("IMAGER", 40)])
+def test_no_label_of_a_star_stands_over_another_one(
+    browser, address, client, drawn, spacecraft, stars
+):
+    """Every number is there; a name for which there is no room is left to the table."""
+    (crowded,) = drawn(spacecraft, 1, seed=3, stars=stars)
+    run = f"crowd-{spacecraft}-{stars}"
+    answer = client.post("/api/v1/batches", json=crowded | {"run": run}).json()
+    assert answer["counts"]["observed"] > 10
+    browser.open(f"{address}/batches/{answer['id']}")
+    boxes = browser.run(
+        "[...document.querySelectorAll('.sky-chart .number, .sky-chart .name')].map(each => {"
+        "const {x, y, width, height} = each.getBBox();"
+        # A box holds the room above and below the letters, too.
+        "return [each.textContent, x, y + 0.2 * height, x + width, y + 0.85 * height]; })"
+    )
+    numbers = [each[0] for each in boxes if each[0].isdigit()]
+    assert numbers == [str(k + 1) for k in range(answer["counts"]["observed"])]
+    assert len(boxes) > len(numbers) + 5
+    over = [
+        (a[0], b[0])
+        for a, b in combinations(boxes, 2)
+        if min(a[3], b[3]) > max(a[1], b[1]) and min(a[4], b[4]) > max(a[2], b[2])
+    ]
+    assert over == []
+    assert browser.complaints == []
 
 
 OFFLINE = {"offline": True, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}

@@ -140,6 +140,16 @@ def test_the_overlay_is_a_picture_of_the_frame_also_for_a_what_if(client, record
     assert client.get(f"/api/v1/batches/{other['id']}/overlay").status_code == 200
 
 
+def test_the_overlay_comes_as_plain_bytes_where_these_are_asked_for(client, recorded):
+    """As a client asks for it that knows no type of pictures."""
+    here = f"/api/v1/batches/{recorded[0]['id']}/overlay"
+    picture = client.get(here)
+    plain = client.get(here, headers={"Accept": "application/octet-stream"})
+    assert picture.headers["content-type"] == "image/png"
+    assert plain.headers["content-type"] == "application/octet-stream"
+    assert plain.content == picture.content
+
+
 def test_a_batch_without_a_frame_has_no_overlay(client, post, batch):
     answer = post(batch).json()
     refused = client.get(f"/api/v1/batches/{answer['id']}/overlay")

@@ -1,6 +1,7 @@
 """The committed reference is the app's own, complete, and its examples are what the app answers."""
 
 import json
+import re
 
 import pytest
 from jsonschema import Draft202012Validator
@@ -62,6 +63,39 @@ def test_every_reference_leads_somewhere():
 @pytest.mark.parametrize("name", reference()["components"]["schemas"])
 def test_every_schema_is_one(name):
     Draft202012Validator.check_schema(reference()["components"]["schemas"][name])
+
+
+def test_every_schema_has_a_name_of_its_own():
+    """Generators call a class after the title; of two with the same one they drop the second."""
+    schemas = reference()["components"]["schemas"]
+    for name, schema in schemas.items():
+        assert schema.get("title", name) == name
+        # No path of a module, which is put there where two classes have one name.
+        assert re.fullmatch("[A-Z][A-Za-z0-9]*", name)
+    assert len({name.lower() for name in schemas}) == len(schemas)
+
+
+BINARY = "application/octet-stream"
+KEPT = ("application/json", BINARY)
+"""The media types of bodies that every generator knows."""
+
+
+@pytest.mark.parametrize(("path", "method", "operation"), OPERATIONS, ids=NAMED)
+def test_a_generated_client_can_send_and_read_every_body(path, method, operation):
+    """One media type at least is known to generators; what is no text and no JSON is binary."""
+    parts = [operation["requestBody"]] if "requestBody" in operation else []
+    parts += [each for each in operation["responses"].values() if each["content"]]
+    for part in parts:
+        kinds = part["content"]
+        assert any(
+            kind in KEPT or kind.endswith("+json") or kind.startswith("text/") for kind in kinds
+        ), list(kinds)
+        for kind, content in kinds.items():
+            if not kind.endswith("json") and not kind.startswith("text/"):
+                assert content["schema"]["type"] == "string"
+                assert content["schema"]["format"] == "binary"
+    if "requestBody" in operation:
+        assert set(operation["requestBody"]["content"]) & set(KEPT)
 
 
 @pytest.mark.parametrize(("path", "method", "operation"), OPERATIONS, ids=NAMED)

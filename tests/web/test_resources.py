@@ -133,6 +133,15 @@ def test_a_replay_run_twice_records_once(client, drawn, run):
     assert len(client.get(f"{API}/batches?run={run}").json()["items"]) == 3
 
 
+def test_a_replay_can_be_sent_as_plain_bytes(client, drawn, run):
+    """As a generated client sends it, which knows no type of lines."""
+    content = "\n".join(json.dumps(each) for each in drawn("XTE", 2)).encode()
+    headers = {"Content-Type": "application/octet-stream"}
+    answer = client.post(f"{API}/replays?run={run}", content=content, headers=headers)
+    assert answer.status_code == 202
+    assert finished(client, answer.headers["Location"])["lines"]["done"] == 2
+
+
 def test_a_line_without_end_is_one_bad_line(client, drawn, run):
     good = json.dumps(drawn("XTE", 1)[0]).encode()
     content = b"\n".join([good, b'{"a": "' + b"x" * 5_000_000, good])

@@ -9,6 +9,7 @@ from fastapi import APIRouter
 from fastapi import Query as InQuery
 from starlette.responses import Response
 
+from service.times import DAY_S, parse_utc, shifted
 from service.web.dashboard.rendering import PageRoute, rendered
 from service.web.dashboard.shell import AtDesk, RunQuery
 from service.web.dashboard.sparkline import Sparkline, sparkline
@@ -33,6 +34,13 @@ class Line:
 
     item: Mapping[str, Any]
     windows: tuple[tuple[str, Window], ...]
+
+    @property
+    def last_day(self) -> tuple[str, str]:
+        """The bounds of the day that ends with the spacecraft's latest batch."""
+        # The latest batch belongs to it, and the end of a stretch does not.
+        end = shifted(parse_utc(self.item["latest_batch"]["time"]), 0.001)
+        return shifted(end, -DAY_S).text, end.text
 
     @property
     def is_stale(self) -> bool:

@@ -9,12 +9,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from service.web.dashboard.sky_labels import Box, Label, Labels, points_along, text_box
+
 SIZE = 640
 """Width and height of the picture."""
 FIELD_MARGIN = 1.12
 LONGEST_ARROW = 70.0
 """Pixels of the longest residual arrow."""
 ROUND = (1.0, 2.0, 5.0)
+MARK_RADIUS = 13.0
+"""Of the mark about an observed star; a triangle's corners reach a little farther."""
+RIVAL_MARGIN = 6.0
+AXES: tuple[Box, ...] = (
+    (SIZE - 30.0, SIZE / 2 - 20.0, SIZE, SIZE / 2 - 2.0),
+    (SIZE / 2, 0.0, SIZE / 2 + 34.0, 18.0),
+)
+"""Where the names of the axes stand."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +62,7 @@ class ObservedStar:
     arrow: Line | None
     head: str
     rivals: tuple[Line, ...]
+    label: Label
 
 
 @dataclass(frozen=True)
@@ -60,6 +71,11 @@ class Ring:
 
     radius: float
     label: str
+
+    @property
+    def label_at(self) -> tuple[float, float]:
+        """Where the label begins: at the top of the circle."""
+        return SIZE / 2 + 3, SIZE / 2 - self.radius - 3
 
 
 @dataclass(frozen=True)
@@ -73,6 +89,7 @@ class SkyChart:
     edges: tuple[str, ...]
     catalog: tuple[CatalogStar, ...]
     observed: tuple[ObservedStar, ...]
+    names: tuple[Label, ...]
     key_arcsec: float | None
     key_px: float
     magnitudes: tuple[tuple[int, float], ...]
@@ -118,13 +135,31 @@ def sky_chart(tracker: Mapping[str, Any], through: str, view: str = "all") -> Sk
             if each["residual_arcsec"]
         ]
     )
+    seen = [place(each["h_deg"], each["v_deg"]) for each in tracker["observed"]]
+    arrows = []
+    for (x, y), each in zip(seen, tracker["observed"], strict=True):
+        along_h, along_v = each["residual_arcsec"] or (0.0, 0.0)
+        tip = x + along_h * px_per_arcsec, y - along_v * px_per_arcsec
+        is_drawn = each["residual_arcsec"] and px_per_arcsec
+        arrows.append(Line(x, y, *tip) if is_drawn else None)
+    rings = tuple(ring(each) for each in _rings(radius_deg, field_deg))
+    named = {star.id: star for star in catalog if star.role != "none"}
+    labels = Labels(
+        SIZE,
+        marks=[(x, y, MARK_RADIUS) for x, y in seen]
+        + [(star.x, star.y, star.radius + RIVAL_MARGIN) for star in named.values()],
+        taken=[*AXES, *(text_box(each.label, *each.label_at) for each in rings)],
+        lines=[
+            point
+            for each in arrows
+            if each is not None
+            for point in points_along((each.x1, each.y1), (each.x2, each.y2))
+        ],
+    )
     observed = []
-    for number, each in enumerate(tracker["observed"], start=1):
-        x, y = place(each["h_deg"], each["v_deg"])
-        arrow = None
-        if each["residual_arcsec"] and px_per_arcsec:
-            along_h, along_v = each["residual_arcsec"]
-            arrow = Line(x, y, x + along_h * px_per_arcsec, y - along_v * px_per_arcsec)
+    for number, (each, (x, y), arrow) in enumerate(
+        zip(tracker["observed"], seen, arrows, strict=True), start=1
+    ):
         observed.append(
             ObservedStar(
                 number,
@@ -136,21 +171,25 @@ def sky_chart(tracker: Mapping[str, Any], through: str, view: str = "all") -> Sk
                 arrow,
                 "" if arrow is None else _head(arrow),
                 tuple(Line(x, y, *at[name]) for name in each["rivals"] if name in at),
+                labels.number(str(number), (x, y)),
             )
         )
+    # Numbers first: by them a name is found in the table, too.
+    names = [labels.name(star.id, (star.x, star.y)) for star in named.values()]
     brightest = min((star.magnitude for star in catalog), default=limit_mag)
     steps = range(math.ceil(brightest), math.floor(limit_mag) + 1)
     return SkyChart(
         tracker=tracker["tracker"],
         boresight=tracker["boresight"],
         field_of_view=ring(field_deg),
-        rings=tuple(ring(each) for each in _rings(radius_deg, field_deg)),
+        rings=rings,
         edges=tuple(
             " ".join("{:.1f},{:.1f}".format(*place(h, v)) for h, v in line)
             for line in tracker["zone_edges"]
         ),
         catalog=catalog,
         observed=tuple(observed),
+        names=tuple(each for each in names if each is not None),
         key_arcsec=key_arcsec,
         key_px=0.0 if key_arcsec is None else key_arcsec * px_per_arcsec,
         magnitudes=tuple((step, star_radius(step, limit_mag)) for step in steps)[-6:],

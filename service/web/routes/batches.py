@@ -11,7 +11,7 @@ from starlette.responses import Response
 from service.errors import BadInput
 from service.observe.wire import BatchIn, OptionsIn, Wire
 from service.web.access import Asking, require_scope
-from service.web.bodies import JsonBody, json_body, read_model, refused
+from service.web.bodies import BINARY, JsonBody, json_body, read_model, refused
 from service.web.describe import IDEMPOTENCY_KEY, LINK, LOCATION, REPLAYED, Gives, described
 from service.web.headers import NO_IDEMPOTENCY_KEY, idempotency_key
 from service.web.holding import Held, answer_response, json_response, page_response
@@ -19,6 +19,8 @@ from service.web.queries import NO_QUERY, BatchQuery, require_no_query
 from service.web.schemas.answers import Answer, BatchPage, Record
 
 router = APIRouter(prefix="/api/v1/batches", tags=["batches"])
+
+PNG = "image/png"
 
 ResultId = Annotated[str, Path(description="The `id` of a recorded result.")]
 
@@ -86,13 +88,18 @@ def get_batch(id: ResultId, operations: Held) -> Response:
     "/{id}/overlay",
     dependencies=[NO_QUERY],
     **described(
-        {200: Gives("The picture.", media_type="image/png")},
+        {200: Gives("The picture.", media_type=PNG, also=BINARY)},
         problems=(404,),
     ),
 )
-def get_overlay(id: ResultId, operations: Held) -> Response:
-    """The frame that a result was made of: its stars, their names, and residual arrows."""
-    return Response(operations.overlay(id), media_type="image/png")
+def get_overlay(request: Request, id: ResultId, operations: Held) -> Response:
+    """The frame that a result was made of: its stars, their names, and residual arrows.
+
+    The PNG has the media type of any bytes where `Accept` asks for that one.
+    """
+    # Clients that are generated from the description know no type of pictures.
+    media_type = BINARY if BINARY in request.headers.get("accept", "").lower() else PNG
+    return Response(operations.overlay(id), media_type=media_type, headers={"Vary": "Accept"})
 
 
 @router.post(

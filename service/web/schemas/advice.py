@@ -15,7 +15,7 @@ Action = Annotated[
 Size = Literal["too_small", "fits", "too_large", "no_verdict"]
 
 
-class Bounds(Shape):
+class Estimate(Shape):
     """An estimate with its 95 % interval; null where the sample does not bound it."""
 
     value: float
@@ -34,8 +34,8 @@ class ToleranceAdvice(Shape):
     confidence: Literal["high", "moderate", "low", "none"]
     differences: Count
     batches: Count
-    needed: Bounds | None = Field(description="What lets 99 % of the true pairs, or stars, pass.")
-    share_beyond: Bounds | None = Field(description="Of the true ones that the value loses.")
+    needed: Estimate | None = Field(description="What lets 99 % of the true pairs, or stars, pass.")
+    share_beyond: Estimate | None = Field(description="Of the true ones that the value loses.")
     recommended: float | None
     action: Action
     text: Text
@@ -46,7 +46,7 @@ class NoiseAdvice(Shape):
 
     tracker: str
     now_arcsec: float
-    sigma_arcsec: Bounds | None
+    sigma_arcsec: Estimate | None
     batches: Count
     verdict: Size
     action: Action
@@ -58,10 +58,10 @@ class MagnitudeAdvice(Shape):
 
     tracker: str
     pivot_mag: float | None = Field(description="The median of the catalog magnitudes.")
-    offset_mag: Bounds | None = Field(description="At the pivot; above zero: measured fainter.")
-    scale: Bounds | None
+    offset_mag: Estimate | None = Field(description="At the pivot; above zero: measured fainter.")
+    scale: Estimate | None
     now_sigma_mag: float
-    scatter_mag: Bounds | None = Field(description="One standard deviation about the line.")
+    scatter_mag: Estimate | None = Field(description="One standard deviation about the line.")
     stars: Count
     verdict: Literal["off", "fits", "no_verdict"]
     scatter_verdict: Size
@@ -74,7 +74,7 @@ class AlignmentAdvice(Shape):
 
     tracker: str
     reference: str
-    rotation_arcsec: Annotated[list[Bounds], Field(min_length=3, max_length=3)] | None = Field(
+    rotation_arcsec: Annotated[list[Estimate], Field(min_length=3, max_length=3)] | None = Field(
         description="Rotation vector about the body axes."
     )
     axes_body: Annotated[list[Components], Field(min_length=3, max_length=3)] | None = Field(
@@ -100,7 +100,7 @@ class Tried(Shape):
     named_otherwise: Count = Field(
         description="Unique here and by verified identification, but not the same star."
     )
-    change_points: Bounds | None = Field(
+    change_points: Estimate | None = Field(
         description=(
             "Change of the share that is not unique, in percentage points, from the votes with "
             "the present settings; null for what is not compared."

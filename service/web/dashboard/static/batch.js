@@ -1,5 +1,6 @@
 // What-if: every change of a setting has the outcome drawn anew; the address says what was changed.
 import { fetchPage, swapRegions } from "./regions.js";
+import { send } from "./sending.js";
 
 const WAIT_MS = 350;
 const form = () => document.getElementById("try");
@@ -40,18 +41,15 @@ async function adopt(button) {
   button.disabled = true;
   const status = document.getElementById("try-status");
   const options = JSON.parse(button.dataset.adopt);
-  const answer = await fetch(`/api/v1/batches/${form().dataset.id}/what-if`, {
-    method: "POST",
-    headers: { "Content-Type": "application/json" },
-    body: JSON.stringify({ options, adopt: true }),
-  }).catch(() => null);
-  if (answer?.ok) {
-    location.href = `/batches/${(await answer.json()).id}`;
-    return;
+  try {
+    const address = `/api/v1/batches/${form().dataset.id}/what-if`;
+    const adopted = await send("POST", address, JSON.stringify({ options, adopt: true }));
+    location.href = `/batches/${adopted.id}`;
+  } catch (error) {
+    button.disabled = false;
+    status.className = "problem";
+    status.textContent = `Not adopted: ${error.message}`;
   }
-  button.disabled = false;
-  status.className = "problem";
-  status.textContent = answer ? `Not adopted: ${(await answer.json()).detail}` : "Not adopted: no answer from the service";
 }
 
 // Shows what works with a script alone.

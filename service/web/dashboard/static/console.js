@@ -1,5 +1,6 @@
 // What every page has: the theme, the choice of a run, copying, and the live connection.
 import { keepFresh } from "./live.js";
+import { attempt, send } from "./sending.js";
 
 const theme = document.getElementById("theme");
 const system = matchMedia("(prefers-color-scheme: dark)");
@@ -29,7 +30,8 @@ nameTheme();
 
 const runs = document.querySelector("[data-run-form]");
 runs.querySelector("button:not([type])").hidden = true;
-runs.elements.run.addEventListener("change", () => runs.requestSubmit());
+// The menu itself is put anew where there are other runs.
+runs.addEventListener("change", () => runs.requestSubmit());
 
 document.addEventListener("click", async (event) => {
   const button = event.target.closest("[data-copy]");
@@ -45,9 +47,11 @@ document.addEventListener("click", async (event) => {
   }
 });
 
-document.getElementById("sign-out")?.addEventListener("click", async () => {
-  await fetch("/api/v1/session", { method: "DELETE" });
-  location.href = "/sign-in";
+document.getElementById("sign-out")?.addEventListener("click", (event) => {
+  attempt(event.target, document.getElementById("connection"), async () => {
+    await send("DELETE", "/api/v1/session");
+    location.href = "/sign-in";
+  });
 });
 
 keepFresh();

@@ -17,12 +17,14 @@ let source = null;
 let last = document.body.dataset.lastEvent || null;
 let drawing = null;
 let lostAt = null;
+let stale = false;
 
 function clock(moment) {
   return moment.toISOString().slice(0, 19).replace("T", " ");
 }
 
 function say(state, text) {
+  shown.className = "";
   shown.dataset.state = state;
   shown.textContent = text;
 }
@@ -40,8 +42,12 @@ export function drawSoon() {
       if (fresh === null) return;
       swapRegions(fresh);
       document.dispatchEvent(new CustomEvent("drawn"));
+      if (stale && lostAt === null) say("live", "● Connected");
+      stale = false;
     } catch (error) {
-      say("lost", `▲ Could not be drawn anew: ${error.message}`);
+      stale = true;
+      say("lost", `▲ Not up to date: ${error.message}. It is tried again every ${POLL_MS / 1000} s; what is shown is of its own time`);
+      setTimeout(drawSoon, POLL_MS);
     }
   }, DRAW_EVERY_MS);
 }
@@ -110,7 +116,7 @@ function lost() {
 
 function tellLost() {
   if (lostAt === null) return;
-  say("lost", `▲ Connection lost since ${clock(lostAt)} UTC; what is shown is of its own time`);
+  say("lost", `▲ Connection lost since ${clock(lostAt)} UTC; it is tried again every second. What is shown is of its own time`);
 }
 
 export function keepFresh() {

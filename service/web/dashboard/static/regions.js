@@ -1,14 +1,15 @@
 // Putting fresh parts of a page in the place of old ones, without disturbing whoever is reading.
+import { ask, unexpected } from "./asking.js";
 
 // The page at an address, as the server draws it now; an error page is an error here too.
 export async function fetchPage(address) {
-  const answer = await fetch(address, { headers: { Accept: "text/html" } });
+  const { answer, text } = await ask(address, { headers: { Accept: "text/html" } });
   // A session has ended: whoever reads signs in again and comes back here.
   if (new URL(answer.url).pathname === "/sign-in") location.href = answer.url;
-  const fresh = new DOMParser().parseFromString(await answer.text(), "text/html");
+  const fresh = new DOMParser().parseFromString(text, "text/html");
   if (!answer.ok) {
     const told = fresh.getElementById("problem");
-    throw new Error(told ? told.querySelector("p").textContent : `the service answered ${answer.status}`);
+    throw new Error(told ? told.querySelector("p").textContent : unexpected(answer));
   }
   return fresh;
 }

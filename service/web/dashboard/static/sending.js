@@ -1,16 +1,9 @@
 // Sending what a form asks for, and telling in words how it went.
+import { askJson } from "./asking.js";
 
 // The answer's JSON; throws with the service's own words where it refused.
 export async function send(method, address, body, headers = { "Content-Type": "application/json" }) {
-  let answer;
-  try {
-    answer = await fetch(address, { method, headers: body === undefined ? {} : headers, body });
-  } catch {
-    throw new Error("no answer from the service");
-  }
-  const told = answer.status === 204 ? null : await answer.json();
-  if (!answer.ok) throw new Error(told.detail ?? `the service answered ${answer.status}`);
-  return told;
+  return askJson(address, { method, headers: body === undefined ? {} : headers, body });
 }
 
 // Runs what a form or a button asks for; meanwhile it cannot be asked again.

@@ -1,4 +1,5 @@
 // The trends of one spacecraft: charts of a stretch of time that the address names.
+import { askJson } from "./asking.js";
 import { fetchLatest, swapRegions } from "./regions.js";
 import { Trend } from "./trend.js";
 
@@ -29,7 +30,6 @@ const CHARTS = {
   rate: { unit: "", quantities: [{ name: "batches_per_hour", label: "batches per hour", tone: "--accent" }] },
 };
 
-const { limits } = JSON.parse(document.querySelector("[data-json]").content.textContent);
 let trends = [];
 let asked = 0;
 let shown = null;
@@ -38,6 +38,7 @@ const posix = (text) => Date.parse(text.replace(":60", ":59").replace(/(\.\d{3})
 const asText = (seconds) => new Date(seconds * 1000).toISOString();
 
 function make() {
+  const { limits } = JSON.parse(document.querySelector("[data-json]").content.textContent);
   trends = [...document.querySelectorAll("[data-chart]")].map((holder) => {
     const id = holder.dataset.chart;
     const title = document.getElementById(`chart-${id}`).textContent;
@@ -51,9 +52,7 @@ async function draw() {
   const { history, start, end } = stretch().dataset;
   delete document.getElementById("charts").dataset.drawn;
   try {
-    const answer = await fetch(history);
-    const told = await answer.json();
-    if (!answer.ok) throw new Error(told.detail);
+    const told = await askJson(history);
     if (mine !== asked) return;
     shown = told;
     for (const trend of trends) trend.show(shown, posix(start), posix(end));
@@ -117,4 +116,7 @@ if (stretch()) {
   addEventListener("popstate", () => go(location.href, false));
   document.addEventListener("drawn", draw);
   document.addEventListener("theme", () => shown && draw());
+} else {
+  // With the first batch there is a page of another kind to show.
+  document.addEventListener("drawn", () => document.querySelector("#state .empty") ?? location.reload());
 }

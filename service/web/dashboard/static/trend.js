@@ -2,6 +2,10 @@
 
 const DASHES = { watch: [2, 4], warning: [6, 4], critical: [] };
 const DAY_S = 86400;
+const LABEL_PX = 16;
+
+// At the top and the right half of a label at the end of an axis has room.
+const PADDING = [12, 32, 0, 0];
 
 function colour(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
@@ -52,6 +56,15 @@ function limitLines(limits, quantities) {
   return lines;
 }
 
+// As wide as the longest label, so that none is cut off.
+function labelWidth(chart, labels, index, cycle) {
+  const axis = chart.axes[index];
+  if (cycle > 1) return axis._size;
+  chart.ctx.font = axis.font[0];
+  const widths = (labels ?? []).map((label) => chart.ctx.measureText(label).width / devicePixelRatio);
+  return Math.ceil(Math.max(40, ...widths) + axis.ticks.size + axis.gap + 4);
+}
+
 // Bounds that several quantities share are one line; it is named after the severity alone.
 function merged(lines, names) {
   const places = new Map();
@@ -70,21 +83,21 @@ function merged(lines, names) {
 function drawLimits(chart, lines) {
   const { ctx, bbox } = chart;
   ctx.save();
-  ctx.beginPath();
-  ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
-  ctx.clip();
   ctx.strokeStyle = ctx.fillStyle = colour("--accent-ink");
   ctx.textAlign = "left";
-  ctx.textBaseline = "bottom";
   ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
   for (const { severity, value, text } of lines) {
     const y = chart.valToPos(value, "y", true);
+    if (y < bbox.top || y > bbox.top + bbox.height) continue;
     ctx.setLineDash(DASHES[severity].map((each) => each * devicePixelRatio));
     ctx.beginPath();
     ctx.moveTo(bbox.left, y);
     ctx.lineTo(bbox.left + bbox.width, y);
     ctx.stroke();
-    ctx.fillText(text, bbox.left + 4 * devicePixelRatio, y - 2 * devicePixelRatio);
+    // Above its line, or below where there is no room.
+    const isHigh = y - bbox.top < LABEL_PX * devicePixelRatio;
+    ctx.textBaseline = isHigh ? "top" : "bottom";
+    ctx.fillText(text, bbox.left + 4 * devicePixelRatio, y + (isHigh ? 3 : -2) * devicePixelRatio);
   }
   ctx.restore();
 }
@@ -163,6 +176,7 @@ export class Trend {
     const lines = merged(limitLines(this.limits, names), names).map((line) => ({ ...line, value: line.value * scale }));
     return {
       ...this.size(),
+      padding: PADDING,
       tzDate: (seconds) => uPlot.tzDate(new Date(seconds * 1000), "Etc/UTC"),
       legend: { show: false },
       cursor: { sync: { key: this.group }, drag: { x: true, y: false, setScale: false }, points: { size: 6 }, bind: { dblclick: () => () => this.onZoom(null) } },
@@ -171,7 +185,7 @@ export class Trend {
       bands,
       axes: [
         { ...axis, values: tickLabels, space: 70, size: 40 },
-        { ...axis, size: 68, values: (_, splits) => splits.map((value) => `${+value.toPrecision(6)}${this.definition.unit}`) },
+        { ...axis, size: labelWidth, values: (_, splits) => splits.map((value) => `${+value.toPrecision(6)}${this.definition.unit}`) },
       ],
       hooks: {
         draw: [(chart) => drawLimits(chart, lines)],
