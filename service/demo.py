@@ -8,7 +8,6 @@ import dataclasses
 import hashlib
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -33,6 +32,7 @@ from service.simulate.telemetry import draw_pass
 from service.sky.catalog import load_embedded
 from service.sky.shelf import Shelf
 from service.sky.view import Sky
+from service.web.ports import require_free, url_of
 
 MISSIONS = ("XTE", "SWAS", "SOHO")
 START_S = 300.0
@@ -54,6 +54,9 @@ def run_demo(folder: Path, settings: Settings, batches: int, seed: int, once: bo
     port is taken or the server does not start.
     """
     started = time.perf_counter()
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        # A script that runs this with & has it ignored: nothing but a kill would end it.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     wanted = Pass(batches, seed)
     if settings.port == 0:
         raise BadInput(Fault("--port", "must be a port that can be named", "0"))
@@ -62,8 +65,8 @@ def run_demo(folder: Path, settings: Settings, batches: int, seed: int, once: bo
     (folder / ".gitignore").write_text("*\n", encoding="utf-8")
     database = folder / "acquire.db"
     settings = dataclasses.replace(settings, database=f"sqlite:///{database}")
-    url = _url(settings)
-    _require_free(settings)
+    url = url_of(settings.host, settings.port)
+    require_free(settings.host, settings.port)
     with _served(settings, folder / "server.log") as server:
         files = _samples(folder, wanted)
         _wait_until_ready(server, url, folder / "server.log")
@@ -142,25 +145,6 @@ def _digest(files: Sequence[Path]) -> str:
     for file in files:
         content.update(file.read_bytes())
     return content.hexdigest()[:8]
-
-
-def _url(settings: Settings) -> str:
-    host = f"[{settings.host}]" if ":" in settings.host else settings.host
-    return f"http://{host}:{settings.port}"
-
-
-def _require_free(settings: Settings) -> None:
-    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_STREAM) as probe:
-        # As the server does: a port that was just let go of is free.
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((settings.host, settings.port))
-        except OSError as error:
-            raise BadConfiguration(
-                f"{_url(settings)}: {error.strerror}; stop what serves there, or choose another "
-                "port with --port (make run PORT=8100)"
-            ) from None
 
 
 @contextmanager

@@ -8,7 +8,7 @@ import math
 import threading
 import time
 from asyncio import wrap_future
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, ExitStack
 from functools import partial
@@ -75,7 +75,14 @@ from service.records.looking import neighbours, recorded_batch, recorded_mission
 from service.records.pages import Page, Stretch
 from service.records.reading import OutcomeName, Status
 from service.records.recording import register, watch_run
-from service.records.replays import Replay, list_replays, mark_interrupted, read_replay
+from service.records.replays import (
+    Replay,
+    list_replays,
+    mark_cancelled,
+    mark_interrupted,
+    read_replay,
+    require_cancellable,
+)
 from service.records.reprocess import Plan, Progress, reprocess
 from service.records.star_field import star_field_of
 from service.records.store import Readers, Store
@@ -102,6 +109,8 @@ REHEARSALS = 8
 """So often a batch is rehearsed at the start: the interpreter settles on how it runs code."""
 """Each keeps a thread and a file of its own; those that come later may come again."""
 REPLAY_RETRY_S = 30
+CANCEL_WAIT_S = 5.0
+"""So long whoever cancels a replay waits until it has ended."""
 
 ADVICE_SAMPLE = 200
 """Batches enough to tell a sigma to some five percent, and run again in seconds."""
@@ -575,6 +584,22 @@ class Operations:
                 connection, name, run=run or LIVE, start=start, end=end, asked=asked
             )
 
+    def every_batch(
+        self,
+        name: str,
+        *,
+        run: str | None = None,
+        start: Utc | None = None,
+        end: Utc | None = None,
+        quantities: Sequence[QuantityName] = (),
+    ) -> Iterator[Row]:
+        """The history of every batch of a stretch, in pages; see `trends.every_batch`."""
+        mission_named(self.missions, name)
+        names = tuple(quantities) or TRENDS
+        return trends.every_batch(
+            self.reading, name, run=run or LIVE, start=start, end=end, quantities=names
+        )
+
     def worst_batches(
         self,
         name: str,
@@ -872,7 +897,7 @@ class Operations:
         stretch = Stretch(source, spacecraft, start, end)
         plan = Plan(
             stretch=stretch,
-            run=_run_name(run or self._run_of_settings(source, chosen)),
+            run=checked_run_name(run or self._run_of_settings(source, chosen)),
             missions=chosen,
             catalog=self.settings.catalog,
             shelf_bytes=self.settings.shelf_mb << 20,
@@ -901,7 +926,7 @@ class Operations:
 
     def watch_run(self, run: str, alarms: bool = True) -> Row:
         """Let limits be held against the batches that a run gets from now on, or no longer."""
-        name = _run_name(run)
+        name = checked_run_name(run)
         if name == LIVE and not alarms:
             raise BadBatch(Fault("alarms", "live batches are always watched", "False"))
         self.store.writer.change(
@@ -917,17 +942,39 @@ class Operations:
         total: int | None = None,
         check: Check = lambda spacecraft: None,
         alarms: bool = False,
+        owner: str | None = None,
     ) -> str:
         """Work through NDJSON lines in the background; the id under which to ask for progress.
 
         Every batch goes to `run`.  `total` is the number of lines, where it is
         known.  Lines that can be closed are closed at the end.  A line for whose
         spacecraft `check` raises an `AcquisitionError` is refused with it.  With `alarms`
-        limits are held against the run (see `watch_run`).
+        limits are held against the run (see `watch_run`).  `owner` is the token
+        that it is started with (see `cancel_replay`).
         """
+        return self._start_replay(lambda replay: lines, run, name, total, check, alarms, owner)
+
+    def _start_replay(
+        self,
+        lines_for: Callable[[Replay], Iterable[bytes]],
+        run: str,
+        name: str,
+        total: int | None,
+        check: Check,
+        alarms: bool,
+        owner: str | None,
+    ) -> str:
         # Whoever knows the id may ask for the progress.
-        row = {"id": lone_ulid(), "run": _run_name(run), "name": name, "lines_total": total}
-        replay = Replay(self.store, self._bulk, lambda: utc_now().text, row, check)
+        row = {"id": lone_ulid(), "run": checked_run_name(run), "name": name, "lines_total": total}
+        replay = Replay(
+            self.store,
+            self._bulk,
+            lambda: utc_now().text,
+            row,
+            check,
+            owner,
+            self.settings.replay_seconds,
+        )
         with self._replays_lock:
             if self._closing:
                 raise Stopping("the service is stopping")
@@ -941,8 +988,8 @@ class Operations:
         except BaseException:
             replay.abandon()
             raise
-        replay.start(lines)
-        return str(row["id"])
+        replay.start(lines_for(replay))
+        return replay.id
 
     def start_replay_of(
         self,
@@ -955,6 +1002,7 @@ class Operations:
         longest_bytes: int,
         check: Check,
         alarms: bool = False,
+        owner: str | None = None,
     ) -> str:
         """`start_replay` of the lines of a file, which is closed at the end.
 
@@ -962,10 +1010,44 @@ class Operations:
         """
         with ExitStack() as on_failure:
             on_failure.callback(file.close)
-            lines = unpacked_lines(file, coding, longest_bytes)
-            id = self.start_replay(lines, run, name, total, check, alarms)
+            id = self._start_replay(
+                lambda replay: unpacked_lines(file, coding, longest_bytes, replay.require_going_on),
+                run,
+                name,
+                total,
+                check,
+                alarms,
+                owner,
+            )
             on_failure.pop_all()
         return id
+
+    def cancel_replay(self, id: str, caller: Caller | None = None) -> Row:
+        """End a replay; what it recorded stays.  Returns how far it came.
+
+        Waits a few seconds for its end, until when its state is `running`.  A
+        replay that is cancelled already is left as it is.  Raises `NotFound`,
+        also where the caller is bound to spacecraft and the replay was not
+        started with their token, and `NotNow` where it has ended otherwise.
+        """
+        known = _known(id, "replay")
+        with self._replays_lock:
+            replay = next((each for each in self._replays if each.id == known), None)
+        if caller is not None and caller.spacecraft is not None:
+            theirs = replay is not None and replay.owner == caller.token_id
+            if not theirs:
+                raise NotFound(f"{caller.name} has started no replay with the id {id[:80]!r}")
+        if replay is None:
+            moment = utc_now().text
+            self.store.writer.change(
+                lambda connection: mark_cancelled(connection, known, moment)
+            ).result()
+        elif not replay.is_over:
+            replay.cancel()
+            replay.wait(CANCEL_WAIT_S)
+        state = self.replay(known)
+        require_cancellable(state["state"])
+        return state
 
     def replay_processes(self) -> int:
         """How many processes beside this one are ready to compute replays."""
@@ -989,7 +1071,8 @@ def _known(id: str, what: str) -> str:
     return id
 
 
-def _run_name(text: str) -> str:
+def checked_run_name(text: str) -> str:
+    """The name of a run; raises `BadBatch` for a text that names none."""
     try:
         return _RUN_NAME.validate_python(text)
     except ValidationError as error:

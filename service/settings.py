@@ -27,7 +27,8 @@ class Settings:
     other than loopback is served once there are tokens.  `token` is what
     commands show that talk to a running service.  `frame_mb` and `frame_megapixels`
     bound a frame's file and what it unfolds into.  `replay_processes` is how
-    many processes beside this one compute replays; 0: this one does.
+    many processes beside this one compute replays; 0: this one does.  A replay
+    ends after `replay_seconds`, wherever it is.
     """
 
     database: str = "sqlite:///acquire.db"
@@ -40,6 +41,7 @@ class Settings:
     frame_mb: int = 64
     frame_megapixels: int = 20
     replay_processes: int = min(os.cpu_count() or 1, MOST_USEFUL_PROCESSES)
+    replay_seconds: int = 6 * 3600
 
     def __post_init__(self) -> None:
         if not self.database.strip():
@@ -51,6 +53,8 @@ class Settings:
                 raise _refusal(name, f"must be from 1 to {most}", getattr(self, name))
         if not 0 <= self.replay_processes <= 64:
             raise _refusal("replay_processes", "must be from 0 to 64", self.replay_processes)
+        if not 1 <= self.replay_seconds <= 30 * 86_400:
+            raise _refusal("replay_seconds", "must be from 1 to 2592000", self.replay_seconds)
         if not 0 <= self.port <= 65535:
             raise _refusal("port", "must be from 0 to 65535", self.port)
         if not _HOST.fullmatch(self.host):
@@ -82,6 +86,7 @@ _READERS: dict[str, Callable[[str], Any]] = {
     "frame_megapixels": int,
     "port": int,
     "replay_processes": int,
+    "replay_seconds": int,
 }
 
 

@@ -23,6 +23,7 @@ from service.observe.csv_cells import COLUMNS
 from service.simulate.files import read_objects
 from service.times import parse_utc
 from tests.sky.test_sky2000 import SIRIUS, written
+from tests.web.serving import served
 
 COMMANDS = [
     "serve",
@@ -438,6 +439,117 @@ def test_records_are_copied_verified_and_pruned(acquire, tmp_path):
     code, out, _ = acquire("database", "verify", *copy)
     assert code == 1
     assert "its attitude is missing" in out
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "advise --spacecraft XTE",
+        "advise --spacecraft XTE --json",
+        "reprocess",
+        "token list",
+        "token revoke nobody",
+        "database verify",
+        "database check",
+        "database backup copy.db",
+        "database prune --before 1999-060T00:00:00Z --dry-run",
+    ],
+)
+def test_no_command_that_reads_makes_a_database(acquire, tmp_path, command):
+    code, out, err = acquire(*command.split(), "--database", "sqlite:///no.db")
+    assert (code, out) == (2, "")
+    assert "ACQUIRE_DATABASE: no.db: there is no such file" in err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["advise --spacecraft XTE", "reprocess", "token list"])
+def test_no_command_that_reads_makes_tables_in_another_file(acquire, tmp_path, command):
+    (tmp_path / "empty.db").touch()
+    (tmp_path / "text.db").write_text("no database, but a text of some length\n" * 40)
+    with closing(sqlite3.connect(tmp_path / "other.db")) as connection:
+        connection.execute("CREATE TABLE theirs (id INTEGER)")
+        connection.commit()
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    for name, complaint in (
+        ("empty", "holds no records of this service"),
+        ("other", "holds no records of this service"),
+        ("text", "file is not a database"),
+    ):
+        code, out, err = acquire(*command.split(), "--database", f"sqlite:///{name}.db")
+        assert (code, out) == (2, "")
+        assert f"{name}.db: {complaint}" in err
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+
+
+def test_reprocess_keeps_off_a_file_that_a_service_is_at_work_on(acquire, tmp_path):
+    """Killed, the service leaves nothing behind that stands in the way."""
+    telemetry(acquire, tmp_path / "pass.ndjson", "XTE", 4, "--nominal")
+    assert acquire("replay", tmp_path / "pass.ndjson", "--in-process", "--run", "r")[0] == 0
+    again = ("reprocess", "--source", "r", "--run", "again", "--processes", 1)
+    with served(f"sqlite:///{tmp_path / 'acquire.db'}") as (process, _):
+        code, out, err = acquire(*again)
+        assert (code, out) == (2, "")
+        assert "acquire.db: a service is at work on it: stop it" in err
+        # Reading does no harm beside it.
+        assert acquire("advise", "--spacecraft", "XTE", "--run", "r")[0] == 0
+        process.kill()
+        process.wait()
+    give_up = time.monotonic() + 30
+    while (code := acquire(*again)[0]) == 2:
+        # The process that writes ends with the one that was killed, a moment later.
+        assert time.monotonic() < give_up
+        time.sleep(0.1)
+    assert code == 0
+
+
+PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR" + bytes(range(256)) * 20
+CSV_TEXT = b"spacecraft,batch,time,tracker,x,y,z\nXTE,b1,1999-060T00:00:00Z,STARTRACKER_1,0,0,1\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "complaint"),
+    [
+        ("a.ndjson", PNG, "is a binary file; telemetry is NDJSON, one batch a line, or CSV"),
+        ("a.csv", PNG, "is a binary file; telemetry is NDJSON, one batch a line, or CSV"),
+        ("a.ndjson", CSV_TEXT, "is no NDJSON but looks like CSV: name it .csv"),
+        ("a.csv", b'{"spacecraft": "XTE"}\n', "is no CSV but looks like NDJSON: name it .ndjson"),
+        ("a.ndjson", b"", "is empty: there is no batch in it"),
+        ("a.csv", b"", "is empty: there is no batch in it"),
+        ("a.ndjson", b"\n \n", "is empty: there is no batch in it"),
+        ("a.ndjson", b"dear reader,\nthis is a letter\n", "is no NDJSON, which has one batch a"),
+        ("a.ndjson", b'[{"spacecraft": "XTE"}]\n', "is JSON, but not NDJSON"),
+        ("a.ndjson", b'{\n  "spacecraft": "XTE"\n}\n', "is JSON, but not NDJSON"),
+        ("a.ndjson.gz", gzip.compress(b"{}\n"), "is packed with gzip: unpack it first (gunzip)"),
+        ("a.csv", b"name,age\nX,3\n", "column name: there is no such column"),
+    ],
+)
+@pytest.mark.parametrize("way", ["--in-process", "--url=http://127.0.0.1:9"])
+def test_a_file_that_is_no_telemetry_is_told_as_what_it_is(
+    acquire, tmp_path, name, content, complaint, way
+):
+    (tmp_path / name).write_bytes(content)
+    code, out, err = acquire("replay", name, "--run", "r", way)
+    assert (code, out) == (2, "")
+    assert complaint in err
+    assert all(line.startswith(f"acquire: {name}: ") for line in err.splitlines())
+    assert not (tmp_path / "acquire.db").exists()
+
+
+def test_a_port_in_use_is_named_with_its_remedy(acquire, tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        code, out, err = acquire("serve", "--port", port)
+    assert (code, out) == (2, "")
+    assert f"acquire: http://127.0.0.1:{port}: Address already in use" in err
+    assert "choose another port with --port" in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_address_of_another_machine_is_named_with_its_remedy(acquire):
+    code, _, err = acquire("serve", "--host", "192.0.2.1", "--port", 8123)
+    assert code == 2
+    assert "acquire: http://192.0.2.1:8123: Cannot assign requested address" in err
+    assert "--host" in err
 
 
 def test_the_description_is_printed_written_and_checked(acquire, tmp_path):

@@ -81,11 +81,17 @@ def test_a_second_time_nothing_is_new_and_the_table_is_the_same(tmp_path):
     assert rows(third.stdout) != rows(first.stdout)
 
 
+@pytest.mark.parametrize("ignored", [False, True])
 @pytest.mark.parametrize("told", [signal.SIGINT, signal.SIGTERM])
-def test_it_keeps_serving_until_it_is_told_to_stop_and_takes_its_server_with_it(tmp_path, told):
+def test_it_keeps_serving_until_it_is_told_to_stop_and_takes_its_server_with_it(
+    tmp_path, told, ignored
+):
+    """Also where a script has started it with &, and it has come to ignore SIGINT by that."""
     port = free_port()
     command = [sys.executable, "-m", "service.cli", "demo", "--folder", str(tmp_path)]
     command += ["--port", str(port), "--batches", "3"]
+    trap = "trap '' INT" if ignored else "trap - INT"
+    command = ["sh", "-c", f'{trap}; exec "$@"', "sh", *command]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as running:
         assert running.stdout is not None
         told_so_far = []
@@ -100,8 +106,11 @@ def test_it_keeps_serving_until_it_is_told_to_stop_and_takes_its_server_with_it(
         url = f"http://127.0.0.1:{port}"
         assert httpx.get(f"{url}/livez", trust_env=False).status_code == 200
         running.send_signal(told)
-        assert running.stdout.read() == "stopped\n"
-        assert running.wait(30) == 0
+        try:
+            assert running.communicate(timeout=30)[0] == "stopped\n"
+        finally:
+            running.kill()
+        assert running.wait() == 0
     with pytest.raises(httpx.ConnectError):
         httpx.get(f"{url}/livez", trust_env=False)
 

@@ -43,6 +43,7 @@ ASKED = (
     "about",
     "acknowledge",
     "advise",
+    "cancel_replay",
     "change",
     "comment",
     "compare",

@@ -23,6 +23,7 @@ from service.observe.wire import Checked
 from service.operations import Operations
 from service.records.draft import Answered
 from service.records.intake import Asked, Recorded
+from service.records.served import hold_served
 
 THREADS = 72
 """Somewhat more than the front has handlers that may wait for one."""
@@ -47,6 +48,13 @@ def run(line: int, files: int) -> None:
     try:
         operations = Operations.open(first.settings)
     except AcquisitionError as error:
+        channel.send(Refused(error))
+        return
+    try:
+        # Held until this process ends.
+        _held = hold_served(first.settings.database)
+    except AcquisitionError as error:
+        operations.close()
         channel.send(Refused(error))
         return
     channel.send(Opened(operations.missions, operations.started))

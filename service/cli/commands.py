@@ -4,6 +4,7 @@ import dataclasses
 import gc
 import sys
 from argparse import Namespace
+from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 from service import __version__
@@ -33,6 +34,18 @@ def settings_of(parsed: Namespace) -> Settings:
     return dataclasses.replace(Settings.from_environment(), **given)
 
 
+def _settings_of_existing(parsed: Namespace) -> Settings:
+    """`settings_of` a command that needs records; raises `BadConfiguration` where there are none.
+
+    To open a SQLite file that is not there would create it.
+    """
+    from service.records.database import require_records
+
+    settings = settings_of(parsed)
+    require_records(settings.database)
+    return settings
+
+
 def version(parsed: Namespace) -> int:
     """Print the version."""
     print(f"acquire {__version__}")
@@ -45,6 +58,9 @@ def serve(parsed: Namespace) -> int:
     # takes a sixth of the start.  Once it is ready the service looks again.
     gc.disable()
     settings = settings_of(parsed)
+    from service.web.ports import require_free
+
+    require_free(settings.host, settings.port)
     from service.backend.start import start_backend
 
     # It loads its part while this process loads the server.
@@ -70,15 +86,15 @@ def demo(parsed: Namespace) -> int:
 
 def replay(parsed: Namespace) -> int:
     """Send files through the service and print what became of them."""
-    from service.observe.formats import read_lines
+    from service.observe.formats import require_telemetry
     from service.replay.carrying import Carrier
     from service.replay.items import Pace, items_of, run_name
     from service.replay.tally import Tally
 
     run = run_name(parsed.files, parsed.run)
     for file in parsed.files:
-        # A file that is missing or has a bad header is refused before anything is sent.
-        next(iter(read_lines(file)), None)
+        # A file that is missing or is no telemetry is refused before anything is sent.
+        require_telemetry(file)
         if parsed.results is not None and parsed.results.resolve() == file.resolve():
             raise BadInput(Fault("--results", "must not be a file that is replayed", str(file)))
     items, pace = items_of(parsed.files, run), Pace(parsed.speed)
@@ -142,12 +158,14 @@ def advise(parsed: Namespace) -> int:
     from tqdm import tqdm
 
     from service.advice.report import as_text
+    from service.missions.mission import load_missions, mission_named
     from service.observe.wire import tolerances_from_text
     from service.operations import Operations
 
     start, end = _stretch_of(parsed)
     tolerances = tolerances_from_text(parsed.tolerance, "--try")
-    operations = Operations.open(settings_of(parsed))
+    mission_named(load_missions(settings_of(parsed).missions), parsed.spacecraft)
+    operations = Operations.open(_settings_of_existing(parsed))
     try:
         with tqdm(
             total=None, unit=" batches", desc="running again", disable=parsed.quiet or None
@@ -174,9 +192,10 @@ def reprocess(parsed: Namespace) -> int:
     from tqdm import tqdm
 
     from service.cli.compared import comparison_text
-    from service.missions.mission import read_mission
-    from service.operations import Operations
-    from service.records.reprocess import Progress
+    from service.missions.mission import load_missions, mission_named, read_mission
+    from service.operations import Operations, checked_run_name
+    from service.records.reprocess import Progress, require_other_run
+    from service.records.served import unserved
 
     start, end = _stretch_of(parsed)
     mission = None if parsed.mission is None else read_mission(parsed.mission)
@@ -186,8 +205,15 @@ def reprocess(parsed: Namespace) -> int:
         if spacecraft != mission.name:
             message = f"is of {mission.name}, and only batches of {spacecraft} are asked for"
             raise BadInput(Fault("--mission", message, str(parsed.mission)))
-    operations = Operations.open(settings_of(parsed), mission)
-    try:
+    elif spacecraft is not None:
+        mission_named(load_missions(settings_of(parsed).missions), spacecraft)
+    if parsed.run is not None:
+        require_other_run(checked_run_name(parsed.run), parsed.source)
+    settings = _settings_of_existing(parsed)
+    with ExitStack() as held:
+        held.enter_context(unserved(settings.database))
+        operations = Operations.open(settings, mission)
+        held.callback(operations.close)
         with tqdm(
             total=None, unit=" batches", desc="running again", disable=parsed.quiet or None
         ) as bar:
@@ -205,8 +231,6 @@ def reprocess(parsed: Namespace) -> int:
                 processes=parsed.processes or 0,
                 step=step,
             )
-    finally:
-        operations.close()
     for refusal in progress.refusals:
         print(f"refused: {refusal}", file=sys.stderr)
     if parsed.json:
@@ -403,14 +427,14 @@ def token_list(parsed: Namespace) -> int:
     """Print every token."""
     from service.cli.tokens import show
 
-    return show(settings_of(parsed))
+    return show(_settings_of_existing(parsed))
 
 
 def token_revoke(parsed: Namespace) -> int:
     """End a token."""
     from service.cli.tokens import revoke
 
-    return revoke(settings_of(parsed), parsed.name)
+    return revoke(_settings_of_existing(parsed), parsed.name)
 
 
 def database_backup(parsed: Namespace) -> int:
@@ -464,7 +488,7 @@ def database_prune(parsed: Namespace) -> int:
     from service.times import parse_utc
 
     before = parse_utc(parsed.before, "--before")
-    store = Store(settings_of(parsed).database)
+    store = Store(_settings_of_existing(parsed).database)
     try:
         with tqdm(total=None, unit=" batches", desc="deleting", disable=None, leave=False) as bar:
 

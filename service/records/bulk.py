@@ -5,7 +5,7 @@ nobody waits who posts one by one.  The database is this process's own.
 """
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from functools import cached_property
 
 from service.errors import AcquisitionError, Busy
@@ -23,6 +23,9 @@ AHEAD = 2
 
 Check = Callable[[str], None]
 """Raises an `AcquisitionError` where batches of a spacecraft are not to be taken."""
+
+Require = Callable[[], object]
+"""Raises an `AcquisitionError` where no more is to be computed."""
 
 
 def work(bench: Bench, lines: Lines) -> list[Found]:
@@ -68,8 +71,14 @@ class Bulk:
         """Whether batches come one by one as well."""
         return self._intake.idle_s < LATELY_S
 
-    def begin(self, texts: Sequence[bytes], run: str, check: Check) -> "Chunk":
-        """Let a chunk be computed; raises `Busy` where the time has not come."""
+    def begin(
+        self, texts: Sequence[bytes], run: str, check: Check, require: Require = lambda: None
+    ) -> "Chunk":
+        """Let a chunk be computed; raises `Busy` where the time has not come.
+
+        `require` is called before each batch that this process computes itself, and
+        ends that where it raises.
+        """
         self.workers.start()
         self._intake.let_pass()
         named = [named_in(text, run) for text in texts]
@@ -78,19 +87,27 @@ class Bulk:
             ids = {each.result_id for each in registry.identities.values()}
             stored = stored_answers(connection, ids)
         known = frozenset(k for k, each in enumerate(named) if each in registry.identities)
-        return Chunk(self, Lines(run, texts, known), check, registry, stored)
+        return Chunk(self, Lines(run, texts, known), check, require, registry, stored)
 
-    def compute(self, lines: Lines) -> "Future[list[Found]]":
+    def compute(self, lines: Lines, require: Require) -> "Future[list[Found]]":
         """What the lines come to, as soon as a worker has found it out, or at once."""
         if self.workers.up:
             return self.workers.submit(lines)
         done: Future[list[Found]] = Future()
-        done.set_result(self.compute_here(lines))
+        done.set_result(self.compute_here(lines, require))
         return done
 
-    def compute_here(self, lines: Lines) -> list[Found]:
+    def compute_here(self, lines: Lines, require: Require) -> list[Found]:
         """The same in this process, which nobody who posts one by one shall feel."""
-        return found_in(lines, lambda fresh: [self.draft_here(each) for each in fresh])
+
+        def drafts(fresh: Sequence[Submission]) -> list[Draft | AcquisitionError]:
+            made = []
+            for each in fresh:
+                require()
+                made.append(self.draft_here(each))
+            return made
+
+        return found_in(lines, drafts)
 
     def draft_here(self, submission: Submission) -> Draft | AcquisitionError:
         """One of them, when nobody waits."""
@@ -109,17 +126,27 @@ class Chunk:
         bulk: Bulk,
         lines: Lines,
         check: Check,
+        require: Require,
         registry: Registry,
         stored: dict[str, bytes],
     ) -> None:
         self._bulk, self._lines, self._check = bulk, lines, check
+        self._require = require
         self._registry, self._stored = registry, stored
-        self._computed = bulk.compute(lines)
+        self._computed = bulk.compute(lines, require)
+
+    def is_computed(self, within_s: float) -> bool:
+        """Whether it is computed, or comes to be within so many seconds."""
+        return bool(wait([self._computed], within_s).done)
 
     def hand_on(self) -> None:
         """Queue what was computed for the writer; raises `Busy` where it must be called again."""
         drafts = [each for each in self._decided if isinstance(each, Draft)]
         self._finish = self._bulk.begin_writing(drafts)
+
+    def give_up(self) -> None:
+        """Let it not be computed, where that has not begun."""
+        self._computed.cancel()
 
     def answers(self) -> Answers:
         """The answer to each line, or what is wrong with it, when all is recorded."""
@@ -131,7 +158,7 @@ class Chunk:
         try:
             found = self._computed.result()
         except WorkerLost:
-            found = self._bulk.compute_here(self._lines)
+            found = self._bulk.compute_here(self._lines, self._require)
         return [
             self._decision(text, each) for text, each in zip(self._lines.texts, found, strict=True)
         ]

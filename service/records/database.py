@@ -35,15 +35,43 @@ def upgrade(database: str) -> None:
         bring_up_to_date(engine)
 
 
+def require_there(database: str) -> None:
+    """Raise `BadConfiguration` where a SQLite file is missing.
+
+    To open it would create it; a command that reads must not.
+    """
+    url = database_url(database)
+    if url.drivername != "sqlite":
+        return
+    file = Path(url.database or "")
+    if not file.is_file():
+        raise BadConfiguration(f"ACQUIRE_DATABASE: {file}: there is no such file")
+
+
+def require_records(database: str) -> None:
+    """Raise `BadConfiguration` for a SQLite file that is missing or was never the service's.
+
+    What opens a database to write would make the service's tables in it.
+    """
+    require_there(database)
+    url = database_url(database)
+    if url.drivername != "sqlite":
+        return
+    with _disposed(reading_engine(url)) as engine, reported(url), engine.begin() as connection:
+        if _revision(connection) is None:
+            raise BadConfiguration(
+                f"ACQUIRE_DATABASE: {shown_url(url)}: holds no records of this service"
+            )
+
+
 def check(database: str) -> list[str]:
     """How the schema of a database differs from the tables of the code; empty: not at all.
 
     Nothing is written and nothing created: raises `BadConfiguration` where
     there is no database.
     """
+    require_there(database)
     url = database_url(database)
-    if url.drivername == "sqlite" and not Path(url.database or "").is_file():
-        raise BadConfiguration(f"ACQUIRE_DATABASE: {url.database}: there is no such file")
     with _disposed(reading_engine(url)) as engine, reported(url), engine.begin() as connection:
         found = _revision(connection)
         if found != HEAD:

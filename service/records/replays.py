@@ -15,9 +15,12 @@ from sqlalchemy import Connection, insert, select, update
 
 from service.errors import (
     AcquisitionError,
+    BadBatch,
     BadInput,
     Busy,
+    Fault,
     NotFound,
+    NotNow,
     Stopping,
     problem_of,
     shown_value,
@@ -35,26 +38,36 @@ MAX_FAULTS_KEPT = 3
 """Of one line: they are written anew with every chunk that adds to them, and read as a whole."""
 MAX_TEXT_KEPT = 300
 BUSY_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
+MAX_BLANK_LINES = 1_000_000
+"""Of a file.  They hold nothing, and five gigabytes of them pack to five megabytes."""
+STOP_WITHIN_S = 0.2
 PROGRESS_S = 0.2
 """Between two notes of how far a replay is: each is a transaction, and told to all who listen."""
 
+CANCELLED = "cancelled"
 COUNTED = ("new", "repeated", "observed", "unique", "ambiguous", "unmatched", "attitudes")
 """What a replay counts: batches by whether they were recorded before, their stars, attitudes."""
 
 log = logging.getLogger(__name__)
 
-Numbered = tuple[int, bytes]
 T = TypeVar("T")
 
 
 @dataclass
 class _Begun:
-    """A chunk on its way: its last line, and those that hold something, with their numbers."""
+    """A chunk that is being computed or written."""
+
+    lines: "_Lines"
+    chunk: Chunk
+
+
+@dataclass
+class _Lines:
+    """Some lines of a file: the number of the last one, and those that are not blank."""
 
     last: int
     numbers: list[int]
     texts: list[bytes]
-    chunk: Chunk
 
 
 def read_replay(connection: Connection, id: str) -> Row:
@@ -106,6 +119,26 @@ def mark_interrupted(connection: Connection, now: str) -> None:
     )
 
 
+def mark_cancelled(connection: Connection, id: str, now: str) -> None:
+    """Close a running replay of another process, which ends it when it next notes its progress.
+
+    Raises `NotFound`, and `NotNow` for one that has ended.
+    """
+    row = read_replay(connection, id)
+    require_cancellable(row["state"])
+    if row["state"] == "running":
+        ended = {"state": CANCELLED, "finished": now}
+        connection.execute(update(replays).where(replays.c.id == id).values(ended))
+        told = {name: each for name, each in (row | ended).items() if name != "errors"}
+        events.note(connection, "replay", told, run=row["run"])
+
+
+def require_cancellable(state: str) -> None:
+    """Raise `NotNow` for the state of a replay that has ended otherwise."""
+    if state not in ("running", CANCELLED):
+        raise NotNow(f"the replay has ended already, its state is {state}")
+
+
 class _Counted(msgspec.Struct):
     """The part of an answer that is counted."""
 
@@ -126,12 +159,18 @@ class Replay:
         now: Callable[[], str],
         row: Row,
         check: Check,
+        owner: str | None,
+        longest_s: float,
     ) -> None:
+        """`owner` is the token that it was started with; it may take `longest_s` at most."""
         self._store = store
         self._bulk = bulk
         self._now = now
         self._row = row
         self._check = check
+        self.owner = owner
+        self._longest_s = longest_s
+        self._until_s = time.monotonic() + longest_s
         self._counts: Counter[str] = Counter()
         self._errors: list[Row] = []
         self._errors_changed = False
@@ -141,7 +180,14 @@ class Replay:
         self._written: _Begun | None = None
         self._saved_s = 0.0
         self._stopping = threading.Event()
+        self._closing = threading.Event()
+        self._cancelled = False
         self._over = threading.Event()
+
+    @property
+    def id(self) -> str:
+        """Its id."""
+        return str(self._row["id"])
 
     def start(self, lines: Iterable[bytes]) -> None:
         """Note the replay in the table and begin in a thread; `lines` are closed at the end."""
@@ -181,12 +227,29 @@ class Replay:
         return self._over.is_set()
 
     def stop(self) -> None:
-        """Let it end after the chunk at hand."""
+        """Let it end after the chunk that is being written: the service closes."""
+        self._closing.set()
         self._stopping.set()
 
-    def wait(self) -> None:
-        """Return when it is over."""
-        self._over.wait()
+    def cancel(self) -> None:
+        """Let it end after the chunk that is being written: a client asked for that."""
+        self._cancelled = True
+        self._stopping.set()
+
+    def wait(self, longest_s: float | None = None) -> None:
+        """Return when it is over, or after so many seconds."""
+        self._over.wait(longest_s)
+
+    def require_going_on(self) -> None:
+        """Raise `Busy` where the replay is to stop, `BadBatch` where its time is over."""
+        if self._stopping.is_set():
+            raise Busy("the replay is to stop", round(BUSY_PAUSE_S) or 1)
+        if time.monotonic() > self._until_s:
+            message = (
+                f"took longer than {self._longest_s:g} s (ACQUIRE_REPLAY_SECONDS); send it again "
+                "to go on: nothing is recorded twice"
+            )
+            raise BadBatch(Fault("body", message))
 
     def _work(self, lines: Iterable[bytes]) -> None:
         state = "failed"
@@ -196,16 +259,16 @@ class Replay:
             state = "interrupted"
         except BadInput as error:
             # The file itself, from here on: its lines before are recorded.
-            self._refuse(self._row["lines_done"] + 1, error)
+            self._refuse(self._row["lines_done"] + 1, error, ends=True)
         except Exception as error:
             log.exception("replay %s failed", self._row["id"])
-            self._refuse(self._row["lines_done"] + 1, error)
+            self._refuse(self._row["lines_done"] + 1, error, ends=True)
         finally:
             try:
                 close: Callable[[], Any] | None = getattr(lines, "close", None)
                 if close is not None:
                     close()
-                self._conclude(state)
+                self._conclude(CANCELLED if self._cancelled and state == "interrupted" else state)
             finally:
                 self._over.set()
 
@@ -215,7 +278,7 @@ class Replay:
         while True:
             self._save(state=state, finished=self._now())
             self._require_noted()
-            if self._noted or self._stopping.wait(pause_s):
+            if self._noted or self._closing.wait(pause_s):
                 return
             pause_s = min(2.0 * pause_s, LONGEST_PAUSE_S)
 
@@ -223,30 +286,63 @@ class Replay:
         """The state in the end; while a chunk is written, those after it are computed."""
         try:
             try:
-                for chunk in _chunks(enumerate(lines, start=1), lambda: self._bulk.lines):
+                for some in self._chunks(lines):
                     if self._stopping.is_set():
                         return "interrupted"
-                    self._ahead.append(self._begin(chunk))
+                    self._ahead.append(self._begin(some))
                     self._hand_on(self._bulk.ahead)
             finally:
                 # Where the lines break off, those before are recorded all the same.
                 if not self._stopping.is_set():
                     self._hand_on(0)
-            return "done"
+            return "interrupted" if self._ahead else "done"
         finally:
+            for begun in self._ahead:
+                begun.chunk.give_up()
             self._finish(self._written)
 
-    def _begin(self, numbered: list[Numbered]) -> _Begun:
-        some = [(number, line.rstrip(b"\r\n")) for number, line in numbered if line.strip()]
-        numbers, texts = [number for number, _ in some], [text for _, text in some]
-        return _Begun(numbered[-1][0], numbers, texts, self._patiently(self._chunk, texts))
+    def _chunks(self, lines: Iterable[bytes]) -> Iterator[_Lines]:
+        """The lines, so many at a time as are computed together.
+
+        Raises `BadBatch` where there are too many blank ones.
+        """
+        some, read, handed, blank = _Lines(0, [], []), 0, 0, 0
+        try:
+            for line in lines:
+                self.require_going_on()
+                read += 1
+                if line.strip():
+                    some.numbers.append(read)
+                    some.texts.append(line.rstrip(b"\r\n"))
+                else:
+                    blank += 1
+                    if blank > MAX_BLANK_LINES:
+                        message = f"has more than {MAX_BLANK_LINES} blank lines"
+                        raise BadBatch(Fault("body", message))
+                some.last = read
+                if len(some.texts) >= self._bulk.lines:
+                    yield some
+                    some, handed = _Lines(0, [], []), read
+        except BadInput:
+            # Damage and bounds end the file; the lines before it are whole.
+            if some.last > handed:
+                yield some
+            raise
+        if some.last > handed:
+            yield some
+
+    def _begin(self, lines: _Lines) -> _Begun:
+        return _Begun(lines, self._patiently(self._chunk, lines.texts))
 
     def _chunk(self, texts: list[bytes]) -> Chunk:
-        return self._bulk.begin(texts, self._row["run"], self._check)
+        return self._bulk.begin(texts, self._row["run"], self._check, self.require_going_on)
 
     def _hand_on(self, left: int) -> None:
         """Queue chunks for the writer, one after the other, until so many are left."""
         while len(self._ahead) > left:
+            # Others' chunks may come before: a replay that is to stop does not wait for them.
+            while not self._ahead[0].chunk.is_computed(STOP_WITHIN_S):
+                self.require_going_on()
             self._patiently(self._ahead[0].chunk.hand_on)
             before, self._written = self._written, self._ahead.popleft()
             self._finish(before)
@@ -260,13 +356,13 @@ class Replay:
         except Stopping:
             raise
         except Busy:
-            answers = self._again(begun.texts)
-        for number, answer in zip(begun.numbers, answers, strict=True):
+            answers = self._again(begun.lines.texts)
+        for number, answer in zip(begun.lines.numbers, answers, strict=True):
             if isinstance(answer, AcquisitionError):
                 self._refuse(number, answer)
             else:
                 self._count(answer)
-        self._row["lines_done"] = begun.last
+        self._row["lines_done"] = begun.lines.last
         if time.monotonic() - self._saved_s > PROGRESS_S:
             self._save(state="running", finished=None)
             self._saved_s = time.monotonic()
@@ -294,8 +390,8 @@ class Replay:
 
     def _pause(self) -> None:
         """Wait: a replay has time, and whoever posts single batches goes first."""
-        if self._stopping.wait(BUSY_PAUSE_S):
-            raise Busy("the replay is to stop", round(BUSY_PAUSE_S) or 1)
+        self._stopping.wait(BUSY_PAUSE_S)
+        self.require_going_on()
 
     def _count(self, outcome: Answered) -> None:
         answer = _COUNTED.decode(outcome.body)
@@ -306,9 +402,10 @@ class Replay:
     def _state(self) -> Row:
         return replay_state({"finished": None} | self._row)
 
-    def _refuse(self, number: int, error: Exception) -> None:
+    def _refuse(self, number: int, error: Exception, *, ends: bool = False) -> None:
+        """Note what is wrong with a line; what `ends` the replay is kept in any case."""
         self._row["lines_refused"] += 1
-        if len(self._errors) < MAX_ERRORS_KEPT:
+        if len(self._errors) < MAX_ERRORS_KEPT or ends:
             self._errors.append({"line": number, "problem": _kept(problem_of(error))})
             self._errors_changed = True
 
@@ -318,13 +415,19 @@ class Replay:
         values["counts"] = json.dumps(self._counts)
         if self._errors_changed:
             values["errors"] = json.dumps(self._errors)
-        change = update(replays).where(replays.c.id == self._row["id"]).values(values)
         self._row |= values
         # As it is now: it is written while the next chunk is at work.
         state = self._state()
 
+        this = replays.c.id == self.id
+
         def save(connection: Connection) -> None:
-            connection.execute(change)
+            if connection.scalar(select(replays.c.state).where(this)) == CANCELLED:
+                # By another process, or by this one in its last note.
+                self.cancel()
+                values["state"] = state["state"] = CANCELLED
+                values["finished"] = state["finished"] = changed["finished"] or self._now()
+            connection.execute(update(replays).where(this).values(values))
             events.note(connection, "replay", state, run=state["run"])
 
         self._require_noted()
@@ -365,20 +468,3 @@ def _kept(problem: Row) -> Row:
 
 def _cut(text: str) -> str:
     return text if len(text) <= MAX_TEXT_KEPT else text[: MAX_TEXT_KEPT - 1] + "…"
-
-
-def _chunks(lines: Iterator[Numbered], most: Callable[[], int]) -> Iterator[list[Numbered]]:
-    chunk: list[Numbered] = []
-    try:
-        for each in lines:
-            chunk.append(each)
-            if len(chunk) >= most():
-                yield chunk
-                chunk = []
-    except BadInput:
-        # Damage ends the file; the lines before it are whole.
-        if chunk:
-            yield chunk
-        raise
-    if chunk:
-        yield chunk

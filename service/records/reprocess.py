@@ -95,10 +95,15 @@ def reprocess(
     return progress
 
 
-def _require_same_settings(store: Store, plan: Plan, catalog_digest: str) -> None:
-    if plan.run == plan.stretch.run:
+def require_other_run(run: str, source: str | None) -> None:
+    """Raise `BadBatch` for a run that is the source itself."""
+    if run == source:
         message = "must be another run than the one whose batches are run again"
-        raise BadBatch(Fault("run", message, shown_value(plan.run)))
+        raise BadBatch(Fault("run", message, shown_value(run)))
+
+
+def _require_same_settings(store: Store, plan: Plan, catalog_digest: str) -> None:
+    require_other_run(plan.run, plan.stretch.run)
     made_with = select(
         results.c.spacecraft, results.c.mission_digest, results.c.catalog_digest
     ).where(results.c.run == plan.run, results.c.current)

@@ -1,6 +1,7 @@
 """Histories of quantities: thinned out to as many points as can be drawn, no extreme lost."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -19,8 +20,15 @@ from service.records.cells import (
 )
 from service.records.draft import Row
 from service.records.measures import rolled_up
-from service.records.pages import Stretch, newest, newest_first
-from service.records.tables import batches, results
+from service.records.pages import (
+    PLACE,
+    Stretch,
+    newest,
+    newest_first,
+    oldest_first,
+    page_of,
+)
+from service.records.tables import MEASURED, batches, results
 from service.times import DAY_S, HOUR_S, Utc, parse_utc, shifted, unix_seconds, utc_now
 from service.vectors import Vector
 
@@ -29,6 +37,8 @@ Integers = npt.NDArray[np.intp]
 Strategy = Literal["minmax", "latest"]
 Source = Literal["batch", "hour", "day"]
 MAX_SIZE = 1_500
+PAGE = 1_000
+"""Batches that are read together where all of a stretch are given."""
 MAX_HOURS_READ = 1_500
 """Of one answer; a stretch with more is drawn from days at the finest."""
 
@@ -127,9 +137,11 @@ def _thinned(cells: Columns, span: Span, width_s: int, asked: Asked) -> Row:
     _, first = np.unique(number, return_index=True)
     unix_s = number[first] * width_s
     reduced = _Reduced(cells, first, _covered_h(unix_s, width_s, span))
+    counts = reduced.sum("batches").astype(int).tolist()
     return {
+        "thinned": sum(counts) > len(counts),
         "unix_s": unix_s.tolist(),
-        "batches": reduced.sum("batches").astype(int).tolist(),
+        "batches": counts,
         "series": {name: reduced.series(name) for name in asked.quantities},
     }
 
@@ -201,22 +213,56 @@ def _listed(values: Vector) -> list[float | None]:
     return list(values.tolist())
 
 
-_OF_BATCHES = select(results, batches.c.batch, batches.c.time).join_from(
-    results, batches, results.c.batch_id == batches.c.id
-)
+_COUNTED = ("id", "observed", "unique", "ambiguous", "unmatched", "status", *MEASURED)
+_OF_BATCHES = select(
+    *(results.c[name] for name in _COUNTED), *PLACE, batches.c.batch, batches.c.time
+).join_from(results, batches, results.c.batch_id == batches.c.id)
+
+
+def every_batch(
+    reading: Callable[[], AbstractContextManager[Connection]],
+    spacecraft: str,
+    *,
+    run: str,
+    start: Utc | None,
+    end: Utc | None,
+    quantities: Sequence[QuantityName],
+) -> Iterator[Row]:
+    """The batches of a stretch as `history` gives the latest, oldest first, in pages.
+
+    At least one page is given, which may hold none.  Between two pages no
+    connection is held, so that a slow reader keeps none from others.
+    """
+    asked = Asked(quantities, "latest", PAGE)
+    with reading() as connection:
+        span = _span(connection, spacecraft, run, start, end)
+    if span is None:
+        yield _of_batches([], asked)
+        return
+    chosen = Stretch(run, spacecraft, span.start, span.end).conditions()
+    cursor: str | None = None
+    while True:
+        with reading() as connection:
+            page = page_of(connection, oldest_first(_OF_BATCHES.where(*chosen), cursor), PAGE, dict)
+        yield _of_batches(page.items, asked)
+        cursor = page.next_cursor
+        if cursor is None:
+            return
 
 
 def _latest(connection: Connection, span: Span, asked: Asked) -> Row:
     chosen = Stretch(span.run, span.spacecraft, span.start, span.end).conditions()
-    query = newest_first(_OF_BATCHES.where(*chosen)).limit(asked.size)
-    rows = list(connection.execute(query).mappings())[::-1]
-    return _of_batches(rows, asked)
+    # One more than asked for tells whether there are more.
+    query = newest_first(_OF_BATCHES.where(*chosen)).limit(asked.size + 1)
+    rows = list(connection.execute(query).mappings())
+    return _of_batches(rows[: asked.size][::-1], asked) | {"thinned": len(rows) > asked.size}
 
 
 def _of_batches(rows: Sequence[Any], asked: Asked) -> Row:
     return {
         "bucket_s": None,
         "source": "batch",
+        "thinned": False,
         "unix_s": unix_seconds([row["time_ns"] for row in rows]).tolist(),
         **{name: [row[name] for row in rows] for name in ("time", "id", "batch")},
         "series": {
@@ -248,6 +294,7 @@ def _empty(asked: Asked) -> Row:
     return {
         "bucket_s": None,
         "source": "batch",
+        "thinned": False,
         "unix_s": [],
         "batches": [],
         "series": {

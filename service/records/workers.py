@@ -208,6 +208,8 @@ class Workers(Generic[Task, Found]):
                 if self._closing or not self._orders:
                     return self._wanted
                 order = self._orders.popleft()
+            if not order.done.set_running_or_notify_cancel():
+                continue
             try:
                 line.send(order.task)
                 found = [each for some in line.recv() for each in pickle.loads(some)]
@@ -222,7 +224,8 @@ class Workers(Generic[Task, Found]):
             waiting = [*self._orders]
             self._orders.clear()
         for order in waiting:
-            order.done.set_exception(error)
+            if order.done.set_running_or_notify_cancel():
+                order.done.set_exception(error)
 
 
 def _start(process: SpawnProcess) -> None:

@@ -7,6 +7,7 @@ time adds nothing, as with single posts.
 import time
 from array import array
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ ROUTE = "/api/v1/replays"
 NDJSON = {"Content-Type": "application/x-ndjson"}
 TIMEOUT = httpx.Timeout(120.0, connect=5.0)
 PAUSE_S = 0.25
+CANCEL_S = 10.0
 SURE_S = 5.0
 """A process that starts says of every replay that it was interrupted; one that another process is
 still at says otherwise with its next lines."""
@@ -80,7 +82,8 @@ def replay_in_bulk(
     `report` every refused line, those beyond the first thousand without their
     place.  Raises `BadInput`, `NotAdmitted`, `NotAllowed` for what the service
     refuses, `NotFound` where it knows the replay no more, and `Busy` where it
-    does not answer or stopped before the end.
+    does not answer or stopped before the end.  Interrupted, it has the service
+    cancel the replay.
     """
     lines = _Lines(files, report)
     shown = {} if token is None else {"Authorization": f"Bearer {token}"}
@@ -88,7 +91,13 @@ def replay_in_bulk(
         base_url=checked_url(url), timeout=TIMEOUT, trust_env=False, headers=shown
     ) as client:
         begun = _begin(client, url, {"run": run, **(query or {})}, lines)
-        state = _followed(client, url, begun, progress)
+        try:
+            state = _followed(client, url, begun, progress)
+        except KeyboardInterrupt:
+            # A second Ctrl-C, or a service that is gone, must not wait for this.
+            with suppress(httpx.HTTPError):
+                client.delete(begun, timeout=CANCEL_S)
+            raise
     for each in state["errors"]:
         report(Outcome(lines.item(each["line"]), None, problem=each["problem"]))
     if state["state"] != "done":

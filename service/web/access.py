@@ -86,6 +86,8 @@ POLICIES: Mapping[str, Policy] = {
     # Its id can be known only from having started it, or from somebody who may read everything:
     # see `lone_ulid`.
     "get_replay": Policy("read", "nothing", or_scope="submit"),
+    # Of tokens that are bound to spacecraft only the one that started it: see the handler.
+    "cancel_replay": Policy("submit", "nothing", noted=True),
     "watch_run": Policy("submit", noted=True),
     "compare": Policy("read", "body"),
     "list_limits": Policy("read", "path"),

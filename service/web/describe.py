@@ -54,7 +54,7 @@ _PROBLEMS = {
     403: "The token does not cover this: its scopes, its spacecraft.",
     404: "There is no such thing.",
     408: "The body did not arrive in time.",
-    409: "The batch is recorded already, with another body.",
+    409: "The batch is recorded already with another body, or the state does not allow this.",
     413: "The body is too large.",
     415: "The body has another type or coding than this route reads.",
     422: "Something in the request is wrong; `errors` names every field and value.",

@@ -1,6 +1,6 @@
 """What may stand behind the question mark: each parameter checked, unknown ones refused."""
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypedDict
 
 from fastapi import Depends
 from pydantic import (
@@ -58,12 +58,25 @@ class Query(BaseModel):
         return {name: getattr(self, name) for name in type(self).model_fields}
 
 
+class Where(TypedDict):
+    """A run and the times of a stretch."""
+
+    run: str
+    start: Utc | None
+    end: Utc | None
+
+
 class Stretch(Query):
     """A stretch of time and a run."""
 
     run: Annotated[RunName, Field(description="The run; `live` is what pipelines send.")] = "live"
     start: Start = None
     end: End = None
+
+    @property
+    def stretch(self) -> Where:
+        """Its run and times by their names, as the operations take them."""
+        return {"run": self.run, "start": self.start, "end": self.end}
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
@@ -123,14 +136,28 @@ class HistoryQuery(Stretch):
         Field(description="One or, repeated, several; without any, all that have a history."),
     ] = []
     strategy: Annotated[
-        Strategy,
+        Strategy | None,
         Field(
             description="`minmax`: buckets with mean, least and greatest of a batch; "
-            "`latest`: the newest batches one by one."
+            "`latest`: the newest batches one by one. Unless given it is `minmax`, but `latest` "
+            "in a CSV without `size`."
         ),
-    ] = "minmax"
-    size: Annotated[int, Field(ge=1, le=MAX_SIZE, description="The most points.")] = 500
+    ] = None
+    size: Annotated[
+        int | None,
+        Field(
+            ge=1,
+            le=MAX_SIZE,
+            description="The most points: 500 unless given, but every batch of the stretch in a "
+            "CSV of single batches.",
+        ),
+    ] = None
     format: Annotated[Literal["json", "csv"], Field(description="Columns, or a table.")] = "json"
+
+    @property
+    def of_every_batch(self) -> bool:
+        """Whether a table of all batches of the stretch is asked for."""
+        return self.format == "csv" and self.size is None and self.strategy != "minmax"
 
     @field_validator("quantity")
     @classmethod

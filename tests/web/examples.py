@@ -4,6 +4,7 @@ They are written to `service/web/examples.json`; `make openapi` then puts them
 into `openapi.yaml`.
 """
 
+import gzip
 import json
 import tempfile
 import time
@@ -122,6 +123,14 @@ def walk(client: httpx.Client, operations: Operations) -> Json:
     take("watch_run", client.put(f"{API}/runs/pass-7", json=asked), "watched", asked)
 
     take("list_audit", client.get(f"{API}/audit"), "two_changes")
+    take("cancel_replay", client.delete(begun.headers["Location"]), "ended_already")
+    # The same batch again and again: it is cancelled long before its end.
+    content = gzip.compress(f"{json.dumps(xte)}\n".encode() * 100_000)
+    packed = headers | {"Content-Encoding": "gzip"}
+    begun = client.post(f"{API}/replays?run=pass-8", content=content, headers=packed)
+    while not client.get(begun.headers["Location"]).json()["counts"]["repeated"]:
+        time.sleep(0.05)
+    take("cancel_replay", client.delete(begun.headers["Location"]), "cancelled")
     take("session", client.get(f"{API}/session"), "open_access")
     _sign_in(client, operations, take)
     return found

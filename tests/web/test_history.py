@@ -2,8 +2,12 @@
 
 import csv
 import io
+import json
+import time
 
 import pytest
+
+from service.times import parse_utc, shifted
 
 ROUTE = "/api/v1/spacecraft/XTE/history"
 
@@ -39,6 +43,60 @@ def test_the_latest_batches_as_csv_have_a_row_each(client, full_run):
     for row, each in zip(rows, latest["items"][:7][::-1], strict=True):
         counts = each["counts"]
         assert float(row["ambiguous_share"]) == counts["ambiguous"] / counts["observed"]
+
+
+@pytest.fixture(scope="module")
+def day(client, drawn):
+    """A run with a day of XTE, a batch every thirty seconds: 2,880 of them."""
+    (first,) = drawn("XTE", 1, seed=6)
+    start = parse_utc("1999-03-01T00:00:00Z")
+    lines = [
+        first | {"batch": f"day-{index:04}", "time": shifted(start, 30.0 * index).text}
+        for index in range(2880)
+    ]
+    content = "\n".join(json.dumps(each) for each in lines)
+    headers = {"Content-Type": "application/x-ndjson"}
+    begun = client.post("/api/v1/replays?run=whole-day", content=content, headers=headers)
+    give_up = time.monotonic() + 300
+    while (state := client.get(begun.headers["Location"]).json())["state"] == "running":
+        assert time.monotonic() < give_up
+        time.sleep(0.1)
+    assert state["counts"]["new"] == 2880
+    return "whole-day"
+
+
+@pytest.mark.parametrize("asked", [{}, {"strategy": "latest"}])
+def test_a_csv_has_every_batch_of_the_stretch(client, day, asked):
+    answer = client.get(ROUTE, params={"run": day, "format": "csv"} | asked)
+    rows = list(csv.DictReader(io.StringIO(answer.text)))
+    assert [row["batch"] for row in rows] == [f"day-{index:04}" for index in range(2880)]
+    assert all(row["unmatched_share"] for row in rows)
+    assert answer.headers["thinned"] == "false"
+    part = {"start": "1999-03-01T01:00:00Z", "end": "1999-03-01T20:00:00Z"}
+    answer = client.get(ROUTE, params={"run": day, "format": "csv"} | asked | part)
+    rows = list(csv.DictReader(io.StringIO(answer.text)))
+    assert [row["batch"] for row in rows] == [f"day-{index:04}" for index in range(120, 2400)]
+
+
+@pytest.mark.parametrize("strategy", ["latest", "minmax"])
+def test_what_is_thinned_says_so_and_what_is_not_says_that(client, day, strategy):
+    asked = {"run": day, "strategy": strategy, "size": 1500}
+    assert client.get(ROUTE, params=asked).json()["thinned"] is True
+    answer = client.get(ROUTE, params=asked | {"format": "csv"})
+    assert answer.headers["thinned"] == "true"
+    assert len(list(csv.DictReader(io.StringIO(answer.text)))) <= 1500
+    hour = asked | {"start": "1999-03-01T01:00:00Z", "end": "1999-03-01T02:00:00Z"}
+    assert client.get(ROUTE, params=hour).json()["thinned"] is False
+    answer = client.get(ROUTE, params=hour | {"format": "csv"})
+    assert answer.headers["thinned"] == "false"
+    assert len(list(csv.DictReader(io.StringIO(answer.text)))) == 120
+
+
+def test_a_csv_of_no_batches_has_its_header(client, run):
+    answer = client.get(ROUTE, params={"run": run, "format": "csv"})
+    assert answer.status_code == 200
+    assert answer.text.startswith("time,batch,id,")
+    assert answer.text.count("\r\n") == 1
 
 
 def test_the_worst_batches_lead_to_their_batch(client, full_run):

@@ -34,6 +34,7 @@ STATES: Mapping[str, tuple[str, str]] = {
     "running": ("▸", "running"),
     "done": ("●", "done"),
     "interrupted": ("‖", "interrupted"),
+    "cancelled": ("‖", "cancelled"),
     "failed": ("✕", "failed"),
 }
 """Shape and word of every state there is."""

@@ -115,6 +115,7 @@ def start_replay(
         longest_bytes=MAX_JSON_BYTES,
         check=caller.require,
         alarms=sent.alarms,
+        owner=caller.token_id,
     )
     location = {"Location": f"/api/v1/replays/{id}"}
     return json_response(operations.replay(id), 202, location)
@@ -128,3 +129,20 @@ def start_replay(
 def get_replay(id: ReplayId, operations: Held) -> Response:
     """A replay and how far it is."""
     return json_response(operations.replay(id))
+
+
+@router.delete(
+    "/replays/{id}",
+    dependencies=[NO_QUERY],
+    **described(
+        {
+            200: Gives("The replay, which is cancelled.", ReplayState),
+            202: Gives("The replay, which ends as soon as it can.", ReplayState),
+        },
+        problems=(404, 409, 503),
+    ),
+)
+def cancel_replay(id: ReplayId, operations: Held, caller: Asking) -> Response:
+    """End a replay before its end; the batches that it recorded stay."""
+    state = operations.cancel_replay(id, caller)
+    return json_response(state, 202 if state["state"] == "running" else 200)

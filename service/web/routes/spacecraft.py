@@ -18,9 +18,11 @@ from service.web.schemas.spacecraft import (
     SpacecraftState,
 )
 from service.web.schemas.trends import History, WorstList
-from service.web.tables import CSV, history_csv
+from service.web.tables import CSV, THINNED, batches_csv, history_csv, thinned
 
 router = APIRouter(prefix="/api/v1/spacecraft", tags=["spacecraft"])
+
+DEFAULT_SIZE = 500
 
 Name = Annotated[str, Path(description="The spacecraft's name, such as `XTE`.")]
 
@@ -66,18 +68,31 @@ def list_rates(name: Name, query: Annotated[RatesQuery, InQuery()], operations: 
 @router.get(
     "/{name}/history",
     **described(
-        {200: Gives("The history; as CSV where that was asked for.", History, also=CSV)},
+        {200: Gives("The history; as CSV where that was asked for.", History, THINNED, also=CSV)},
         problems=(404,),
     ),
 )
 def get_history(
     name: Name, query: Annotated[HistoryQuery, InQuery()], operations: Held
 ) -> Response:
-    """How quantities went over a stretch of time, thinned out to as many points as can be drawn."""
-    asked = query.asked()
-    as_csv = asked.pop("format") == "csv"
-    history = operations.history(name, quantities=asked.pop("quantity"), **asked)
-    return history_csv(history) if as_csv else json_response(history)
+    """How quantities went over a stretch of time.
+
+    Thinned out to as many points as can be drawn, or as a table of every batch.
+    """
+    where = query.stretch
+    if query.of_every_batch:
+        pages = operations.every_batch(name, quantities=query.quantity, **where)
+        return batches_csv(name, query.run, pages)
+    history = operations.history(
+        name,
+        quantities=query.quantity,
+        strategy=query.strategy or "minmax",
+        size=query.size or DEFAULT_SIZE,
+        **where,
+    )
+    if query.format == "csv":
+        return history_csv(history)
+    return json_response(history, headers=thinned(history["thinned"]))
 
 
 @router.get(

@@ -65,10 +65,12 @@ class ReplayState(Shape):
     id: Id
     run: str
     name: str
-    state: Literal["running", "done", "interrupted", "failed"]
+    state: Literal["running", "done", "interrupted", "failed", "cancelled"]
     lines: ReplayLines
     counts: ReplayCounts
-    errors: list[RefusedLine] = Field(description="The first thousand.")
+    errors: list[RefusedLine] = Field(
+        description="The first thousand, then what ended a replay that failed."
+    )
     started: Moment
     finished: Moment | None
 

@@ -34,6 +34,7 @@ class History(Shape):
     source: Literal["batch", "hour", "day"] = Field(
         description="What it was read from; both ends are exact in any case."
     )
+    thinned: bool = Field(description="Whether the stretch has more batches than there are points.")
     unix_s: list[float] = Field(
         description="POSIX time at which each bucket begins, or of each batch. Buckets without "
         "a batch are left out."

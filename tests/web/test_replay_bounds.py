@@ -1,0 +1,368 @@
+"""What a small body that holds much may cost, and replays that are cancelled."""
+
+import gzip
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import httpx
+import pytest
+import zstandard
+
+from service.operations import Operations
+from service.settings import Settings
+from service.web.app import create_app
+from tests.web.browser import CHROMIUM, Browser
+from tests.web.serving import Server, served
+from tests.web.test_access import Guarded, shown
+
+API = "/api/v1"
+NDJSON = {"Content-Type": "application/x-ndjson"}
+
+
+PACKERS = {"gzip": gzip.compress, "zstd": zstandard.compress}
+
+
+def begun(client, run, data, coding="identity", **headers):
+    headers = NDJSON | {"Content-Encoding": coding} | headers
+    answer = client.post(f"{API}/replays?run={run}", content=data, headers=headers)
+    assert answer.status_code == 202, answer.text
+    return answer.headers["Location"]
+
+
+def followed(client, place, patience_s=120, **more):
+    give_up = time.monotonic() + patience_s
+    while (state := client.get(place, **more).json())["state"] == "running":
+        assert time.monotonic() < give_up, state
+        time.sleep(0.02)
+    return state
+
+
+# ---- bounds ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("coding", PACKERS)
+def test_newlines_without_end_are_refused_and_leave_room_for_other_replays(
+    client, batch, run, coding
+):
+    """Eight bodies of 5 GiB of newlines each, and a good file after them."""
+    data = PACKERS[coding](b"\n" * (64 << 20)) * 80
+    assert len(data) < 6 << 20
+    places = [begun(client, run, data, coding) for _ in range(8)]
+    for place in places:
+        state = followed(client, place)
+        assert state["state"] == "failed"
+        (error,) = state["errors"]
+        assert "has more than 1000000 blank lines" in error["problem"]["detail"]
+        assert error["line"] == 1_000_001
+    good = followed(client, begun(client, run, json.dumps(batch).encode()))
+    assert (good["state"], good["counts"]["new"]) == ("done", 1)
+
+
+def test_blank_lines_are_bounded_where_nothing_is_packed_too(client, batch, run):
+    line = json.dumps(batch).encode() + b"\n"
+    state = followed(client, begun(client, run, line + b"\n" * 1_000_001))
+    assert (state["state"], state["counts"]["new"]) == ("failed", 1)
+    assert "blank lines" in state["errors"][0]["problem"]["detail"]
+
+
+def test_blank_lines_between_batches_and_at_the_end_are_passed_over(client, batch, run):
+    lines = b"\n\r\n  \n".join(
+        json.dumps(batch | {"batch": f"{run}-{index}"}).encode() + b"\n" for index in range(5)
+    )
+    state = followed(client, begun(client, run, lines + b"\n" * 1000))
+    assert (state["state"], state["counts"]["new"]) == ("done", 5)
+    assert state["lines"]["done"] == state["lines"]["total"] == 5 + 4 * 3 + 1000
+
+
+@pytest.mark.parametrize("coding", PACKERS)
+def test_a_body_that_unpacks_to_too_much_of_its_size_says_which_bound_and_what_size(
+    client, batch, run, coding
+):
+    """2 GiB of spaces behind a good line; several members or frames change nothing."""
+    pack = PACKERS[coding]
+    data = pack(json.dumps(batch).encode() + b"\n") + pack(b" " * (64 << 20)) * 32
+    state = followed(client, begun(client, run, data, coding))
+    assert (state["state"], state["counts"]["new"]) == ("failed", 1)
+    detail = state["errors"][-1]["problem"]["detail"]
+    allowed = max(256 << 20, 200 * len(data))
+    assert f"unpacks to more than {allowed} bytes" in detail
+    assert "200 times its size" in detail
+    assert f"{len(data)} bytes" in detail
+
+
+@pytest.mark.parametrize("coding", PACKERS)
+def test_telemetry_that_packs_to_a_hundredth_is_taken(client, batch, run, coding, figures):
+    """The same five stars in every batch, in several members or frames."""
+    pack = PACKERS[coding]
+    lines = [
+        json.dumps(batch | {"batch": f"{run}-{index:05}"}).encode() + b"\n" for index in range(600)
+    ]
+    again = 3
+    data = b"".join(pack(b"".join(lines[first : first + 200])) for first in (0, 200, 400)) * again
+    figures(ratio=round(again * sum(map(len, lines)) / len(data)))
+    state = followed(client, begun(client, run, data, coding))
+    assert (state["state"], state["lines"]["refused"]) == ("done", 0)
+    assert (state["counts"]["new"], state["counts"]["repeated"]) == (600, 600 * (again - 1))
+
+
+@pytest.fixture(scope="module")
+def hurried(chosen_database):
+    """A service whose replays may take a second."""
+    settings = Settings(database=chosen_database(), replay_seconds=1, replay_processes=0)
+    with (
+        Server(create_app(Operations.open(settings))) as url,
+        httpx.Client(base_url=url, timeout=60) as client,
+    ):
+        yield client
+
+
+def bad_lines():
+    return gzip.compress(b"{\n" * (5 << 20)) * 10
+
+
+def empty_members():
+    return gzip.compress(b"") * 2_000_000
+
+
+def empty_frames():
+    return zstandard.compress(b"") * 4_000_000
+
+
+@pytest.mark.parametrize(
+    ("coding", "made"),
+    [("gzip", bad_lines), ("gzip", empty_members), ("zstd", empty_frames)],
+)
+def test_a_replay_that_takes_too_long_ends_and_names_the_setting(hurried, coding, made):
+    state = followed(hurried, begun(hurried, "long", made(), coding), patience_s=30)
+    assert state["state"] == "failed"
+    detail = state["errors"][-1]["problem"]["detail"]
+    assert "took longer than 1 s (ACQUIRE_REPLAY_SECONDS)" in detail
+
+
+# ---- cancelling --------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def running(client, batch, run):
+    """The address of a replay that has recorded something and would go on for long."""
+    place = begun(client, run, many(batch, run))
+    wait_for_records(client, place)
+    yield place
+    client.delete(place)
+
+
+def many(batch, run, count=20_000):
+    return b"".join(
+        json.dumps(batch | {"batch": f"{run}-{index}"}).encode() + b"\n" for index in range(count)
+    )
+
+
+def wait_for_records(client, place, **more):
+    give_up = time.monotonic() + 60
+    while not (state := client.get(place, **more).json())["counts"]["new"]:
+        assert state["state"] == "running"
+        assert time.monotonic() < give_up
+        time.sleep(0.02)
+
+
+def test_a_cancelled_replay_ends_within_two_seconds_and_keeps_what_it_recorded(
+    client, running, run
+):
+    started = time.monotonic()
+    answer = client.delete(running)
+    assert time.monotonic() - started < 2.0
+    assert (answer.status_code, answer.json()["state"]) == (200, "cancelled")
+    state = client.get(running).json()
+    assert state == answer.json()
+    assert state["finished"] is not None
+    assert 0 < state["lines"]["done"] < state["lines"]["total"]
+    assert state["counts"]["new"] == state["lines"]["done"]
+    (row,) = [each for each in client.get(f"{API}/runs").json()["items"] if each["run"] == run]
+    assert row["batches"] == state["counts"]["new"]
+    # Again is no error, and changes nothing.
+    again = client.delete(running)
+    assert (again.status_code, again.json()) == (200, state)
+
+
+def test_what_listens_for_events_is_told_of_a_cancelled_replay(client, address, running, run):
+    with httpx.stream("GET", f"{address}{API}/events?run={run}", timeout=30) as told:
+        lines = told.iter_lines()
+        assert client.delete(running).status_code == 200
+        for line in lines:
+            if line.startswith("data: ") and running.rpartition("/")[2] in line:
+                data = json.loads(line.removeprefix("data: "))
+                if data["state"] != "running":
+                    break
+    assert data["state"] == "cancelled"
+
+
+def test_a_replay_that_has_ended_cannot_be_cancelled_nor_one_that_is_not_there(client, batch, run):
+    place = begun(client, run, json.dumps(batch).encode())
+    followed(client, place)
+    answer = client.delete(place)
+    assert answer.status_code == 409
+    assert "its state is done" in answer.json()["detail"]
+    assert client.get(place).json()["state"] == "done"
+    assert client.delete(f"{API}/replays/01JD0000000000000000000000").status_code == 404
+    assert client.delete(f"{API}/replays/none").status_code == 404
+
+
+@pytest.mark.parametrize(
+    ("coding", "made"),
+    [("gzip", bad_lines), ("gzip", empty_members), ("zstd", empty_frames)],
+)
+def test_cancelling_frees_the_place_of_a_replay_whatever_it_is_at(client, run, coding, made):
+    data = made()
+    headers = NDJSON | {"Content-Encoding": coding}
+    places = []
+    try:
+        places += [begun(client, run, data, coding) for _ in range(8)]
+        full = client.post(f"{API}/replays?run={run}", content=data, headers=headers)
+        assert full.status_code == 503
+        assert client.delete(places[0]).status_code == 200
+        places.append(begun(client, run, data, coding))
+    finally:
+        states = [client.delete(each).json()["state"] for each in places]
+    assert states == ["cancelled"] * 9
+
+
+@pytest.fixture(scope="module")
+def guarded(chosen_database):
+    service = Guarded(chosen_database())
+    of_swas = {"spacecraft": ["SWAS"]}
+    service.tokens = {
+        "theirs": service.token("theirs", "submit", **of_swas),
+        "another": service.token("another", "submit", "read", "operate", **of_swas),
+        "all": service.token("all", "submit"),
+        "reader": service.token("reader", "read"),
+        "operator": service.token("operator", "read", "submit", "operate"),
+    }
+    app = create_app(service.operations)
+    with Server(app) as url, httpx.Client(base_url=url, timeout=60) as service.client:
+        yield service
+
+
+def test_a_bound_token_cancels_its_own_replays_only_and_it_is_noted(guarded, drawn):
+    client, tokens = guarded.client, guarded.tokens
+    batch = drawn("SWAS", 1)[0]
+
+    def begin(token, run):
+        place = begun(client, run, many(batch, run), **shown(tokens[token]))
+        wait_for_records(client, place, headers=shown(tokens[token]))
+        return place
+
+    def cancelled(token, place):
+        return client.delete(place, headers=shown(tokens[token])).status_code
+
+    one, two = begin("theirs", "one"), begin("all", "two")
+    assert cancelled("another", one) == 404
+    assert cancelled("theirs", two) == 404
+    assert cancelled("reader", one) == 403
+    assert client.delete(one).status_code == 401
+    for place in (one, two):
+        assert client.get(place, headers=shown(tokens["all"])).json()["state"] == "running"
+    assert cancelled("theirs", one) == 200
+    assert cancelled("operator", two) == 200
+    noted = client.get(f"{API}/audit", headers=shown(tokens["operator"])).json()["items"]
+    told = {
+        (each["who"], each["about"], each["status"])
+        for each in noted
+        if each["action"] == "cancel_replay"
+    }
+    assert ("theirs", one, 200) in told
+    assert ("operator", two, 200) in told
+
+
+def test_a_replay_of_another_process_is_cancelled_through_the_database(chosen_database, drawn):
+    database = chosen_database()
+    settings = Settings(database=database, replay_processes=0)
+    batch = drawn("XTE", 1)[0]
+    with (
+        Server(create_app(Operations.open(settings))) as one,
+        Server(create_app(Operations.open(settings))) as other,
+        httpx.Client(base_url=one, timeout=60) as client,
+        httpx.Client(base_url=other, timeout=60) as elsewhere,
+    ):
+        place = begun(client, "r", many(batch, "r"))
+        wait_for_records(client, place)
+        answer = elsewhere.delete(place)
+        assert (answer.status_code, answer.json()["state"]) == (200, "cancelled")
+        # The process that works on it ends it with its next note, which has the last counts.
+        give_up = time.monotonic() + 10
+        done = -1
+        while (now := client.get(place).json()["lines"]["done"]) != done:
+            assert time.monotonic() < give_up
+            done = now
+            time.sleep(1.0)
+        (row,) = client.get(f"{API}/runs").json()["items"]
+        state = client.get(place).json()
+        assert row["batches"] == state["counts"]["new"] < 20_000
+        assert state["state"] == "cancelled"
+
+
+def test_an_interrupted_command_cancels_its_replay_on_the_server(client, batch, run, tmp_path):
+    file = tmp_path / "long.ndjson"
+    file.write_bytes(many(batch, run))
+    command = [sys.executable, "-m", "service.cli", "replay", str(file), "--run", run]
+    command += ["--url", str(client.base_url)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    with process:
+        give_up = time.monotonic() + 60
+        while not (mine := [each for each in replays(client) if each["run"] == run]):
+            assert process.poll() is None
+            assert time.monotonic() < give_up
+            time.sleep(0.05)
+        place = f"{API}/replays/{mine[0]['id']}"
+        wait_for_records(client, place)
+        process.send_signal(signal.SIGINT)
+        _, complaint = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert "interrupted" in complaint
+    assert client.get(place).json()["state"] == "cancelled"
+
+
+def replays(client):
+    return client.get(f"{API}/replays").json()["items"]
+
+
+def test_a_service_in_two_processes_cancels_too(chosen_database, drawn):
+    with (
+        served(chosen_database()) as (_, url),
+        httpx.Client(base_url=url, timeout=60) as client,
+    ):
+        place = begun(client, "r", many(drawn("XTE", 1)[0], "r"))
+        wait_for_records(client, place)
+        answer = client.delete(place)
+        assert (answer.status_code, answer.json()["state"]) == (200, "cancelled")
+        assert client.delete(f"{API}/replays/01JD0000000000000000000000").status_code == 404
+        # Its place is free, and so are the processes that compute.
+        batch = drawn("XTE", 2)[1]
+        state = followed(client, begun(client, "s", json.dumps(batch).encode()))
+        assert (state["state"], state["counts"]["new"]) == ("done", 1)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
+def test_the_page_of_a_running_replay_has_a_button_that_cancels_it(
+    client, address, running, tmp_path
+):
+    page = f"{address}{running.removeprefix('/api/v1')}"
+    button = "document.querySelector('[data-cancel]')"
+    with Browser(tmp_path) as browser:
+        browser.open(page)
+        browser.wait(lambda: browser.run(f"{button} !== null"))
+        browser.run(f"{button}.click()")
+        browser.wait(lambda: browser.run("document.getElementById('told').innerText") != "Working…")
+        assert browser.run("document.getElementById('told').innerText") == "Cancelled."
+        browser.wait(lambda: browser.run(f"{button} === null"))
+        assert "cancelled" in browser.run("document.getElementById('replay').innerText")
+        assert browser.complaints == []
+    assert client.get(running).json()["state"] == "cancelled"
+
+
+def test_the_page_of_a_replay_that_has_ended_has_no_such_button(client, batch, run):
+    place = begun(client, run, json.dumps(batch).encode())
+    followed(client, place)
+    assert "data-cancel" not in client.get(place.removeprefix("/api/v1")).text
