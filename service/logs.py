@@ -70,6 +70,13 @@ def configure(settings: LogSettings, process: str, stream: TextIO | None = None)
     logging.getLogger("uvicorn").setLevel(max(level, logging.INFO))
 
 
+def finish() -> None:
+    """Write what is counted by now: a process that a signal ends does not come to close its log."""
+    for handler in logging.getLogger().handlers:
+        if isinstance(handler, CountingHandler):
+            handler.write_counts()
+
+
 class CountingHandler(logging.StreamHandler[TextIO]):
     """Writes a warning or an error once, counts its repetitions, and writes their number.
 
@@ -133,23 +140,27 @@ class CountingHandler(logging.StreamHandler[TextIO]):
         told = logging.LogRecord(
             last.name, last.levelno, last.pathname, last.lineno, message, None, None
         )
-        told.repeated = known.count
         # Of many requests, not of the one that this thread happens to work on.
-        told.about = None
+        vars(told).update(repeated=known.count, about=None)
         super().emit(told)
 
-    def close(self) -> None:
-        """Write what is counted by now."""
+    def write_counts(self) -> None:
+        """Write what is counted by now, and count anew."""
         self.acquire()
         try:
             if self._timer is not None:
                 self._timer.cancel()
+                self._timer = None
             for known in self._counted.values():
                 if known.count:
                     self._write_count(known)
             self._counted.clear()
         finally:
             self.release()
+
+    def close(self) -> None:
+        """Write what is counted, and no more."""
+        self.write_counts()
         super().close()
 
 
@@ -169,9 +180,9 @@ def _kind(record: logging.LogRecord) -> object:
         if isinstance(each, BaseException)
     )
     raised: tuple[object, ...] = ()
-    if record.exc_info and record.exc_info[0] is not None:
+    if record.exc_info and (kind := record.exc_info[0]) is not None:
         frames = traceback.extract_tb(record.exc_info[2], limit=-1)
-        raised = record.exc_info[0].__name__, *((each.filename, each.lineno) for each in frames)
+        raised = kind.__name__, *((each.filename, each.lineno) for each in frames)
     return record.name, record.levelno, str(record.msg), errors, raised
 
 

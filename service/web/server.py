@@ -10,6 +10,7 @@ from contextlib import suppress
 import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
+from service import logs
 from service.backend.front import Front
 from service.backend.start import Started, start_backend
 from service.errors import BadConfiguration
@@ -179,6 +180,7 @@ class Server(uvicorn.Server):
         """End the streams, then everything else."""
         self._stop_streams()
         await super().shutdown(sockets)
+        logs.finish()
 
 
 def _connections() -> int:
