@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from service.errors import BadConfiguration, shown_value
+from service.logs import FORMATS, LEVELS, LogSettings
 
 PREFIX = "ACQUIRE_"
 MOST_USEFUL_PROCESSES = 4
@@ -28,7 +29,8 @@ class Settings:
     commands show that talk to a running service.  `frame_mb` and `frame_megapixels`
     bound a frame's file and what it unfolds into.  `replay_processes` is how
     many processes beside this one compute replays; 0: this one does.  A replay
-    ends after `replay_seconds`, wherever it is.
+    ends after `replay_seconds`, wherever it is.  `log_format` and `log_level` are
+    of `service.logs`.
     """
 
     database: str = "sqlite:///acquire.db"
@@ -42,6 +44,8 @@ class Settings:
     frame_megapixels: int = 20
     replay_processes: int = min(os.cpu_count() or 1, MOST_USEFUL_PROCESSES)
     replay_seconds: int = 6 * 3600
+    log_format: str = "text"
+    log_level: str = "info"
 
     def __post_init__(self) -> None:
         if not self.database.strip():
@@ -55,10 +59,18 @@ class Settings:
             raise _refusal("replay_processes", "must be from 0 to 64", self.replay_processes)
         if not 1 <= self.replay_seconds <= 30 * 86_400:
             raise _refusal("replay_seconds", "must be from 1 to 2592000", self.replay_seconds)
+        for name, known in (("log_format", FORMATS), ("log_level", LEVELS)):
+            if getattr(self, name) not in known:
+                raise _refusal(name, f"must be {' or '.join(known)}", getattr(self, name))
         if not 0 <= self.port <= 65535:
             raise _refusal("port", "must be from 0 to 65535", self.port)
         if not _HOST.fullmatch(self.host):
             raise _refusal("host", "must be an address or a name, such as 127.0.0.1", self.host)
+
+    @property
+    def logs(self) -> LogSettings:
+        """How the service's processes write their logs."""
+        return LogSettings(self.log_format, self.log_level)
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str] = os.environ) -> "Settings":

@@ -13,7 +13,7 @@ import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import UTC, date, datetime, timedelta
+from datetime import MAXYEAR, MINYEAR, UTC, date, datetime, timedelta
 from functools import cache, lru_cache
 from typing import Any, Generic, TypeVar
 
@@ -195,7 +195,7 @@ def shifted(moment: Utc, seconds: float) -> Utc:
     """
     tai1, tai2, _ = ufunc.utctai(moment.jd1, moment.jd2)
     jd1, jd2, _ = ufunc.taiutc(tai1, tai2 + seconds / DAY_S)
-    return parse_utc(Utc(float(jd1), float(jd2)).text)
+    return recorded_utc(Utc(float(jd1), float(jd2)).text)
 
 
 def parse_utc(text: object, field: str = "time") -> Utc:
@@ -207,21 +207,29 @@ def parse_utc(text: object, field: str = "time") -> Utc:
     try:
         if not isinstance(text, str):
             raise ValueError(f"must be {_FORMS}")
-        return _read(text)
+        return _read(text, FIRST_YEAR, LAST_YEAR)
     except ValueError as error:
         raise BadInput(Fault(field, str(error), shown_value(text))) from None
 
 
+def recorded_utc(text: str) -> Utc:
+    """Read UTC text that the service itself wrote, whatever the year.
+
+    A machine's clock may have been years off when a record was made.
+    """
+    return _read(text, MINYEAR, MAXYEAR)
+
+
 @lru_cache(maxsize=4096)
-def _read(text: str) -> Utc:
+def _read(text: str, first_year: int, last_year: int) -> Utc:
     """The moment of a text, which one batch asks for again and again; raises `ValueError`."""
     match = _TEXT.fullmatch(text)
     if match is None:
         raise ValueError(f"must be {_FORMS}")
     years, months, days, days_of_year, hours, minutes, seconds, fraction = match.groups("")
     year, hour, minute, second = int(years), int(hours), int(minutes), int(seconds)
-    if not FIRST_YEAR <= year <= LAST_YEAR:
-        raise ValueError(f"the year must be from {FIRST_YEAR} to {LAST_YEAR}")
+    if not first_year <= year <= last_year:
+        raise ValueError(f"the year must be from {first_year} to {last_year}")
     if hour > 23 or minute > 59 or second > 60:
         raise ValueError("there is no such time of day")
     try:

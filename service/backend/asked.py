@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from service.errors import AcquisitionError
+from service.logs import About
 from service.missions.mission import Mission
 from service.records.tokens import Caller
 from service.settings import Settings
@@ -47,12 +48,16 @@ class Takes:
 
 @dataclass(frozen=True)
 class Call:
-    """A method of the operations is to be called; files among what it is given are `Handed`."""
+    """A method of the operations is to be called; files among what it is given are `Handed`.
+
+    `request` is the request that it is called for, as logs name it.
+    """
 
     number: int
     method: str
     given: tuple[Any, ...]
     named: Mapping[str, Any]
+    request: About | None = None
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from contextlib import ExitStack, suppress
 from functools import partial, wraps
 from typing import Any
 
+from service import logs
 from service.backend.asked import (
     Call,
     Close,
@@ -172,6 +173,7 @@ class Front(Operations):
             method,
             tuple(self._handed(each) for each in given),
             {name: self._handed(each) for name, each in named.items()},
+            logs.request.get(),
         )
         self._loop.call_soon_threadsafe(self._send_call, number, packed(call), done)
         return done.result()

@@ -16,6 +16,7 @@ from typing import Any
 
 from msgspec import structs
 
+from service import logs
 from service.backend.asked import Call, Close, Gave, Open, Opened, Refused, Takes, Told
 from service.backend.channel import Channel, Files, Handed
 from service.errors import AcquisitionError
@@ -45,6 +46,7 @@ def run(line: int, files: int) -> None:
         first: Open = channel.receive()[0]
     except EOFError:
         return
+    logs.configure(first.settings.logs, "backend")
     try:
         operations = Operations.open(first.settings)
     except AcquisitionError as error:
@@ -145,6 +147,7 @@ class Backend:
             self._channel.send(told)
 
     def _call(self, asked: Call) -> None:
+        logs.request.set(asked.request)
         try:
             method = getattr(self._operations, asked.method)
             given = [self._opened(each) for each in asked.given]

@@ -58,10 +58,12 @@ def serve(parsed: Namespace) -> int:
     # takes a sixth of the start.  Once it is ready the service looks again.
     gc.disable()
     settings = settings_of(parsed)
+    from service import logs
+    from service.backend.start import start_backend
     from service.web.ports import require_free
 
     require_free(settings.host, settings.port)
-    from service.backend.start import start_backend
+    logs.configure(settings.logs, "front")
 
     # It loads its part while this process loads the server.
     started = start_backend(settings)

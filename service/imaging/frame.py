@@ -14,6 +14,8 @@ Counts = npt.NDArray[Any]
 
 LEAST_KNOWN, MOST_FULL = 0.5, 0.5
 """Shares of a frame: of pixels with a number in them, and of full ones."""
+LARGEST_COUNT = float(np.finfo(np.float32).max)
+"""Detection works in single precision: there a larger count is infinite."""
 
 
 @dataclass(frozen=True)
@@ -69,13 +71,20 @@ def refused(message: str, value: str | None = None) -> BadFile:
 
 
 def require_light(frame: Frame, saturation_counts: float) -> None:
-    """Raise `BadFile` for counts in which no star can be: no numbers, no contrast, all full."""
+    """Raise `BadFile` for counts in which no star can be: no numbers, no contrast, all full.
+
+    Also for a count that is too large to work with, of either sign.
+    """
     known = np.isfinite(frame.counts)
     share = float(known.mean())
     if share < LEAST_KNOWN:
         raise refused("has no number in most of its pixels", f"NaN in {1.0 - share:.0%}")
     least = float(np.min(frame.counts, where=known, initial=np.inf))
     most = float(np.max(frame.counts, where=known, initial=-np.inf))
+    largest = max(least, most, key=abs)
+    if abs(largest) > LARGEST_COUNT:
+        message = f"holds a count beyond {LARGEST_COUNT:.4g}, the largest of single precision"
+        raise refused(message, f"{largest:.4g}")
     if least == most:
         raise refused("has no contrast: every pixel holds the same count", f"{least:g}")
     full = float((frame.counts >= min(saturation_counts, frame.full_scale)).mean())

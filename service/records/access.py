@@ -94,6 +94,15 @@ class Access:
                 return self._holder(kind, tokens.digest_of(secret))
         raise NotAdmitted("a token is needed: Authorization: Bearer acq_...")
 
+    def look_up(self, token: str | None, session: str | None) -> Caller:
+        """What `caller` gives by the database of this moment, whatever was known before."""
+        with self._lock:
+            self._open_until_s = 0.0
+            for kind, secret in (("token", token), ("session", session)):
+                if secret is not None:
+                    self._known.pop((kind, tokens.digest_of(secret)), None)
+        return self.caller(token, session)
+
     def _holder(self, kind: str, digest: str) -> Caller:
         key, clock_s = (kind, digest), time.monotonic()
         known = self._known.get(key)

@@ -89,7 +89,9 @@ class Bench:
             return error
         except Exception:
             # A fault of ours in one batch: the others are recorded all the same.
-            log.exception("%s, run %s, batch %s failed", *identity_of(submission.batch))
+            identity = identity_of(submission.batch)
+            run = {"run": submission.batch.run}
+            log.exception("%s, run %s, batch %s failed", *identity, extra=run)
             return AcquisitionError("the fault is on the service's side; it is logged")
 
     def acquire(self, batch: ObservationBatch, mission: Mission) -> Acquisition:

@@ -22,7 +22,7 @@ from service.records.draft import Row
 from service.records.histories import live_state
 from service.records.tables import COUNTS, rollups_daily, runs
 from service.records.trends import latest_time
-from service.times import DAY_S, HOUR_S, Utc, parse_utc, shifted
+from service.times import DAY_S, HOUR_S, Utc, recorded_utc, shifted
 
 STEPS = {HOUR_S: 120, DAY_S: 1800}
 """The buckets of a sparkline: two minutes in an hour, half an hour in a day."""
@@ -66,8 +66,8 @@ def _item(connection: Connection, mission: Mission, run: str, as_of: Utc | None,
     }
     if batch is None or as_of is None:
         return item
-    item["age_s"] = max(0.0, (as_of.tai_ns - parse_utc(batch["time"]).tai_ns) * 1e-9)
-    item["received_age_s"] = (now.tai_ns - parse_utc(batch["received"]).tai_ns) * 1e-9
+    item["age_s"] = max(0.0, (as_of.tai_ns - recorded_utc(batch["time"]).tai_ns) * 1e-9)
+    item["received_age_s"] = (now.tai_ns - recorded_utc(batch["received"]).tai_ns) * 1e-9
     for name, width_s in (("hour", HOUR_S), ("day", DAY_S)):
         # The latest batch is of the window, one just as long before it is not.
         end = shifted(as_of, _TICK_S)

@@ -79,7 +79,6 @@ class Store(Readers):
         try:
             if self._writing.dialect.name == "sqlite":
                 bring_up_to_date(self._writing)
-                _warn_of_old_sqlite()
             else:
                 require_up_to_date(self._writing)
         except BaseException:
@@ -96,8 +95,11 @@ class Store(Readers):
         self._writing.dispose()
 
 
-def _warn_of_old_sqlite() -> None:
+def warn_of_old_sqlite(database: str) -> None:
+    """Log that a database's SQLite is one whose file two processes must not write to."""
     first, last = _WAL_RESET_BUG
+    if database_url(database).drivername != "sqlite":
+        return
     if first <= sqlite3.sqlite_version_info <= last:
         log.warning(
             "this SQLite (%s) has a known fault when two processes write to one file at the same "

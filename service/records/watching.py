@@ -27,7 +27,7 @@ from service.records.measures import VALUE_OF
 from service.records.prepared import prepared
 from service.records.statements import insert_missing
 from service.records.tables import alarms, batches, missions, results, runs, watches
-from service.times import Utc, parse_utc, shifted
+from service.times import Utc, recorded_utc, shifted
 
 _IDS = Ulids()
 SILENCE: QuantityName = "silence_s"
@@ -252,7 +252,7 @@ class _Seen(Struct):
 
     def ns_of(self, received: str) -> int:
         """A moment of receipt as `Utc.tai_ns`."""
-        return self.received_ns if self.received == received else parse_utc(received).tai_ns
+        return self.received_ns if self.received == received else recorded_utc(received).tai_ns
 
 
 _NOTHING_SEEN = _Seen("", {}, "", 0)
@@ -451,4 +451,4 @@ def _moment(batch: Row) -> Moment:
 
 
 def _seconds(earlier: str, later: str) -> float:
-    return (parse_utc(later).tai_ns - parse_utc(earlier).tai_ns) * 1e-9
+    return (recorded_utc(later).tai_ns - recorded_utc(earlier).tai_ns) * 1e-9

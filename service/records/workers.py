@@ -25,6 +25,7 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+from service import logs
 from service.errors import BadConfiguration, Stopping
 from service.missions.mission import Mission
 from service.records.bench import Bench
@@ -177,7 +178,9 @@ class Workers(Generic[Task, Found]):
         here, there = _CONTEXT.Pipe()
         with here:
             process = _CONTEXT.Process(
-                target=_serve, args=(there, self._equipment, self._work), daemon=True
+                target=_serve,
+                args=(there, self._equipment, self._work, logs.configured()),
+                daemon=True,
             )
             with there, self._changed:
                 if self._closing:
@@ -241,7 +244,14 @@ def _start(process: SpawnProcess) -> None:
 # ---- in the worker -----------------------------------------------------------------------------
 
 
-def _serve(line: Connection, equipment: Equipment, work: "Work[Any, Any]") -> None:
+def _serve(
+    line: Connection,
+    equipment: Equipment,
+    work: "Work[Any, Any]",
+    log_settings: logs.LogSettings | None,
+) -> None:
+    if log_settings is not None:
+        logs.configure(log_settings, "worker")
     # Whoever stops the whole group stops the process that started this one, which ends it.
     for each in _SIGNALS:
         signal.signal(each, signal.SIG_IGN)

@@ -16,8 +16,10 @@ from fastapi import Depends
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 
+from service import logs
 from service.errors import NotAdmitted, NotAllowed, NotFound
 from service.operations import Operations
+from service.records.access import OPEN_CALLER
 from service.records.tokens import Caller, Scope
 
 COOKIE = "acquire_session"
@@ -120,6 +122,13 @@ POLICIES: Mapping[str, Policy] = {
     "about_page": Policy("read", "nothing"),
 }
 
+_FOLLOWED_LINK = (
+    ("sec-fetch-mode", "navigate"),
+    ("sec-fetch-dest", "document"),
+    ("sec-fetch-user", "?1"),
+)
+"""What a browser sends where its user has followed a link, and not a script or a frame."""
+
 _THREADS = CapacityLimiter(8)
 """Their own: a handler may wait for a commit, and who asks shall not wait for that."""
 
@@ -138,7 +147,7 @@ async def guard(request: Request) -> None:
     if policy.open:
         request.state.caller = None
         return
-    token, session = _shown(request)
+    token, session = credentials(request)
     caller = operations.access.known(token, session)
     try:
         if caller is None:
@@ -152,9 +161,13 @@ async def guard(request: Request) -> None:
                 303, "sign in first", {"Location": f"{SIGN_IN}?next={wanted}"}
             ) from None
         raise
-    if token is None and session is not None:
-        _refuse_other_sites(request)
+    if caller is OPEN_CALLER:
+        _refuse_pages_of_other_sites(request)
+    elif token is None and request.method not in SAFE_METHODS:
+        _require_own_page(request)
     request.state.caller = caller
+    if (about := logs.request.get()) is not None:
+        about.caller = caller.name
     operations.access.take_turn(caller)
     require_scope(caller, *policy.scopes)
     if caller.spacecraft is not None:
@@ -193,7 +206,8 @@ def bearer(request: Request) -> str | None:
     return token.strip() if kind.lower() == "bearer" else None
 
 
-def _shown(request: Request) -> tuple[str | None, str | None]:
+def credentials(request: Request) -> tuple[str | None, str | None]:
+    """The token and the session that a request shows, each None where there is none."""
     return bearer(request), request.cookies.get(COOKIE)
 
 
@@ -202,16 +216,33 @@ def _is_page(request: Request) -> bool:
     return not route.include_in_schema and request.method in SAFE_METHODS
 
 
-def _refuse_other_sites(request: Request) -> None:
-    """A browser sends its cookie by itself: a page elsewhere must not have things changed by it."""
-    if request.method in SAFE_METHODS:
-        return
+def _site(request: Request) -> str | None:
+    """Where the page stands that had a browser ask, as `Sec-Fetch-Site` says; None: not told."""
     site = request.headers.get("sec-fetch-site")
-    if site is None:
-        origin = request.headers.get("origin", "")
-        site = "same-origin" if origin.partition("://")[2] == request.headers["host"] else "other"
-    if site != "same-origin":
+    if site is None and (origin := request.headers.get("origin")) is not None:
+        host = request.headers.get("host")
+        site = "same-origin" if origin.partition("://")[2] == host else "cross-site"
+    return site
+
+
+def _require_own_page(request: Request) -> None:
+    """A browser sends its cookie by itself: a page elsewhere must not have things changed by it."""
+    if _site(request) != "same-origin":
         raise NotAllowed("a session changes things from the service's own pages alone")
+
+
+def _refuse_pages_of_other_sites(request: Request) -> None:
+    """While access is open, a page elsewhere must not have the service work either.
+
+    Its reader may follow a link to a page.  Programs that are no browsers say nothing of sites.
+    """
+    if _site(request) in (None, "same-origin", "none"):
+        return
+    followed = _is_page(request) and all(
+        request.headers.get(name) == value for name, value in _FOLLOWED_LINK
+    )
+    if not followed:
+        raise NotAllowed("while access is open, the service's own pages alone may ask for this")
 
 
 async def _require_own(

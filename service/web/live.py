@@ -12,14 +12,16 @@ import asyncio
 import logging
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Sequence
+from dataclasses import dataclass
 from typing import TypeVar
 
 from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
 
-from service.errors import Busy
+from service.errors import Busy, NotAdmitted, TooOften
 from service.operations import Operations
 from service.records.events import Event
+from service.records.tokens import Caller
 
 HELD = 2_000
 READ_AT_ONCE = 500
@@ -30,11 +32,25 @@ HEARTBEAT_S = 15.0
 LONGEST_S = 900.0
 """Of one stream; who listens comes again by itself, and is asked anew who it is."""
 MAX_LISTENERS = 100
+MAX_OF_ONE_TOKEN = 10
+"""Streams at a time: some pages in some browsers, and no more that would keep out others."""
+ADMITTED_EVERY_S = 1.0
+"""How often the database is asked whether those who listen may still do so."""
 RETRY_MS = 2_000
 
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
+
+
+@dataclass(eq=False)
+class Listener:
+    """Who follows a stream, and by what they were let in."""
+
+    caller: Caller
+    token: str | None = None
+    session: str | None = None
+    is_admitted: bool = True
 
 
 class Live:
@@ -46,8 +62,8 @@ class Live:
         self._last = 0
         self._news = asyncio.Event()
         self._poke = asyncio.Event()
-        self._task: asyncio.Task[None] | None = None
-        self._listeners = 0
+        self._tasks: list[asyncio.Task[None]] = []
+        self._listeners: set[Listener] = set()
         self._stopping = False
         self._swept_s = 0.0
         self._threads = CapacityLimiter(4)
@@ -59,7 +75,9 @@ class Live:
         self._last = await self._read(self._operations.last_event)
         self._on_commit = lambda: loop.call_soon_threadsafe(self._poke.set)
         self._operations.listen(self._on_commit)
-        self._task = asyncio.create_task(self._follow())
+        self._tasks = [
+            asyncio.create_task(each) for each in (self._follow(), self._end_what_is_revoked())
+        ]
 
     def stop(self) -> None:
         """End every stream; new ones are refused."""
@@ -69,59 +87,71 @@ class Live:
     async def close(self) -> None:
         """Stop following."""
         self.stop()
-        if self._task is not None:
+        if self._tasks:
             self._operations.unlisten(self._on_commit)
-            self._task.cancel()
-            await asyncio.gather(self._task, return_exceptions=True)
+            for task in self._tasks:
+                task.cancel()
+            await asyncio.gather(*self._tasks, return_exceptions=True)
 
     async def stream(
-        self, last: int | None, run: str | None, spacecraft: str | None
+        self, listener: "Listener", last: int | None, run: str | None, spacecraft: str | None
     ) -> AsyncIterator[bytes]:
-        """Events after `last`, or from now on, as lines of an event stream."""
+        """Events after `last`, or from now on, as lines of an event stream.
+
+        It ends when the listener's token or session does; the caller says when the
+        listener has left.  Raises `TooOften` where
+        the token has as many streams as it may, `Busy` where there are too many of all.
+        """
         if self._stopping:
             raise Busy("the service is stopping")
-        if self._listeners >= MAX_LISTENERS:
-            raise Busy(f"{self._listeners} are listening already", 30)
-        self._listeners += 1
-        return self._lines(last, run, spacecraft)
+        token_id = listener.caller.token_id
+        of_token = sum(each.caller.token_id == token_id for each in self._listeners)
+        if token_id is not None and of_token >= MAX_OF_ONE_TOKEN:
+            message = f"{listener.caller.name} has {of_token} event streams open; close one first"
+            raise TooOften(message, 30)
+        if len(self._listeners) >= MAX_LISTENERS:
+            raise Busy(f"{len(self._listeners)} are listening already", 30)
+        self._listeners.add(listener)
+        return self._lines(listener, last, run, spacecraft)
+
+    def leave(self, listener: "Listener") -> None:
+        """Make room for another listener."""
+        self._listeners.discard(listener)
 
     async def _lines(
-        self, last: int | None, run: str | None, spacecraft: str | None
+        self, listener: "Listener", last: int | None, run: str | None, spacecraft: str | None
     ) -> AsyncIterator[bytes]:
-        try:
-            clock = asyncio.get_running_loop().time
-            end_s = clock() + LONGEST_S
-            yield f"retry: {RETRY_MS}\n\n".encode()
-            if last is None:
+        clock = asyncio.get_running_loop().time
+        end_s = clock() + LONGEST_S
+        yield f"retry: {RETRY_MS}\n\n".encode()
+        if last is None:
+            last = await self._read(self._operations.last_event)
+        yield _line(last, "hello", f'{{"last":{last}}}')
+        heard_s = clock()
+        while not self._stopping and listener.is_admitted and clock() < end_s:
+            news = self._news
+            found = await self._after(last)
+            if found is None:
                 last = await self._read(self._operations.last_event)
-            yield _line(last, "hello", f'{{"last":{last}}}')
-            heard_s = clock()
-            while not self._stopping and clock() < end_s:
-                news = self._news
-                found = await self._after(last)
-                if found is None:
-                    last = await self._read(self._operations.last_event)
-                    yield _line(last, "reset", f'{{"last":{last}}}')
-                    continue
-                if found:
-                    last = found[-1].id
-                    lines = b"".join(_told(e) for e in found if _concerns(e, run, spacecraft))
-                    if lines:
-                        heard_s = clock()
-                        yield lines
-                    continue
-                if clock() - heard_s >= HEARTBEAT_S:
-                    # A number alone: the listener comes again from here, and hears of nothing.
+                yield _line(last, "reset", f'{{"last":{last}}}')
+                continue
+            if found:
+                last = found[-1].id
+                lines = b"".join(_told(e) for e in found if _concerns(e, run, spacecraft))
+                if lines:
                     heard_s = clock()
-                    yield f": {HEARTBEAT_S:g} s without news\nid: {last}\n\n".encode()
-                wait_s = min(heard_s + HEARTBEAT_S, end_s) - clock()
-                try:
-                    async with asyncio.timeout(max(wait_s, 0.0)):
-                        await news.wait()
-                except TimeoutError:
-                    pass
-        finally:
-            self._listeners -= 1
+                    yield lines
+                continue
+            if clock() - heard_s >= HEARTBEAT_S:
+                # A number alone: the listener comes again from here, and hears of nothing.
+                heard_s = clock()
+                yield f": {HEARTBEAT_S:g} s without news\nid: {last}\n\n".encode()
+            wait_s = min(heard_s + HEARTBEAT_S, end_s) - clock()
+            try:
+                async with asyncio.timeout(max(wait_s, 0.0)):
+                    await news.wait()
+            except TimeoutError:
+                pass
 
     async def _after(self, last: int) -> Sequence[Event] | None:
         if last == self._last:
@@ -145,6 +175,26 @@ class Live:
             except Exception as error:
                 # The records are out of reach for a while: nothing is lost, it comes later.
                 log.warning("events could not be read: %s", error)
+
+    async def _end_what_is_revoked(self) -> None:
+        """End the streams of tokens and sessions that were revoked or are past their time."""
+        while True:
+            await asyncio.sleep(ADMITTED_EVERY_S)
+            asked = {(each.token, each.session) for each in self._listeners}
+            for token, session in asked:
+                try:
+                    await run_sync(
+                        self._operations.access.look_up, token, session, limiter=self._threads
+                    )
+                except NotAdmitted:
+                    for each in self._listeners:
+                        if (each.token, each.session) == (token, session):
+                            each.is_admitted = False
+                    self._tell()
+                except Exception as error:
+                    # Nothing is known of anybody while the records are out of reach.
+                    log.warning("listeners could not be looked up: %s", error)
+                    break
 
     async def _sweep(self) -> None:
         now_s = asyncio.get_running_loop().time()

@@ -1,8 +1,11 @@
 """What happens around every request: whom it is for, HEAD, timing, the last resort."""
 
 import logging
+import re
+import secrets
 import time
 from collections.abc import Mapping
+from urllib.parse import parse_qs
 
 from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
@@ -11,6 +14,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service import logs
 from service.records.access import Access
 from service.settings import is_loopback
 from service.web.access import guard
@@ -21,6 +25,11 @@ from service.web.rehearsal import REHEARSAL
 NOT_HERE = Kind(421, "This is another host's", "not-this-host")
 
 log = logging.getLogger(__name__)
+requests = logging.getLogger("service.requests")
+
+_PROBES = ("/livez", "/readyz", "/metrics")
+_MAX_PATH = 200
+_SANE_ID = re.compile(rb"[A-Za-z0-9][A-Za-z0-9._:=+/@-]{0,127}")
 
 _NOTES = CapacityLimiter(8)
 _NO_SNIFF = (b"x-content-type-options", b"nosniff")
@@ -71,13 +80,17 @@ class AroundRequests:
             if message["type"] == "http.response.start":
                 status = message["status"]
                 await self._note(inner, status)
-                message = {**message, "headers": [*message["headers"], _NO_SNIFF]}
+                headers = [*message["headers"], _NO_SNIFF, (b"x-request-id", about.id.encode())]
+                message = {**message, "headers": headers}
             elif is_head:
                 message = {**message, "body": b""}
             await send(message)
 
         # A scope of its own: the server still sees HEAD and frames the answer accordingly.
         inner = {**scope, "method": "GET"} if is_head else scope
+        about = logs.About(_request_id(scope), run=_run(scope))
+        # Every request has a task, and so a context, of its own.
+        logs.request.set(about)
         try:
             host = _host(inner)
             if host is not None and not is_loopback(host) and self.access.is_open:
@@ -97,7 +110,30 @@ class AroundRequests:
             await our_fault(Request(inner), error)(inner, receive, sent)
         finally:
             if REHEARSAL not in inner:
-                self.metrics.count_request(inner, status, time.perf_counter() - started)
+                seconds = time.perf_counter() - started
+                self.metrics.count_request(inner, status, seconds)
+                self._log(scope, inner, status, seconds)
+
+    def _log(self, scope: Scope, inner: Scope, status: int, seconds: float) -> None:
+        """One line for a request: no query, no header and no body."""
+        method, path = scope["method"], scope["path"]
+        usual = 200 <= status < 400 and (
+            path in _PROBES or path.startswith("/static/") or (inner["method"], path) in self.direct
+        )
+        level = logging.DEBUG if usual else logging.INFO
+        if not requests.isEnabledFor(level):
+            return
+        milliseconds = round(1e3 * seconds, 1)
+        fields = {"method": method, "path": path[:_MAX_PATH], "status": status or None}
+        requests.log(
+            level,
+            "%s %s %s %.1f ms",
+            method,
+            path[:_MAX_PATH],
+            status or "no answer",
+            milliseconds,
+            extra={"access": {**fields, "duration_ms": milliseconds}},
+        )
 
     async def _note(self, scope: Scope, status: int) -> None:
         state = scope.get("state", {})
@@ -125,6 +161,21 @@ async def _answered(route: APIRoute, request: Request) -> Response:
     except Exception as error:
         return await answer_to(request, error)
     return response
+
+
+def _request_id(scope: Scope) -> str:
+    """The id that a client or a proxy gave a request, where it is a plain word; else a new one."""
+    given = next((value for name, value in scope["headers"] if name == b"x-request-id"), b"")
+    return given.decode() if _SANE_ID.fullmatch(given) else secrets.token_hex(8)
+
+
+def _run(scope: Scope) -> str | None:
+    """The run that a query names."""
+    query: bytes = scope["query_string"]
+    if b"run=" not in query:
+        return None
+    named = parse_qs(query.decode("latin-1")).get("run")
+    return named[0][:128] if named else None
 
 
 def _host(scope: Scope) -> str | None:

@@ -10,9 +10,11 @@ from contextlib import suppress
 import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
+from service import logs
 from service.backend.front import Front
 from service.backend.start import Started, start_backend
 from service.errors import BadConfiguration
+from service.records.store import warn_of_old_sqlite
 from service.settings import Settings, is_loopback
 from service.web.app import create_app
 
@@ -46,6 +48,7 @@ def serve(settings: Settings, started: Started | None = None) -> None:
             f"ACQUIRE_HOST: {settings.host} is beyond this machine, and anybody there could ask "
             "and submit: make a token first with `acquire token create`"
         )
+    warn_of_old_sqlite(settings.database)
     app = create_app(operations)
     sys.setswitchinterval(TURN_S)
     config = uvicorn.Config(
@@ -55,6 +58,8 @@ def serve(settings: Settings, started: Started | None = None) -> None:
         http=Connection,
         loop="uvloop",
         ws="none",
+        # As `service.logs` has it; requests are logged where their caller is known.
+        log_config=None,
         access_log=False,
         server_header=False,
         timeout_graceful_shutdown=GRACE_S,
@@ -175,6 +180,7 @@ class Server(uvicorn.Server):
         """End the streams, then everything else."""
         self._stop_streams()
         await super().shutdown(sockets)
+        logs.finish()
 
 
 def _connections() -> int:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
+from typing import IO
 
 import httpx
 import uvicorn
@@ -58,12 +59,14 @@ class Server:
 
 
 @contextmanager
-def served(database: str) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
+def served(
+    database: str, stderr: IO[bytes] | None = None
+) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
     """`acquire serve` on a database, ready for work: its process, which has others, and its URL."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     command = [sys.executable, "-m", "service.cli", "serve", "--port", str(port)]
-    process = subprocess.Popen([*command, "--database", database])
+    process = subprocess.Popen([*command, "--database", database], stderr=stderr)
     url = f"http://127.0.0.1:{port}"
     try:
         while True:

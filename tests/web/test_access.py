@@ -2,7 +2,10 @@
 
 import json
 import re
+import socket
+import threading
 import time
+from contextlib import ExitStack
 
 import httpx
 import pytest
@@ -13,9 +16,11 @@ from service.records import tokens
 from service.records.ids import Ulids
 from service.settings import Settings
 from service.times import shifted, utc_now
+from service.web import live
 from service.web.access import COOKIE, POLICIES, guard
 from service.web.app import ROUTERS, bare_app, create_app
 from tests.web.serving import Server
+from tests.web.test_bodies import raw
 
 PLACES = {
     "name": "XTE",
@@ -78,6 +83,40 @@ def guarded(chosen_database):
 def anybody(guarded):
     with httpx.Client(base_url=guarded.url, timeout=60) as client:
         yield client
+
+
+class Stream:
+    """An event stream that was begun, and is read to its end in a thread."""
+
+    def __init__(self, url, headers):
+        self._client = httpx.Client(base_url=url, timeout=60)
+        request = self._client.build_request("GET", "/api/v1/events", headers=headers)
+        self._answer = self._client.send(request, stream=True)
+        assert self._answer.status_code == 200, self._answer.read()
+        self._socket = self._answer.extensions["network_stream"].get_extra_info("socket")
+        self.ended = threading.Event()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self):
+        try:
+            for _ in self._answer.iter_raw():
+                pass
+        except (httpx.HTTPError, OSError):
+            pass
+        self.ended.set()
+
+    def close(self):
+        if not self.ended.is_set():
+            self._socket.shutdown(socket.SHUT_RDWR)
+        assert self.ended.wait(10)
+        self._answer.close()
+        self._client.close()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
 
 
 def shown(token):
@@ -274,6 +313,78 @@ def test_a_session_is_a_cookie_that_scripts_cannot_read_and_other_sites_cannot_u
         browser.cookies.update(kept)
         time.sleep(KNOWN_AGAIN_S)
         assert browser.get("/api/v1/session").status_code == 401
+
+
+@pytest.mark.parametrize("host", [b"", b"Host:\r\n"])
+def test_a_session_without_a_host_changes_nothing_and_reads(guarded, host):
+    """As HTTP/1.0 allows: no host can be held against the page that asks."""
+    with httpx.Client(base_url=guarded.url, timeout=60) as browser:
+        browser.post("/api/v1/session", json={"token": guarded.all}).raise_for_status()
+        cookie = b"Cookie: acquire_session=" + browser.cookies[COOKIE].encode() + b"\r\n"
+
+    def status(line, *headers):
+        head = b"".join((line, b" HTTP/1.0\r\n", host, cookie, *headers, b"\r\n"))
+        return raw(guarded.url, head).split()[1]
+
+    assert status(b"DELETE /api/v1/zones") == b"403"
+    assert status(b"DELETE /api/v1/zones", b"Origin: http://127.0.0.1\r\n") == b"403"
+    assert status(b"DELETE /api/v1/zones", b"Sec-Fetch-Site: same-origin\r\n") == b"200"
+    assert status(b"GET /api/v1/session") == status(b"GET /") == b"200"
+
+
+@pytest.mark.parametrize("by", ["token", "session"])
+def test_the_stream_of_a_revoked_token_ends_within_two_seconds(guarded, by):
+    """Also where a browser listens with a session of that token; others go on."""
+    name = f"listening by {by}"
+    token = guarded.token(name, "read")
+    headers = shown(token)
+    if by == "session":
+        begun = httpx.post(f"{guarded.url}/api/v1/session", json={"token": token})
+        headers = {"Cookie": f"{COOKIE}={begun.cookies[COOKIE]}"}
+    with Stream(guarded.url, headers) as stream, Stream(guarded.url, shown(guarded.all)) as other:
+        assert not stream.ended.wait(1.5)
+        guarded.revoke(name)
+        revoked_s = time.monotonic()
+        assert stream.ended.wait(10)
+        assert time.monotonic() - revoked_s < 2.0
+        assert not other.ended.is_set()
+    with httpx.stream("GET", f"{guarded.url}/api/v1/events", headers=headers) as again:
+        assert again.status_code == 401
+
+
+def test_the_stream_of_an_expired_token_ends_within_two_seconds(guarded):
+    token = guarded.token("short", "read", days=4 / 86400)
+    expires_s = time.monotonic() + 4
+    with Stream(guarded.url, shown(token)) as stream:
+        assert stream.ended.wait(20)
+        assert 0 < time.monotonic() - expires_s < 2.0
+
+
+def test_the_first_token_ends_the_streams_of_those_who_needed_none(chosen_database):
+    service = Guarded(chosen_database())
+    with Server(create_app(service.operations)) as url, Stream(url, {}) as stream:
+        service.token("first", "read")
+        assert stream.ended.wait(2.5)
+
+
+def test_one_token_s_streams_are_bounded_and_keep_out_nobody_else(guarded):
+    token = guarded.token("many streams", "read")
+    with ExitStack() as streams:
+        for _ in range(live.MAX_OF_ONE_TOKEN):
+            last = streams.enter_context(Stream(guarded.url, shown(token)))
+        refused = httpx.get(f"{guarded.url}/api/v1/events", headers=shown(token))
+        assert refused.status_code == 429
+        assert refused.headers["Retry-After"] == "30"
+        assert "10 event streams open" in refused.json()["detail"]
+        streams.enter_context(Stream(guarded.url, shown(guarded.all)))
+        last.close()
+        for _ in range(100):
+            # The server sees that a client has gone a moment later.
+            answer = asked(httpx, "GET", f"{guarded.url}/api/v1/events", headers=shown(token))
+            if answer.status_code == 200:
+                break
+            time.sleep(0.05)
+        assert answer.status_code == 200
 
 
 def test_a_session_ends_with_its_token(guarded):

@@ -183,6 +183,19 @@ def test_a_picture_does_not_tell_its_time_and_is_asked_for_it(send, frames):
     assert answer.json()["errors"][0]["field"] == "time"
 
 
+@pytest.mark.parametrize("counts", [1e300, -1e300])
+def test_a_frame_of_counts_that_are_too_large_is_refused_as_a_frame(send, frames, counts):
+    """Not as a detector with a wrong noise, of which its sender has told nothing."""
+    values = frames[0].counts.astype(np.float64)
+    values[50, 60] = counts
+    file = io.BytesIO()
+    np.save(file, values)
+    answer = send(file.getvalue(), frames[0].known | {"batch": "too large"})
+    assert answer.status_code == 422
+    (fault,) = answer.json()["errors"]
+    assert (fault["field"], fault["value"]) == ("frame", f"{counts:g}")
+
+
 def test_a_spacecraft_without_a_camera_and_one_that_is_not_there(send, frames):
     answer = send(frames[0], frames[0].known, url="/api/v1/spacecraft/XTE/frames")
     assert (answer.status_code, "no camera" in answer.json()["detail"]) == (422, True)

@@ -8,7 +8,7 @@ from starlette.responses import Response
 
 from service.errors import NotFound, shown_value
 from service.observe.wire import Key
-from service.times import parse_utc, shifted
+from service.times import recorded_utc, shifted
 from service.web.dashboard.rendering import PageRoute, rendered
 from service.web.dashboard.shell import AtDesk, RunQuery
 from service.web.queries import Cursor
@@ -60,7 +60,7 @@ def alarm_page(id: Annotated[str, Path()], desk: AtDesk) -> Response:
     if not desk.caller.may_see(alarm["spacecraft"]):
         # As if it were not there: ids of others are not to be tried out.
         raise NotFound(f"there is no alarm with the id {shown_value(id)}")
-    raised = parse_utc(alarm["raised"]["time"])
+    raised = recorded_utc(alarm["raised"]["time"])
     return rendered(
         "alarm.html.jinja",
         desk.shell(alarm["run"], "/alarms"),

@@ -6,12 +6,11 @@ dash and never a zero.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from datetime import UTC, datetime
 from typing import Any
 
 from markupsafe import Markup
 
-from service.times import Utc, parse_utc
+from service.times import Utc, recorded_utc, utc_now
 
 DASH = "–"
 THIN = "\N{NARROW NO-BREAK SPACE}"
@@ -57,12 +56,12 @@ QUANTITIES: Mapping[str, str] = {
 
 def present() -> Utc:
     """This moment, to the second."""
-    return parse_utc(datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"))
+    return recorded_utc(utc_now().text[:19])
 
 
 def with_day_of_year(moment: Utc | str, seconds: bool = True) -> str:
     """UTC for reading: date, day of the year, time of day."""
-    moment = parse_utc(moment) if isinstance(moment, str) else moment
+    moment = recorded_utc(moment) if isinstance(moment, str) else moment
     day, _, clock = moment.text.partition("T")
     return f"{day} ({moment.day_of_year:03d}) {clock[: 8 if seconds else 5]}"
 
@@ -71,7 +70,7 @@ def utc(moment: Utc | str | None, seconds: bool = True) -> Markup:
     """The same as an element that programs can read; a dash where there is none."""
     if moment is None:
         return Markup(DASH)
-    moment = parse_utc(moment) if isinstance(moment, str) else moment
+    moment = recorded_utc(moment) if isinstance(moment, str) else moment
     return Markup('<time datetime="{}">{}</time>').format(
         moment.text, with_day_of_year(moment, seconds)
     )

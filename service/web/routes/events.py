@@ -1,6 +1,7 @@
 """Live events, as a stream that a browser's EventSource follows."""
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
+from functools import partial
 from typing import Annotated
 
 import anyio
@@ -13,8 +14,9 @@ from starlette.types import Receive, Scope, Send
 
 from service.errors import BadBatch, Fault, shown_value
 from service.observe.wire import RunName
+from service.web.access import Asking, credentials
 from service.web.describe import LAST_EVENT_ID, Gives, described
-from service.web.live import Live
+from service.web.live import Listener, Live
 from service.web.queries import Query, Spacecraft
 
 router = APIRouter(prefix="/api/v1", tags=["events"])
@@ -39,10 +41,11 @@ class EventQuery(Query):
 class EventStream(Response):
     """An answer that goes on until the listener leaves, the events end, or nothing is taken."""
 
-    def __init__(self, lines: AsyncIterator[bytes]) -> None:
+    def __init__(self, lines: AsyncIterator[bytes], leave: Callable[[], object]) -> None:
         super().__init__(None, 200, HEADERS, EVENT_STREAM)
         del self.headers["content-length"]
         self._lines = lines
+        self._leave = leave
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send the lines as they come."""
@@ -57,6 +60,8 @@ class EventStream(Response):
             try:
                 await self._send(send)
             finally:
+                # Also of lines that were never begun, whose own end nothing reaches.
+                self._leave()
                 with anyio.CancelScope(shield=True):
                     await self._lines.aclose()  # type: ignore[attr-defined]
             group.cancel_scope.cancel()
@@ -90,10 +95,13 @@ async def events(
     request: Request,
     query: Annotated[EventQuery, InQuery()],
     live: Annotated[Live, Depends(_live)],
+    caller: Asking,
 ) -> Response:
     """What happens, as server-sent events: batches, alarms, limits, replays."""
     last = _last_event_id(request, query)
-    return EventStream(await live.stream(last, query.run, query.spacecraft))
+    listener = Listener(caller, *credentials(request))
+    lines = await live.stream(listener, last, query.run, query.spacecraft)
+    return EventStream(lines, partial(live.leave, listener))
 
 
 def _last_event_id(request: Request, query: EventQuery) -> int | None:

@@ -1,0 +1,272 @@
+"""Logs: how a line looks, which request it belongs to, and that an error is not repeated endlessly.
+
+The standard library's logging does the work; `configure` sets it up, once in each
+process.  A line never holds a token, a cookie or a body: nothing of these is given to
+a logger, and what an error's own text might bring along is cut.
+"""
+
+import json
+import logging
+import re
+import threading
+import time
+import traceback
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from typing import TextIO
+
+FORMATS = ("text", "json")
+LEVELS = ("debug", "info", "warning", "error")
+REPEATS_S = 60.0
+"""An error that comes again within this time is counted; the count is written at its end."""
+
+_MAX_COUNTED = 1_000
+_MAX_LINE = 300
+_SECRET = re.compile(r"acq_[A-Za-z0-9_-]+")
+_PARAMETERS = re.compile(r"\[parameters: [^\n]*")
+_PLAIN = re.compile(r"[!#-<>-~]+")
+_NUMBER = re.compile(r"\d+")
+
+
+@dataclass
+class About:
+    """The request that is worked on: its id, who asks (a token's name), and the run it names."""
+
+    id: str
+    caller: str | None = None
+    run: str | None = None
+
+
+request: ContextVar[About | None] = ContextVar("request", default=None)
+"""What the lines written meanwhile belong to, also in threads that handlers run in."""
+
+
+@dataclass(frozen=True)
+class LogSettings:
+    """Format and level, as other processes of the service are to have them too."""
+
+    format: str
+    level: str
+
+
+_configured: LogSettings | None = None
+
+
+def configured() -> LogSettings | None:
+    """What this process was configured with; None where it leaves logging as it was."""
+    return _configured
+
+
+def configure(settings: LogSettings, process: str, stream: TextIO | None = None) -> None:
+    """Write every line of this process to a stream (standard error), `process` named in each."""
+    global _configured
+    _configured = settings
+    handler = CountingHandler(stream)
+    handler.setFormatter(JsonLines(process) if settings.format == "json" else TextLines(process))
+    level = logging.getLevelNamesMapping()[settings.level.upper()]
+    # Libraries tell of much that nobody asked for: of them only what is wrong.
+    logging.basicConfig(handlers=[handler], level=max(level, logging.WARNING), force=True)
+    logging.getLogger("service").setLevel(level)
+    logging.getLogger("uvicorn").setLevel(max(level, logging.INFO))
+
+
+def finish() -> None:
+    """Write what is counted by now: a process that a signal ends does not come to close its log."""
+    for handler in logging.getLogger().handlers:
+        if isinstance(handler, CountingHandler):
+            handler.write_counts()
+
+
+class CountingHandler(logging.StreamHandler[TextIO]):
+    """Writes a warning or an error once, counts its repetitions, and writes their number.
+
+    Two are the same where the text before its arguments is filled in, the error and
+    the place that raised it are the same.
+    """
+
+    def __init__(self, stream: TextIO | None = None, period_s: float = REPEATS_S) -> None:
+        super().__init__(stream)
+        self._period_s = period_s
+        self._counted: dict[object, _Counted] = {}
+        self._timer: threading.Timer | None = None
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a record, or count it."""
+        if record.levelno >= logging.WARNING and self._is_repeated(record):
+            return
+        super().emit(record)
+
+    def _is_repeated(self, record: logging.LogRecord) -> bool:
+        # The caller holds the handler's lock.
+        key = _kind(record)
+        if key not in self._counted and len(self._counted) >= _MAX_COUNTED:
+            key = (record.name, record.levelno)
+        known = self._counted.get(key)
+        if known is not None:
+            known.count += 1
+            known.last = record
+            return True
+        self._counted[key] = _Counted(record, time.monotonic() + self._period_s)
+        self._set_timer()
+        return False
+
+    def _set_timer(self) -> None:
+        if self._timer is None and self._counted:
+            until_s = min(each.until_s for each in self._counted.values())
+            self._timer = threading.Timer(max(0.0, until_s - time.monotonic()), self._tell)
+            self._timer.daemon = True
+            self._timer.start()
+
+    def _tell(self) -> None:
+        self.acquire()
+        try:
+            self._timer = None
+            now_s = time.monotonic()
+            for key, known in list(self._counted.items()):
+                if now_s < known.until_s:
+                    continue
+                if known.count:
+                    self._write_count(known)
+                    known.count, known.until_s = 0, now_s + self._period_s
+                else:
+                    del self._counted[key]
+            self._set_timer()
+        finally:
+            self.release()
+
+    def _write_count(self, known: "_Counted") -> None:
+        last = known.last
+        message = f"repeated {known.count} times within {self._period_s:g} s: {last.getMessage()}"
+        told = logging.LogRecord(
+            last.name, last.levelno, last.pathname, last.lineno, message, None, None
+        )
+        # Of many requests, not of the one that this thread happens to work on.
+        vars(told).update(repeated=known.count, about=None)
+        super().emit(told)
+
+    def write_counts(self) -> None:
+        """Write what is counted by now, and count anew."""
+        self.acquire()
+        try:
+            if self._timer is not None:
+                self._timer.cancel()
+                self._timer = None
+            for known in self._counted.values():
+                if known.count:
+                    self._write_count(known)
+            self._counted.clear()
+        finally:
+            self.release()
+
+    def close(self) -> None:
+        """Write what is counted, and no more."""
+        self.write_counts()
+        super().close()
+
+
+@dataclass
+class _Counted:
+    last: logging.LogRecord
+    until_s: float
+    count: int = field(default=0)
+
+
+def _kind(record: logging.LogRecord) -> object:
+    """What makes two records the same; numbers in an error's text do not tell them apart."""
+    arguments = record.args if isinstance(record.args, tuple) else ()
+    errors = tuple(
+        (type(each).__name__, _NUMBER.sub("#", str(each)[:_MAX_LINE]))
+        for each in arguments
+        if isinstance(each, BaseException)
+    )
+    raised: tuple[object, ...] = ()
+    if record.exc_info and (kind := record.exc_info[0]) is not None:
+        frames = traceback.extract_tb(record.exc_info[2], limit=-1)
+        raised = kind.__name__, *((each.filename, each.lineno) for each in frames)
+    return record.name, record.levelno, str(record.msg), errors, raised
+
+
+class _Lines(logging.Formatter):
+    """What is common to both formats."""
+
+    def __init__(self, process: str) -> None:
+        super().__init__()
+        self._process = process
+
+    def fields(self, record: logging.LogRecord) -> dict[str, object]:
+        """The fields of a line, in order; those that have no value are left out."""
+        seconds = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
+        about: About | None = getattr(record, "about", request.get())
+        told: dict[str, object | None] = {
+            "time": f"{seconds}.{int(record.msecs):03d}Z",
+            "level": record.levelname.lower(),
+            "process": self._process,
+            "logger": record.name,
+            "message": record.getMessage(),
+            "request_id": about and about.id,
+            "caller": about and about.caller,
+            "run": getattr(record, "run", None) or (about and about.run),
+            "repeated": getattr(record, "repeated", None),
+            **getattr(record, "access", {}),
+        }
+        return {
+            name: _harmless(value) if isinstance(value, str) else value
+            for name, value in told.items()
+            if value is not None
+        }
+
+    def error(self, record: logging.LogRecord) -> list[str]:
+        """The lines of what was raised; none where nothing was."""
+        if not record.exc_info or record.exc_info[0] is None:
+            return []
+        return _harmless(self.formatException(record.exc_info)).splitlines()
+
+
+class TextLines(_Lines):
+    """A line to be read; what was raised follows in lines of its own."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record as text."""
+        fields = self.fields(record)
+        head = " ".join(str(fields.pop(each)) for each in ("time", "level", "process", "logger"))
+        message = _one_line(str(fields.pop("message")))
+        rest = "".join(
+            f" {name}={_quoted(str(value))}"
+            for name, value in fields.items()
+            if name not in ("method", "path", "status", "duration_ms")
+        )
+        raised = "".join(f"\n    {_one_line(each)}" for each in self.error(record))
+        return f"{head}: {message}{rest}{raised}"
+
+
+class JsonLines(_Lines):
+    """An object a line."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record as JSON."""
+        fields = self.fields(record)
+        if raised := self.error(record):
+            fields["error"] = "\n".join(raised)
+        return json.dumps(fields)
+
+
+def _harmless(text: str) -> str:
+    """Text without tokens and statements' parameters; each of its lines is cut."""
+    text = _PARAMETERS.sub("[parameters: not shown]", _SECRET.sub("acq_(not shown)", text))
+    return "\n".join(
+        line if len(line) <= _MAX_LINE else line[: _MAX_LINE - 1] + "…"
+        for line in text.splitlines()
+    )
+
+
+def _one_line(text: str) -> str:
+    """Text that cannot begin a line or move a terminal's cursor."""
+    if text.isprintable():
+        return text
+    return "".join(
+        each if each.isprintable() else each.encode("unicode_escape").decode() for each in text
+    )
+
+
+def _quoted(text: str) -> str:
+    return text if _PLAIN.fullmatch(text) else json.dumps(text)
