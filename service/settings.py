@@ -31,6 +31,10 @@ class Settings:
     many processes beside this one compute replays; 0: this one does.  A replay
     ends after `replay_seconds`, wherever it is.  `log_format` and `log_level` are
     of `service.logs`.
+    `probe_port` is a second port that answers probes alone.  One client address
+    may have `connections_per_address` at a time; addresses and networks in
+    `trusted_proxies` may have more, and the service believes what they say about
+    the clients behind them (X-Forwarded-For, X-Forwarded-Proto).
     """
 
     database: str = "sqlite:///acquire.db"
@@ -46,6 +50,9 @@ class Settings:
     replay_seconds: int = 6 * 3600
     log_format: str = "text"
     log_level: str = "info"
+    probe_port: int | None = None
+    connections_per_address: int = 256
+    trusted_proxies: str = "127.0.0.1,::1"
 
     def __post_init__(self) -> None:
         if not self.database.strip():
@@ -64,6 +71,19 @@ class Settings:
                 raise _refusal(name, f"must be {' or '.join(known)}", getattr(self, name))
         if not 0 <= self.port <= 65535:
             raise _refusal("port", "must be from 0 to 65535", self.port)
+        if self.probe_port is not None and not 1 <= self.probe_port <= 65535:
+            raise _refusal("probe_port", "must be from 1 to 65535", self.probe_port)
+        if self.probe_port is not None and self.probe_port == self.port:
+            raise _refusal("probe_port", "must be another port than ACQUIRE_PORT", self.probe_port)
+        if not 1 <= self.connections_per_address <= 65535:
+            raise _refusal(
+                "connections_per_address", "must be from 1 to 65535", self.connections_per_address
+            )
+        try:
+            networks(self.trusted_proxies)
+        except ValueError:
+            message = "must be addresses or networks, such as 127.0.0.1,10.0.0.0/8"
+            raise _refusal("trusted_proxies", message, self.trusted_proxies) from None
         if not _HOST.fullmatch(self.host):
             raise _refusal("host", "must be an address or a name, such as 127.0.0.1", self.host)
 
@@ -97,6 +117,8 @@ _READERS: dict[str, Callable[[str], Any]] = {
     "frame_mb": int,
     "frame_megapixels": int,
     "port": int,
+    "probe_port": int,
+    "connections_per_address": int,
     "replay_processes": int,
     "replay_seconds": int,
 }
@@ -111,6 +133,14 @@ def _read(field: str, text: str) -> Any:
 
 def _refusal(field: str, message: str, value: object) -> BadConfiguration:
     return BadConfiguration(f"{PREFIX}{field.upper()}: {message} (got {shown_value(value)})")
+
+
+Network = ipaddress.IPv4Network | ipaddress.IPv6Network
+
+
+def networks(text: str) -> tuple[Network, ...]:
+    """The networks in a list such as "127.0.0.1,10.0.0.0/8"; raises ValueError."""
+    return tuple(ipaddress.ip_network(each.strip()) for each in text.split(",") if each.strip())
 
 
 @lru_cache(maxsize=256)

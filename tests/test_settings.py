@@ -28,6 +28,9 @@ def test_every_setting_has_its_variable():
             "ACQUIRE_HOST": "::1",
             "ACQUIRE_PORT": "9000",
             "ACQUIRE_TOKEN": "acq_from-elsewhere",
+            "ACQUIRE_PROBE_PORT": "9001",
+            "ACQUIRE_CONNECTIONS_PER_ADDRESS": "32",
+            "ACQUIRE_TRUSTED_PROXIES": "10.1.2.3, 2001:db8::/32",
             "HOME": "/root",
         }
     ) == Settings(
@@ -38,6 +41,9 @@ def test_every_setting_has_its_variable():
         host="::1",
         port=9000,
         token="acq_from-elsewhere",
+        probe_port=9001,
+        connections_per_address=32,
+        trusted_proxies="10.1.2.3, 2001:db8::/32",
     )
 
 
@@ -50,6 +56,11 @@ def test_an_empty_variable_counts_as_not_set():
     [
         ("ACQUIRE_PORT", "http", "whole number"),
         ("ACQUIRE_PORT", "65536", "from 0 to 65535"),
+        ("ACQUIRE_PROBE_PORT", "0", "from 1 to 65535"),
+        ("ACQUIRE_PROBE_PORT", "8000", "another port than ACQUIRE_PORT"),
+        ("ACQUIRE_CONNECTIONS_PER_ADDRESS", "0", "from 1 to"),
+        ("ACQUIRE_TRUSTED_PROXIES", "proxy.example", "addresses or networks"),
+        ("ACQUIRE_TRUSTED_PROXIES", "10.1.2.3/8", "addresses or networks"),
         ("ACQUIRE_SHELF_MB", "0", "from 1 to"),
         ("ACQUIRE_SHELF_MB", "1.5", "whole number"),
         ("ACQUIRE_DATABASE", "   ", "must be a URL"),

@@ -14,7 +14,7 @@ from starlette.staticfiles import StaticFiles
 from service import __version__
 from service.operations import Operations
 from service.web.access import guard
-from service.web.bodies import DEFAULT_LIMITS, Limits
+from service.web.bodies import DEFAULT_LIMITS, BodyBudget, Limits
 from service.web.dashboard import PAGES
 from service.web.errors import add_error_handlers
 from service.web.live import Live
@@ -87,12 +87,14 @@ def create_app(operations: Operations, limits: Limits = DEFAULT_LIMITS) -> FastA
     app.router.lifespan_context = lifespan
     app.state.operations = operations
     app.state.limits = limits
+    app.state.body_budget = BodyBudget(limits)
     app.state.metrics = Metrics(operations)
     app.state.live = Live(operations)
     app.add_middleware(
         AroundRequests,
         metrics=app.state.metrics,
         access=operations.access,
+        body_budget=app.state.body_budget,
         direct={
             (method, route.path): route
             for route in app.state.routes

@@ -2,10 +2,12 @@
 
 The server below has no deadline for a body and the framework would buffer
 one whole, whatever its size.  A body that is too large is refused as soon as
-it passes the bound; what still arrives of it is dropped unread.
+it passes the bound; what still arrives of it is dropped unread.  All JSON bodies
+together may take `Limits.budget_bytes` of memory until their requests are answered.
 """
 
 import asyncio
+import ctypes
 import tempfile
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
@@ -16,8 +18,9 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import from_json
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
+from starlette.types import Scope
 
-from service.errors import BadBatch, BadInput, Fault
+from service.errors import BadBatch, BadInput, Busy, Fault
 from service.observe.compressed import Coding
 from service.observe.wire import faults_of
 from service.web.errors import NotJson
@@ -47,6 +50,12 @@ class Limits:
     """How large and how slow a body may be."""
 
     json_bytes: int = MAX_JSON_BYTES
+    session_bytes: int = 4 << 10
+    """Of `POST /session`, which asks for no token."""
+    small_bytes: int = 8 << 10
+    """So much of each body is not counted in `budget_bytes`: a batch of 60 stars is never
+    refused because of others."""
+    budget_bytes: int = 8 << 20
     replay_bytes: int = 1 << 30
     pause_s: float = 20.0
     """The longest wait for the next piece of a body."""
@@ -56,6 +65,55 @@ class Limits:
 
 
 DEFAULT_LIMITS = Limits()
+COUNTED = "counted_bytes"
+"""In the state of a request: how much of its body is counted in `BodyBudget`."""
+RETRY_S = 1
+TRIM_AFTER_BYTES, TRIM_AFTER_S = 4 << 20, 5.0
+"""Memory is given back so long after so many bytes of large bodies: it takes some 5 ms."""
+
+
+class BodyBudget:
+    """Counts the bytes of all bodies that are held in memory."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._small_bytes = limits.small_bytes
+        self._most_bytes = limits.budget_bytes
+        self._bytes = self._freed_bytes = 0
+        self._is_trim_due = False
+
+    def add(self, request: Request, received: int) -> None:
+        """Count a request's body, of which so much has arrived; raises `Busy` beyond the bound."""
+        state = request.scope.setdefault("state", {})
+        counted = state.get(COUNTED, 0)
+        more = max(received - self._small_bytes, 0) - counted
+        if self._bytes + more > self._most_bytes:
+            raise Busy("too many large bodies are being read at once", RETRY_S)
+        self._bytes += more
+        state[COUNTED] = counted + more
+
+    def remove(self, scope: Scope) -> None:
+        """The request is answered: forget its body, which its connection would keep."""
+        state = scope.get("state", {})
+        state.pop("body", None)
+        counted = state.pop(COUNTED, 0)
+        if not counted:
+            return
+        self._bytes -= counted
+        self._freed_bytes += counted
+        if self._freed_bytes >= TRIM_AFTER_BYTES and not self._is_trim_due:
+            self._is_trim_due = True
+            asyncio.get_running_loop().call_later(TRIM_AFTER_S, self._trim)
+
+    def _trim(self) -> None:
+        self._freed_bytes, self._is_trim_due = 0, False
+        give_memory_back()
+
+
+def give_memory_back() -> None:
+    """Return to the system what the C library keeps of freed memory; glibc alone can."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
 
 
 def _limits(request: Request) -> Limits:
@@ -119,11 +177,26 @@ async def _pieces(
 
 async def json_body(request: Request) -> bytes:
     """The bytes of a JSON body."""
+    return await _json_body(request, _limits(request).json_bytes)
+
+
+async def session_body(request: Request) -> bytes:
+    """The bytes of a JSON body that begins a session: anybody may send it."""
+    return await _json_body(request, _limits(request).session_bytes)
+
+
+async def _json_body(request: Request, max_bytes: int) -> bytes:
     _require_type(request, (JSON,))
     _coding(request, ("identity",))
     limits = _limits(request)
-    pieces = _pieces(request, limits.json_bytes, limits.pause_s, limits.json_s)
-    request.state.body = body = b"".join([piece async for piece in pieces])
+    budget: BodyBudget = request.app.state.body_budget
+    pieces: list[bytes] = []
+    received = 0
+    async for piece in _pieces(request, max_bytes, limits.pause_s, limits.json_s):
+        received += len(piece)
+        budget.add(request, received)
+        pieces.append(piece)
+    request.state.body = body = b"".join(pieces)
     return body
 
 
@@ -195,3 +268,4 @@ def refused(body: bytes, refusal: BadInput) -> BadInput:
 
 
 JsonBody = Annotated[bytes, Depends(json_body)]
+SessionBody = Annotated[bytes, Depends(session_body)]

@@ -61,7 +61,7 @@ _PROBLEMS = {
     429: "More requests than the token's rate; `Retry-After` says when to try again.",
     503: "The service cannot take this now; `Retry-After` says when to try again.",
 }
-READING_JSON = (400, 408, 413, 415)
+READING_JSON = (400, 408, 413, 415, 503)
 READING_NDJSON = READING_FRAME = (408, 413, 415)
 _BINARY = {"type": "string", "format": "binary"}
 _RETRY_AFTER = {"Retry-After": {"description": "Seconds.", "schema": {"type": "string"}}}

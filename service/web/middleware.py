@@ -18,11 +18,13 @@ from service import logs
 from service.records.access import Access
 from service.settings import is_loopback
 from service.web.access import guard
+from service.web.bodies import BodyBudget
 from service.web.errors import Kind, answer_to, our_fault, problem
 from service.web.metrics import Metrics
 from service.web.rehearsal import REHEARSAL
 
 NOT_HERE = Kind(421, "This is another host's", "not-this-host")
+NOT_FOUND = Kind(404, "Not Found")
 
 log = logging.getLogger(__name__)
 requests = logging.getLogger("service.requests")
@@ -58,12 +60,14 @@ class AroundRequests:
         app: ASGIApp,
         metrics: Metrics,
         access: Access,
+        body_budget: BodyBudget,
         direct: Mapping[tuple[str, str], APIRoute],
     ) -> None:
         """`direct` routes stand under method and path; their handlers take the request alone."""
         self.app = app
         self.metrics = metrics
         self.access = access
+        self.body_budget = body_budget
         self.direct = direct
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -109,6 +113,7 @@ class AroundRequests:
                 raise
             await our_fault(Request(inner), error)(inner, receive, sent)
         finally:
+            self.body_budget.remove(inner)
             if REHEARSAL not in inner:
                 seconds = time.perf_counter() - started
                 self.metrics.count_request(inner, status, seconds)
@@ -151,6 +156,24 @@ class AroundRequests:
         except Exception as error:
             # The change itself is made: its answer must not be lost to this.
             log.error("%s by %s was not noted: %s", action, state["caller"].name, error)
+
+
+PROBES = ("/livez", "/readyz", "/metrics")
+
+
+class ProbesAlone:
+    """The app of the port for probes: it passes on their paths, and answers 404 to all others."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request.  The other port's app is opened and closed with the server."""
+        if scope["path"] in PROBES:
+            await self.app(scope, receive, send)
+            return
+        told = {"detail": f"this port answers probes alone: {', '.join(PROBES)}"}
+        await problem(Request(scope), NOT_FOUND, told)(scope, receive, send)
 
 
 async def _answered(route: APIRoute, request: Request) -> Response:

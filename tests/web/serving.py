@@ -19,7 +19,8 @@ from service.sky.catalog import load_embedded
 from service.sky.shelf import Shelf
 from service.sky.view import Sky
 from service.warm import warm_up
-from service.web.server import Connection
+from service.web.admission import Admission
+from service.web.connection import Connection
 from service.web.server import Server as StreamingServer
 
 
@@ -38,10 +39,10 @@ def compile_kernels() -> None:
 class Server:
     """The app behind uvicorn on a free port, in a thread of this process."""
 
-    def __init__(self, app: FastAPI, port: int = 0) -> None:
+    def __init__(self, app: FastAPI, port: int = 0, admission: Admission | None = None) -> None:
         compile_kernels()
         config = uvicorn.Config(app, port=port, http=Connection, ws="none", log_level="warning")
-        self._server = StreamingServer(config, _stop_streams_of(app))
+        self._server = StreamingServer(config, _stop_streams_of(app), admission)
         # Signals belong to the main thread, which is the caller's.
         self._thread = threading.Thread(target=self._server.run, name="server")
 

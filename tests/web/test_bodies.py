@@ -27,6 +27,15 @@ def impatient(tmp_path_factory):
         yield address
 
 
+@pytest.fixture(scope="module")
+def narrow(tmp_path_factory):
+    """A server that has a hundred kilobytes for all bodies together."""
+    path = tmp_path_factory.mktemp("narrow") / "acquire.db"
+    operations = Operations.open(Settings(database=f"sqlite:///{path}"))
+    with Server(create_app(operations, Limits(budget_bytes=100_000))) as address:
+        yield address
+
+
 def raw(address, *pieces, pause_s=0.0):
     """What the server answers to bytes sent as they are, piece by piece."""
     host, port = httpx.URL(address).host, httpx.URL(address).port
@@ -95,6 +104,48 @@ def test_a_replay_that_is_too_large_is_refused(impatient, batch):
         headers={"Content-Type": "application/x-ndjson"},
     )
     assert answer.status_code == 413
+
+
+@pytest.mark.parametrize("chunked", [False, True])
+def test_a_session_is_not_begun_with_more_than_4_kib(client, chunked):
+    def post(length):
+        body = json.dumps({"token": "x"}).encode().ljust(length)
+        content = iter([body]) if chunked else body
+        return client.post("/api/v1/session", content=content, headers=HEADERS)
+
+    assert post(4096).status_code == 401
+    answer = post(4097)
+    assert answer.status_code == 413
+    assert "4096 bytes" in answer.json()["detail"]
+
+
+def test_bodies_that_are_too_many_together_are_put_off_and_small_ones_are_not(narrow, batch):
+    host, port = httpx.URL(narrow).host, httpx.URL(narrow).port
+
+    def post(length, name):
+        content = json.dumps(batch | {"batch": name}).encode().ljust(length)
+        return httpx.post(f"{narrow}{URL}", content=content, headers=HEADERS, timeout=60)
+
+    with socket.create_connection((host, port), timeout=10) as connection:
+        connection.sendall(head(95_000) + 90_000 * b" ")
+        deadline = time.monotonic() + 20
+        while (answer := post(60_000, "large")).status_code != 503:
+            assert time.monotonic() < deadline
+        assert answer.json()["type"] == "/problems/busy"
+        assert answer.headers["Retry-After"] == "1"
+        assert post(0, "small").status_code == 201
+    # The client has gone, and its body with it.
+    while (answer := post(60_000, "after")).status_code != 201:
+        assert answer.status_code == 503
+        assert time.monotonic() < deadline
+
+
+def test_bodies_one_after_another_take_no_more_room_than_one(narrow, batch):
+    with httpx.Client(base_url=narrow, timeout=60) as client:
+        for number in range(10):
+            content = json.dumps(batch | {"batch": f"one-by-one-{number}"}).encode().ljust(90_000)
+            assert client.post(URL, content=content, headers=HEADERS).status_code == 201
+            assert client.post(URL, content=b"{" * 90_000, headers=HEADERS).status_code == 400
 
 
 def test_what_is_no_http_is_refused(impatient):

@@ -1,20 +1,18 @@
 """Clients that are slow, or send far too much, cost others nothing and the server no memory."""
 
 import json
-import resource
 import socket
 import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
-import numpy as np
 import pytest
 
 from tests.scale import size
+from tests.web.healthy import answers, resident_mb, tries
 from tests.web.serving import served
 
 SLOW = 1_000
@@ -25,8 +23,6 @@ TURNS = 5
 SETTLING = 200
 PATIENCE_S = 300
 CHECKOUT = Path(__file__).parents[2]
-TRIES = 3
-"""Other work on the machine delays a post now and then; what slow clients do shows every time."""
 HUGE_BYTES = 300_000_000
 SENDERS = 4
 MORE_MEMORY_MB = 50
@@ -45,70 +41,8 @@ def server(tmp_path):
         yield process, httpx.URL(url).port, url
 
 
-def resident_mb(process):
-    """What the server's processes hold."""
-    pages = sum(
-        int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in family(process.pid)
-    )
-    return pages * resource.getpagesize() / 1e6
-
-
-def family(pid):
-    """A process and all that it started."""
-    yield pid
-    for children in Path(f"/proc/{pid}/task").glob("*/children"):
-        for child in children.read_text().split():
-            yield from family(int(child))
-
-
 def connected(port):
     return socket.create_connection(("127.0.0.1", port), timeout=30)
-
-
-def answers(client, batch, names, count):
-    """Healthy requests, each of which must be answered as ever; how long each took, in ms."""
-    taken = []
-    for _ in range(count):
-        content = json.dumps(batch | {"batch": next(names)})
-        begun = time.perf_counter()
-        answer = client.post(
-            "/api/v1/batches", content=content, headers={"Content-Type": "application/json"}
-        )
-        taken.append(1e3 * (time.perf_counter() - begun))
-        assert answer.status_code == 201, answer.text
-    return taken
-
-
-def p99(taken):
-    return float(np.percentile(taken, 99))
-
-
-@dataclass(frozen=True)
-class Tried:
-    """The 99th percentile of healthy requests in ms, beside trouble and without, and memory."""
-
-    beside: float
-    without: float
-    more_mb: float
-
-    @property
-    def slower(self):
-        return self.beside / self.without
-
-    def __str__(self):
-        return f"p99 {self.beside:.1f} ms, without {self.without:.1f} ms, {self.more_mb:+.1f} MB"
-
-
-def tries(process, alone, beside):
-    """Healthy requests alone, beside trouble, and alone again; once more where it was disturbed."""
-    tried = []
-    while len(tried) < TRIES and not (tried and tried[-1].slower < 2.0):
-        without = alone()
-        before_mb = resident_mb(process)
-        taken, mb = beside()
-        without += alone()
-        tried.append(Tried(p99(taken), p99(without), mb - before_mb))
-    return tried
 
 
 @pytest.mark.torture
@@ -226,7 +160,7 @@ def read_all(connection, pause_s):
 def test_an_answer_is_given_up_when_nothing_of_it_is_read_but_not_where_it_is_read_slowly(
     address, monkeypatch
 ):
-    monkeypatch.setattr("service.web.server.UNREAD_S", 0.5)
+    monkeypatch.setattr("service.web.connection.UNREAD_S", 0.5)
     with asking_much(address) as slow, asking_much(address) as deaf:
         begun = time.monotonic()
         assert read_all(slow, pause_s=0.01) == LONG
@@ -262,7 +196,7 @@ def closed_after_s(connection, every_s=0.1, byte=b"x"):
     ids=["nothing", "a head", "a second head", "a body that was refused"],
 )
 def test_a_client_that_trickles_where_a_head_should_come_is_let_go(address, monkeypatch, sent):
-    monkeypatch.setattr("service.web.server.HEAD_S", 0.8)
+    monkeypatch.setattr("service.web.connection.HEAD_S", 0.8)
     url = httpx.URL(address)
     with socket.create_connection((url.host, url.port)) as connection:
         connection.sendall(sent.encode())
@@ -277,8 +211,8 @@ def test_a_client_that_trickles_where_a_head_should_come_is_let_go(address, monk
 
 def test_the_rest_of_a_refused_body_is_taken_off_slowly_and_to_its_end(address, monkeypatch):
     """Longer than a client may dawdle: it is not the client who does."""
-    monkeypatch.setattr("service.web.server.HEAD_S", 2.0)
-    monkeypatch.setattr("service.web.server.PASSED_BY_PER_S", 10e6)
+    monkeypatch.setattr("service.web.connection.HEAD_S", 2.0)
+    monkeypatch.setattr("service.web.connection.DISCARDED_PER_S", 10e6)
     url = httpx.URL(address)
     with socket.create_connection((url.host, url.port), timeout=30) as connection:
         connection.sendall(HEAD.replace("100000", "40000000")[:-1].encode())
@@ -293,7 +227,7 @@ def test_the_rest_of_a_refused_body_is_taken_off_slowly_and_to_its_end(address, 
 
 
 def test_a_client_that_asks_now_and_then_is_kept(address, monkeypatch):
-    monkeypatch.setattr("service.web.server.HEAD_S", 0.8)
+    monkeypatch.setattr("service.web.connection.HEAD_S", 0.8)
     url = httpx.URL(address)
     with socket.create_connection((url.host, url.port), timeout=10) as connection:
         for _ in range(8):
@@ -304,7 +238,7 @@ def test_a_client_that_asks_now_and_then_is_kept(address, monkeypatch):
 
 def test_a_request_may_take_longer_than_the_next_head(address, monkeypatch):
     """Here a body that comes slowly: it has deadlines of its own."""
-    monkeypatch.setattr("service.web.server.HEAD_S", 0.5)
+    monkeypatch.setattr("service.web.connection.HEAD_S", 0.5)
     url = httpx.URL(address)
     with socket.create_connection((url.host, url.port), timeout=30) as connection:
         connection.sendall(

@@ -12,7 +12,7 @@ from service.errors import NotAdmitted
 from service.observe.wire import Wire
 from service.records.tokens import SESSION_H
 from service.web.access import COOKIE, Asking
-from service.web.bodies import JsonBody, read_model
+from service.web.bodies import SessionBody, read_model
 from service.web.describe import LINK, Gives, described
 from service.web.holding import Held, json_response, page_response
 from service.web.queries import NO_QUERY, AuditQuery
@@ -32,7 +32,7 @@ class SignIn(Wire):
     dependencies=[NO_QUERY],
     **described({200: Gives("Who is signed in now.", Session)}, body=SignIn, problems=(401, 503)),
 )
-def sign_in(request: Request, body: JsonBody, operations: Held) -> Response:
+def sign_in(request: Request, body: SessionBody, operations: Held) -> Response:
     """Exchange a token for a cookie that scripts cannot read and other sites cannot use."""
     secret, caller = operations.access.sign_in(read_model(SignIn, body).token)
     response = json_response(_shown(caller))
