@@ -44,17 +44,20 @@ class Bounds:
 
     lock_s: float
     statement_s: float
+    idle_s: float = 0.0
+    """After so long a server ends a transaction whose client asks nothing, and frees its locks."""
 
 
 # A post waits at most 5 s for its turn, then for one look-up, for the turn to write and for one
 # transaction, of which one ends with a time-out: 15 s in all.
-TO_LOOK_UP, TO_COMMIT = Bounds(lock_s=2.0, statement_s=3.0), Bounds(lock_s=2.0, statement_s=4.0)
-TO_SHOW = Bounds(lock_s=2.0, statement_s=8.0)
+TO_LOOK_UP = Bounds(lock_s=2.0, statement_s=3.0)
+TO_COMMIT = Bounds(lock_s=2.0, statement_s=4.0, idle_s=30.0)
+TO_SHOW = Bounds(lock_s=2.0, statement_s=12.0)
 """For pages and lists, some of which read much."""
+PATIENT_S = 60.0
+"""For a statement of a bulk load, which has time: posts do not wait for it."""
 MORE_S = 1.0
 CONNECT_S, TCP_USER_TIMEOUT_S = 2, 8
-IDLE_IN_TRANSACTION_S = 30
-"""After so long a server ends a transaction whose client is out of reach, and frees its locks."""
 FREE_S = 10.0
 """The longest wait for a reader's connection that is free."""
 TURN_S = 2.0
@@ -158,7 +161,7 @@ def _bounded(url: URL, bounds: Bounds, pool: dict[str, Any]) -> Engine:
     seconds = {
         "lock_timeout": bounds.lock_s,
         "statement_timeout": bounds.statement_s,
-        "idle_in_transaction_session_timeout": IDLE_IN_TRANSACTION_S,
+        "idle_in_transaction_session_timeout": bounds.idle_s,
     }
     options = [f"-c {name}={round(1000 * value)}" for name, value in seconds.items()]
     own = url.query.get("options", ())
@@ -255,6 +258,22 @@ class Reported:
 def _by_driver(connection: Connection, sql: str) -> None:
     with Reported(connection, sql) as driver:
         driver.execute(sql)
+
+
+@contextmanager
+def patience(connection: Connection) -> Iterator[None]:
+    """Let the statements of a transaction take longer than those that a post waits for."""
+    driver: Any = connection.connection.driver_connection
+    answer_s = getattr(driver, "answer_s", None)
+    if answer_s is None:
+        yield
+        return
+    connection.exec_driver_sql(f"SET LOCAL statement_timeout = {round(1000 * PATIENT_S)}")
+    driver.answer_s = PATIENT_S + MORE_S
+    try:
+        yield
+    finally:
+        driver.answer_s = answer_s
 
 
 class TakenBack(Exception):

@@ -12,9 +12,9 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -24,7 +24,7 @@ from sqlalchemy.exc import DBAPIError
 from service.errors import Busy, Stopping
 from service.records.database_file import DatabaseFile
 from service.records.draft import Draft, Row
-from service.records.engines import TO_WRITE, Kept, TakenBack
+from service.records.engines import TO_WRITE, Kept, TakenBack, patience
 from service.records.tables import WRITTEN_BY_POSTS, event_counter
 from service.records.transaction import (
     Job,
@@ -94,7 +94,8 @@ class Writer:
         error that kept this draft, and no other, from being recorded.  Where
         the database itself fails, the future raises `Busy`.
         """
-        return self._put(Awaited(drafts), self._patient if patient else self._queue)
+        queue = self._patient if patient else self._queue
+        return self._put(Awaited(drafts, patient=patient), queue)
 
     def record_here(self, drafts: Sequence[Draft], tell: bool = True) -> Results:
         """`record`, in the thread that asks, as soon as nothing else is being written.
@@ -248,12 +249,21 @@ class Writer:
                 # What is written is written, whoever listens.
                 log.exception("nobody could be told of a commit")
 
+    @contextmanager
+    def _transaction(self, jobs: Sequence[Job]) -> Iterator[Connection]:
+        has_time = all(job.patient for job in jobs)
+        with (
+            self._connection.transaction() as connection,
+            patience(connection) if has_time else nullcontext(),
+        ):
+            yield connection
+
     def _write(self, jobs: Sequence[Job], attempt: int = 1) -> list[Any]:
         try:
             if all(job.change is None for job in jobs):
-                with suppress(TakenBack), self._connection.transaction() as connection:
+                with suppress(TakenBack), self._transaction(jobs) as connection:
                     return transact_at_once(connection, jobs)
-            with self._connection.transaction() as connection:
+            with self._transaction(jobs) as connection:
                 return transact(connection, jobs)
         except BaseException as error:
             crossed = getattr(getattr(error, "orig", None), "sqlstate", None) in _CROSSED

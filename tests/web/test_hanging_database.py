@@ -157,9 +157,14 @@ class Proxy:
         self._flows = threading.Event()
         self._flows.set()
         self._over = False
+        self._ends, self._threads = [], []
         self._server = socket.create_server(("127.0.0.1", 0))
         self.port = self._server.getsockname()[1]
-        threading.Thread(target=self._accept, daemon=True).start()
+        self._start(self._accept)
+
+    def _start(self, target, *ends):
+        self._threads.append(threading.Thread(target=target, args=ends, daemon=True))
+        self._threads[-1].start()
 
     def stall(self):
         self._flows.clear()
@@ -170,17 +175,25 @@ class Proxy:
     def close(self):
         self._over = True
         self._flows.set()
-        self._server.close()
+        for end in (self._server, *self._ends):
+            with suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+        for thread in self._threads:
+            thread.join()
+        for end in (self._server, *self._ends):
+            end.close()
 
     def _accept(self):
         while not self._over:
             with suppress(OSError):
                 here, _ = self._server.accept()
+                self._ends.append(here)
                 # A connection that nobody greets.
                 self._flows.wait()
                 there = socket.create_connection(self._target)
-                for ends in ((here, there), (there, here)):
-                    threading.Thread(target=self._pass_on, args=ends, daemon=True).start()
+                self._ends.append(there)
+                self._start(self._pass_on, here, there)
+                self._start(self._pass_on, there, here)
 
     def _pass_on(self, source, target):
         with suppress(OSError):
