@@ -1004,7 +1004,7 @@ class Operations:
 
         def also(connection: Connection) -> None:
             if alarms:
-                watch_run(connection, row["run"], True, utc_now().text)
+                watch_run(connection, str(row["run"]), True, utc_now().text)
             if entry is not None:
                 entry.add_to(connection)
 

@@ -216,6 +216,9 @@ class Desk:
             held_up = self._active and time.monotonic() - self._moved_s > LISTEN_S
             if held_up and self._more is not None and (came := self._more()):
                 self._refuse(self._put(came))
+                with self._changed:
+                    # Those that were held up may have found nothing more and gone by now.
+                    self._step_in.notify_all()
 
     def _begins(self, turn: threading.Condition, leave: bool = False) -> bool:
         """Whether there is something to do for this thread, and it has begun; it waits for that.
