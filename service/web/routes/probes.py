@@ -18,6 +18,7 @@ router = APIRouter(tags=["probes"], dependencies=[NO_QUERY])
 
 TEXT = "text/plain"
 READY_WAIT_S = 1.5
+"""Whatever the database does, the answer is due within two seconds."""
 
 log = logging.getLogger(__name__)
 
@@ -30,10 +31,7 @@ async def livez() -> Response:
 
 @router.get("/readyz", **described({200: Gives("Ready.", media_type=TEXT)}, problems=(503,)))
 async def readyz(request: Request, operations: Held) -> Response:
-    """Whether batches can be taken: catalog loaded, database within reach, last write good.
-
-    It answers within two seconds, whatever the database does.
-    """
+    """Whether batches can be taken: catalog loaded, database within reach, last write good."""
     state = request.app.state
     if getattr(state, "getting_ready", None) is None or state.getting_ready.done():
         # A thread of its own: those of the handlers may all be at work.  One for all who ask:
