@@ -655,9 +655,9 @@ def _warnings(
     if solution is not None:
         warnings += _doubts(solution, mission, presumed)
     if rival is not None:
-        stars = sum(int((star >= 0).sum()) for star in rival.star)
+        others = sum(int((star >= 0).sum()) for star in rival.star)
         warnings.append(
-            f"rival_attitude: {stars} stars that this attitude leaves unexplained have one of "
+            f"rival_attitude: {others} stars that this attitude leaves unexplained have one of "
             f"their own, {rival.angle_deg:.3f} deg away, with probability {rival.probability:.3g}"
         )
     for each in trackers:

@@ -63,12 +63,15 @@ from service.records import (
 )
 from service.records.access import Access
 from service.records.ahead import LIVE
+from service.records.audit import Entry
 from service.records.bench import mission_in_input
 from service.records.bulk import Bulk, Check
 from service.records.comparing import Pair, compare
 from service.records.comparison import compare_runs
+from service.records.database_file import FileIdentity
 from service.records.draft import Answered, Row
 from service.records.events import Event
+from service.records.identity import OwnKey, own_key
 from service.records.ids import Ulids, is_ulid, lone_ulid
 from service.records.intake import Asked, Intake, Observer, Recorded
 from service.records.looking import neighbours, recorded_batch, recorded_mission
@@ -164,17 +167,27 @@ class Operations:
         self._advising = threading.Lock()
 
     @classmethod
-    def open(cls, settings: Settings, mission: Mission | None = None) -> "Operations":
+    def open(
+        cls,
+        settings: Settings,
+        mission: Mission | None = None,
+        *,
+        create: bool = True,
+        serving: bool = False,
+        expected: FileIdentity | None = None,
+    ) -> "Operations":
         """Read missions and catalog, open the database, start writing.
 
-        `mission`, where given, takes the place of the one of that name.
+        `mission`, where given, takes the place of the one of that name.  `create`,
+        `serving` and `expected` are about the database; see `Store`.
         Raises `BadConfiguration` for whatever of these cannot be used.
         """
         missions = load_missions(settings.missions)
         if mission is not None:
             missions[mission.name] = mission
         sky = Sky(open_catalog(settings.catalog), Shelf(settings.shelf_mb << 20))
-        operations = cls(settings, missions, sky, Store(settings.database))
+        store = Store(settings.database, create=create, serving=serving, expected=expected)
+        operations = cls(settings, missions, sky, store)
         try:
             operations._register()
         except BaseException:
@@ -216,8 +229,8 @@ class Operations:
     def ready(self) -> None:
         """Return once batches can be taken at full speed; the first call compiles and warms.
 
-        Raises `Busy` while another call is at that, and where the database can
-        be neither read nor written.
+        Raises `Busy` while another call is at that, where the database cannot be
+        read, and where the last write failed and another that is tried now does too.
         """
         if not self._warm:
             if not self._warming.acquire(blocking=False):
@@ -233,6 +246,7 @@ class Operations:
                 gc.enable()
                 self._warming.release()
         self.store.writer.require()
+        self.store.writer.require_written()
         with self.reading() as connection:
             connection.exec_driver_sql("SELECT 1")
 
@@ -256,6 +270,10 @@ class Operations:
             except Exception as error:
                 # One that cannot be run any more is no reason not to start.
                 log.warning("the latest batch of a spacecraft could not be rehearsed: %s", error)
+
+    def backlog(self) -> Row:
+        """What waits to be answered and to be written, and whether the last write succeeded."""
+        return self._intake.backlog()
 
     async def attach(self) -> None:
         """Be asked from an event loop from now on."""
@@ -285,14 +303,19 @@ class Operations:
         """Called with every batch that is new, after its commit."""
         return self._intake.observers
 
-    def submit(self, submission: Submission, idempotency_key: str | None = None) -> Answered:
+    def submit(
+        self,
+        submission: Submission,
+        idempotency_key: str | None = None,
+        caller: Caller | None = None,
+    ) -> Answered:
         """Record a batch and answer it; a repeat gets the stored answer.
 
         Raises `KeyReused` and `Conflict` for another body under a key or a
         batch that is taken, `BadBatch` for an unknown spacecraft and for what
         does not fit its mission, `Busy` when too much is waiting.
         """
-        return self.take(submission, idempotency_key).result()
+        return self.take(submission, idempotency_key, caller).result()
 
     def take(
         self,
@@ -303,7 +326,7 @@ class Operations:
         """`submit` for who does not want to wait: the future gives the answer, or the error.
 
         What was sent as JSON is read here; `caller`, where given, must be allowed
-        to ask about its spacecraft.
+        to ask about its spacecraft; a key of one token is not that of another.
         """
         done: Future[Answered] = Future()
         # Who gives up does not take the record back.
@@ -315,7 +338,7 @@ class Operations:
             else:
                 done.set_result(outcome)
 
-        self._intake.take([Asked(sent, idempotency_key, settle, caller)])
+        self._intake.take([Asked(sent, own_key(caller, idempotency_key), settle, caller)])
         return done
 
     def take_all(self, asked: Sequence[Asked]) -> None:
@@ -346,6 +369,7 @@ class Operations:
         known: FrameIn,
         file: IO[bytes],
         idempotency_key: str | None = None,
+        caller: Caller | None = None,
     ) -> Answered:
         """Find the stars on a frame, then `submit` the batch of them; see `imaging.submit`.
 
@@ -355,10 +379,10 @@ class Operations:
         frame of its tracker's, and whatever `submit` raises.
         """
         with file:
-            return self._submit_frame(spacecraft, known, file, idempotency_key)
+            return self._submit_frame(spacecraft, known, file, own_key(caller, idempotency_key))
 
     def _submit_frame(
-        self, spacecraft: str, known: FrameIn, file: IO[bytes], idempotency_key: str | None
+        self, spacecraft: str, known: FrameIn, file: IO[bytes], key: OwnKey | None
     ) -> Answered:
         mission = mission_named(self.missions, spacecraft)
         digest = digest_of(file)
@@ -376,7 +400,7 @@ class Operations:
             (mission.name, known.run, known.batch_of(digest)),
             known.fingerprint(mission.name, digest),
             make,
-            idempotency_key,
+            key,
         )
 
     def overlay(self, id: str) -> bytes:
@@ -397,14 +421,21 @@ class Operations:
         return draw_overlay(row["preview"], row["preview_step"], marks, title)
 
     def what_if(
-        self, id: str, options: OptionsIn, record: bool = False, adopt: bool = False
+        self,
+        id: str,
+        options: OptionsIn,
+        record: bool = False,
+        adopt: bool = False,
+        entry: Entry | None = None,
     ) -> Answered:
         """Run a recorded batch again with other options, in place of what they name.
 
         The answer names its parent.  It is kept only where `record` or `adopt`
         asks for that; adopted, it becomes what lists, histories and rates show.
+        `entry` is what the audit list is to say of it then.
         """
-        return self._intake.what_if(_known(id, "batch"), options, record=record, adopt=adopt)
+        known = _known(id, "batch")
+        return self._intake.what_if(known, options, record=record, adopt=adopt, entry=entry)
 
     def batch(self, id: str) -> Row:
         """One result: `answer`, `input`, `current`, `parent`, and the `what_ifs` of its batch."""
@@ -724,14 +755,19 @@ class Operations:
         *,
         who: str,
         comment: str | None = None,
+        entry: Entry | None = None,
     ) -> Row:
-        """Let a limit hold from the next batch on; None: the shipped one again."""
+        """Let a limit hold from the next batch on; None: the shipped one again.
+
+        Here as in what follows, `entry` is what the audit list is to say of the change.
+        """
         mission, moment = mission_named(self.missions, name), utc_now().text
-        return self.store.writer.change(
+        return self._change_noted(
             lambda connection: limits.set_limit(
                 connection, mission, quantity, settings, who=who, comment=comment, now=moment
-            )
-        ).result()
+            ),
+            entry,
+        )
 
     def alarms(
         self,
@@ -764,28 +800,44 @@ class Operations:
         with self.reading() as connection:
             return alarms.one_alarm(connection, _known(id, "alarm"), utc_now().text)
 
-    def acknowledge(self, id: str, who: str, comment: str | None = None) -> Row:
+    def acknowledge(
+        self, id: str, who: str, comment: str | None = None, entry: Entry | None = None
+    ) -> Row:
         """Somebody has seen an alarm; with the quantity back in limits it is cleared."""
         moment = utc_now().text
         return self._act(
-            id, lambda alarm: latch.acknowledged(alarm, who, moment), who, comment, moment
+            id, lambda alarm: latch.acknowledged(alarm, who, moment), who, comment, moment, entry
         )
 
-    def shelve(self, id: str, who: str, minutes: int, comment: str | None = None) -> Row:
+    def shelve(
+        self,
+        id: str,
+        who: str,
+        minutes: int,
+        comment: str | None = None,
+        entry: Entry | None = None,
+    ) -> Row:
         """Put an alarm aside for some minutes."""
         now = utc_now()
         until = shelf_end(now, minutes)
         return self._act(
-            id, lambda alarm: latch.shelved(alarm, who, until, now.text), who, comment, now.text
+            id,
+            lambda alarm: latch.shelved(alarm, who, until, now.text),
+            who,
+            comment,
+            now.text,
+            entry,
         )
 
-    def unshelve(self, id: str, who: str, comment: str | None = None) -> Row:
+    def unshelve(
+        self, id: str, who: str, comment: str | None = None, entry: Entry | None = None
+    ) -> Row:
         """Take an alarm off the shelf."""
-        return self._act(id, latch.unshelved, who, comment, utc_now().text)
+        return self._act(id, latch.unshelved, who, comment, utc_now().text, entry)
 
-    def comment(self, id: str, who: str, comment: str) -> Row:
+    def comment(self, id: str, who: str, comment: str, entry: Entry | None = None) -> Row:
         """Say something about an alarm, cleared ones included."""
-        return self._act(id, lambda _: ({}, ["commented"]), who, comment, utc_now().text)
+        return self._act(id, lambda _: ({}, ["commented"]), who, comment, utc_now().text, entry)
 
     def _act(
         self,
@@ -794,13 +846,26 @@ class Operations:
         who: str,
         comment: str | None,
         moment: str,
+        entry: Entry | None,
     ) -> Row:
         known = _known(id, "alarm")
-        return self.store.writer.change(
+        return self._change_noted(
             lambda connection: alarms.act(
                 connection, known, step, who=who, comment=comment, now=moment
-            )
-        ).result()
+            ),
+            entry,
+        )
+
+    def _change_noted(self, change: Callable[[Connection], T], entry: Entry | None) -> T:
+        """`change`, with its entry in the audit list: both are stored, or neither."""
+
+        def noted(connection: Connection) -> T:
+            changed = change(connection)
+            if entry is not None:
+                entry.add_to(connection)
+            return changed
+
+        return self.store.writer.change(noted).result()
 
     def sweep(self) -> bool:
         """Look for silent spacecraft and shelves whose time is over; whether there were any."""
@@ -924,14 +989,14 @@ class Operations:
         with self.reading() as connection:
             return compare_runs(connection, Stretch(run, spacecraft, start, end), other)
 
-    def watch_run(self, run: str, alarms: bool = True) -> Row:
+    def watch_run(self, run: str, alarms: bool = True, entry: Entry | None = None) -> Row:
         """Let limits be held against the batches that a run gets from now on, or no longer."""
         name = checked_run_name(run)
         if name == LIVE and not alarms:
             raise BadBatch(Fault("alarms", "live batches are always watched", "False"))
-        self.store.writer.change(
-            lambda connection: watch_run(connection, name, alarms, utc_now().text)
-        ).result()
+        self._change_noted(
+            lambda connection: watch_run(connection, name, alarms, utc_now().text), entry
+        )
         return {"run": name, "alarms": alarms}
 
     def start_replay(
@@ -943,6 +1008,7 @@ class Operations:
         check: Check = lambda spacecraft: None,
         alarms: bool = False,
         owner: str | None = None,
+        entry: Entry | None = None,
     ) -> str:
         """Work through NDJSON lines in the background; the id under which to ask for progress.
 
@@ -950,9 +1016,12 @@ class Operations:
         known.  Lines that can be closed are closed at the end.  A line for whose
         spacecraft `check` raises an `AcquisitionError` is refused with it.  With `alarms`
         limits are held against the run (see `watch_run`).  `owner` is the token
-        that it is started with (see `cancel_replay`).
+        that it is started with (see `cancel_replay`).  `entry` of the audit is noted
+        with it.
         """
-        return self._start_replay(lambda replay: lines, run, name, total, check, alarms, owner)
+        return self._start_replay(
+            lambda replay: lines, run, name, total, check, alarms, owner, entry
+        )
 
     def _start_replay(
         self,
@@ -963,6 +1032,7 @@ class Operations:
         check: Check,
         alarms: bool,
         owner: str | None,
+        entry: Entry | None,
     ) -> str:
         # Whoever knows the id may ask for the progress.
         row = {"id": lone_ulid(), "run": checked_run_name(run), "name": name, "lines_total": total}
@@ -982,13 +1052,14 @@ class Operations:
             if len(at_work) >= MAX_REPLAYS:
                 raise Busy(f"{len(at_work)} replays are at work", REPLAY_RETRY_S)
             self._replays = [*at_work, replay]
-        try:
+
+        def also(connection: Connection) -> None:
             if alarms:
-                self.watch_run(run)
-        except BaseException:
-            replay.abandon()
-            raise
-        replay.start(lines_for(replay))
+                watch_run(connection, str(row["run"]), True, utc_now().text)
+            if entry is not None:
+                entry.add_to(connection)
+
+        replay.start(lines_for(replay), also)
         return replay.id
 
     def start_replay_of(
@@ -1003,6 +1074,7 @@ class Operations:
         check: Check,
         alarms: bool = False,
         owner: str | None = None,
+        entry: Entry | None = None,
     ) -> str:
         """`start_replay` of the lines of a file, which is closed at the end.
 
@@ -1018,6 +1090,7 @@ class Operations:
                 check,
                 alarms,
                 owner,
+                entry,
             )
             on_failure.pop_all()
         return id

@@ -7,12 +7,14 @@ from typing import Any
 from service.errors import AcquisitionError
 from service.logs import About
 from service.missions.mission import Mission
+from service.records.database_file import FileIdentity
+from service.records.identity import OwnKey
 from service.records.tokens import Caller
 from service.settings import Settings
 from service.times import Utc
 
 # Of what comes with every batch there are plain tuples: objects take four times as long to pack.
-Take = tuple[int, bytes | tuple[str, str], str | None, Caller | None]
+Take = tuple[int, bytes | tuple[str, str], OwnKey | None, Caller | None]
 """A batch that is to be taken: its number, as sent or the fields of `Checked`, its key, and who
 sent it, if they are bound to a spacecraft."""
 
@@ -22,6 +24,8 @@ class Open:
     """The first word of the front: open the operations."""
 
     settings: Settings
+    file: FileIdentity | None = None
+    """SQLite's file that must be there, for a backend that takes the place of another."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,8 @@ class Opened:
 
     missions: Mapping[str, Mission]
     started: Utc
+    file: FileIdentity | None
+    """SQLite's file that was opened."""
 
 
 @dataclass(frozen=True)

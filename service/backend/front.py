@@ -34,6 +34,7 @@ from service.observe.wire import checked_from_json
 from service.operations import Operations
 from service.records.access import Access
 from service.records.draft import Answered
+from service.records.identity import own_key
 from service.records.intake import Observer, Recorded
 from service.records.store import Readers
 from service.records.tokens import Caller
@@ -44,6 +45,7 @@ ASKED = (
     "about",
     "acknowledge",
     "advise",
+    "backlog",
     "cancel_replay",
     "change",
     "comment",
@@ -103,7 +105,7 @@ class Front(Operations):
         self.settings = started.settings
         self.missions = dict(opened.missions)
         self.started = opened.started
-        self.readers = Readers(started.settings.database)
+        self.readers = Readers(started.settings.database, serving=True, expected=opened.file)
         self.access = Access(self.reading, self.change, is_loopback(self.settings.host), utc_now)
         self._observers: list[Observer] = []
         self._listeners: list[Callable[[], object]] = []
@@ -150,9 +152,10 @@ class Front(Operations):
         self._waiting[number] = done
         if not self._takes:
             loop.call_soon(self._send_takes)
+        key = own_key(caller, idempotency_key)
         # Who is bound to no spacecraft need not be known there.
         bound = caller if caller is not None and caller.spacecraft is not None else None
-        self._takes.append((number, batch, idempotency_key, bound))
+        self._takes.append((number, batch, key, bound))
         return await done
 
     def _send_takes(self) -> None:
@@ -265,7 +268,7 @@ class Front(Operations):
         """Go on with another backend, once it has opened its operations and is warm."""
         assert self._loop is not None
         try:
-            _handshake(started)
+            _handshake(started, self.readers)
         except AcquisitionError as error:
             log.error("it could not be started, and is in %g s again: %s", pause_s, error)
             longer_s = min(2.0 * pause_s, LONGEST_PAUSE_S)
@@ -335,14 +338,16 @@ def _restarting() -> Busy:
     return Busy("the process that works on batches is being started again", RESTART_S)
 
 
-def _handshake(started: Started) -> Opened:
+def _handshake(started: Started, readers: Readers | None = None) -> Opened:
+    """What a backend says first; it must find the file that the readers have, if there are any."""
+    expected = None if readers is None or readers.file is None else readers.file.identity
     channel = Channel(started.line)
     with ExitStack() as on_failure:
         on_failure.callback(started.files.close)
         on_failure.callback(started.line.close)
         on_failure.callback(started.process.wait)
         try:
-            channel.send(Open(started.settings))
+            channel.send(Open(started.settings, expected))
             said = channel.receive()[0]
         except (EOFError, OSError):
             code = started.process.wait()

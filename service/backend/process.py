@@ -48,7 +48,7 @@ def run(line: int, files: int) -> None:
         return
     logs.configure(first.settings.logs, "backend")
     try:
-        operations = Operations.open(first.settings)
+        operations = Operations.open(first.settings, serving=True, expected=first.file)
     except AcquisitionError as error:
         channel.send(Refused(error))
         return
@@ -59,7 +59,9 @@ def run(line: int, files: int) -> None:
         operations.close()
         channel.send(Refused(error))
         return
-    channel.send(Opened(operations.missions, operations.started))
+    file = operations.store.file
+    identity = None if file is None else file.identity
+    channel.send(Opened(operations.missions, operations.started, identity))
     Backend(operations, channel, Files(socket.socket(fileno=files))).serve()
 
 

@@ -490,7 +490,7 @@ def database_prune(parsed: Namespace) -> int:
     from service.times import parse_utc
 
     before = parse_utc(parsed.before, "--before")
-    store = Store(_settings_of_existing(parsed).database)
+    store = Store(_settings_of_existing(parsed).database, create=False)
     try:
         with tqdm(total=None, unit=" batches", desc="deleting", disable=None, leave=False) as bar:
 

@@ -61,7 +61,7 @@ def create(
 def show(settings: Settings) -> int:
     """Print every token without its secret."""
     moment = utc_now().text
-    with _opened(settings) as store, store.reading() as connection:
+    with _opened(settings, create=False) as store, store.reading() as connection:
         rows = tokens.list_tokens(connection)
     if not rows:
         print("there are no tokens: access on this machine is open")
@@ -80,7 +80,7 @@ def show(settings: Settings) -> int:
 def revoke(settings: Settings, name: str) -> int:
     """End a token."""
     ids, moment = Ulids(), utc_now().text
-    with _opened(settings) as store:
+    with _opened(settings, create=False) as store:
 
         def change(connection: Connection) -> None:
             tokens.revoke_token(connection, name, moment)
@@ -101,8 +101,8 @@ def _note(connection: Connection, ids: Ulids, moment: str, action: str, name: st
 
 
 @contextmanager
-def _opened(settings: Settings) -> Iterator[Store]:
-    store = Store(settings.database)
+def _opened(settings: Settings, create: bool = True) -> Iterator[Store]:
+    store = Store(settings.database, create=create)
     try:
         yield store
     finally:

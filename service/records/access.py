@@ -15,7 +15,7 @@ from typing import Any
 
 from sqlalchemy import Connection
 
-from service.errors import NotAdmitted, TooOften
+from service.errors import Busy, NotAdmitted, TooOften
 from service.records import audit, tokens
 from service.records.ids import Ulids
 from service.records.tokens import SCOPES, Caller
@@ -56,6 +56,7 @@ class Access:
         self._lock = threading.Lock()
         self._known: dict[tuple[str, str], tuple[Caller, float]] = {}
         self._open_until_s = 0.0
+        self._out_of_reach_until_s = 0.0
         self._closed = False
         self._buckets: dict[str, _Bucket] = {}
 
@@ -70,6 +71,22 @@ class Access:
             self._closed = self.has_tokens()
             self._open_until_s = clock_s + KNOWN_FOR_S
         return not self._closed
+
+    @property
+    def known_open(self) -> bool | None:
+        """`is_open` where that is known without a look into the database."""
+        if self._closed or not self._loopback:
+            return False
+        return True if time.monotonic() < self._open_until_s else None
+
+    def out_of_reach(self) -> None:
+        """Note that the database did not answer in time."""
+        self._out_of_reach_until_s = time.monotonic() + KNOWN_FOR_S
+
+    def require_within_reach(self) -> None:
+        """Raise `Busy` where the database has just not answered: nobody waits for it meanwhile."""
+        if time.monotonic() < self._out_of_reach_until_s:
+            raise Busy("the database does not answer", 5)
 
     def has_tokens(self) -> bool:
         """Whether a token was ever made."""
@@ -160,18 +177,12 @@ class Access:
         with self._lock:
             self._known.pop(("session", digest), None)
 
-    def note(self, who: str, action: str, about: str, body: str | None, status: int) -> None:
-        """Add to the list of what was changed; returns once that is stored."""
-        id, moment = self._ids.new(), self._now().text
-        self._change(
-            partial(
-                audit.note,
-                id=id,
-                moment=moment,
-                who=who,
-                action=action,
-                about=about,
-                body=body,
-                status=status,
-            )
-        )
+    def entry(
+        self, who: str, action: str, about: str, body: str | None, status: int
+    ) -> audit.Entry:
+        """An entry for the list of what was changed."""
+        return audit.Entry(self._ids.new(), self._now().text, who, action, about, body, status)
+
+    def note(self, entry: audit.Entry) -> None:
+        """Add an entry of its own to the list; returns once it is stored."""
+        self._change(entry.add_to)

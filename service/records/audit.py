@@ -1,5 +1,7 @@
 """Who changed what: a list that is only ever added to."""
 
+from dataclasses import dataclass
+
 from sqlalchemy import Connection, insert, select
 
 from service.records.draft import Row
@@ -7,6 +9,31 @@ from service.records.pages import Page
 from service.records.tables import audit
 
 MAX_BODY_KEPT = 4_000
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One entry: who did what to what, with what body, and the status of the answer.
+
+    Handed to the operation that makes the change, it becomes part of the change's own
+    transaction: neither is stored without the other.
+    """
+
+    id: str
+    moment: str
+    who: str
+    action: str
+    about: str
+    body: str | None = None
+    status: int | None = None
+
+    def row(self) -> Row:
+        """The entry as a row of the table, its body cut to what is kept."""
+        return vars(self) | {"body": _kept(self.body)}
+
+    def add_to(self, connection: Connection) -> None:
+        """Add the entry to the list."""
+        connection.execute(insert(audit).values(self.row()))
 
 
 def note(
@@ -21,12 +48,13 @@ def note(
     status: int | None = None,
 ) -> None:
     """Add an entry: who did what to what, with what body, and the status of the answer."""
-    kept = body if body is None or len(body) <= MAX_BODY_KEPT else body[: MAX_BODY_KEPT - 1] + "…"
-    connection.execute(
-        insert(audit).values(
-            id=id, moment=moment, who=who, action=action, about=about, body=kept, status=status
-        )
-    )
+    Entry(id, moment, who, action, about, body, status).add_to(connection)
+
+
+def _kept(body: str | None) -> str | None:
+    if body is None or len(body) <= MAX_BODY_KEPT:
+        return body
+    return body[: MAX_BODY_KEPT - 1] + "…"
 
 
 def list_entries(connection: Connection, limit: int, cursor: str | None) -> Page:

@@ -74,7 +74,9 @@ def _copy_sqlite(source: Path, part: Path, step: Step) -> None:
 
 
 def _opened(source: Path) -> sqlite3.Connection:
-    connection = sqlite3.connect(source, isolation_level=None)
+    # Read and write, for its log; but never created.
+    uri = f"{source.absolute().as_uri()}?mode=rw"
+    connection = sqlite3.connect(uri, isolation_level=None, uri=True)
     connection.execute(f"PRAGMA busy_timeout = {BUSY_TIMEOUT_MS}")
     connection.execute("PRAGMA query_only = ON")
     return connection

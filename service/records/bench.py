@@ -13,7 +13,7 @@ from service.missions.mission import Mission, mission_named
 from service.observe.batch import ObservationBatch
 from service.observe.wire import Submission
 from service.records.draft import Draft, submission_draft
-from service.records.identity import identity_of
+from service.records.identity import OwnKey, identity_of
 from service.records.ids import Ulids
 from service.records.writer import RETRY_AFTER_S
 from service.sky.view import Sky
@@ -40,7 +40,7 @@ class Bench:
         for _ in range(self.processors):
             self._free.put(None)
 
-    def draft(self, submission: Submission, key: str | None = None) -> Draft:
+    def draft(self, submission: Submission, key: OwnKey | None = None) -> Draft:
         """The draft of a submission; raises `BadBatch` for what does not fit its mission."""
         received = utc_now()
         return self.draft_of(submission, self.acquired(submission), received, key)
@@ -55,7 +55,7 @@ class Bench:
         submission: Submission,
         acquisition: Acquisition,
         received: Utc,
-        key: str | None = None,
+        key: OwnKey | None = None,
     ) -> Draft:
         """The draft of what was acquired of a submission that was received at a moment."""
         return submission_draft(

@@ -21,7 +21,7 @@ from service.resources import shipped
 if TYPE_CHECKING:
     from alembic.config import Config
 
-HEAD = "0006"
+HEAD = "0007"
 """The latest revision of `migrations/`."""
 
 

@@ -21,7 +21,7 @@ from service.acquire import Acquisition
 from service.errors import AcquisitionError, Busy, Stopping
 from service.observe.wire import Submission
 from service.records.draft import Answered, Draft
-from service.records.identity import Identity, identity_of
+from service.records.identity import Identity, OwnKey, identity_of
 from service.records.writer import RETRY_AFTER_S
 from service.times import Utc, utc_now
 
@@ -35,6 +35,8 @@ AWAKE_S = 1.0
 """So long after the last batch one thread goes on looking: to be woken is dear."""
 WAIT_S = 5.0
 """The longest that an order may wait for its turn."""
+LISTEN_S = 0.2
+"""So often somebody asks for more while every thread is held up."""
 
 Outcome = Answered | Exception
 Found = Sequence[Answered | AcquisitionError | None]
@@ -51,7 +53,7 @@ class Order:
     """
 
     read: Callable[[], Submission]
-    key: str | None
+    key: OwnKey | None
     settle: Callable[[Outcome], object]
     received: Utc = field(default_factory=utc_now)
     since_s: float = field(default_factory=time.monotonic)
@@ -97,6 +99,7 @@ class Desk:
         self._new: deque[Order] = deque()
         self._ready: deque[Order] = deque()
         self._at_work: dict[Identity, list[Order]] = {}
+        self._unsettled: dict[Order, None] = {}
         lock = threading.RLock()
         self._changed = threading.Condition(lock)
         self._step_in = threading.Condition(lock)
@@ -117,7 +120,10 @@ class Desk:
             threading.Thread(target=self._watch, name=f"desk-{number}", daemon=True)
             for number in range(1, threads)
         ]
-        for thread in self._others:
+        # Whatever the others wait for, calls that come the same way as batches go on.
+        self._listener = threading.Thread(target=self._listen, name="desk-listener", daemon=True)
+        self._over = threading.Event()
+        for thread in (*self._others, self._listener):
             thread.start()
 
     def take(self, orders: Sequence[Order]) -> None:
@@ -153,6 +159,7 @@ class Desk:
             taken = 0 if self._closing else max(0, min(room, len(orders)))
             if taken:
                 self._new.extend(orders[:taken])
+                self._unsettled.update(dict.fromkeys(orders[:taken]))
                 self._quiet.clear()
         return orders[taken:]
 
@@ -169,6 +176,13 @@ class Desk:
         """Seconds since something was last put here."""
         return time.monotonic() - self._taken_s
 
+    def state(self) -> tuple[int, float]:
+        """How many orders are not settled yet, and the age of the oldest in seconds."""
+        with self._changed:
+            oldest = next(iter(self._unsettled), None)
+            age_s = 0.0 if oldest is None else time.monotonic() - oldest.since_s
+            return len(self._unsettled), age_s
+
     def let_pass(self, seconds: float) -> None:
         """Wait until nothing lies here, but no longer than so; for whoever has more time."""
         self._quiet.wait(seconds)
@@ -181,6 +195,8 @@ class Desk:
         for thread in (self._first, *self._others):
             if thread.ident:
                 thread.join()
+        self._over.set()
+        self._listener.join()
 
     def _notify_all(self) -> None:
         self._changed.notify_all()
@@ -193,6 +209,16 @@ class Desk:
     def _watch(self) -> None:
         while self._begins(self._step_in):
             self._work_through_group()
+
+    def _listen(self) -> None:
+        """Ask for what came while every thread is held up, for batches are not all that comes."""
+        while not self._over.wait(LISTEN_S):
+            held_up = self._active and time.monotonic() - self._moved_s > LISTEN_S
+            if held_up and self._more is not None and (came := self._more()):
+                self._refuse(self._put(came))
+                with self._changed:
+                    # Those that were held up may have found nothing more and gone by now.
+                    self._step_in.notify_all()
 
     def _begins(self, turn: threading.Condition, leave: bool = False) -> bool:
         """Whether there is something to do for this thread, and it has begun; it waits for that.
@@ -257,6 +283,7 @@ class Desk:
 
     def _look(self, orders: Sequence[Order]) -> None:
         """Answer what is wrong or stored; let the rest be computed, each identity once."""
+        orders = self._in_time(orders)
         orders, refused = self._read(orders)
         self._settle(refused)
         if not orders:
@@ -276,6 +303,16 @@ class Desk:
                 else:
                     followers.append(order)
         self._settle([each for each in zip(orders, found, strict=True) if each[1] is not None])
+
+    def _in_time(self, orders: Sequence[Order]) -> Sequence[Order]:
+        """The orders that have not waited too long; the others may come again."""
+        since_s = time.monotonic() - WAIT_S
+        late = [order for order in orders if order.since_s < since_s]
+        if not late:
+            return orders
+        error = Busy(f"it has waited {WAIT_S:g} s for its turn", RETRY_AFTER_S)
+        self._settle([(order, error) for order in late])
+        return [order for order in orders if order.since_s >= since_s]
 
     def _read(
         self, orders: Sequence[Order]
@@ -337,6 +374,9 @@ class Desk:
         self._settle(list(zip(orders, outcomes, strict=True)))
 
     def _settle(self, settled: Sequence[tuple[Order, Outcome | None]]) -> None:
+        with self._changed:
+            for order, _ in settled:
+                self._unsettled.pop(order, None)
         for order, outcome in settled:
             assert outcome is not None
             order.settle(outcome)

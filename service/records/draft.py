@@ -76,13 +76,15 @@ class Draft(Struct, eq=False):
     stars: list[Row]
     solution: Row | None
     buckets: Buckets
-    key: str | None
+    key: tuple[str, str] | None
     received_ns: int
     """When it came, as `Utc.tai_ns`."""
     frame: Row | None = None
     is_ahead: bool = False
     """Of a live batch: dated so far ahead that its time cannot be believed."""
     handed: Handed | None = None
+    audit: Row | None = None
+    """The entry of the audit list that is stored with it, of a what-if that somebody recorded."""
 
     def __reduce__(self) -> tuple[type["Draft"], tuple[Any, ...]]:
         # To another process without what stands first, the settings of its mission: they are many.
@@ -118,7 +120,7 @@ def submission_draft(
     *,
     id: str,
     received: Utc,
-    key: str | None = None,
+    key: tuple[str, str] | None = None,
 ) -> Draft:
     """The draft of a batch's first result, which is current and gives the batch its id."""
     batch = acquisition.batch
@@ -175,7 +177,7 @@ def _draft(
     answer: Row,
     batch_row: Row | None,
     result: Row,
-    key: str | None,
+    key: tuple[str, str] | None,
     received: Utc,
 ) -> Draft:
     batch = acquisition.batch

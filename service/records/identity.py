@@ -12,9 +12,16 @@ from service.errors import Conflict, KeyReused, shown_value
 from service.observe.batch import ObservationBatch
 from service.records.prepared import execute
 from service.records.tables import idempotency_keys
+from service.records.tokens import Caller
 
 Identity = tuple[str, str, str]
 """(spacecraft, run, batch): unique among submissions."""
+
+OwnKey = tuple[str, str]
+"""The id of a token and an Idempotency-Key: keys of different tokens are different keys.
+
+The id is empty where a key came without a token.
+"""
 
 # What is looked for comes as one value, so that the text of each statement never changes: to
 # make one for so many values takes longer than to run it.
@@ -35,7 +42,18 @@ _AMONG = {
     "sqlite": "(SELECT value FROM json_each(:wanted))",
     "postgresql": "(SELECT json_array_elements_text(CAST(%(wanted)s AS json)))",
 }
-_BY_KEY = "SELECT key, result_id, fingerprint FROM idempotency_keys WHERE key IN "
+_BY_KEY = {
+    "sqlite": """
+        SELECT k.token_id, k.key, k.result_id, k.fingerprint
+        FROM json_each(:wanted) AS w CROSS JOIN idempotency_keys AS k
+        WHERE k.token_id = json_extract(w.value, '$[0]') AND k.key = json_extract(w.value, '$[1]')
+    """,
+    "postgresql": """
+        SELECT k.token_id, k.key, k.result_id, k.fingerprint
+        FROM json_array_elements(CAST(%(wanted)s AS json)) AS w JOIN idempotency_keys AS k
+        ON k.token_id = w->>0 AND k.key = w->>1
+    """,
+}
 _ANSWERS = "SELECT id, answer FROM results WHERE id IN "
 
 
@@ -44,6 +62,13 @@ class Taken(Struct, frozen=True):
 
     result_id: str
     fingerprint: str
+
+
+def own_key(caller: Caller | None, key: str | None) -> OwnKey | None:
+    """An Idempotency-Key as the key of whoever sent it; None where there is none."""
+    if key is None:
+        return None
+    return (caller and caller.token_id) or "", key
 
 
 def identity_of(batch: ObservationBatch) -> Identity:
@@ -56,18 +81,18 @@ class Registry:
     """What is already there of some identities and keys."""
 
     identities: dict[Identity, Taken] = field(default_factory=dict)
-    keys: dict[str, Taken] = field(default_factory=dict)
+    keys: dict[OwnKey, Taken] = field(default_factory=dict)
 
-    def first(self, identity: Identity, key: str | None, fingerprint: str) -> Taken | None:
+    def first(self, identity: Identity, key: OwnKey | None, fingerprint: str) -> Taken | None:
         """Who recorded this body before; None: nobody did.
 
         Raises `KeyReused` where the key belongs to another body, which is
         looked at first, and `Conflict` where the identity does.
         """
         by_key = None if key is None else self.keys.get(key)
-        if by_key is not None:
+        if key is not None and by_key is not None:
             if by_key.fingerprint != fingerprint:
-                raise KeyReused(f"Idempotency-Key {shown_value(key)} was used with another body")
+                raise KeyReused(f"Idempotency-Key {shown_value(key[1])} was used with another body")
             return by_key
         by_identity = self.identities.get(identity)
         if by_identity is not None and by_identity.fingerprint != fingerprint:
@@ -77,7 +102,7 @@ class Registry:
             )
         return by_identity
 
-    def enter(self, identity: Identity, key: str | None, taken: Taken) -> None:
+    def enter(self, identity: Identity, key: OwnKey | None, taken: Taken) -> None:
         """Note a new holder, so that whoever comes next finds it."""
         self.identities[identity] = taken
         if key is not None:
@@ -85,7 +110,7 @@ class Registry:
 
 
 def look_up(
-    connection: Connection, identities: Collection[Identity], keys: Collection[str] = ()
+    connection: Connection, identities: Collection[Identity], keys: Collection[OwnKey] = ()
 ) -> Registry:
     """What is recorded under these identities and keys."""
     registry = Registry()
@@ -95,8 +120,10 @@ def look_up(
         for spacecraft, run, batch, id, fingerprint in rows:
             registry.identities[spacecraft, run, batch] = Taken(id, fingerprint)
     if keys:
-        rows = _rows(connection, _BY_KEY + _AMONG[dialect], keys)
-        registry.keys = {key: Taken(id, fingerprint) for key, id, fingerprint in rows}
+        rows = _rows(connection, _BY_KEY[dialect], keys)
+        registry.keys = {
+            (token_id, key): Taken(id, fingerprint) for token_id, key, id, fingerprint in rows
+        }
     return registry
 
 
@@ -104,11 +131,21 @@ def _rows(connection: Connection, sql: str, wanted: Collection[object]) -> Itera
     return execute(connection, sql, {"wanted": msgspec.json.encode(list(wanted)).decode()})
 
 
-def remember_key(connection: Connection, identity: Identity, key: str, taken: Taken) -> None:
+def remember_key(connection: Connection, identity: Identity, key: OwnKey, taken: Taken) -> None:
     """Give a key to a body that is recorded without it; raises `KeyReused` if another has it."""
     if look_up(connection, (), [key]).first(identity, key, taken.fingerprint) is None:
-        row = {"key": key, "fingerprint": taken.fingerprint, "result_id": taken.result_id}
-        connection.execute(insert(idempotency_keys), row)
+        connection.execute(insert(idempotency_keys), key_row(key, taken))
+
+
+def key_row(key: OwnKey, taken: Taken) -> dict[str, str]:
+    """A row of the table of keys."""
+    token_id, name = key
+    return {
+        "token_id": token_id,
+        "key": name,
+        "fingerprint": taken.fingerprint,
+        "result_id": taken.result_id,
+    }
 
 
 def stored_answers(connection: Connection, ids: Collection[str]) -> dict[str, bytes]:

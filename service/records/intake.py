@@ -2,8 +2,8 @@
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 
 import msgspec
@@ -23,11 +23,13 @@ from service.observe.wire import (
 )
 from service.records.again import batch_again
 from service.records.answer import answer_of
+from service.records.audit import Entry
 from service.records.bench import Bench
 from service.records.desk import Desk, Order
-from service.records.draft import Answered, Draft, Handed, what_if_draft
+from service.records.draft import Answered, Draft, Handed, Row, what_if_draft
 from service.records.identity import (
     Identity,
+    OwnKey,
     Registry,
     Taken,
     identity_of,
@@ -75,7 +77,7 @@ class Asked(Struct, frozen=True, eq=False):
     """
 
     sent: bytes | Checked | Submission
-    key: str | None
+    key: OwnKey | None
     settle: Callable[[Answered | Exception], object]
     caller: Caller | None = None
 
@@ -116,6 +118,12 @@ class Intake:
         """
         self._desk.take_here(_orders(asked), lambda: _orders(more()))
 
+    def backlog(self) -> Row:
+        """What waits: `posts` that are not answered yet, and the state of the `writes`."""
+        waiting, oldest_s = self._desk.state()
+        posts = {"queued": waiting, "oldest_s": oldest_s}
+        return {"posts": posts, "writes": self._store.writer.state()}
+
     @property
     def after_group(self) -> list[Callable[[], object]]:
         """Called when the outcomes of a group of those that `take` was given are all told."""
@@ -130,7 +138,7 @@ class Intake:
         identity: Identity,
         fingerprint: str,
         make: Callable[[], Submission],
-        key: str | None,
+        key: OwnKey | None,
     ) -> Answered:
         """The same of a batch that is still to be made, and is not where it is recorded.
 
@@ -192,8 +200,19 @@ class Intake:
         finish = self._begin_writing(drafts, patient=True)
         return lambda: _decided(finish())
 
-    def what_if(self, id: str, options: OptionsIn, *, record: bool, adopt: bool) -> Answered:
-        """Run a recorded batch again; `options` replace what they name of the result's own."""
+    def what_if(
+        self,
+        id: str,
+        options: OptionsIn,
+        *,
+        record: bool,
+        adopt: bool,
+        entry: Entry | None = None,
+    ) -> Answered:
+        """Run a recorded batch again; `options` replace what they name of the result's own.
+
+        `entry` is stored in the audit list together with a result that is recorded.
+        """
         with self._store.reading() as connection:
             parent = one_result(connection, id)
         batch = batch_again(parent["input"], parent["options"], options)
@@ -209,6 +228,8 @@ class Intake:
             adopt=adopt,
             created=utc_now(),
         )
+        if entry is not None:
+            draft.audit = entry.row()
         return _raised(self._write([draft])[0])
 
     def rehearse(self, submission: Submission) -> None:
@@ -239,7 +260,7 @@ class Intake:
         """What is stored of each: the answer, the error of whose place is taken, or nothing."""
         # Identities before keys, each as of its moment: what is recorded in between is found by its
         # key, or seems new, and then the transaction finds it.
-        with self._store.glancing() as connection:
+        with self._noted_failure(len(orders)), self._store.glancing() as connection:
             registry = look_up(
                 connection,
                 {each.identity for each in orders},
@@ -270,8 +291,17 @@ class Intake:
                 found.append(Answered(holder.result_id, stored[holder.result_id], replayed=True))
         return found
 
+    @contextmanager
+    def _noted_failure(self, count: int) -> Iterator[None]:
+        """Batches that cannot be looked up cannot be written either."""
+        try:
+            yield
+        except Busy:
+            self._store.writer.note_failure(count)
+            raise
+
     def _remember(
-        self, identity: Identity, key: str | None, first: Taken, registry: Registry
+        self, identity: Identity, key: OwnKey | None, first: Taken, registry: Registry
     ) -> None:
         """Give a repeat's key, where it is a new one, to the body that is recorded."""
         if key is not None and key not in registry.keys:
@@ -279,7 +309,7 @@ class Intake:
                 lambda connection: remember_key(connection, identity, key, first)
             ).result()
 
-    def _stored(self, identity: Identity, fingerprint: str, key: str | None) -> Answered | None:
+    def _stored(self, identity: Identity, fingerprint: str, key: OwnKey | None) -> Answered | None:
         with self._store.reading() as connection:
             registry = look_up(connection, [identity], [] if key is None else [key])
             first = registry.first(identity, key, fingerprint)
@@ -376,7 +406,7 @@ def _read(asked: Asked) -> Submission:
 
 
 def _holder(
-    registry: Registry, identity: Identity, key: str | None, fingerprint: str
+    registry: Registry, identity: Identity, key: OwnKey | None, fingerprint: str
 ) -> Taken | AcquisitionError | None:
     try:
         return registry.first(identity, key, fingerprint)
@@ -384,7 +414,8 @@ def _holder(
         return error
 
 
-def _check_key(key: str) -> None:
+def _check_key(own: OwnKey) -> None:
+    _, key = own
     if not (0 < len(key) <= MAX_KEY_LENGTH and key.isascii() and key.isprintable()):
         message = f"must be 1 to {MAX_KEY_LENGTH} printable ASCII characters"
         raise BadBatch(Fault("Idempotency-Key", message, shown_value(key)))

@@ -7,9 +7,10 @@ from sqlalchemy import Connection, and_, insert, select, update
 from service.errors import AcquisitionError
 from service.records import events, rollups
 from service.records.draft import Answered, Draft, Row
-from service.records.identity import Registry, Taken, look_up, stored_answers
+from service.records.identity import Registry, Taken, key_row, look_up, stored_answers
 from service.records.statements import insert_all, insert_missing
 from service.records.tables import (
+    audit,
     batches,
     catalogs,
     frames,
@@ -85,7 +86,7 @@ def record(connection: Connection, drafts: Sequence[Draft], unseen: bool = False
         connection,
         idempotency_keys,
         [
-            {"key": key, "fingerprint": taken.fingerprint, "result_id": taken.result_id}
+            key_row(key, taken)
             for key, taken in sorted(registry.keys.items())
             if key not in keys_before
         ],
@@ -148,6 +149,7 @@ def _insert(connection: Connection, fresh: Sequence[tuple[Draft, bytes]], unseen
                 adopted.append((where.spacecraft, where.run, where.hour))
             _insert_results(connection, [(draft, body)])
     rollups.renew(connection, adopted)
+    insert_all(connection, audit, [draft.audit for draft, _ in fresh if draft.audit is not None])
     watch(connection, [draft for draft, _ in firsts])
     _tell(connection, [draft for draft, _ in fresh])
 

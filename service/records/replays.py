@@ -189,10 +189,13 @@ class Replay:
         """Its id."""
         return str(self._row["id"])
 
-    def start(self, lines: Iterable[bytes]) -> None:
-        """Note the replay in the table and begin in a thread; `lines` are closed at the end."""
+    def start(self, lines: Iterable[bytes], also: Callable[[Connection], object]) -> None:
+        """Note the replay in the table and begin in a thread; `lines` are closed at the end.
+
+        `also` is called in the transaction that notes it.
+        """
         try:
-            self._note()
+            self._note(also)
             threading.Thread(
                 target=self._work, args=(lines,), name=f"replay-{self._row['id']}"
             ).start()
@@ -200,11 +203,7 @@ class Replay:
             self._over.set()
             raise
 
-    def abandon(self) -> None:
-        """Be over before it has begun."""
-        self._over.set()
-
-    def _note(self) -> None:
+    def _note(self, also: Callable[[Connection], object]) -> None:
         row = self._row | {
             "state": "running",
             "lines_done": 0,
@@ -217,6 +216,7 @@ class Replay:
 
         def begin(connection: Connection) -> None:
             connection.execute(insert(replays), row)
+            also(connection)
             events.note(connection, "replay", self._state(), run=row["run"])
 
         self._store.writer.change(begin).result()

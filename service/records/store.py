@@ -10,7 +10,19 @@ from sqlalchemy.exc import DBAPIError, TimeoutError
 
 from service.errors import Busy
 from service.records.database import bring_up_to_date, require_up_to_date
-from service.records.engines import TO_READ, Kept, database_url, reading_engine, writing_engine
+from service.records.database_file import DatabaseFile, FileIdentity
+from service.records.engines import (
+    TO_COMMIT,
+    TO_LOOK_UP,
+    TO_READ,
+    TO_SHOW,
+    TURN_S,
+    Kept,
+    database_file,
+    database_url,
+    reading_engine,
+    writing_engine,
+)
 from service.records.transaction import may_pass
 from service.records.writer import RETRY_AFTER_S, Writer
 
@@ -23,11 +35,28 @@ _WAL_RESET_BUG = (3, 7, 0), (3, 51, 2)
 class Readers:
     """Connections that see one moment of a database each, and cannot write."""
 
-    def __init__(self, database: str) -> None:
-        """Nothing is connected yet; raises `BadConfiguration` for what is no database's URL."""
+    def __init__(
+        self,
+        database: str,
+        *,
+        serving: bool = False,
+        expected: FileIdentity | None = None,
+        file: DatabaseFile | None = None,
+    ) -> None:
+        """Nothing is connected yet; raises `BadConfiguration` for what is no database's URL.
+
+        While `serving`, nobody waits long for a database that does not answer.  Of SQLite
+        the file that is `expected`, or the one that is there now, must stay the same.
+        """
         self.url = database_url(database)
-        self._readers = reading_engine(self.url)
-        self._glances = Kept(self._readers, TO_READ)
+        self.file = file or database_file(self.url, expected)
+        if self.file is not None:
+            self.file.remember()
+        self._readers = reading_engine(self.url, TO_SHOW if serving else None)
+        self._glancing = self._readers
+        if serving and self.file is None:
+            self._glancing = reading_engine(self.url, TO_LOOK_UP, 1)
+        self._glances = Kept(self._glancing, TO_READ, self.file, TURN_S if serving else None)
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
@@ -35,6 +64,8 @@ class Readers:
 
         Raises `Busy` where the database is out of reach or every reader taken.
         """
+        if self.file is not None:
+            self.file.require()
         with _reported(), self._readers.connect() as connection, connection.begin():
             yield connection
 
@@ -50,6 +81,7 @@ class Readers:
     def close(self) -> None:
         """Let go of the database."""
         self._glances.close()
+        self._glancing.dispose()
         self._readers.dispose()
 
 
@@ -70,12 +102,27 @@ def _reported() -> Iterator[None]:
 class Store(Readers):
     """The one connection that writes, behind its thread, and the readers."""
 
-    def __init__(self, database: str) -> None:
+    def __init__(
+        self,
+        database: str,
+        *,
+        create: bool = True,
+        serving: bool = False,
+        expected: FileIdentity | None = None,
+    ) -> None:
         """Open a database: SQLite is created and migrated, PostgreSQL must be up to date.
 
+        Without `create`, or where a certain file is `expected`, SQLite's must be there.
+        `serving` is for who must answer in time; see `Readers`.
         Raises `BadConfiguration` with what to do.
         """
-        self._writing = writing_engine(database_url(database))
+        url = database_url(database)
+        file = database_file(url, expected)
+        create = create and expected is None
+        if file is not None and not create:
+            file.require_there()
+        bounds = TO_COMMIT if serving else None
+        self._writing = writing_engine(url, file=file, create=create, bounds=bounds)
         try:
             if self._writing.dialect.name == "sqlite":
                 bring_up_to_date(self._writing)
@@ -84,8 +131,8 @@ class Store(Readers):
         except BaseException:
             self._writing.dispose()
             raise
-        super().__init__(database)
-        self.writer = Writer(self._writing)
+        super().__init__(database, serving=serving, file=file)
+        self.writer = Writer(self._writing, file=file, turn_s=TURN_S if serving else None)
 
     def close(self) -> None:
         """Write what is queued, then let go of the database."""

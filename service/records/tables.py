@@ -289,6 +289,8 @@ rollups_daily = _rollup("rollups_daily")
 idempotency_keys = Table(
     "idempotency_keys",
     metadata,
+    # The token whose key it is; empty: none, for keys sent while access was open.
+    Column("token_id", String(26), primary_key=True, server_default=text("''")),
     Column("key", String(255), primary_key=True),
     Column("fingerprint", String(64), nullable=False),
     Column("result_id", Id, ForeignKey(results.c.id), nullable=False, index=True),
@@ -450,3 +452,20 @@ event_counter = Table(
     Column("id", SmallInteger, primary_key=True, autoincrement=False),
     Column("last", BigInteger, nullable=False),
 )
+
+WRITTEN_BY_POSTS = (
+    runs,
+    batches,
+    results,
+    star_results,
+    solutions,
+    rollups_hourly,
+    rollups_daily,
+    idempotency_keys,
+    watches,
+    alarms,
+    alarm_actions,
+    events,
+    event_counter,
+)
+"""The tables that a batch may be written to."""

@@ -36,6 +36,8 @@ class Job:
 
     drafts: Sequence[Draft] = ()
     change: Callable[[Connection], Any] | None = None
+    patient: bool = False
+    """Whether it has time, as a bulk load has, and is written by itself."""
 
     @property
     def weight(self) -> int:

@@ -15,12 +15,13 @@ from sqlalchemy import Connection, Engine, func, select
 from sqlalchemy.exc import DatabaseError
 
 from service.errors import BadInput
+from service.observe.batch import ObservationBatch
 from service.observe.wire import submission_from_json
 from service.records import rollups
 from service.records.database import check, reported
 from service.records.draft import Row
 from service.records.engines import database_url, reading_engine
-from service.records.tables import batches, results, solutions, star_results
+from service.records.tables import batches, frames, results, solutions, star_results
 
 AT_ONCE = 500
 OUTCOMES = ("unique", "ambiguous", "unmatched")
@@ -112,21 +113,32 @@ def _of_a_chunk(connection: Connection, chunk: Mapping[str, Row]) -> Iterator[st
     solved = set(
         connection.scalars(select(solutions.c.result_id).where(solutions.c.result_id.in_(ids)))
     )
+    framed = {
+        row["batch_id"]: dict(row)
+        for row in connection.execute(
+            select(frames.c.batch_id, frames.c.digest, frames.c.detections).where(
+                frames.c.batch_id.in_(chunk)
+            )
+        ).mappings()
+    }
     of_batch: dict[str, list[Row]] = {id: [] for id in chunk}
     for row in made:
         of_batch[row["batch_id"]].append(row)
     for id, batch in chunk.items():
-        yield from _of_a_batch(batch, of_batch[id])
+        yield from _of_a_batch(batch, of_batch[id], framed.get(id))
         for row in of_batch[id]:
             yield from _of_a_result(row, batch, stars.get(row["id"], Counter()), solved)
 
 
-def _of_a_batch(batch: Row, made: Sequence[Row]) -> Iterator[str]:
+def _of_a_batch(batch: Row, made: Sequence[Row], frame: Row | None) -> Iterator[str]:
+    """The faults of a batch; `frame` is the row of the frame it was made of, if any."""
     name = f"batch {batch['id']}"
     current = sum(bool(row["current"]) for row in made)
     if current != 1:
         yield f"{name}: {current} of its results are current, not one"
-    if hashlib.sha256(batch["input"].encode()).hexdigest() != batch["fingerprint"]:
+    # The fingerprint of a batch made of a frame is that of the frame and of what was told with it.
+    is_own = hashlib.sha256(batch["input"].encode()).hexdigest() == batch["fingerprint"]
+    if frame is None and not is_own:
         yield f"{name}: its input is not the one that was fingerprinted"
     try:
         read = submission_from_json(batch["input"]).batch
@@ -136,6 +148,36 @@ def _of_a_batch(batch: Row, made: Sequence[Row]) -> Iterator[str]:
     identity = (read.spacecraft, read.run, read.batch, read.time.tai_ns)
     if identity != tuple(batch[key] for key in ("spacecraft", "run", "batch", "time_ns")):
         yield f"{name}: its input is of {read.spacecraft}, run {read.run}, batch {read.batch}"
+    if frame is not None:
+        yield from _of_a_frame(name, frame, read, made)
+
+
+def _of_a_frame(
+    name: str, frame: Row, read: ObservationBatch, made: Sequence[Row]
+) -> Iterator[str]:
+    """The faults of a batch made of a frame.
+
+    What was told with the frame is not kept, so its fingerprint cannot be computed again.
+    """
+    sent = [mag for each in read.observations for mag in each.magnitude_mag.tolist()]
+    try:
+        stars = msgspec.json.decode(frame["detections"])["stars"]
+        found = [star["magnitude"] for star in stars if star["used"]]
+    except (msgspec.DecodeError, KeyError, TypeError):
+        yield f"{name}: what was found on its frame cannot be read"
+        return
+    if sent != found:
+        yield f"{name}: the stars of its input are not those of its frame"
+    for row in made:
+        if row["id"] == row["batch_id"] and _frame_digest(row["answer"]) != frame["digest"]:
+            yield f"{name}: its answer is about another frame than the one that is kept"
+
+
+def _frame_digest(answer: str) -> object:
+    try:
+        return msgspec.json.decode(answer)["frame"]["digest"]
+    except (msgspec.DecodeError, KeyError, TypeError):
+        return None
 
 
 def _of_a_result(row: Row, batch: Row, stars: "Counter[str]", solved: set[Any]) -> Iterator[str]:

@@ -10,19 +10,22 @@ processor's cache to another's, the group would cost half as much again.
 
 import logging
 import threading
+import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from sqlalchemy import Connection, Engine
+from sqlalchemy import Connection, Engine, update
 from sqlalchemy.exc import DBAPIError
 
 from service.errors import Busy, Stopping
-from service.records.draft import Draft
-from service.records.engines import TO_WRITE, Kept, TakenBack
+from service.records.database_file import DatabaseFile
+from service.records.draft import Draft, Row
+from service.records.engines import TO_WRITE, Kept, TakenBack, patience
+from service.records.tables import WRITTEN_BY_POSTS, event_counter
 from service.records.transaction import (
     Job,
     Results,
@@ -49,14 +52,26 @@ class Awaited(Job):
     """A job, and what whoever waits for it is told by."""
 
     done: "Future[Any]" = field(default_factory=Future)
+    since_s: float = field(default_factory=time.monotonic)
 
 
 class Writer:
     """Writes what is queued, from one thread over one connection."""
 
-    def __init__(self, engine: Engine, max_queued: int = MAX_QUEUED) -> None:
-        self._connection = Kept(engine, TO_WRITE)
+    def __init__(
+        self,
+        engine: Engine,
+        max_queued: int = MAX_QUEUED,
+        *,
+        file: DatabaseFile | None = None,
+        turn_s: float | None = None,
+    ) -> None:
+        """`file` is that of SQLite; `turn_s` bounds how long `record_here` waits for its turn."""
+        self._connection = Kept(engine, TO_WRITE, file)
         self._max_queued = max_queued
+        self._turn_s = -1.0 if turn_s is None else turn_s
+        self._failures = 0
+        self._is_failing = False
         self._queue: deque[Awaited] = deque()
         self._patient: deque[Awaited] = deque()
         self._has_waited = False
@@ -79,7 +94,8 @@ class Writer:
         error that kept this draft, and no other, from being recorded.  Where
         the database itself fails, the future raises `Busy`.
         """
-        return self._put(Awaited(drafts), self._patient if patient else self._queue)
+        queue = self._patient if patient else self._queue
+        return self._put(Awaited(drafts, patient=patient), queue)
 
     def record_here(self, drafts: Sequence[Draft], tell: bool = True) -> Results:
         """`record`, in the thread that asks, as soon as nothing else is being written.
@@ -88,7 +104,10 @@ class Writer:
         """
         jobs = [Job(drafts)]
         failure = None
-        with self._turn:
+        if not self._turn.acquire(timeout=self._turn_s):
+            self.note_failure(len(drafts))
+            raise Busy("what was to be written before is not written yet", RETRY_AFTER_S)
+        try:
             self.require()
             try:
                 results: Results = self._write(jobs)[0]
@@ -96,6 +115,9 @@ class Writer:
                 # Whatever it is, it is logged, and raised in the words for those who wait.
                 _log(jobs, error)
                 failure = _told(error)
+        finally:
+            self._turn.release()
+        self._note_outcome(jobs, failure)
         if tell:
             self._tell()
         if failure is not None:
@@ -111,6 +133,41 @@ class Writer:
         with self._changed:
             if self._closing or not self._thread.is_alive():
                 raise Stopping("nothing is written any more: the service must be started again")
+
+    def note_failure(self, count: int) -> None:
+        """Count work that could not be written, or not even be looked up before that."""
+        with self._changed:
+            self._failures += count
+            self._is_failing = True
+
+    def require_written(self) -> None:
+        """Raise `Busy` where the last write failed, and one that is tried now fails too.
+
+        Without that nothing but the next client's batch could show that the database
+        can be written again.
+        """
+        if self._is_failing:
+            self.change(_try_to_write).result()
+
+    def state(self) -> Row:
+        """Whether the last write `succeeded`, how many `failed`, and what waits, since when."""
+        with self._changed:
+            heads = [queue[0].since_s for queue in (self._queue, self._patient) if queue]
+            return {
+                "succeeded": not self._is_failing,
+                "failed": self._failures,
+                "queued": self._queued,
+                "oldest_s": time.monotonic() - min(heads) if heads else 0.0,
+            }
+
+    def _note_outcome(self, jobs: Sequence[Job], failure: Exception | None) -> None:
+        if failure is None:
+            # Read first: the lock is for the rare case that something changes.
+            if self._is_failing:
+                with self._changed:
+                    self._is_failing = False
+        elif isinstance(failure, Busy) and not isinstance(failure, Stopping):
+            self.note_failure(sum(job.weight for job in jobs))
 
     def close(self) -> None:
         """Refuse new work, write what is queued, and end the thread."""
@@ -171,11 +228,13 @@ class Writer:
             outcomes = self._write(jobs)
         except BaseException as error:
             _log(jobs, error)
+            self._note_outcome(jobs, _told(error))
             for job in jobs:
                 job.done.set_exception(_told(error))
             if not isinstance(error, Exception):
                 raise
             return
+        self._note_outcome(jobs, None)
         for job, outcome in zip(jobs, outcomes, strict=True):
             if isinstance(outcome, Exception):
                 job.done.set_exception(outcome)
@@ -190,18 +249,37 @@ class Writer:
                 # What is written is written, whoever listens.
                 log.exception("nobody could be told of a commit")
 
+    @contextmanager
+    def _transaction(self, jobs: Sequence[Job]) -> Iterator[Connection]:
+        has_time = all(job.patient for job in jobs)
+        with (
+            self._connection.transaction() as connection,
+            patience(connection) if has_time else nullcontext(),
+        ):
+            yield connection
+
     def _write(self, jobs: Sequence[Job], attempt: int = 1) -> list[Any]:
         try:
             if all(job.change is None for job in jobs):
-                with suppress(TakenBack), self._connection.transaction() as connection:
+                with suppress(TakenBack), self._transaction(jobs) as connection:
                     return transact_at_once(connection, jobs)
-            with self._connection.transaction() as connection:
+            with self._transaction(jobs) as connection:
                 return transact(connection, jobs)
         except BaseException as error:
             crossed = getattr(getattr(error, "orig", None), "sqlstate", None) in _CROSSED
             if not crossed or attempt == MAX_ATTEMPTS:
                 raise
         return self._write(jobs, attempt + 1)
+
+
+def _try_to_write(connection: Connection) -> None:
+    """Take the locks that a post takes, and write a row as it is."""
+    if connection.dialect.name == "postgresql":
+        names = ", ".join(sorted(table.name for table in WRITTEN_BY_POSTS))
+        connection.exec_driver_sql(f"LOCK TABLE {names} IN ROW EXCLUSIVE MODE")
+    # There and back: of a row that gets the value it has SQLite writes nothing.
+    for step in (1, -1):
+        connection.execute(update(event_counter).values(last=event_counter.c.last + step))
 
 
 def _log(jobs: Sequence[Job], error: BaseException) -> None:

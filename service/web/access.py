@@ -5,27 +5,30 @@ it says which spacecraft it is about.  A route that does not stand there is
 refused to everybody, so a new one cannot be forgotten.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 from urllib.parse import quote
 
-from anyio import CapacityLimiter
+from anyio import CapacityLimiter, fail_after
 from anyio.to_thread import run_sync
 from fastapi import Depends
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
+from starlette.types import Scope as HttpScope
 
 from service import logs
 from service.errors import NotAdmitted, NotAllowed, NotFound
 from service.operations import Operations
-from service.records.access import OPEN_CALLER
+from service.records.access import OPEN_CALLER, Access
+from service.records.audit import Entry
 from service.records.tokens import Caller, Scope
 
 COOKIE = "acquire_session"
 SIGN_IN = "/sign-in"
 SAFE_METHODS = ("GET", "HEAD")
 
+T = TypeVar("T")
 About = Literal["nothing", "path", "query", "result", "body", "every"]
 
 
@@ -131,13 +134,17 @@ _FOLLOWED_LINK = (
 
 _THREADS = CapacityLimiter(8)
 """Their own: a handler may wait for a commit, and who asks shall not wait for that."""
+_OWNERS = CapacityLimiter(8)
+_KNOWN_WITHIN_S = 1.5
+"""A look at the database that takes longer will not tell who asks: probes are due within 2 s."""
 
 
 async def guard(request: Request) -> None:
     """Let a request through to its handler, or raise what it lacks.
 
     What a caller with the scope `operate` changes, and what a policy says is
-    `noted`, is noted once it is answered (`service.web.middleware`).
+    `noted`, is noted with the change (`Audited`), or once it is answered
+    (`service.web.middleware`) where it was refused or changed no record.
     """
     route = request.scope["route"]
     policy = POLICIES.get(route.name)
@@ -151,7 +158,7 @@ async def guard(request: Request) -> None:
     caller = operations.access.known(token, session)
     try:
         if caller is None:
-            caller = await run_sync(operations.access.caller, token, session, limiter=_THREADS)
+            caller = await _in_time(operations.access, operations.access.caller, token, session)
     except NotAdmitted:
         if _is_page(request):
             wanted = quote(
@@ -176,6 +183,25 @@ async def guard(request: Request) -> None:
         request.state.changes = route.name
 
 
+async def is_open(access: Access) -> bool:
+    """`Access.is_open`, without a wait for the database in the event loop."""
+    if access.known_open is not None:
+        return access.known_open
+    return await _in_time(access, lambda: access.is_open)
+
+
+async def _in_time(access: Access, ask: Callable[..., T], *given: object) -> T:
+    """What a function finds in the database; raises `Busy` where that takes long, or just did."""
+    access.require_within_reach()
+    try:
+        with fail_after(_KNOWN_WITHIN_S):
+            return await run_sync(ask, *given, limiter=_THREADS, abandon_on_cancel=True)
+    except TimeoutError:
+        access.out_of_reach()
+        access.require_within_reach()
+        raise
+
+
 async def _caller(request: Request) -> Caller:
     caller = request.state.caller
     assert isinstance(caller, Caller)
@@ -183,6 +209,39 @@ async def _caller(request: Request) -> Caller:
 
 
 Asking = Annotated[Caller, Depends(_caller)]
+
+
+def entry_of(scope: HttpScope, access: Access, status: int) -> Entry:
+    """What the audit list is to say of a request that is answered with this status."""
+    state = scope["state"]
+    query = scope["query_string"].decode("latin-1")
+    about = scope["path"] + (f"?{query}" if query else "")
+    body = state.get("body")
+    text = None if not body else body.decode("utf-8", "replace")
+    return access.entry(state["caller"].name, state["changes"], about, text, status)
+
+
+class Auditing:
+    """Gives a handler the entry that becomes part of the change it makes."""
+
+    def __init__(self, request: Request) -> None:
+        self._request = request
+
+    def entry(self, status: int = 200) -> Entry:
+        """The entry for a change that is answered with this status.
+
+        For the operation that makes the change: nothing more is noted of it then.
+        """
+        request = self._request
+        request.state.noted = True
+        return entry_of(request.scope, request.app.state.operations.access, status)
+
+
+async def _auditing(request: Request) -> Auditing:
+    return Auditing(request)
+
+
+Audited = Annotated[Auditing, Depends(_auditing)]
 
 
 def require_scope(caller: Caller, *scopes: Scope) -> None:
@@ -259,7 +318,7 @@ async def _require_own(
             raise NotAllowed(f"{caller.name} must say which spacecraft: {theirs}")
     elif about == "result":
         id = request.path_params["id"]
-        owner = await run_sync(operations.spacecraft_of, id, limiter=_THREADS)
+        owner = await run_sync(operations.spacecraft_of, id, limiter=_OWNERS)
         if owner is None or not caller.may_see(owner):
             # As if it were not there: ids of others are not to be tried out.
             raise NotFound(f"there is no batch with the id {id[:80]!r}")

@@ -34,7 +34,7 @@ IDEMPOTENCY_KEY = {
     "in": "header",
     "description": (
         "Any text of the client's choice. Sent again with the same body it gives the first "
-        "answer again; with another body it is refused."
+        "answer again; with another body it is refused. Each token has keys of its own."
     ),
     "schema": {"type": "string", "minLength": 1, "maxLength": 255, "pattern": "^[\\x20-\\x7e]+$"},
 }

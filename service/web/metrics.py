@@ -1,9 +1,12 @@
 """Counters for Prometheus, in a registry of the app's own: no state is shared between apps."""
 
 import logging
+import threading
 from collections import Counter as Counted
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from itertools import product
+from typing import Any
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -12,75 +15,144 @@ from starlette.types import Scope
 
 from service.alarms.limits import Severity
 from service.operations import LIVE, Operations, Recorded
+from service.records.draft import Row
 
 log = logging.getLogger(__name__)
 
+WAIT_S = 1.0
+"""For what is asked of others: the answer is due within two seconds."""
 OUTCOMES = ("unique", "ambiguous", "unmatched")
 ALARM_STATES = ("open", "acknowledged", "shelved")
 _METHODS = ("GET", "POST", "DELETE", "PUT", "PATCH", "OPTIONS")
 _SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
 
 
-class _Zones(Collector):
-    """The cache of zones and run catalogs, and who computes replays beside it, read when asked."""
+class _Asked:
+    """Values that are asked for elsewhere, all at once, and may not come in time.
+
+    One that is still being waited for is not asked for again: while the database hangs,
+    more and more threads would wait.
+    """
+
+    def __init__(self, **asked: Callable[[], Any]) -> None:
+        self._asked = asked
+        self._threads = ThreadPoolExecutor(len(asked), "metrics")
+        self._lock = threading.Lock()
+        self._answers: dict[str, Future[Any]] = {}
+
+    def __call__(self) -> dict[str, Any]:
+        """What came within `WAIT_S`, by name."""
+        with self._lock:
+            for name, ask in self._asked.items():
+                before = self._answers.get(name)
+                if before is None or before.done():
+                    self._answers[name] = self._threads.submit(ask)
+            answers = dict(self._answers)
+        wait(answers.values(), WAIT_S)
+        found = {}
+        for name, answer in answers.items():
+            if not answer.done():
+                log.warning("%s: no answer within %g s", name, WAIT_S)
+            elif (error := answer.exception()) is not None:
+                # A gauge that is missing is seen; zero would say that all is well.
+                log.warning("%s cannot be counted: %s", name, error)
+            else:
+                found[name] = answer.result()
+        return found
+
+
+class _Elsewhere(Collector):
+    """What other threads and processes know, read when asked."""
 
     def __init__(self, operations: Operations) -> None:
         self._operations = operations
+        self._asked = _Asked(
+            zones=operations.zones,
+            processes=operations.replay_processes,
+            alarms=operations.active_alarms,
+            backlog=operations.backlog,
+        )
 
     def collect(self) -> Iterator[Metric]:
-        shelf = self._operations.zones()
-        yield CounterMetricFamily(
-            "starid_zone_cache_hits",
-            "Zones and run catalogs found in the cache; replays have others.",
-            value=shelf["hits"],
-        )
-        yield CounterMetricFamily(
-            "starid_zone_cache_misses",
-            "Zones and run catalogs built.",
-            value=shelf["misses"],
-        )
-        yield CounterMetricFamily(
-            "starid_zone_build_seconds",
-            "Time spent building them.",
-            value=shelf["build_us"] / 1e6,
-        )
-        yield GaugeMetricFamily(
-            "starid_zone_cache_bytes",
-            "Memory that the cache holds.",
-            value=shelf["bytes"],
-        )
-        yield GaugeMetricFamily(
-            "starid_replay_processes",
-            "Processes that are ready to compute replays, each with a cache of its own.",
-            value=self._operations.replay_processes(),
-        )
-
-
-class _Alarms(Collector):
-    """The live alarms that are not cleared, read when asked."""
-
-    def __init__(self, operations: Operations) -> None:
-        self._operations = operations
-
-    def collect(self) -> Iterator[Metric]:
-        family = GaugeMetricFamily(
-            "starid_alarms",
-            "Alarms of live batches that are not cleared.",
-            labels=("spacecraft", "severity", "state"),
-        )
-        try:
-            found = Counted(
-                (each["spacecraft"], each["severity"], each["state"])
-                for each in self._operations.active_alarms()
+        found = self._asked()
+        if "zones" in found:
+            yield from _of_zones(found["zones"])
+        if "processes" in found:
+            yield GaugeMetricFamily(
+                "starid_replay_processes",
+                "Processes that are ready to compute replays, each with a cache of its own.",
+                value=found["processes"],
             )
-        except Exception as error:
-            # A gauge that is missing is seen; zero would say that all is well.
-            log.warning("alarms cannot be counted: %s", error)
-            return
-        severities = [each.word for each in Severity]
-        for labels in product(self._operations.missions, severities, ALARM_STATES):
-            family.add_metric(labels, found[labels])
-        yield family
+        if "alarms" in found:
+            yield _of_alarms(self._operations, found["alarms"])
+        if "backlog" in found:
+            yield from _of_backlog(found["backlog"])
+
+
+def _of_zones(shelf: Row) -> Iterator[Metric]:
+    """The cache of zones and run catalogs."""
+    yield CounterMetricFamily(
+        "starid_zone_cache_hits",
+        "Zones and run catalogs found in the cache; replays have others.",
+        value=shelf["hits"],
+    )
+    yield CounterMetricFamily(
+        "starid_zone_cache_misses",
+        "Zones and run catalogs built.",
+        value=shelf["misses"],
+    )
+    yield CounterMetricFamily(
+        "starid_zone_build_seconds",
+        "Time spent building them.",
+        value=shelf["build_us"] / 1e6,
+    )
+    yield GaugeMetricFamily(
+        "starid_zone_cache_bytes",
+        "Memory that the cache holds.",
+        value=shelf["bytes"],
+    )
+
+
+def _of_alarms(operations: Operations, active: Sequence[Row]) -> Metric:
+    """The live alarms that are not cleared."""
+    family = GaugeMetricFamily(
+        "starid_alarms",
+        "Alarms of live batches that are not cleared.",
+        labels=("spacecraft", "severity", "state"),
+    )
+    found = Counted((each["spacecraft"], each["severity"], each["state"]) for each in active)
+    severities = [each.word for each in Severity]
+    for labels in product(operations.missions, severities, ALARM_STATES):
+        family.add_metric(labels, found[labels])
+    return family
+
+
+def _of_backlog(backlog: Row) -> Iterator[Metric]:
+    """What waits, and what became of the writes."""
+    posts, writes = backlog["posts"], backlog["writes"]
+    yield CounterMetricFamily(
+        "starid_writes_failed",
+        "Batches and changes that could not be written, or not be looked up before that.",
+        value=writes["failed"],
+    )
+    yield GaugeMetricFamily(
+        "starid_last_write_succeeded",
+        "1 where the last write succeeded, 0 where it failed.",
+        value=float(writes["succeeded"]),
+    )
+    depth = GaugeMetricFamily(
+        "starid_queue_depth",
+        "Posted batches that are not answered yet, and records that wait to be written.",
+        labels=("queue",),
+    )
+    age = GaugeMetricFamily(
+        "starid_queue_oldest_seconds", "The age of the oldest of them.", labels=("queue",)
+    )
+    for name, queue in (("posts", posts), ("writes", writes)):
+        depth.add_metric((name,), queue["queued"])
+        age.add_metric((name,), queue["oldest_s"])
+    yield depth
+    yield age
 
 
 class Metrics:
@@ -114,8 +186,7 @@ class Metrics:
         )
         # Looked up by its own labels, the histogram would check them each time.
         self._by_labels: dict[tuple[str, str, int], Histogram] = {}
-        self.registry.register(_Zones(operations))
-        self.registry.register(_Alarms(operations))
+        self.registry.register(_Elsewhere(operations))
         operations.observers.append(self.count_batch)
         for name in operations.missions:
             # A counter that is there from the start has a first increase.

@@ -15,9 +15,10 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service import logs
+from service.errors import Busy
 from service.records.access import Access
 from service.settings import is_loopback
-from service.web.access import guard
+from service.web.access import entry_of, guard, is_open
 from service.web.bodies import BodyBudget
 from service.web.errors import Kind, answer_to, our_fault, problem
 from service.web.metrics import Metrics
@@ -44,8 +45,8 @@ class AroundRequests:
     page elsewhere could let its own name lead to this machine, and would then
     be let in as this one.
 
-    What a caller changed is noted before the answer goes out
-    (`service.web.access`).
+    What a caller was refused, or changed in memory alone, is noted before the
+    answer goes out (`service.web.access`).
 
     A request for one of the `direct` routes goes straight to its handler: to find
     a route, and out what its handler depends on, takes the framework twice as
@@ -97,7 +98,7 @@ class AroundRequests:
         logs.request.set(about)
         try:
             host = _host(inner)
-            if host is not None and not is_loopback(host) and self.access.is_open:
+            if host is not None and not is_loopback(host) and await is_open(self.access):
                 told = {"detail": f"the service answers to names of this machine, not to {host!r}"}
                 await problem(Request(inner), NOT_HERE, told)(inner, receive, sent)
                 return
@@ -108,6 +109,11 @@ class AroundRequests:
                 inner["route"] = route
                 response = await _answered(route, Request(inner, receive))
                 await response(inner, receive, sent)
+        except Busy as error:
+            # Whether access is open could not be found out.
+            if status:
+                raise
+            await (await answer_to(Request(inner), error))(inner, receive, sent)
         except Exception as error:
             if status:
                 raise
@@ -143,18 +149,15 @@ class AroundRequests:
     async def _note(self, scope: Scope, status: int) -> None:
         state = scope.get("state", {})
         action = state.get("changes")
-        if action is None:
+        # What was changed is noted with the change itself; of a 503 nothing is decided, and the
+        # database that it may be about is not asked once more.
+        if action is None or status == 503 or (state.get("noted") and status < 400):
             return
-        query = scope["query_string"].decode("latin-1")
-        about = scope["path"] + (f"?{query}" if query else "")
-        body = state.get("body")
-        text = None if not body else body.decode("utf-8", "replace")
         try:
-            await run_sync(
-                self.access.note, state["caller"].name, action, about, text, status, limiter=_NOTES
-            )
+            entry = entry_of(scope, self.access, status)
+            await run_sync(self.access.note, entry, limiter=_NOTES)
         except Exception as error:
-            # The change itself is made: its answer must not be lost to this.
+            # Nothing in the records was changed: the answer must not be lost to this.
             log.error("%s by %s was not noted: %s", action, state["caller"].name, error)
 
 

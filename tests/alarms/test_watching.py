@@ -470,3 +470,14 @@ def test_the_sample_raises_an_alarm_in_its_growing_attitude_error(opened, spacec
     assert operations.acknowledge(alarm["id"], "jb", "seen")["state"] == "cleared"
     nominal = Pass(batches=120, seed=seed % 1000 + 1, troubles=NO_TROUBLES)
     assert submitted(operations, spacecraft, "nominal", nominal) == []
+
+
+def test_a_limit_that_is_set_closes_no_limit_of_another_spacecraft(operations):
+    """Nor one of another quantity."""
+    before = operations.set_limit("SWAS", "unmatched_share", TIGHT, who="jb", comment="theirs")
+    other = operations.set_limit("XTE", "ambiguous_share", TIGHT, who="jb", comment="other")
+    operations.set_limit("XTE", "unmatched_share", TIGHT, who="mk", comment="first")
+    operations.set_limit("XTE", "unmatched_share", None, who="mk", comment="second")
+    assert operations.limit("SWAS", "unmatched_share")["limit"] == before
+    assert operations.limit("XTE", "ambiguous_share")["limit"] == other
+    assert operations.limit("XTE", "unmatched_share")["limit"]["comment"] == "second"

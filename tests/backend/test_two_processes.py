@@ -317,6 +317,37 @@ def test_told_to_stop_both_end_in_order(served, sky, missions, whom):
     assert _parent_of(backend) is None
 
 
+def test_a_key_is_that_of_the_token_it_came_with(served, sky, missions, tmp_path):
+    """Two clients with tokens of their own use the same key for batches of their own."""
+    url, _ = served
+    database = f"sqlite:///{tmp_path / 'acquire.db'}"
+    command = [sys.executable, "-m", "service.cli", "token", "create"]
+    tokens = [
+        subprocess.run(
+            [*command, name, "--scope", "submit", "--database", database],
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout.split()[0]
+        for name in ("one", "other")
+    ]
+    time.sleep(1.1)
+    sent = [samples.batch(sky, missions, name) for name in ("a", "b")]
+
+    def post(token, body):
+        headers = {"Authorization": f"Bearer {token}", "Idempotency-Key": "same"}
+        headers["Content-Type"] = "application/json"
+        return httpx.post(f"{url}/api/v1/batches", content=body, headers=headers, timeout=60)
+
+    firsts = [post(token, body) for token, body in zip(tokens, sent, strict=True)]
+    assert [answer.status_code for answer in firsts] == [201, 201]
+    for token, body, first, others in zip(tokens, sent, firsts, reversed(sent), strict=True):
+        again = post(token, body)
+        assert (again.status_code, again.content) == (200, first.content)
+        refused = post(token, others)
+        assert (refused.status_code, refused.json()["type"]) == (422, "/problems/key-reused")
+
+
 def test_what_the_backend_counts_the_front_tells(served, sky, missions):
     url, _ = served
     for name in ("one", "two", "two"):

@@ -13,6 +13,7 @@ from service.observe.wire import OptionsIn, submission_from_json
 from service.records.prune import prune
 from service.records.statements import COPIED_FROM
 from service.records.tables import batches, idempotency_keys, metadata, results, star_results
+from service.records.tokens import Caller
 from service.times import utc_now
 from tests.records.recount import assert_equal_to_a_recount
 
@@ -58,6 +59,39 @@ def test_the_same_body_gets_the_stored_answer_byte_for_byte(operations, make):
     assert again.replayed
     assert (again.id, again.body) == (first.id, first.body)
     assert count(operations, batches) == 1
+
+
+def caller(id):
+    return Caller(f"name of {id}", frozenset(["submit"]), None, id)
+
+
+def test_a_key_of_one_token_is_not_that_of_another(operations, make):
+    """Nor of nobody's: other bodies go under the same key, and each keeps its own."""
+    callers = caller("A"), caller("B"), None
+    sent = [make(name, after_s=60.0 * k) for k, name in enumerate("abc")]
+    firsts = [operations.submit(each, "key", who) for each, who in zip(sent, callers, strict=True)]
+    assert len({first.id for first in firsts}) == 3
+    assert not any(first.replayed for first in firsts)
+    for k, (first, each, who) in enumerate(zip(firsts, sent, callers, strict=True)):
+        again = operations.submit(each, "key", who)
+        assert (again.replayed, again.id) == (True, first.id)
+        with pytest.raises(KeyReused, match="'key'"):
+            operations.submit(sent[k - 1], "key", who)
+    assert count(operations, idempotency_keys) == 3
+
+
+def test_keys_of_several_tokens_at_once_and_of_a_repeat_are_kept_apart(operations, make):
+    """The same body under the same key of two tokens is one record, and each has the key."""
+    sent = make()
+    answers = all_at_once(operations, [(sent, "key", caller(f"T{k}")) for k in range(8)])
+    assert len({each.id for each in answers}) == 1
+    assert count(operations, idempotency_keys) == 8
+    other = make(stars=4)
+    for k in range(8):
+        with pytest.raises(KeyReused):
+            operations.submit(other, "key", caller(f"T{k}"))
+    with pytest.raises(Conflict):
+        operations.submit(other, "key")
 
 
 def test_white_space_and_the_order_of_keys_make_no_other_body(operations, make):
@@ -172,7 +206,7 @@ def test_what_was_recorded_between_look_and_transaction_is_found(operations, mak
     sent = [make(f"b{i}") for i in range(6)]
     changed = make("b2", after_s=3600.0)
     drafts = [bench.draft(each) for each in (sent[0], sent[1], changed, sent[3])]
-    drafts += [bench.draft(sent[4], key), bench.draft(sent[5])]
+    drafts += [bench.draft(sent[4], ("", key)), bench.draft(sent[5])]
     first = [operations.submit(each) for each in (sent[1], sent[2])]
     operations.submit(make("b6"), key)
     new, repeat, conflict, neighbour, reused, last = operations.store.writer.record_here(drafts)

@@ -5,10 +5,12 @@ from alembic import command
 from alembic.script import ScriptDirectory
 from sqlalchemy import MetaData, create_engine, inspect, select
 
+from service.errors import KeyReused
 from service.observe.wire import OptionsIn
 from service.records import database as migrations
 from service.records.engines import database_url, writing_engine
 from service.records.tables import metadata
+from service.records.tokens import Caller
 from service.records.verify import verify
 from tests.records.test_upkeep import KINDS
 
@@ -97,6 +99,12 @@ def test_an_older_database_is_brought_up_to_date_with_all_it_holds(
     try:
         assert len(operations.batches().items) == len(KINDS)
         assert operations.submit(make("b0", kind="good")).replayed
+        assert operations.submit(make("b0", kind="good"), "key-0").replayed
+        # Older keys belong to no token: under one of them a token may send another body.
+        with pytest.raises(KeyReused):
+            operations.submit(make("other", after_s=98_000.0), "key-0")
+        token = Caller("a", frozenset(["submit"]), None, "A")
+        assert not operations.submit(make("other", after_s=98_000.0), "key-0", token).replayed
         assert not operations.submit(make("new", after_s=99_000.0)).replayed
     finally:
         operations.close()

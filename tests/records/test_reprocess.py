@@ -12,6 +12,7 @@ from service.observe.wire import OptionsIn, submission_from_json
 from service.records.tables import batches, results
 from service.simulate.stretches import Pass, Trouble, Troubles
 from service.simulate.telemetry import draw_pass
+from service.sky.catalog import save
 from service.times import parse_utc
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion
 from tests.records.samples import without_accidents
@@ -209,6 +210,20 @@ def test_a_run_of_other_settings_is_not_mixed_with_these(opened, missions, make)
         first.reprocess("live", processes=1)
     with pytest.raises(NotFound):
         first.reprocess("again", spacecraft="NOPE")
+
+
+def test_a_run_of_another_catalog_is_not_mixed_with_this_one(opened, sky, tmp_path, make):
+    """Also where the missions' settings are the same."""
+    first = opened()
+    first.submit(make())
+    first.reprocess("again", processes=1)
+    file = tmp_path / "other.npz"
+    save(sky.catalog, file)
+    other = opened(catalog=file)
+    assert other.sky.catalog.digest != first.sky.catalog.digest
+    with pytest.raises(BadBatch, match="run: holds results of XTE with another catalog"):
+        other.reprocess("again", processes=1)
+    assert len(answers_of(other, "again")) == 1
 
 
 def test_a_run_without_a_name_is_named_after_the_settings(opened, missions, make):

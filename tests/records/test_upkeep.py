@@ -1,5 +1,6 @@
 """Backup, verify and prune: copies of one moment, every fault named, nothing left hanging."""
 
+import io
 import sqlite3
 import subprocess
 import threading
@@ -9,6 +10,7 @@ import pytest
 from sqlalchemy import create_engine, delete, func, make_url, select, text, update
 
 from service.errors import BadConfiguration
+from service.imaging.submit import read_known
 from service.observe.wire import OptionsIn
 from service.operations import Operations
 from service.records import rollups
@@ -18,6 +20,7 @@ from service.records.prune import OF_A_BATCH, OF_A_RESULT, prune
 from service.records.store import Store
 from service.records.tables import (
     batches,
+    frames,
     idempotency_keys,
     metadata,
     results,
@@ -28,6 +31,8 @@ from service.records.tables import (
 )
 from service.records.verify import verify
 from service.settings import Settings
+from service.simulate.frame_files import frame_bytes
+from service.simulate.frames import FrameSettings, draw_frames
 from service.times import shifted
 from tests.records.samples import START
 
@@ -109,6 +114,39 @@ def test_every_kind_of_damage_is_named(operations, make, database, fault, told):
     id = operations.submit(make()).id
     assert verify(database) == []
     change(operations, fault(id))
+    assert any(told in problem for problem in verify(database))
+
+
+@pytest.fixture
+def framed(operations, missions):
+    """The id of a batch that was made of a frame."""
+    (drawn,) = draw_frames(missions["IMAGER"], operations.sky, FrameSettings(frames=1, seed=5))
+    known = read_known(drawn.known)
+    return operations.submit_frame("IMAGER", known, io.BytesIO(frame_bytes(drawn))).id
+
+
+def test_a_sound_batch_made_of_a_frame_is_not_called_damaged(operations, framed, database):
+    operations.what_if(framed, OptionsIn(solver="triad"), record=True, adopt=False)
+    assert verify(database) == []
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        (
+            lambda id: (
+                update(batches)
+                .where(batches.c.id == id)
+                .values(input=func.replace(batches.c.input, '"magnitude":', '"magnitude":1'))
+            ),
+            "stars of its input are not those of its frame",
+        ),
+        (lambda id: update(frames).values(digest="sha256:0"), "is about another frame"),
+        (lambda id: update(frames).values(detections="{"), "cannot be read"),
+    ],
+)
+def test_damage_to_a_batch_made_of_a_frame_is_named(operations, framed, database, fault, told):
+    change(operations, fault(framed))
     assert any(told in problem for problem in verify(database))
 
 

@@ -10,6 +10,7 @@ from contextlib import ExitStack
 import httpx
 import pytest
 from fastapi.routing import APIRoute
+from sqlalchemy import text
 
 from service.operations import Operations
 from service.records import tokens
@@ -424,6 +425,57 @@ def test_what_is_changed_is_noted_with_who_changed_it(guarded, anybody, drawn):
     following = re.match("<([^>]+)>", page.headers["Link"])[1]
     again = anybody.get(following, headers=shown(guarded.all)).json()["items"]
     assert again[0] == listed[1]
+
+
+@pytest.mark.parametrize("broken", ["audit", "limits", "event_counter"])
+def test_a_change_and_its_note_are_stored_together_or_not_at_all(chosen_database, broken):
+    """Whichever of the tables fails that one of them needs."""
+    service = Guarded(chosen_database())
+    limit = "/api/v1/spacecraft/XTE/limits/ambiguous_share"
+    body = {"settings": {"warning": {"high": 0.5}}}
+
+    def rename(old, new):
+        statement = text(f"ALTER TABLE {old} RENAME TO {new}")
+        service.operations.change(lambda connection: connection.execute(statement).close())
+
+    with Server(create_app(service.operations)) as url:
+        headers = shown(service.token("all", "read", "operate"))
+        with httpx.Client(base_url=url, headers=headers, timeout=60) as client:
+
+            def stored():
+                history = client.get(limit).json()["history"]
+                listed = client.get("/api/v1/audit").json()["items"]
+                return len(history), [each["status"] for each in listed if each["status"] < 400]
+
+            rename(broken, "elsewhere")
+            assert client.put(limit, json=body).status_code >= 500
+            rename("elsewhere", broken)
+            assert stored() == (0, [])
+            assert client.put(limit, json=body).status_code == 200
+            assert stored() == (1, [200])
+
+
+def test_each_change_is_noted_once_and_what_was_refused_too(guarded, anybody):
+    headers = shown(guarded.of_scope["operate"])
+    reading = shown(guarded.all)
+
+    def newest(count):
+        listed = anybody.get(f"/api/v1/audit?limit={count}", headers=reading).json()["items"]
+        return [(each["action"], each["status"]) for each in listed]
+
+    limit = "/api/v1/spacecraft/XTE/limits/ambiguous_share"
+    body = {"settings": {"warning": {"high": 0.5}}}
+    assert anybody.put(limit, json=body, headers=headers).status_code == 200
+    assert anybody.delete(limit, headers=headers).status_code == 200
+    assert anybody.put(limit, json={"settings": 1}, headers=headers).status_code == 422
+    unknown = "/api/v1/alarms/01JD0000000000000000000000/acknowledge"
+    assert anybody.post(unknown, json={}, headers=headers).status_code == 404
+    assert newest(4) == [
+        ("acknowledge_alarm", 404),
+        ("set_limit", 422),
+        ("reset_limit", 200),
+        ("set_limit", 200),
+    ]
 
 
 def test_the_database_holds_nothing_that_could_be_used(guarded):

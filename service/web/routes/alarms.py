@@ -13,7 +13,7 @@ from service.alarms.quantities import QuantityName
 from service.errors import BadBatch, Fault, NotFound
 from service.observe.wire import Wire
 from service.records.tokens import Caller
-from service.web.access import Asking
+from service.web.access import Asking, Audited
 from service.web.bodies import JsonBody, read_model
 from service.web.describe import LINK, Gives, described
 from service.web.holding import Held, json_response, page_response
@@ -83,13 +83,20 @@ def get_limit(name: Name, quantity: Quantity, operations: Held) -> Response:
     ),
 )
 def set_limit(
-    name: Name, quantity: Quantity, body: JsonBody, operations: Held, caller: Asking
+    name: Name,
+    quantity: Quantity,
+    body: JsonBody,
+    operations: Held,
+    caller: Asking,
+    audited: Audited,
 ) -> Response:
     """Set a limit; the one before stays in its history."""
     asked = read_model(LimitIn, body)
     limited, who = _limited(quantity), _who(caller, asked.who)
     return json_response(
-        operations.set_limit(name, limited, asked.settings, who=who, comment=asked.comment)
+        operations.set_limit(
+            name, limited, asked.settings, who=who, comment=asked.comment, entry=audited.entry()
+        )
     )
 
 
@@ -105,10 +112,15 @@ def reset_limit(
     query: Annotated[SaidQuery, InQuery()],
     operations: Held,
     caller: Asking,
+    audited: Audited,
 ) -> Response:
     """Let the shipped limit hold again; those that were set stay in the history."""
     limited, who = _limited(quantity), _who(caller, query.who)
-    return json_response(operations.set_limit(name, limited, None, who=who, comment=query.comment))
+    return json_response(
+        operations.set_limit(
+            name, limited, None, who=who, comment=query.comment, entry=audited.entry()
+        )
+    )
 
 
 @router.get("/alarms", **described({200: Gives("A page of alarms.", AlarmPage, LINK)}))
@@ -138,11 +150,14 @@ def get_alarm(id: AlarmId, operations: Held, caller: Asking) -> Response:
         problems=(404, 409, 503),
     ),
 )
-def acknowledge_alarm(id: AlarmId, body: JsonBody, operations: Held, caller: Asking) -> Response:
+def acknowledge_alarm(
+    id: AlarmId, body: JsonBody, operations: Held, caller: Asking, audited: Audited
+) -> Response:
     """Say that an alarm was seen; with the quantity back in limits it is cleared."""
     asked = read_model(Said, body)
     _theirs(operations, id, caller)
-    return json_response(operations.acknowledge(id, _who(caller, asked.who), asked.comment))
+    who = _who(caller, asked.who)
+    return json_response(operations.acknowledge(id, who, asked.comment, audited.entry()))
 
 
 @router.post(
@@ -154,12 +169,14 @@ def acknowledge_alarm(id: AlarmId, body: JsonBody, operations: Held, caller: Ask
         problems=(404, 409, 503),
     ),
 )
-def shelve_alarm(id: AlarmId, body: JsonBody, operations: Held, caller: Asking) -> Response:
+def shelve_alarm(
+    id: AlarmId, body: JsonBody, operations: Held, caller: Asking, audited: Audited
+) -> Response:
     """Put an alarm aside for a while; it comes back by itself."""
     asked = read_model(ShelveIn, body)
     _theirs(operations, id, caller)
     who = _who(caller, asked.who)
-    return json_response(operations.shelve(id, who, asked.minutes, asked.comment))
+    return json_response(operations.shelve(id, who, asked.minutes, asked.comment, audited.entry()))
 
 
 @router.post(
@@ -167,11 +184,14 @@ def shelve_alarm(id: AlarmId, body: JsonBody, operations: Held, caller: Asking) 
     dependencies=[NO_QUERY],
     **described({200: Gives("The alarm.", AlarmRecord)}, body=Said, problems=(404, 409, 503)),
 )
-def unshelve_alarm(id: AlarmId, body: JsonBody, operations: Held, caller: Asking) -> Response:
+def unshelve_alarm(
+    id: AlarmId, body: JsonBody, operations: Held, caller: Asking, audited: Audited
+) -> Response:
     """Take an alarm off the shelf."""
     asked = read_model(Said, body)
     _theirs(operations, id, caller)
-    return json_response(operations.unshelve(id, _who(caller, asked.who), asked.comment))
+    who = _who(caller, asked.who)
+    return json_response(operations.unshelve(id, who, asked.comment, audited.entry()))
 
 
 @router.post(
@@ -179,11 +199,14 @@ def unshelve_alarm(id: AlarmId, body: JsonBody, operations: Held, caller: Asking
     dependencies=[NO_QUERY],
     **described({200: Gives("The alarm.", AlarmRecord)}, body=CommentIn, problems=(404, 503)),
 )
-def comment_alarm(id: AlarmId, body: JsonBody, operations: Held, caller: Asking) -> Response:
+def comment_alarm(
+    id: AlarmId, body: JsonBody, operations: Held, caller: Asking, audited: Audited
+) -> Response:
     """Say something about an alarm."""
     asked = read_model(CommentIn, body)
     _theirs(operations, id, caller)
-    return json_response(operations.comment(id, _who(caller, asked.who), asked.comment))
+    who = _who(caller, asked.who)
+    return json_response(operations.comment(id, who, asked.comment, audited.entry()))
 
 
 def _limited(quantity: str) -> QuantityName:

@@ -10,7 +10,7 @@ from starlette.responses import Response
 
 from service.errors import BadInput
 from service.observe.wire import BatchIn, OptionsIn, Wire
-from service.web.access import Asking, require_scope
+from service.web.access import Asking, Audited, require_scope
 from service.web.bodies import BINARY, JsonBody, json_body, read_model, refused
 from service.web.describe import IDEMPOTENCY_KEY, LINK, LOCATION, REPLAYED, Gives, described
 from service.web.headers import NO_IDEMPOTENCY_KEY, idempotency_key
@@ -115,14 +115,19 @@ def get_overlay(request: Request, id: ResultId, operations: Held) -> Response:
     ),
 )
 def what_if(
-    request: Request, id: ResultId, body: JsonBody, operations: Held, caller: Asking
+    request: Request,
+    id: ResultId,
+    body: JsonBody,
+    operations: Held,
+    caller: Asking,
+    audited: Audited,
 ) -> Response:
     """Run a recorded batch again with other options; to keep the result needs `operate`."""
     asked = read_model(WhatIfIn, body)
-    if asked.record or asked.adopt:
+    record, entry = asked.record or asked.adopt, None
+    if record:
         require_scope(caller, "operate")
         request.state.changes = "what_if"
-    answered = operations.what_if(
-        id, asked.options, record=asked.record or asked.adopt, adopt=asked.adopt
-    )
-    return answer_response(answered, recorded=asked.record or asked.adopt)
+        entry = audited.entry(201)
+    answered = operations.what_if(id, asked.options, record=record, adopt=asked.adopt, entry=entry)
+    return answer_response(answered, recorded=record)

@@ -15,6 +15,7 @@ from starlette.responses import Response
 from service.errors import BadBatch, Fault, shown_value
 from service.imaging.submit import FrameIn, read_known
 from service.missions.mission import mission_named
+from service.web.access import Asking
 from service.web.bodies import frame_body
 from service.web.describe import IDEMPOTENCY_KEY, LOCATION, REPLAYED, Gives, described
 from service.web.headers import IdempotencyKey
@@ -121,10 +122,11 @@ def submit_frame(
     key: IdempotencyKey,
     operations: Held,
     metrics: Counted,
+    caller: Asking,
 ) -> Response:
     """Find the stars on a frame, identify them, solve for the attitude, and record it all."""
     with sent.opened() as file:
-        answered = operations.submit_frame(name, sent.known, file, key)
+        answered = operations.submit_frame(name, sent.known, file, key, caller)
     if answered.replayed:
         metrics.count_repeat()
     return answer_response(answered)

@@ -10,7 +10,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.observe.wire import BatchIn, RunName, Wire
-from service.web.access import Asking, require_unbound
+from service.web.access import Asking, Audited, require_unbound
 from service.web.bodies import (
     MAX_JSON_BYTES,
     JsonBody,
@@ -79,9 +79,10 @@ def list_runs(operations: Held) -> Response:
     dependencies=[NO_QUERY],
     **described({200: Gives("The run.", RunState)}, body=RunIn),
 )
-def watch_run(run: Run, body: JsonBody, operations: Held) -> Response:
+def watch_run(run: Run, body: JsonBody, operations: Held, audited: Audited) -> Response:
     """Say whether limits are held against a run; it is made where there is none."""
-    return json_response(operations.watch_run(run, read_model(RunIn, body).alarms))
+    asked = read_model(RunIn, body)
+    return json_response(operations.watch_run(run, asked.alarms, audited.entry()))
 
 
 @router.get(
@@ -103,7 +104,10 @@ def list_replays(operations: Held) -> Response:
     ),
 )
 def start_replay(
-    sent: Annotated[Sent, Depends(_telemetry)], operations: Held, caller: Asking
+    sent: Annotated[Sent, Depends(_telemetry)],
+    operations: Held,
+    caller: Asking,
+    audited: Audited,
 ) -> Response:
     """Take a telemetry file, a batch a line, and work through it in the background."""
     id = operations.start_replay_of(
@@ -116,6 +120,7 @@ def start_replay(
         check=caller.require,
         alarms=sent.alarms,
         owner=caller.token_id,
+        entry=audited.entry(202) if sent.alarms else None,
     )
     location = {"Location": f"/api/v1/replays/{id}"}
     return json_response(operations.replay(id), 202, location)
