@@ -1,203 +1,52 @@
-"""Views in which two groups of stars are consistent, or none is: what is called good must be right.
+"""Two groups of stars, mirrored fields, no star at all: what is called good must be right.
 
-python -m benchmarks two_groups
+    python -m benchmarks two_groups            ghosts, slews, mirrored axes, random points
+    python -m benchmarks two_groups --quick    small samples
 
 Ghosts: every star is doubled by a reflection .05 to 1 deg away, as bright or up to 3 mag fainter,
-in part with the magnitudes of the ghosts shuffled.  Slews: half of the stars were exposed after an
-unreported slew of .05 to 5 deg.  Mirrored axes, and points that are no stars at all.
+in half of the batches with the magnitudes of the ghosts exchanged.  Slews: half of the stars were
+exposed after an unreported slew of .05 to 5 deg.
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from tqdm import tqdm
 
+from benchmarks.bounds import Bound, at_least, at_most
+from benchmarks.record import CORE, SIMULATOR
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
 from service.acquire import Acquisition, acquire
 from service.attitude.solution import AttitudeSolution
-from service.missions.mission import Band, Mission, load_missions
-from service.observe.batch import ObservationBatch, Options, QuaternionPrior, TrackerStars
-from service.simulate.motion import pointed, random_axis, tilted, turned
-from service.simulate.sightings import anywhere, shaken
+from service.missions.mission import load_missions
+from service.observe.batch import ObservationBatch, QuaternionPrior
+from service.simulate.two_groups import Group, Rows, Views
 from service.sky.catalog import load_embedded
-from service.sky.ephemeris import sun_direction
-from service.sky.run_catalog import RunCatalog
 from service.sky.shelf import Shelf
 from service.sky.view import Sky
-from service.times import parse_utc
-from service.vectors import (
-    ARCSEC_PER_RADIAN,
-    Matrix,
-    Vector,
-    attitude_error_arcsec,
-    coordinate_rotation,
-    quaternion_from_matrix,
-    read_only,
-)
-
-Rows = npt.NDArray[np.intp]
+from service.vectors import Matrix, attitude_error_arcsec
 
 MISSIONS = ("XTE", "SWAS", "SOHO")
-MOMENT = parse_utc("1996-03-01T00:00:00Z")
-GHOST_SHIFT_DEG, SLEW_DEG = (0.05, 1.0), (0.05, 5.0)
-GHOST_DIMMING_MAG = (0.0, 0.0, 1.0, 2.0, 3.0)
+KINDS, STARS = ("ghosts", "slews"), (6, 10)
+BATCHES, QUICK_BATCHES = 5000, 40
+"""Of every mission, kind, number of stars, with and without an a priori attitude."""
+MIRRORED, POINTS, TWO_POINTS, NOMINAL, QUICK = 20_000, 20_000, 50_000, 50_000, 100
+POINT_COUNTS = (3, 4, 5, 6, 7, 8)
+MOST_WRONG_PCT, LEAST_NAMED_RIGHT_PCT, LEAST_RIVAL_PCT = 0.1, 99.9, 99.0
+MOST_MIRRORED, MOST_POINTS, MOST_TWO_POINTS, MOST_FLAGGED = 10, 3, 10, 20
 SAME_ATTITUDE_DEG = 0.03
 """An attitude nearer to another than this is taken for the same: the least shift is .05 deg."""
 LARGEST_ERROR = 40.0
 """e^T P^-1 e of an error that noise explains: more than this chi-square of three hardly ever is."""
-CAP_PRIOR_DEG, BAND_PRIOR_DEG = 3.0, 0.1
-"""How far the a priori attitude is off at most: each angle in a cap, the pole in a band."""
+SHELF_BYTES = 256 << 20
 
 
-@dataclass(frozen=True)
-class Group:
-    """Stars of one attitude: directions in tracker axes, magnitudes, rows of the run catalog."""
-
-    attitude: Matrix
-    direction: Vector
-    magnitude_mag: Vector
-    star: Rows
-
-    def __len__(self) -> int:
-        return len(self.magnitude_mag)
-
-
-@dataclass(frozen=True)
-class Views:
-    """Draws groups of stars for one mission, and makes batches of them."""
-
-    mission: Mission
-    sky: Sky
-    rng: np.random.Generator
-
-    @property
-    def run_catalog(self) -> RunCatalog:
-        """The run catalog that batches are identified in."""
-        return self.sky.run_catalog(self.mission, MOMENT)
-
-    def attitude(self) -> Matrix:
-        """Anywhere; a mission with a band keeps its pole near the Sun."""
-        roll = self.rng.uniform(0.0, math.tau)
-        if isinstance(self.mission.zone, Band):
-            tilt = math.radians(self.rng.uniform(0.0, BAND_PRIOR_DEG))
-            return pointed(
-                self.mission.axis_body, tilted(sun_direction(MOMENT, None), tilt, self.rng), roll
-            )
-        return pointed(self.mission.axis_body, random_axis(self.rng), roll)
-
-    def prior(self, attitude: Matrix) -> QuaternionPrior:
-        """An a priori attitude that is off as the mission's is."""
-        if isinstance(self.mission.zone, Band):
-            roll = self.rng.uniform(0.0, math.tau)
-            presumed = pointed(self.mission.axis_body, sun_direction(MOMENT, None), roll)
-        else:
-            psi, theta, phi = self.rng.uniform(-CAP_PRIOR_DEG, CAP_PRIOR_DEG, 3)
-            error = coordinate_rotation(0, psi) @ coordinate_rotation(1, theta)
-            presumed = (error @ coordinate_rotation(2, phi)).T @ attitude
-        return QuaternionPrior(read_only(quaternion_from_matrix(presumed)))
-
-    def visible(self, attitude: Matrix) -> Rows:
-        """The stars in the field of view, in random order."""
-        tracker, catalog = self.mission.trackers[0], self.run_catalog
-        boresight = attitude.T @ tracker.body_from_tracker[:, 2]
-        least = math.cos(math.radians(tracker.field_of_view_radius_deg))
-        return self.rng.permutation(np.flatnonzero(catalog.direction @ boresight >= least))
-
-    def group(self, attitude: Matrix, star: Rows) -> Group:
-        """These stars as they are measured at an attitude."""
-        tracker, catalog = self.mission.trackers[0], self.run_catalog
-        exact = catalog.direction[star] @ attitude.T @ tracker.body_from_tracker
-        noise_mag = self.rng.normal(0.0, tracker.magnitude_sigma_mag, len(star))
-        return Group(
-            attitude,
-            shaken(exact, tracker.sigma_arcsec / ARCSEC_PER_RADIAN, self.rng),
-            catalog.magnitude_mag[star] + noise_mag,
-            star,
-        )
-
-    def field(self, stars: int) -> Group:
-        """So many stars at an attitude that shows as many."""
-        while True:
-            attitude = self.attitude()
-            star = self.visible(attitude)
-            if len(star) >= stars:
-                return self.group(attitude, star[:stars])
-
-    def shifted(self, attitude: Matrix, least_deg: float, most_deg: float) -> Matrix:
-        """The attitude after a turn across the boresight."""
-        boresight = self.mission.trackers[0].body_from_tracker[:, 2]
-        axis = np.cross(boresight, random_axis(self.rng))
-        axis /= np.linalg.norm(axis)
-        return turned(attitude, axis * math.radians(self.rng.uniform(least_deg, most_deg)))
-
-    def ghosts(self, stars: int) -> tuple[Group, Group]:
-        """So many stars and as many reflections of them."""
-        real = self.field(stars)
-        ghost = self.group(self.shifted(real.attitude, *GHOST_SHIFT_DEG), real.star)
-        magnitude = ghost.magnitude_mag + self.rng.choice(GHOST_DIMMING_MAG)
-        if self.rng.random() < 0.5:
-            magnitude = self.rng.permutation(magnitude)
-        return real, replace(ghost, magnitude_mag=magnitude)
-
-    def slew(self, stars: int) -> tuple[Group, Group]:
-        """Half of so many stars before a slew and half after it."""
-        half = stars // 2
-        while True:
-            before = self.attitude()
-            after = self.shifted(before, *SLEW_DEG)
-            here, there = self.visible(before), self.visible(after)
-            there = there[~np.isin(there, here[:half])]
-            if min(len(here), len(there)) >= half:
-                return self.group(before, here[:half]), self.group(after, there[:half])
-
-    def random_points(self, points: int) -> Group:
-        """Points that are no stars, as bright as stars of the catalog."""
-        tracker, catalog = self.mission.trackers[0], self.run_catalog
-        radius = math.radians(tracker.field_of_view_radius_deg)
-        return Group(
-            self.attitude(),
-            anywhere(radius, points, self.rng),
-            self.rng.choice(catalog.magnitude_mag, points),
-            np.full(points, -1),
-        )
-
-    def batch(
-        self, *groups: Group, prior: QuaternionPrior | None, options: Options | None = None
-    ) -> tuple[ObservationBatch, npt.NDArray[np.intp]]:
-        """A batch of these groups' stars in random order, and that order."""
-        direction = np.concatenate([group.direction for group in groups])
-        magnitude = np.concatenate([group.magnitude_mag for group in groups])
-        order = self.rng.permutation(len(magnitude))
-        n = len(order)
-        stars = TrackerStars(
-            self.mission.trackers[0].name,
-            read_only(direction[order]),
-            read_only(np.full((n, 2), np.nan)),
-            read_only(magnitude[order]),
-            read_only(np.zeros(n)),
-            read_only(np.full(n, np.nan)),
-        )
-        batch = ObservationBatch(
-            spacecraft=self.mission.name,
-            batch="two-groups",
-            run="benchmark",
-            time=MOMENT,
-            a_priori=prior,
-            body_rates_deg_per_s=read_only(np.zeros(3)),
-            velocity_km_per_s=None,
-            aberration="ignore",
-            observations=(stars,),
-            options=options or Options(),
-        )
-        return batch, order
-
-    def acquire(self, batch: ObservationBatch) -> Acquisition:
-        """The answer to a batch."""
-        return acquire(batch, self.mission, self.sky)
+def acquired(views: Views, batch: ObservationBatch) -> Acquisition:
+    """The answer to a batch of these views."""
+    return acquire(batch, views.mission, views.sky)
 
 
 def is_good(found: Acquisition) -> bool:
@@ -226,7 +75,6 @@ class Counted:
     named_wrong: int = 0
     smaller_good_alone: int = 0
     of_these_with_rival: int = 0
-    missed: list[int] = field(default_factory=list)
 
     @property
     def wrong_pct(self) -> float:
@@ -254,12 +102,12 @@ def two_groups(
 ) -> Counted:
     """Batches of ghosts or slews, counted."""
     counted = Counted()
-    for number in range(batches):
+    for _ in range(batches):
         first, second = views.ghosts(stars) if kind == "ghosts" else views.slew(stars)
         prior = views.prior(first.attitude) if with_prior else None
         batch, order = views.batch(first, second, prior=prior)
-        found = views.acquire(batch)
-        _count(counted, views, kind, found, order, first, second, prior, number)
+        found = acquired(views, batch)
+        _count(counted, views, kind, found, order, first, second, prior)
         step(1)
     return counted
 
@@ -273,7 +121,6 @@ def _count(
     first: Group,
     second: Group,
     prior: QuaternionPrior | None,
-    number: int,
 ) -> None:
     counted.batches += 1
     good = is_good(found)
@@ -297,13 +144,11 @@ def _count(
         for group, is_named in ((first, named[0]), (second, named[1])):
             if is_at(found.solution, group.attitude):
                 continue
-            alone = views.acquire(views.batch(group, prior=prior)[0])
+            alone = acquired(views, views.batch(group, prior=prior)[0])
             if _is_right(alone, group.attitude):
                 counted.smaller_good_alone += 1
                 counted.of_these_with_rival += is_named
-                if not is_named:
-                    counted.missed.append(number)
-                    is_wrong = True
+                is_wrong |= not is_named
     counted.good_and_wrong += good and is_wrong
 
 
@@ -313,51 +158,177 @@ def _is_right(found: Acquisition, attitude: Matrix) -> bool:
     return solution is not None and not solution.suspect and is_at(solution, attitude)
 
 
-def mirrored(views: Views, stars: int, batches: int, step: Callable[[int], object] = int) -> int:
-    """How many batches of a tracker with one axis of the wrong sign are called good."""
-    good = 0
-    for _ in range(batches):
-        group = views.field(stars)
-        image = replace(group, direction=read_only(group.direction * np.array([-1.0, 1.0, 1.0])))
-        good += is_good(views.acquire(views.batch(image, prior=views.prior(group.attitude))[0]))
-        step(1)
-    return good
-
-
-def random_points(
-    views: Views, points: int, batches: int, step: Callable[[int], object] = int
-) -> int:
-    """How many batches without any star are called good."""
-    good = 0
-    for _ in range(batches):
-        group = views.random_points(points)
-        good += is_good(views.acquire(views.batch(group, prior=views.prior(group.attitude))[0]))
-        step(1)
-    return good
-
-
 @dataclass
-class Nominal:
-    """What came of batches of real stars alone."""
+class Simple:
+    """What came of batches of one group: how many were good and right, good and wrong, doubted."""
 
     batches: int = 0
-    good: int = 0
-    flagged: int = 0
-    """With a rival or called mirrored."""
+    right: int = 0
+    wrong: int = 0
+    doubted: int = 0
+    """With a rival, or called mirrored."""
 
 
-def nominal(
-    views: Views, fewest: int, most: int, batches: int, step: Callable[[int], object] = int
-) -> Nominal:
-    """Batches of so many real stars, as the mission sees them."""
-    counted = Nominal()
-    for _ in range(batches):
-        group = views.field(int(views.rng.integers(fewest, most + 1)))
-        found = views.acquire(views.batch(group, prior=views.prior(group.attitude))[0])
+def simple(
+    views: Views, drawn: Iterator[Group], with_truth: bool, step: Callable[[int], object] = int
+) -> Simple:
+    """Batches of one group each; without truth every good answer is a wrong one."""
+    counted = Simple()
+    for group in drawn:
+        found = acquired(views, views.batch(group, prior=views.prior(group.attitude))[0])
+        right = with_truth and _is_right(found, group.attitude)
         counted.batches += 1
-        counted.good += _is_right(found, group.attitude)
-        counted.flagged += found.rival is not None or any(
+        counted.right += right
+        counted.wrong += is_good(found) and not right
+        counted.doubted += found.rival is not None or any(
             each.identification.mirrored for each in found.trackers
         )
         step(1)
     return counted
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of the first table: where and how it was drawn, and what came of it."""
+
+    mission: str
+    kind: str
+    stars: int
+    with_prior: bool
+    counted: Counted
+
+    def bounds(self) -> list[Bound]:
+        """What is asked of it; one batch is allowed for in small samples."""
+        prior = "a priori" if self.with_prior else "no prior"
+        name = f"{self.mission}, {self.kind}, {self.stars} stars, {prior}"
+        counted = self.counted
+        allowed = max(1, math.floor(counted.batches * MOST_WRONG_PCT / 100.0))
+        missing = counted.smaller_good_alone - counted.of_these_with_rival
+        few = math.ceil(counted.smaller_good_alone * (1.0 - LEAST_RIVAL_PCT / 100.0))
+        return [
+            at_most(f"{name}: good and wrong", counted.good_and_wrong, allowed),
+            at_most(f"{name}: other group good alone, not named", missing, few),
+        ]
+
+
+def measured(quick: bool, seed: int) -> tuple[list[Row], dict[str, Simple]]:
+    """Every row, and by label what came of single groups."""
+    sky, missions = Sky(load_embedded(), Shelf(SHELF_BYTES)), load_missions()
+    batches = QUICK_BATCHES if quick else BATCHES
+    rows, others = [], {}
+    with tqdm(desc="two groups", unit="batch", unit_scale=True) as bar:
+        for place, mission in enumerate(MISSIONS):
+            for kind in KINDS:
+                for stars in STARS:
+                    for with_prior in (True, False):
+                        drawn = [seed, place, KINDS.index(kind), stars, with_prior]
+                        views = Views(missions[mission], sky, np.random.default_rng(drawn))
+                        counted = two_groups(views, kind, stars, with_prior, batches, bar.update)
+                        rows.append(Row(mission, kind, stars, with_prior, counted))
+        views = Views(missions["XTE"], sky, np.random.default_rng([seed, 99]))
+        many = [QUICK if quick else count for count in (MIRRORED, POINTS, TWO_POINTS, NOMINAL)]
+        for stars in (5, 10):
+            group = (views.mirrored(stars) for _ in range(many[0]))
+            others[f"mirrored, {stars} stars"] = simple(views, group, False, bar.update)
+        for points in POINT_COUNTS:
+            group = (views.random_points(points) for _ in range(many[1]))
+            others[f"{points} random points"] = simple(views, group, False, bar.update)
+        group = (views.random_points(2) for _ in range(many[2]))
+        others["2 random points"] = simple(views, group, False, bar.update)
+        group = (views.field(2) for _ in range(many[1]))
+        others["2 real stars"] = simple(views, group, True, bar.update)
+        group = (views.field(int(views.rng.integers(3, 9))) for _ in range(many[3]))
+        others["3 to 8 real stars"] = simple(views, group, True, bar.update)
+    return rows, others
+
+
+def bounds_of(rows: list[Row], others: dict[str, Simple]) -> list[Bound]:
+    """All that is asked."""
+    bounds = [bound for row in rows for bound in row.bounds()]
+    named = sum(row.counted.named for row in rows)
+    wrong = sum(row.counted.named_wrong for row in rows)
+    right_pct = 100.0 * (1.0 - wrong / max(named, 1))
+    bounds.append(
+        at_least("names of probability .999: right", right_pct, LEAST_NAMED_RIGHT_PCT, "%")
+    )
+    for label, counted in others.items():
+        if "real" not in label:
+            most = MOST_MIRRORED if "mirrored" in label else MOST_POINTS
+            most = MOST_TWO_POINTS if label == "2 random points" else most
+            bounds.append(at_most(f"{label}: good", counted.wrong, most))
+        else:
+            bounds.append(at_most(f"{label}: good and wrong", counted.wrong, 1))
+            bounds.append(at_most(f"{label}: doubted", counted.doubted, MOST_FLAGGED))
+    return bounds
+
+
+def run(quick: bool, seed: int) -> Report:
+    """The benchmark: every row."""
+    rows, others = measured(quick, seed)
+    figures = {
+        f"{row.mission}, {row.kind}, {row.stars}, {'a priori' if row.with_prior else 'no prior'}": (
+            f"wrong {row.counted.good_and_wrong} of {row.counted.batches}, rival named in "
+            f"{row.counted.rival_pct:.2f} % of {row.counted.smaller_good_alone}"
+        )
+        for row in rows
+    }
+    figures |= {
+        label: f"good and right {each.right}, wrong {each.wrong}, doubted {each.doubted} of "
+        f"{each.batches}"
+        for label, each in others.items()
+    }
+    return Report("two_groups", figures, bounds_of(rows, others))
+
+
+def write(quick: bool, seed: int) -> Written:
+    """The section of the verification."""
+    rows, others = measured(quick, seed)
+    groups = table(
+        (
+            "mission", "view", "stars", "a priori", "answered", "good", "good and wrong",
+            "names at .999", "right %", "other good alone", "of these named %",
+        ),
+        [
+            (
+                row.mission, row.kind, row.stars, "yes" if row.with_prior else "none",
+                row.counted.answered, row.counted.good, row.counted.good_and_wrong,
+                row.counted.named, f"{row.counted.named_right_pct:.2f}",
+                row.counted.smaller_good_alone, f"{row.counted.rival_pct:.2f}",
+            )
+            for row in rows
+        ],
+        numbers=7,
+    )  # fmt: skip
+    single = table(
+        ("batches of", "batches", "good and right", "good and wrong", "doubted"),
+        [
+            (label, each.batches, each.right, each.wrong, each.doubted)
+            for label, each in others.items()
+        ],
+        numbers=4,
+    )
+    text = f"""
+An attitude may be wrong although chance does not explain it: a view may hold a second group of
+stars that agree with one another. *Ghosts*: every star is doubled by a reflection 0.05 to 1 deg
+away, as bright or up to 3 mag fainter, in half of the batches with magnitudes exchanged; true is
+the attitude of the stars. *Slews*: half of the stars were exposed after an unreported slew of 0.05
+to 5 deg; either attitude is true, if both are named. {rows[0].counted.batches:,} batches a row,
+half of their stars in each group; the a priori attitude is off by up to 3 deg about each axis, the
+pole of SOHO by up to 0.1 deg.
+
+*Good and wrong* counts `good` answers that are wrong, and those that do not name the attitude of
+the other group although its stars alone give a `good` one. The last two columns say in how many
+answers the other group alone gives a `good` attitude, and in how many of these it is named as the
+rival. Without a prior, six stars in two groups of three are mostly refused: there is no answer.
+
+{groups}
+
+Below, XTE: fields of a tracker with one axis of the wrong sign, points that are no stars at all,
+and real stars. *Doubted* are answers with a rival or with the warning `mirrored_field`.
+
+{single}
+"""
+    return Written(text, bounds_of(rows, others))
+
+
+SECTION = Section("Two groups of stars", write, (*CORE, *SIMULATOR))

@@ -47,7 +47,9 @@ class Advice:
     """Everything that a sample of batches says of a mission's settings.
 
     `refused` counts batches that no longer fit the mission, the first reason
-    beside it; `sampled` those that gave evidence.  `by_votes` says whether any
+    beside it; `sampled` those that gave evidence.  `with_rival` counts batches in
+    which two groups of stars have each an attitude, `mirrored` those that fit
+    better in a mirror.  `by_votes` says whether any
     of these is identified by votes, which alone ask for the tolerances.
     """
 
@@ -62,6 +64,8 @@ class Advice:
     alignment: tuple[AlignmentFinding, ...]
     tried: tuple[Tried, ...]
     by_votes: bool
+    with_rival: int
+    mirrored: int
 
 
 def advise(
@@ -91,6 +95,8 @@ def advise(
             evidence.append(evidence_of(number, acquisition))
             sure = tuple(each.identification for each in acquisition.trackers)
             seen.cases.append((batch, sure, counts_of(acquisition, sure)))
+            seen.with_rival += acquisition.rival is not None
+            seen.mirrored += any(each.mirrored for each in sure)
         pace.step()
     gathered_evidence = gathered(evidence)
     tolerances = tuple(tolerance_findings(mission, gathered_evidence))
@@ -108,6 +114,8 @@ def advise(
         by_votes=any(
             (batch.options.identifier or mission.identifier) == "starid" for batch, *_ in seen.cases
         ),
+        with_rival=seen.with_rival,
+        mirrored=seen.mirrored,
     )
 
 
@@ -120,6 +128,8 @@ class _Seen:
     )
     refused: int = 0
     refusal: str | None = None
+    with_rival: int = 0
+    mirrored: int = 0
 
     def refuse(self, error: BadInput) -> None:
         """Note a batch that does not fit the mission any more, or asks for too much work."""

@@ -11,6 +11,7 @@ from service.advice.tried import Tried
 from service.advice.words import (
     Said,
     said_of_alignment,
+    said_of_groups,
     said_of_magnitudes,
     said_of_noise,
     said_of_tolerance,
@@ -34,6 +35,7 @@ def as_row(advice: Advice) -> Row:
         "batches_identified": advice.identified,
         "batches_refused": advice.refused,
         "refusal": advice.refusal,
+        "groups": [_words(each) for each in said_of_groups(advice)],
         "tolerances": [
             {
                 "tolerance": each.tolerance.name,
@@ -140,6 +142,7 @@ def as_text(row: Mapping[str, Any]) -> str:
     """The advice for people: sentences, a table of what was tried, the lines to change."""
     lines = [*_heading(row), ""]
     for title, kind in (
+        ("Groups of stars", "groups"),
         ("Tolerances", "tolerances"),
         ("Noise", "noise"),
         ("Magnitudes", "magnitudes"),

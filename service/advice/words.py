@@ -39,6 +39,30 @@ class Said:
     changes: tuple[Change, ...] = ()
 
 
+def said_of_groups(advice: Advice) -> list[Said]:
+    """Batches in which two groups of stars have each an attitude, and mirrored ones."""
+    said = []
+    if advice.with_rival:
+        said.append(
+            Said(
+                "correct",
+                f"In {advice.with_rival} of {advice.sampled} batches two groups of stars have each "
+                "an attitude of their own, and the attitude is suspect: look for reflections in "
+                "the tracker, or for a slew while the stars of a batch were observed.",
+            )
+        )
+    if advice.mirrored:
+        said.append(
+            Said(
+                "correct",
+                f"In {advice.mirrored} of {advice.sampled} batches the stars fit better in a "
+                "mirror: look whether an axis of the tracker has the wrong sign, or two are "
+                "exchanged.",
+            )
+        )
+    return said
+
+
 def said_of_tolerance(finding: ToleranceFinding, advice: Advice) -> Said:
     """One tolerance."""
     name, unit = finding.tolerance.name, finding.tolerance.unit

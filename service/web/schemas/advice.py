@@ -41,6 +41,13 @@ class ToleranceAdvice(Shape):
     text: Text
 
 
+class GroupAdvice(Shape):
+    """What no setting of the identification mends: two groups of stars, mirrored axes."""
+
+    action: Action
+    text: Text
+
+
 class NoiseAdvice(Shape):
     """A tracker's noise, one standard deviation per tangent axis."""
 
@@ -130,6 +137,10 @@ class Advice(Shape):
     refusal: str | None
     mission: Digest
     identifier: Identifier
+    groups: list[GroupAdvice] = Field(
+        description="Batches in which two groups of stars have each an attitude of their own, and "
+        "mirrored ones; empty where there are none."
+    )
     tolerances: list[ToleranceAdvice]
     noise: list[NoiseAdvice]
     magnitudes: list[MagnitudeAdvice]

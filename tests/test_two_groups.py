@@ -1,0 +1,86 @@
+"""Views with two groups of stars, or none, give no wrong attitude that is called good."""
+
+import numpy as np
+import pytest
+
+from benchmarks.two_groups import acquired, is_at, is_good, simple, two_groups
+from service.simulate.two_groups import Views
+
+BATCHES = 25
+
+
+@pytest.fixture
+def views(sky, missions, seed):
+    return lambda mission, *place: Views(
+        missions[mission], sky, np.random.default_rng([seed, *place])
+    )
+
+
+@pytest.mark.parametrize("with_prior", [True, False])
+@pytest.mark.parametrize("stars", [6, 10])
+@pytest.mark.parametrize("kind", ["ghosts", "slews"])
+@pytest.mark.parametrize("mission", ["XTE", "SOHO"])
+def test_of_two_groups_neither_is_passed_over(views, mission, kind, stars, with_prior):
+    """The answer is no good one that is wrong, and where both groups are sound it names both."""
+    counted = two_groups(views(mission, stars), kind, stars, with_prior, BATCHES)
+    assert counted.batches == BATCHES
+    assert counted.good_and_wrong == 0
+    assert counted.of_these_with_rival == counted.smaller_good_alone
+    assert counted.named_wrong <= 0.02 * max(counted.named, 1)
+
+
+def test_the_rival_is_the_attitude_of_the_other_group(views):
+    """Halves of ten stars before and after a slew: one is the answer, the other one its rival."""
+    drawn = views("XTE")
+    for _ in range(BATCHES):
+        before, after = drawn.slew(10)
+        batch, order = drawn.batch(before, after, prior=drawn.prior(before.attitude))
+        found = acquired(drawn, batch)
+        assert found.solution is not None
+        assert found.solution.suspect
+        assert found.rival is not None
+        attitudes = found.solution, found.rival.solution
+        assert any(is_at(attitudes[0], group.attitude) for group in (before, after))
+        assert any(is_at(attitudes[1], group.attitude) for group in (before, after))
+        assert 0.0 < found.rival.probability <= 0.5
+        (named,) = found.rival.star
+        truth = np.concatenate([before.star, after.star])[order]
+        assert (named[named >= 0] == truth[named >= 0]).all()
+        assert (named >= 0).sum() >= 3
+        assert any(text.startswith("rival_attitude: ") for text in found.warnings)
+
+
+def test_single_groups_have_no_rival(views):
+    """Real stars alone, with or without a point that is none, are answered as before."""
+    drawn = views("XTE")
+    counted = simple(drawn, (drawn.field(6) for _ in range(10 * BATCHES)), True)
+    assert counted.right >= 0.98 * counted.batches
+    assert counted.wrong == counted.doubted == 0
+    good = 0
+    for _ in range(BATCHES):
+        group = drawn.field(5)
+        both = drawn.batch(group, drawn.random_points(3), prior=drawn.prior(group.attitude))[0]
+        found = acquired(drawn, both)
+        assert found.rival is None
+        good += is_good(found)
+    assert good >= BATCHES - 2
+
+
+@pytest.mark.parametrize("stars", [5, 10])
+def test_a_mirrored_field_is_not_called_good_and_the_answer_names_the_mirror(views, stars):
+    """Of mirrored fields, 1 to 2.5 % have three stars that fit somewhere by themselves."""
+    drawn = views("XTE", stars)
+    found = [
+        acquired(drawn, drawn.batch(group, prior=drawn.prior(group.attitude))[0])
+        for group in (drawn.mirrored(stars) for _ in range(16 * BATCHES))
+    ]
+    assert not any(is_good(each) for each in found)
+    told = [text for each in found for text in each.warnings if text.startswith("mirrored_field: ")]
+    assert told
+
+
+@pytest.mark.parametrize("points", [2, 3, 5, 8])
+def test_points_that_are_no_stars_give_no_good_attitude(views, points):
+    drawn = views("XTE", points)
+    group = (drawn.random_points(points) for _ in range(16 * BATCHES))
+    assert simple(drawn, group, False).wrong <= 1
