@@ -519,7 +519,11 @@ CSV_TEXT = b"spacecraft,batch,time,tracker,x,y,z\nXTE,b1,1999-060T00:00:00Z,STAR
         ("a.ndjson", b"dear reader,\nthis is a letter\n", "is no NDJSON, which has one batch a"),
         ("a.ndjson", b'[{"spacecraft": "XTE"}]\n', "is JSON, but not NDJSON"),
         ("a.ndjson", b'{\n  "spacecraft": "XTE"\n}\n', "is JSON, but not NDJSON"),
-        ("a.ndjson.gz", gzip.compress(b"{}\n"), "is packed with gzip: unpack it first (gunzip)"),
+        (
+            "a.ndjson.gz",
+            gzip.compress(b"{}\n", mtime=0),
+            "is packed with gzip: unpack it first (gunzip)",
+        ),
         ("a.csv", b"name,age\nX,3\n", "column name: there is no such column"),
     ],
 )

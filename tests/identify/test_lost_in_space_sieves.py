@@ -6,11 +6,12 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from service.attitude.kernels import within
 from service.identify.lost_in_space.pair_order import rows_within
 from service.identify.lost_in_space.room import CHUNK, Chunk
 from service.identify.lost_in_space.sieve import candidates_of
 from service.identify.lost_in_space.solver import FieldOfView, LostInSpace
-from service.identify.lost_in_space.verdict import LARGEST_SIGMA_RAD, _within
+from service.identify.lost_in_space.verdict import LARGEST_SIGMA_RAD
 from service.simulate.scenes import Conditions, SceneSky, draw_random_points, draw_scenes
 from service.sky.sky_index import build_sky_index
 
@@ -81,7 +82,7 @@ def test_an_attitude_is_told_where_every_axis_is_known_well_enough(rng):
         root = rng.normal(size=(3, 3)) * LARGEST_SIGMA_RAD * rng.uniform(0.1, 1.0)
         covariance = root @ root.T
         largest = np.linalg.eigvalsh(covariance)[-1]
-        assert _within(covariance, LARGEST_SIGMA_RAD**2) == (largest < LARGEST_SIGMA_RAD**2)
+        assert within(covariance, LARGEST_SIGMA_RAD**2) == (largest < LARGEST_SIGMA_RAD**2)
         told += largest < LARGEST_SIGMA_RAD**2
     assert 30 < told < 270
 
