@@ -11,6 +11,7 @@ a schema of its own there.
 """
 
 import faulthandler
+import logging
 import os
 import tomllib
 import uuid
@@ -113,6 +114,19 @@ def pytest_terminal_summary(terminalreporter):
         terminalreporter.section("figures")
         for line in sorted(told):
             terminalreporter.line(line)
+
+
+@pytest.fixture(autouse=True)
+def logging_as_before():
+    """What a test has a command configure ends with it: the stream that it writes to is closed."""
+    root, service = logging.getLogger(), logging.getLogger("service")
+    handlers, levels = list(root.handlers), (root.level, service.level)
+    yield
+    root.handlers[:] = [each for each in root.handlers if each in handlers] + [
+        each for each in handlers if each not in root.handlers
+    ]
+    root.setLevel(levels[0])
+    service.setLevel(levels[1])
 
 
 @pytest.fixture

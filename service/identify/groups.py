@@ -118,7 +118,7 @@ def shared(found: Identification, rival: Identification, share: float) -> Identi
         rivals[k] = tuple(row for row, _ in ranked)
         likely[k] = tuple(chance for _, chance in ranked)
         star[k] = -1
-        outcome[k] = _UNMATCHED if none >= chances[best] else _AMBIGUOUS
+        outcome[k] = _UNMATCHED if none > chances[best] else _AMBIGUOUS
         probability[k] = max(none, chances[best])
     return structs.replace(
         found,

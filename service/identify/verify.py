@@ -104,9 +104,16 @@ def identify_verified(sighting: Sighting) -> Identification:
         probability=probability,
         rivals_cut=rivals_cut,
         bounded=found.bounded,
-        hypothesis=np.where(found.hypothesis >= 0, star_of[found.hypothesis], -1),
+        hypothesis=_named(found.hypothesis, star_of),
         mirrored=found.mirrored,
     )
+
+
+def _named(rows: Integers, star_of: Integers) -> Integers:
+    """The stars of zone rows (n,), -1 where there is no row; a zone may have no stars."""
+    star = np.full(len(rows), -1)
+    star[rows >= 0] = star_of[rows[rows >= 0]]
+    return star
 
 
 def scene_of(sighting: Sighting) -> tuple[Seen, Stars, Pairs]:

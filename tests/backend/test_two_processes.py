@@ -32,6 +32,7 @@ READ_HERE = {
     "compare_runs",
     "default_run",
     "events_after",
+    "every_batch",
     "history",
     "last_event",
     "limit",
