@@ -9,8 +9,11 @@ exposed after an unreported slew of .05 to 5 deg.
 """
 
 import math
+import os
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
+from multiprocessing import get_context
 
 import numpy as np
 from tqdm import tqdm
@@ -211,35 +214,68 @@ class Row:
         ]
 
 
+@dataclass(frozen=True)
+class Task:
+    """What one process is given: a row of ghosts or slews, or batches of one group each."""
+
+    seed: int
+    mission: str
+    kind: str
+    stars: int
+    with_prior: bool
+    batches: int
+
+    def run(self) -> Counted | Simple:
+        """Draw and acquire its batches."""
+        sky = Sky(load_embedded(), Shelf(SHELF_BYTES))
+        drawn = [self.seed, *self.mission.encode(), *self.kind.encode(), self.stars]
+        rng = np.random.default_rng([*drawn, self.with_prior])
+        views = Views(load_missions()[self.mission], sky, rng)
+        if self.kind in KINDS:
+            return two_groups(views, self.kind, self.stars, self.with_prior, self.batches)
+        draw = {
+            "mirrored": lambda: views.mirrored(self.stars),
+            "random": lambda: views.random_points(self.stars),
+            "real": lambda: views.field(self.stars or int(rng.integers(3, 9))),
+        }[self.kind]
+        return simple(views, (draw() for _ in range(self.batches)), self.kind == "real")
+
+
 def measured(quick: bool, seed: int) -> tuple[list[Row], dict[str, Simple]]:
     """Every row, and by label what came of single groups."""
-    sky, missions = Sky(load_embedded(), Shelf(SHELF_BYTES)), load_missions()
     batches = QUICK_BATCHES if quick else BATCHES
-    rows, others = [], {}
-    with tqdm(desc="two groups", unit="batch", unit_scale=True) as bar:
-        for place, mission in enumerate(MISSIONS):
-            for kind in KINDS:
-                for stars in STARS:
-                    for with_prior in (True, False):
-                        drawn = [seed, place, KINDS.index(kind), stars, with_prior]
-                        views = Views(missions[mission], sky, np.random.default_rng(drawn))
-                        counted = two_groups(views, kind, stars, with_prior, batches, bar.update)
-                        rows.append(Row(mission, kind, stars, with_prior, counted))
-        views = Views(missions["XTE"], sky, np.random.default_rng([seed, 99]))
-        many = [QUICK if quick else count for count in (MIRRORED, POINTS, TWO_POINTS, NOMINAL)]
-        for stars in (5, 10):
-            group = (views.mirrored(stars) for _ in range(many[0]))
-            others[f"mirrored, {stars} stars"] = simple(views, group, False, bar.update)
-        for points in POINT_COUNTS:
-            group = (views.random_points(points) for _ in range(many[1]))
-            others[f"{points} random points"] = simple(views, group, False, bar.update)
-        group = (views.random_points(2) for _ in range(many[2]))
-        others["2 random points"] = simple(views, group, False, bar.update)
-        group = (views.field(2) for _ in range(many[1]))
-        others["2 real stars"] = simple(views, group, True, bar.update)
-        group = (views.field(int(views.rng.integers(3, 9))) for _ in range(many[3]))
-        others["3 to 8 real stars"] = simple(views, group, True, bar.update)
-    return rows, others
+    rows = [
+        Task(seed, mission, kind, stars, with_prior, batches)
+        for mission in MISSIONS
+        for kind in KINDS
+        for stars in STARS
+        for with_prior in (True, False)
+    ]
+    many = [QUICK if quick else count for count in (MIRRORED, POINTS, TWO_POINTS, NOMINAL)]
+    labels = {f"mirrored, {stars} stars": ("mirrored", stars, many[0]) for stars in (5, 10)}
+    labels |= {f"{points} random points": ("random", points, many[1]) for points in POINT_COUNTS}
+    labels["2 random points"] = "random", 2, many[2]
+    labels["2 real stars"] = "real", 2, many[1]
+    labels["3 to 8 real stars"] = "real", 0, many[3]
+    single = [Task(seed, "XTE", kind, stars, True, n) for kind, stars, n in labels.values()]
+    tasks = rows + single
+    total = sum(task.batches for task in tasks)
+    with (
+        ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool,
+        tqdm(total=total, desc="two groups", unit="batch", unit_scale=True) as bar,
+    ):
+        found = {}
+        waiting = {pool.submit(task.run): task for task in tasks}
+        for done in as_completed(waiting):
+            task = waiting[done]
+            found[task] = done.result()
+            bar.update(task.batches)
+    counted = {task: each for task, each in found.items() if isinstance(each, Counted)}
+    simples = {task: each for task, each in found.items() if isinstance(each, Simple)}
+    return (
+        [Row(t.mission, t.kind, t.stars, t.with_prior, counted[t]) for t in rows],
+        {label: simples[task] for label, task in zip(labels, single, strict=True)},
+    )
 
 
 def bounds_of(rows: list[Row], others: dict[str, Simple]) -> list[Bound]:

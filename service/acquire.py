@@ -78,6 +78,8 @@ IDENTIFIERS: Mapping[Identifier, Callable[[Sighting], Identification]] = {
     # About the attitude that was found in the whole sky.
     "lost_in_space": identify_verified,
 }
+LEAST_APART = 30.0
+"""Of chi-square with three degrees of freedom: two attitudes of noise alone pass it in 1e-6."""
 WITH_HYPOTHESES: frozenset[Identifier] = frozenset({"verified", "lost_in_space"})
 """Identifiers that weigh hypotheses, so that two groups of stars can be told apart and weighed."""
 WITHOUT_PRIOR: frozenset[Identifier] = frozenset({"ptp"})
@@ -317,17 +319,24 @@ class _Search:
         """
         found = self.find(corrected)
         left = [~mask for mask in found.explained]
-        if self.choices.identifier not in WITH_HYPOTHESES or not may_be_a_group(left):
+        nothing_found = not any(mask.any() for mask in found.explained)
+        if nothing_found or not may_be_a_group(left):
+            return found, None
+        if self.choices.identifier not in WITH_HYPOTHESES:
             return found, None
         other = self.find(part_of(corrected, left))
         if not other.good:
             return found, None
+        first = found
         if not found.good:
             first = self.find(part_of(corrected, found.explained))
             if not first.good:
                 return found, None
-            found = _of_all(first, found.explained)
-        return self._weighed(corrected, found, _of_all(other, left))
+            first = _of_all(first, found.explained)
+        if not _is_apart(_solution_of(first), _solution_of(other)):
+            # The same attitude twice: every star was sent twice, say.
+            return found, None
+        return self._weighed(corrected, first, _of_all(other, left))
 
     def _weighed(
         self, corrected: tuple[CorrectedObservations, ...], one: _Found, other: _Found
@@ -339,9 +348,7 @@ class _Search:
         first, second = one.looked, other.looked
         assert first is not None
         assert second is not None
-        solution, rival = first.solved, second.solved
-        assert isinstance(solution, AttitudeSolution)
-        assert isinstance(rival, AttitudeSolution)
+        solution, rival = _solution_of(one), _solution_of(other)
         stars = tuple(each.star for each in second.identifications)
         share = share_of(*weights, sum(int((rows >= 0).sum()) for rows in stars))
         apart_arcsec = attitude_error_arcsec(rival.matrix, solution.matrix)
@@ -453,14 +460,28 @@ class _Search:
         )
 
 
+def _solution_of(found: _Found) -> AttitudeSolution:
+    """The attitude of what is good."""
+    assert found.looked is not None
+    assert isinstance(found.looked.solved, AttitudeSolution)
+    return found.looked.solved
+
+
+def _is_apart(one: AttitudeSolution, other: AttitudeSolution) -> bool:
+    """Whether two attitudes of different stars differ by more than their noise explains."""
+    apart_arcsec = attitude_error_arcsec(other.matrix, one.matrix)
+    covariance_arcsec2 = one.covariance_arcsec2 + other.covariance_arcsec2
+    weighted = float(apart_arcsec @ np.linalg.solve(covariance_arcsec2, apart_arcsec))
+    return weighted > LEAST_APART
+
+
 def _of_all(found: _Found, masks: Sequence[Mask]) -> _Found:
     """What was found for a part of the stars, as of all, the others unmatched."""
-    looked = found.looked
+    looked, solution = found.looked, _solution_of(found)
     assert looked is not None
-    assert isinstance(looked.solved, AttitudeSolution)
     every = np.concatenate(masks)
     residual = np.full(len(every), np.nan)
-    residual[every] = looked.solved.residual_arcsec
+    residual[every] = solution.residual_arcsec
     return replace(
         found,
         looked=replace(
@@ -468,7 +489,7 @@ def _of_all(found: _Found, masks: Sequence[Mask]) -> _Found:
             identifications=[
                 of_all(each, mask) for each, mask in zip(looked.identifications, masks, strict=True)
             ],
-            solved=replace(looked.solved, residual_arcsec=read_only(residual)),
+            solved=replace(solution, residual_arcsec=read_only(residual)),
         ),
         explained=tuple(masks),
     )

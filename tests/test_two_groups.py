@@ -66,6 +66,15 @@ def test_single_groups_have_no_rival(views):
     assert good >= BATCHES - 2
 
 
+def test_stars_that_are_sent_twice_are_no_second_group(views):
+    drawn = views("XTE")
+    for _ in range(BATCHES):
+        group = drawn.field(5)
+        again = drawn.group(group.attitude, group.star)
+        found = acquired(drawn, drawn.batch(group, again, prior=drawn.prior(group.attitude))[0])
+        assert found.rival is None
+
+
 @pytest.mark.parametrize("stars", [5, 10])
 def test_a_mirrored_field_is_not_called_good_and_the_answer_names_the_mirror(views, stars):
     """Of mirrored fields, 1 to 2.5 % have three stars that fit somewhere by themselves."""
