@@ -233,11 +233,14 @@ class Task:
         views = Views(load_missions()[self.mission], sky, rng)
         if self.kind in KINDS:
             return two_groups(views, self.kind, self.stars, self.with_prior, self.batches)
-        draw = {
-            "mirrored": lambda: views.mirrored(self.stars),
-            "random": lambda: views.random_points(self.stars),
-            "real": lambda: views.field(self.stars or int(rng.integers(3, 9))),
-        }[self.kind]
+
+        def draw() -> Group:
+            if self.kind == "mirrored":
+                return views.mirrored(self.stars)
+            if self.kind == "random":
+                return views.random_points(self.stars)
+            return views.field(self.stars or int(rng.integers(3, 9)))
+
         return simple(views, (draw() for _ in range(self.batches)), self.kind == "real")
 
 

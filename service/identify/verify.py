@@ -109,7 +109,7 @@ def identify_verified(sighting: Sighting) -> Identification:
     )
 
 
-def _named(rows: Integers, star_of: Integers) -> Integers:
+def _named(rows: Integers, star_of: npt.NDArray[np.int32]) -> Integers:
     """The stars of zone rows (n,), -1 where there is no row; a zone may have no stars."""
     star = np.full(len(rows), -1)
     star[rows >= 0] = star_of[rows[rows >= 0]]
