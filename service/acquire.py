@@ -220,6 +220,12 @@ class _Found(Struct, frozen=True, eq=False, gc=False):
         """Whether there is an attitude that its own residuals do not speak against."""
         return self.looked is not None and self.looked.good
 
+    @property
+    def unique(self) -> list[Mask]:
+        """The stars (n,) of every tracker that are named for certain."""
+        assert self.looked is not None
+        return [each.unique for each in self.looked.identifications]
+
 
 class _Clock:
     """Time spent in each step, also where a step is taken again."""
@@ -318,25 +324,37 @@ class _Search:
         likeliest hypothesis: two groups of like weight leave every star ambiguous.
         """
         found = self.find(corrected)
+        if self.choices.identifier not in WITH_HYPOTHESES or not any(
+            mask.any() for mask in found.explained
+        ):
+            return found, None
         left = [~mask for mask in found.explained]
-        nothing_found = not any(mask.any() for mask in found.explained)
-        if nothing_found or not may_be_a_group(left):
-            return found, None
-        if self.choices.identifier not in WITH_HYPOTHESES:
-            return found, None
-        other = self.find(part_of(corrected, left))
-        if not other.good:
+        other = self._group(corrected, left)
+        if other is None:
             return found, None
         first = found
         if not found.good:
-            first = self.find(part_of(corrected, found.explained))
-            if not first.good:
+            explained = self._group(corrected, found.explained)
+            if explained is None:
                 return found, None
-            first = _of_all(first, found.explained)
-        if not _is_apart(_solution_of(first), _solution_of(other)):
+            first = explained
+        elif not _is_apart(_solution_of(found), _solution_of(other)):
+            # Another tracker decided for this group: then it is the hypothesis that is left over.
+            left = [mask & ~each for mask, each in zip(found.explained, found.unique, strict=True)]
+            other = self._group(corrected, left)
+        if other is None or not _is_apart(_solution_of(first), _solution_of(other)):
             # The same attitude twice: every star was sent twice, say.
             return found, None
-        return self._weighed(corrected, first, _of_all(other, left))
+        return self._weighed(corrected, first, other)
+
+    def _group(
+        self, corrected: tuple[CorrectedObservations, ...], masks: Sequence[Mask]
+    ) -> _Found | None:
+        """What these stars are by themselves, as of all; None without a good attitude."""
+        if not may_be_a_group(masks):
+            return None
+        found = self.find(part_of(corrected, masks))
+        return _of_all(found, masks) if found.good else None
 
     def _weighed(
         self, corrected: tuple[CorrectedObservations, ...], one: _Found, other: _Found

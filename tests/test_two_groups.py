@@ -1,10 +1,18 @@
 """Views with two groups of stars, or none, give no wrong attitude that is called good."""
 
+import json
+
 import numpy as np
 import pytest
 
 from benchmarks.two_groups import acquired, is_at, is_good, simple, two_groups
+from service.acquire import acquire
+from service.observe.wire import submission_from_json
+from service.simulate.stretches import Pass
+from service.simulate.telemetry import draw_pass
 from service.simulate.two_groups import Views
+from service.vectors import rotate_about
+from tests.advice.passes import mission_like
 
 BATCHES = 25
 
@@ -73,6 +81,27 @@ def test_stars_that_are_sent_twice_are_no_second_group(views):
         again = drawn.group(group.attitude, group.star)
         found = acquired(drawn, drawn.batch(group, again, prior=drawn.prior(group.attitude))[0])
         assert found.rival is None
+
+
+@pytest.mark.parametrize("with_prior", [True, False])
+def test_reflections_in_one_of_two_trackers_are_named(sky, seed, with_prior):
+    """The other tracker tells which group is real, and the reflections are named all the same."""
+    mission = mission_like("XTE", second_tracker={})
+    turn = np.radians([0.3, 0.0, 0.0])
+    named = 0
+    for drawn in draw_pass(mission, sky, Pass(BATCHES, seed, stars=6, angles_share=0.0)):
+        body = drawn.batch
+        first, second = (each["stars"] for each in body["observations"])
+        if min(len(first), len(second)) < 5:
+            continue
+        ghosts = [s | {"vector": rotate_about(turn, np.array(s["vector"])).tolist()} for s in first]
+        body["observations"][0]["stars"] = first + ghosts
+        if not with_prior:
+            body["a_priori"] = None
+        found = acquire(submission_from_json(json.dumps(body)).batch, mission, sky)
+        assert found.solution is None or found.solution.suspect
+        named += found.rival is not None
+    assert named >= 1
 
 
 @pytest.mark.parametrize("stars", [5, 10])
