@@ -34,6 +34,7 @@ def crowded(tmp_path_factory):
 def connect(crowded):
     """Connects from an address of this machine, and sends something."""
     url = httpx.URL(crowded)
+    wait_for_room(crowded)
     with ExitStack() as opened:
 
         def open_one(sent=b"", client="127.0.0.1"):
@@ -46,6 +47,14 @@ def connect(crowded):
             return connection
 
         yield open_one
+
+
+def wait_for_room(address):
+    """Until the server has noticed that the last test closed its connections."""
+    until = time.monotonic() + PATIENCE_S
+    while httpx.get(f"{address}/livez").status_code == 503:
+        assert time.monotonic() < until, "the server has no room for a connection"
+        time.sleep(0.05)
 
 
 def answer(connection):
