@@ -34,7 +34,7 @@ from service.vectors import Matrix, attitude_error_arcsec
 
 MISSIONS = ("XTE", "SWAS", "SOHO")
 KINDS, STARS = ("ghosts", "slews"), (6, 10)
-BATCHES, QUICK_BATCHES = 2000, 40
+BATCHES, QUICK_BATCHES = 5000, 40
 """Of every mission, kind, number of stars, with and without an a priori attitude."""
 MIRRORED, POINTS, TWO_POINTS, NOMINAL, QUICK = 20_000, 20_000, 50_000, 50_000, 100
 POINT_COUNTS = (3, 4, 5, 6, 7, 8)

@@ -350,11 +350,16 @@ class _Search:
     def _group(
         self, corrected: tuple[CorrectedObservations, ...], masks: Sequence[Mask]
     ) -> _Found | None:
-        """What these stars are by themselves, as of all; None without a good attitude."""
+        """What these stars are by themselves, as of all; None where three have no attitude.
+
+        Also one that its residuals speak against: one sound group in a thousand is such.
+        """
         if not may_be_a_group(masks):
             return None
         found = self.find(part_of(corrected, masks))
-        return _of_all(found, masks) if found.good else None
+        if found.looked is None or not isinstance(found.looked.solved, AttitudeSolution):
+            return None
+        return _of_all(found, masks) if may_be_a_group(found.unique) else None
 
     def _weighed(
         self, corrected: tuple[CorrectedObservations, ...], one: _Found, other: _Found
