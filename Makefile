@@ -30,7 +30,7 @@ DEV = $(VENV)/.installed-dev
 # The steps of `make check` run one after another, also under -j.
 .NOTPARALLEL:
 .PHONY: help run test torture check format-check lint types floors migrations-check openapi-check \
-	format lock bench stale openapi clean
+	format lock bench compare stale openapi clean
 
 help:
 	@echo "make run      set up, serve on http://$(HOST):$(PORT), replay sample telemetry, print a table"
@@ -39,20 +39,21 @@ help:
 	@echo "make check    tests, format, lint, types, import floors, migrations, openapi.yaml"
 	@echo "make format   format the code and mend what the linter can"
 	@echo "make bench    measure speed, write docs/performance.md; BENCH_ARGS=--all for all benchmarks"
+	@echo "make compare  send the same inputs to this version and to BASE=commit, show differences"
 	@echo "make stale    name the measured sections of the documents that are older than the code"
 	@echo "make openapi  write openapi.yaml anew"
 	@echo "make lock     resolve the dependencies anew (needs the package index)"
 	@echo "make clean    remove .venv and everything that was built or cached"
 	@echo
 	@echo "Variables: PORT, HOST, BATCHES, PYTHON, WORKERS, TEST_POSTGRESQL_URL,"
-	@echo "           DEMO_ARGS, PYTEST_ARGS, BENCH_ARGS"
+	@echo "           DEMO_ARGS, PYTEST_ARGS, BENCH_ARGS, BASE, COMPARE_ARGS"
 
 run: $(RUNTIME)
 	@exec $(BIN)/acquire demo --host $(HOST) --port $(PORT) $(if $(BATCHES),--batches $(BATCHES)) $(DEMO_ARGS)
 
 test: $(DEV)
 	@echo "== compiling the kernels (minutes after a change of the core, else seconds)"
-	@$(BIN)/python -m service.warm
+	@$(BIN)/python -m service.acquire.prewarm
 	@echo "== tests"
 	@$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile $(PYTEST_ARGS)
 ifeq ($(strip $(PYTEST_ARGS)),)
@@ -99,6 +100,10 @@ format: $(DEV)
 
 bench: $(DEV)
 	@$(BIN)/python -m benchmarks --write $(BENCH_ARGS)
+
+compare: $(DEV)
+	@test -n "$(BASE)" || { echo "Name a commit: make compare BASE=main"; exit 2; }
+	@$(BIN)/python -m benchmarks.compare --base "$(BASE)" $(COMPARE_ARGS)
 
 # Before a release; not part of `make check`, because measuring everything again takes hours.
 stale: $(DEV)

@@ -10,9 +10,9 @@ from benchmarks.covariance import Passes, error_of
 from benchmarks.record import CORE, SIMULATOR
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
-from service.sky.catalog import load_embedded
-from service.sky.shelf import Shelf
-from service.sky.view import Sky
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.model import SkyModel
 from service.vectors import ARCSEC_PER_RADIAN
 from tests.reference import batches
 
@@ -35,7 +35,7 @@ WAYS = {
 def run(quick: bool, seed: int) -> Report:
     """Mean pointing error across the boresight, beside the shift that aberration makes there."""
     count = count_of(quick)
-    passes = Passes("XTE", Sky(load_embedded(), Shelf(256 << 20)))
+    passes = Passes("XTE", SkyModel(load_embedded(), LruCache(256 << 20)))
     boresight = passes.mission.trackers[0].body_from_tracker[:, 2]
     figures: dict[str, Any] = {}
     bounds: list[Bound] = []

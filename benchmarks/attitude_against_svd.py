@@ -19,8 +19,8 @@ from benchmarks.bounds import at_most, between, equal
 from benchmarks.record import CORE
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
-from service.attitude import kernels
-from service.attitude.solve import WORST_AXIS_RAD, room_to_fit
+from service.attitude.kernels import QUEST, START, fit_attitude
+from service.attitude.solve import WORST_AXIS_RAD, fit_workspace
 from service.vectors import ARCSEC_PER_RADIAN
 
 Array = npt.NDArray[np.float64]
@@ -133,10 +133,11 @@ def agreement(cases: Cases) -> Agreement:
     count, stars = cases.sigma.shape
     quaternions, triads = np.empty((count, 4)), np.empty((count, 4))
     solved = np.zeros(count, bool)
-    room = room_to_fit(stars)
+    workspace = fit_workspace(stars)
     for k in range(count):
-        solved[k] = kernels.fit(cases.b[k], cases.r[k], cases.sigma[k], WORST_AXIS_RAD, 1, *room)
-        triads[k], quaternions[k] = room[0][:2]
+        vectors = cases.b[k], cases.r[k], cases.sigma[k]
+        solved[k] = fit_attitude(*vectors, WORST_AXIS_RAD, QUEST, workspace)
+        triads[k], quaternions[k] = workspace.quaternions[:START]
     least = np.linalg.eigvalsh(information(cases))[:, 0]
     worst = 1.0 / np.sqrt(np.maximum(least, 1e-300))
     # Within a thousandth of the bound either verdict is rounding.

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from service.uncounted import borrowing
+from service.compiled.jit import njit_no_refcount
 from service.vectors import Matrix, Vector
 
 Integers = npt.NDArray[np.int32]
@@ -20,14 +20,14 @@ Arrays = tuple[Any, ...]
 """Of several types, in the order in which the first line of a kernel unpacks them."""
 
 
-@borrowing
+@njit_no_refcount
 def _angle(a: Vector, b: Vector) -> float:
     x, y, z = a[0] - b[0], a[1] - b[1], a[2] - b[2]
     half = 0.5 * math.sqrt(x * x + y * y + z * z)
     return 2.0 * math.asin(min(1.0, half))
 
 
-@borrowing
+@njit_no_refcount
 def bare_votes(
     observed: Vector,
     observed_mag: Vector,
@@ -131,7 +131,7 @@ def bare_votes(
             votes[i, touched[k]] = 0
 
 
-@borrowing
+@njit_no_refcount
 def bare_attitude(
     b: Vector, r: Vector, weight: Vector, turned: Vector, matrix: Matrix, q: Vector
 ) -> None:
@@ -221,7 +221,7 @@ def bare_attitude(
         q[i] /= norm
 
 
-@borrowing
+@njit_no_refcount
 def _frame(a: Vector, b: Vector, rows: Matrix) -> None:
     x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
     norm = math.sqrt(x * x + y * y + z * z)
@@ -235,7 +235,7 @@ def _frame(a: Vector, b: Vector, rows: Matrix) -> None:
     )
 
 
-@borrowing
+@njit_no_refcount
 def bare_one(
     observed: Vector,
     mag: Vector,
@@ -284,7 +284,7 @@ def bare_one(
     return True
 
 
-@borrowing
+@njit_no_refcount
 def bare_many(
     observed: Vector,
     mag: Vector,

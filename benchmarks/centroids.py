@@ -22,11 +22,11 @@ from benchmarks.bounds import Bound, at_most, between, every
 from benchmarks.record import IMAGING
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
-from service.imaging.centroid import METHODS, centroid
-from service.imaging.psf import GaussianPsf, Psf
-from service.imaging.sampled_psf import airy_psf
-from service.imaging.window import Detector, cutout
-from service.simulate.imaging.windows import DrawnStar, draw_stars, flux_of_peak
+from service.imaging.centroids.centroid import METHODS, centroid
+from service.imaging.centroids.psf import GaussianPsf, Psf
+from service.imaging.centroids.sampled_psf import airy_psf
+from service.imaging.centroids.window import Detector, cutout
+from service.studies.star_image_report.windows import DrawnStar, draw_stars, flux_of_peak
 
 RATIOS = (10.0, 30.0, 100.0, 300.0, 1000.0)
 DETECTOR = Detector(gain_e_per_count=2.0, read_noise_e=10.0, saturation_counts=1e9)

@@ -19,10 +19,10 @@ from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
 from service.acquire import Acquisition, acquire
 from service.missions.mission import SHIPPED_FOLDER, Mission
-from service.observe.wire import submission_from_json
-from service.sky.catalog import load_embedded
-from service.sky.shelf import Shelf
-from service.sky.view import Sky
+from service.observations.schema import submission_from_json
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.model import SkyModel
 from service.times import parse_utc
 from service.vectors import ARCSEC_PER_RADIAN, attitude_error_arcsec, matrix_from_quaternion
 from tests.reference import batches
@@ -44,7 +44,7 @@ LEAST_SOLVED = 0.99
 class Passes:
     """Nominal batches of one mission with their true attitudes."""
 
-    def __init__(self, name: str, sky: Sky, solver: str = "quest") -> None:
+    def __init__(self, name: str, sky: SkyModel, solver: str = "quest") -> None:
         self.solver = solver
         text = (SHIPPED_FOLDER / f"{name.lower()}.toml").read_text("utf-8")
         self.toml: dict[str, Any] = tomllib.loads(text)
@@ -121,7 +121,7 @@ def error_of(truth: Array, found: Acquisition) -> Array | None:
 def run(quick: bool, seed: int) -> Report:
     """The benchmark: every mission and solver, errors in units of the covariance and TASTE."""
     count = count_of(quick)
-    sky = Sky(load_embedded(), Shelf(256 << 20))
+    sky = SkyModel(load_embedded(), LruCache(256 << 20))
     figures: dict[str, Any] = {}
     bounds: list[Bound] = []
     missions = ("XTE", "SWAS", "SOHO")

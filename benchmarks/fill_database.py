@@ -20,26 +20,23 @@ import numpy.typing as npt
 from sqlalchemy import create_engine
 from tqdm import tqdm
 
-from service.observe.wire import submission_from_json
-from service.operations import Operations
-from service.records.ids import Ulids
-from service.records.tables import (
+from service.app.factory import open_app
+from service.observations.schema import submission_from_json
+from service.settings import Settings
+from service.simulate.stretches import Pass
+from service.simulate.telemetry import draw_pass
+from service.storage.recording.ids import Ulids
+from service.storage.sql.rollup_tables import (
     COUNTS,
     MAXIMA,
     MINIMA,
     SHARES,
     SUMS,
     VALUES,
-    batches,
-    results,
     rollups_daily,
     rollups_hourly,
-    runs,
-    solutions,
 )
-from service.settings import Settings
-from service.simulate.stretches import Pass
-from service.simulate.telemetry import draw_pass
+from service.storage.sql.tables import batches, results, runs, solutions
 from service.times import DAY_S, HOUR_S, UNIX_DAY, parse_utc
 
 DEFAULT_BATCHES = 5_000_000
@@ -86,10 +83,10 @@ def main() -> None:
 
 def fill(output: Path, total: int, seed: int, newest: int) -> None:
     """Make the database."""
-    operations = Operations.open(Settings(database=f"sqlite:///{output}"))
-    digests = {each.name: each.digest for each in operations.missions.values()}
-    catalog = operations.sky.catalog.digest
-    operations.close()
+    app = open_app(Settings(database=f"sqlite:///{output}"))
+    digests = {each.name: each.digest for each in app.missions.values()}
+    catalog = app.sky.catalog.digest
+    app.close()
     connection = sqlite3.connect(output, isolation_level=None)
     # A fill that fails is begun anew: nothing here needs to be safe.
     for pragma in ("journal_mode = OFF", "synchronous = OFF", "cache_size = -400000"):
@@ -234,7 +231,7 @@ def _rows(
 
 
 def _rollups(drawn: dict[str, Floats], bucket: npt.NDArray[np.int64]) -> Iterator[dict[str, Any]]:
-    """The rollup of every bucket in a chunk (see `service.records.measures.rolled_up`)."""
+    """The rollup of every bucket in a chunk (see `rolled_up` of the result metrics)."""
     numbers, first = np.unique(bucket, return_index=True)
     columns: dict[str, Any] = {"bucket": numbers.tolist()}
     columns["batches"] = np.diff([*first.tolist(), len(bucket)]).tolist()
@@ -274,17 +271,17 @@ def _newest(output: Path, total: int, seed: int, newest: int) -> None:
     """Real batches after the others, with stars, answers and all that belongs to them."""
     if not newest:
         return
-    operations = Operations.open(Settings(database=f"sqlite:///{output}"))
+    app = open_app(Settings(database=f"sqlite:///{output}"))
     try:
         for part in tqdm(parts_of(total)[:3], unit="spacecraft", disable=None):
             after_s = part.batches * CADENCE_S
             moment = np.datetime64(START[:-1], "s") + np.timedelta64(after_s, "s")
             wanted = Pass(newest, seed, start=f"{moment}.000Z", cadence_s=CADENCE_S)
-            mission = operations.missions[part.spacecraft]
-            lines = [json.dumps(each.batch) for each in draw_pass(mission, operations.sky, wanted)]
-            operations.submit_many([submission_from_json(line.encode()) for line in lines])
+            mission = app.missions[part.spacecraft]
+            lines = [json.dumps(each.batch) for each in draw_pass(mission, app.sky, wanted)]
+            app.submissions.submit_many([submission_from_json(line.encode()) for line in lines])
     finally:
-        operations.close()
+        app.close()
 
 
 def _listed(values: Floats) -> list[Any]:

@@ -33,21 +33,21 @@ from benchmarks.report import Report
 from benchmarks.sections import bounds_table, table
 from service.acquire import Acquisition, acquire
 from service.errors import NotAvailable
-from service.imaging.detect import detect, detection_kernel
-from service.imaging.files import digest_of, read_frame
-from service.imaging.frame import Frame, FrameLimits
-from service.imaging.marks import marks_of
+from service.imaging.detection.detect import detect, detection_kernel
+from service.imaging.frames.files import digest_of, read_frame
+from service.imaging.frames.frame import Frame, FrameLimits
 from service.imaging.overlay import draw_overlay
+from service.imaging.overlay_marks import marks_of
 from service.imaging.submit import read_known, submission_of_frame
 from service.missions.camera import Camera
 from service.missions.mission import Mission, load_missions
-from service.observe.wire import Submission, submission_from_json
-from service.records.answer import answer_of
+from service.observations.schema import Submission, submission_from_json
 from service.simulate.frame_files import frame_bytes
 from service.simulate.frames import DrawnFrame, FrameSettings, draw_frames
-from service.sky.catalog import load_embedded
-from service.sky.shelf import Shelf
-from service.sky.view import Sky
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.model import SkyModel
+from service.storage.recording.answer import answer_of
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion
 
 SPACECRAFT = "IMAGER"
@@ -131,8 +131,8 @@ def measured_report(frames: int, seed: int, processes: int) -> Report:
 
 
 @cache
-def _house() -> tuple[Sky, Mission]:
-    return Sky(load_embedded(), Shelf(256 << 20)), load_missions()[SPACECRAFT]
+def _house() -> tuple[SkyModel, Mission]:
+    return SkyModel(load_embedded(), LruCache(256 << 20)), load_missions()[SPACECRAFT]
 
 
 def _chunk(task: tuple[int, int, list[int]]) -> list[Measured]:
@@ -146,7 +146,7 @@ def _chunk(task: tuple[int, int, list[int]]) -> list[Measured]:
     ]
 
 
-def _measured(drawn: DrawnFrame, mission: Mission, sky: Sky, timed: bool) -> Measured:
+def _measured(drawn: DrawnFrame, mission: Mission, sky: SkyModel, timed: bool) -> Measured:
     _, camera = mission.camera_tracker(None, "tracker")
     file = io.BytesIO(frame_bytes(drawn))
     frame = read_frame(file, FrameLimits(camera.width_px * camera.height_px))
@@ -220,7 +220,7 @@ def _without_prior(submission: Submission) -> Submission:
 def _solved(
     submission: Submission,
     mission: Mission,
-    sky: Sky,
+    sky: SkyModel,
     drawn: DrawnFrame,
     used: Sequence[Mapping[str, Any]],
 ) -> Solved:

@@ -4,8 +4,8 @@ from benchmarks.bounds import Bound, every
 from benchmarks.record import IMAGING
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
-from service.simulate.imaging.claims import Row
-from service.simulate.imaging.command import ROWS, run_imaging
+from service.studies.star_image_report.claims import Row
+from service.studies.star_image_report.command import ROWS, run_imaging
 
 
 def _rows(quick: bool, seed: int) -> list[Row]:

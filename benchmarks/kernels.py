@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -23,20 +23,21 @@ from benchmarks.bounds import Bound, at_least, at_most, equal
 from benchmarks.report import Report
 from service.attitude.kernels import QUEST, solve
 from service.attitude.solve import WORST_AXIS_DEG
-from service.identify.matched import attitude_of, match
-from service.identify.pair_tests import cast_votes, count_votes
-from service.identify.starid import (
-    Sighting,
+from service.identify.attitude_from_matches import attitude_of, match
+from service.identify.sighting import SightedArrays, Sighting
+from service.identify.voting.pair_tests import cast_votes, count_votes, polar_angles
+from service.identify.voting.starid import (
+    ballots_for,
     identify_by_votes,
-    votes_arguments,
-    with_polar_angles,
+    tallies_for,
+    voting_arrays,
 )
 from service.missions.mission import Band, Mission, load_missions
-from service.sky.catalog import load_embedded
-from service.sky.pairs import build_pairs
-from service.sky.shelf import Shelf
-from service.sky.view import Sky
-from service.sky.zones import Aim, Zone, build_zone
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.geometry.pairs import build_pairs
+from service.sky.model import SkyModel
+from service.sky.zones import SearchRegion, Zone, build_zone
 from service.times import parse_utc
 from service.vectors import ARCSEC_PER_RADIAN, Vector, from_ra_dec, unit
 
@@ -76,7 +77,7 @@ class Views:
     """Views of n stars in one zone: what is observed (k, n, 3), and what is true (k, n)."""
 
     zone: Zone
-    aim: Aim
+    region: SearchRegion
     observed: Vector
     body: Vector
     magnitude: Vector
@@ -85,7 +86,9 @@ class Views:
     attitude: Vector
 
 
-def zone_near(place: Place, sky: Sky, rng: np.random.Generator) -> tuple[Mission, Zone, Aim]:
+def zone_near(
+    place: Place, sky: SkyModel, rng: np.random.Generator
+) -> tuple[Mission, Zone, SearchRegion]:
     """Of many zones one whose number of pairs is about that which is asked for, or the fullest."""
     mission = load_missions()[place.mission]
     catalog = sky.run_catalog(mission, MOMENT)
@@ -105,11 +108,11 @@ def zone_near(place: Place, sky: Sky, rng: np.random.Generator) -> tuple[Mission
     first, last = 0, TRIED - 1
     while True:
         rank = (first + last) // 2
-        aim = Aim(kind, axes[ranks[rank]], low, high)
+        region = SearchRegion(kind, axes[ranks[rank]], low, high)
         reach = mission.tolerances.pair_separation_max_deg
-        zone = build_zone(mission.name, catalog, aim, reach)
+        zone = build_zone(mission.name, catalog, region, reach)
         if first >= last:
-            return mission, zone, aim
+            return mission, zone, region
         if zone.pairs.count < place.pairs:
             first = rank + 1
         else:
@@ -117,17 +120,19 @@ def zone_near(place: Place, sky: Sky, rng: np.random.Generator) -> tuple[Mission
 
 
 def draw_views(
-    mission: Mission, zone: Zone, aim: Aim, n: int, count: int, rng: np.random.Generator
+    mission: Mission, zone: Zone, region: SearchRegion, n: int, count: int, rng: np.random.Generator
 ) -> Views:
     """Views of n stars of a zone within one field of view, with nominal noise."""
     tracker = mission.trackers[0]
     radius = tracker.field_of_view_radius_deg
     sigma = tracker.sigma_arcsec / ARCSEC_PER_RADIAN
     parts: list[tuple[Vector, ...]] = []
-    middle = 0.5 * (aim.least_deg + aim.most_deg) if aim.kind == "band" else 0.0
-    spread = max(0.0, (aim.most_deg - aim.least_deg) / 2 - radius) if middle else aim.most_deg
+    middle = 0.5 * (region.least_deg + region.most_deg) if region.kind == "band" else 0.0
+    spread = (
+        max(0.0, (region.most_deg - region.least_deg) / 2 - radius) if middle else region.most_deg
+    )
     while len(parts) < count:
-        boresight = _turned_from(aim.axis, middle + rng.uniform(-1, 1) * spread * 0.5, rng)
+        boresight = _turned_from(region.axis, middle + rng.uniform(-1, 1) * spread * 0.5, rng)
         near = np.flatnonzero(zone.direction @ boresight >= math.cos(math.radians(radius)))
         if len(near) < n:
             radius *= 1.02  # a thin place: stars a little further out do as well
@@ -140,7 +145,7 @@ def draw_views(
     observed = np.array([part[0] for part in parts])
     return Views(
         zone,
-        aim,
+        region,
         observed,
         np.ascontiguousarray(observed @ attitude.T),
         np.array([part[1] for part in parts]),
@@ -165,39 +170,76 @@ def _any_attitude(rng: np.random.Generator) -> Vector:
     return np.asarray(rows * np.linalg.det(rows))
 
 
+class Room(NamedTuple):
+    """What the service's kernels write to, made once for many batches."""
+
+    ballots: Any
+    tallies: Any
+    quaternions: Any
+    covariance: Any
+    squares: Any
+    sums: Any
+    b: Any
+    r: Any
+    sigma: Any
+    weights: Any
+    scratch: Any
+
+
+def _room_for(n: int, stars: int) -> Room:
+    return Room(
+        ballots=ballots_for(n, stars),
+        tallies=tallies_for(n),
+        quaternions=np.empty((3, 4)),
+        covariance=np.empty((3, 3)),
+        squares=np.empty((2, n)),
+        sums=np.empty((2, 3)),
+        b=np.empty((n, 3)),
+        r=np.empty((n, 3)),
+        sigma=np.empty(n),
+        weights=np.empty(n),
+        scratch=np.empty((3, 3, 3)),
+    )
+
+
 @njit(nogil=True)
-def service_many(
-    observed: Vector,
-    mag: Vector,
-    body: Vector,
-    sigma: Vector,
-    given: tuple[Any, ...],
-    boresights: Vector,
-    rows: npt.NDArray[np.int64],
-    direction: Vector,
-    worst: float,
-    room: tuple[Any, ...],
-    star: npt.NDArray[np.int64],
-    q: Vector,
-) -> None:
-    """The service's kernels over many batches, as `identify_by_votes` and `attitude_of` do."""
-    votes, voted, counts, edges, outcome, highest, second = room[:7]
-    quaternions, covariance, squares, sums, b, r, s, w, inner = room[7:]
+def service_many(  # type: ignore[no-untyped-def]
+    views, like, zone, polar, bounds, rules, rows, worst, room, star, q
+):
+    """The service's kernels over many batches, as `identify_by_votes` and `attitude_of` do.
+
+    `views` are directions, magnitudes, body vectors and boresights (k, n, ...); `like`
+    has what the batches share.
+    """
+    direction, magnitude, body, boresight = views
     still = np.zeros(3)
-    for k in range(len(observed)):
-        votes[:] = 0
-        counts[:] = 0
-        cast_votes(observed[k], mag[k], boresights[k], *given, votes, voted, counts, edges)
-        count_votes(votes, voted, counts, rows, outcome, star[k], highest, second)
-        n = match(body[k], sigma, star[k], direction, still, 1.0, b, r, s)
+    ballots, tallies = room.ballots, room.tallies
+    b, r, s, w = room.b, room.r, room.sigma, room.weights
+    for k in range(len(direction)):
+        ballots.votes[:] = 0
+        ballots.counts[:] = 0
+        sighted = SightedArrays(
+            direction=direction[k],
+            magnitude=magnitude[k],
+            sigma_rad=like.sigma_rad,
+            boresight=boresight[k],
+            velocity=like.velocity,
+            prior_kind=like.prior_kind,
+            prior_axis=like.prior_axis,
+        )
+        cast_votes(sighted, zone, polar, bounds, rules, ballots)
+        count_votes(ballots, rows, tallies)
+        star[k] = tallies.star
+        n = match(body[k], like.sigma_rad, star[k], zone.direction, still, 1.0, b, r, s)
         q[k] = np.nan
         if n >= 2:
             for i in range(n):
                 w[i] = 1.0 / (s[i] * s[i])
+            squares = room.squares
             part = squares if n == squares.shape[1] else squares[:, :n].copy()
-            given = b[:n], r[:n], w[:n], worst, QUEST
-            if solve(*given, quaternions, covariance, part, sums, inner):
-                q[k] = quaternions[1]
+            vectors = b[:n], r[:n], w[:n], worst, QUEST
+            if solve(*vectors, room.quaternions, room.covariance, part, room.sums, room.scratch):
+                q[k] = room.quaternions[QUEST]
 
 
 def _sighting(views: Views, mission: Mission, k: int) -> Sighting:
@@ -210,7 +252,7 @@ def _sighting(views: Views, mission: Mission, k: int) -> Sighting:
         None,
         np.zeros(3),
         views.boresight[k],
-        views.aim,
+        views.region,
         views.zone,
         mission.rules,
     )
@@ -232,29 +274,15 @@ def least_us(calls: Sequence[Callable[[], object]], each: int) -> list[float]:
 def compare(mission: Mission, views: Views) -> tuple[dict[str, float], list[Bound]]:
     """Times and ratios of the service's and the bare kernels on the same views."""
     count, n = views.magnitude.shape
-    zone, aim, limits = views.zone, views.aim, mission.tolerances
+    zone, region, limits = views.zone, views.region, mission.tolerances
     sightings = [_sighting(views, mission, k) for k in range(count)]
-    given = with_polar_angles(votes_arguments(sightings[0]))[3:]
+    sighted, arrays_of_zone, of_region, rules = voting_arrays(sightings[0])
     sigma = sightings[0].sigma_rad
     star = {name: np.full((count, n), -1) for name in ("service", "bare")}
     q = {name: np.zeros((count, 4)) for name in star}
     stars = len(zone.star)
-    room = (
-        np.zeros((n, stars), np.int32),
-        np.empty((n, stars), np.int32),
-        np.zeros(n, np.int32),
-        np.empty((0, 4), np.int32),
-        *(np.empty((3, n), np.int64)),
-        np.empty((3, 4)),
-        np.empty((3, 3)),
-        np.empty((2, n)),
-        np.empty((2, 3)),
-        np.empty((n, 3)),
-        np.empty((n, 3)),
-        np.empty(n),
-        np.empty(n),
-        np.empty((3, 3, 3)),
-    )
+    polar_of_zone = polar_angles(arrays_of_zone.polar, stars, of_region, rules)
+    room = _room_for(n, stars)
     worst = math.radians(WORST_AXIS_DEG)
     rows = np.arange(stars)
     still = np.zeros(3)
@@ -262,18 +290,9 @@ def compare(mission: Mission, views: Views) -> tuple[dict[str, float], list[Boun
 
     def service() -> None:
         service_many(
-            views.observed,
-            views.magnitude,
-            views.body,
-            sigma,
-            given,
-            views.boresight,
-            rows,
-            zone.direction,
-            worst,
-            room,
-            star["service"],
-            q["service"],
+            (views.observed, views.magnitude, views.body, views.boresight),
+            *(sighted, arrays_of_zone, polar_of_zone, of_region, rules),
+            *(rows, worst, room, star["service"], q["service"]),
         )
 
     pairs = zone.pairs
@@ -294,11 +313,11 @@ def compare(mission: Mission, views: Views) -> tuple[dict[str, float], list[Boun
         math.radians(limits.pole_difference_deg),
         math.radians(limits.pole_angle_deg),
     )
-    is_band = aim.kind == "band"
-    polar = np.arccos(np.clip(zone.direction @ aim.axis, -1.0, 1.0))
+    is_band = region.kind == "band"
+    polar = np.arccos(np.clip(zone.direction @ region.axis, -1.0, 1.0))
     weight = np.broadcast_to(1.0 / sigma**2, (count, n)).copy()
     bare_room = room_for(n, stars, pairs.count)
-    poles = np.broadcast_to(aim.axis, (count, 3)).copy()
+    poles = np.broadcast_to(region.axis, (count, 3)).copy()
     about = (is_band, polar, bare_room)
 
     def bare() -> None:
@@ -411,16 +430,16 @@ def pairs_beside_a_tree(
 
 def run(quick: bool, seed: int) -> Report:
     """The benchmark: every place, each number of stars."""
-    sky = Sky(load_embedded(), Shelf(MEGABYTES_512))
+    sky = SkyModel(load_embedded(), LruCache(MEGABYTES_512))
     figures: dict[str, Any] = {}
     bounds: list[Bound] = []
     for name, place in PLACES.items():
         rng = np.random.default_rng(seed)
-        mission, zone, aim = zone_near(place, sky, rng)
+        mission, zone, region = zone_near(place, sky, rng)
         for n in STARS:
             if quick and n not in (5,):
                 continue
-            views = draw_views(mission, zone, aim, n, QUICK_VIEWS if quick else VIEWS, rng)
+            views = draw_views(mission, zone, region, n, QUICK_VIEWS if quick else VIEWS, rng)
             found, checked = compare(mission, views)
             figures |= {f"{name}, {n} stars: {key}": value for key, value in found.items()}
             bounds += [

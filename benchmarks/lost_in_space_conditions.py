@@ -11,7 +11,7 @@ from benchmarks.lost_in_space_peers import LIMIT_MAG, Solver, ours, peers, tetra
 from service.acquire import acquire
 from service.identify.lost_in_space.solver import FieldOfView
 from service.missions.mission import Mission
-from service.observe.batch import ObservationBatch, Options, QuaternionPrior, TrackerStars
+from service.observations.batch import ObservationBatch, Options, QuaternionPrior, TrackerStars
 from service.simulate.motion import random_axis
 from service.simulate.scenes import (
     EPOCH_YEAR,
@@ -23,10 +23,10 @@ from service.simulate.scenes import (
     draw_random_points,
     draw_scenes,
 )
-from service.sky.catalog import load_embedded
-from service.sky.shelf import Shelf
-from service.sky.sky_index import FURTHER_MAG
-from service.sky.view import Sky
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.model import SkyModel
+from service.sky.whole_sky.index import FURTHER_MAG
 from service.times import parse_utc
 from service.vectors import (
     ARCSEC_PER_RADIAN,
@@ -202,7 +202,7 @@ def mission_of(conditions: Conditions) -> Mission:
 
 def _staircase(conditions: Conditions, prior_deg: float) -> Solver:
     mission = mission_of(conditions)
-    sky = Sky(load_embedded(), Shelf(64 << 20))
+    sky = SkyModel(load_embedded(), LruCache(64 << 20))
     run_catalog = sky.run_catalog(mission, parse_utc(MOMENT))
     assert run_catalog.epoch_year == EPOCH_YEAR
 

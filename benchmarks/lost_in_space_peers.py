@@ -21,8 +21,8 @@ import numpy as np
 from service.identify.lost_in_space.finder import search_sky
 from service.identify.lost_in_space.solver import FieldOfView, LostInSpace
 from service.simulate.scenes import Camera, Scene
-from service.sky.run_catalog import RunCatalog
-from service.sky.sky_index import build_sky_index
+from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.whole_sky.index import build_sky_index
 from service.vectors import Matrix, from_ra_dec
 
 LIMIT_MAG = 6.5

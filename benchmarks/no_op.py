@@ -11,7 +11,7 @@ from fastapi import FastAPI
 from starlette.requests import Request
 from starlette.responses import JSONResponse
 
-from service.observe.wire import BatchIn
+from service.observations.schema import BatchIn
 
 app = FastAPI(openapi_url=None)
 

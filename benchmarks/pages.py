@@ -22,8 +22,8 @@ import msgspec
 from tqdm import tqdm
 
 from benchmarks.fill_database import CADENCE_S
-from service.observe.wire import OptionsIn
-from service.operations import Operations
+from service.app.factory import App, open_app
+from service.observations.schema import OptionsIn
 from service.settings import Settings
 from service.times import DAY_S, HOUR_S, Utc, parse_utc, shifted
 
@@ -44,16 +44,18 @@ class Asked:
     check: Callable[[Any], bool]
 
 
-def asked_of(operations: Operations) -> list[Asked]:
+def asked_of(app: App) -> list[Asked]:
     """Every page's data."""
-    overview = operations.overview()
-    latest = parse_utc(overview["as_of"])
+    overview = app.spacecraft.overview()
+    latest = parse_utc(overview.as_of)
     first = shifted(latest, -MONTH_S)
     spans = {"hour": HOUR_S, "day": DAY_S, "month": MONTH_S, "year": 365 * DAY_S}
-    newest = operations.batches(limit=1).items[0]["id"]
+    newest = app.results.page(limit=1).items[0].id
 
     def drawn(span_s: float) -> Any:
-        return operations.history(SPACECRAFT, start=shifted(latest, -span_s), end=latest, size=800)
+        return app.spacecraft.history(
+            SPACECRAFT, start=shifted(latest, -span_s), end=latest, size=800
+        )
 
     def whole(span_s: float) -> Callable[[Any], bool]:
         # A batch every cadence, the first of the stretch included and its end excluded.
@@ -74,7 +76,7 @@ def asked_of(operations: Operations) -> list[Asked]:
             "Overview",
             "every spacecraft of live",
             PAGE_MS,
-            operations.overview,
+            app.spacecraft.overview,
             lambda found: all(
                 each["last_hour"]["batches"] == HOUR_S // CADENCE_S
                 for each in found["items"]
@@ -86,25 +88,23 @@ def asked_of(operations: Operations) -> list[Asked]:
             "Spacecraft",
             "worst batches of a month",
             PAGE_MS,
-            lambda: operations.worst_batches(
+            lambda: app.spacecraft.worst_batches(
                 SPACECRAFT, by="ambiguous_share", start=first, end=latest
             ),
-            lambda found: (
-                found[0]["value"] == _worst(operations, first, latest) and len(found) == 20
-            ),
+            lambda found: found[0]["value"] == _worst(app, first, latest) and len(found) == 20,
         ),
         Asked(
             "Spacecraft",
             "state, settings and their history",
             PAGE_MS,
-            lambda: operations.spacecraft_state(SPACECRAFT),
+            lambda: app.spacecraft.state(SPACECRAFT),
             lambda found: found["state"] != "no_batches",
         ),
         Asked(
             "Batches",
             "the newest hundred across runs",
             PAGE_MS,
-            lambda: operations.batches(run="*").items,
+            lambda: app.results.page(run="*").items,
             lambda found: (
                 len(found) == 100
                 and [each["time"] for each in found]
@@ -115,27 +115,27 @@ def asked_of(operations: Operations) -> list[Asked]:
             "Batch",
             "one with its stars",
             PAGE_MS,
-            lambda: operations.batch(newest),
+            lambda: app.results.get(newest),
             lambda found: found["answer"]["counts"]["observed"] > 0,
         ),
         Asked(
             "Batch",
             "what if",
             PAGE_MS,
-            lambda: operations.what_if(newest, OptionsIn(solver="triad")).body.decode(),
+            lambda: app.results.what_if(newest, OptionsIn(solver="triad")).body.decode(),
             lambda found: '"recorded":false' in found,
         ),
-        Asked("Alarms", "active ones", PAGE_MS, lambda: operations.alarms().items, _is_list),
-        Asked("Alarms", "limits", PAGE_MS, lambda: operations.limits(SPACECRAFT), bool),
+        Asked("Alarms", "active ones", PAGE_MS, lambda: app.alarms.page().items, _is_list),
+        Asked("Alarms", "limits", PAGE_MS, lambda: app.limits.all(SPACECRAFT), bool),
         Asked(
             "Runs",
             "every run",
             PAGE_MS,
-            operations.runs,
-            lambda found: sum(each["batches"] for each in found) == _count(operations),
+            app.runs.all,
+            lambda found: sum(each["batches"] for each in found) == _count(app),
         ),
-        Asked("Zones", "the cache", PAGE_MS, operations.zones, lambda found: "items" in found),
-        Asked("About", "what answers", PAGE_MS, operations.about, bool),
+        Asked("Zones", "the cache", PAGE_MS, app.zones.state, lambda found: "items" in found),
+        Asked("About", "what answers", PAGE_MS, app.service.about, bool),
     ]
 
 
@@ -185,14 +185,14 @@ def main() -> int:
     file = parser.parse_args().database
     if not file.is_file():
         sys.exit(f"{file} is not there: make it with `python -m benchmarks.fill_database {file}`")
-    operations = Operations.open(Settings(database=f"sqlite:///{file}"))
+    app = open_app(Settings(database=f"sqlite:///{file}"))
     try:
-        operations.ready()
-        print(f"{_count(operations):,} batches, {file.stat().st_size / 1e9:.2f} GB")
-        every = asked_of(operations)
+        app.service.ready()
+        print(f"{_count(app):,} batches, {file.stat().st_size / 1e9:.2f} GB")
+        every = asked_of(app)
         found = [measure(each) for each in tqdm(every, unit="page", disable=None)]
     finally:
-        operations.close()
+        app.close()
     head = f"{'median ms':>10}{'fastest':>9}{'processor':>11}{'bound':>7}  answer"
     print(f"{'page':<12}{'data':<36}{head}")
     for each in found:
@@ -204,9 +204,9 @@ def _is_list(found: Any) -> bool:
     return isinstance(found, list)
 
 
-def _worst(operations: Operations, start: Utc, end: Utc) -> float:
+def _worst(app: App, start: Utc, end: Utc) -> float:
     """The greatest share of ambiguous stars, by looking at every batch."""
-    with operations.store.reading() as connection:
+    with app.store.reading() as connection:
         found = connection.exec_driver_sql(
             "SELECT MAX(1.0 * ambiguous / observed) FROM results WHERE current = 1 AND "
             f"spacecraft = '{SPACECRAFT}' AND run = 'live' AND "
@@ -215,8 +215,8 @@ def _worst(operations: Operations, start: Utc, end: Utc) -> float:
         return float(found or 0.0)
 
 
-def _count(operations: Operations) -> int:
-    with operations.store.reading() as connection:
+def _count(app: App) -> int:
+    with app.store.reading() as connection:
         return int(connection.exec_driver_sql("SELECT COUNT(*) FROM batches").scalar() or 0)
 
 

@@ -16,13 +16,13 @@ from benchmarks.bounds import Bound, at_least, at_most
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, pictures_of, table
 from service.simulate.drawing import Folder
-from service.simulate.paper.document import document
-from service.simulate.paper.experiments import run_experiments
-from service.simulate.paper.plots import draw
-from service.simulate.paper.printed import Run, the_paper
-from service.simulate.paper.region import differences, is_inside
-from service.simulate.paper.tables import TITLES
-from service.simulate.paper.tally import AMBIGUOUS, MISIDENTIFIED, UNMATCHED, Tally
+from service.studies.paper_1994.document import document
+from service.studies.paper_1994.experiments import run_experiments
+from service.studies.paper_1994.plots import draw
+from service.studies.paper_1994.printed import Run, the_paper
+from service.studies.paper_1994.region import differences, is_inside
+from service.studies.paper_1994.tables import TITLES
+from service.studies.paper_1994.tally import AMBIGUOUS, MISIDENTIFIED, UNMATCHED, Tally
 
 STARS, QUICK_STARS = 20_000, 400
 SEEDS = 3

@@ -56,7 +56,7 @@ ABOUT = {
     "posts": (
         "The service as it is served, over SQLite with synchronous=FULL, beside a no-op of the "
         "same server and framework whose route declares the same body, so that the framework "
-        "checks it, and answers a small JSON ([decision 24](decisions/0024-the-front-checks.md)). "
+        "checks it, and answers a small JSON. "
         "Each batch is dated a second after the one before. Bounds: 0.35 of the no-op's rate at 16 "
         "connections; bulk 0.5 of parsing and inserting "
         "alone; p99 of single posts beside bulk under 3 times its idle value; ready within 3 s of "

@@ -16,9 +16,9 @@ from benchmarks.bounds import Bound, at_least, equal
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
 from service.missions.mission import SHIPPED_FOLDER
-from service.sky.catalog import load_embedded
-from service.sky.shelf import Shelf
-from service.sky.view import Sky
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.model import SkyModel
 from tests.reference.batches import with_trackers
 from tests.reference.compare import Judge
 
@@ -31,7 +31,7 @@ LEAST_OF_EACH = 0.02
 def run(quick: bool, seed: int) -> Report:
     """The benchmark: every shipped mission, and a tenth as many batches of three trackers."""
     count = QUICK_BATCHES if quick else BATCHES
-    sky = Sky(load_embedded(), Shelf(256 << 20))
+    sky = SkyModel(load_embedded(), LruCache(256 << 20))
     shipped = [
         tomllib.loads(path.read_text("utf-8")) for path in sorted(SHIPPED_FOLDER.glob("*.toml"))
     ]

@@ -27,15 +27,15 @@ from benchmarks.bounds import Bound, at_least, at_most, equal
 from benchmarks.load import Driven, drive, request
 from benchmarks.report import Report
 from benchmarks.serving import START_S, Served, no_op, service
+from service.app.factory import open_app
 from service.missions.mission import load_missions
-from service.observe.wire import submission_from_json
-from service.operations import Operations
+from service.observations.schema import submission_from_json
 from service.settings import Settings
 from service.simulate.stretches import DEFAULT_START, NO_TROUBLES, Pass
 from service.simulate.telemetry import Drawn, draw_pass
-from service.sky.catalog import load_embedded
-from service.sky.shelf import Shelf
-from service.sky.view import Sky
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.model import SkyModel
 
 API = "/api/v1"
 FIRST = datetime.fromisoformat(DEFAULT_START)
@@ -92,7 +92,7 @@ class Telemetry:
 
 def telemetry(seed: int) -> Telemetry:
     """A nominal pass of XTE, long enough that its batches do not look alike."""
-    sky = Sky(load_embedded(), Shelf(64 << 20))
+    sky = SkyModel(load_embedded(), LruCache(64 << 20))
     wanted = Pass(batches=400, seed=seed, troubles=NO_TROUBLES, angles_share=0.0)
     return Telemetry(list(draw_pass(load_missions()["XTE"], sky, wanted)))
 
@@ -309,21 +309,21 @@ def _replay_processes(served: Served) -> float:
 
 def _parse_and_insert(lines: Sequence[bytes], database: Path) -> float:
     """Batches a second of the service's own parser and rows, nothing worked out between."""
-    operations = Operations.open(Settings(database=f"sqlite:///{database}"))
+    app = open_app(Settings(database=f"sqlite:///{database}"))
     try:
         made = [submission_from_json(line, run="bulk") for line in lines]
-        drafts = [operations._intake._bench.draft(each) for each in made]
-        operations.store.writer.change(lambda connection: None).result()
+        drafts = [app.submissions.ingest.solver.solve(each) for each in made]
+        app.store.writer.change(lambda connection: None).result()
         spent = 0.0
         for first in range(0, len(lines), CHUNK):
             started = time.perf_counter()
             for line in lines[first : first + CHUNK]:
                 submission_from_json(line, run="bulk")
             part = drafts[first : first + CHUNK]
-            operations.store.writer.record(part).result()
+            app.store.writer.record(part).result()
             spent += time.perf_counter() - started
     finally:
-        operations.close()
+        app.close()
     return len(lines) / spent
 
 

@@ -9,16 +9,16 @@ from tqdm import tqdm
 from benchmarks.bounds import Bound, at_least, at_most, between, equal
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
-from service.identify.ptp import identify_triangles, propose
-from service.identify.triangle_match import projection_sigma
+from service.identify.triangles.ptp import identify_triangles, propose
+from service.identify.triangles.triangle_match import projection_sigma
 from service.missions.mission import RunCatalogSettings
-from service.simulate.ptp.printed import the_ptp_paper
 from service.simulate.scenes import Conditions, Scene, SceneSky, draw_random_points, draw_scenes
-from service.sky.catalog import load_embedded
-from service.sky.guide import Guide, build_guide
-from service.sky.kvector import bracket
-from service.sky.run_catalog import build_run_catalog
-from service.sky.triangles import REACH_DEG, build_triangles, project
+from service.sky.catalog.run_catalog import build_run_catalog
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.geometry.kvector import bracket
+from service.sky.geometry.triangles import REACH_DEG, build_triangles, project
+from service.sky.whole_sky.guide import Guide, build_guide
+from service.studies.ptp_2015.printed import the_ptp_paper
 from service.vectors import unit
 
 FIELDS, QUICK_FIELDS = 10_000, 200

@@ -20,19 +20,19 @@ PACKAGES = ("numpy", "numba", "scipy")
 
 CORE = (
     "catalogs/stars.npz",
-    "service/acquire.py",
+    "service/acquire",
     "service/attitude",
     "service/identify",
     "service/missions",
-    "service/observe",
+    "service/observations",
     "service/sky",
     "service/times.py",
-    "service/uncounted.py",
+    "service/compiled",
     "service/vectors.py",
 )
 """What the answer to a batch depends on."""
 SIMULATOR = ("service/simulate", "tests/reference")
-IMAGING = ("service/imaging", "service/simulate/imaging", "service/simulate/drawing.py")
+IMAGING = ("service/imaging", "service/studies/star_image_report", "service/simulate/drawing.py")
 SERVICE = ("service", "catalogs/stars.npz")
 
 _RECORD = re.compile(

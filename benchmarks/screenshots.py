@@ -18,8 +18,8 @@ import httpx
 from PIL import Image
 from tqdm import tqdm
 
+from service.app.factory import App, open_app
 from service.missions.mission import load_missions
-from service.operations import Operations
 from service.settings import Settings
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
@@ -51,9 +51,9 @@ def main() -> int:
     if CHROMIUM is None:
         parser.error("there is no chromium on this machine")
     with tempfile.TemporaryDirectory() as folder:
-        operations = Operations.open(Settings(database=f"sqlite:///{folder}/acquire.db"))
-        with Server(create_app(operations)) as address:
-            pages = filled(address, operations)
+        app = open_app(Settings(database=f"sqlite:///{folder}/acquire.db"))
+        with Server(create_app(app)) as address:
+            pages = filled(address, app)
             if asked.only:
                 pages = {name: pages[name] for name in asked.only.split(",")}
             asked.folder.mkdir(parents=True, exist_ok=True)
@@ -66,14 +66,14 @@ def main() -> int:
     return 0
 
 
-def filled(address: str, operations: Operations) -> Mapping[str, str]:
+def filled(address: str, app: App) -> Mapping[str, str]:
     """Replay a pass of every mission, act on its alarms; the pages that are worth a look."""
     with httpx.Client(base_url=address, timeout=PATIENCE_S) as client:
         while client.get("/readyz").status_code != 200:
             time.sleep(0.2)
         for name, mission in load_missions().items():
             wanted = Pass(batches=BATCHES, seed=1, start=START, cadence_s=30.0)
-            drawn = draw_pass(mission, operations.sky, wanted)
+            drawn = draw_pass(mission, app.sky, wanted)
             lines = b"\n".join(json.dumps(each.batch).encode() for each in drawn)
             replay(client, lines, name)
         alarms = client.get("/api/v1/alarms", params={"run": RUN, "state": "all"}).json()["items"]

@@ -22,13 +22,13 @@ from tqdm import tqdm
 from benchmarks.bounds import Bound, at_least, at_most, equal
 from benchmarks.report import Report
 from service.acquire import acquire
+from service.acquire.prewarm import prewarm_kernels
 from service.missions.mission import SHIPPED_FOLDER, load_missions
-from service.observe.batch import ObservationBatch
-from service.observe.wire import submission_from_json
-from service.sky.catalog import load_embedded
-from service.sky.shelf import Shelf
-from service.sky.view import Sky
-from service.warm import warm_up
+from service.observations.batch import ObservationBatch
+from service.observations.schema import submission_from_json
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.model import SkyModel
 from tests.reference import batches
 from tests.reference.compare import Judge
 
@@ -70,8 +70,8 @@ class Place:
 
 def run(quick: bool, seed: int) -> Report:
     """The benchmark: every place, one after another, on one sky."""
-    sky = Sky(load_embedded(), Shelf(MEGABYTES_256))
-    warm_up(sky, load_missions())
+    sky = SkyModel(load_embedded(), LruCache(MEGABYTES_256))
+    prewarm_kernels(sky, load_missions())
     figures: dict[str, Any] = {}
     bounds: list[Bound] = []
     count = QUICK_BATCHES if quick else BATCHES
@@ -84,7 +84,7 @@ def run(quick: bool, seed: int) -> Report:
 
 
 def measured(
-    name: str, count: int, rng: np.random.Generator, sky: Sky, step: Callable[[int], object]
+    name: str, count: int, rng: np.random.Generator, sky: SkyModel, step: Callable[[int], object]
 ) -> Place:
     """One place: nominal batches of five stars about one a priori attitude."""
     mission_name, place = PLACES[name]
@@ -164,20 +164,20 @@ def measured(
     return Place(figures, bounds)
 
 
-def _cold(batch: ObservationBatch, judge: Judge, sky: Sky) -> tuple[float, int]:
+def _cold(batch: ObservationBatch, judge: Judge, sky: SkyModel) -> tuple[float, int]:
     """Milliseconds of a first answer without its zone, and zones built by many first requests."""
     times = []
     for _ in range(3):
-        fresh = Sky(sky.catalog, Shelf(MEGABYTES_256))
+        fresh = SkyModel(sky.catalog, LruCache(MEGABYTES_256))
         fresh.run_catalog(judge.mission, batch.time)
         started = time.perf_counter()
         acquire(batch, judge.mission, fresh)
         times.append((time.perf_counter() - started) * 1000)
-    fresh = Sky(sky.catalog, Shelf(MEGABYTES_256))
+    fresh = SkyModel(sky.catalog, LruCache(MEGABYTES_256))
     fresh.run_catalog(judge.mission, batch.time)
     with ThreadPoolExecutor(CONCURRENT) as pool:
         list(pool.map(lambda _: acquire(batch, judge.mission, fresh), range(CONCURRENT)))
-    return statistics.median(times), fresh.shelf.state().misses - 1
+    return statistics.median(times), fresh.cache.state().misses - 1
 
 
 def _empty_call_us(zone: Any) -> float:

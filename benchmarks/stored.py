@@ -22,8 +22,8 @@ from benchmarks.bounds import Bound, at_most
 from benchmarks.fill_database import START, fill
 from benchmarks.posts import telemetry
 from benchmarks.report import Report
-from service.observe.wire import submission_from_json
-from service.operations import Operations
+from service.app.factory import App, open_app
+from service.observations.schema import submission_from_json
 from service.settings import Settings
 from service.times import parse_utc, shifted
 
@@ -36,15 +36,15 @@ MOST_BYTES = 2000.0
 MOST_MONTH_MS, MOST_YEAR_MS = 10.0, 30.0
 
 
-def record_us(operations: Operations, seed: int) -> float:
+def record_us(app: App, seed: int) -> float:
     """Microseconds a batch of a file in bulk, the median chunk."""
     bodies = telemetry(seed).bodies(RECORDED, f"stored-{seed}")
     made = [submission_from_json(body, run="stored") for body in bodies]
-    operations.submit_many(made[:CHUNK])
+    app.submissions.submit_many(made[:CHUNK])
     spent = []
     for first in range(CHUNK, RECORDED, CHUNK):
         started = time.perf_counter()
-        operations.submit_many(made[first : first + CHUNK])
+        app.submissions.submit_many(made[first : first + CHUNK])
         spent.append((time.perf_counter() - started) / CHUNK * 1e6)
     return median(spent)
 
@@ -58,13 +58,13 @@ def _ms(call: Callable[[], object]) -> float:
     return median(spent)
 
 
-def _scan(operations: Operations, start_ns: int, end_ns: int) -> tuple[int, int]:
+def _scan(app: App, start_ns: int, end_ns: int) -> tuple[int, int]:
     """Observed and ambiguous stars of a stretch, counted from the results one by one."""
     query = text(
         "SELECT sum(observed), sum(ambiguous) FROM results WHERE +current = 1 AND +run = 'live' "
         "AND +spacecraft = 'XTE' AND +time_ns >= :start AND +time_ns < :end"
     )
-    with operations.store.reading() as connection:
+    with app.store.reading() as connection:
         found = connection.execute(query, {"start": start_ns, "end": end_ns}).one()
     return int(found[0] or 0), int(found[1] or 0)
 
@@ -73,18 +73,18 @@ def measured(total: int, seed: int) -> tuple[dict[str, Any], list[Bound]]:
     """The figures of one size, and of an empty database."""
     bounds: list[Bound] = []
     with tempfile.TemporaryDirectory() as folder:
-        empty = Operations.open(Settings(database=f"sqlite:///{Path(folder) / 'empty.db'}"))
+        empty = open_app(Settings(database=f"sqlite:///{Path(folder) / 'empty.db'}"))
         try:
-            empty.ready()
+            empty.service.ready()
             alone_us = record_us(empty, seed)
         finally:
             empty.close()
         file = Path(folder) / "filled.db"
         fill(file, total, seed, 0)
-        operations = Operations.open(Settings(database=f"sqlite:///{file}"))
+        app = open_app(Settings(database=f"sqlite:///{file}"))
         try:
-            operations.ready()
-            beside_us = record_us(operations, seed)
+            app.service.ready()
+            beside_us = record_us(app, seed)
             start = parse_utc(START)
             spans = {"a month by hour": ("hour", 30), "a year by day": ("day", 365)}
             figures: dict[str, Any] = {
@@ -98,12 +98,12 @@ def measured(total: int, seed: int) -> tuple[dict[str, Any], list[Bound]]:
                 end = shifted(start, days * 86_400.0)
 
                 def read(bucket: Any = bucket, end: Any = end) -> Any:
-                    return operations.rates("XTE", start=start, end=end, bucket=bucket)
+                    return app.spacecraft.rates("XTE", start=start, end=end, bucket=bucket)
 
                 rows = read()
                 took = _ms(read)
-                counted = _scan(operations, start.tai_ns, end.tai_ns)
-                scan_ms = _ms(partial(_scan, operations, start.tai_ns, end.tai_ns))
+                counted = _scan(app, start.tai_ns, end.tai_ns)
+                scan_ms = _ms(partial(_scan, app, start.tai_ns, end.tai_ns))
                 figures[f"{name}, buckets"] = len(rows)
                 figures[f"{name}, ms"] = took
                 figures[f"{name}: counted one by one, ms"] = scan_ms
@@ -115,7 +115,7 @@ def measured(total: int, seed: int) -> tuple[dict[str, Any], list[Bound]]:
                 most = MOST_MONTH_MS if bucket == "hour" else MOST_YEAR_MS
                 bounds.append(at_most(name, took, most, "ms"))
         finally:
-            operations.close()
+            app.close()
     bounds.append(at_most("a batch, filled over empty", beside_us / alone_us, MOST_GROWTH))
     bounds.append(
         at_most("database", figures["size, MB"] / total * 1e6, MOST_BYTES, "bytes a batch")

@@ -25,11 +25,11 @@ from benchmarks.sections import Section, Written, table
 from service.acquire import Acquisition, acquire
 from service.attitude.solution import AttitudeSolution
 from service.missions.mission import load_missions
-from service.observe.batch import ObservationBatch, QuaternionPrior
+from service.observations.batch import ObservationBatch, QuaternionPrior
 from service.simulate.two_groups import Group, Rows, Views
-from service.sky.catalog import load_embedded
-from service.sky.shelf import Shelf
-from service.sky.view import Sky
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.model import SkyModel
 from service.vectors import Matrix, attitude_error_arcsec
 
 MISSIONS = ("XTE", "SWAS", "SOHO")
@@ -227,7 +227,7 @@ class Task:
 
     def run(self) -> Counted | Simple:
         """Draw and acquire its batches."""
-        sky = Sky(load_embedded(), Shelf(SHELF_BYTES))
+        sky = SkyModel(load_embedded(), LruCache(SHELF_BYTES))
         drawn = [self.seed, *self.mission.encode(), *self.kind.encode(), self.stars]
         rng = np.random.default_rng([*drawn, self.with_prior])
         views = Views(load_missions()[self.mission], sky, rng)

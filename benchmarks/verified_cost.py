@@ -22,18 +22,20 @@ from benchmarks.bounds import Bound, at_least, at_most
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
 from service.acquire import acquire
-from service.identify.hypotheses import marginals
-from service.identify.pair_tests import cast_votes, count_votes
-from service.identify.presumed import presumed_attitude
-from service.identify.scene import MAX_HYPOTHESES, Seen, scratch_for
-from service.identify.search import search_in
-from service.identify.starid import MAX_RIVALS, Sighting, votes_arguments, with_polar_angles
-from service.identify.verify import UNIQUE_PROBABILITY, scene_of
-from service.simulate.paper.experiments import open_sky
-from service.simulate.paper.printed import the_paper
-from service.simulate.paper.views import EPOCH, batch_of, draw_zone, paper_mission
-from service.sky.view import Sky
-from service.vectors import ARCSEC_PER_RADIAN, Vector
+from service.identify.budget import MAX_WORK
+from service.identify.hypotheses.marginals import marginals
+from service.identify.hypotheses.scene import ObservedStars, ledger_for, scratch_for
+from service.identify.hypotheses.search import search
+from service.identify.hypotheses.verified import UNIQUE_PROBABILITY, posterior_for, scene_of
+from service.identify.prior_attitude import prior_attitude
+from service.identify.sighting import SightedArrays, Sighting
+from service.identify.voting.pair_tests import cast_votes, count_votes, polar_angles
+from service.identify.voting.starid import ballots_for, tallies_for, voting_arrays
+from service.sky.model import SkyModel
+from service.studies.paper_1994.experiments import open_sky
+from service.studies.paper_1994.printed import the_paper
+from service.studies.paper_1994.views import EPOCH, batch_of, draw_zone, paper_mission
+from service.vectors import ARCSEC_PER_RADIAN
 
 Rows = npt.NDArray[np.int64]
 
@@ -82,7 +84,7 @@ class Cost:
 
 
 def sightings(
-    place: Place, views: int, seed: int, sky: Sky
+    place: Place, views: int, seed: int, sky: SkyModel
 ) -> Iterator[list[tuple[Sighting, Rows]]]:
     """Views of five stars, zone by zone, with the zone rows that are true."""
     run = next(r for r in the_paper().runs if (r.table, r.run) == (place.table, place.run))
@@ -106,7 +108,7 @@ def sightings(
 def _sighting(acquired: Any) -> Sighting:
     """What the identifier was given, from what the staircase keeps of it."""
     batch, mission, tracker = acquired.batch, acquired.mission, acquired.trackers[0]
-    presumed = presumed_attitude(batch.a_priori, batch.time, mission)
+    presumed = prior_attitude(batch.a_priori, batch.time, mission)
     return Sighting(
         direction=tracker.corrected.direction_body @ presumed.attitude,
         magnitude_mag=tracker.corrected.magnitude_mag,
@@ -114,101 +116,85 @@ def _sighting(acquired: Any) -> Sighting:
         known_axis=presumed.known_axis,
         velocity_c=np.zeros(3),
         boresight=mission.trackers[0].body_from_tracker[:, 2] @ presumed.attitude,
-        aim=tracker.aim,
+        region=tracker.region,
         zone=tracker.zone,
         rules=acquired.choices.rules,
     )
 
 
 @njit(nogil=True)
-def many_verified(
-    observed: Vector,
-    magnitude: Vector,
-    like: Seen,
-    stars: Any,
-    pairs: Any,
-    exhaustive: bool,
-    room: tuple[Any, ...],
-    star: Rows,
-    probability: Vector,
-) -> None:
+def many_verified(  # type: ignore[no-untyped-def]
+    direction, magnitude, like, stars, pairs, exhaustive, star, probability, posterior
+):
     """Identify many views of one zone; `like` has what they share."""
-    ledger, log_weight, none, rivals, likely = room
-    scratch = scratch_for(observed.shape[1])
-    for k in range(len(observed)):
-        seen = Seen(
-            observed[k],
-            magnitude[k],
-            like.sigma_rad,
-            like.weight,
-            like.reference_sigma,
-            like.velocity,
-            like.prior_kind,
-            like.prior_axis,
+    n = direction.shape[1]
+    scratch, ledger = scratch_for(n), ledger_for(n)
+    for k in range(len(direction)):
+        observed = ObservedStars(
+            direction=direction[k],
+            magnitude=magnitude[k],
+            sigma_rad=like.sigma_rad,
+            weight=like.weight,
+            reference_sigma=like.reference_sigma,
+            velocity=like.velocity,
+            prior_kind=like.prior_kind,
+            prior_axis=like.prior_axis,
         )
-        count, rest, _, _ = search_in(scratch, seen, stars, pairs, exhaustive, ledger, log_weight)
-        marginals(ledger, log_weight, count, rest, star[k], probability[k], none, rivals, likely)
+        progress, _ = search(observed, stars, pairs, exhaustive, MAX_WORK, scratch, ledger)
+        marginals(ledger, progress.count, progress.unexplored_weight, posterior)
+        star[k], probability[k] = posterior.star, posterior.probability
 
 
 @njit(nogil=True)
-def many_votes(
-    observed: Vector,
-    magnitude: Vector,
-    boresight: Vector,
-    tallies: tuple[Any, ...],
-    edges: npt.NDArray[np.int32],
-    given: tuple[Any, ...],
-    star_of: Rows,
-    star: Rows,
-    room: tuple[Any, ...],
-) -> None:
-    """Count the votes of many views of one zone."""
-    outcome, highest, second = room
-    votes, voted, counts = tallies
-    for k in range(len(observed)):
-        votes[:] = 0
-        counts[:] = 0
-        cast_votes(observed[k], magnitude[k], boresight, *given, votes, voted, counts, edges)
-        count_votes(votes, voted, counts, star_of, outcome, star[k], highest, second)
+def many_votes(  # type: ignore[no-untyped-def]
+    direction, magnitude, like, zone, polar, bounds, rules, ballots, star_of, tallies, star
+):
+    """Count the votes of many views of one zone; `like` has what they share."""
+    for k in range(len(direction)):
+        ballots.votes[:] = 0
+        ballots.counts[:] = 0
+        sighted = SightedArrays(
+            direction=direction[k],
+            magnitude=magnitude[k],
+            sigma_rad=like.sigma_rad,
+            boresight=like.boresight,
+            velocity=like.velocity,
+            prior_kind=like.prior_kind,
+            prior_axis=like.prior_axis,
+        )
+        cast_votes(sighted, zone, polar, bounds, rules, ballots)
+        count_votes(ballots, star_of, tallies)
+        star[k] = tallies.star
 
 
 def _kernels(several: list[Sighting], named: dict[str, Rows]) -> dict[str, Callable[[], object]]:
     """The three kernels on the views of one zone; each writes the rows it names to `named`."""
-    seen, stars, pairs = scene_of(several[0])
-    observed = np.array([each.direction for each in several])
+    like, stars, pairs = scene_of(several[0])
+    direction = np.array([each.direction for each in several])
     magnitude = np.array([each.magnitude_mag for each in several])
     shape = (len(several), STARS)
     star, probability = np.full(shape, -1), np.zeros(shape)
-    room = (
-        np.empty((MAX_HYPOTHESES, STARS), np.int32),
-        np.empty(MAX_HYPOTHESES),
-        np.ones(STARS),
-        np.full((STARS, MAX_RIVALS), -1),
-        np.zeros((STARS, MAX_RIVALS)),
-    )
-    given = with_polar_angles(votes_arguments(several[0]))[3:]
+    posterior = posterior_for(STARS)
+    sighted, zone, bounds, rules = voting_arrays(several[0])
     count = len(several[0].zone.star)
-    edges = np.empty((0, 4), np.int32)
-    tallies = (
-        np.zeros((STARS, count), np.int32),
-        np.empty((STARS, count), np.int32),
-        np.zeros(STARS, np.int32),
-    )
-    counts = tuple(np.empty((3, STARS), np.int64))
-    rows = np.arange(count)
+    polar = polar_angles(zone.polar, count, bounds, rules)
+    ballots, tallies, rows = ballots_for(STARS, count), tallies_for(STARS), np.arange(count)
 
     def verified(name: str, exhaustive: bool) -> Callable[[], object]:
         def call() -> None:
             many_verified(
-                observed, magnitude, seen, stars, pairs, exhaustive, room, star, probability
+                *(direction, magnitude, like, stars, pairs, exhaustive),
+                *(star, probability, posterior),
             )
             named[name] = np.where(probability >= UNIQUE_PROBABILITY, star, -1)
 
         return call
 
     def by_votes() -> None:
-        boresight = several[0].boresight
-        many_votes(observed, magnitude, boresight, tallies, edges, given, rows, star, counts)
+        many_votes(
+            *(direction, magnitude, sighted, zone, polar, bounds, rules),
+            *(ballots, rows, tallies, star),
+        )
         named[VOTES] = star.copy()
 
     return {
@@ -218,7 +204,7 @@ def _kernels(several: list[Sighting], named: dict[str, Rows]) -> dict[str, Calla
     }
 
 
-def measured(place: Place, views: int, seed: int, sky: Sky) -> Cost:
+def measured(place: Place, views: int, seed: int, sky: SkyModel) -> Cost:
     """The least time of several, kernel by kernel in turn, so that all meet the same machine."""
     total = dict.fromkeys((VOTES, EXHAUSTIVE, EARLY), 0.0)
     right = dict.fromkeys(total, 0)

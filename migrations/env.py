@@ -1,8 +1,8 @@
-"""Runs the migrations on the connection that `service.records.database` hands over."""
+"""Runs the migrations on the connection that `service.storage.sql.migrations` hands over."""
 
 from alembic import context
 
-from service.records.tables import metadata
+from service.storage.sql.columns import metadata
 
 context.configure(
     connection=context.config.attributes["connection"],

@@ -1,7 +1,7 @@
-"""The whole service at work: a real server, sample passes through HTTP, a table against truth.
+"""A demonstration: a real server, sample passes through HTTP, a table against truth.
 
-Everything goes into one folder.  A second time the samples are the same, the
-server knows their batches already, and the table is the same.
+Everything goes into one folder.  A second run draws the same samples, whose
+batches the server has recorded already, and prints the same table.
 """
 
 import dataclasses
@@ -22,16 +22,16 @@ from service.errors import BadConfiguration, BadInput, Busy, Fault
 from service.missions.mission import load_missions
 from service.replay.items import items_of
 from service.replay.over_http import replay_over_http
-from service.replay.tally import Tally
+from service.replay.summary import ReplaySummary
 from service.settings import PREFIX, Settings
 from service.simulate.files import read_objects, truth_path, write_pass
 from service.simulate.score import score
 from service.simulate.score_table import table
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
-from service.sky.catalog import load_embedded
-from service.sky.shelf import Shelf
-from service.sky.view import Sky
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.model import SkyModel
 from service.web.ports import require_free, url_of
 
 MISSIONS = ("XTE", "SWAS", "SOHO")
@@ -39,10 +39,10 @@ START_S = 300.0
 """The longest that the server may take to be ready: the first time it compiles."""
 COMPILES_AFTER_S = 5.0
 """A start that takes longer than this is a first one."""
-SAID_EVERY_S = 10.0
-"""How often a wait is told where there is no terminal to show it moving."""
+PROGRESS_EVERY_S = 10.0
+"""How often progress is printed without a terminal."""
 STOP_S = 15.0
-TOLD_TO_STOP = (0, 130, 143, -signal.SIGINT, -signal.SIGTERM)
+STOPPED_EXIT_CODES = (0, 130, 143, -signal.SIGINT, -signal.SIGTERM)
 CONCURRENCY = 2
 """Posts at a time: more would only wait for each other and swell the times that are shown."""
 
@@ -55,13 +55,13 @@ def run_demo(folder: Path, settings: Settings, batches: int, seed: int, once: bo
     """
     started = time.perf_counter()
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
-        # A script that runs this with & has it ignored: nothing but a kill would end it.
+        # A script that starts this with & ignores the signal: only a kill would end it.
         signal.signal(signal.SIGINT, signal.default_int_handler)
     wanted = Pass(batches, seed)
     if settings.port == 0:
         raise BadInput(Fault("--port", "must be a port that can be named", "0"))
     folder.mkdir(parents=True, exist_ok=True)
-    # Whatever lies in here can be made again: it is none of a repository's business.
+    # Everything in here can be made again: git ignores it.
     (folder / ".gitignore").write_text("*\n", encoding="utf-8")
     database = folder / "acquire.db"
     settings = dataclasses.replace(settings, database=f"sqlite:///{database}")
@@ -75,11 +75,11 @@ def run_demo(folder: Path, settings: Settings, batches: int, seed: int, once: bo
         scores = {}
         for name, file in zip(MISSIONS, files, strict=True):
             results = file.with_name(f"{file.stem}.results.ndjson")
-            with Tally([file], results, title=f"{name:<4}") as tally:
+            with ReplaySummary([file], results, title=f"{name:<4}") as summary:
                 replay_over_http(
                     url,
                     items_of([file], run),
-                    tally.add,
+                    summary.add,
                     concurrency=CONCURRENCY,
                     watched_run=run,
                 )
@@ -96,8 +96,8 @@ def run_demo(folder: Path, settings: Settings, batches: int, seed: int, once: bo
             return 0
         print(f"\nServing on {url} until Ctrl-C.", flush=True)
         with suppress(KeyboardInterrupt):
-            # A terminal's Ctrl-C reaches the server as well, which may be the first to go.
-            if server.wait() not in TOLD_TO_STOP:
+            # A terminal's Ctrl-C reaches the server too, which may stop first.
+            if server.wait() not in STOPPED_EXIT_CODES:
                 raise Busy(f"the server stopped by itself; see {folder / 'server.log'}")
         print("stopped")
         return 0
@@ -112,7 +112,7 @@ def _where_next(
             serve += f" --{name} {getattr(settings, name)}"
     page = f"{url}/?run={run}"
     if once:
-        # Nothing serves any more: an address alone would lead nowhere.
+        # The server has stopped: its address alone would be of no use.
         yield serve, "serve these records; the console of this run is then"
         yield f"  {page}", "  every spacecraft, its trends, each batch down to its stars"
     else:
@@ -125,14 +125,18 @@ def _where_next(
             "the latest batch of XTE as the API gives it",
         )
     yield f"{folder}/*.results.ndjson", "every answer; the truth is in *.truth.ndjson beside it"
+    yield (
+        "acquire frame PICTURE",
+        "any picture of the sky, from any camera: its attitude, its lens, the names of its stars",
+    )
     yield "docs/quickstart.md", "a walk: post a batch, read the attitude, try other tolerances"
     if not once:
         yield serve, "serve these records again, without the demonstration"
 
 
 def _samples(folder: Path, wanted: Pass) -> list[Path]:
-    # As the server: a site's own missions and catalog stay out of the demonstration.
-    sky, missions = Sky(load_embedded(), Shelf(64 << 20)), load_missions()
+    # Like the server, without a site's own missions and catalog.
+    sky, missions = SkyModel(load_embedded(), LruCache(64 << 20)), load_missions()
     files = [folder / f"{name.lower()}.ndjson" for name in MISSIONS]
     for name, file in zip(MISSIONS, files, strict=True):
         write_pass(draw_pass(missions[name], sky, wanted), file)
@@ -140,7 +144,7 @@ def _samples(folder: Path, wanted: Pass) -> list[Path]:
 
 
 def _digest(files: Sequence[Path]) -> str:
-    # The run is named after what is in it: other samples can never clash with recorded ones.
+    # The run is named after its content: other samples cannot conflict with recorded ones.
     content = hashlib.sha256()
     for file in files:
         content.update(file.read_bytes())
@@ -183,8 +187,8 @@ def _wait_until_ready(server: subprocess.Popen[bytes], url: str, log: Path) -> N
     with httpx.Client(base_url=url, timeout=START_S, trust_env=False) as client, _Waiting() as wait:
         while (waited_s := time.monotonic() - start) < START_S:
             if server.poll() is not None:
-                said = log.read_text(encoding="utf-8", errors="replace").strip()
-                raise BadConfiguration(f"the server did not start:\n{said}")
+                output = log.read_text(encoding="utf-8", errors="replace").strip()
+                raise BadConfiguration(f"the server did not start:\n{output}")
             try:
                 if client.get("/readyz").status_code == 200:
                     return
@@ -196,7 +200,7 @@ def _wait_until_ready(server: subprocess.Popen[bytes], url: str, log: Path) -> N
 
 
 class _Waiting:
-    """A line that moves while the server starts; without a terminal a line now and then."""
+    """Progress while the server starts: one moving line on a terminal, else a line at times."""
 
     def __init__(self) -> None:
         self._moves = sys.stderr.isatty()
@@ -204,7 +208,7 @@ class _Waiting:
         self._next_s = COMPILES_AFTER_S
 
     def show(self, waited_s: float) -> None:
-        """Tell how long it has been."""
+        """Show how long the start has taken."""
         line = f"the server is starting: {waited_s:.0f} s"
         if waited_s >= COMPILES_AFTER_S:
             line += (
@@ -215,7 +219,7 @@ class _Waiting:
             self._shown = len(line)
         elif waited_s >= self._next_s:
             print(line, file=sys.stderr, flush=True)
-            self._next_s += SAID_EVERY_S
+            self._next_s += PROGRESS_EVERY_S
 
     def __enter__(self) -> Self:
         return self

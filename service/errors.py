@@ -1,23 +1,23 @@
-"""Every exception that the service raises on purpose.
+"""Every exception that the service raises itself.
 
     AcquisitionError
-    ├── BadInput              what a client sent: names the field and the value
+    ├── BadInput              invalid input: names the field and the value
     │   ├── BadBatch          a batch, an option, a query
-    │   └── BadFile           a telemetry or catalog file: names line and column
-    ├── Conflict              another body under a batch id that is taken
-    ├── KeyReused             another body under an Idempotency-Key that is taken
-    ├── NotNow                an alarm is acknowledged or cleared already
+    │   ├── BadFile           a telemetry or catalog file: names line and column
+    │   └── NotAvailable      a feature that this version or installation lacks
+    ├── Conflict              the batch id is taken by another body
+    ├── KeyReused             the Idempotency-Key was used with another body
+    ├── WrongState            the state does not allow this, as of a cleared alarm
     ├── NotFound              no such spacecraft, batch, zone, run or replay
-    ├── NotAvailable          asked for something that is not there yet
-    ├── NotAdmitted           nobody is known by this token: absent, unknown, expired, revoked
-    ├── NotAllowed            known, but this is not theirs: a scope, another spacecraft
-    ├── TooOften              more requests than the token's rate allows
+    ├── Unauthenticated       the token is absent, unknown, expired or revoked
+    ├── Forbidden             the token lacks the scope or the spacecraft
+    ├── RateLimited           more requests than the token's rate allows
     ├── BadConfiguration      a mission file, a setting: names file, key and allowed values
-    └── Busy                  the writer's queue is full, or the database cannot be reached now
-        └── Stopping          the service is stopping: here, later will not succeed
+    └── Busy                  the queue is full, or the database does not answer
+        └── Stopping          the service is stopping: a later attempt here will fail too
 
 Not finding a star is a result and raises nothing.  Nothing here knows HTTP;
-the status codes are given in `service.web.errors`.
+the status codes are given in `service.web.api.problems`.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,7 +27,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing that is wrong with an input: where it stands, what it was, what is asked for."""
+    """One fault of an input: the field, what is expected, and the value."""
 
     field: str
     message: str
@@ -45,27 +45,27 @@ def shown_value(value: object, limit: int = 80) -> str:
 
 
 class AcquisitionError(Exception):
-    """The root of every error that the service raises on purpose."""
+    """The base of every error that the service raises itself."""
 
 
 class BadInput(AcquisitionError):
-    """An input that is refused, with every fault found in it."""
+    """Invalid input, with every fault found in it."""
 
     def __init__(self, faults: Iterable[Fault] | Fault) -> None:
         self.faults = (faults,) if isinstance(faults, Fault) else tuple(faults)
         super().__init__("; ".join(str(fault) for fault in self.faults))
 
     def __reduce__(self) -> tuple[type["BadInput"], tuple[tuple[Fault, ...]]]:
-        # Made anew elsewhere of what it was made of here, not of its text.
+        # Pickling would pass the text in place of the faults.
         return type(self), (self.faults,)
 
 
 class BadBatch(BadInput):
-    """A batch, an option or a query that is refused."""
+    """An invalid batch, option or query."""
 
 
 class BadFile(BadInput):
-    """A file that is refused, with the line and the column where it is damaged."""
+    """An invalid file; names line and column."""
 
 
 class Conflict(AcquisitionError):
@@ -76,27 +76,27 @@ class KeyReused(AcquisitionError):
     """Another body under an Idempotency-Key that is already taken."""
 
 
-class NotNow(AcquisitionError):
-    """What was asked does not fit the state that the thing is in."""
+class WrongState(AcquisitionError):
+    """The state of the object does not allow the operation."""
 
 
 class NotFound(AcquisitionError):
-    """No such thing: names what was asked for and, where the list is short, what there is."""
+    """There is no such object; names it, and where the list is short those that exist."""
 
 
 class NotAvailable(BadInput):
-    """Something the interface names that this version does not do yet."""
+    """A feature of the interface that this version or installation lacks."""
 
 
-class NotAdmitted(AcquisitionError):
-    """No token, or one that nobody is known by; which of these is not told."""
+class Unauthenticated(AcquisitionError):
+    """The token is absent, unknown, expired or revoked; the message does not say which."""
 
 
-class NotAllowed(AcquisitionError):
-    """The token is good, but its scopes or its spacecraft do not cover what was asked."""
+class Forbidden(AcquisitionError):
+    """The token is valid, but its scopes or spacecraft do not cover the request."""
 
 
-class TooOften(AcquisitionError):
+class RateLimited(AcquisitionError):
     """More requests than a token's rate allows; trying again later will succeed."""
 
     def __init__(self, message: str, retry_after_s: int = 1) -> None:
@@ -117,14 +117,14 @@ class Busy(AcquisitionError):
 
 
 class Stopping(Busy):
-    """The service is stopping: the same process will not take the work any more."""
+    """The service is stopping: this process will take no more work."""
 
 
 def problem_of(error: Exception) -> dict[str, Any]:
-    """What an error says of an input, in one form wherever it is told: `detail`, and its `errors`.
+    """The `detail` and `errors` of an error, the same in HTTP, replays and files.
 
-    `detail` is the first fault with the number of the others; `errors` names
-    every field and value, and is absent where the error is about no field.
+    `detail` is the first fault with the number of the others; `errors` has every
+    field and value, and is absent where the error is about no field.
     """
     if not isinstance(error, BadInput):
         return {"detail": str(error)}
@@ -132,7 +132,7 @@ def problem_of(error: Exception) -> dict[str, Any]:
 
 
 def problem_of_faults(faults: Sequence[Fault]) -> dict[str, Any]:
-    """The same of faults that no exception carries."""
+    """The same for faults without an exception."""
     more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
     return {
         "detail": f"{faults[0]}{more}",

@@ -29,7 +29,8 @@ class Settings:
     commands show that talk to a running service.  `frame_mb` and `frame_megapixels`
     bound a frame's file and what it unfolds into.  `replay_processes` is how
     many processes beside this one compute replays; 0: this one does.  A replay
-    ends after `replay_seconds`, wherever it is.  `log_format` and `log_level` are
+    ends after `replay_seconds`, wherever it is.  `spool` is the folder of uploaded
+    telemetry files whose replays are not over.  `log_format` and `log_level` are
     of `service.logs`.
     `probe_port` is a second port that answers probes alone.  One client address
     may have `connections_per_address` at a time; addresses and networks in
@@ -50,6 +51,7 @@ class Settings:
     replay_seconds: int = 6 * 3600
     log_format: str = "text"
     log_level: str = "info"
+    spool: Path | None = None
     probe_port: int | None = None
     connections_per_address: int = 256
     trusted_proxies: str = "127.0.0.1,::1"
@@ -88,6 +90,14 @@ class Settings:
             raise _refusal("host", "must be an address or a name, such as 127.0.0.1", self.host)
 
     @property
+    def spool_folder(self) -> Path:
+        """Where uploads are stored: `spool`, by default beside SQLite's file, or here."""
+        if self.spool is not None:
+            return self.spool
+        scheme, _, file = self.database.partition(":///")
+        return Path(f"{file}.spool" if scheme == "sqlite" else "acquire-spool")
+
+    @property
     def logs(self) -> LogSettings:
         """How the service's processes write their logs."""
         return LogSettings(self.log_format, self.log_level)
@@ -113,6 +123,7 @@ class Settings:
 _READERS: dict[str, Callable[[str], Any]] = {
     "missions": Path,
     "catalog": Path,
+    "spool": Path,
     "shelf_mb": int,
     "frame_mb": int,
     "frame_megapixels": int,

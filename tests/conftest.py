@@ -25,11 +25,11 @@ from sqlalchemy import create_engine, make_url, text
 
 from service.cli import main
 from service.missions.mission import SHIPPED_FOLDER, load_missions
-from service.records.database import upgrade
-from service.records.engines import database_url
-from service.sky.catalog import load_embedded
-from service.sky.shelf import Shelf
-from service.sky.view import Sky
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.model import SkyModel
+from service.storage.sql.engines import database_url
+from service.storage.sql.migrations import upgrade
 from tests import scale
 
 DEFAULT_SEED = 19941026
@@ -153,7 +153,7 @@ def rng(seed):
 @pytest.fixture(scope="session")
 def sky():
     """The embedded catalog with a shelf, shared by all tests: answers do not depend on it."""
-    return Sky(load_embedded(), Shelf(max_bytes=256 << 20))
+    return SkyModel(load_embedded(), LruCache(max_bytes=256 << 20))
 
 
 @pytest.fixture(scope="session")
@@ -193,6 +193,12 @@ def chosen_database(request, tmp_path_factory):
             return url
 
         yield fresh
+
+
+@pytest.fixture(scope="session")
+def postgresql_schema():
+    """Makes the URL of a schema of its own on PostgreSQL, as a context; skips without a server."""
+    return _postgresql_schema
 
 
 @contextmanager

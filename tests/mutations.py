@@ -23,20 +23,20 @@ import zstandard
 from PIL import Image
 
 from service.errors import BadConfiguration, BadInput
-from service.imaging.files import read_frame
-from service.imaging.fits import write_fits
-from service.imaging.frame import FrameLimits
+from service.imaging.frames.files import read_frame
+from service.imaging.frames.fits import write_fits
+from service.imaging.frames.frame import FrameLimits
 from service.missions.mission import SHIPPED_FOLDER, load_missions, read_mission
-from service.observe.compressed import unpacked_lines
-from service.observe.csv_rows import write_csv
-from service.observe.formats import read_lines
-from service.observe.lines import MAX_LINE_BYTES
-from service.observe.wire import BatchIn, submission_from_json
+from service.observations.readers.csv_rows import write_csv
+from service.observations.readers.decompress import unpacked_lines
+from service.observations.readers.lines import MAX_LINE_BYTES
+from service.observations.readers.telemetry import read_lines
+from service.observations.schema import BatchIn, submission_from_json
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
-from service.sky.catalog import import_csv, import_sky2000, load, load_embedded, save
-from service.sky.shelf import Shelf
-from service.sky.view import Sky
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import import_csv, import_sky2000, load, load_embedded, save
+from service.sky.model import SkyModel
 from tests.sky.sky2000_records import SIRIUS, written
 
 MORE_MEMORY = 1 << 30
@@ -89,7 +89,7 @@ def with_right_sums(data):
 
 
 def pass_lines():
-    sky = Sky(load_embedded(), Shelf(64 << 20))
+    sky = SkyModel(load_embedded(), LruCache(64 << 20))
     drawn = list(draw_pass(load_missions()["XTE"], sky, Pass(batches=3, seed=1)))
     return [each.batch for each in drawn]
 

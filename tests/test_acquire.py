@@ -8,26 +8,27 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from service.acquire import IDENTIFIERS, WITHOUT_PRIOR, acquire, choices_of
+from service.acquire import acquire
+from service.acquire.choices import choices_of
+from service.acquire.prewarm import prewarm_kernels, prewarm_zones
 from service.attitude.solution import NoAttitude
 from service.errors import BadBatch
+from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Mission
-from service.observe.batch import BoresightPrior
-from service.observe.wire import submission_from_json
-from service.records.answer import answer_of, star_rows
-from service.sky.catalog import import_csv
-from service.sky.shelf import Shelf
-from service.sky.view import Sky
+from service.observations.batch import BoresightPrior
+from service.observations.schema import submission_from_json
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import import_csv
+from service.sky.model import SkyModel
+from service.storage.recording.answer import star_rows
 from service.times import parse_utc
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion
-from service.warm import warm_up, warm_zones
 from tests.reference import batches
-from tests.reference.compare import Judge, answered, plain_view
+from tests.reference.compare import Judge, answer_as_json, answered, plain_view
 
 TIME = "2000-01-01T12:00:00.000Z"
 
-NO_ZONE = WITHOUT_PRIOR | {"lost_in_space"}
-"""Identifiers that look at the whole sky."""
+IN_ZONES = sorted(name for name, entry in IDENTIFIERS.items() if entry.searches_zone)
 
 
 def read(body):
@@ -60,7 +61,7 @@ class TestByHand:
         def made(*stars):
             path = tmp_path / f"{len(stars)}.csv"
             path.write_text("\n".join(["id,ra_deg,dec_deg,magnitude", *stars]) + "\n")
-            return Sky(import_csv(path), Shelf(1 << 20))
+            return SkyModel(import_csv(path), LruCache(1 << 20))
 
         return made
 
@@ -88,7 +89,7 @@ class TestByHand:
 
     def test_the_stars_are_named_and_the_attitude_is_the_true_one(self, small_sky, missions):
         found = acquire(read(self.batch()), missions["XTE"], small_sky)
-        answer = answer_of(found, id="1")
+        answer = answer_as_json(found, id="1")
         stars = answer["observations"][0]["stars"]
         assert [star["star"]["id"] for star in stars] == ["A 1", "B 2", "C 3"]
         assert [(star["votes"], star["runner_up"]) for star in stars] == [(2, 0)] * 3
@@ -135,19 +136,19 @@ class TestByHand:
     ):
         options = {"identifier": "starid", "tests": {"magnitude": False, "cross_product": False}}
         body = self.batch(self.SEEN[:count], options=options)
-        answer = answer_of(acquire(read(body), missions["XTE"], small_sky), id="1")
+        answer = answer_as_json(acquire(read(body), missions["XTE"], small_sky), id="1")
         assert answer["attitude"] is None
         assert answer["reason"] == "fewer_than_two_unique_stars"
         assert answer["counts"]["unmatched" if count == 1 else "ambiguous"] == count
         if count == 2:
             assert answer["observations"][0]["stars"][0]["rivals"] == ["A 1", "B 2"]
 
-    @pytest.mark.parametrize("identifier", sorted(IDENTIFIERS.keys() - NO_ZONE))
+    @pytest.mark.parametrize("identifier", IN_ZONES)
     def test_a_zone_without_stars_leaves_all_unmatched(self, small_sky, missions, identifier):
         body = self.batch(a_priori={"boresight": {"ra_deg": 10.0, "dec_deg": -60.0}})
         body["options"] = {"identifier": identifier}
         mission = missions["XTE"].within_zones
-        answer = answer_of(acquire(read(body), mission, small_sky), id="1")
+        answer = answer_as_json(acquire(read(body), mission, small_sky), id="1")
         assert answer["counts"]["unmatched"] == 3
         assert answer["observations"][0]["zone"]["stars"] == 0
 
@@ -165,7 +166,7 @@ class TestByHand:
         for off_arcsec in np.arange(0.0, 100.0, 2.0):
             seen = (*self.SEEN, (0.5 + off_arcsec / 3600.0, 1.0, 4.5), (-0.8, -0.7, 3.6))
             body = self.batch(seen, options={"identifier": "verified"})
-            answer = answer_of(acquire(read(body), missions["XTE"].within_zones, sky), id="1")
+            answer = answer_as_json(acquire(read(body), missions["XTE"].within_zones, sky), id="1")
             found += answer["observations"][0]["stars"]
         assert all((each["outcome"] == "unique") == (each["star"] is not None) for each in found)
         named = [each["probability"] for each in found if each["outcome"] == "unique"]
@@ -187,7 +188,9 @@ class TestByHand:
                 options = {"identifier": identifier, "tests": {"cross_product": False}}
                 body = self.batch(((0.0, 0.0, 4.0), (0.5, 0.0, 4.0)), options=options)
                 body["a_priori"] = {"boresight": {"ra_deg": 89.0, "dec_deg": 0.0}}
-                answer = answer_of(acquire(read(body), missions["XTE"].within_zones, sky), id="1")
+                answer = answer_as_json(
+                    acquire(read(body), missions["XTE"].within_zones, sky), id="1"
+                )
                 rivals = [star["rivals"] for star in answer["observations"][0]["stars"]]
                 assert [len(each) for each in rivals] == [20, 20]
                 warned = [each for each in answer["warnings"] if each.startswith("rivals_cut: ")]
@@ -203,9 +206,9 @@ class TestByHand:
     def test_flags_tell_what_is_odd_about_a_star(self, small_sky, missions):
         body = self.batch((*self.SEEN, (4.5, 0.0, 5.0)))
         del body["observations"][0]["stars"][0]["magnitude"]
-        stars = answer_of(acquire(read(body), missions["XTE"], small_sky), id="1")["observations"][
-            0
-        ]["stars"]
+        stars = answer_as_json(acquire(read(body), missions["XTE"], small_sky), id="1")[
+            "observations"
+        ][0]["stars"]
         assert [star["flags"] for star in stars] == [
             ["no_magnitude"], [], [], ["outside_field_of_view"]
         ]  # fmt: skip
@@ -233,17 +236,19 @@ def test_a_zone_of_another_run_catalog_is_never_used(sky, missions):
         "a_priori": prior,
         "observations": [{"tracker": "STARTRACKER_1", "stars": stars}],
     }
-    shared = Sky(sky.catalog, Shelf(64 << 20))
+    shared = SkyModel(sky.catalog, LruCache(64 << 20))
     catalogs = set()
     for its_mission, year in ((mission, 1995), (brighter, 1995), (mission, 1975), (mission, 1995)):
         batch = read({**body, "time": f"{year}-06-01T00:00:00.000Z"})
-        alone = acquire(batch, its_mission, Sky(sky.catalog, Shelf(64 << 20)))
+        alone = acquire(batch, its_mission, SkyModel(sky.catalog, LruCache(64 << 20)))
         found = acquire(batch, its_mission, shared)
         catalogs.add(found.provenance.run_catalog)
         (zone,), (expected,) = ([each.zone for each in one.trackers] for one in (found, alone))
         assert zone.run_catalog == found.provenance.run_catalog
         assert zone.direction.tolist() == expected.direction.tolist()
-        assert without_clock(answer_of(found, id="1")) == without_clock(answer_of(alone, id="1"))
+        assert without_clock(answer_as_json(found, id="1")) == without_clock(
+            answer_as_json(alone, id="1")
+        )
     assert len(catalogs) == 3
 
 
@@ -306,10 +311,10 @@ def test_an_answer_depends_neither_on_the_batches_before_it_nor_on_other_threads
     judge = Judge(mission_files[name], sky)
     bodies = [nominal(rng, judge, k) for k in range(24)]
     alone = [
-        without_clock(answered(body, judge.mission, Sky(sky.catalog, Shelf(64 << 20))))
+        without_clock(answered(body, judge.mission, SkyModel(sky.catalog, LruCache(64 << 20))))
         for body in bodies[:4]
     ]
-    shared = Sky(sky.catalog, Shelf(8 << 20))
+    shared = SkyModel(sky.catalog, LruCache(8 << 20))
     with ThreadPoolExecutor(8) as pool:
         together = list(pool.map(lambda body: answered(body, judge.mission, shared), bodies * 2))
     assert [without_clock(answer) for answer in together[:4]] == alone
@@ -319,14 +324,14 @@ def test_an_answer_depends_neither_on_the_batches_before_it_nor_on_other_threads
 def test_fifty_first_requests_for_one_zone_build_it_once(mission_files, sky, rng):
     judge = Judge(mission_files["SOHO"], sky)
     body = nominal(rng, judge, 0)
-    fresh = Sky(sky.catalog, Shelf(64 << 20))
+    fresh = SkyModel(sky.catalog, LruCache(64 << 20))
     fresh.run_catalog(judge.mission, parse_utc(body["time"]))
     with ThreadPoolExecutor(50) as pool:
         answers = list(pool.map(lambda _: answered(body, judge.mission, fresh), range(50)))
     cached = [answer["observations"][0]["zone"]["cached"] for answer in answers]
     assert cached.count(False) == 1
     # One run catalog and one zone.
-    assert fresh.shelf.state().misses == 2
+    assert fresh.cache.state().misses == 2
 
 
 def test_a_pole_far_from_the_sun_is_told_and_not_refused(rng, mission_files, sky):
@@ -443,8 +448,8 @@ def test_provenance_and_counts_say_what_an_answer_was_made_of(rng, mission_files
 
 
 def test_warmed_zones_are_those_that_batches_ask_for(rng, mission_files, missions, sky):
-    fresh = Sky(sky.catalog, Shelf(64 << 20))
-    warm_zones(fresh, missions["XTE"], BoresightPrior(83.0, -5.0), parse_utc(TIME))
+    fresh = SkyModel(sky.catalog, LruCache(64 << 20))
+    prewarm_zones(fresh, missions["XTE"], BoresightPrior(83.0, -5.0), parse_utc(TIME))
     body = TestByHand().batch(a_priori={"boresight": {"ra_deg": 83.05, "dec_deg": -5.05}})
     assert answered(body, missions["XTE"], fresh)["observations"][0]["zone"]["cached"]
     assert fresh.drop_zones("SWAS") == 0
@@ -453,9 +458,9 @@ def test_warmed_zones_are_those_that_batches_ask_for(rng, mission_files, mission
 
 
 def test_warming_up_leaves_nothing_on_the_shelf(missions, sky):
-    fresh = Sky(sky.catalog, Shelf(64 << 20))
-    warm_up(fresh, missions)
-    assert fresh.shelf.state().entries == ()
+    fresh = SkyModel(sky.catalog, LruCache(64 << 20))
+    prewarm_kernels(fresh, missions)
+    assert fresh.cache.state().entries == ()
 
 
 def test_a_batch_s_options_take_the_place_of_the_mission_s_settings(missions):

@@ -19,7 +19,7 @@ import yaml
 from service import __version__
 from service.cli.parser import build_parser
 from service.missions.mission import SHIPPED_FOLDER
-from service.observe.csv_cells import COLUMNS
+from service.observations.readers.csv_columns import COLUMNS
 from service.simulate.files import read_objects
 from service.times import parse_utc
 from tests.sky.test_sky2000 import SIRIUS, written
@@ -29,6 +29,7 @@ COMMANDS = [
     "serve",
     "replay",
     "advise",
+    "history",
     "reprocess",
     "frame",
     "catalog",
@@ -81,12 +82,12 @@ def test_every_example_in_the_help_is_understood(acquire):
             words = [word for word in words if not word.startswith("ACQUIRE_")]
             if "COMMAND" not in words and words:
                 assert words[0] == "acquire"
-                assert build_parser().parse_args(words[1:]).command
+                assert build_parser().parse_args(words[1:]).function
 
 
 def test_the_help_of_replay_names_every_column_of_a_csv_file(acquire):
     _, out, _ = acquire("replay", "--help")
-    named = out.split("named after the JSON:\n")[1].split("spacecraft, batch, time")[0].split()
+    named = out.split("Columns, as in the JSON:\n")[1].split("spacecraft, batch, time")[0].split()
     assert sorted(named) == sorted(COLUMNS)
 
 
@@ -245,13 +246,22 @@ def test_replay_in_process_records_answers_and_sums_up(acquire, tmp_path):
     assert "already recorded  6" in out
 
 
+def test_the_history_of_a_run_is_printed_as_a_table(acquire, tmp_path):
+    telemetry(acquire, tmp_path / "pass.ndjson", "XTE", 3, "--nominal")
+    assert acquire("replay", tmp_path / "pass.ndjson", "--in-process", "--run", "r")[0] == 0
+    code, out, _ = acquire("history", "--spacecraft", "XTE", "--run", "r")
+    rows = list(csv.DictReader(out.splitlines()))
+    assert (code, len(rows)) == (0, 3)
+    assert {"time", "batch", "id", "ambiguous_share"} <= set(rows[0])
+
+
 def test_advice_is_printed_in_sentences_or_as_the_api_answers_it(acquire, tmp_path):
     telemetry(acquire, tmp_path / "pass.ndjson", "XTE", 30, "--nominal")
     assert acquire("replay", tmp_path / "pass.ndjson", "--in-process", "--run", "r")[0] == 0
     asked = ("advise", "--spacecraft", "XTE", "--run", "r", "--quiet")
     code, out, complaint = acquire(*asked, "--try", "separation_deg=0.01")
     assert (code, "batches" in complaint) == (0, False)
-    assert "30 of 30 batches were looked at." in out
+    assert "30 of 30 batches were examined." in out
     assert "ok  SEPTOL (separation_deg) fits: 99 %" in out
     assert "separation_deg = 0.01, asked for" in out
     code, out, _ = acquire(*asked, "--json")

@@ -8,7 +8,7 @@ import pytest
 DOCKER = Path(__file__).parent.parent / "docker"
 DOCKERFILE = (DOCKER / "Dockerfile").read_text(encoding="utf-8")
 COMPOSE = (DOCKER / "compose.yaml").read_text(encoding="utf-8")
-BACKUP = DOCKER.parent / "service" / "records" / "backup.py"
+BACKUP = DOCKER.parent / "service" / "storage" / "upkeep" / "backup.py"
 
 
 def test_the_image_has_the_program_that_a_backup_of_postgresql_runs():

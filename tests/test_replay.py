@@ -11,16 +11,16 @@ from itertools import count
 
 import pytest
 
-from service.errors import BadFile, BadInput, Busy, NotAdmitted, NotAllowed, NotFound
-from service.observe.csv_rows import write_csv
-from service.observe.wire import BatchIn
-from service.operations import Operations
-from service.records.replays import mark_interrupted
-from service.replay.in_bulk import replay_in_bulk
+from service.app.factory import open_app
+from service.errors import BadFile, BadInput, Busy, Forbidden, NotFound, Unauthenticated
+from service.ingest.replays import mark_interrupted
+from service.observations.readers.csv_rows import write_csv
+from service.observations.schema import BatchIn
+from service.replay.bulk_upload import replay_in_bulk
 from service.replay.in_process import replay_in_process
 from service.replay.items import Pace, items_of, run_name
 from service.replay.over_http import replay_over_http
-from service.replay.tally import Tally
+from service.replay.summary import ReplaySummary
 from service.settings import Settings
 from service.simulate.files import read_objects
 from service.simulate.stretches import Pass, Trouble, Troubles
@@ -33,14 +33,14 @@ _names = count(1)
 
 
 def opened(folder, name="acquire.db"):
-    return Operations.open(Settings(database=f"sqlite:///{folder / name}"))
+    return open_app(Settings(database=f"sqlite:///{folder / name}"))
 
 
 @pytest.fixture(scope="module")
-def operations(tmp_path_factory):
-    operations = opened(tmp_path_factory.mktemp("in-process"))
-    yield operations
-    operations.close()
+def app(tmp_path_factory):
+    app = opened(tmp_path_factory.mktemp("in-process"))
+    yield app
+    app.close()
 
 
 @pytest.fixture(scope="module")
@@ -70,14 +70,14 @@ def written(path, lines):
     return path
 
 
-def replayed(files, run, results, *, operations=None, url=None, **how):
+def replayed(files, run, results, *, app=None, url=None, **how):
     files = files if isinstance(files, list) else [files]
-    with Tally(files, results, progress=False) as tally:
+    with ReplaySummary(files, results, progress=False) as summary:
         if url is None:
-            replay_in_process(operations, items_of(files, run), tally.add, **how)
+            replay_in_process(app, items_of(files, run), summary.add, **how)
         else:
-            replay_over_http(url, items_of(files, run), tally.add, **how)
-    return tally, list(read_objects(results))
+            replay_over_http(url, items_of(files, run), summary.add, **how)
+    return summary, list(read_objects(results))
 
 
 def without_circumstances(result):
@@ -106,19 +106,19 @@ def bad_lines(batch):
     ]
 
 
-def test_both_ways_give_equal_results_star_by_star(operations, address, batches, run, tmp_path):
+def test_both_ways_give_equal_results_star_by_star(app, address, batches, run, tmp_path):
     """Answers and refusals alike, serious errors and bad lines included."""
     middle = len(batches) // 2
     lines = [*batches[:middle], *bad_lines(batches[0]), *batches[middle:]]
     path = written(tmp_path / "pass.ndjson", lines)
-    inside, here = replayed(path, run, tmp_path / "in.ndjson", operations=operations)
+    inside, here = replayed(path, run, tmp_path / "in.ndjson", app=app)
     outside, there = replayed(path, run, tmp_path / "out.ndjson", url=address)
     assert [without_circumstances(each) for each in here] == [
         without_circumstances(each) for each in there
     ]
-    for tally in (inside, outside):
-        assert (tally.new, tally.replayed, tally.refused) == (len(batches), 1, 8)
-        assert tally.stars["observed"] == sum(
+    for summary in (inside, outside):
+        assert (summary.new, summary.replayed, summary.refused) == (len(batches), 1, 8)
+        assert summary.stars["observed"] == sum(
             len(tracker["stars"])
             for batch in [*batches, batches[0]]
             for tracker in batch["observations"]
@@ -126,7 +126,7 @@ def test_both_ways_give_equal_results_star_by_star(operations, address, batches,
 
 
 def test_files_sent_as_a_whole_come_to_the_same_and_bad_lines_keep_their_place(
-    operations, address, batches, run, tmp_path, capsys
+    app, address, batches, run, tmp_path, capsys
 ):
     """NDJSON and CSV in one upload; what one by one is refused is refused, line by line."""
     first = written(tmp_path / "one.ndjson", [*batches[:5], *bad_lines(batches[0]), batches[5]])
@@ -137,36 +137,36 @@ def test_files_sent_as_a_whole_come_to_the_same_and_bad_lines_keep_their_place(
     rows.insert(2, rows[1].replace("STARTRACKER_1", "STARTRACKER_1,5"))
     second.write_text("\n".join(rows))
     files = [first, second]
-    inside, _ = replayed(files, run, tmp_path / "in.ndjson", operations=operations)
+    inside, _ = replayed(files, run, tmp_path / "in.ndjson", app=app)
     told_one_by_one = capsys.readouterr().err
-    with Tally(files, progress=False) as tally:
-        replay_in_bulk(address, files, run, tally.add, tally.follow)
+    with ReplaySummary(files, progress=False) as summary:
+        replay_in_bulk(address, files, run, summary.add, summary.follow)
     told = capsys.readouterr().err
     assert sorted(told.splitlines()) == sorted(told_one_by_one.splitlines())
     assert f"{first}:9: spacecraft: there is no such" in told
     for name in ("new", "replayed", "refused", "attitudes", "stars"):
-        assert getattr(tally, name) == getattr(inside, name), name
+        assert getattr(summary, name) == getattr(inside, name), name
 
 
 def test_a_replay_that_a_starting_process_calls_interrupted_is_followed_to_its_end(
     missions, sky, run, tmp_path
 ):
     many = [each.batch for each in draw_pass(missions["XTE"], sky, Pass(1_000, 5))]
-    operations, states = opened(tmp_path), []
+    app, states = opened(tmp_path), []
 
     def call_interrupted(state):
         if state["state"] == "running":
             # What a process does with the replays that it finds at work when it opens the database.
-            operations.change(lambda connection: mark_interrupted(connection, state["started"]))
+            app.context.change(lambda connection: mark_interrupted(connection, state["started"]))
         states.append(state["state"])
 
-    with Server(create_app(operations)) as url:
+    with Server(create_app(app)) as url:
         files = [written(tmp_path / "many.ndjson", many)]
         replay_in_bulk(url, files, run, print, call_interrupted)
-        recorded = operations.runs()
+        recorded = app.runs.all()
     assert states[-1] == "done"
     assert "interrupted" in states
-    assert [each["batches"] for each in recorded if each["run"] == run] == [len(many)]
+    assert [each.batches for each in recorded if each.run == run] == [len(many)]
 
 
 def test_a_service_that_is_not_there_is_named_before_anything_is_read(run, tmp_path):
@@ -177,7 +177,7 @@ def test_a_service_that_is_not_there_is_named_before_anything_is_read(run, tmp_p
 
 
 @pytest.mark.parametrize(
-    ("status", "kind"), [(401, NotAdmitted), (403, NotAllowed), (404, NotFound)]
+    ("status", "kind"), [(401, Unauthenticated), (403, Forbidden), (404, NotFound)]
 )
 def test_who_may_not_follow_a_replay_is_told_so_at_once(status, kind, run, tmp_path):
     """In the service's own words, not that it no longer answers."""
@@ -216,10 +216,10 @@ def test_who_may_not_follow_a_replay_is_told_so_at_once(status, kind, run, tmp_p
 
 
 def test_bad_lines_are_told_by_number_and_field_and_the_rest_goes_on(
-    operations, batches, run, tmp_path, capsys
+    app, batches, run, tmp_path, capsys
 ):
     path = written(tmp_path / "pass.ndjson", [batches[0], *bad_lines(batches[0]), batches[1]])
-    tally, results = replayed(path, run, tmp_path / "out.ndjson", operations=operations)
+    summary, results = replayed(path, run, tmp_path / "out.ndjson", app=app)
     problems = {each["line"]: each["problem"] for each in results if "problem" in each}
     assert list(problems) == [2, 4, 5, 6, 7, 8, 9, 10]
     assert problems[5]["detail"].startswith("spacecraft: there is no such spacecraft;")
@@ -231,7 +231,7 @@ def test_bad_lines_are_told_by_number_and_field_and_the_rest_goes_on(
     assert results[-1]["batch"] == batches[1]["batch"]
     told = capsys.readouterr().err
     assert f"{path}:5: spacecraft: there is no such" in told
-    assert tally.refused == 8
+    assert summary.refused == 8
 
 
 @pytest.mark.parametrize("concurrency", [1, 16])
@@ -250,30 +250,30 @@ def test_results_stand_in_input_order_exactly_as_answered(
 
 @pytest.mark.parametrize("way", ["in process", "http"])
 def test_a_second_time_nothing_is_new_and_every_answer_is_the_same(
-    operations, address, batches, run, tmp_path, way
+    app, address, batches, run, tmp_path, way
 ):
     path = written(tmp_path / "pass.ndjson", batches)
-    where = {"url": address} if way == "http" else {"operations": operations}
+    where = {"url": address} if way == "http" else {"app": app}
     replayed(path, run, tmp_path / "first", **where)
-    tally, _ = replayed(path, run, tmp_path / "second", **where)
-    assert (tally.new, tally.replayed, tally.refused) == (0, len(batches), 0)
+    summary, _ = replayed(path, run, tmp_path / "second", **where)
+    assert (summary.new, summary.replayed, summary.refused) == (0, len(batches), 0)
     assert (tmp_path / "first").read_bytes() == (tmp_path / "second").read_bytes()
-    assert "already recorded  27" in tally.table()
+    assert "already recorded  27" in summary.table()
 
 
-def test_rows_and_json_are_one_run(operations, batches, run, tmp_path):
+def test_rows_and_json_are_one_run(app, batches, run, tmp_path):
     """A CSV file of batches that were replayed as NDJSON brings nothing new."""
     json_file = written(tmp_path / "pass.ndjson", batches)
     csv_file = tmp_path / "pass.csv"
     with csv_file.open("w", newline="", encoding="utf-8") as file:
         write_csv((BatchIn.model_validate_json(json.dumps(each)) for each in batches), file)
-    replayed(json_file, run, tmp_path / "a", operations=operations)
-    tally, _ = replayed(csv_file, run, tmp_path / "b", operations=operations)
-    assert (tally.new, tally.replayed) == (0, len(batches))
+    replayed(json_file, run, tmp_path / "a", app=app)
+    summary, _ = replayed(csv_file, run, tmp_path / "b", app=app)
+    assert (summary.new, summary.replayed) == (0, len(batches))
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
-def test_a_bad_row_of_a_csv_file_is_told_by_line_and_column(operations, batches, run, tmp_path):
+def test_a_bad_row_of_a_csv_file_is_told_by_line_and_column(app, batches, run, tmp_path):
     path = tmp_path / "pass.csv"
     text = io.StringIO(newline="")
     write_csv((BatchIn.model_validate_json(json.dumps(each)) for each in batches[:3]), text)
@@ -285,8 +285,8 @@ def test_a_bad_row_of_a_csv_file_is_told_by_line_and_column(operations, batches,
     cells[rows[0].split(",").index("magnitude")] = "dim"
     rows[at] = ",".join(cells)
     path.write_text("\n".join(rows), encoding="utf-8")
-    tally, results = replayed(path, run, tmp_path / "out", operations=operations)
-    assert (tally.new, tally.refused) == (2, 1)
+    summary, results = replayed(path, run, tmp_path / "out", app=app)
+    assert (summary.new, summary.refused) == (2, 1)
     assert results[1] == {
         "line": at + 1,
         "problem": {
@@ -303,14 +303,14 @@ def test_a_bad_row_of_a_csv_file_is_told_by_line_and_column(operations, batches,
 
 
 def test_several_files_are_one_run_and_a_refusal_names_its_file(
-    operations, batches, run, tmp_path, capsys
+    app, batches, run, tmp_path, capsys
 ):
     files = [
         written(tmp_path / "one.ndjson", batches[:2]),
         written(tmp_path / "two.ndjson", ["{", batches[2]]),
     ]
-    tally, results = replayed(files, run, tmp_path / "out", operations=operations)
-    assert (tally.new, tally.refused) == (3, 1)
+    summary, results = replayed(files, run, tmp_path / "out", app=app)
+    assert (summary.new, summary.refused) == (3, 1)
     assert set(results[2]) == {"line", "problem"}
     assert results[2]["line"] == 1
     assert f"{files[1]}:1: " in capsys.readouterr().err
@@ -319,8 +319,8 @@ def test_several_files_are_one_run_and_a_refusal_names_its_file(
 class Unreliable:
     """The real app on a bad day: every third post is turned away, every fourth answer is lost."""
 
-    def __init__(self, app):
-        self.app, self.posts, self.lock = app, 0, threading.Lock()
+    def __init__(self, web_app):
+        self.app, self.posts, self.lock = web_app, 0, threading.Lock()
 
     async def __call__(self, scope, receive, send):
         if scope["type"] != "http" or scope["method"] != "POST":
@@ -349,11 +349,11 @@ class Unreliable:
 
 def test_busy_answers_and_lost_ones_are_asked_again_and_nothing_is_doubled(batches, run, tmp_path):
     path = written(tmp_path / "pass.ndjson", batches)
-    operations = opened(tmp_path)
-    unreliable = Unreliable(create_app(operations))
+    app = opened(tmp_path)
+    unreliable = Unreliable(create_app(app))
     with Server(unreliable) as url:
-        tally, results = replayed(path, run, tmp_path / "out", url=url)
-        stored = operations.batches(
+        summary, results = replayed(path, run, tmp_path / "out", url=url)
+        stored = app.results.page(
             spacecraft=None,
             run=run,
             start=None,
@@ -364,9 +364,9 @@ def test_busy_answers_and_lost_ones_are_asked_again_and_nothing_is_doubled(batch
             cursor=None,
         )
     assert unreliable.posts > len(batches)
-    assert tally.refused == 0
-    assert tally.new + tally.replayed == len(batches) == len(stored.items)
-    assert tally.replayed > 0
+    assert summary.refused == 0
+    assert summary.new + summary.replayed == len(batches) == len(stored.items)
+    assert summary.replayed > 0
     assert [each["batch"] for each in results] == [each["batch"] for each in batches]
 
 
@@ -380,30 +380,30 @@ def test_a_replay_that_was_cut_off_goes_on_where_it_stopped(batches, run, tmp_pa
                 server.__exit__()
             yield item
 
-    with Tally([path], None, progress=False) as tally:
+    with ReplaySummary([path], None, progress=False) as summary:
         url = server.__enter__()
         with pytest.raises(Busy, match="run the same command again to go on"):
             replay_over_http(
                 url,
                 stopping_after(10, items_of([path], run)),
-                tally.add,
+                summary.add,
                 concurrency=1,
-                patience_s=0.2,
+                give_up_after_s=0.2,
             )
-    done = tally.new
+    done = summary.new
     assert 9 <= done <= 10
     with Server(create_app(opened(tmp_path))) as url:
-        tally, _ = replayed(path, run, tmp_path / "out", url=url)
+        summary, _ = replayed(path, run, tmp_path / "out", url=url)
     # The answer of one more may have been on its way.
-    assert done <= tally.replayed <= done + 1
-    assert tally.replayed + tally.new == len(batches)
+    assert done <= summary.replayed <= done + 1
+    assert summary.replayed + summary.new == len(batches)
 
 
-def test_batches_are_sent_at_their_own_times_sped_up(operations, address, missions, sky, tmp_path):
+def test_batches_are_sent_at_their_own_times_sped_up(app, address, missions, sky, tmp_path):
     """Five batches a second apart, at four times the speed, take a second."""
     drawn = list(draw_pass(missions["XTE"], sky, Pass(5, 9, cadence_s=1.0)))
     path = written(tmp_path / "pass.ndjson", [each.batch for each in drawn])
-    for run, where in (("paced-1", {"operations": operations}), ("paced-2", {"url": address})):
+    for run, where in (("paced-1", {"app": app}), ("paced-2", {"url": address})):
         start = time.monotonic()
         replayed(path, run, tmp_path / "out", pace=Pace(4.0), **where)
         assert 1.0 <= time.monotonic() - start < 3.0
@@ -437,13 +437,13 @@ def test_the_run_is_named_or_takes_the_first_files_stem(tmp_path):
         run_name([tmp_path / "my pass.ndjson"], None)
 
 
-def test_a_file_without_a_batch_leaves_results_without_a_line(operations, run, tmp_path):
+def test_a_file_without_a_batch_leaves_results_without_a_line(app, run, tmp_path):
     (tmp_path / "out").write_text("of an earlier run")
-    replayed(written(tmp_path / "pass", []), run, tmp_path / "out", operations=operations)
+    replayed(written(tmp_path / "pass", []), run, tmp_path / "out", app=app)
     assert (tmp_path / "out").read_bytes() == b""
 
 
 @pytest.mark.parametrize("place", ["", "none/out"])
 def test_a_place_for_results_that_cannot_be_is_refused_beforehand(tmp_path, place):
     with pytest.raises(BadFile, match="cannot be written"):
-        Tally([], tmp_path / place)
+        ReplaySummary([], tmp_path / place)

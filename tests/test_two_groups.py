@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.two_groups import acquired, is_at, is_good, simple, two_groups
 from service.acquire import acquire
-from service.observe.wire import submission_from_json
+from service.observations.schema import submission_from_json
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
 from service.simulate.two_groups import Views

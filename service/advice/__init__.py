@@ -1,1 +1,1 @@
-"""WHAT TO CHANGE: what stored batches say of a mission's settings."""
+"""Advice on a mission's settings from recorded batches."""

@@ -1,14 +1,14 @@
-"""Advice for a mission's settings, from batches that were recorded: put together in one place.
+"""Advice for a mission's settings from recorded batches.
 
-The batches run again twice over: by verified identification, for evidence;
-then with other settings, for what these would have come to.
+The batches run again twice: by verified identification, which gives evidence;
+then with other settings, to compare their outcomes.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from service.acquire import Acquisition
-from service.advice.evidence import evidence_of, gathered
+from service.advice.evidence import evidence_of, merged
 from service.advice.tolerances import ToleranceFinding, tolerance_findings
 from service.advice.trackers import (
     AlignmentFinding,
@@ -18,21 +18,21 @@ from service.advice.trackers import (
     magnitude_findings,
     noise_findings,
 )
-from service.advice.tried import Counts, Tried, Variant, counts_of, summed, variants
+from service.advice.trials import Counts, Trial, Variant, counts_of, trial_of, variants
 from service.errors import BadInput
 from service.identify.identification import Identification
 from service.missions.mission import Mission
-from service.observe.batch import ObservationBatch
+from service.observations.batch import ObservationBatch
 
 EVIDENCE_SHARE = 0.4
-"""Of the time there is, the share in which evidence is gathered; the rest is for trying."""
+"""Of the time there is, the share in which evidence is collected; the rest is for trials."""
 
 Run = Callable[[ObservationBatch], Acquisition]
 
 
 @dataclass(frozen=True)
-class Pace:
-    """How long it may take, and who is told of each step.
+class WorkLimit:
+    """How long the work may take, and a callback for its progress.
 
     `in_time` says whether a share of the time is still left; `step` is called
     after each batch of either round.
@@ -44,12 +44,12 @@ class Pace:
 
 @dataclass(frozen=True)
 class Advice:
-    """Everything that a sample of batches says of a mission's settings.
+    """The findings of a sample of batches on a mission's settings.
 
     `refused` counts batches that no longer fit the mission, the first reason
     beside it; `sampled` those that gave evidence.  `with_rival` counts batches in
-    which two groups of stars have each an attitude, `mirrored` those that fit
-    better in a mirror.  `by_votes` says whether any
+    which two groups of stars each have an attitude, `mirrored` those that fit
+    better in a mirror.  `uses_voting` says whether any
     of these is identified by votes, which alone ask for the tolerances.
     """
 
@@ -62,8 +62,8 @@ class Advice:
     noise: tuple[NoiseFinding, ...]
     magnitudes: tuple[MagnitudeFinding, ...]
     alignment: tuple[AlignmentFinding, ...]
-    tried: tuple[Tried, ...]
-    by_votes: bool
+    trials: tuple[Trial, ...]
+    uses_voting: bool
     with_rival: int
     mirrored: int
 
@@ -73,55 +73,56 @@ def advise(
     batches: Sequence[ObservationBatch],
     run: Run,
     own: Mapping[str, float] | None = None,
-    pace: Pace | None = None,
+    pace: WorkLimit | None = None,
 ) -> Advice:
-    """The advice that batches of a mission give; `run` takes one down the staircase.
+    """The advice that batches of a mission give; `run` acquires one batch.
 
-    Batches should come in random order: where time runs out, those that are
-    left are not looked at.  `own` are tolerances to be tried as well.
+    Batches should come in random order: when time runs out, the rest are
+    left out.  `own` are additional tolerances to try.
     """
-    pace = pace or Pace()
-    seen = _Seen()
+    pace = pace or WorkLimit()
+    sample = _SampledBatches()
     verified = Variant("", "verified")
-    evidence = []
+    parts = []
     for number, batch in enumerate(batches):
         if not pace.in_time(EVIDENCE_SHARE):
             break
         try:
             acquisition = run(verified.of(batch))
         except BadInput as error:
-            seen.refuse(error)
+            sample.refuse(error)
         else:
-            evidence.append(evidence_of(number, acquisition))
+            parts.append(evidence_of(number, acquisition))
             sure = tuple(each.identification for each in acquisition.trackers)
-            seen.cases.append((batch, sure, counts_of(acquisition, sure)))
-            seen.with_rival += acquisition.rival is not None
-            seen.mirrored += any(each.mirrored for each in sure)
+            sample.cases.append((batch, sure, counts_of(acquisition, sure)))
+            sample.with_rival += acquisition.rival is not None
+            sample.mirrored += any(each.mirrored for each in sure)
         pace.step()
-    gathered_evidence = gathered(evidence)
-    tolerances = tuple(tolerance_findings(mission, gathered_evidence))
+    evidence = merged(parts)
+    tolerances = tuple(tolerance_findings(mission, evidence))
     return Advice(
         mission=mission,
-        sampled=len(seen.cases),
-        identified=gathered_evidence.batches,
+        sampled=len(sample.cases),
+        identified=evidence.batches,
         tolerances=tolerances,
-        noise=tuple(noise_findings(mission, gathered_evidence)),
-        magnitudes=tuple(magnitude_findings(mission, gathered_evidence)),
-        alignment=tuple(alignment_findings(mission, gathered_evidence)),
-        tried=tuple(_tried(mission, tolerances, seen, run, own or {}, pace)),
-        refused=seen.refused,
-        refusal=seen.refusal,
-        by_votes=any(
-            (batch.options.identifier or mission.identifier) == "starid" for batch, *_ in seen.cases
+        noise=tuple(noise_findings(mission, evidence)),
+        magnitudes=tuple(magnitude_findings(mission, evidence)),
+        alignment=tuple(alignment_findings(mission, evidence)),
+        trials=tuple(_trials(mission, tolerances, sample, run, own or {}, pace)),
+        refused=sample.refused,
+        refusal=sample.refusal,
+        uses_voting=any(
+            (batch.options.identifier or mission.identifier) == "starid"
+            for batch, *_ in sample.cases
         ),
-        with_rival=seen.with_rival,
-        mirrored=seen.mirrored,
+        with_rival=sample.with_rival,
+        mirrored=sample.mirrored,
     )
 
 
 @dataclass
-class _Seen:
-    """The batches that could be run, with what verified identification says of each."""
+class _SampledBatches:
+    """The batches that could run, each with its verified identification."""
 
     cases: list[tuple[ObservationBatch, tuple[Identification, ...], Counts]] = field(
         default_factory=list
@@ -137,29 +138,29 @@ class _Seen:
         self.refusal = self.refusal or str(error.faults[0])
 
 
-def _tried(
+def _trials(
     mission: Mission,
     findings: Sequence[ToleranceFinding],
-    seen: _Seen,
+    sample: _SampledBatches,
     run: Run,
     own: Mapping[str, float],
-    pace: Pace,
-) -> list[Tried]:
+    pace: WorkLimit,
+) -> list[Trial]:
     present, by_probability, *others = variants(mission, findings, own)
     counts: dict[Variant, list[Counts]] = {each: [] for each in (present, *others)}
-    for batch, sure, _ in seen.cases:
+    for batch, sure, _ in sample.cases:
         if not pace.in_time(1.0):
             break
         try:
             of_batch = {each: counts_of(run(each.of(batch)), sure) for each in counts}
         except BadInput as error:
-            seen.refuse(error)
+            sample.refuse(error)
         else:
             for each, found in of_batch.items():
                 counts[each].append(found)
         pace.step()
     return [
-        summed(present, counts[present], None),
-        summed(by_probability, [found for *_, found in seen.cases], None),
-        *(summed(each, counts[each], counts[present]) for each in others),
+        trial_of(present, counts[present], None),
+        trial_of(by_probability, [found for *_, found in sample.cases], None),
+        *(trial_of(each, counts[each], counts[present]) for each in others),
     ]

@@ -1,9 +1,8 @@
-"""What identified stars say of the settings: differences between what was seen and the catalog.
+"""What identified stars say of the settings: observed minus catalog differences.
 
 The stars are those that verified identification names.  It does not look at
-the tolerances, so that what lies beyond one is seen as well as what lies
-within; the pairs that the votes accept would only ever confirm the tolerance
-that they were accepted by.
+the tolerances, so differences beyond a tolerance are visible too; pairs
+accepted by the votes could only confirm the tolerance that accepted them.
 """
 
 from collections.abc import Iterable, Sequence
@@ -13,18 +12,20 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from service.acquire import Acquisition, Path, TrackerResult, velocity_to_correct
+from service.acquire import Acquisition
+from service.acquire.choices import aberration_velocity
+from service.acquire.result import Path, TrackerResult
 from service.attitude.solution import AttitudeSolution
-from service.identify.matched import attitude_of
+from service.identify.attitude_from_matches import attitude_of
 from service.missions.mission import Band
-from service.observe.batch import BoresightPrior
+from service.observations.batch import BoresightPrior
 from service.sky.ephemeris import sun_distance_au
 from service.times import Utc
 from service.vectors import Matrix, Vector, angle_between_deg, unit
 
 
 @dataclass(frozen=True)
-class Stars:
+class StarEvidence:
     """Of identified stars (n): which batch and tracker, observed and catalog magnitude.
 
     `pole_angle_deg` is the difference between the observed angle to the pole,
@@ -39,7 +40,7 @@ class Stars:
 
 
 @dataclass(frozen=True)
-class Pairs:
+class PairEvidence:
     """Of pairs (n) of identified stars of one tracker, no farther apart than the pair index goes.
 
     `separation_deg` is observed minus catalog.  `pole_difference_deg` is that
@@ -54,11 +55,11 @@ class Pairs:
     cross_product_deg: Vector
 
 
-_Columns = TypeVar("_Columns", Stars, Pairs)
+_Columns = TypeVar("_Columns", StarEvidence, PairEvidence)
 
 
 @dataclass(frozen=True)
-class Fit:
+class TrackerAttitude:
     """One tracker's own attitude in one batch: its quaternion, covariance, fit and time."""
 
     batch: int
@@ -72,11 +73,11 @@ class Fit:
 
 @dataclass(frozen=True)
 class Evidence:
-    """All that the identified stars of some batches say."""
+    """The evidence that the identified stars of some batches give."""
 
-    stars: Stars
-    pairs: Pairs
-    fits: tuple[Fit, ...]
+    stars: StarEvidence
+    pairs: PairEvidence
+    fits: tuple[TrackerAttitude, ...]
 
     @property
     def batches(self) -> int:
@@ -85,30 +86,30 @@ class Evidence:
 
 
 def evidence_of(batch: int, acquisition: Acquisition) -> Evidence:
-    """What one acquisition, by verified identification, gives; `batch` numbers it.
+    """The evidence of one acquisition by verified identification; `batch` is its number.
 
-    Tests and zones are judged by what was presumed: where the whole sky had to
-    give the attitude, nothing is said.
+    Tests and zones are judged by the prior attitude: an acquisition whose attitude
+    came from the whole sky gives no evidence.
     """
     mission = acquisition.mission
     names = [tracker.name for tracker in mission.trackers]
     stars, pairs, fits = [], [], []
     for result in acquisition.trackers:
-        used = _used(result)
-        if not used.any() or acquisition.presumed is None or result.aim is None:
+        used = _uniquely_identified(result)
+        if not used.any() or acquisition.prior is None or result.region is None:
             continue
         if acquisition.path is not Path.ZONE:
             continue
-        presumed = acquisition.presumed.attitude
+        presumed = acquisition.prior.attitude
         tracker = names.index(result.corrected.tracker.name)
         row = result.identification.star[used]
         observed = result.corrected.direction_body[used] @ presumed
         catalog = acquisition.run_catalog.direction[row]
         polar = [np.full(len(row), np.nan)] * 2
         if isinstance(mission.zone, Band):
-            polar = [angle_between_deg(each, result.aim.axis) for each in (observed, catalog)]
+            polar = [angle_between_deg(each, result.region.axis) for each in (observed, catalog)]
         stars.append(
-            Stars(
+            StarEvidence(
                 np.full(len(row), batch),
                 np.full(len(row), tracker),
                 result.corrected.magnitude_mag[used],
@@ -117,10 +118,10 @@ def evidence_of(batch: int, acquisition: Acquisition) -> Evidence:
             )
         )
         pairs.append(_pairs(batch, acquisition, observed, catalog, polar))
-        solution = _alone(acquisition, result, used)
+        solution = _tracker_attitude(acquisition, result, used)
         if solution is not None:
             fits.append(
-                Fit(
+                TrackerAttitude(
                     batch,
                     tracker,
                     solution.quaternion,
@@ -130,21 +131,21 @@ def evidence_of(batch: int, acquisition: Acquisition) -> Evidence:
                     acquisition.batch.time,
                 )
             )
-    return Evidence(_joined(Stars, stars), _joined(Pairs, pairs), tuple(fits))
+    return Evidence(_joined(StarEvidence, stars), _joined(PairEvidence, pairs), tuple(fits))
 
 
-def gathered(parts: Iterable[Evidence]) -> Evidence:
+def merged(parts: Iterable[Evidence]) -> Evidence:
     """The evidence of many batches as one."""
     parts = list(parts)
     return Evidence(
-        _joined(Stars, [part.stars for part in parts]),
-        _joined(Pairs, [part.pairs for part in parts]),
+        _joined(StarEvidence, [part.stars for part in parts]),
+        _joined(PairEvidence, [part.pairs for part in parts]),
         tuple(fit for part in parts for fit in part.fits),
     )
 
 
-def _used(result: TrackerResult) -> npt.NDArray[np.bool_]:
-    """The unique stars; of those that share an identity one is wrong, so neither counts."""
+def _uniquely_identified(result: TrackerResult) -> npt.NDArray[np.bool_]:
+    """The unique stars, without those that share an identity: one of them must be wrong."""
     star = result.identification.star
     names, count = np.unique(star, return_counts=True)
     return result.identification.unique & ~np.isin(star, names[count > 1])
@@ -156,7 +157,7 @@ def _pairs(
     observed: Vector,
     catalog: Vector,
     polar: Sequence[Vector],
-) -> Pairs:
+) -> PairEvidence:
     tolerances = acquisition.choices.tolerances
     i, j = np.triu_indices(len(observed), 1)
     between = angle_between_deg(catalog[i], catalog[j])
@@ -170,7 +171,7 @@ def _pairs(
     crossing[np.minimum(*apart) > tolerances.pole_difference_deg] = np.nan
     if isinstance(acquisition.batch.a_priori, BoresightPrior):
         crossing[:] = np.nan
-    return Pairs(
+    return PairEvidence(
         np.full(len(i), batch),
         angle_between_deg(observed[i], observed[j]) - between,
         np.abs(apart[0] - apart[1]),
@@ -178,10 +179,10 @@ def _pairs(
     )
 
 
-def _alone(
+def _tracker_attitude(
     acquisition: Acquisition, result: TrackerResult, used: npt.NDArray[np.bool_]
 ) -> AttitudeSolution | None:
-    """The attitude of one tracker's stars alone, whatever the other trackers say."""
+    """The attitude of one tracker's stars alone, independent of the other trackers."""
     solved = attitude_of(
         result.corrected.direction_body,
         result.corrected.sigma_rad,
@@ -189,7 +190,7 @@ def _alone(
         None,
         (result.corrected.tracker.name,),
         acquisition.run_catalog.direction,
-        velocity_to_correct(acquisition.batch),
+        aberration_velocity(acquisition.batch),
         sun_distance_au(acquisition.batch.time),
         "quest",
     )
@@ -201,6 +202,6 @@ def _joined(kind: type[_Columns], parts: Sequence[_Columns]) -> _Columns:
     return kind(**{each.name: _column(each.name, parts) for each in fields(kind)})
 
 
-def _column(name: str, parts: Sequence[Stars] | Sequence[Pairs]) -> npt.NDArray[Any]:
+def _column(name: str, parts: Sequence[StarEvidence] | Sequence[PairEvidence]) -> npt.NDArray[Any]:
     kind = np.int64 if name in ("batch", "tracker") else np.float64
     return np.concatenate([np.empty(0, kind), *(vars(part)[name] for part in parts)])

@@ -3,7 +3,7 @@
 The stars of a batch share its attitude, its time and its luck, so a thousand
 pairs of a hundred batches are not a thousand independent ones.  Every interval
 here counts batches: it is made wider by what the values of one batch have in
-common (Kish's design effect, or a sandwich covariance summed over batches).
+common (Kish's design effect, or a sandwich covariance trial_of over batches).
 """
 
 import math
@@ -101,11 +101,11 @@ def median(values: Vector, confidence: float = 0.95) -> Interval:
     return Interval(at, float(ordered[k - 1]), float(ordered[n - k]))
 
 
-def fitted(design: Vector, values: Vector, cluster: Clusters) -> tuple[Vector, Vector]:
+def robust_fit(design: Vector, values: Vector, cluster: Clusters) -> tuple[Vector, Vector]:
     """Coefficients (p,) of a robust linear fit and their covariance (p, p).
 
     Huber's M-estimate of values (n,) on the design (n, p) by reweighted least
-    squares; the covariance is the sandwich summed over clusters (n,).
+    squares; the covariance is the sandwich trial_of over clusters (n,).
     """
     beta = _least_squares(design, values)
     weight = np.ones(len(values))

@@ -1,4 +1,4 @@
-"""The advice as it is sent and printed: plain values for JSON, and a text for a terminal."""
+"""Advice as plain values for JSON, and as text for a terminal."""
 
 import math
 import textwrap
@@ -7,27 +7,27 @@ from typing import Any
 
 from service.advice.advice import Advice
 from service.advice.intervals import Interval
-from service.advice.tried import Tried
-from service.advice.words import (
-    Said,
-    said_of_alignment,
-    said_of_groups,
-    said_of_magnitudes,
-    said_of_noise,
-    said_of_tolerance,
+from service.advice.statements import (
+    Statement,
+    alignment_statement,
+    group_statements,
+    magnitude_statement,
+    noise_statement,
+    tolerance_statement,
 )
+from service.advice.trials import Trial
 
 Row = dict[str, Any]
 WIDTH = 96
 
 
-def as_row(advice: Advice) -> Row:
-    """The advice ready for JSON: findings with figures and words, what was tried, the changes."""
-    tolerances = [(each, said_of_tolerance(each, advice)) for each in advice.tolerances]
-    noise = [(each, said_of_noise(each)) for each in advice.noise]
-    magnitudes = [(each, said_of_magnitudes(each, advice)) for each in advice.magnitudes]
-    alignment = [(each, said_of_alignment(each)) for each in advice.alignment]
-    said = [each for pairs in (tolerances, noise, magnitudes, alignment) for _, each in pairs]
+def advice_record(advice: Advice) -> Row:
+    """The advice ready for JSON: findings with figures and words, the trials, the changes."""
+    tolerances = [(each, tolerance_statement(each, advice)) for each in advice.tolerances]
+    noise = [(each, noise_statement(each)) for each in advice.noise]
+    magnitudes = [(each, magnitude_statement(each, advice)) for each in advice.magnitudes]
+    alignment = [(each, alignment_statement(each)) for each in advice.alignment]
+    statements = [each for pairs in (tolerances, noise, magnitudes, alignment) for _, each in pairs]
     return {
         "mission": advice.mission.digest,
         "identifier": advice.mission.identifier,
@@ -35,7 +35,7 @@ def as_row(advice: Advice) -> Row:
         "batches_identified": advice.identified,
         "batches_refused": advice.refused,
         "refusal": advice.refusal,
-        "groups": [_words(each) for each in said_of_groups(advice)],
+        "groups": [_words(each) for each in group_statements(advice)],
         "tolerances": [
             {
                 "tolerance": each.tolerance.name,
@@ -92,15 +92,15 @@ def as_row(advice: Advice) -> Row:
             }
             for each, words in alignment
         ],
-        "tried": [_tried(each) for each in advice.tried],
-        "changes": _changes(said),
+        "tried": [_trial_record(each) for each in advice.trials],
+        "changes": _changes(statements),
     }
 
 
-def _changes(said: Iterable[Said]) -> list[Row]:
+def _changes(statements: Iterable[Statement]) -> list[Row]:
     """The lines to write, a key of a table once: trackers may share one."""
     lines: dict[tuple[str, str | None, str], Row] = {}
-    for change in (change for each in said for change in each.changes):
+    for change in (change for each in statements for change in each.changes):
         key = change.table, change.tracker, change.line.partition(" = ")[0]
         lines.setdefault(
             key, {"table": change.table, "tracker": change.tracker, "line": change.line}
@@ -108,8 +108,8 @@ def _changes(said: Iterable[Said]) -> list[Row]:
     return list(lines.values())
 
 
-def _words(said: Said) -> Row:
-    return {"action": said.action, "text": said.text}
+def _words(statement: Statement) -> Row:
+    return {"action": statement.action, "text": statement.text}
 
 
 def _interval(found: Interval | None) -> Row | None:
@@ -120,7 +120,7 @@ def _interval(found: Interval | None) -> Row | None:
     return {name: part if math.isfinite(part) else None for name, part in parts.items()}
 
 
-def _tried(each: Tried) -> Row:
+def _trial_record(each: Trial) -> Row:
     return {
         "name": each.variant.name,
         "identifier": each.variant.identifier,
@@ -130,7 +130,7 @@ def _tried(each: Tried) -> Row:
         "unique": each.unique,
         "ambiguous": each.ambiguous,
         "unmatched": each.unmatched,
-        "named_otherwise": each.otherwise,
+        "named_otherwise": each.other_star,
         "change_points": _interval(each.change),
     }
 
@@ -138,8 +138,8 @@ def _tried(each: Tried) -> Row:
 # ---- for a terminal --------------------------------------------------------------------------
 
 
-def as_text(row: Mapping[str, Any]) -> str:
-    """The advice for people: sentences, a table of what was tried, the lines to change."""
+def advice_text(row: Mapping[str, Any]) -> str:
+    """The advice for people: sentences, a table of trials, the lines to change."""
     lines = [*_heading(row), ""]
     for title, kind in (
         ("Groups of stars", "groups"),
@@ -157,9 +157,9 @@ def as_text(row: Mapping[str, Any]) -> str:
 def _heading(row: Mapping[str, Any]) -> list[str]:
     span = f"{row['first']} to {row['last']}" if row["first"] else "no batches"
     lines = [f"Advice for {row['spacecraft']}, run {row['run']}: {span}"]
-    sampled = f"{row['batches_sampled']} of {row['batches_in_range']} batches were looked at"
+    sampled = f"{row['batches_sampled']} of {row['batches_in_range']} batches were examined"
     if row["batches_refused"]:
-        sampled += f"; {row['batches_refused']} could not be run again: {row['refusal']}"
+        sampled += f"; {row['batches_refused']} could not be processed again: {row['refusal']}"
     return [*lines, *textwrap.wrap(sampled + ".", WIDTH)]
 
 
@@ -181,7 +181,7 @@ def _table(tried: Iterable[Mapping[str, Any]]) -> list[str]:
     wide = max(28, *(len(each["name"]) for each in tried))
     heads = "  ".join(("batches", "stars", "ambig. %", "unmat. %", "other"))
     lines = [
-        "What the stars would have come to with other settings",
+        "Outcomes of the stars with other settings",
         f"  {'':<{wide}}  {'':<8}  {heads}",
     ]
     for each in tried:
@@ -191,7 +191,7 @@ def _table(tried: Iterable[Mapping[str, Any]]) -> list[str]:
             f"  {each['observed']:>5}  {100 * each['ambiguous'] / observed:>8.2f}"
             f"  {100 * each['unmatched'] / observed:>8.2f}  {each['named_otherwise']:>5}"
         )
-    return [*lines, "  other: stars named otherwise than by verified identification"]
+    return [*lines, "  other: stars that verified identification names differently"]
 
 
 def changes_text(row: Mapping[str, Any]) -> list[str]:
@@ -213,11 +213,11 @@ def changes_text(row: Mapping[str, Any]) -> list[str]:
 
 
 def no_changes_text(row: Mapping[str, Any]) -> str:
-    """What there is to say where no line of the mission file is to be changed."""
+    """The text shown when no line of the mission file should change."""
     findings = (row[kind] for kind in ("tolerances", "noise", "magnitudes", "alignment"))
     actions = {each["action"] for found in findings for each in found}
     if actions - {"keep", "wait"}:
-        return "No line of the mission file mends what was found: each sentence says what to do."
+        return "No line of the mission file corrects these findings: each sentence says what to do."
     if "wait" in actions:
-        return "Nothing in the mission file is to be changed by what was seen so far."
+        return "The batches so far give no reason to change the mission file."
     return "Nothing in the mission file needs to change."

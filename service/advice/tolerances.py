@@ -22,7 +22,7 @@ from service.vectors import Vector
 KEPT = 0.99
 """The share of true pairs that a tolerance is to let through."""
 MARGIN = 1.2
-"""What is recommended is so many times what is needed: tomorrow may be worse than the sample."""
+"""Factor of the recommended over the needed value: later data may be worse than the sample."""
 WIDE = 4.0
 LEAST_BATCHES = 20
 LEAST_DIFFERENCES = 100
@@ -113,7 +113,7 @@ class ToleranceFinding:
     """What the differences say of one tolerance.
 
     `needed` is the value that lets KEPT of the true pairs pass; `beyond` is the
-    share that the present value loses.  Both are None where nothing was seen.
+    share that the present value loses.  Both are None without data.
     `recommended` is None where there is nothing to recommend.
     """
 
@@ -145,8 +145,8 @@ def _finding(
     now = float(getattr(mission.tolerances, tolerance.name))
     symbol = tolerance.symbol_in_bands if in_band else tolerance.symbol
     differences, batch = tolerance.differences(evidence)
-    seen = np.isfinite(differences)
-    differences, batch = np.abs(differences[seen]), batch[seen]
+    known = np.isfinite(differences)
+    differences, batch = np.abs(differences[known]), batch[known]
     batches = len(np.unique(batch))
     used = tolerance.test is None or bool(getattr(mission.tests, tolerance.test))
     needed = beyond = recommended = None

@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from service.advice.evidence import Evidence, Fit, Stars
-from service.advice.intervals import Interval, fitted, intervals, median, quantile
+from service.advice.evidence import Evidence, StarEvidence, TrackerAttitude
+from service.advice.intervals import Interval, intervals, median, quantile, robust_fit
 from service.missions.mission import Mission, Tracker
 from service.times import Utc
 from service.vectors import (
@@ -101,7 +101,7 @@ def _noise(tracker: Tracker, index: int, evidence: Evidence) -> NoiseFinding:
         return NoiseFinding(tracker.name, tracker.sigma_arcsec, None, len(fits), "no_verdict")
     fits.sort(key=lambda fit: fit.time.tai_ns)
     squared = _squared_noise(fits)
-    latest = _changed(squared)
+    latest = _latest_with_own_noise(squared)
     now, before = squared[-latest:], squared[:-latest]
     sigma = _sigma(now, tracker)
     return NoiseFinding(
@@ -122,7 +122,7 @@ def _sigma(squared: Vector, tracker: Tracker) -> Interval:
     return Interval(*map(math.sqrt, bounds)).scaled(tracker.sigma_arcsec)
 
 
-def _changed(squared: Vector) -> int:
+def _latest_with_own_noise(squared: Vector) -> int:
     """How many of the latest batches show another noise than those before; all if none do.
 
     The fewest that do so with certainty: of a noise that grows all the time they
@@ -140,7 +140,7 @@ def _changed(squared: Vector) -> int:
     return count
 
 
-def _squared_noise(fits: list[Fit]) -> Vector:
+def _squared_noise(fits: list[TrackerAttitude]) -> Vector:
     """One estimate a fit of the squared noise, in units of the stars' sigmas."""
     from scipy.stats import chi2
 
@@ -165,7 +165,7 @@ def magnitude_findings(mission: Mission, evidence: Evidence) -> list[MagnitudeFi
     ]
 
 
-def _magnitudes(tracker: Tracker, index: int, stars: Stars) -> MagnitudeFinding:
+def _magnitudes(tracker: Tracker, index: int, stars: StarEvidence) -> MagnitudeFinding:
     own = (stars.tracker == index) & np.isfinite(stars.observed_mag)
     observed, catalog, batch = stars.observed_mag[own], stars.catalog_mag[own], stars.batch[own]
     count = int(own.sum())
@@ -184,7 +184,7 @@ def _magnitudes(tracker: Tracker, index: int, stars: Stars) -> MagnitudeFinding:
         )
     pivot = float(np.median(catalog))
     design = np.stack([np.ones(count), catalog - pivot], axis=1)
-    beta, covariance = fitted(design, observed - catalog, batch)
+    beta, covariance = robust_fit(design, observed - catalog, batch)
     offset, slope = intervals(beta, covariance)
     residual = np.abs(observed - catalog - design @ beta)
     # Half of a Gaussian's values lie within 0.6745 sigma.
@@ -224,7 +224,9 @@ def alignment_findings(mission: Mission, evidence: Evidence) -> list[AlignmentFi
     ]
 
 
-def _alignment(first: Tracker, tracker: Tracker, both: list[tuple[Fit, Fit]]) -> AlignmentFinding:
+def _alignment(
+    first: Tracker, tracker: Tracker, both: list[tuple[TrackerAttitude, TrackerAttitude]]
+) -> AlignmentFinding:
     """The rotation e of tracker B's attitude from A's, A_B = exp(-[e x]) A_A, weighed by both.
 
     A tracker whose axes lie turned by e from the mission's gives, through the
@@ -244,7 +246,7 @@ def _alignment(first: Tracker, tracker: Tracker, both: list[tuple[Fit, Fit]]) ->
     root, errors = np.stack(whiten), np.stack(turned)
     cluster = np.repeat(np.arange(len(both)), 3)
     values = np.einsum("nij,nj->ni", root, errors).ravel()
-    beta, covariance = fitted(root.reshape(-1, 3), values, cluster)
+    beta, covariance = robust_fit(root.reshape(-1, 3), values, cluster)
     certain = float(beta @ np.linalg.solve(covariance, beta)) > CERTAIN_CHI2
     x, y, z = intervals(beta, covariance)
     axes = rotate_about(beta / ARCSEC_PER_RADIAN, tracker.body_from_tracker.T)

@@ -1,1 +1,1 @@
-"""WHEN TO CALL SOMEBODY: the quantities that are watched, their limits, and how alarms live."""
+"""Alarms: the monitored quantities, their limits, and the states of an alarm."""

@@ -1,28 +1,24 @@
-"""Limits: the bounds of a quantity by severity, and how a value is held against them.
+"""Limits: the bounds of a quantity by severity, and how a value is evaluated against them.
 
-The judged value is taken over the latest `minimum_count` batches together.  It
-is out of a bound when it lies beyond it, and stays out until it has come back
-by `hysteresis`.  Only what has been out for `duration_s` of batch time counts.
+The value is taken over the latest `minimum_count` batches together.  It is out
+of a bound when it lies beyond it, and stays out until it has come back by
+`hysteresis`.  It counts only once it has been out for `duration_s` of batch time.
 """
 
 import math
-from collections.abc import Mapping
 from enum import IntEnum
 from functools import cached_property
 from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, model_validator
 
-from service.alarms.quantities import QUANTITIES, QuantityName
-from service.missions.mission import Band, Mission
-
 MAX_COUNT = 200
-"""Batches that a value is taken over: each is kept with the watch, and written with every batch."""
+"""Most batches that a value is taken over: the samples are written with every batch."""
 LONGEST_S = 7 * 86400.0
 
 
 class Severity(IntEnum):
-    """How bad it is; the worst is the greatest."""
+    """The severity of an alarm; the worst is the greatest."""
 
     WATCH = 1
     WARNING = 2
@@ -39,7 +35,7 @@ class _Strict(BaseModel):
 
 
 class Bounds(_Strict):
-    """Below `low` or above `high` is out; null is no bound."""
+    """A value below `low` or above `high` is out of limits; null: no bound."""
 
     low: float | None = None
     high: float | None = None
@@ -59,15 +55,20 @@ class LimitSettings(_Strict):
     warning: Bounds = Bounds()
     critical: Bounds = Bounds()
     hysteresis: Annotated[
-        float, Field(ge=0, description="How far inside a bound the value must come to be back.")
+        float,
+        Field(ge=0, description="How far inside a bound the value must return."),
     ] = 0.0
     minimum_count: Annotated[
         int,
-        Field(ge=1, le=MAX_COUNT, description="Batches that are judged together; before, none is."),
+        Field(
+            ge=1,
+            le=MAX_COUNT,
+            description="Batches that are evaluated together; before that, none is.",
+        ),
     ] = 20
     duration_s: Annotated[
         float,
-        Field(ge=0, le=LONGEST_S, description="Of batch time, for which it must have been out."),
+        Field(ge=0, le=LONGEST_S, description="Batch time for which the value must have been out."),
     ] = 60.0
 
     @model_validator(mode="after")
@@ -106,13 +107,13 @@ class LimitSettings(_Strict):
         )
 
     @cached_property
-    def calm(self) -> tuple[float, float]:
-        """The least and the greatest value that is out of no bound; infinite without one."""
+    def inner_bounds(self) -> tuple[float, float]:
+        """The least and the greatest value within every bound; infinite where there is none."""
         lows, highs = ([level[k] for level in self._levels] for k in (1, 2))
         return max(lows, default=-math.inf), min(highs, default=math.inf)
 
-    def passed(self, value: float) -> list[Severity]:
-        """The severities whose bounds a value is out of that was in them so far, worst last."""
+    def severities_out(self, value: float) -> list[Severity]:
+        """The severities whose bounds a value leaves that was within them so far, worst last."""
         return [s for s, low, high in self._levels if value < low or value > high]
 
     def beyond(self, severity: Severity, value: float) -> float:
@@ -129,52 +130,15 @@ class LimitSettings(_Strict):
         return min(middle, key=lambda each: abs(value - each))
 
 
-LIMITED: tuple[QuantityName, ...] = tuple(
-    name
-    for name, each in QUANTITIES.items()
-    if each.of != "rate" and name != "predicted_rms_arcsec"
-)
-"""Quantities that limits can be set for."""
-
-
-def default_limits(mission: Mission) -> Mapping[QuantityName, LimitSettings]:
-    """The limits that hold for a mission until others are set (docs/alarms.md gives reasons)."""
-    margin_deg = a_priori_margin_deg(mission)
-    return {
-        "ambiguous_share": _above(0.15, 0.25, 0.5, hysteresis=0.03),
-        "unmatched_share": _above(0.15, 0.25, 0.5, hysteresis=0.03),
-        "no_attitude_share": _above(0.1, 0.25, 0.5, hysteresis=0.03),
-        "suspect_share": _above(0.1, 0.25, 0.5, hysteresis=0.03),
-        # What is normal depends on the tracker; the ratio below knows it.
-        "residual_rms_arcsec": LimitSettings(),
-        "residual_ratio": _above(1.5, 2.0, 3.0, hysteresis=0.1),
-        "magnitude_offset_mag": _about_zero(0.2, 0.35, 0.6, hysteresis=0.03),
-        "a_priori_angle_deg": _above(
-            0.8 * margin_deg,
-            1.0 * margin_deg,
-            1.3 * margin_deg,
-            hysteresis=0.03 * margin_deg,
-            minimum_count=5,
-        ),
-        "silence_s": _above(None, 3600.0, 6 * 3600.0, minimum_count=1, duration_s=0.0),
-    }
-
-
-def a_priori_margin_deg(mission: Mission) -> float:
-    """How far the a priori attitude may be off before the field of view leaves the zone."""
-    zone = mission.zone
-    half_width_deg = zone.half_width_deg if isinstance(zone, Band) else zone.radius_deg
-    widest_deg = max(each.field_of_view_radius_deg for each in mission.trackers)
-    return max(half_width_deg - widest_deg, 0.1 * half_width_deg)
-
-
-def _above(watch: float | None, warning: float, critical: float, **others: float) -> LimitSettings:
+def above(watch: float | None, warning: float, critical: float, **others: float) -> LimitSettings:
+    """Upper bounds alone; `others` are further settings by name."""
     highs = {"watch": watch, "warning": warning, "critical": critical}
     bounds = {name: {"high": high} for name, high in highs.items()}
     return LimitSettings.model_validate(bounds | others)
 
 
-def _about_zero(watch: float, warning: float, critical: float, hysteresis: float) -> LimitSettings:
+def about_zero(watch: float, warning: float, critical: float, hysteresis: float) -> LimitSettings:
+    """Bounds of these sizes on both sides of zero."""
     sizes = {"watch": watch, "warning": warning, "critical": critical}
     bounds = {name: {"low": -size, "high": size} for name, size in sizes.items()}
     return LimitSettings.model_validate(bounds | {"hysteresis": hysteresis})

@@ -1,50 +1,308 @@
-"""What is watched of a spacecraft: each quantity with its unit and what it is made of."""
+"""The registry of quantities: what trends show, limits apply to and batches are ranked by.
 
-from collections.abc import Mapping
+Every list of quantities is derived from `QUANTITIES`: the columns of the tables
+and rollups, histories, limits, the ranking, query parameters and the OpenAPI
+document, the labels of the console, and the columns of CSV files.
+
+A quantity that is derived from the counts of stars and batches is one entry
+here.  One that is measured anew (`Measured`) needs a migration as well: a column
+of its name in `results`; and for `rolled_up`, of a share or a value, the columns
+`_min` and `_max` in both rollups, of a value also `_n` and `_sum`.  Results that
+were recorded before it have no value of it.
+"""
+
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from operator import itemgetter
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-QuantityName = Literal[
-    "ambiguous_share",
-    "unmatched_share",
-    "no_attitude_share",
-    "suspect_share",
-    "residual_rms_arcsec",
-    "predicted_rms_arcsec",
-    "residual_ratio",
-    "magnitude_offset_mag",
-    "a_priori_angle_deg",
-    "batches_per_hour",
-    "silence_s",
-]
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic_core import CoreSchema, PydanticKnownError, core_schema
+
+from service.alarms import measurements
+from service.alarms.limits import LimitSettings, about_zero, above
+from service.alarms.window import Sample
+from service.missions.mission import Band, Mission
+
+if TYPE_CHECKING:
+    from service.acquire import Acquisition
+
+Counts = Mapping[str, Any]
+"""`batches`, `observed`, `unique`, `ambiguous`, `unmatched`, `solved`, `suspect`: the counts of
+one result, columns of a rollup, or SQL."""
+
+
+@dataclass(frozen=True)
+class StarShare:
+    """A share of the observed stars; `part` gives the stars from counts."""
+
+    part: Callable[[Counts], Any]
+
+
+@dataclass(frozen=True)
+class BatchShare:
+    """A share of the batches; `part` gives the batches from counts, 0 or 1 for one batch."""
+
+    part: Callable[[Counts], Any]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A value that is measured as a result is recorded and stored in a column of its own."""
+
+    measure: Callable[["Acquisition"], float | None]
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """The ratio of two measured quantities, by their names; None where either is missing."""
+
+    numerator: str
+    denominator: str
+
+
+@dataclass(frozen=True)
+class Rate:
+    """Batches in an hour of batch time."""
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Time without a batch; it has no history."""
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """One quantity: `of` says what one batch adds, a share of counts or a value of its own."""
+    """One quantity with all that derives from it."""
 
+    name: str
     unit: str
-    of: Literal["stars", "batches", "value", "rate", "gap"]
-    meaning: str
+    label: str
+    """As pages show it."""
+    source: StarShare | BatchShare | Measured | Ratio | Rate | Gap
+    limits: Callable[[Mission], LimitSettings] | None = None
+    """The limits of a mission until others are set; None: limits do not apply."""
+    worse: Literal["high", "size"] = "high"
+    """Whether a greater value is worse, or one further from zero."""
+    description: str = ""
+    """Of its value in `measures`, in the OpenAPI document."""
+    rolled_up: bool = False
+    """Whether the rollups have columns of it.  Without, buckets have no extremes of a share of
+    stars, and no values of a ratio; and batches are not ranked by it."""
+
+    @property
+    def is_share(self) -> bool:
+        """Whether it is a share, which pages show in percent."""
+        return isinstance(self.source, StarShare | BatchShare)
+
+    @property
+    def value_of(self) -> Callable[[Mapping[str, Any]], float | None]:
+        """The function that gives the value of one result, a row; None where it has none."""
+        match self.source:
+            case Measured():
+                return itemgetter(self.name)
+            case Ratio(numerator, denominator):
+                return lambda row: _over(row[numerator], row[denominator])
+            case StarShare(part):
+                return lambda row: _over(part(row), row["observed"])
+            case BatchShare(part):
+                return lambda row: float(part(counts_of(row)))
+            case _:
+                return lambda row: None
+
+    def sample_of(self, result: Mapping[str, Any]) -> Sample | None:
+        """What one result adds to the value that limits are evaluated for; None: nothing."""
+        match self.source:
+            case StarShare(part):
+                whole = result["observed"]
+                return (result["time_ns"], part(result), whole) if whole else None
+            case BatchShare(part):
+                return result["time_ns"], part(counts_of(result)), 1
+            case _:
+                value = self.value_of(result)
+                return None if value is None else (result["time_ns"], value, 1)
 
 
-QUANTITIES: Mapping[QuantityName, Quantity] = {
-    "ambiguous_share": Quantity("1", "stars", "ambiguous of all observed stars"),
-    "unmatched_share": Quantity("1", "stars", "unmatched of all observed stars"),
-    "no_attitude_share": Quantity("1", "batches", "batches without an attitude"),
-    "suspect_share": Quantity("1", "batches", "batches whose attitude is suspect"),
-    "residual_rms_arcsec": Quantity("arcsec", "value", "rms of the attitude's residuals"),
-    "predicted_rms_arcsec": Quantity("arcsec", "value", "what its covariance predicts of it"),
-    "residual_ratio": Quantity("1", "value", "residual rms over predicted"),
-    "magnitude_offset_mag": Quantity("mag", "value", "observed less catalog, unique stars"),
-    "a_priori_angle_deg": Quantity("deg", "value", "from the a priori attitude to the one found"),
-    "batches_per_hour": Quantity("1/h", "rate", "batches in an hour of their own time"),
-    "silence_s": Quantity("s", "gap", "since the latest batch"),
+def counts_of(result: Mapping[str, Any]) -> dict[str, int]:
+    """The counts of one result, as a rollup of it has them."""
+    stars = {name: result[name] for name in ("observed", "unique", "ambiguous", "unmatched")}
+    solved, suspect = result["status"] is not None, result["status"] == "suspect"
+    return {"batches": 1, **stars, "solved": int(solved), "suspect": int(suspect)}
+
+
+def a_priori_margin_deg(mission: Mission) -> float:
+    """How far the a priori attitude may be off before the field of view leaves the zone."""
+    zone = mission.zone
+    half_width_deg = zone.half_width_deg if isinstance(zone, Band) else zone.radius_deg
+    widest_deg = max(each.field_of_view_radius_deg for each in mission.trackers)
+    return max(half_width_deg - widest_deg, 0.1 * half_width_deg)
+
+
+def _a_priori_limits(mission: Mission) -> LimitSettings:
+    margin_deg = a_priori_margin_deg(mission)
+    bounds_deg = (0.8 * margin_deg, 1.0 * margin_deg, 1.3 * margin_deg)
+    return above(*bounds_deg, hysteresis=0.03 * margin_deg, minimum_count=5)
+
+
+def _over(part: float | None, whole: float | None) -> float | None:
+    return None if part is None or not whole else float(part / whole)
+
+
+SILENCE = "silence_s"
+QUANTITIES: dict[str, Quantity] = {
+    each.name: each
+    for each in (
+        Quantity(
+            "ambiguous_share",
+            "1",
+            "ambiguous stars",
+            StarShare(itemgetter("ambiguous")),
+            lambda mission: above(0.15, 0.25, 0.5, hysteresis=0.03),
+            rolled_up=True,
+        ),
+        Quantity(
+            "unmatched_share",
+            "1",
+            "unmatched stars",
+            StarShare(itemgetter("unmatched")),
+            lambda mission: above(0.15, 0.25, 0.5, hysteresis=0.03),
+            rolled_up=True,
+        ),
+        Quantity(
+            "no_attitude_share",
+            "1",
+            "batches without attitude",
+            BatchShare(lambda counts: counts["batches"] - counts["solved"]),
+            lambda mission: above(0.1, 0.25, 0.5, hysteresis=0.03),
+        ),
+        Quantity(
+            "suspect_share",
+            "1",
+            "batches with a suspect attitude",
+            BatchShare(itemgetter("suspect")),
+            lambda mission: above(0.1, 0.25, 0.5, hysteresis=0.03),
+        ),
+        Quantity(
+            "residual_rms_arcsec",
+            "arcsec",
+            "residual rms",
+            Measured(measurements.residual_rms_arcsec),
+            # The normal value depends on the tracker; the ratio below takes that into account.
+            lambda mission: LimitSettings(),
+            rolled_up=True,
+        ),
+        Quantity(
+            "predicted_rms_arcsec",
+            "arcsec",
+            "predicted residual rms",
+            Measured(measurements.predicted_rms_arcsec),
+            rolled_up=True,
+        ),
+        Quantity(
+            "residual_ratio",
+            "1",
+            "residual over predicted",
+            Ratio("residual_rms_arcsec", "predicted_rms_arcsec"),
+            lambda mission: above(1.5, 2.0, 3.0, hysteresis=0.1),
+            description="Residual rms divided by the predicted rms; about 1.",
+            rolled_up=True,
+        ),
+        Quantity(
+            "magnitude_offset_mag",
+            "mag",
+            "magnitude offset",
+            Measured(measurements.magnitude_offset_mag),
+            lambda mission: about_zero(0.2, 0.35, 0.6, hysteresis=0.03),
+            worse="size",
+            description="Observed minus catalog magnitude, mean over the unique stars.",
+            rolled_up=True,
+        ),
+        Quantity(
+            "a_priori_angle_deg",
+            "deg",
+            "angle from the a priori attitude",
+            Measured(measurements.a_priori_angle_deg),
+            _a_priori_limits,
+            description="Angle from the a priori attitude to the found one; without a priori roll, "
+            "from the a priori boresight or pole.",
+            rolled_up=True,
+        ),
+        Quantity("batches_per_hour", "1/h", "batches per hour", Rate()),
+        Quantity(
+            SILENCE,
+            "s",
+            "silence",
+            Gap(),
+            lambda mission: above(None, 3600.0, 6 * 3600.0, minimum_count=1, duration_s=0.0),
+        ),
+    )
 }
 
-TRENDS: tuple[QuantityName, ...] = tuple(n for n, q in QUANTITIES.items() if q.of != "gap")
-"""Quantities with a history."""
-OF_A_BATCH: tuple[QuantityName, ...] = tuple(
-    n for n, q in QUANTITIES.items() if q.of in ("stars", "value")
-)
-"""Quantities by which one batch is worse than another."""
+
+def quantity_named(name: str) -> Quantity:
+    """The quantity of a stored alarm, which may be registered no longer: then its name is known."""
+    return QUANTITIES.get(name) or Quantity(name, "", name.replace("_", " "), Gap())
+
+
+def names() -> tuple[str, ...]:
+    """Every quantity."""
+    return tuple(QUANTITIES)
+
+
+def trend_names() -> tuple[str, ...]:
+    """The quantities that have a history."""
+    return _names(lambda each: not isinstance(each.source, Gap))
+
+
+def limited_names() -> tuple[str, ...]:
+    """The quantities that limits apply to."""
+    return _names(lambda each: each.limits is not None)
+
+
+def ranked_names() -> tuple[str, ...]:
+    """The quantities that batches are ranked by."""
+    return _names(lambda each: each.rolled_up)
+
+
+def value_names() -> tuple[str, ...]:
+    """The quantities that are values of one batch: measured, or the ratio of such."""
+    return _names(lambda each: isinstance(each.source, Measured | Ratio))
+
+
+def default_limits(mission: Mission) -> dict[str, LimitSettings]:
+    """The limits of a mission until others are set (docs/alarms.md gives reasons)."""
+    return {name: each.limits(mission) for name, each in QUANTITIES.items() if each.limits}
+
+
+def _names(chosen: Callable[[Quantity], bool]) -> tuple[str, ...]:
+    return tuple(name for name, each in QUANTITIES.items() if chosen(each))
+
+
+@dataclass(frozen=True)
+class OneOf:
+    """Validates a name against the registry as it is when the name is validated."""
+
+    names: Callable[[], tuple[str, ...]]
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        """A text that is one of the names."""
+        return core_schema.no_info_after_validator_function(self._check, handler(source))
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        """An enumeration, as for a `Literal`."""
+        return {"enum": list(self.names()), "type": "string"}
+
+    def _check(self, name: str) -> str:
+        known = self.names()
+        if name not in known:
+            *first, last = (repr(each) for each in known)
+            raise PydanticKnownError("literal_error", {"expected": f"{', '.join(first)} or {last}"})
+        return name
+
+
+QuantityName = Annotated[str, OneOf(names)]
+RankedName = Annotated[str, OneOf(ranked_names)]

@@ -1,7 +1,7 @@
-"""The latest values of one quantity, judged together: out of limits, for how long, how badly.
+"""The latest values of one quantity, evaluated together: out of limits, how long, how badly.
 
-The latest are those of the latest batch times, whatever the order they came in:
-a batch that comes late takes its place among them, or none if it is older.
+The latest are those of the latest batch times, in whatever order they arrived:
+a batch that comes late is inserted in order of time, or left out if it is older.
 """
 
 from bisect import insort
@@ -19,12 +19,12 @@ SLACK = 1e-9
 """Of the largest part: far more than sums in another order differ by."""
 
 
-Moment = tuple[str, str | None]
+BatchRef = tuple[str, str | None]
 """The time and the id of a batch."""
 
 
 class Point(NamedTuple):
-    """A judged value, with the time and the batch that it is of."""
+    """An evaluated value, with the time and the id of its batch."""
 
     value: float
     time: str
@@ -32,10 +32,10 @@ class Point(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Judged:
-    """What the latest values amount to: the value, and how bad it is, None: in limits.
+class Evaluated:
+    """The value over the latest batches and its severity, None within limits.
 
-    `worst` is the value furthest beyond the bounds of that severity since it is out of them.
+    `worst` is the value furthest beyond the bounds of that severity since it left them.
     """
 
     value: float
@@ -51,64 +51,63 @@ class Window:
     since_ns: dict[Severity, int] = field(default_factory=dict)
     worst: dict[Severity, Point] = field(default_factory=dict)
     """The value furthest beyond each limit that they are out of, since then."""
-    _calm: LimitSettings | None = field(default=None, compare=False, repr=False)
-    """The limits that each of the samples is known to be in by itself."""
+    _known_within: LimitSettings | None = field(default=None, compare=False, repr=False)
+    """The limits that every sample is known to be within by itself."""
 
     def add(
-        self, sample: Sample, limits: LimitSettings, moment: Moment = ("", None)
-    ) -> Judged | None:
-        """Take one batch's part and judge the latest; None while there are too few of them.
+        self, sample: Sample, limits: LimitSettings, latest: BatchRef = ("", None)
+    ) -> Evaluated | None:
+        """Add one batch's sample and evaluate the latest; None while there are too few.
 
-        `moment` is that of the batch of the latest time, this one included.
+        `latest` names the batch of the latest time, this one included.
         """
-        self._calm = None
+        self._known_within = None
         insort(self.samples, sample)
         del self.samples[: -limits.minimum_count]
         value = self.value(limits)
         if value is None:
             return None
-        severity = self.judge(Point(value, *moment), self.samples[-1][0], limits)
-        return Judged(value, severity, None if severity is None else self.worst[severity])
+        severity = self.severity_at(Point(value, *latest), self.samples[-1][0], limits)
+        return Evaluated(value, severity, None if severity is None else self.worst[severity])
 
     def value(self, limits: LimitSettings) -> float | None:
-        """What the latest amount to; None while there are too few of them."""
+        """The value over the latest samples; None while there are too few."""
         if len(self.samples) < limits.minimum_count:
             return None
         _, parts, wholes = zip(*self.samples, strict=True)
         return float(sum(parts) / sum(wholes))
 
-    def pass_over(self, samples: Sequence[Sample], limits: LimitSettings) -> bool:
-        """Take many batches' parts at once, if none of them could change how bad it is.
+    def add_if_within(self, samples: Sequence[Sample], limits: LimitSettings) -> bool:
+        """Add many samples at once, if none of them could change the severity.
 
-        True: what `add` makes of them one after the other is in limits each time,
-        and was before.  False: nothing is taken, and they must be added one by one.
+        True: `add` for one after the other would be within limits each time, as the
+        window was before.  False: nothing is added, and they must be added one by one.
         """
         if self.since_ns:
             return False
         count = limits.minimum_count
-        if self._calm is limits and _each_within(samples, limits):
+        if self._known_within is limits and _each_within(samples, limits):
             self.samples = sorted([*self.samples, *samples])[-count:]
             return True
         if len(self.samples) >= count:
-            # What is older than all that is judged takes no place.
+            # A sample older than the whole window is not part of it.
             samples = [each for each in samples if each > self.samples[0]]
         taken = [*self.samples, *samples]
         in_order = sorted(taken)
         # In whatever order they come, a mean lies between the least and the greatest.
         each_within = _each_within(taken, limits)
-        calm = each_within or (
-            taken == in_order
-            and _all_within(_judged_values(taken, count, len(self.samples)), limits)
+        within = each_within or (
+            taken == in_order and _all_within(_means(taken, count, len(self.samples)), limits)
         )
-        if calm:
+        if within:
             self.samples = in_order[-count:]
-            self._calm = limits if each_within else None
-        return calm
+            self._known_within = limits if each_within else None
+        return within
 
-    def judge(self, point: Point, time_ns: int, limits: LimitSettings) -> Severity | None:
-        """The worst severity whose bound the value has been out of for long enough."""
+    def severity_at(self, point: Point, time_ns: int, limits: LimitSettings) -> Severity | None:
+        """The worst severity whose bounds the value has been out of for `duration_s`."""
         worst = None
-        for severity in Severity if self.since_ns else limits.passed(point.value):
+        for severity in Severity if self.since_ns else limits.severities_out(point.value):
             if not limits.out(severity, point.value, self._was_out(severity, limits)):
                 self.since_ns.pop(severity, None)
                 self.worst.pop(severity, None)
@@ -155,12 +154,12 @@ def _each_within(samples: Sequence[Sample], limits: LimitSettings) -> bool:
 
 
 def _all_within(values: Sequence[float], limits: LimitSettings) -> bool:
-    low, high = limits.calm
+    low, high = limits.inner_bounds
     return not values or (low <= min(values) and max(values) <= high)
 
 
-def _judged_values(samples: Sequence[Sample], count: int, known: int) -> list[float]:
-    """The means over the latest `count`, after each sample beyond the `known` ones and before.
+def _means(samples: Sequence[Sample], count: int, known: int) -> list[float]:
+    """The mean over the latest `count` after each sample beyond the `known` ones.
 
     The least and the greatest are widened: as differences of sums from the start
     they may differ in the last digits from sums of their own.

@@ -1,1 +1,1 @@
-"""WHERE WE POINT: matched vectors to an attitude with its covariance."""
+"""Attitude determination: TRIAD and QUEST from matched vectors, with covariance."""

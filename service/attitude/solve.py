@@ -11,9 +11,9 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from service.attitude import kernels
+from service.attitude.kernels import QUEST, TASTE, TRIAD, FitWorkspace, fit_attitude
 from service.attitude.solution import AttitudeSolution, NoAttitude, TrackerFit
-from service.vectors import Matrix, Vector, matrix_from_quaternion
+from service.vectors import Vector, matrix_from_quaternion
 
 WORST_AXIS_DEG = 1.0
 WORST_AXIS_RAD = math.radians(WORST_AXIS_DEG)
@@ -22,6 +22,7 @@ SUSPECT_TAIL = 0.001
 ODDS_OF_TWO = 100.0
 """Of two trackers one is named only where the other alone fits so many times likelier."""
 METHODS = ("triad", "quest")
+"""By their rows in the quaternions of a fit."""
 
 
 def solve_attitude(
@@ -42,54 +43,49 @@ def solve_attitude(
     n = len(observed)
     if n < 2:
         return NoAttitude.FEWER_THAN_TWO_UNIQUE_STARS
-    room = room_to_fit(n)
+    workspace = fit_workspace(n)
     chosen = METHODS.index(method)
-    if not kernels.fit(observed, reference, sigma_rad, WORST_AXIS_RAD, chosen, *room):
+    if not fit_attitude(observed, reference, sigma_rad, WORST_AXIS_RAD, chosen, workspace):
         return NoAttitude.DEGENERATE_GEOMETRY
     fits: tuple[TrackerFit, ...] = ()
     if len(trackers) > 1:
-        suspect = is_suspect(room[0], n)
-        fits = tracker_fits(observed, reference, sigma_rad, room[0], suspect, tracker_of, trackers)
-    return solution_of(*room, n, method, fits)
+        fits = tracker_fits(observed, reference, sigma_rad, workspace, tracker_of, trackers)
+    return solution_of(workspace, n, method, fits)
 
 
-def room_to_fit(n: int) -> tuple[Vector, Matrix, Vector]:
-    """What `kernels.fit` writes to: quaternions, matrices and the residuals of n vectors."""
-    return np.empty((3, 4)), np.empty((2, 3, 3)), np.empty(n)
-
-
-def is_suspect(quaternions: Vector, matched: int) -> bool:
-    """Whether the TASTE that `kernels.fit` wrote is more than so many vectors explain."""
-    return float(quaternions[2, 2]) > taste_bound(2 * matched - 3)
+def fit_workspace(n: int) -> FitWorkspace:
+    """Room for what `fit_attitude` writes of n vectors."""
+    return FitWorkspace(
+        quaternions=np.empty((3, 4)),
+        attitude=np.empty((3, 3)),
+        covariance_arcsec2=np.empty((3, 3)),
+        residual_arcsec=np.empty(n),
+        figures=np.empty(4),
+    )
 
 
 def solution_of(
-    quaternions: Vector,
-    matrices: Matrix,
-    residual_arcsec: Vector,
-    matched: int,
-    method: str,
-    fits: tuple[TrackerFit, ...] = (),
+    workspace: FitWorkspace, matched: int, method: str, fits: tuple[TrackerFit, ...] = ()
 ) -> AttitudeSolution:
-    """The solution that `kernels.fit` wrote, of so many matched vectors."""
-    rms_arcsec, predicted_arcsec, taste, apart_arcsec = quaternions[2].tolist()
+    """The solution that `fit_attitude` wrote, of so many matched vectors; its arrays are locked."""
+    rms_arcsec, predicted_arcsec, taste, apart_arcsec = workspace.figures.tolist()
     freedom = 2 * matched - 3
-    for array in (quaternions, matrices, residual_arcsec):
+    for array in workspace:
         array.setflags(write=False)
-    triad, quest = quaternions[0], quaternions[1]
+    quaternions = workspace.quaternions
     return AttitudeSolution(
-        quaternion=triad if method == "triad" else quest,
-        matrix=matrices[0],
+        quaternion=quaternions[METHODS.index(method)],
+        matrix=workspace.attitude,
         method=method,
-        covariance_arcsec2=matrices[1],
-        residual_arcsec=residual_arcsec,
+        covariance_arcsec2=workspace.covariance_arcsec2,
+        residual_arcsec=workspace.residual_arcsec,
         residual_rms_arcsec=rms_arcsec,
         predicted_rms_arcsec=predicted_arcsec,
         taste=taste,
         degrees_of_freedom=freedom,
         suspect=taste > taste_bound(freedom),
-        triad=triad,
-        quest=quest,
+        triad=quaternions[TRIAD],
+        quest=quaternions[QUEST],
         triad_quest_angle_arcsec=apart_arcsec,
         trackers=fits,
     )
@@ -129,19 +125,19 @@ def tracker_fits(
     observed: Vector,
     reference: Vector,
     sigma_rad: Vector,
-    quaternions: Vector,
-    suspect: bool,
+    workspace: FitWorkspace,
     tracker_of: npt.NDArray[np.int64],
     trackers: tuple[str, ...],
 ) -> tuple[TrackerFit, ...]:
     """Each tracker's share of TASTE, and whether it is the one that does not agree.
 
-    `quaternions` (3, 4) is as `kernels.fit` wrote it.
+    The workspace is as `fit_attitude` wrote it.
     """
-    quest = matrix_from_quaternion(quaternions[kernels.QUEST])
+    quest = matrix_from_quaternion(workspace.quaternions[QUEST])
     weighted = np.sum((observed - reference @ quest.T) ** 2, axis=1) / sigma_rad**2
     stars = np.bincount(tracker_of, minlength=len(trackers))
     taste = np.bincount(tracker_of, weights=weighted, minlength=len(trackers))
+    suspect = float(workspace.figures[TASTE]) > taste_bound(2 * len(observed) - 3)
     outlier = _outlier(observed, reference, sigma_rad, tracker_of) if suspect else -1
     return tuple(
         TrackerFit(name, int(stars[i]), float(taste[i]), i == outlier)
@@ -167,9 +163,9 @@ def _outlier(
         tail = 0.0
         if n > 1:
             parts = observed[rest], reference[rest], sigma_rad[rest]
-            room = room_to_fit(n)
-            solved = kernels.fit(*parts, WORST_AXIS_RAD, METHODS.index("quest"), *room)
-            tail = float(chdtrc(2 * n - 3, room[0][2, 2])) if solved else 0.0
+            workspace = fit_workspace(n)
+            solved = fit_attitude(*parts, WORST_AXIS_RAD, QUEST, workspace)
+            tail = float(chdtrc(2 * n - 3, workspace.figures[TASTE])) if solved else 0.0
         tails.append((tail, int(tracker)))
     (second, _), (best, outlier) = sorted(tails)[-2:] if len(tails) > 1 else [(0.0, -1)] * 2
     plain = len(tails) > 2 or best > ODDS_OF_TWO * second

@@ -22,10 +22,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for its usage, configuration or input, or no service to talk to.
     """
     parsed = build_parser().parse_args(arguments)
-    from service.cli import commands
-
     try:
-        code: int = getattr(commands, parsed.command)(parsed)
+        code: int = parsed.function(parsed)
         sys.stdout.flush()
         return code
     except BadInput as error:
@@ -37,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _complain("interrupted")
         return INTERRUPTED
     except BrokenPipeError:
-        # Whoever read the output has seen enough; nothing more may be written to it.
+        # The reader closed the pipe: further output would raise again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:

@@ -6,12 +6,12 @@ from contextlib import contextmanager
 
 from sqlalchemy import Connection
 
+from service.access import audit, tokens
 from service.errors import BadInput, Fault, shown_value
 from service.missions.mission import load_missions, mission_named
-from service.records import audit, tokens
-from service.records.ids import Ulids
-from service.records.store import Store
 from service.settings import Settings
+from service.storage.recording.ids import Ulids
+from service.storage.sql.database import Store
 from service.times import DAY_S, shifted, utc_now
 
 MAX_DAYS = 3660

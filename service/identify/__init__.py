@@ -1,1 +1,1 @@
-"""WHICH IS WHICH: observed stars to catalog stars."""
+"""Identification: which catalog star each observed star is."""

@@ -1,4 +1,4 @@
-"""What an identifier says of the stars of one tracker."""
+"""The result of an identifier: an identity for each star of one tracker."""
 
 from enum import IntEnum
 from functools import lru_cache
@@ -75,7 +75,7 @@ def not_known(n: int) -> Vector:
 
 
 def nothing_known(n: int) -> Identification:
-    """The identification of n stars for which there was nowhere to look: all unmatched."""
+    """The identification of n stars that could not be searched for: all unmatched."""
     return Identification(
         outcome=np.full(n, int(Outcome.UNMATCHED)),
         star=np.full(n, -1),

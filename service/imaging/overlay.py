@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from service.imaging.marks import Mark
+from service.imaging.overlay_marks import Mark
 
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw

@@ -1,4 +1,4 @@
-"""From a frame and what is known of it to the batch that goes down the staircase.
+"""From a frame and what is known of it to the batch that the pipeline processes.
 
 The batch holds all that the answer follows from, so that a what-if needs no frame.
 """
@@ -14,15 +14,15 @@ import numpy as np
 from pydantic import AfterValidator, Field, ValidationError
 
 from service.errors import BadBatch, Fault
-from service.imaging.files import read_frame
-from service.imaging.frame import Frame, FrameLimits, refused, require_light
-from service.imaging.preview import preview_of
-from service.imaging.record import Flag
+from service.imaging.centroids.record import Flag
+from service.imaging.frames.files import read_frame
+from service.imaging.frames.frame import Frame, FrameLimits, refused, require_light
+from service.imaging.frames.preview import preview_of
 from service.missions.camera import Camera, CentroidMethod
 from service.missions.mission import Mission, Tracker
-from service.observe.batch import Aberration
-from service.observe.frame_record import FrameRecord
-from service.observe.wire import (
+from service.observations.batch import Aberration
+from service.observations.frame_record import FrameRecord
+from service.observations.schema import (
     APrioriIn,
     BatchIn,
     Key,
@@ -42,8 +42,8 @@ from service.observe.wire import (
 from service.vectors import Vector
 
 if TYPE_CHECKING:
-    from service.imaging.detect import Detections
-    from service.imaging.measure import MeasuredStar
+    from service.imaging.detection.detect import Detections
+    from service.imaging.detection.measure import MeasuredStar
 
 LEAST_SIGMA_ARCSEC = 1e-3
 BLENDED_SHARE = 0.15
@@ -104,13 +104,13 @@ def submission_of_frame(
     require_light(frame, camera.saturation_counts)
     time = known.time or frame.time
     if time is None:
-        raise BadBatch(Fault("time", "must be given: the file does not tell when it was exposed"))
+        raise BadBatch(Fault("time", "must be given: the file has no time of exposure"))
     if known.exposure_s is not None:
-        frame = _exposed(frame, known.exposure_s)
+        frame = with_exposure(frame, known.exposure_s)
     clock.append(clock_ns())
     # What these import takes a third of the service's start, which no frame may follow.
-    from service.imaging.detect import detect
-    from service.imaging.measure import measure
+    from service.imaging.detection.detect import detect
+    from service.imaging.detection.measure import measure
 
     found = detect(frame, camera)
     clock.append(clock_ns())
@@ -128,7 +128,7 @@ def submission_of_frame(
     used = [star for star in stars if star.left_out is None]
     if not used:
         raise refused("shows no star that could be used", f"{found.count} candidates")
-    model = _batch(mission.name, known, digest, time, tracker, _observed(used, camera))
+    model = batch_of_stars(mission.name, known, digest, time, tracker, _observed(used, camera))
     steps = dict(
         zip(
             ("read", "detect", "centroid"),
@@ -142,13 +142,14 @@ def submission_of_frame(
     return Submission(submission.batch, submission.text, fingerprint, record)
 
 
-def _exposed(frame: Frame, exposure_s: float) -> Frame:
+def with_exposure(frame: Frame, exposure_s: float) -> Frame:
+    """The same frame, exposed for a time that its file does not tell."""
     return Frame(
         frame.counts, frame.file_format, frame.digest, frame.full_scale, frame.time, exposure_s
     )
 
 
-def _batch(
+def batch_of_stars(
     spacecraft: str,
     known: FrameIn,
     digest: str,
@@ -156,6 +157,7 @@ def _batch(
     tracker: Tracker,
     stars: list[dict[str, Any]],
 ) -> BatchIn:
+    """The batch of a tracker's stars, with what is told of their frame."""
     told = json.loads(known.model_dump_json(exclude_defaults=True))
     for name in ("tracker", "exposure_s", "centroid"):
         told.pop(name, None)
@@ -182,7 +184,7 @@ def _observed(stars: "list[MeasuredStar]", camera: Camera) -> list[dict[str, Any
     return [
         {
             "vector": vector,
-            "magnitude": round(star.magnitude_mag, 3),
+            "magnitude": _rounded(star.magnitude_mag, 3),
             "sigma_arcsec": round(max(sigma_arcsec, LEAST_SIGMA_ARCSEC), 4),
         }
         for star, vector, sigma_arcsec in zip(

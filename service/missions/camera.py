@@ -33,6 +33,8 @@ class Camera(Strict):
 
     width_px: int = Field(ge=16, le=MAX_SIDE_PX)
     height_px: int = Field(ge=16, le=MAX_SIDE_PX)
+    calibrated: bool = True
+    """False: focal length and zero point are rough, and are fitted on every frame anew."""
     focal_length_px: float = Field(ge=10, le=1e7)
     center_u_px: float = Field(ge=-MAX_SIDE_PX, le=MAX_SIDE_PX)
     center_v_px: float = Field(ge=-MAX_SIDE_PX, le=MAX_SIDE_PX)
@@ -51,8 +53,8 @@ class Camera(Strict):
     """Of a frame that does not say otherwise."""
     psf_sigma_px: float = Field(ge=0.3, le=20)
     """Of a star's image along each axis, before the pixel integrates it."""
-    zero_point_mag: float = Field(ge=-10, le=40)
-    """Instrument magnitude of a star that gives one count a second."""
+    zero_point_mag: float | None = Field(default=None, ge=-10, le=40)
+    """Instrument magnitude of a star that gives one count a second; without it stars have none."""
     sigma_floor_px: float = Field(default=0.0, ge=0, le=10)
     """What the calibration leaves in a position, per axis, however bright the star."""
     threshold_sigma: float = Field(default=5.0, ge=3, le=100)
@@ -130,13 +132,23 @@ class Camera(Strict):
         return np.asarray(np.sqrt(variance / 2.0) * ARCSEC_PER_RADIAN)
 
     def magnitude(self, flux_counts: Vector, exposure_s: float) -> Vector:
-        """Instrument magnitudes of light summed over an exposure; NaN where there is none."""
+        """Instrument magnitudes of light summed over an exposure; NaN where there is none.
+
+        All are NaN where the zero point is not known.
+        """
+        if self.zero_point_mag is None:
+            return np.full(np.shape(flux_counts), np.nan)
         with np.errstate(divide="ignore", invalid="ignore"):
             light = np.where(flux_counts > 0.0, flux_counts, np.nan) / exposure_s
         return np.asarray(self.zero_point_mag - 2.5 * np.log10(light))
 
     def flux_counts(self, magnitude_mag: Vector, exposure_s: float) -> Vector:
-        """The light, in counts, of a star of an instrument magnitude over an exposure."""
+        """The light, in counts, of a star of an instrument magnitude over an exposure.
+
+        NaN where the zero point is not known.
+        """
+        if self.zero_point_mag is None:
+            return np.full(np.shape(magnitude_mag), np.nan)
         return np.asarray(exposure_s * 10.0 ** (0.4 * (self.zero_point_mag - magnitude_mag)))
 
     def _plane(self, u_px: Vector, v_px: Vector) -> tuple[Vector, Vector]:

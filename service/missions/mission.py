@@ -12,10 +12,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import (
     AfterValidator,
     Field,
@@ -27,6 +26,8 @@ from pydantic import (
 
 from service.errors import BadConfiguration, BadInput, Fault, NotFound, shown_value
 from service.missions.camera import Camera
+from service.missions.camera_defaults import with_camera_defaults
+from service.missions.identifiers import IDENTIFIERS
 from service.missions.strict import Strict
 from service.vectors import Matrix, Vector, read_only, unit
 
@@ -44,7 +45,10 @@ def _zero_or_wide(step_deg: float) -> float:
 
 LEAST_GRID_DEG = 0.01
 GridStep = Annotated[float, Field(ge=0, le=10), AfterValidator(_zero_or_wide)]
-Identifier = Literal["starid", "verified", "ptp", "lost_in_space"]
+if TYPE_CHECKING:
+    Identifier = str
+else:
+    Identifier = Literal[tuple(IDENTIFIERS)]
 Solver = Literal["quest", "triad"]
 
 
@@ -94,19 +98,35 @@ class Tests(Strict):
     match_groups: bool = False
 
 
+class Limits(NamedTuple):
+    """The tolerances of the pair tests as kernels take them, angles in radians."""
+
+    separation: float  # SEPTOL
+    magnitude: float  # XMTOL
+    magnitude_order: float  # TMAGMX
+    cross_product: float  # CAPMAX, in bands BANMAX
+    pole_difference: float  # BANTOL1
+    pole_angle: float  # BANTOL2
+    fov_rotation: float
+
+
+class Switches(NamedTuple):
+    """The pair tests that are made, as kernels take them."""
+
+    magnitude: bool
+    cross_product: bool
+    pole: bool
+    fov_rotation: bool
+
+
 @dataclass(frozen=True, eq=False)
 class Rules:
-    """The tolerances and tests of an identification, and both as compiled code is given them.
-
-    `limits` (7,) are the tolerances from `separation_deg` on, angles in radians;
-    `switches` (4,) those of the tests up to `fov_rotation`.  They are not locked:
-    numba takes in an array that is at twice the cost.
-    """
+    """The tolerances and tests of an identification, and both as kernels take them."""
 
     tolerances: Tolerances
     tests: Tests
-    limits: Vector
-    switches: npt.NDArray[np.bool_]
+    limits: Limits
+    switches: Switches
 
 
 def rules_of(tolerances: Tolerances, tests: Tests) -> Rules:
@@ -114,18 +134,16 @@ def rules_of(tolerances: Tolerances, tests: Tests) -> Rules:
     return Rules(
         tolerances,
         tests,
-        np.array(
-            [
-                math.radians(tolerances.separation_deg),
-                tolerances.magnitude_mag,
-                tolerances.magnitude_order_mag,
-                math.radians(tolerances.cross_product_deg),
-                math.radians(tolerances.pole_difference_deg),
-                math.radians(tolerances.pole_angle_deg),
-                math.radians(tolerances.fov_rotation_deg),
-            ]
+        Limits(
+            separation=math.radians(tolerances.separation_deg),
+            magnitude=float(tolerances.magnitude_mag),
+            magnitude_order=float(tolerances.magnitude_order_mag),
+            cross_product=math.radians(tolerances.cross_product_deg),
+            pole_difference=math.radians(tolerances.pole_difference_deg),
+            pole_angle=math.radians(tolerances.pole_angle_deg),
+            fov_rotation=math.radians(tolerances.fov_rotation_deg),
         ),
-        np.array([tests.magnitude, tests.cross_product, tests.pole, tests.fov_rotation]),
+        Switches(tests.magnitude, tests.cross_product, tests.pole, tests.fov_rotation),
     )
 
 
@@ -299,7 +317,7 @@ class Mission(Strict):
 def parse_mission(text: str, file: str) -> Mission:
     """Read one mission from TOML; raises `BadConfiguration` naming file, key and allowed values."""
     try:
-        return Mission.model_validate(tomllib.loads(text))
+        return Mission.model_validate(with_camera_defaults(tomllib.loads(text)))
     except tomllib.TOMLDecodeError as error:
         raise BadConfiguration(f"{file}: not TOML: {error}") from None
     except ValidationError as error:

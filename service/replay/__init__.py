@@ -1,4 +1,4 @@
-"""Files of batches, through the operations of this process or through HTTP.
+"""Files of batches, in this process or through HTTP.
 
 A run that was cut short is taken up by replaying it again: a batch that is
 already recorded is answered with what is stored, and nothing is written twice.

@@ -1,11 +1,11 @@
-"""Replay through the operations of this process, without a server."""
+"""Replay in this process, without a server."""
 
 import time
 from collections.abc import Iterable
 
+from service.app.factory import App
 from service.errors import AcquisitionError, Busy, problem_of
-from service.operations import Operations
-from service.replay.carrying import Carrier, noted
+from service.replay.carry_attitude import AttitudeCarrier, reporting_to_carrier
 from service.replay.items import Item, Outcome, Pace, Report
 
 CHUNK = 500
@@ -13,11 +13,11 @@ CHUNK = 500
 
 
 def replay_in_process(
-    operations: Operations,
+    app: App,
     items: Iterable[Item],
     report: Report,
     pace: Pace | None = None,
-    carrier: Carrier | None = None,
+    carrier: AttitudeCarrier | None = None,
 ) -> None:
     """Submit every item and report what became of it, in order.
 
@@ -30,21 +30,23 @@ def replay_in_process(
         if carrier is not None:
             if wait_s > 0:
                 time.sleep(wait_s)
-            _submit(operations, [carrier.prepared(item)], noted(report, carrier))
+            _submit(app, [carrier.prepared(item)], reporting_to_carrier(report, carrier))
             continue
         if chunk and (wait_s > 0 or len(chunk) == CHUNK):
-            _submit(operations, chunk, report)
+            _submit(app, chunk, report)
             chunk = []
             wait_s = pace.wait_s(item, time.monotonic())
         if wait_s > 0:
             time.sleep(wait_s)
         chunk.append(item)
-    _submit(operations, chunk, report)
+    _submit(app, chunk, report)
 
 
-def _submit(operations: Operations, chunk: list[Item], report: Report) -> None:
+def _submit(app: App, chunk: list[Item], report: Report) -> None:
     answers = iter(
-        operations.submit_many([each.submission for each in chunk if each.submission is not None])
+        app.submissions.submit_many(
+            [each.submission for each in chunk if each.submission is not None]
+        )
     )
     for item in chunk:
         if item.submission is None:

@@ -1,4 +1,4 @@
-"""The lines of telemetry files on their way to the service, and what became of each."""
+"""The lines of telemetry files to replay, and the outcome of each."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -8,8 +8,8 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from service.errors import BadInput, Fault, problem_of, problem_of_faults, shown_value
-from service.observe.formats import read_lines
-from service.observe.wire import RunName, Submission, submission_from_json
+from service.observations.readers.telemetry import read_lines
+from service.observations.schema import RunName, Submission, submission_from_json
 from service.times import Utc
 
 Problem = dict[str, Any]
@@ -27,7 +27,7 @@ class Item:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a line: the answer's own bytes, or a problem.
+    """The outcome of a line: the answer's own bytes, or a problem.
 
     `replayed` tells that the batch was already recorded.
     """

@@ -11,16 +11,16 @@ from collections.abc import Iterable
 
 import httpx
 
-from service.errors import BadInput, Busy, Fault, NotAdmitted, shown_value
-from service.replay.carrying import Carrier, noted
+from service.errors import BadInput, Busy, Fault, Unauthenticated, shown_value
+from service.replay.carry_attitude import AttitudeCarrier, reporting_to_carrier
 from service.replay.items import Item, Outcome, Pace, Problem, Report
 
 ROUTE = "/api/v1/batches"
 JSON = {"Content-Type": "application/json"}
-AGAIN = frozenset({429, 502, 503, 504})
+RETRY_STATUSES = frozenset({429, 502, 503, 504})
 TIMEOUT = httpx.Timeout(60.0, connect=5.0)
-FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 5.0
-PATIENCE_S = 30.0
+FIRST_RETRY_S, LONGEST_RETRY_S = 0.1, 5.0
+GIVE_UP_AFTER_S = 30.0
 
 
 def replay_over_http(
@@ -29,22 +29,22 @@ def replay_over_http(
     report: Report,
     pace: Pace | None = None,
     concurrency: int = 4,
-    patience_s: float = PATIENCE_S,
+    give_up_after_s: float = GIVE_UP_AFTER_S,
     token: str | None = None,
     watched_run: str | None = None,
-    carrier: Carrier | None = None,
+    carrier: AttitudeCarrier | None = None,
 ) -> None:
     """Post every item to the service at `url` and report what became of it, in order.
 
     With a `carrier` each batch waits for the answer to the one before.
-    Raises `BadInput` for an address that is none, `NotAdmitted` where the
-    service knows nobody by `token`, `Busy` when no service answers there, or
-    none any more for `patience_s`.  `watched_run` is a run that limits are to
+    Raises `BadInput` for an address that is none, `Unauthenticated` where the
+    service does not accept `token`, `Busy` when no service answers there, or
+    none any more for `give_up_after_s`.  `watched_run` is a run that limits are to
     be held against.
     """
-    shown = {} if token is None else {"Authorization": f"Bearer {token}"}
+    headers = {} if token is None else {"Authorization": f"Bearer {token}"}
     if carrier is not None:
-        report, concurrency = noted(report, carrier), 1
+        report, concurrency = reporting_to_carrier(report, carrier), 1
     asyncio.run(
         _replay(
             checked_url(url),
@@ -52,8 +52,8 @@ def replay_over_http(
             report,
             pace or Pace(),
             concurrency,
-            patience_s,
-            shown,
+            give_up_after_s,
+            headers,
             watched_run,
             carrier,
         )
@@ -79,15 +79,15 @@ async def _replay(
     report: Report,
     pace: Pace,
     concurrency: int,
-    patience_s: float,
-    shown: dict[str, str],
+    give_up_after_s: float,
+    headers: dict[str, str],
     watched_run: str | None,
-    carrier: Carrier | None,
+    carrier: AttitudeCarrier | None,
 ) -> None:
     limits = httpx.Limits(max_connections=concurrency, max_keepalive_connections=concurrency)
     # The service listens to this machine alone: a proxy of the environment cannot reach it.
     async with httpx.AsyncClient(
-        base_url=url, timeout=TIMEOUT, limits=limits, trust_env=False, headers=shown
+        base_url=url, timeout=TIMEOUT, limits=limits, trust_env=False, headers=headers
     ) as client:
         await _require_service(client, url)
         if watched_run is not None:
@@ -104,7 +104,7 @@ async def _replay(
                     report(await window.popleft())
                 if carrier is not None:
                     item = carrier.prepared(item)
-                window.append(asyncio.create_task(_outcome(client, url, item, patience_s)))
+                window.append(asyncio.create_task(_outcome(client, url, item, give_up_after_s)))
             while window:
                 report(await window.popleft())
         finally:
@@ -124,7 +124,7 @@ async def _require_service(client: httpx.AsyncClient, url: str) -> None:
     if response.status_code != 200:
         raise Busy(f"{url} is not this service: GET /livez gives {response.status_code}")
     if (await client.get("/api/v1/session")).status_code == 401:
-        raise NotAdmitted(
+        raise Unauthenticated(
             f"{url} asks for a token: set ACQUIRE_TOKEN to one of its `acquire token create`"
         )
 
@@ -135,36 +135,38 @@ async def _watch(client: httpx.AsyncClient, run: str) -> None:
         raise BadInput(Fault("--alarms", str(_problem(answer)["detail"]), run))
 
 
-async def _outcome(client: httpx.AsyncClient, url: str, item: Item, patience_s: float) -> Outcome:
+async def _outcome(
+    client: httpx.AsyncClient, url: str, item: Item, give_up_after_s: float
+) -> Outcome:
     if item.submission is None:
         return Outcome(item, None, problem=item.problem)
-    response = await _post(client, url, item.submission.text, patience_s)
+    response = await _post(client, url, item.submission.text, give_up_after_s)
     if response.status_code in (200, 201):
         return Outcome(item, response.content, response.headers.get("Replayed") == "true")
     return Outcome(item, None, problem=_problem(response))
 
 
 async def _post(
-    client: httpx.AsyncClient, url: str, text: str, patience_s: float
+    client: httpx.AsyncClient, url: str, text: str, give_up_after_s: float
 ) -> httpx.Response:
     clock = asyncio.get_running_loop().time
-    give_up, wait_s = clock() + patience_s, FIRST_WAIT_S
+    deadline, wait_s = clock() + give_up_after_s, FIRST_RETRY_S
     while True:
         asked_s = 0.0
         try:
             response = await client.post(ROUTE, content=text, headers=JSON)
-            if response.status_code not in AGAIN:
+            if response.status_code not in RETRY_STATUSES:
                 return response
             why = f"HTTP {response.status_code}"
             asked_s = _seconds(response.headers.get("Retry-After", ""))
         except httpx.TransportError as error:
             why = shown_error(error)
-        if clock() >= give_up:
+        if clock() >= deadline:
             raise Busy(
                 f"{url} no longer answers ({why}); run the same command again to go on "
                 "from here: nothing is recorded twice"
             )
-        await asyncio.sleep(min(max(wait_s, asked_s), LONGEST_WAIT_S))
+        await asyncio.sleep(min(max(wait_s, asked_s), LONGEST_RETRY_S))
         wait_s *= 2
 
 
@@ -180,7 +182,7 @@ def shown_error(error: Exception) -> str:
 def _problem(response: httpx.Response) -> Problem:
     """The part of a problem that does not depend on how the batch was sent."""
     try:
-        told = response.json()
-        return {name: told[name] for name in ("detail", "errors") if name in told}
+        content = response.json()
+        return {name: content[name] for name in ("detail", "errors") if name in content}
     except (json.JSONDecodeError, UnicodeDecodeError, TypeError):
         return {"detail": f"HTTP {response.status_code}: {response.text[:200]}"}

@@ -1,1 +1,1 @@
-"""SKIES WITH KNOWN TRUTH: sample telemetry drawn from the real sky, and how answers compare."""
+"""Simulation: telemetry and frames with known truth, drawn from the real sky."""

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from service.errors import BadFile, Fault
-from service.observe.csv_rows import write_csv
-from service.observe.formats import form_of
-from service.observe.wire import BatchIn
+from service.observations.readers.csv_rows import write_csv
+from service.observations.readers.telemetry import form_of
+from service.observations.schema import BatchIn
 from service.simulate.telemetry import Drawn
 
 

@@ -9,7 +9,7 @@ from typing import BinaryIO, Literal
 import numpy as np
 
 from service.errors import BadFile, Fault
-from service.imaging.fits import write_fits
+from service.imaging.frames.fits import write_fits
 from service.simulate.frames import DrawnFrame
 from service.times import shifted
 

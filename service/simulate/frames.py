@@ -15,18 +15,18 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from service.errors import BadInput, Fault, shown_value
-from service.imaging.frame import Counts
-from service.imaging.psf import GaussianPsf, Psf
-from service.imaging.sampled_psf import airy_psf, cross_psf
-from service.imaging.trail import TrailPsf, trails_px
+from service.imaging.centroids.psf import GaussianPsf, Psf
+from service.imaging.centroids.sampled_psf import airy_psf, cross_psf
+from service.imaging.detection.trail import TrailPsf, trails_px
+from service.imaging.frames.frame import Counts
 from service.missions.camera import Camera
 from service.missions.mission import Mission, RunCatalogSettings, Tracker
 from service.simulate.motion import pointed, random_axis, turned
 from service.simulate.orbits import orbit_of
 from service.simulate.real_sky import RealSky, real_sky
+from service.sky.catalog.run_catalog import build_run_catalog
 from service.sky.ephemeris import apparent, observer_velocity
-from service.sky.run_catalog import build_run_catalog
-from service.sky.view import Sky
+from service.sky.model import SkyModel
 from service.times import Utc, parse_utc, shifted
 from service.vectors import Matrix, Vector, quaternion_from_matrix
 
@@ -118,7 +118,7 @@ class _Stars:
 
 
 def draw_frames(
-    mission: Mission, sky: Sky, wanted: FrameSettings, numbers: Iterable[int] | None = None
+    mission: Mission, sky: SkyModel, wanted: FrameSettings, numbers: Iterable[int] | None = None
 ) -> Iterator[DrawnFrame]:
     """The frames of one tracker, or some of them by number; each with a generator of its own."""
     tracker, camera = mission.camera_tracker(wanted.tracker, "tracker")
@@ -170,7 +170,7 @@ def draw_frames(
         yield DrawnFrame(counts, camera.exposure_s, time, known, truth)
 
 
-def whole_sky(sky: Sky, mission: Mission, time: Utc) -> RealSky:
+def whole_sky(sky: SkyModel, mission: Mission, time: Utc) -> RealSky:
     """Every star of the catalog as it shines by itself, in the mission's instrument."""
     settings = RunCatalogSettings(
         magnitude_limit_mag=FAINTEST_RENDERED_MAG,
@@ -179,7 +179,7 @@ def whole_sky(sky: Sky, mission: Mission, time: Utc) -> RealSky:
         color_polynomial_mag=mission.catalog.color_polynomial_mag,
     )
     epoch_year = settings.epoch_of(time.julian_year)
-    run, _ = sky.shelf.get(
+    run, _ = sky.cache.get(
         ("whole sky", sky.catalog.digest, settings.digest, epoch_year),
         lambda: build_run_catalog(sky.catalog, settings, epoch_year),
     )

@@ -16,11 +16,11 @@ import numpy as np
 from erfa import ufunc
 
 from service.missions.mission import RunCatalogSettings
-from service.sky.blending import Rows, merge
-from service.sky.catalog import Catalog
+from service.sky.catalog.blending import Rows, merge
+from service.sky.catalog.proper_motion import moved
+from service.sky.catalog.run_catalog import J2000_YEAR, RunCatalog, instrument_magnitude
+from service.sky.catalog.star_catalog import Catalog
 from service.sky.ephemeris import KM_PER_AU
-from service.sky.proper_motion import moved
-from service.sky.run_catalog import J2000_YEAR, RunCatalog, instrument_magnitude
 from service.times import Utc
 from service.vectors import ARCSEC_PER_RADIAN, Vector, unit
 

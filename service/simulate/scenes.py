@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from service.missions.mission import RunCatalogSettings
-from service.sky.catalog import Catalog, load_embedded
-from service.sky.run_catalog import RunCatalog, build_run_catalog
+from service.sky.catalog.run_catalog import RunCatalog, build_run_catalog
+from service.sky.catalog.star_catalog import Catalog, load_embedded
 from service.vectors import Matrix, Vector, matrix_from_quaternion, read_only, unit
 
 EPOCH_YEAR = 2000.0

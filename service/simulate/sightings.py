@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from service.missions.mission import Band, Calibration, Mission, Tracker
-from service.observe.batch import Aberration
+from service.observations.batch import Aberration
 from service.simulate.motion import across, random_axis, turned
 from service.simulate.real_sky import RealSky
 from service.simulate.stretches import Stretch

@@ -6,7 +6,7 @@ from typing import Literal, get_args
 
 from service.errors import BadInput, Fault, shown_value
 from service.missions.mission import Band, Mission
-from service.observe.batch import MAX_STARS_PER_TRACKER, Aberration
+from service.observations.batch import MAX_STARS_PER_TRACKER, Aberration
 
 Prior = Literal["quaternion", "direction", "mixed"]
 Kind = Literal["nominal", "attitude_error", "spurious", "magnitude_error", "position_error"]

@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 
 from service.missions.mission import Band, Mission
-from service.observe.batch import Aberration
+from service.observations.batch import Aberration
 from service.simulate.motion import (
     body_rates_deg_per_s,
     pointed,
@@ -27,7 +27,7 @@ from service.simulate.real_sky import real_sky
 from service.simulate.sightings import Scene, Seen
 from service.simulate.stretches import Pass
 from service.sky.ephemeris import observer_velocity, sun_direction
-from service.sky.view import Sky
+from service.sky.model import SkyModel
 from service.times import Utc, parse_utc, shifted
 from service.vectors import (
     Matrix,
@@ -53,7 +53,7 @@ class Drawn:
     truth: dict[str, Any]
 
 
-def draw_pass(mission: Mission, sky: Sky, wanted: Pass) -> Iterator[Drawn]:
+def draw_pass(mission: Mission, sky: SkyModel, wanted: Pass) -> Iterator[Drawn]:
     """The batches of a pass, in order of time.
 
     Every batch has a random generator of its own, so that a change of one

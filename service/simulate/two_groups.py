@@ -11,12 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from service.missions.mission import Band, Mission
-from service.observe.batch import ObservationBatch, Options, QuaternionPrior, TrackerStars
+from service.observations.batch import ObservationBatch, Options, QuaternionPrior, TrackerStars
 from service.simulate.motion import pointed, random_axis, tilted, turned
 from service.simulate.sightings import anywhere, shaken
+from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.ephemeris import sun_direction
-from service.sky.run_catalog import RunCatalog
-from service.sky.view import Sky
+from service.sky.model import SkyModel
 from service.times import parse_utc
 from service.vectors import (
     ARCSEC_PER_RADIAN,
@@ -54,7 +54,7 @@ class Views:
     """Draws groups of stars for one mission, and makes batches of them."""
 
     mission: Mission
-    sky: Sky
+    sky: SkyModel
     rng: np.random.Generator
 
     @property

@@ -1,1 +1,1 @@
-"""WHAT IS THERE: the catalog, run catalogs, zones, pairs, the Sun and the caches."""
+"""The sky: star catalog, run catalogs, zones, pairs of stars, the Sun, and their cache."""

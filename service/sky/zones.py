@@ -3,7 +3,7 @@
 A zone is the set of stars whose angle to an axis lies between two bounds: a
 cap from zero to its radius, a band within its half width of the coelevation.
 
-The shelf keeps zones whose axis is snapped to a grid and whose bounds are
+The cache keeps zones whose axis is snapped to a grid and whose bounds are
 grown by what the snapping may move the axis.  The identifier then keeps only
 the stars within the bounds about the exact axis, so that the answer to a batch
 depends neither on the grid nor on the batches before it.
@@ -11,6 +11,7 @@ depends neither on the grid nor on the batches before it.
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,11 +19,11 @@ import numpy.typing as npt
 from msgspec import Struct
 from numba import njit
 
-from service.sky.pairs import PairIndex, build_pairs, separation_rad
-from service.sky.run_catalog import RunCatalog
-from service.sky.shelf import Shelf
-from service.sky.star_buckets import StarBuckets, build_star_buckets
-from service.sky.star_voxels import Bits, build_star_voxels
+from service.sky.cache import LruCache
+from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.geometry.pairs import PairIndex, build_pairs, separation_rad
+from service.sky.geometry.star_buckets import StarBuckets, build_star_buckets
+from service.sky.geometry.star_voxels import Bits, build_star_voxels
 from service.vectors import (
     Vector,
     angle_between_deg,
@@ -38,8 +39,8 @@ _ROUNDING_DEG = 1e-9
 _CLEAR = 1e-12
 
 
-class Aim(Struct, frozen=True, eq=False, gc=False):
-    """Where to look: an exact axis (3,), inertial, and the bounds on the angle to it."""
+class SearchRegion(Struct, frozen=True, eq=False, gc=False):
+    """Where to search: an exact axis (3,), inertial, and the bounds on the angle to it."""
 
     kind: str
     axis: Vector
@@ -52,6 +53,32 @@ class Aim(Struct, frozen=True, eq=False, gc=False):
         return min(angle + radius_deg, 180.0) > self.most_deg or (
             self.least_deg > 0.0 and angle - radius_deg < self.least_deg
         )
+
+
+class ZoneArrays(NamedTuple):
+    """A zone of m stars and p pairs as kernels take it.
+
+    `direction` (m, 3), `magnitude` (m,), and `vector_mag` (m, 4) with both.
+    `grid_start`, `grid_rows` and `grid_direction` are those of `StarBuckets`, `voxels`
+    those of `build_star_voxels`.  `pair_separation` (p,), `pair_rows` (2, p),
+    `bin_start` and `bins_per_rad` are those of `PairIndex`.  In a band `polar` (m,) are
+    the stars' angles to the zone's axis and `polar_difference` (p,) the pairs'
+    differences of them; in a cap both are empty.
+    """
+
+    direction: Any
+    magnitude: Any
+    vector_mag: Any
+    grid_start: Any
+    grid_rows: Any
+    grid_direction: Any
+    voxels: Any
+    pair_separation: Any
+    pair_rows: Any
+    bin_start: Any
+    bins_per_rad: Any
+    polar: Any
+    polar_difference: Any
 
 
 @dataclass(frozen=True)
@@ -67,7 +94,7 @@ class Zone:
 
     mission: str
     run_catalog: str
-    aim: Aim
+    region: SearchRegion
     grid_deg: float
     star: npt.NDArray[np.int32]
     direction: Vector
@@ -88,20 +115,40 @@ class Zone:
         )
         return sum(part.nbytes for part in parts)
 
-    def serves_exactly(self, aim: Aim) -> bool:
-        """Whether the zone's stars are just those within an aim."""
-        own = self.aim
-        return own is aim or (
-            own.least_deg == aim.least_deg
-            and own.most_deg == aim.most_deg
-            and own.axis.tolist() == aim.axis.tolist()
+    @cached_property
+    def arrays(self) -> ZoneArrays:
+        """The zone as kernels take it."""
+        grid, pairs = self.grid, self.pairs
+        return ZoneArrays(
+            direction=self.direction,
+            magnitude=self.magnitude_mag,
+            vector_mag=self.vector_mag,
+            grid_start=grid.start,
+            grid_rows=grid.rows,
+            grid_direction=grid.direction,
+            voxels=self.voxels,
+            pair_separation=pairs.separation_rad,
+            pair_rows=pairs.rows,
+            bin_start=pairs.bin_start,
+            bins_per_rad=pairs.bins_per_rad,
+            polar=self.polar_rad,
+            polar_difference=self.polar_difference_rad,
+        )
+
+    def serves_exactly(self, region: SearchRegion) -> bool:
+        """Whether the zone's stars are just those within a region."""
+        own = self.region
+        return own is region or (
+            own.least_deg == region.least_deg
+            and own.most_deg == region.most_deg
+            and own.axis.tolist() == region.axis.tolist()
         )
 
     def summary(self) -> dict[str, Any]:
         """What the zone is, as the interface shows it."""
-        ra_deg, dec_deg = to_ra_dec(self.aim.axis)
+        ra_deg, dec_deg = to_ra_dec(self.region.axis)
         return {
-            "kind": self.aim.kind,
+            "kind": self.region.kind,
             "ra_deg": float(ra_deg),
             "dec_deg": float(dec_deg),
             "stars": len(self.star),
@@ -110,7 +157,7 @@ class Zone:
 
 
 class ZoneKey(NamedTuple):
-    """What a zone depends on: the key under which the shelf keeps it."""
+    """What a zone depends on: its key in the cache."""
 
     mission: str
     run_catalog: str
@@ -124,33 +171,33 @@ class ZoneKey(NamedTuple):
 def build_zone(
     mission: str,
     run_catalog: RunCatalog,
-    aim: Aim,
+    region: SearchRegion,
     separation_max_deg: float,
     grid_deg: float = 0.0,
 ) -> Zone:
-    """Select the stars within the aim and index their pairs."""
-    cosine = run_catalog.direction @ aim.axis
-    low = math.cos(math.radians(min(180.0, aim.most_deg + 1e-4)))
-    high = math.cos(math.radians(max(0.0, aim.least_deg - 1e-4)))
+    """Select the stars within a region and index their pairs."""
+    cosine = run_catalog.direction @ region.axis
+    low = math.cos(math.radians(min(180.0, region.most_deg + 1e-4)))
+    high = math.cos(math.radians(max(0.0, region.least_deg - 1e-4)))
     # The cosine chooses cheaply and generously, the accurate angle decides.
     near = (
         np.flatnonzero((cosine >= low) & (cosine <= high))
-        if aim.least_deg > 0
+        if region.least_deg > 0
         else np.flatnonzero(cosine >= low)
     )
-    angle = angle_between_deg(run_catalog.direction[near], aim.axis)
-    star = near[(angle >= aim.least_deg) & (angle <= aim.most_deg)].astype(np.int32)
+    angle = angle_between_deg(run_catalog.direction[near], region.axis)
+    star = near[(angle >= region.least_deg) & (angle <= region.most_deg)].astype(np.int32)
     direction = np.ascontiguousarray(run_catalog.direction[star])
     magnitude = run_catalog.magnitude_mag[star]
     pairs = build_pairs(direction, separation_max_deg)
     polar, difference = np.empty(0), np.empty(0, np.float32)
-    if aim.kind == "band":
+    if region.kind == "band":
         polar, difference = np.empty(len(star)), np.empty(pairs.count, np.float32)
-        _polar_angles(direction, aim.axis, pairs.brighter, pairs.dimmer, polar, difference)
+        _polar_angles(direction, region.axis, pairs.brighter, pairs.dimmer, polar, difference)
     return Zone(
         mission=mission,
         run_catalog=run_catalog.digest,
-        aim=aim,
+        region=region,
         grid_deg=grid_deg,
         star=read_only(star),
         direction=read_only(direction),
@@ -172,15 +219,15 @@ def _polar_angles(direction, axis, brighter, dimmer, polar, difference):  # type
         difference[k] = polar[brighter[k]] - polar[dimmer[k]]
 
 
-def counts_within(zone: Zone, aim: Aim) -> tuple[int, int]:
-    """How many of a zone's stars and pairs lie within an aim that it serves."""
+def counts_within(zone: Zone, region: SearchRegion) -> tuple[int, int]:
+    """How many of a zone's stars and pairs lie within a region that it serves."""
     if zone.grid_deg == 0.0:
         return len(zone.star), zone.pairs.count
     stars, pairs = _counts_within(
         zone.direction,
-        aim.axis,
-        math.radians(aim.least_deg),
-        math.radians(aim.most_deg),
+        region.axis,
+        math.radians(region.least_deg),
+        math.radians(region.most_deg),
         zone.pairs.rows,
     )
     return stars, pairs
@@ -206,20 +253,20 @@ def _counts_within(direction, axis, least, most, pair_rows):  # type: ignore[no-
 
 
 def zone_for(
-    shelf: Shelf,
+    cache: LruCache,
     mission: str,
     run_catalog: RunCatalog,
-    aim: Aim,
+    region: SearchRegion,
     separation_max_deg: float,
     grid_deg: float,
 ) -> tuple[Zone, bool]:
-    """The zone that serves an aim, from the shelf or built, and whether it was there.
+    """The zone that serves a search region, cached or built, and whether it was cached.
 
     With a grid the zone's axis is the nearest grid point and its bounds are
     grown by half the diagonal of a grid cell; grid 0 is the exact zone.
     """
-    x, y, z = aim.axis.tolist()
-    least_deg, most_deg = aim.least_deg, aim.most_deg
+    x, y, z = region.axis.tolist()
+    least_deg, most_deg = region.least_deg, region.most_deg
     if grid_deg > 0.0:
         x, y, z = _snapped(x, y, z, grid_deg)
         grown_by_deg = grid_deg / math.sqrt(2.0) + _ROUNDING_DEG
@@ -228,7 +275,7 @@ def zone_for(
     key = ZoneKey(
         mission,
         run_catalog.digest,
-        aim.kind,
+        region.kind,
         (x, y, z),
         least_deg,
         most_deg,
@@ -236,10 +283,14 @@ def zone_for(
     )
 
     def build() -> Zone:
-        wide = Aim(aim.kind, np.array([x, y, z]), least_deg, most_deg) if grid_deg > 0.0 else aim
+        wide = (
+            SearchRegion(region.kind, np.array([x, y, z]), least_deg, most_deg)
+            if grid_deg > 0.0
+            else region
+        )
         return build_zone(mission, run_catalog, wide, separation_max_deg, grid_deg)
 
-    return shelf.get(key, build)
+    return cache.get(key, build)
 
 
 def snapped(axis: Vector, grid_deg: float) -> Vector:

@@ -1,1 +1,1 @@
-"""The HTTP door: routes, problems, metrics and the page."""
+"""HTTP: the API, the console, and the server."""

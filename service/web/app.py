@@ -12,18 +12,8 @@ from fastapi.routing import APIRoute
 from starlette.staticfiles import StaticFiles
 
 from service import __version__
-from service.operations import Operations
-from service.web.access import guard
-from service.web.bodies import DEFAULT_LIMITS, BodyBudget, Limits
-from service.web.dashboard import PAGES
-from service.web.errors import add_error_handlers
-from service.web.live import Live
-from service.web.metrics import Metrics
-from service.web.middleware import AroundRequests
-from service.web.reference import add_reference
-from service.web.rehearsal import rehearse
-from service.web.routes import (
-    access,
+from service.app.factory import App
+from service.web.api import (
     advice,
     alarms,
     batches,
@@ -36,6 +26,16 @@ from service.web.routes import (
     spacecraft,
     zones,
 )
+from service.web.api import tokens as access
+from service.web.api.access import authorize
+from service.web.api.metrics import Metrics
+from service.web.api.problems import add_error_handlers
+from service.web.api.request_body import DEFAULT_LIMITS, BodyBudget, BodyLimits
+from service.web.console import console_router
+from service.web.event_stream import Live
+from service.web.middleware import AroundRequests
+from service.web.openapi.document import add_reference
+from service.web.warm_request import warm_request
 
 log = logging.getLogger(__name__)
 
@@ -55,59 +55,57 @@ ROUTERS: tuple[APIRouter, ...] = (
     events.router,
     access.router,
     probes.router,
-    *PAGES,
 )
 
 DIRECT = (batches.submit_batch,)
 """Handlers that are asked by the thousand a second: see `AroundRequests`."""
 
 
-def create_app(operations: Operations, limits: Limits = DEFAULT_LIMITS) -> FastAPI:
-    """The app over open operations, which it closes when it has served its last request."""
+def create_app(app: App, limits: BodyLimits = DEFAULT_LIMITS) -> FastAPI:
+    """The web app over an open `App`, which it closes after its last request."""
 
     @asynccontextmanager
-    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+    async def lifespan(web_app: FastAPI) -> AsyncIterator[None]:
         anyio.to_thread.current_default_thread_limiter().total_tokens = WORKER_THREADS
-        await operations.attach()
         here = asyncio.get_running_loop()
-        warming = threading.Thread(target=_warm_up, args=(app, operations, here), name="warm-up")
+        warming = threading.Thread(target=_warm_up, args=(web_app, app, here), name="warm-up")
         warming.start()
         try:
-            await app.state.live.start()
+            await web_app.state.live.start()
             yield
         finally:
-            await app.state.live.close()
-            operations.stop_warming()
+            await web_app.state.live.close()
+            app.service.cancel_warmup()
             # The handlers' own threads may all be at work still.
             own = anyio.CapacityLimiter(1)
             await anyio.to_thread.run_sync(warming.join, limiter=own)
-            await anyio.to_thread.run_sync(operations.close, limiter=own)
+            await anyio.to_thread.run_sync(app.close, limiter=own)
 
-    app = bare_app()
-    app.router.lifespan_context = lifespan
-    app.state.operations = operations
-    app.state.limits = limits
-    app.state.body_budget = BodyBudget(limits)
-    app.state.metrics = Metrics(operations)
-    app.state.live = Live(operations)
-    app.add_middleware(
+    web_app = bare_app()
+    web_app.router.lifespan_context = lifespan
+    web_app.state.app = app
+    web_app.state.limits = limits
+    web_app.state.body_budget = BodyBudget(limits)
+    web_app.state.metrics = Metrics(app)
+    web_app.state.live = Live(app)
+    web_app.add_middleware(
         AroundRequests,
-        metrics=app.state.metrics,
-        access=operations.access,
-        body_budget=app.state.body_budget,
+        metrics=web_app.state.metrics,
+        access=app.access,
+        body_budget=web_app.state.body_budget,
         direct={
             (method, route.path): route
-            for route in app.state.routes
+            for route in web_app.state.routes
             if isinstance(route, APIRoute) and route.endpoint in DIRECT
             for method in route.methods or ()
         },
     )
-    return app
+    return web_app
 
 
 def bare_app() -> FastAPI:
     """The app without anything behind it: enough to describe it."""
-    app = FastAPI(
+    web_app = FastAPI(
         title="Attitude acquisition",
         version=__version__,
         # The framework's own pages load scripts from elsewhere.
@@ -117,21 +115,23 @@ def bare_app() -> FastAPI:
         redirect_slashes=False,
         generate_unique_id_function=_operation_id,
     )
-    for router in ROUTERS:
-        app.include_router(router, dependencies=[Depends(guard)])
-    app.state.routes = [route for router in ROUTERS for route in router.routes]
-    app.mount("/static", StaticFiles(packages=[("service.web.dashboard", "static")]))
-    add_error_handlers(app)
-    add_reference(app)
-    return app
+    routers = (*ROUTERS, console_router())
+    for router in routers:
+        web_app.include_router(router, dependencies=[Depends(authorize)])
+    web_app.state.routers = routers
+    web_app.state.routes = [route for router in routers for route in router.routes]
+    web_app.mount("/static", StaticFiles(packages=[("service.web.console", "static")]))
+    add_error_handlers(web_app)
+    add_reference(web_app)
+    return web_app
 
 
-def _warm_up(app: FastAPI, operations: Operations, loop: asyncio.AbstractEventLoop) -> None:
+def _warm_up(web_app: FastAPI, app: App, loop: asyncio.AbstractEventLoop) -> None:
     try:
-        operations.ready()
-        asyncio.run_coroutine_threadsafe(rehearse(app), loop).result()
+        app.service.ready()
+        asyncio.run_coroutine_threadsafe(warm_request(web_app), loop).result()
     except Exception as error:
-        # Whoever asks /readyz is told, and the next call tries again.
+        # /readyz reports it, and its next call tries again.
         log.warning("not ready yet: %s", error)
 
 

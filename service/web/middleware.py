@@ -1,4 +1,4 @@
-"""What happens around every request: whom it is for, HEAD, timing, the last resort."""
+"""Middleware: host check, HEAD, timing, audit entries, and errors that nothing else answered."""
 
 import logging
 import re
@@ -15,17 +15,17 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service import logs
+from service.access.sessions import Access
 from service.errors import Busy
-from service.records.access import Access
 from service.settings import is_loopback
-from service.web.access import entry_of, guard, is_open
-from service.web.bodies import BodyBudget
-from service.web.errors import Kind, answer_to, our_fault, problem
-from service.web.metrics import Metrics
-from service.web.rehearsal import REHEARSAL
+from service.web.api.access import authorize, entry_of, is_open
+from service.web.api.metrics import Metrics
+from service.web.api.problems import ProblemType, error_response, internal_error, problem_response
+from service.web.api.request_body import BodyBudget
+from service.web.warm_request import WARM_REQUEST
 
-NOT_HERE = Kind(421, "This is another host's", "not-this-host")
-NOT_FOUND = Kind(404, "Not Found")
+WRONG_HOST = ProblemType(421, "Misdirected request", "not-this-host")
+NOT_FOUND = ProblemType(404, "Not Found")
 
 log = logging.getLogger(__name__)
 requests = logging.getLogger("service.requests")
@@ -34,26 +34,25 @@ _PROBES = ("/livez", "/readyz", "/metrics")
 _MAX_PATH = 200
 _SANE_ID = re.compile(rb"[A-Za-z0-9][A-Za-z0-9._:=+/@-]{0,127}")
 
-_NOTES = CapacityLimiter(8)
+_AUDIT_THREADS = CapacityLimiter(8)
 _NO_SNIFF = (b"x-content-type-options", b"nosniff")
 
 
 class AroundRequests:
     """Times every request, answers HEAD as GET without its body, and forbids type guessing.
 
-    While access is open, a request for a host of another name is refused: a
-    page elsewhere could let its own name lead to this machine, and would then
-    be let in as this one.
+    While access is open, a request for a host of another name is refused: the
+    page of another site could otherwise resolve its own name to this machine.
 
-    What a caller was refused, or changed in memory alone, is noted before the
-    answer goes out (`service.web.access`).
+    Changes that were refused, or that changed memory only, get their audit entry
+    before the answer is sent (`service.web.api.access`).
 
-    A request for one of the `direct` routes goes straight to its handler: to find
-    a route, and out what its handler depends on, takes the framework twice as
-    long as all else that a batch needs of it.
+    A request for one of the `direct` routes goes straight to its handler: the
+    framework's routing and dependencies take twice as long as the rest of a
+    submission's handling.
 
-    An error that nothing below has answered is answered here; let through, it
-    would cost the client its connection.
+    An error that no other handler answered is answered here; otherwise the client
+    would lose its connection.
     """
 
     def __init__(
@@ -64,7 +63,7 @@ class AroundRequests:
         body_budget: BodyBudget,
         direct: Mapping[tuple[str, str], APIRoute],
     ) -> None:
-        """`direct` routes stand under method and path; their handlers take the request alone."""
+        """`direct` has routes by method and path; their handlers take only the request."""
         self.app = app
         self.metrics = metrics
         self.access = access
@@ -72,7 +71,7 @@ class AroundRequests:
         self.direct = direct
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request, or pass on what is none."""
+        """Serve one request; pass on other events."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
@@ -84,7 +83,7 @@ class AroundRequests:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
-                await self._note(inner, status)
+                await self._audit(inner, status)
                 headers = [*message["headers"], _NO_SNIFF, (b"x-request-id", about.id.encode())]
                 message = {**message, "headers": headers}
             elif is_head:
@@ -99,8 +98,8 @@ class AroundRequests:
         try:
             host = _host(inner)
             if host is not None and not is_loopback(host) and await is_open(self.access):
-                told = {"detail": f"the service answers to names of this machine, not to {host!r}"}
-                await problem(Request(inner), NOT_HERE, told)(inner, receive, sent)
+                details = {"detail": f"the host must be a name of this machine, not {host!r}"}
+                await problem_response(Request(inner), WRONG_HOST, details)(inner, receive, sent)
                 return
             route = self.direct.get((inner["method"], inner["path"]))
             if route is None:
@@ -110,23 +109,23 @@ class AroundRequests:
                 response = await _answered(route, Request(inner, receive))
                 await response(inner, receive, sent)
         except Busy as error:
-            # Whether access is open could not be found out.
+            # The database did not tell whether access is open.
             if status:
                 raise
-            await (await answer_to(Request(inner), error))(inner, receive, sent)
+            await (await error_response(Request(inner), error))(inner, receive, sent)
         except Exception as error:
             if status:
                 raise
-            await our_fault(Request(inner), error)(inner, receive, sent)
+            await internal_error(Request(inner), error)(inner, receive, sent)
         finally:
             self.body_budget.remove(inner)
-            if REHEARSAL not in inner:
+            if WARM_REQUEST not in inner:
                 seconds = time.perf_counter() - started
                 self.metrics.count_request(inner, status, seconds)
                 self._log(scope, inner, status, seconds)
 
     def _log(self, scope: Scope, inner: Scope, status: int, seconds: float) -> None:
-        """One line for a request: no query, no header and no body."""
+        """Log one line for a request, without query, headers and body."""
         method, path = scope["method"], scope["path"]
         usual = 200 <= status < 400 and (
             path in _PROBES or path.startswith("/static/") or (inner["method"], path) in self.direct
@@ -146,26 +145,25 @@ class AroundRequests:
             extra={"access": {**fields, "duration_ms": milliseconds}},
         )
 
-    async def _note(self, scope: Scope, status: int) -> None:
+    async def _audit(self, scope: Scope, status: int) -> None:
         state = scope.get("state", {})
         action = state.get("changes")
-        # What was changed is noted with the change itself; of a 503 nothing is decided, and the
-        # database that it may be about is not asked once more.
+        # A change carries its own entry.  A 503 decides nothing, and its cause may be the database.
         if action is None or status == 503 or (state.get("noted") and status < 400):
             return
         try:
             entry = entry_of(scope, self.access, status)
-            await run_sync(self.access.note, entry, limiter=_NOTES)
+            await run_sync(self.access.add_entry, entry, limiter=_AUDIT_THREADS)
         except Exception as error:
-            # Nothing in the records was changed: the answer must not be lost to this.
-            log.error("%s by %s was not noted: %s", action, state["caller"].name, error)
+            # No record was changed: a failed entry must not replace the answer.
+            log.error("%s by %s has no audit entry: %s", action, state["caller"].name, error)
 
 
 PROBES = ("/livez", "/readyz", "/metrics")
 
 
-class ProbesAlone:
-    """The app of the port for probes: it passes on their paths, and answers 404 to all others."""
+class ProbesOnly:
+    """The app of the probe port: it serves the paths of probes and answers 404 to all others."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
@@ -175,17 +173,17 @@ class ProbesAlone:
         if scope["path"] in PROBES:
             await self.app(scope, receive, send)
             return
-        told = {"detail": f"this port answers probes alone: {', '.join(PROBES)}"}
-        await problem(Request(scope), NOT_FOUND, told)(scope, receive, send)
+        details = {"detail": f"this port answers only probes: {', '.join(PROBES)}"}
+        await problem_response(Request(scope), NOT_FOUND, details)(scope, receive, send)
 
 
 async def _answered(route: APIRoute, request: Request) -> Response:
     """What a direct route answers, guarded as every route is."""
     try:
-        await guard(request)
+        await authorize(request)
         response: Response = await route.endpoint(request)
     except Exception as error:
-        return await answer_to(request, error)
+        return await error_response(request, error)
     return response
 
 

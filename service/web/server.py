@@ -1,65 +1,75 @@
-"""Serving the app with uvicorn: on this machine alone, until there are tokens."""
+"""Serving the app with uvicorn: on the loopback address alone, until there are tokens."""
 
 import asyncio
 import resource
 import socket
 import sys
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from functools import partial
 from typing import cast
 
 import uvicorn
+from fastapi import FastAPI
 from starlette.types import ASGIApp
 
 from service import logs
-from service.backend.front import Front
-from service.backend.start import Started, start_backend
+from service.app.factory import App, open_app
 from service.errors import BadConfiguration
-from service.records.store import warn_of_old_sqlite
 from service.settings import Settings, is_loopback, networks
-from service.web.admission import Admission
+from service.storage.sql.database import warn_of_old_sqlite
+from service.storage.sql.served import hold_served
 from service.web.app import create_app
-from service.web.connection import Connection, State
-from service.web.middleware import ProbesAlone
+from service.web.connection_limits import Admission
+from service.web.middleware import ProbesOnly
+from service.web.slow_clients import Connection, State
 
 MAX_FILES = 4096
 
 START_FAILED = 3
-TURN_S = 0.001
-"""How long a thread keeps others waiting that want to go on, such as the one that speaks HTTP."""
+SWITCH_INTERVAL_S = 0.001
+"""The longest that one thread keeps the interpreter while others, such as the event loop, wait."""
 GRACE_S = 10
 """How long running requests may still take when the server is told to stop."""
 PROBE_CONNECTIONS = 64
 """Connections of the port for probes: they are outside the bound of all others."""
 
 
-def serve(settings: Settings, started: Started | None = None) -> None:
-    """Serve until told to stop (SIGINT, SIGTERM); the operations have a process of their own.
+def serve(settings: Settings) -> None:
+    """Serve until told to stop (SIGINT, SIGTERM).
 
-    That process may have been `started` before.
-    Raises `BadConfiguration` for a host beyond this machine while there are no
-    tokens: nobody would be asked who they are.
+    Raises `BadConfiguration` for settings that cannot be used, and for a host other than
+    a loopback address while there are no tokens: every client could submit there.
     """
-    operations = Front(start_backend(settings) if started is None else started)
-    if not is_loopback(settings.host) and not operations.access.has_tokens():
-        operations.close()
-        raise BadConfiguration(
-            f"ACQUIRE_HOST: {settings.host} is beyond this machine, and anybody there could ask "
-            "and submit: make a token first with `acquire token create`"
-        )
-    warn_of_old_sqlite(settings.database)
-    try:
-        probes = _listening(settings.host, settings.probe_port)
-    except BadConfiguration:
-        operations.close()
-        raise
-    app = create_app(operations)
-    sys.setswitchinterval(TURN_S)
+    with ExitStack() as held:
+        app, probes = _opened(settings, held)
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        _run(settings, create_app(app), probes)
 
-    def configured(app: ASGIApp) -> uvicorn.Config:
+
+def _opened(settings: Settings, held: ExitStack) -> tuple[App, socket.socket | None]:
+    """The open app, and the socket for probes; the lock on the database goes to `held`."""
+    with ExitStack() as on_failure:
+        app = open_app(settings, serving=True)
+        on_failure.callback(app.close)
+        lock = hold_served(settings.database)
+        if lock is not None:
+            held.enter_context(lock)
+        if not is_loopback(settings.host) and not app.access.has_tokens():
+            raise BadConfiguration(
+                f"ACQUIRE_HOST: {settings.host} is not a loopback address: create a token first, "
+                "with `acquire token create`"
+            )
+        warn_of_old_sqlite(settings.database)
+        probes = _listening(settings.host, settings.probe_port)
+        on_failure.pop_all()
+    return app, probes
+
+
+def _run(settings: Settings, web_app: FastAPI, probes: socket.socket | None) -> None:
+    def configured(web_app: ASGIApp) -> uvicorn.Config:
         return uvicorn.Config(
-            app,
+            web_app,
             host=settings.host,
             port=settings.port,
             http=cast(type[asyncio.Protocol], Connection),
@@ -76,9 +86,9 @@ def serve(settings: Settings, started: Started | None = None) -> None:
     admission = Admission(
         _connections(), settings.connections_per_address, networks(settings.trusted_proxies)
     )
-    server = Server(configured(app), app.state.live.stop, admission)
+    server = Server(configured(web_app), web_app.state.live.stop, admission)
     if probes is not None:
-        server.add_probes(probes, configured(ProbesAlone(app)))
+        server.add_probes(probes, configured(ProbesOnly(web_app)))
     with suppress(KeyboardInterrupt):
         server.run()
     if not server.started:

@@ -9,9 +9,9 @@ from msgspec import structs
 
 from service.acquire import acquire
 from service.advice.advice import advise
-from service.advice.evidence import evidence_of, gathered
+from service.advice.evidence import evidence_of, merged
 from service.missions.mission import SHIPPED_FOLDER, Mission
-from service.observe.wire import submission_from_json
+from service.observations.schema import submission_from_json
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
 
@@ -60,7 +60,7 @@ def evidence_from(mission, sky, batches):
         options = batch.options.__class__(identifier="verified")
         again = structs.replace(batch, options=options)
         parts.append(evidence_of(number, acquire(again, mission.within_zones, sky)))
-    return gathered(parts)
+    return merged(parts)
 
 
 def advice_from(mission, sky, batches, **wanted):

@@ -7,11 +7,11 @@ import pytest
 from scipy import stats
 
 from service.acquire import acquire
-from service.advice.advice import Pace
-from service.advice.report import as_row, as_text
+from service.advice.advice import WorkLimit
+from service.advice.report import advice_record, advice_text
+from service.advice.statements import alignment_statement, noise_statement
 from service.advice.tolerances import rounded_up, tolerance_findings
 from service.advice.trackers import alignment_findings, magnitude_findings, noise_findings
-from service.advice.words import said_of_alignment, said_of_noise
 from service.missions.mission import Mission
 from service.simulate.stretches import NO_TROUBLES, Trouble, Troubles
 from service.vectors import (
@@ -53,7 +53,7 @@ def test_the_noise_of_a_tracker_is_found(sky, missions, seed, factor, verdict):
     assert near(noise.sigma_arcsec, sigma_arcsec)
     assert noise.sigma_arcsec.high - noise.sigma_arcsec.low < 0.4 * sigma_arcsec
     assert noise.verdict == verdict
-    lines = [change.line for change in said_of_noise(noise).changes]
+    lines = [change.line for change in noise_statement(noise).changes]
     assert [line.split(" = ")[0] for line in lines] == ["sigma_arcsec"] * (verdict != "fits")
 
 
@@ -80,7 +80,7 @@ def test_a_tracker_whose_noise_grows_does_not_fit_and_no_sigma_is_advised(
     pass_ = flown(
         mission, sky, batches, seed, change=worn(mission, begin, batches, 5.0), angles_share=0.0
     )
-    row = as_row(advice_from(mission, sky, pass_.batches[::-1]))
+    row = advice_record(advice_from(mission, sky, pass_.batches[::-1]))
     (noise,) = row["noise"]
     assert noise["verdict"] == "too_small"
     assert noise["action"] == "correct"
@@ -89,7 +89,7 @@ def test_a_tracker_whose_noise_grows_does_not_fit_and_no_sigma_is_advised(
     assert "Look at the tracker first" in noise["text"]
     assert row["changes"] == []
     about = {"spacecraft": "XTE", "run": "r", "first": "a", "last": "b", "batches_in_range": 200}
-    text = as_text(about | row)
+    text = advice_text(about | row)
     assert "Nothing in the mission file needs to change" not in text
     assert "sigma_arcsec =" not in text
 
@@ -108,7 +108,7 @@ def test_noise_that_was_large_before_and_fits_now_is_left_alone(sky, missions, s
     (noise,) = noise_findings(mission, evidence_from(mission, sky, pass_.batches))
     assert noise.verdict == "fits"
     assert near(noise.sigma_arcsec, mission.trackers[0].sigma_arcsec)
-    said = said_of_noise(noise)
+    said = noise_statement(noise)
     assert (said.action, said.changes) == ("keep", ())
     assert "before" in said.text
 
@@ -138,7 +138,7 @@ def test_the_line_for_the_magnitudes_undoes_their_offset(sky, missions, seed):
 
     mission = missions["XTE"]
     pass_ = flown(mission, sky, BATCHES, seed, change=fainter)
-    row = as_row(advice_from(mission, sky, pass_.batches[:60]))
+    row = advice_record(advice_from(mission, sky, pass_.batches[:60]))
     (line,) = [c["line"] for c in row["changes"] if c["table"] == "catalog"]
     key, value = line.partition("#")[0].split(" = ")
     polynomial = tuple(float(part) for part in value.strip(" []").split(","))
@@ -169,7 +169,7 @@ def test_a_misaligned_tracker_is_found_and_the_lines_put_it_right(sky, seed):
         assert part.high - part.low < 20.0
     advised = {
         change.line.split(" = ")[0]: [float(x) for x in change.line.split("[")[1][:-1].split(",")]
-        for change in said_of_alignment(found).changes
+        for change in alignment_statement(found).changes
     }
     mended = mission_like(second_tracker=advised)
     (left,) = alignment_findings(mended, evidence_from(mended, sky, pass_.batches))
@@ -214,7 +214,7 @@ def test_a_tolerance_is_changed_only_where_the_identifier_asks_for_it(sky, seed,
     mission = mission_like(tolerances={"separation_deg": 0.001})
     mission = mission.model_copy(update={"identifier": identifier})
     pass_ = flown(mission, sky, 60, seed)
-    row = as_row(advice_from(mission, sky, pass_.batches))
+    row = advice_record(advice_from(mission, sky, pass_.batches))
     found = next(each for each in row["tolerances"] if each["tolerance"] == "separation_deg")
     keys = [each["line"].partition(" = ")[0] for each in row["changes"]]
     assert found["verdict"] == "too_tight"
@@ -223,13 +223,13 @@ def test_a_tolerance_is_changed_only_where_the_identifier_asks_for_it(sky, seed,
         assert (found["action"], "separation_deg" in keys) == ("widen", True)
     else:
         assert (found["action"], "separation_deg" in keys) == ("keep", False)
-        assert "leave it as it is" in found["text"]
+        assert "does not use it: keep it" in found["text"]
 
 
 def test_a_tolerance_that_growing_noise_makes_too_tight_waits(sky, seed):
     mission = mission_like().model_copy(update={"identifier": "starid"})
     pass_ = flown(mission, sky, 150, seed, change=worn(mission, 0.6, 150, 8.0), angles_share=0.0)
-    row = as_row(advice_from(mission, sky, pass_.batches))
+    row = advice_record(advice_from(mission, sky, pass_.batches))
     found = next(each for each in row["tolerances"] if each["tolerance"] == "separation_deg")
     assert (found["verdict"], found["action"]) == ("too_tight", "wait")
     keys = {each["line"].partition(" = ")[0] for each in row["changes"]}
@@ -244,7 +244,9 @@ def test_two_trackers_with_the_same_offset_give_one_line(sky, seed):
             star["magnitude"] += 0.35
 
     mission = mission_like(second_tracker={})
-    row = as_row(advice_from(mission, sky, flown(mission, sky, 40, seed, change=fainter).batches))
+    row = advice_record(
+        advice_from(mission, sky, flown(mission, sky, 40, seed, change=fainter).batches)
+    )
     lines = [each["line"] for each in row["changes"] if each["table"] == "catalog"]
     assert [line.partition(" = ")[0] for line in lines] == ["color_polynomial_mag"]
 
@@ -293,15 +295,15 @@ def test_a_tolerance_whose_test_is_off_is_not_judged(sky, seed):
 
 def test_of_a_few_batches_nothing_is_said(sky, missions, seed):
     mission = missions["XTE"]
-    row = as_row(advice_from(mission, sky, flown(mission, sky, 6, seed).batches))
+    row = advice_record(advice_from(mission, sky, flown(mission, sky, 6, seed).batches))
     assert row["changes"] == []
     findings = row["tolerances"] + row["noise"] + row["magnitudes"]
     assert {each["action"] for each in findings} == {"wait"}
-    assert all("too little was seen" in each["text"] for each in findings)
+    assert all("too little data" in each["text"] for each in findings)
 
 
 def test_of_no_batches_nothing_is_said(sky, missions):
-    row = as_row(advice_from(missions["SOHO"], sky, []))
+    row = advice_record(advice_from(missions["SOHO"], sky, []))
     assert row["changes"] == []
     assert row["batches_sampled"] == 0
 
@@ -325,12 +327,12 @@ def test_a_recommended_value_is_one_a_person_would_write(value, rounded):
 # ---- other settings ----------------------------------------------------------------------------
 
 
-def test_what_was_tried_is_what_the_staircase_gives(sky, seed):
+def test_what_was_tried_is_what_an_acquisition_gives(sky, seed):
     """Each row's counts are those of the batches run one by one with these settings."""
     mission = mission_like(tolerances={"separation_deg": 0.002})
     pass_ = flown(mission, sky, 25, seed, troubles=Troubles())
     advice = advice_from(mission, sky, pass_.batches, own={"separation_deg": 0.015})
-    rows = {(t.variant.name, t.variant.identifier): t for t in advice.tried}
+    rows = {(t.variant.name, t.variant.identifier): t for t in advice.trials}
     for (_, identifier), row in rows.items():
         changed = dict(row.variant.tolerances)
         again = mission_like(
@@ -344,7 +346,7 @@ def test_what_was_tried_is_what_the_staircase_gives(sky, seed):
     assert present.change is None
     lost = 100 * (present.unique - asked.unique) / present.observed
     assert asked.change.value == pytest.approx(lost)
-    assert rows["present settings", "verified"].otherwise == 0
+    assert rows["present settings", "verified"].other_star == 0
 
 
 def test_a_batch_that_no_longer_fits_is_counted_and_passed_by(sky, missions, seed):
@@ -360,11 +362,11 @@ def test_where_time_runs_out_fewer_batches_are_looked_at_and_the_answer_says_so(
     sky, missions, seed
 ):
     steps = []
-    pace = Pace(lambda share: len(steps) < 20 * share, lambda: steps.append(1))
+    pace = WorkLimit(lambda share: len(steps) < 20 * share, lambda: steps.append(1))
     mission = missions["XTE"]
     advice = advice_from(mission, sky, flown(mission, sky, 40, seed).batches, pace=pace)
     assert advice.sampled == 8
-    assert {t.batches for t in advice.tried if t.variant.identifier == "starid"} == {8}
+    assert {t.batches for t in advice.trials if t.variant.identifier == "starid"} == {8}
 
 
 def test_the_text_can_be_acted_upon(sky, seed):
@@ -374,8 +376,8 @@ def test_the_text_can_be_acted_upon(sky, seed):
     pass_ = flown(mission, sky, 60, seed, troubles=NO_TROUBLES)
     advice = advice_from(mission, sky, pass_.batches)
     about = {"spacecraft": "XTE", "run": "r", "first": "a", "last": "b", "batches_in_range": 99}
-    text = as_text(about | as_row(advice))
-    assert "60 of 99 batches were looked at." in text
+    text = advice_text(about | advice_record(advice))
+    assert "60 of 99 batches were examined." in text
     assert "SEPTOL (separation_deg) is too tight" in text
     changes = text.partition("To change in the mission file of XTE:")[2].splitlines()
     assert "  [tolerances]" in changes

@@ -90,13 +90,15 @@ def test_a_line_through_clustered_outliers_is_covered(rng):
     for place, truth in ((0, 0.3), (1, 0.05)):
 
         def estimate(*drawn, place=place):
-            return intervals.intervals(*intervals.fitted(*drawn))[place]
+            return intervals.intervals(*intervals.robust_fit(*drawn))[place]
 
         assert covered(rng, draw, estimate, truth) >= LEAST_COVERED
 
 
 def test_values_that_all_agree_are_bounded_by_themselves():
     design = np.stack([np.ones(60), np.linspace(-1, 1, 60)], axis=1)
-    beta, covariance = intervals.fitted(design, design @ [2.0, -1.0], np.repeat(np.arange(20), 3))
+    beta, covariance = intervals.robust_fit(
+        design, design @ [2.0, -1.0], np.repeat(np.arange(20), 3)
+    )
     assert beta == pytest.approx([2.0, -1.0])
     assert np.abs(covariance).max() < 1e-12

@@ -1,5 +1,5 @@
 """Databases and batches as the records' own tests have them."""
 
-from tests.records.conftest import make, opened, operations
+from tests.storage.conftest import app, make, opened
 
-__all__ = ["make", "opened", "operations"]
+__all__ = ["app", "make", "opened"]

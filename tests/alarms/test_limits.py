@@ -5,7 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from service.alarms.limits import LIMITED, LimitSettings, Severity, default_limits
+from service.alarms.limits import LimitSettings, Severity
+from service.alarms.quantities import default_limits, limited_names
 from service.alarms.window import Window
 
 S = 10**9
@@ -122,7 +123,7 @@ def test_what_is_passed_over_would_have_been_in_limits_one_by_one(groups, count,
         settings = wide if is_wide else narrow
         samples = [(time * S, value, 1) for time, value in values]
         before = together.to_json()
-        passed = together.pass_over(samples, settings)
+        passed = together.add_if_within(samples, settings)
         judged = [one_by_one.add(each, settings) for each in samples]
         if passed:
             assert not any(each and each.severity for each in judged)
@@ -136,11 +137,11 @@ def test_what_is_passed_over_would_have_been_in_limits_one_by_one(groups, count,
 
 def test_what_stays_well_in_limits_is_passed_over():
     settings, window = limits(minimum_count=3), Window()
-    assert window.pass_over([(k, 0.5, 1) for k in range(10)], settings)
-    assert not window.pass_over([(k, 1.5, 1) for k in range(10, 13)], settings)
+    assert window.add_if_within([(k, 0.5, 1) for k in range(10)], settings)
+    assert not window.add_if_within([(k, 1.5, 1) for k in range(10, 13)], settings)
     # Of batches that come late no mean is worse than the worst of them.
-    assert window.pass_over([(8, 0.9, 1), (1, 1.5, 1)], settings)
-    assert not window.pass_over([(8, 1.1, 1)], settings)
+    assert window.add_if_within([(8, 0.9, 1), (1, 1.5, 1)], settings)
+    assert not window.add_if_within([(8, 1.1, 1)], settings)
 
 
 @given(st.lists(st.floats(-5, 5), max_size=30), st.floats(0, 100), st.integers(1, 5))
@@ -173,7 +174,7 @@ def test_limits_that_make_no_sense_are_refused(wrong):
 
 def test_every_limited_quantity_has_a_shipped_limit(missions):
     for mission in missions.values():
-        assert set(default_limits(mission)) == set(LIMITED)
+        assert set(default_limits(mission)) == set(limited_names())
 
 
 def test_the_bound_that_is_told_is_the_one_that_was_passed():

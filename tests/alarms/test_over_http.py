@@ -5,13 +5,13 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from tests.web.conftest import (
     address,
+    app,
     batch,
     client,
     drawn,
-    operations,
 )
 
-__all__ = ["address", "batch", "client", "drawn", "operations"]
+__all__ = ["address", "app", "batch", "client", "drawn"]
 
 LIMITS = "/api/v1/spacecraft/XTE/limits"
 TIGHT = {"warning": {"high": 0.5}, "minimum_count": 1, "duration_s": 0}

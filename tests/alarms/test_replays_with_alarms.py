@@ -2,8 +2,8 @@
 
 import pytest
 
+from service.app.factory import open_app
 from service.cli import main
-from service.operations import Operations
 from service.settings import Settings
 from service.web.app import create_app
 from tests.web.serving import Server
@@ -19,34 +19,34 @@ def file(tmp_path_factory):
 
 
 @pytest.fixture
-def operations(tmp_path):
-    return Operations.open(Settings(database=f"sqlite:///{tmp_path / 'acquire.db'}"))
+def app(tmp_path):
+    return open_app(Settings(database=f"sqlite:///{tmp_path / 'acquire.db'}"))
 
 
-def raised(operations, run):
-    return {each["quantity"] for each in operations.alarms(run=run, state="all").items}
+def raised(app, run):
+    return {each.quantity for each in app.alarms.page(run=run, state="all").items}
 
 
 @pytest.mark.parametrize("way", [(), ("--concurrency", "4")], ids=["as a file", "batch by batch"])
-def test_through_a_server(operations, file, way):
-    with Server(create_app(operations)) as url:
+def test_through_a_server(app, file, way):
+    with Server(create_app(app)) as url:
         for run, alarms in (("quiet", ()), ("loud", ("--alarms",))):
             assert main(["replay", str(file), "--url", url, "--run", run, *way, *alarms]) == 0
-        assert raised(operations, "quiet") == set()
-        assert "a_priori_angle_deg" in raised(operations, "loud")
+        assert raised(app, "quiet") == set()
+        assert "a_priori_angle_deg" in raised(app, "loud")
 
 
-def test_in_process(operations, file, tmp_path):
-    operations.close()
+def test_in_process(app, file, tmp_path):
+    app.close()
     database = f"sqlite:///{tmp_path / 'acquire.db'}"
     asked = ["replay", str(file), "--in-process", "--database", database, "--run", "loud"]
     assert main([*asked, "--alarms"]) == 0
-    again = Operations.open(Settings(database=database))
-    before = again.alarms(run="loud", state="all").items
+    again = open_app(Settings(database=database))
+    before = again.alarms.page(run="loud", state="all").items
     again.close()
-    assert "a_priori_angle_deg" in {each["quantity"] for each in before}
+    assert "a_priori_angle_deg" in {each.quantity for each in before}
     # A second time adds nothing, and raises nothing anew.
     assert main([*asked, "--alarms"]) == 0
-    again = Operations.open(Settings(database=database))
-    assert again.alarms(run="loud", state="all").items == before
+    again = open_app(Settings(database=database))
+    assert again.alarms.page(run="loud", state="all").items == before
     again.close()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.acquire import acquire
-from service.observe.wire import submission_from_json
+from service.observations.schema import submission_from_json
 from service.sky.ephemeris import apparent, observer_velocity
 from service.times import parse_utc
 from service.vectors import ARCSEC_PER_RADIAN, angle_between_deg, matrix_from_quaternion

@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 
-from service.observe.correct import correct
-from service.observe.wire import submission_from_json
-from tests.observe.example import BATCH
+from service.observations.calibrate import correct
+from service.observations.schema import submission_from_json
+from tests.observations.example import BATCH
 from tests.reference.batches import rotation
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from tests.reference import batches
 from tests.reference.compare import Judge, plain_view
-from tests.reference.plain_starid import presumed_attitude
+from tests.reference.plain_starid import prior_attitude
 
 NAMES = ("XTE", "SWAS", "SOHO")
 
@@ -70,7 +70,7 @@ def test_a_pole_on_the_sun_agrees_with_and_without_a_position(prior, rng, missio
         "a_priori": batches.prior_of(prior, mission_files["SOHO"], np.eye(3)),
         "observations": [{"tracker": "STARTRACKER_1", "stars": [{"h_deg": 0.0, "v_deg": 0.0}]}],
     }  # fmt: skip
-    attitude, widened_deg = presumed_attitude(probe, mission_files["SOHO"])
+    attitude, widened_deg = prior_attitude(probe, mission_files["SOHO"])
     assert widened_deg == (0.3 if prior == "sun_pointed" else 0.0)
     answers = [
         judge.hold(

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from service.acquire import acquire, choices_of
-from service.identify.fov_rotation import rotation_rad
-from service.observe.batch import BoresightPrior
-from service.observe.wire import OptionsIn
+from service.acquire import acquire
+from service.acquire.choices import choices_of
+from service.identify.voting.fov_rotation import rotation_rad
+from service.observations.batch import BoresightPrior
+from service.observations.schema import OptionsIn
 from service.simulate.motion import random_axis, turned
-from service.simulate.paper.printed import the_paper
-from service.simulate.paper.views import EPOCH, batch_of, draw_zone
+from service.studies.paper_1994.printed import the_paper
+from service.studies.paper_1994.views import EPOCH, batch_of, draw_zone
 from service.vectors import rotate_about, unit
 
 BORESIGHT, POLE = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])

@@ -17,29 +17,29 @@ def scene(seed, kind):
     rng = np.random.default_rng(seed)
     if kind == "cap":
         places = from_ra_dec(rng.uniform(-8, 8, 60), rng.uniform(-8, 8, 60))
-        aim = cap(radius_deg=9.0)
+        region = cap(radius_deg=9.0)
     else:
         places = from_ra_dec(rng.uniform(-15, 15, 60), rng.uniform(-5, 5, 60))
-        aim = band(half_width_deg=5.5)
+        region = band(half_width_deg=5.5)
     # No two magnitudes alike, so that the order of rows is the same in every frame.
     magnitudes = rng.permutation(60) * 0.05 + 3.0
     chosen = rng.choice(60, 5, replace=False)
     observed = places[chosen] + rng.normal(size=(5, 3)) * 1e-5
     observed /= np.linalg.norm(observed, axis=1, keepdims=True)
     seen = magnitudes[chosen] + rng.normal(size=5) * 0.1
-    return rng, places, magnitudes, observed, seen, aim
+    return rng, places, magnitudes, observed, seen, region
 
 
 @pytest.mark.parametrize("kind", ["cap", "band"])
 @settings(max_examples=60)
 @given(seed=seeds)
 def test_turning_the_sky_and_all_that_is_seen_of_it_changes_nothing(kind, seed):
-    rng, places, magnitudes, observed, seen, aim = scene(seed, kind)
+    rng, places, magnitudes, observed, seen, region = scene(seed, kind)
     turn = quaternion_matrix(random_quaternion(rng))
     still = run_catalog(places, magnitudes)
     turned = run_catalog(places @ turn.T, magnitudes)
-    aim_turned = type(aim)(aim.kind, turn @ aim.axis, aim.least_deg, aim.most_deg)
-    before = named(identify(still, observed, seen, aim), still)
+    aim_turned = type(region)(region.kind, turn @ region.axis, region.least_deg, region.most_deg)
+    before = named(identify(still, observed, seen, region), still)
     after = named(identify(turned, observed @ turn.T, seen, aim_turned), turned)
     assert before == after
 
@@ -48,11 +48,11 @@ def test_turning_the_sky_and_all_that_is_seen_of_it_changes_nothing(kind, seed):
 @settings(max_examples=60)
 @given(seed=seeds)
 def test_seeing_the_stars_in_another_order_reorders_the_outcome_and_nothing_else(kind, seed):
-    rng, places, magnitudes, observed, seen, aim = scene(seed, kind)
+    rng, places, magnitudes, observed, seen, region = scene(seed, kind)
     catalog = run_catalog(places, magnitudes)
     order = rng.permutation(5)
-    straight = named(identify(catalog, observed, seen, aim), catalog)
-    shuffled = named(identify(catalog, observed[order], seen[order], aim), catalog)
+    straight = named(identify(catalog, observed, seen, region), catalog)
+    shuffled = named(identify(catalog, observed[order], seen[order], region), catalog)
     assert shuffled == [straight[k] for k in order]
 
 
@@ -60,20 +60,20 @@ def test_seeing_the_stars_in_another_order_reorders_the_outcome_and_nothing_else
 @settings(max_examples=40)
 @given(seed=seeds, factor=st.floats(1.0, 50.0))
 def test_a_wider_separation_tolerance_never_takes_a_vote_away(kind, seed, factor):
-    _, places, magnitudes, observed, seen, aim = scene(seed, kind)
+    _, places, magnitudes, observed, seen, region = scene(seed, kind)
     catalog = run_catalog(places, magnitudes)
-    narrow = identify(catalog, observed, seen, aim)
-    wide = identify(catalog, observed, seen, aim, separation_deg=0.0066 * factor)
+    narrow = identify(catalog, observed, seen, region)
+    wide = identify(catalog, observed, seen, region, separation_deg=0.0066 * factor)
     assert (wide.votes >= narrow.votes).all()
 
 
 @settings(max_examples=40)
 @given(seed=seeds)
 def test_the_tallies_say_what_the_outcome_is(seed):
-    _, places, magnitudes, observed, seen, aim = scene(seed, "cap")
+    _, places, magnitudes, observed, seen, region = scene(seed, "cap")
     catalog = run_catalog(places, magnitudes)
     for outcome, star, votes, runner_up in named(
-        identify(catalog, observed, seen, aim, separation_deg=0.3), catalog
+        identify(catalog, observed, seen, region, separation_deg=0.3), catalog
     ):
         assert votes >= runner_up >= 0
         if outcome == "unique":

@@ -22,9 +22,9 @@ from service.simulate.scenes import (
     draw_random_points,
     draw_scenes,
 )
-from service.sky.catalog import load_embedded
-from service.sky.run_catalog import build_run_catalog
-from service.sky.sky_index import build_sky_index
+from service.sky.catalog.run_catalog import build_run_catalog
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.whole_sky.index import build_sky_index
 from service.vectors import unit
 
 INDEX_LIMIT_MAG = 6.5

@@ -3,16 +3,21 @@
 import numpy as np
 import pytest
 
-from service.identify.attitude_check import log_chance
 from service.identify.identification import Outcome
-from service.identify.ptp import SIGMA_FLOOR_ARCSEC, identify_triangles, observed_triangles, propose
-from service.identify.sharing import count_pairs, validate
-from service.identify.triangle_match import projection_sigma, side_sigma
+from service.identify.triangles.attitude_check import log_chance
+from service.identify.triangles.ptp import (
+    SIGMA_FLOOR_ARCSEC,
+    identify_triangles,
+    observed_triangles,
+    propose,
+)
+from service.identify.triangles.sharing import count_pairs, validate
+from service.identify.triangles.triangle_match import projection_sigma, side_sigma
 from service.missions.mission import RunCatalogSettings
-from service.sky.catalog import load_embedded
-from service.sky.guide import build_guide
-from service.sky.run_catalog import build_run_catalog
-from service.sky.triangles import REACH_DEG, chord, project
+from service.sky.catalog.run_catalog import build_run_catalog
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.geometry.triangles import REACH_DEG, chord, project
+from service.sky.whole_sky.guide import build_guide
 from service.vectors import ARCSEC_PER_RADIAN, angle_between_deg, coordinate_rotation, unit
 
 PIXEL_RAD = 12e-3 / 70.2262

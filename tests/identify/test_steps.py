@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from service.identify.starid import identify_by_votes
+from service.identify.voting.starid import identify_by_votes
 from service.missions.mission import Tests as Switches
 from service.sky.zones import build_zone
 from tests.reference.batches import rotation

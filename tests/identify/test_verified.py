@@ -10,19 +10,19 @@ from msgspec import structs
 from scipy.stats import multivariate_normal
 
 from service.acquire import acquire
-from service.identify import evidence
-from service.identify.fitting import fit, weigh, weigh_without
+from service.identify.attitude_from_matches import aberrate
+from service.identify.hypotheses import evidence
+from service.identify.hypotheses.fitting import fit_match, weigh, weigh_without
+from service.identify.hypotheses.scene import ObservedStars, ZoneStars, scratch_for
+from service.identify.hypotheses.verified import identify_verified, posterior_of
+from service.identify.hypotheses.verified import scene_of as scene_of_sighting
 from service.identify.identification import Outcome
-from service.identify.matched import aberrate
-from service.identify.scene import Seen, Stars, scratch_for
-from service.identify.starid import identify_by_votes
-from service.identify.verify import identify_verified, posterior_of
-from service.identify.verify import scene_of as scene_of_sighting
+from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import load_missions
-from service.simulate.paper.printed import the_paper
-from service.simulate.paper.views import EPOCH, batch_of, draw_zone
-from service.sky.star_buckets import build_star_buckets, nearest
-from service.sky.star_voxels import build_star_voxels
+from service.sky.geometry.star_buckets import build_star_buckets, nearest
+from service.sky.geometry.star_voxels import build_star_voxels
+from service.studies.paper_1994.printed import the_paper
+from service.studies.paper_1994.views import EPOCH, batch_of, draw_zone
 from service.vectors import ARCSEC_PER_RADIAN, from_ra_dec, unit
 
 VIEWS = 60
@@ -81,15 +81,13 @@ def test_stopping_early_names_what_the_exhaustive_search_names(sky, rng, table, 
         sightings.append(sighting)
         return identify_verified(sighting)
 
-    monkeypatch.setattr(
-        "service.acquire.IDENTIFIERS", {"verified": both, "starid": identify_by_votes}
-    )
+    monkeypatch.setitem(IDENTIFIERS, "verified", replace(IDENTIFIERS["verified"], function=both))
     identified(sky, rng, table, run, views=30)
     same = 0
     for sighting in sightings:
         early, whole = posterior_of(sighting), posterior_of(sighting, exhaustive=True)
-        sure = (early.probability >= 0.999) & (whole.probability >= 0.999)
-        assert np.array_equal(early.star[sure], whole.star[sure])
+        sure = (early.stars.probability >= 0.999) & (whole.stars.probability >= 0.999)
+        assert np.array_equal(early.stars.star[sure], whole.stars.star[sure])
         same += sure.mean()
     assert same / len(sightings) > 0.97
 
@@ -97,10 +95,13 @@ def test_stopping_early_names_what_the_exhaustive_search_names(sky, rng, table, 
 def test_leaving_a_star_out_of_a_fit_is_fitting_without_it(sky, rng, monkeypatch):
     """The hypothesis less one star: taken away from the fit, and fitted anew."""
     caught = []
-    monkeypatch.setattr(
-        "service.acquire.IDENTIFIERS",
-        {"verified": lambda sighting: caught.append(sighting) or identify_verified(sighting)},
-    )
+
+    def caught_by(sighting):
+        caught.append(sighting)
+        return identify_verified(sighting)
+
+    entry = replace(IDENTIFIERS["verified"], function=caught_by)
+    monkeypatch.setitem(IDENTIFIERS, "verified", entry)
     found = identified(sky, rng, 8, "nominal", views=5)
     for sighting, (identification, _) in zip(caught[-5:], found[-5:], strict=True):
         if not identification.unique.all():
@@ -108,7 +109,7 @@ def test_leaving_a_star_out_of_a_fit_is_fitting_without_it(sky, rng, monkeypatch
         seen, stars, _ = scene_of_sighting(sighting)
         rows = np.searchsorted(sighting.zone.star, identification.star).astype(np.int32)
         scratch = scratch_for(len(rows))
-        _, square, _ = fit(seen, stars, rows, scratch, 2)
+        _, square, _ = fit_match(seen, stars, rows, scratch, 2)
         for k in range(len(rows)):
             less = rows.copy()
             less[k] = -1
@@ -213,7 +214,7 @@ def test_the_prior_of_the_attitude_is_a_density():
 def scene_of(direction):
     """Zone stars all over the sky as the kernels take them."""
     grid = build_star_buckets(direction)
-    return Stars(
+    return ZoneStars(
         direction, np.zeros(len(direction)), grid.start, grid.rows, grid.direction,
         build_star_voxels(direction), np.array([0.0, 0.0, 1.0]), 0.0, math.pi,
         np.full(len(direction), -1.0), 0.0,
@@ -247,13 +248,13 @@ def test_the_fit_is_wahba_s_optimum(rng):
     turn *= np.linalg.det(turn)
     sigma = rng.uniform(1.0, 4.0, 6) / ARCSEC_PER_RADIAN
     observed = unit(direction @ turn.T + sigma[:, None] * rng.normal(size=(6, 3)))
-    seen = Seen(
+    seen = ObservedStars(
         observed, np.zeros(6), sigma, (sigma.min() / sigma) ** 2, sigma.min(), np.zeros(3), 0,
         np.array([1.0, 0.0, 0.0]),
     )  # fmt: skip
     scratch = scratch_for(6)
     match = np.arange(6, dtype=np.int32)
-    assert fit(seen, scene_of(direction), match, scratch, 2)[0] == 6
+    assert fit_match(seen, scene_of(direction), match, scratch, 2)[0] == 6
     u, _, vt = np.linalg.svd((seen.weight[:, None] * observed).T @ direction)
     best = u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
     assert np.abs(scratch.t - best).max() * ARCSEC_PER_RADIAN < 1e-4

@@ -7,7 +7,7 @@ import zlib
 import numpy as np
 from PIL import Image
 
-from service.imaging.fits import write_fits
+from service.imaging.frames.fits import write_fits
 
 SIDE = 1024
 
@@ -47,8 +47,16 @@ def hostile_files(rng):
     yield "png text bomb", _png(SIDE, SIDE, 0, chunk=_text_bomb()), "PNG"
     yield "png profile bomb", _png(SIDE, SIDE, 0, chunk=_profile_bomb()), "PNG"
     yield "png cut off", _picture(sky, "PNG")[:50_000], "PNG"
-    yield "colour", _picture(np.zeros((SIDE, SIDE, 3), np.uint8), "PNG"), "in colour"
-    yield "colour tiff", _picture(np.zeros((SIDE, SIDE, 3), np.uint8), "TIFF"), "in colour"
+    yield "colour", _picture(np.zeros((SIDE, SIDE, 3), np.uint8), "PNG"), "no contrast"
+    yield "colour tiff", _picture(np.zeros((SIDE, SIDE, 3), np.uint8), "TIFF"), "no contrast"
+    yield "a bit a pixel", _picture(np.zeros((SIDE, SIDE), bool), "PNG"), "a bit a pixel"
+    grey = np.clip(sky, 0, 255).astype(np.uint8)
+    yield "jpeg cut off", _picture(grey, "JPEG")[:20_000], "JPEG"
+    yield "jpeg of no body", b"\xff\xd8\xff\xe0" + bytes(100), "JPEG"
+    yield "jpeg bomb", _jpeg_of_size(_picture(grey, "JPEG"), 60_000), "3600000000 pixels"
+    yield "bmp cut off", _picture(grey, "BMP")[:50_000], "BMP"
+    bomb = b"BM" + struct.pack("<LLLLllHHL24x", 54, 0, 54, 40, 30_000, 30_000, 1, 24, 1)
+    yield "bmp bomb", bomb, "900000000 pixels"
     yield "tiff bomb", _tiff_bomb(20_000, 20_000), "400000000 pixels"
     yield "tiff of more than it says", _tiff_bomb(SIDE, SIDE), "no contrast"
     yield "tiff with great tags", _tiff_tags(200), "TIFF tag"
@@ -105,6 +113,12 @@ def _picture(values, file_format):
     file = io.BytesIO()
     Image.fromarray(values).save(file, file_format)
     return file.getvalue()
+
+
+def _jpeg_of_size(whole, side):
+    """A JPEG whose header claims another size."""
+    at = whole.index(b"\xff\xc0") + 5
+    return whole[:at] + struct.pack(">HH", side, side) + whole[at + 4 :]
 
 
 def _chunk(kind, data):

@@ -5,16 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-from service.imaging.centroid import centroid
-from service.imaging.detect import detect
-from service.imaging.frame import Frame
-from service.imaging.measure import measure
-from service.imaging.psf import GaussianPsf
-from service.imaging.shapes import is_sharp
-from service.imaging.struck import hits_under
-from service.imaging.window import Detector
+from service.imaging.centroids.centroid import centroid
+from service.imaging.centroids.psf import GaussianPsf
+from service.imaging.centroids.window import Detector
+from service.imaging.detection.cosmic_rays import hits_under
+from service.imaging.detection.detect import detect
+from service.imaging.detection.measure import measure
+from service.imaging.detection.shapes import is_sharp
+from service.imaging.frames.frame import Frame
 from service.simulate.frames import FrameSettings, draw_frames
-from service.simulate.imaging.windows import draw_window
+from service.studies.star_image_report.windows import draw_window
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,7 @@ def test_places_scatter_as_they_say(frames, camera, missions):
 
 @pytest.mark.parametrize("sigma_px", [0.7, 0.9, 1.5])
 def test_points_of_light_are_stars_wherever_they_fall_on_a_pixel(rng, sigma_px):
-    from service.imaging.psf import GaussianPsf
+    from service.imaging.centroids.psf import GaussianPsf
 
     light = np.zeros((41, 41))
     steps = np.arange(41)

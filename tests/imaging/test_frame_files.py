@@ -8,9 +8,9 @@ import pytest
 from astropy.io import fits
 from PIL import Image
 
-from service.imaging.files import read_frame
-from service.imaging.fits import write_fits
-from service.imaging.frame import FrameLimits
+from service.imaging.frames.files import read_frame
+from service.imaging.frames.fits import write_fits
+from service.imaging.frames.frame import FrameLimits
 
 LIMITS = FrameLimits(max_pixels=1_000_000)
 
@@ -117,3 +117,37 @@ def test_the_digest_is_that_of_the_file(counts):
     file = io.BytesIO()
     np.save(file, counts)
     assert read(file.getvalue()).digest == ("sha256:" + hashlib.sha256(file.getvalue()).hexdigest())
+
+
+@pytest.mark.parametrize("file_format", ["PNG", "TIFF", "BMP"])
+def test_of_a_picture_in_colour_the_channels_are_summed(rng, file_format):
+    values = rng.integers(0, 256, (31, 47, 3)).astype(np.uint8)
+    file = io.BytesIO()
+    Image.fromarray(values).save(file, file_format)
+    frame = read(file.getvalue())
+    assert np.array_equal(frame.counts, values.astype(np.float64).sum(axis=2))
+    assert frame.full_scale == 765.0
+    assert frame.file_format == file_format
+
+
+def test_how_opaque_a_pixel_is_makes_no_light(rng):
+    values = rng.integers(0, 256, (31, 47, 4)).astype(np.uint8)
+    file = io.BytesIO()
+    Image.fromarray(values).save(file, "PNG")
+    assert np.array_equal(read(file.getvalue()).counts, values[..., :3].sum(axis=2))
+
+
+@pytest.mark.parametrize(
+    ("offset", "time"), [("+02:00", "2024-08-11T21:30:01.000Z"), (None, None), ("later", None)]
+)
+def test_a_jpeg_tells_its_exposure_and_its_time_where_the_clock_s_offset_is_known(offset, time):
+    exif = Image.Exif()
+    told = exif.get_ifd(0x8769)
+    told[33434], told[36867] = 2.0, "2024:08:11 23:30:00"
+    if offset is not None:
+        told[36881] = offset
+    file = io.BytesIO()
+    Image.fromarray(np.zeros((32, 32), np.uint8)).save(file, "JPEG", exif=exif)
+    frame = read(file.getvalue())
+    assert frame.exposure_s == 2.0
+    assert frame.time == time

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from service.imaging.marks import Mark
 from service.imaging.overlay import draw_overlay
+from service.imaging.overlay_marks import Mark
 
 SIDE_PX = 256
 ARROW = (110, 200, 255)

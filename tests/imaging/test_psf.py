@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from service.errors import BadInput
-from service.imaging.centroid import centroid
-from service.imaging.gaussian_line import airy
-from service.imaging.psf import GaussianPsf
-from service.imaging.sampled_psf import SampledPsf, airy_psf, cross_psf
-from service.imaging.spectrum import thermal
-from service.imaging.window import Detector
-from service.simulate.imaging.windows import draw_stars
+from service.imaging.centroids.centroid import centroid
+from service.imaging.centroids.psf import GaussianPsf
+from service.imaging.centroids.sampled_psf import SampledPsf, airy_psf, cross_psf
+from service.imaging.centroids.window import Detector
+from service.imaging.optics.spectrum import thermal
+from service.studies.star_image_report.gaussian_line import airy
+from service.studies.star_image_report.windows import draw_stars
 from tests.imaging.optics import DIAMETER_M, LASER_M, MESH
 
 WIRES = MESH.across(DIAMETER_M)

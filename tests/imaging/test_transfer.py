@@ -7,7 +7,16 @@ import pytest
 from scipy.special import j1
 
 from service.errors import BadInput
-from service.imaging.gaussian_line import (
+from service.imaging.optics.pupil import Pupil, disc
+from service.imaging.optics.spectrum import Spectrum, gaussian_line, monochromatic, thermal
+from service.imaging.optics.transfer import (
+    autocorrelation,
+    image_at,
+    image_by_fft,
+    image_by_functional,
+    image_of,
+)
+from service.studies.star_image_report.gaussian_line import (
     airy,
     disc_autocorrelation,
     disc_image,
@@ -15,15 +24,6 @@ from service.imaging.gaussian_line import (
     line_correlation,
     null_fill,
     omega_of,
-)
-from service.imaging.pupil import Pupil, disc
-from service.imaging.spectrum import Spectrum, gaussian_line, monochromatic, thermal
-from service.imaging.transfer import (
-    autocorrelation,
-    image_at,
-    image_by_fft,
-    image_by_functional,
-    image_of,
 )
 from tests.imaging.optics import DIAMETER_M, LASER_M
 

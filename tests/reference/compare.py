@@ -5,14 +5,15 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
 import numpy as np
 
-from service.acquire import acquire
-from service.identify.starid import MAX_RIVALS
+from service.acquire import Acquisition, acquire
+from service.identify.voting.starid import MAX_RIVALS
 from service.missions.mission import Mission
-from service.observe.wire import submission_from_json
-from service.records.answer import answer_of
-from service.sky.view import Sky
+from service.observations.schema import submission_from_json
+from service.sky.model import SkyModel
+from service.storage.recording.answer import answer_of
 from service.times import parse_utc
 from tests.reference import batches
 from tests.reference.plain_starid import PlainCatalog, PlainOutcome, identify
@@ -28,11 +29,15 @@ class Comparison:
     differences: list[str] = field(default_factory=list)
 
 
-def answered(batch: Json, mission: Mission, sky: Sky) -> Json:
+def answered(batch: Json, mission: Mission, sky: SkyModel) -> Json:
     """The service's answer, by the way every batch takes: from its JSON text."""
     submission = submission_from_json(json.dumps(batch))
-    answer = answer_of(acquire(submission.batch, mission, sky), id=None)
-    return dict(json.loads(json.dumps(answer, allow_nan=False)))
+    return answer_as_json(acquire(submission.batch, mission, sky))
+
+
+def answer_as_json(acquisition: Acquisition, id: str | None = None) -> Json:
+    """An answer as a client reads it."""
+    return dict(json.loads(msgspec.json.encode(answer_of(acquisition, id=id))))
 
 
 def plain_view(answer: Json) -> list[list[PlainOutcome]]:
@@ -55,7 +60,7 @@ def plain_view(answer: Json) -> list[list[PlainOutcome]]:
 class Judge:
     """Holds the service against the plain implementation, for one mission; keeps its zones."""
 
-    def __init__(self, toml: Json, sky: Sky) -> None:
+    def __init__(self, toml: Json, sky: SkyModel) -> None:
         self.toml, self.sky = toml, sky
         self.mission = Mission.model_validate(toml)
         self.comparison = Comparison()

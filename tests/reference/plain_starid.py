@@ -98,7 +98,7 @@ def identify(
     """
     zones = {} if zones is None else zones
     settings = settings_of(batch, mission)
-    attitude, widened_deg = presumed_attitude(batch, mission)
+    attitude, widened_deg = prior_attitude(batch, mission)
     axis_body = np.array(mission["zone"]["axis_body"], dtype=float)
     pole = None
     if mission["zone"]["kind"] == "band":
@@ -161,7 +161,7 @@ def attitude_matrix(quaternion: Triple) -> Array:
     return (q4 * q4 - vector @ vector) * np.eye(3) + 2 * np.outer(vector, vector) - 2 * q4 * skew
 
 
-def presumed_attitude(batch: Json, mission: Json) -> tuple[Array, float]:
+def prior_attitude(batch: Json, mission: Json) -> tuple[Array, float]:
     """The a priori attitude matrix, and by how many degrees the zone is to be widened."""
     prior = batch["a_priori"]
     axis_body = np.array(mission["zone"]["axis_body"], dtype=float)

@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from service.identify.starid import Sighting, identify_by_votes
+from service.identify.sighting import Sighting
+from service.identify.voting.starid import identify_by_votes
 from service.missions.mission import Tests, Tolerances, rules_of
-from service.sky.run_catalog import RunCatalog
-from service.sky.zones import Aim, build_zone
+from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.zones import SearchRegion, build_zone
 from service.vectors import from_ra_dec, to_ra_dec, unit
 
 TOLERANCES = Tolerances(
@@ -40,39 +41,39 @@ def at(*places):
 
 
 def cap(axis=(1.0, 0.0, 0.0), radius_deg=10.66):
-    return Aim("cap", unit(axis), 0.0, radius_deg)
+    return SearchRegion("cap", unit(axis), 0.0, radius_deg)
 
 
 def band(axis=(0.0, 0.0, 1.0), coelevation_deg=90.0, half_width_deg=5.0):
-    return Aim(
+    return SearchRegion(
         "band", unit(axis), coelevation_deg - half_width_deg, coelevation_deg + half_width_deg
     )
 
 
-def sighting(observed, magnitudes, aim, zone, tests, limits=TOLERANCES):
+def sighting(observed, magnitudes, region, zone, tests, limits=TOLERANCES):
     """What the identifier is given of inertial vectors; the presumed attitude is known whole."""
-    aside = np.eye(3)[int(np.argmin(np.abs(aim.axis)))]
-    across = np.cross(aim.axis, aside)
+    aside = np.eye(3)[int(np.argmin(np.abs(region.axis)))]
+    across = np.cross(region.axis, aside)
     return Sighting(
         direction=np.ascontiguousarray(observed),
         magnitude_mag=np.array([np.nan if m is None else m for m in magnitudes], float),
         sigma_rad=np.full(len(observed), 1e-5),
         known_axis=None,
         velocity_c=np.zeros(3),
-        boresight=aim.axis if aim.kind == "cap" else across / np.linalg.norm(across),
-        aim=aim,
+        boresight=region.axis if region.kind == "cap" else across / np.linalg.norm(across),
+        region=region,
         zone=zone,
         rules=rules_of(limits, tests),
     )
 
 
-def identify(catalog, observed, magnitudes, aim=None, tests=None, **tolerances):
+def identify(catalog, observed, magnitudes, region=None, tests=None, **tolerances):
     """The identification of inertial vectors in the exact zone."""
-    aim = aim or cap()
+    region = region or cap()
     limits = TOLERANCES.model_copy(update=tolerances)
-    zone = build_zone("SMALL", catalog, aim, limits.pair_separation_max_deg)
-    tests = tests or Tests(pole=aim.kind == "band")
-    return identify_by_votes(sighting(observed, magnitudes, aim, zone, tests, limits))
+    zone = build_zone("SMALL", catalog, region, limits.pair_separation_max_deg)
+    tests = tests or Tests(pole=region.kind == "band")
+    return identify_by_votes(sighting(observed, magnitudes, region, zone, tests, limits))
 
 
 def named(identification, catalog):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from service.errors import BadInput
-from service.imaging.files import read_frame
-from service.imaging.frame import FrameLimits
+from service.imaging.frames.files import read_frame
+from service.imaging.frames.frame import FrameLimits
 from service.simulate.frame_files import write_frames
 from service.simulate.frames import FrameSettings, draw_frames
 

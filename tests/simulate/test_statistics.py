@@ -12,16 +12,12 @@ import numpy as np
 import pytest
 
 from service.acquire import Acquisition, acquire
-from service.observe.wire import submission_from_json
+from service.observations.schema import submission_from_json
 from service.simulate.score import CHI_SQUARE_997
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
 from service.sky.ephemeris import apparent, observer_velocity
-from service.vectors import (
-    angle_between_deg,
-    attitude_error_arcsec,
-    matrix_from_quaternion,
-)
+from service.vectors import angle_between_deg, attitude_error_arcsec, matrix_from_quaternion
 
 WHOLE_PASS = int(os.environ.get("TEST_PASS", "2000"))
 SHORT_PASS = WHOLE_PASS // 4

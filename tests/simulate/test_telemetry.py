@@ -11,8 +11,8 @@ import pytest
 
 from service.errors import BadInput
 from service.missions.mission import Calibration
-from service.observe.correct import correct, tracker_vectors
-from service.observe.wire import submission_from_json
+from service.observations.calibrate import correct, tracker_vectors
+from service.observations.schema import submission_from_json
 from service.simulate.files import read_objects, truth_path, write_pass
 from service.simulate.orbits import HaloOrbit, orbit_of
 from service.simulate.real_sky import real_sky
@@ -21,12 +21,7 @@ from service.simulate.stretches import NO_TROUBLES, Pass, Stretch, Trouble, Trou
 from service.simulate.telemetry import draw_pass
 from service.sky.ephemeris import apparent, observer_velocity, sun_direction
 from service.times import parse_utc, shifted
-from service.vectors import (
-    ARCSEC_PER_RADIAN,
-    angle_between_deg,
-    matrix_from_quaternion,
-    unit,
-)
+from service.vectors import ARCSEC_PER_RADIAN, angle_between_deg, matrix_from_quaternion, unit
 
 SERIOUS = Troubles(Trouble(0.2), Trouble(0.2, 2), Trouble(0.2, 0.5), Trouble(0.2, 12.0))
 ALL = ("XTE", "SWAS", "SOHO")

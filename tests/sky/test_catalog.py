@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 
 from service.errors import BadFile, NotFound
 from service.resources import shipped
-from service.sky.catalog import Catalog, import_csv, load, load_embedded, save
-from service.sky.catalog_coding import COLUMNS
-from service.sky.proper_motion import moved
+from service.sky.catalog.coding import COLUMNS
+from service.sky.catalog.proper_motion import moved
+from service.sky.catalog.star_catalog import Catalog, import_csv, load, load_embedded, save
 from service.vectors import angle_between_deg, from_ra_dec
 
 ARRAYS = [field.name for field in dataclasses.fields(Catalog)][2:]

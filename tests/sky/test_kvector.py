@@ -5,7 +5,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from service.sky.kvector import bracket, build_kvector, rows_within
+from service.sky.geometry.kvector import bracket, build_kvector, rows_within
 
 VALUES = st.lists(
     st.floats(-1e6, 1e6, allow_nan=False) | st.sampled_from([0.0, -1.0, 713.2]), max_size=60

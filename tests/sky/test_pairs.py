@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from service.sky.pairs import build_pairs, separation_rad
+from service.sky.geometry.pairs import build_pairs, separation_rad
 from service.vectors import from_ra_dec
 
 

@@ -8,14 +8,14 @@ import pytest
 from scipy.spatial import cKDTree
 
 from service.missions.mission import RunCatalogSettings
-from service.sky.blending import merge
-from service.sky.catalog import import_csv, load_embedded
-from service.sky.run_catalog import (
+from service.sky.catalog.blending import merge
+from service.sky.catalog.run_catalog import (
     build_run_catalog,
     export_csv,
     export_rejected_csv,
     instrument_magnitude,
 )
+from service.sky.catalog.star_catalog import import_csv, load_embedded
 from service.vectors import angle_between_deg, from_ra_dec, unit
 
 CAP, BAND = 6.5, 8.0

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 
 from service.acquire import acquire
 from service.errors import BadFile
-from service.observe.wire import submission_from_json
+from service.observations.schema import submission_from_json
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
-from service.sky.catalog import import_catalog, load, save
-from service.sky.shelf import Shelf
-from service.sky.sky2000 import FIELDS, is_sky2000, read
-from service.sky.view import Sky
+from service.sky.cache import LruCache
+from service.sky.catalog.sky2000 import FIELDS, is_sky2000, read
+from service.sky.catalog.star_catalog import import_catalog, load, save
+from service.sky.model import SkyModel
 from tests.sky.sky2000_records import LAYOUT, SIRIUS, written
 
 
@@ -260,7 +260,7 @@ def test_a_site_that_has_the_catalog_identifies_by_its_numbers(missions, sky, se
                 "Vmag": float(shipped.magnitude_v_mag[row]),
             }
             out.write(written(**record) + "\n")
-    site = Sky(import_catalog(path), Shelf(64 << 20))
+    site = SkyModel(import_catalog(path), LruCache(64 << 20))
     wanted = Pass(12, seed, troubles=NO_TROUBLES)
     named = 0
     for drawn in draw_pass(mission, sky, wanted):

@@ -7,10 +7,10 @@ import pytest
 from numba import njit
 
 from service.missions.mission import RunCatalogSettings
-from service.sky.catalog import load_embedded
-from service.sky.run_catalog import build_run_catalog
-from service.sky.shelf import Shelf
-from service.sky.sky_bitmap import (
+from service.sky.cache import LruCache
+from service.sky.catalog.run_catalog import build_run_catalog
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.whole_sky.bitmap import (
     CELLS,
     build_sky_bitmap,
     cell_of,
@@ -18,7 +18,7 @@ from service.sky.sky_bitmap import (
     cells_of_points,
     star_near,
 )
-from service.sky.sky_index import (
+from service.sky.whole_sky.index import (
     BUCKET_RAD,
     FURTHER_MAG,
     MAX_PAIR_DEG,
@@ -27,7 +27,7 @@ from service.sky.sky_index import (
     patch_of,
     sky_index_for,
 )
-from service.sky.sky_store import LARGE_PAGE
+from service.sky.whole_sky.store import LARGE_PAGE
 from service.vectors import angle_between_deg, unit
 
 LIMIT_MAG = 6.5
@@ -166,14 +166,14 @@ def test_a_patch_lists_every_star_of_a_field_about_it_brightest_first(index, rng
 
 
 def test_it_is_small_and_kept_by_what_it_is_made_of(run_catalog):
-    shelf = Shelf(1 << 26)
-    first, cached = sky_index_for(shelf, run_catalog, LIMIT_MAG, 7.1)
+    cache = LruCache(1 << 26)
+    first, cached = sky_index_for(cache, run_catalog, LIMIT_MAG, 7.1)
     assert not cached
     assert first.nbytes <= 15e6
-    again, cached = sky_index_for(shelf, run_catalog, LIMIT_MAG, 7.1)
+    again, cached = sky_index_for(cache, run_catalog, LIMIT_MAG, 7.1)
     assert cached
     assert again is first
-    assert sky_index_for(shelf, run_catalog, 6.0, 7.1)[0] is not first
+    assert sky_index_for(cache, run_catalog, 6.0, 7.1)[0] is not first
 
 
 def test_of_a_deep_catalog_the_brightest_are_kept():

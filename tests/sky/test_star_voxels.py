@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from service.sky.star_voxels import REACH_RAD, build_star_voxels, level_for, star_within_reach
+from service.sky.geometry.star_voxels import (
+    REACH_RAD,
+    build_star_voxels,
+    level_for,
+    star_within_reach,
+)
 from service.vectors import unit
 
 

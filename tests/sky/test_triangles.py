@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.sky.triangles import (
+from service.sky.geometry.triangles import (
     LEAST_SEPARATION_DEG,
     SIDE_SCALE,
     build_triangles,

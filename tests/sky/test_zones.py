@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.sky.shelf import Shelf
-from service.sky.zones import Aim, build_zone, counts_within, snapped, zone_for
+from service.sky.cache import LruCache
+from service.sky.zones import SearchRegion, build_zone, counts_within, snapped, zone_for
 from service.vectors import angle_between_deg, from_ra_dec, unit
 from tests.reference.small_sky import run_catalog
 
@@ -39,15 +39,15 @@ aims = st.one_of(
     st.tuples(st.just("band"), directions, st.floats(0, 175), st.floats(0.1, 60)).map(
         lambda a: (a[0], a[1], a[2], min(180.0, a[2] + a[3]))
     ),
-).map(lambda a: Aim(*a))
+).map(lambda a: SearchRegion(*a))
 
 
 @settings(max_examples=60)
-@given(seed=st.integers(0, 2**32 - 1), aim=aims)
-def test_a_zone_is_what_brute_force_selects_brightest_first(seed, aim):
+@given(seed=st.integers(0, 2**32 - 1), region=aims)
+def test_a_zone_is_what_brute_force_selects_brightest_first(seed, region):
     catalog = sky(seed)
-    zone = build_zone("X", catalog, aim, 8.0)
-    assert zone.star.tolist() == within(catalog, aim.axis, aim.least_deg, aim.most_deg)
+    zone = build_zone("X", catalog, region, 8.0)
+    assert zone.star.tolist() == within(catalog, region.axis, region.least_deg, region.most_deg)
     assert (np.diff(zone.magnitude_mag) >= 0).all()
     assert (zone.direction == catalog.direction[zone.star]).all()
     assert zone.summary()["stars"] == len(zone.star)
@@ -74,20 +74,20 @@ def test_poles_and_the_zero_meridian_snap_like_any_other_place(place, grid_deg):
 
 
 @settings(max_examples=60)
-@given(seed=st.integers(0, 2**32 - 1), aim=aims, grid_deg=grids)
-def test_the_shelf_s_zone_holds_every_star_of_the_exact_one(seed, aim, grid_deg):
-    catalog, shelf = sky(seed), Shelf(1 << 20)
-    wide, cached = zone_for(shelf, "X", catalog, aim, 8.0, grid_deg)
-    exact, _ = zone_for(shelf, "X", catalog, aim, 8.0, 0.0)
+@given(seed=st.integers(0, 2**32 - 1), region=aims, grid_deg=grids)
+def test_the_shelf_s_zone_holds_every_star_of_the_exact_one(seed, region, grid_deg):
+    catalog, cache = sky(seed), LruCache(1 << 20)
+    wide, cached = zone_for(cache, "X", catalog, region, 8.0, grid_deg)
+    exact, _ = zone_for(cache, "X", catalog, region, 8.0, 0.0)
     assert not cached
     assert set(exact.star.tolist()) <= set(wide.star.tolist())
-    assert exact.star.tolist() == within(catalog, aim.axis, aim.least_deg, aim.most_deg)
-    assert counts_within(wide, aim) == counts_within(exact, aim)
-    assert counts_within(exact, aim) == (len(exact.star), exact.pairs.count)
+    assert exact.star.tolist() == within(catalog, region.axis, region.least_deg, region.most_deg)
+    assert counts_within(wide, region) == counts_within(exact, region)
+    assert counts_within(exact, region) == (len(exact.star), exact.pairs.count)
 
 
 def test_aims_of_one_grid_cell_share_a_zone_and_others_do_not():
-    catalog, shelf = sky(3), Shelf(1 << 20)
+    catalog, cache = sky(3), LruCache(1 << 20)
 
     def zone(
         ra_deg,
@@ -98,8 +98,8 @@ def test_aims_of_one_grid_cell_share_a_zone_and_others_do_not():
         grid_deg=1.0,
         stars=catalog,
     ):
-        aim = Aim("cap", from_ra_dec(ra_deg, dec_deg), 0.0, most_deg)
-        return zone_for(shelf, mission, stars, aim, separation_deg, grid_deg)
+        region = SearchRegion("cap", from_ra_dec(ra_deg, dec_deg), 0.0, most_deg)
+        return zone_for(cache, mission, stars, region, separation_deg, grid_deg)
 
     first, cached = zone(83.1, -2.4)
     assert not cached
@@ -121,19 +121,19 @@ def test_aims_of_one_grid_cell_share_a_zone_and_others_do_not():
     [(0.0, 4.0, False), (6.65, 4.0, False), (6.67, 4.0, True), (170.0, 4.0, True)],
 )
 def test_a_field_that_reaches_past_a_cap_s_edge_is_noticed(boresight_deg, radius_deg, past):
-    aim = Aim("cap", from_ra_dec(0, 0), 0.0, 10.66)
-    assert aim.reaches_past(from_ra_dec(boresight_deg, 0), radius_deg) == past
+    region = SearchRegion("cap", from_ra_dec(0, 0), 0.0, 10.66)
+    assert region.reaches_past(from_ra_dec(boresight_deg, 0), radius_deg) == past
 
 
 @pytest.mark.parametrize(
     ("latitude_deg", "past"), [(0.0, False), (0.09, False), (0.11, True), (-0.11, True)]
 )
 def test_a_field_that_reaches_past_a_band_s_edge_is_noticed_on_either_side(latitude_deg, past):
-    aim = Aim("band", from_ra_dec(0, 90), 87.9, 92.1)
-    assert aim.reaches_past(from_ra_dec(200, latitude_deg), 2.0) == past
+    region = SearchRegion("band", from_ra_dec(0, 90), 87.9, 92.1)
+    assert region.reaches_past(from_ra_dec(200, latitude_deg), 2.0) == past
 
 
 def test_what_is_held_is_counted():
-    zone = build_zone("X", sky(5), Aim("cap", unit([1.0, 2.0, 3.0]), 0.0, 30.0), 8.0)
+    zone = build_zone("X", sky(5), SearchRegion("cap", unit([1.0, 2.0, 3.0]), 0.0, 30.0), 8.0)
     own = zone.star.nbytes + zone.direction.nbytes + zone.magnitude_mag.nbytes
     assert zone.nbytes >= own + zone.pairs.nbytes

@@ -10,8 +10,8 @@ from typing import Any
 import httpx
 import pytest
 
+from service.app.factory import App, open_app
 from service.missions.mission import load_missions
-from service.operations import Operations
 from service.settings import Settings
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
@@ -23,14 +23,14 @@ Json = dict[str, Any]
 
 
 @pytest.fixture(scope="session")
-def operations(chosen_database: Callable[[], str]) -> Operations:
+def app(chosen_database: Callable[[], str]) -> App:
     """The real operations over a new database; the server closes them."""
-    return Operations.open(Settings(database=chosen_database()))
+    return open_app(Settings(database=chosen_database()))
 
 
 @pytest.fixture(scope="session")
-def address(operations: Operations) -> Iterator[str]:
-    with Server(create_app(operations)) as url:
+def address(app: App) -> Iterator[str]:
+    with Server(create_app(app)) as url:
         yield url
 
 
@@ -43,13 +43,13 @@ def client(address: str) -> Iterator[httpx.Client]:
 
 
 @pytest.fixture(scope="session")
-def drawn(operations: Operations) -> Callable[..., list[Json]]:
+def drawn(app: App) -> Callable[..., list[Json]]:
     """Batches of a pass over the real catalog."""
 
     def draw(spacecraft: str, batches: int, **wanted: Any) -> list[Json]:
         mission = load_missions()[spacecraft]
         wanted_pass = Pass(batches=batches, **wanted)
-        return [each.batch for each in draw_pass(mission, operations.sky, wanted_pass)]
+        return [each.batch for each in draw_pass(mission, app.sky, wanted_pass)]
 
     return draw
 

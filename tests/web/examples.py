@@ -8,24 +8,23 @@ import gzip
 import json
 import tempfile
 import time
-from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import httpx
 
+from service.access.tokens import add_token, new_secret
+from service.app.factory import App, open_app
 from service.missions.mission import load_missions
-from service.operations import Operations
-from service.records.tokens import add_token, new_secret
 from service.settings import Settings
 from service.simulate.frame_files import frame_bytes
 from service.simulate.frames import FrameSettings, draw_frames
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
-from service.sky.catalog import load_embedded
-from service.sky.shelf import Shelf
-from service.sky.view import Sky
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.model import SkyModel
 from service.web.app import create_app
 from tests.web.serving import Server, compile_kernels
 
@@ -34,7 +33,7 @@ API = "/api/v1"
 Json = dict[str, Any]
 
 
-def walk(client: httpx.Client, operations: Operations) -> Json:
+def walk(client: httpx.Client, app: App) -> Json:
     """Requests and answers by operation and status, of a walk through every route."""
     found: Json = {}
 
@@ -132,7 +131,7 @@ def walk(client: httpx.Client, operations: Operations) -> Json:
         time.sleep(0.05)
     take("cancel_replay", client.delete(begun.headers["Location"]), "cancelled")
     take("session", client.get(f"{API}/session"), "open_access")
-    _sign_in(client, operations, take)
+    _sign_in(client, app, take)
     return found
 
 
@@ -162,9 +161,9 @@ def _alarm(client: httpx.Client, take: Any) -> None:
     take("reset_limit", client.delete(f"{limit}?who=J.%20Operator"), "shipped_again")
 
 
-def _sign_in(client: httpx.Client, operations: Operations, take: Any) -> None:
+def _sign_in(client: httpx.Client, app: App, take: Any) -> None:
     secret = new_secret()
-    operations.change(
+    app.context.change(
         partial(
             add_token,
             id="01JD0000000000000000000001",
@@ -188,8 +187,8 @@ def _sign_in(client: httpx.Client, operations: Operations, take: Any) -> None:
 
 
 @cache
-def _sky() -> Sky:
-    return Sky(load_embedded(), Shelf(64 << 20))
+def _sky() -> SkyModel:
+    return SkyModel(load_embedded(), LruCache(64 << 20))
 
 
 def _frame() -> tuple[Json, bytes]:
@@ -214,17 +213,17 @@ def _drawn(spacecraft: str, **wanted: Any) -> Json:
     return drawn.batch
 
 
-def fresh_walk(open_operations: Callable[[Settings], Operations] = Operations.open) -> Json:
+def fresh_walk() -> Json:
     """The walk through a server of its own with an empty database."""
     with tempfile.TemporaryDirectory() as folder:
         # Where nothing is compiled yet, that takes longer than a client waits.
         compile_kernels()
-        operations = open_operations(Settings(database=f"sqlite:///{folder}/acquire.db"))
+        app = open_app(Settings(database=f"sqlite:///{folder}/acquire.db"))
         with (
-            Server(create_app(operations)) as address,
+            Server(create_app(app)) as address,
             httpx.Client(base_url=address, timeout=300) as client,
         ):
-            return walk(client, operations)
+            return walk(client, app)
 
 
 if __name__ == "__main__":

@@ -14,14 +14,14 @@ import httpx
 import uvicorn
 from fastapi import FastAPI
 
+from service.acquire.prewarm import prewarm_kernels
 from service.missions.mission import load_missions
-from service.sky.catalog import load_embedded
-from service.sky.shelf import Shelf
-from service.sky.view import Sky
-from service.warm import warm_up
-from service.web.admission import Admission
-from service.web.connection import Connection
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.model import SkyModel
+from service.web.connection_limits import Admission
 from service.web.server import Server as StreamingServer
+from service.web.slow_clients import Connection
 
 
 def _stop_streams_of(app: FastAPI) -> Callable[[], None]:
@@ -33,7 +33,7 @@ def _stop_streams_of(app: FastAPI) -> Callable[[], None]:
 @cache
 def compile_kernels() -> None:
     """Compile what a first request would wait for: on a fresh checkout that takes minutes."""
-    warm_up(Sky(load_embedded(), Shelf(64 << 20)), load_missions())
+    prewarm_kernels(SkyModel(load_embedded(), LruCache(64 << 20)), load_missions())
 
 
 class Server:

@@ -12,18 +12,18 @@ import pytest
 from fastapi.routing import APIRoute
 from sqlalchemy import text
 
-from service.operations import Operations
-from service.records import tokens
-from service.records.ids import Ulids
+from service.access import tokens
+from service.app.factory import open_app
 from service.settings import Settings
+from service.storage.recording.ids import Ulids
 from service.times import shifted, utc_now
-from service.web import live
-from service.web.access import COOKIE, POLICIES, guard
-from service.web.app import ROUTERS, bare_app, create_app
+from service.web import event_stream as live
+from service.web.api.access import COOKIE, POLICIES, authorize
+from service.web.app import bare_app, create_app
 from tests.web.serving import Server
 from tests.web.test_bodies import raw
 
-PLACES = {
+PATH_PARAMETERS = {
     "name": "XTE",
     "id": "01JD0000000000000000000000",
     "run": "pass-7",
@@ -40,12 +40,12 @@ class Guarded:
 
     def __init__(self, database):
         self.settings = Settings(database=database)
-        self.operations = Operations.open(self.settings)
+        self.app = open_app(self.settings)
         self._ids = Ulids()
 
     def token(self, name, *scopes, days=1, **more):
         secret, created = tokens.new_secret(), utc_now()
-        self.operations.store.writer.change(
+        self.app.store.writer.change(
             lambda connection: tokens.add_token(
                 connection,
                 id=self._ids.new(),
@@ -60,7 +60,7 @@ class Guarded:
         return secret
 
     def revoke(self, name):
-        self.operations.store.writer.change(
+        self.app.store.writer.change(
             lambda connection: tokens.revoke_token(connection, name, utc_now().text)
         ).result()
 
@@ -74,9 +74,9 @@ def guarded(chosen_database):
     service.revoke("revoked")
     service.of_scope = {each: service.token(each, each) for each in tokens.SCOPES}
     service.swas = service.token("swas", "read", "submit", "operate", spacecraft=["SWAS"])
-    app = create_app(service.operations)
-    service.routes = app.state.routes
-    with Server(app) as service.url:
+    web_app = create_app(service.app)
+    service.routes = web_app.state.routes
+    with Server(web_app) as service.url:
         yield service
 
 
@@ -150,7 +150,7 @@ def replay_begun(client, token, lines, query="run=bound"):
 def requests_of(routes):
     """A request to every route: its name, method and a path that fits."""
     for route in routes:
-        path = re.sub(r"\{(\w+)[^}]*\}", lambda found: PLACES[found[1]], route.path)
+        path = re.sub(r"\{(\w+)[^}]*\}", lambda found: PATH_PARAMETERS[found[1]], route.path)
         for method in sorted(route.methods - {"HEAD"}):
             yield route.name, method, path
 
@@ -161,15 +161,16 @@ def test_every_route_has_a_policy_and_every_policy_a_route(guarded):
 
 
 def test_what_stands_beside_the_guarded_routes_is_known_to_be_open(guarded, anybody):
-    """Whatever is added to the app itself never comes to the guard, which asks for a policy."""
+    """Whatever is added to the app itself never reaches `authorize`, which requires a policy."""
     beside = set()
-    for each in bare_app().router.routes:
-        if getattr(each, "original_router", None) in ROUTERS:
-            assert guard in [asked.dependency for asked in each.include_context.dependencies]
+    web_app = bare_app()
+    for each in web_app.router.routes:
+        if getattr(each, "original_router", None) in web_app.state.routers:
+            assert authorize in [asked.dependency for asked in each.include_context.dependencies]
         else:
             beside.add(each.path)
     assert beside == OPEN_BESIDE_THE_ROUTES
-    # Routes of any other kind have no dependencies, so the guard would not be asked.
+    # Routes of any other kind have no dependencies, so `authorize` would not be called.
     assert all(isinstance(each, APIRoute) for each in guarded.routes)
     for path in ("/static/console.css", "/static/sign-in.js", "/api/v1/openapi.json"):
         assert anybody.get(path).status_code == 200, path
@@ -207,13 +208,13 @@ def test_a_token_without_the_scope_is_refused_by_every_route(guarded, anybody):
 def test_a_token_of_another_spacecraft_is_refused_by_every_route_about_one(guarded, anybody):
     for name, method, path in requests_of(guarded.routes):
         policy = POLICIES[name]
-        if policy.open or policy.about in ("nothing", "body"):
+        if policy.open or policy.spacecraft_in in ("nothing", "body"):
             continue
-        query = {"spacecraft": "XTE"} if policy.about == "query" else None
+        query = {"spacecraft": "XTE"} if policy.spacecraft_in == "query" else None
         response = asked(anybody, method, path, params=query, headers=shown(guarded.swas))
-        wanted = 404 if policy.about == "result" else 403
+        wanted = 404 if policy.spacecraft_in == "result" else 403
         assert response.status_code == wanted, name
-        if policy.about == "query":
+        if policy.spacecraft_in == "query":
             assert asked(anybody, method, path, headers=shown(guarded.swas)).status_code == 403
 
 
@@ -239,7 +240,7 @@ def test_a_bound_token_submits_reads_and_replays_its_own_spacecraft_alone(guarde
     state = ended(anybody, begun.headers["Location"], shown(guarded.swas))
     assert (state["lines"]["done"], state["lines"]["refused"]) == (3, 1)
     assert [each["line"] for each in state["errors"]] == [2]
-    assert "SWAS, not about XTE" in state["errors"][0]["problem"]["detail"]
+    assert "SWAS, not to XTE" in state["errors"][0]["problem"]["detail"]
 
 
 def test_whoever_may_start_a_replay_may_follow_it(guarded, anybody, drawn):
@@ -363,7 +364,7 @@ def test_the_stream_of_an_expired_token_ends_within_two_seconds(guarded):
 
 def test_the_first_token_ends_the_streams_of_those_who_needed_none(chosen_database):
     service = Guarded(chosen_database())
-    with Server(create_app(service.operations)) as url, Stream(url, {}) as stream:
+    with Server(create_app(service.app)) as url, Stream(url, {}) as stream:
         service.token("first", "read")
         assert stream.ended.wait(2.5)
 
@@ -436,9 +437,9 @@ def test_a_change_and_its_note_are_stored_together_or_not_at_all(chosen_database
 
     def rename(old, new):
         statement = text(f"ALTER TABLE {old} RENAME TO {new}")
-        service.operations.change(lambda connection: connection.execute(statement).close())
+        service.app.context.change(lambda connection: connection.execute(statement).close())
 
-    with Server(create_app(service.operations)) as url:
+    with Server(create_app(service.app)) as url:
         headers = shown(service.token("all", "read", "operate"))
         with httpx.Client(base_url=url, headers=headers, timeout=60) as client:
 
@@ -480,7 +481,7 @@ def test_each_change_is_noted_once_and_what_was_refused_too(guarded, anybody):
 
 def test_the_database_holds_nothing_that_could_be_used(guarded):
     """Tokens and sessions alike are kept as digests."""
-    with guarded.operations.store.reading() as connection:
+    with guarded.app.store.reading() as connection:
         kept = "\n".join(
             str(tuple(row))
             for table in ("access_tokens", "access_sessions", "audit")
@@ -492,7 +493,7 @@ def test_the_database_holds_nothing_that_could_be_used(guarded):
 
 def test_access_is_open_on_loopback_until_the_first_token_is_made(chosen_database):
     service = Guarded(chosen_database())
-    with Server(create_app(service.operations)) as url, httpx.Client(base_url=url) as client:
+    with Server(create_app(service.app)) as url, httpx.Client(base_url=url) as client:
         assert client.get("/api/v1/session").json()["name"] == "local"
         service.token("first", "read")
         time.sleep(KNOWN_AGAIN_S)

@@ -62,14 +62,14 @@ def test_the_page_says_it_in_words_and_is_whole(address, full_run):
     assert answer.status_code == 200
     tags = [tag for tag, _ in Markup(answer.text).elements]
     assert tags.count("section") == 1
-    assert "20 of 20 batches run again" in answer.text
+    assert "20 of 20 batches processed again" in answer.text
     assert "SEPTOL (separation_deg)" in answer.text
     assert "default-src 'none'" in answer.headers["content-security-policy"]
 
 
 def test_the_page_of_nothing_says_so(address):
     answer = httpx.get(f"{address}/advice/SOHO", params={"run": "nobody"})
-    assert "There are no batches to advise from" in answer.text
+    assert "There are no batches in this period" in answer.text
 
 
 def test_the_front_page_leads_there(address, full_run):
@@ -91,7 +91,7 @@ def test_the_link_to_the_advice_asks_for_the_day_up_to_the_latest_batch(address,
     start, end = (parse_utc(link[name][0]) for name in ("start", "end"))
     assert (end.tai_ns - start.tai_ns) / 1e9 == pytest.approx(86400)
     answer = httpx.get(f"{address}/advice/XTE", params=link, timeout=60)
-    assert "20 of 20 batches run again" in answer.text
+    assert "20 of 20 batches processed again" in answer.text
 
 
 def test_the_link_asks_for_the_stretch_that_the_page_of_a_spacecraft_shows(address, full_run):
@@ -134,7 +134,7 @@ def test_fields_of_the_form_that_are_left_empty_ask_for_nothing(address, full_ru
     asked = {"run": full_run, "start": "", "end": "", "sample": "5", "tolerance": ""}
     answer = httpx.get(f"{address}/advice/XTE", params=asked, timeout=60)
     assert answer.status_code == 200
-    assert "5 of 20 batches run again" in answer.text
+    assert "5 of 20 batches processed again" in answer.text
 
 
 def test_no_line_is_boxed_that_a_sentence_takes_back(client, full_run):

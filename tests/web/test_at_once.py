@@ -10,12 +10,12 @@ import httpx
 import pytest
 from sqlalchemy import func, select
 
-from service.operations import Operations
-from service.records.tables import batches, idempotency_keys, results
+from service.app.factory import open_app
 from service.settings import Settings
-from tests.records import samples
-from tests.records.whole import assert_whole
+from service.storage.sql.tables import batches, idempotency_keys, results
 from tests.scale import size
+from tests.storage import samples
+from tests.storage.whole import assert_whole
 from tests.web.serving import served
 
 ROUNDS, CONNECTIONS = 1_000, 50
@@ -102,14 +102,14 @@ def test_the_same_key_fifty_times_at_once_is_one_record_and_one_answer(
         for each in connections:
             each.close()
     assert len(acknowledged) == rounds
-    operations = Operations.open(Settings(database=database))
+    app = open_app(Settings(database=database))
     try:
-        assert_whole(operations, acknowledged)
-        with operations.store.reading() as connection:
+        assert_whole(app, acknowledged)
+        with app.store.reading() as connection:
             for table in (batches, results, idempotency_keys):
                 assert connection.scalar(select(func.count()).select_from(table)) == rounds
     finally:
-        operations.close()
+        app.close()
     figures(
         rounds=rounds,
         at_once=CONNECTIONS,

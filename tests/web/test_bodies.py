@@ -7,10 +7,10 @@ import time
 import httpx
 import pytest
 
-from service.operations import Operations
+from service.app.factory import open_app
 from service.settings import Settings
+from service.web.api.request_body import MAX_JSON_BYTES, BodyLimits
 from service.web.app import create_app
-from service.web.bodies import MAX_JSON_BYTES, Limits
 from tests.web.serving import Server
 
 URL = "/api/v1/batches"
@@ -21,9 +21,9 @@ HEADERS = {"Content-Type": "application/json"}
 def impatient(tmp_path_factory):
     """A server that waits half a second for a body, and reads a kilobyte of a replay."""
     path = tmp_path_factory.mktemp("impatient") / "acquire.db"
-    operations = Operations.open(Settings(database=f"sqlite:///{path}"))
-    limits = Limits(replay_bytes=1024, pause_s=0.5, json_s=1.0)
-    with Server(create_app(operations, limits)) as address:
+    app = open_app(Settings(database=f"sqlite:///{path}"))
+    limits = BodyLimits(replay_bytes=1024, pause_s=0.5, json_s=1.0)
+    with Server(create_app(app, limits)) as address:
         yield address
 
 
@@ -31,8 +31,8 @@ def impatient(tmp_path_factory):
 def narrow(tmp_path_factory):
     """A server that has a hundred kilobytes for all bodies together."""
     path = tmp_path_factory.mktemp("narrow") / "acquire.db"
-    operations = Operations.open(Settings(database=f"sqlite:///{path}"))
-    with Server(create_app(operations, Limits(budget_bytes=100_000))) as address:
+    app = open_app(Settings(database=f"sqlite:///{path}"))
+    with Server(create_app(app, BodyLimits(budget_bytes=100_000))) as address:
         yield address
 
 

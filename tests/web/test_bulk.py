@@ -9,7 +9,7 @@ import time
 import pytest
 import zstandard
 
-from tests.records.samples import without_accidents
+from tests.storage.samples import without_accidents
 from tests.web.test_bad_input import WRONG, changed
 
 API = "/api/v1"

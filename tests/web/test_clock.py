@@ -5,24 +5,15 @@ import time
 import httpx
 import pytest
 
-from service.operations import Operations
+from service.app.factory import open_app
 from service.settings import Settings
 from service.web.app import create_app
+from tests.web.console_pages import console_addresses
 from tests.web.serving import Server
 
 PAGES = (
-    "/",
-    "/spacecraft/XTE",
-    "/batches",
-    "/alarms",
-    "/spacecraft/XTE/limits",
-    "/compare",
+    *console_addresses(),
     "/compare?spacecraft=XTE",
-    "/advice/XTE",
-    "/runs",
-    "/zones",
-    "/missions",
-    "/about",
     "/sign-in",
     "/api/v1/overview",
     "/api/v1/spacecraft/XTE",
@@ -38,7 +29,7 @@ def test_every_page_works_whatever_the_year(chosen_database, drawn, monkeypatch,
         clock.setattr(time, "time", lambda: unix_s)
         clock.setattr(time, "time_ns", lambda: int(unix_s) * 10**9)
         with (
-            Server(create_app(Operations.open(database))) as url,
+            Server(create_app(open_app(database))) as url,
             httpx.Client(base_url=url, timeout=60, trust_env=False) as client,
         ):
             settings = {"critical": {"high": 0.5}, "minimum_count": 2, "duration_s": 0}
@@ -59,7 +50,7 @@ def test_every_page_works_whatever_the_year(chosen_database, drawn, monkeypatch,
             assert f"{year}-0" in client.get("/").text
     # The clock is set right, and what was recorded before that is still shown.
     with (
-        Server(create_app(Operations.open(database))) as url,
+        Server(create_app(open_app(database))) as url,
         httpx.Client(base_url=url, timeout=60, trust_env=False) as client,
     ):
         assert _statuses(client, pages) == dict.fromkeys(pages, 200)

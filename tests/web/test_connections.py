@@ -8,10 +8,10 @@ from ipaddress import ip_network
 import httpx
 import pytest
 
-from service.operations import Operations
+from service.app.factory import open_app
 from service.settings import Settings
-from service.web.admission import Admission
 from service.web.app import create_app
+from service.web.connection_limits import Admission
 from tests.web.serving import Server, served
 
 GET = b"GET /livez HTTP/1.1\r\nHost: localhost\r\n\r\n"
@@ -24,9 +24,9 @@ PATIENCE_S = 20
 def crowded(tmp_path_factory):
     """A server for twenty connections, four of each address but 127.0.0.1."""
     path = tmp_path_factory.mktemp("crowded") / "acquire.db"
-    operations = Operations.open(Settings(database=f"sqlite:///{path}"))
+    app = open_app(Settings(database=f"sqlite:///{path}"))
     admission = Admission(MOST, SHARE, [ip_network("127.0.0.1")])
-    with Server(create_app(operations), admission=admission) as address:
+    with Server(create_app(app), admission=admission) as address:
         yield address
 
 
@@ -140,7 +140,7 @@ def test_where_every_connection_is_used_a_new_one_is_told_so(connect):
 
 
 def test_a_client_that_sends_nothing_is_let_go(connect, monkeypatch):
-    monkeypatch.setattr("service.web.connection.FIRST_BYTE_S", 0.5)
+    monkeypatch.setattr("service.web.slow_clients.FIRST_BYTE_S", 0.5)
     silent = connect()
     begun = time.monotonic()
     assert answer(silent) == b""
@@ -152,7 +152,7 @@ class Kept:
 
     closed = False
 
-    def give_up(self):
+    def abort(self):
         self.closed = True
 
 

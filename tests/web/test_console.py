@@ -9,16 +9,19 @@ import httpx
 import numpy as np
 import pytest
 
+from service.app.factory import open_app
 from service.missions.mission import load_missions
-from service.observe.wire import submission_from_json
-from service.operations import Operations
+from service.observations.schema import submission_from_json
 from service.settings import Settings
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
+from service.storage.models.overview import Sparkline
 from service.vectors import angle_between_deg, matrix_from_quaternion
 from service.web.app import create_app
-from service.web.dashboard import options, sky_chart, words
-from service.web.dashboard.sparkline import HEIGHT, WIDTH, sparkline
+from service.web.console import formatting, options
+from service.web.console.charts import sky_chart
+from service.web.console.charts.sparkline import HEIGHT, WIDTH, sparkline
+from tests.web.console_pages import console_addresses
 from tests.web.markup import Markup
 from tests.web.serving import Server
 
@@ -27,8 +30,8 @@ HOSTILE = "<script>alert(1)</script>\"'><img src=x onerror=alert(2)>{{7*7}}\u202
 
 @pytest.fixture(scope="module")
 def empty(chosen_database):
-    operations = Operations.open(Settings(database=chosen_database()))
-    with Server(create_app(operations)) as address, httpx.Client(base_url=address) as client:
+    app = open_app(Settings(database=chosen_database()))
+    with Server(create_app(app)) as address, httpx.Client(base_url=address) as client:
         yield client
 
 
@@ -36,8 +39,7 @@ def empty(chosen_database):
 def addresses(client, full_run):
     """Every page of a run with something in it."""
     found = client.get("/api/v1/batches", params={"run": full_run, "spacecraft": "XTE"}).json()
-    names = ["/", "/alarms", "/batches", "/compare", "/runs", "/zones", "/missions", "/about"]
-    names += ["/spacecraft/XTE", "/spacecraft/SOHO", "/spacecraft/XTE/limits"]
+    names = [*console_addresses(), "/spacecraft/SOHO"]
     return [
         *(f"{name}?run={full_run}" for name in names),
         f"/batches/{found['items'][0]['id']}",
@@ -129,7 +131,7 @@ def test_with_nothing_recorded_it_says_what_to_do(empty):
     assert "No live batches yet" in answer.text
     assert "POST /api/v1/batches" in answer.text
     assert "No live batches of XTE yet" in text_of(empty.get("/spacecraft/XTE"))
-    assert "No zones are kept yet" in text_of(empty.get("/zones"))
+    assert "No zones are cached" in text_of(empty.get("/zones"))
 
 
 def test_with_only_named_runs_it_leads_to_them(empty, batch):
@@ -199,11 +201,11 @@ def test_names_of_clients_are_shown_as_they_are_and_do_nothing(client, post, bat
 # ---- one batch -----------------------------------------------------------------------------------
 
 
-def test_residual_arrows_are_as_long_as_the_residuals_that_were_recorded(operations, client, run):
+def test_residual_arrows_are_as_long_as_the_residuals_that_were_recorded(app, client, run):
     """The picture is worked out anew from the batch; what it shows must be what was recorded."""
-    for each in pass_of(client, operations, run):
+    for each in pass_of(client, app, run):
         answer = client.get(f"/api/v1/batches/{each}").json()["answer"]
-        field = operations.star_field(each)
+        field = app.results.star_field(each)
         for tracker, drawn in zip(answer["observations"], field["trackers"], strict=True):
             for star, seen in zip(tracker["stars"], drawn["observed"], strict=True):
                 if star["residual_arcsec"] is None:
@@ -213,16 +215,16 @@ def test_residual_arrows_are_as_long_as_the_residuals_that_were_recorded(operati
                     assert length == pytest.approx(star["residual_arcsec"], abs=2e-3)
 
 
-def pass_of(client, operations, run):
+def pass_of(client, app, run):
     """The results of a few batches of every mission, with aberration and body rates."""
     lines = [
         submission_from_json(
             httpx.Request("POST", "http://x", json=each.batch | {"run": run}).content
         )
         for name in ("XTE", "SWAS", "SOHO")
-        for each in draw_pass(load_missions()[name], operations.sky, Pass(batches=6, seed=3))
+        for each in draw_pass(load_missions()[name], app.sky, Pass(batches=6, seed=3))
     ]
-    return [each.id for each in operations.submit_many(lines)]
+    return [each.id for each in app.submissions.submit_many(lines)]
 
 
 @pytest.mark.parametrize(("angle", "sign"), [("h", 1), ("h", -1), ("v", 1), ("v", -1)])
@@ -249,9 +251,9 @@ def test_residual_arrows_point_from_the_predicted_place_to_where_a_star_was_seen
     assert (right, up) == pytest.approx([70.0 * each for each in expected], abs=25.0)
 
 
-def test_stars_named_by_an_answer_stand_where_they_were_seen(operations, client, run):
-    for each in pass_of(client, operations, run):
-        for tracker in operations.star_field(each)["trackers"]:
+def test_stars_named_by_an_answer_stand_where_they_were_seen(app, client, run):
+    for each in pass_of(client, app, run):
+        for tracker in app.results.star_field(each)["trackers"]:
             places = {star["id"]: star for star in tracker["catalog"]}
             for seen in tracker["observed"]:
                 if seen["residual_arcsec"] is not None:
@@ -260,15 +262,15 @@ def test_stars_named_by_an_answer_stand_where_they_were_seen(operations, client,
                     assert off * 3600 < 2.0 * math.hypot(*seen["residual_arcsec"]) + 1.0
 
 
-def test_the_edge_of_a_zone_lies_at_the_bounds_of_its_aim(operations, client, run):
+def test_the_edge_of_a_zone_lies_at_the_bounds_of_its_aim(app, client, run):
     """Every point of SOHO's edges is 2.1 deg above or below the great circle about the pole."""
-    id = pass_of(client, operations, run)[-1]
+    id = pass_of(client, app, run)[-1]
     record = client.get(f"/api/v1/batches/{id}").json()
     presumed, found = (
         matrix_from_quaternion(record[place][name]["quaternion"])
         for place, name in (("input", "a_priori"), ("answer", "attitude"))
     )
-    (tracker,) = operations.star_field(id)["trackers"]
+    (tracker,) = app.results.star_field(id)["trackers"]
     assert len(tracker["zone_edges"]) >= 2
     hv = np.radians(np.concatenate([np.array(line) for line in tracker["zone_edges"]]))
     # Its tracker's axes are the body's; the pole is body X.
@@ -347,12 +349,14 @@ def test_brighter_stars_are_larger_and_the_faintest_are_still_seen():
 
 
 def test_a_sparkline_has_a_gap_where_nothing_was_recorded():
-    series = {
-        "bucket_s": 60,
-        "unix_s": [0, 60, 120, 600, 660, 1200],
-        "ambiguous_share": [0.0, 0.5, 0.0, 1.0, 0.0, 0.25],
-        "unmatched_share": [0.0] * 6,
-    }
+    series = Sparkline(
+        bucket_s=60,
+        unix_s=[0, 60, 120, 600, 660, 1200],
+        batches=[1] * 6,
+        unique_share=[0.0] * 6,
+        ambiguous_share=[0.0, 0.5, 0.0, 1.0, 0.0, 0.25],
+        unmatched_share=[0.0] * 6,
+    )
     line = sparkline(series, 0, 1260)
     assert line.ambiguous.count("M") == 2
     assert [name for name, _, _ in line.dots] == ["ambiguous", "unmatched"]
@@ -366,15 +370,15 @@ def test_a_sparkline_has_a_gap_where_nothing_was_recorded():
 
 
 def test_values_are_written_with_their_units():
-    thin = words.THIN
-    assert words.share(1, 8) == f"12.5{thin}%"
-    assert words.share(0, 0) == "–"
-    assert words.share(None) == "–"
-    assert words.arcsec(2.345) == "2.35″"
-    assert words.arcsec(7200) == "2.00°"
-    assert words.number(-0.5) == "−0.50"
-    assert words.number(math.nan) == "–"
-    assert words.age(3725) == f"1{thin}h 2{thin}min"
-    assert words.age(None) == "–"
-    assert words.count(1234567) == f"1{thin}234{thin}567"
-    assert words.with_day_of_year("1998-12-31T23:59:60.000Z") == "1998-12-31 (365) 23:59:60"
+    thin = formatting.THIN
+    assert formatting.share(1, 8) == f"12.5{thin}%"
+    assert formatting.share(0, 0) == "–"
+    assert formatting.share(None) == "–"
+    assert formatting.arcsec(2.345) == "2.35″"
+    assert formatting.arcsec(7200) == "2.00°"
+    assert formatting.number(-0.5) == "−0.50"
+    assert formatting.number(math.nan) == "–"
+    assert formatting.age(3725) == f"1{thin}h 2{thin}min"
+    assert formatting.age(None) == "–"
+    assert formatting.count(1234567) == f"1{thin}234{thin}567"
+    assert formatting.with_day_of_year("1998-12-31T23:59:60.000Z") == "1998-12-31 (365) 23:59:60"

@@ -9,10 +9,11 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.operations import Operations
+from service.app.factory import open_app
 from service.settings import Settings
 from service.web.app import create_app
 from tests.web.browser import CHROMIUM, Browser
+from tests.web.console_pages import console_addresses
 from tests.web.serving import Server
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
@@ -61,10 +62,8 @@ def pages(client, full_run):
     found = client.get("/api/v1/batches", params={"run": full_run, "spacecraft": "XTE"}).json()[
         "items"
     ]
-    names = ["/", "/alarms", "/batches", "/compare", "/runs", "/zones", "/missions", "/about"]
-    names += ["/spacecraft/XTE", "/spacecraft/XTE/limits", "/advice/XTE"]
     return [
-        *(f"{name}?run={full_run}" for name in names),
+        *(f"{name}?run={full_run}" for name in console_addresses()),
         "/?run=nobody",
         f"/compare?run={full_run}&spacecraft=XTE&a.identifier=starid&b.identifier=verified",
         "/batches/nothing",
@@ -171,7 +170,7 @@ def test_a_what_if_changes_what_becomes_of_an_ambiguous_star(browser, address, c
     assert "ambiguous" not in text(browser, ".votes")
     assert client.get(f"/api/v1/batches/{found}").json()["current"] is False
     browser.open(f"{address}/batches/{found}")
-    shows(browser, "Another result stands for this batch")
+    shows(browser, "This batch has another current result")
     assert browser.complaints == []
 
 
@@ -213,7 +212,7 @@ def test_a_lost_connection_is_told_and_what_was_missed_is_caught_up(
     """The server goes away and comes back with batches that nobody heard of."""
     settings = Settings(database=f"sqlite:///{tmp_path}/acquire.db")
     first, second, third = drawn("XTE", 3, seed=6)
-    with Server(create_app(Operations.open(settings))) as own:
+    with Server(create_app(open_app(settings))) as own:
         port = int(own.rpartition(":")[2])
         httpx.post(f"{own}/api/v1/batches", json=first, timeout=60).raise_for_status()
         browser.open(f"{own}/")
@@ -221,7 +220,7 @@ def test_a_lost_connection_is_told_and_what_was_missed_is_caught_up(
         shows(browser, first["batch"])
     browser.wait(lambda: "Connection lost since" in text(browser, "#connection"))
     assert first["batch"] in text(browser)
-    with Server(create_app(Operations.open(settings)), port) as own:
+    with Server(create_app(open_app(settings)), port) as own:
         for each in (second, third):
             httpx.post(f"{own}/api/v1/batches", json=each, timeout=60).raise_for_status()
         shows(browser, third["batch"])
@@ -306,7 +305,7 @@ def test_where_the_service_does_not_answer_people_are_told_what_to_do(
 
     def told(selector, *words):
         # What stood there before may say that the service does not answer, too.
-        expected = ("does not answer", "check that it runs", *words)
+        expected = ("does not answer", "check that it is running", *words)
         browser.wait(lambda: all(each in text(browser, selector) for each in expected))
         said = text(browser, selector)
         assert not [each for each in RAW if each in said], said
@@ -325,14 +324,14 @@ def test_where_the_service_does_not_answer_people_are_told_what_to_do(
     browser.wait(lambda: browser.run(CONNECTED))
     offline(True)
     browser.run("document.getElementById('try').requestSubmit()")
-    told("#try-status", "Not tried")
+    told("#try-status", "Not computed")
     offline(False)
 
     browser.open(f"{address}/runs?run={run}")
     browser.wait(lambda: browser.run(CONNECTED))
     offline(True)
     click(browser, "[data-watch]")
-    told("#told", "Not done")
+    told("#message", "Not done")
     offline(False)
 
     browser.open(f"{address}/batches?run={run}")
@@ -340,7 +339,7 @@ def test_where_the_service_does_not_answer_people_are_told_what_to_do(
     # The stream goes on, and the page itself is not given.
     browser.run("window.fetch = () => Promise.reject(new TypeError('Failed to fetch')); 0")
     client.post("/api/v1/batches", json=second | {"run": run}).raise_for_status()
-    told("#connection", "Not up to date", "tried again")
+    told("#connection", "Not up to date", "trying again")
     browser.open(f"{address}/about")
     browser.complaints.clear()
 
@@ -460,7 +459,7 @@ def test_a_shift_from_the_overview_to_the_star_and_the_alarm(browser, address, c
     browser.wait(lambda: "/spacecraft/XTE" in browser.run("location.href"))
     browser.wait(lambda: browser.run(DRAWN))
     said = browser.run("document.querySelector('[data-chart=stars]').getAttribute('aria-label')")
-    assert re.search(r"unmatched: greatest \d+ % at 1999-03-01 \(060\)", said)
+    assert re.search(r"unmatched stars: greatest \d+ % at 1999-03-01 \(060\)", said)
     click(browser, "#worst tbody a")
     browser.wait(lambda: "/batches/" in browser.run("location.pathname"))
     browser.wait(lambda: browser.run("document.readyState") == "complete")
@@ -544,7 +543,7 @@ def test_a_limit_is_changed_on_its_page_and_kept_with_who_and_why(browser, addre
     assert limit["settings"]["watch"]["high"] == 0.2
     browser.run(f"{form}.elements['watch.high'].value = '0.9'")
     browser.run(f"{form}.requestSubmit()")
-    shows(browser, "Not done", "#told")
+    shows(browser, "Not done", "#message")
     click(browser, "#ambiguous_share [data-default]")
     shows(browser, "as shipped", "#ambiguous_share")
     assert client.get("/api/v1/spacecraft/SWAS/limits/ambiguous_share").json()["limit"][

@@ -8,10 +8,10 @@ from contextlib import contextmanager
 import httpx
 import pytest
 
-from service.operations import Operations
-from service.records import events as records
+from service.app.factory import open_app
 from service.settings import Settings
-from service.web import live
+from service.storage.recording import events as records
+from service.web import event_stream as live
 from service.web.app import create_app
 from tests.web.serving import Server
 
@@ -67,7 +67,7 @@ class Listener:
 
 @contextmanager
 def service(database):
-    with Server(create_app(Operations.open(Settings(database=database)))) as address:
+    with Server(create_app(open_app(Settings(database=database)))) as address:
         yield address
 
 
@@ -129,10 +129,10 @@ def test_who_was_away_is_told_of_everything_in_between_and_of_nothing_twice(data
 def test_what_another_process_writes_is_told_of_too(database, drawn):
     with service(database) as address:
         listener = Listener(address)
-        other = Operations.open(Settings(database=database))
+        other = open_app(Settings(database=database))
         try:
             lines = [json.dumps(each).encode() for each in drawn("SWAS", 3)]
-            other.start_replay(lines, "elsewhere")
+            other.replays.start(lines, "elsewhere")
             seen = []
             for count in range(2, 6):
                 seen = listener.wait_for(count)

@@ -17,9 +17,9 @@ URL = "/api/v1/spacecraft/IMAGER/frames"
 
 
 @pytest.fixture(scope="module")
-def frames(operations):
+def frames(app):
     mission = load_missions()["IMAGER"]
-    return list(draw_frames(mission, operations.sky, FrameSettings(frames=2, seed=5)))
+    return list(draw_frames(mission, app.sky, FrameSettings(frames=2, seed=5)))
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from tests.records import samples
+from tests.storage import samples
 from tests.web.serving import served
 from tests.web.test_hanging_database import descendants, locked, ready_again
 

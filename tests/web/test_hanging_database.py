@@ -16,13 +16,13 @@ import httpx
 import pytest
 from sqlalchemy import create_engine, make_url, select, text
 
-from service.operations import Operations
-from service.records.engines import database_url
-from service.records.tables import batches, idempotency_keys
+from service.app.factory import open_app
 from service.settings import Settings
+from service.storage.sql.engines import database_url
+from service.storage.sql.tables import batches, idempotency_keys
 from tests import scale
-from tests.records import samples
-from tests.records.whole import assert_whole
+from tests.storage import samples
+from tests.storage.whole import assert_whole
 from tests.web.serving import served
 
 ANSWERED_S, PROBED_S = 15.0, 2.0
@@ -232,16 +232,16 @@ def assert_in_time(clients, probes):
 
 
 def assert_each_recorded_once(database, clients):
-    operations = Operations.open(Settings(database=database))
+    app = open_app(Settings(database=database))
     try:
-        with operations.store.reading() as connection:
+        with app.store.reading() as connection:
             held = dict(connection.execute(select(batches.c.batch, batches.c.id)).all())
             keys = Counter(connection.scalars(select(idempotency_keys.c.key)))
         assert held == clients.acknowledged
         assert keys == dict.fromkeys(clients.sent, 1)
-        assert_whole(operations, {})
+        assert_whole(app, {})
     finally:
-        operations.close()
+        app.close()
 
 
 @pytest.mark.parametrize("empty_database", ["postgresql"], indirect=True)

@@ -11,12 +11,12 @@ import httpx
 import pytest
 from sqlalchemy import make_url, select
 
-from service.operations import Operations
-from service.records.tables import batches
+from service.app.factory import open_app
 from service.settings import Settings
-from tests.records import samples
-from tests.records.whole import assert_whole
+from service.storage.sql.tables import batches
 from tests.scale import size
+from tests.storage import samples
+from tests.storage.whole import assert_whole
 from tests.web.load import Load
 
 KILLS = {"sqlite": 500, "postgresql": 100}
@@ -70,12 +70,12 @@ def test_a_server_killed_under_load_loses_tears_and_doubles_nothing(
 
     figures(kills=kills, acknowledged=len(load.acknowledged), answers=dict(load.met))
     assert len(load.acknowledged) >= kills * a_round
-    operations = Operations.open(Settings(database=database))
+    app = open_app(Settings(database=database))
     try:
-        assert_whole(operations, dict(load.acknowledged.values()))
-        with operations.store.reading() as connection:
+        assert_whole(app, dict(load.acknowledged.values()))
+        with app.store.reading() as connection:
             held = dict(connection.execute(select(batches.c.batch, batches.c.id)).all())
         # Nothing is left waiting at the end: what is there is what was acknowledged, one for one.
         assert held == {name: id for name, (id, _) in load.acknowledged.items()}
     finally:
-        operations.close()
+        app.close()

@@ -14,7 +14,7 @@ import pytest
 from tests.web.serving import served
 
 LINE = re.compile(
-    r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z (debug|info|warning|error) (front|backend) "
+    r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z (debug|info|warning|error) (server|worker) "
 )
 OLD_SQLITE = (3, 7, 0) <= sqlite3.sqlite_version_info <= (3, 51, 2)
 
@@ -151,7 +151,7 @@ def test_an_error_that_is_repeated_is_written_once_and_counted(service):
     assert {each["repeated"] for each in told if "repeated" in each} == {29}
 
 
-def test_the_second_process_writes_the_request_too(service, batch):
+def test_an_error_line_names_the_request_that_failed(service, batch):
     made = service(log_format="json")
     with made.running() as client:
         id = client.post("/api/v1/batches", json=batch).json()["id"]
@@ -159,8 +159,8 @@ def test_the_second_process_writes_the_request_too(service, batch):
             database.execute("ALTER TABLE batches RENAME TO elsewhere")
         answer = client.post(f"/api/v1/batches/{id}/what-if", json={})
     assert answer.status_code in (500, 503)
-    of_backend = [each for each in made.objects if each["process"] == "backend"]
-    assert answer.headers["X-Request-ID"] in [each.get("request_id") for each in of_backend]
+    errors = [each for each in made.objects if each["level"] == "error"]
+    assert answer.headers["X-Request-ID"] in [each.get("request_id") for each in errors]
 
 
 @pytest.mark.skipif(not OLD_SQLITE, reason="this SQLite is without the fault")

@@ -3,23 +3,19 @@
 And no command that only reads makes a file.
 """
 
-import os
 import shutil
-import signal
-import time
-from pathlib import Path
 
 import httpx
 import pytest
 from sqlalchemy import select
 
-from service.operations import Operations
-from service.records.tables import batches
-from service.records.verify import verify
+from service.app.factory import open_app
 from service.settings import Settings
-from tests.records import samples
+from service.storage.sql.tables import batches
+from service.storage.upkeep.verify import verify
+from tests.storage import samples
 from tests.web.serving import served
-from tests.web.test_hanging_database import descendants, ready_again
+from tests.web.test_hanging_database import ready_again
 
 PARTS = ("", "-wal", "-shm")
 
@@ -58,12 +54,12 @@ def assert_told(url, answer):
 
 
 def names_in(file):
-    operations = Operations.open(Settings(database=f"sqlite:///{file}"), create=False)
+    app = open_app(Settings(database=f"sqlite:///{file}"), create=False)
     try:
-        with operations.reading() as connection:
+        with app.context.reading() as connection:
             return set(connection.scalars(select(batches.c.batch)))
     finally:
-        operations.close()
+        app.close()
 
 
 @pytest.mark.parametrize("parts", [PARTS, ("",)], ids=["with its log", "alone"])
@@ -107,29 +103,6 @@ def test_deleted_nothing_is_acknowledged_and_no_file_is_made(file, post):
             assert_told(url, post(url, f"meanwhile-{k}"))
         assert not file.exists()
     assert not file.exists()
-
-
-def test_a_process_that_is_started_again_makes_no_file(file, tmp_path, post):
-    """The one that works on batches is killed while the file is away."""
-    away = tmp_path / "away"
-    with served(f"sqlite:///{file}") as (process, url):
-        assert post(url, "before").status_code == 201
-        moved(file, away)
-        backend = next(
-            pid
-            for pid in descendants(process.pid)
-            if b"service.backend" in Path(f"/proc/{pid}/cmdline").read_bytes()
-        )
-        os.kill(backend, signal.SIGKILL)
-        until = time.monotonic() + 12
-        while time.monotonic() < until:
-            assert post(url, "meanwhile").status_code == 503
-            assert not file.exists()
-            time.sleep(0.5)
-        moved(away / file.name, file.parent)
-        ready_again(url, 90)
-        assert post(url, "after").status_code == 201
-    assert names_in(file) == {"before", "after"}
 
 
 @pytest.mark.parametrize(

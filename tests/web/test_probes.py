@@ -11,11 +11,11 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from sqlalchemy import text
 
+from service.app.factory import open_app
 from service.errors import Stopping
-from service.operations import Operations
 from service.settings import Settings
 from service.web.app import create_app
-from service.web.rehearsal import rehearse
+from service.web.warm_request import warm_request
 from tests.web.serving import Server
 
 
@@ -77,50 +77,59 @@ def test_the_cache_of_zones_is_counted(client):
 
 
 def test_two_apps_share_no_counter(client, tmp_path):
-    operations = Operations.open(Settings(database=f"sqlite:///{tmp_path}/other.db"))
-    with Server(create_app(operations)) as address, httpx.Client(base_url=address) as other:
+    app = open_app(Settings(database=f"sqlite:///{tmp_path}/other.db"))
+    with Server(create_app(app)) as address, httpx.Client(base_url=address) as other:
         assert stars(samples(other), "unique") == 0
 
 
-def test_the_rehearsal_before_the_first_client_reaches_the_records_door_and_is_not_counted(
+def test_the_warm_up_request_reaches_the_queue_and_is_not_counted(
     tmp_path,
 ):
-    operations = Operations.open(Settings(database=f"sqlite:///{tmp_path}/rehearsed.db"))
-    app = create_app(operations)
+    app = open_app(Settings(database=f"sqlite:///{tmp_path}/rehearsed.db"))
+    web_app = create_app(app)
     try:
-        assert asyncio.run(rehearse(app)) == 422
-        assert math.isfinite(operations._intake.idle_s), "nothing came to the desk"
-        assert b'route="/api/v1/batches"' not in app.state.metrics.text()
+        assert asyncio.run(warm_request(web_app)) == 422
+        assert math.isfinite(app.submissions.ingest.idle_s), "nothing was queued"
+        assert b'route="/api/v1/batches"' not in web_app.state.metrics.text()
     finally:
-        operations.close()
+        app.close()
+
+
+def test_an_ingest_thread_that_has_ended_is_told_by_the_probe_of_life(tmp_path):
+    app = open_app(Settings(database=f"sqlite:///{tmp_path}/ended.db"))
+    with Server(create_app(app)) as address, httpx.Client(base_url=address) as client:
+        assert client.get("/livez").status_code == 200
+        app.submissions.ingest._queue._inbox.put(None)
+        app.submissions.ingest._queue._thread.join(10)
+        assert client.get("/livez").status_code == 503
 
 
 def test_where_the_records_cannot_be_followed_it_does_not_start_and_ends(tmp_path, monkeypatch):
-    operations = Operations.open(Settings(database=f"sqlite:///{tmp_path}/unread.db"))
-    operations.ready()
-    app = create_app(operations)
+    app = open_app(Settings(database=f"sqlite:///{tmp_path}/unread.db"))
+    app.service.ready()
+    web_app = create_app(app)
 
     def unreadable():
         raise RuntimeError("there is nothing to follow")
 
-    monkeypatch.setattr(operations, "last_event", unreadable)
+    monkeypatch.setattr(app.events, "last", unreadable)
 
     async def start():
-        async with app.router.lifespan_context(app):
+        async with web_app.router.lifespan_context(web_app):
             raise AssertionError("it started")
 
     with pytest.raises(RuntimeError, match="nothing to follow"):
         asyncio.run(start())
     assert not [thread for thread in threading.enumerate() if thread.name == "warm-up"]
     with pytest.raises(Stopping):
-        operations.store.writer.require()
+        app.store.writer.require()
 
 
 def test_a_fault_of_ours_is_logged_and_says_nothing_of_what_is_inside(tmp_path, caplog):
-    operations = Operations.open(Settings(database=f"sqlite:///{tmp_path}/gone.db"))
-    with Server(create_app(operations)) as address:
+    app = open_app(Settings(database=f"sqlite:///{tmp_path}/gone.db"))
+    with Server(create_app(app)) as address:
         rename = text("ALTER TABLE runs RENAME TO elsewhere")
-        operations.change(lambda connection: connection.execute(rename).close())
+        app.context.change(lambda connection: connection.execute(rename).close())
         with httpx.Client(base_url=address) as client:
             answer = client.get("/api/v1/runs")
             assert client.get("/livez").status_code == 200, "on the same connection"
@@ -133,12 +142,12 @@ def test_a_fault_of_ours_is_logged_and_says_nothing_of_what_is_inside(tmp_path, 
 
 def test_with_every_handler_at_work_it_is_still_ready_and_still_stops(tmp_path, monkeypatch):
     """Probes and the way out have threads of their own."""
-    operations = Operations.open(Settings(database=f"sqlite:///{tmp_path}/busy.db"))
-    operations.ready()
+    app = open_app(Settings(database=f"sqlite:///{tmp_path}/busy.db"))
+    app.service.ready()
     monkeypatch.setattr("service.web.app.WORKER_THREADS", 2)
     go_on = threading.Event()
-    monkeypatch.setattr(operations, "runs", lambda: go_on.wait(30) and [])
-    with Server(create_app(operations)) as address, ThreadPoolExecutor(2) as threads:
+    monkeypatch.setattr(app.runs, "all", lambda: go_on.wait(30) and [])
+    with Server(create_app(app)) as address, ThreadPoolExecutor(2) as threads:
         for _ in range(2):
             threads.submit(httpx.get, f"{address}/api/v1/runs", timeout=60)
         time.sleep(0.3)

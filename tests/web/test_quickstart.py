@@ -25,6 +25,7 @@ pytestmark = pytest.mark.skipif(
 def folder(tmp_path):
     """A folder that looks like the checkout to who follows the quick start."""
     (tmp_path / "docs").symlink_to(ROOT / "docs")
+    (tmp_path / "tests").symlink_to(ROOT / "tests")
     (tmp_path / ".venv").symlink_to(sys.prefix)
     return tmp_path
 
@@ -94,8 +95,8 @@ def test_every_link_leads_to_a_file():
 
 
 def test_the_guide_knows_every_kind_of_problem():
-    from service.web.errors import KINDS
+    from service.web.api.problems import PROBLEM_TYPES
 
     guide = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
-    for kind in KINDS.values():
+    for kind in PROBLEM_TYPES.values():
         assert f"| {kind.status} | `{kind.type}` |" in guide

@@ -11,7 +11,7 @@ import httpx
 import pytest
 import zstandard
 
-from service.operations import Operations
+from service.app.factory import open_app
 from service.settings import Settings
 from service.web.app import create_app
 from tests.web.browser import CHROMIUM, Browser
@@ -32,8 +32,8 @@ def begun(client, run, data, coding="identity", **headers):
     return answer.headers["Location"]
 
 
-def followed(client, place, patience_s=120, **more):
-    give_up = time.monotonic() + patience_s
+def followed(client, place, give_up_after_s=120, **more):
+    give_up = time.monotonic() + give_up_after_s
     while (state := client.get(place, **more).json())["state"] == "running":
         assert time.monotonic() < give_up, state
         time.sleep(0.02)
@@ -88,7 +88,7 @@ def test_a_body_that_unpacks_to_too_much_of_its_size_says_which_bound_and_what_s
     assert (state["state"], state["counts"]["new"]) == ("failed", 1)
     detail = state["errors"][-1]["problem"]["detail"]
     allowed = max(256 << 20, 200 * len(data))
-    assert f"unpacks to more than {allowed} bytes" in detail
+    assert f"decompresses to more than {allowed} bytes" in detail
     assert "200 times its size" in detail
     assert f"{len(data)} bytes" in detail
 
@@ -113,7 +113,7 @@ def hurried(chosen_database):
     """A service whose replays may take a second."""
     settings = Settings(database=chosen_database(), replay_seconds=1, replay_processes=0)
     with (
-        Server(create_app(Operations.open(settings))) as url,
+        Server(create_app(open_app(settings))) as url,
         httpx.Client(base_url=url, timeout=60) as client,
     ):
         yield client
@@ -136,7 +136,7 @@ def empty_frames():
     [("gzip", bad_lines), ("gzip", empty_members), ("zstd", empty_frames)],
 )
 def test_a_replay_that_takes_too_long_ends_and_names_the_setting(hurried, coding, made):
-    state = followed(hurried, begun(hurried, "long", made(), coding), patience_s=30)
+    state = followed(hurried, begun(hurried, "long", made(), coding), give_up_after_s=30)
     assert state["state"] == "failed"
     detail = state["errors"][-1]["problem"]["detail"]
     assert "took longer than 1 s (ACQUIRE_REPLAY_SECONDS)" in detail
@@ -240,8 +240,8 @@ def guarded(chosen_database):
         "reader": service.token("reader", "read"),
         "operator": service.token("operator", "read", "submit", "operate"),
     }
-    app = create_app(service.operations)
-    with Server(app) as url, httpx.Client(base_url=url, timeout=60) as service.client:
+    web_app = create_app(service.app)
+    with Server(web_app) as url, httpx.Client(base_url=url, timeout=60) as service.client:
         yield service
 
 
@@ -281,8 +281,8 @@ def test_a_replay_of_another_process_is_cancelled_through_the_database(chosen_da
     settings = Settings(database=database, replay_processes=0)
     batch = drawn("XTE", 1)[0]
     with (
-        Server(create_app(Operations.open(settings))) as one,
-        Server(create_app(Operations.open(settings))) as other,
+        Server(create_app(open_app(settings))) as one,
+        Server(create_app(open_app(settings))) as other,
         httpx.Client(base_url=one, timeout=60) as client,
         httpx.Client(base_url=other, timeout=60) as elsewhere,
     ):
@@ -354,8 +354,10 @@ def test_the_page_of_a_running_replay_has_a_button_that_cancels_it(
         browser.open(page)
         browser.wait(lambda: browser.run(f"{button} !== null"))
         browser.run(f"{button}.click()")
-        browser.wait(lambda: browser.run("document.getElementById('told').innerText") != "Working…")
-        assert browser.run("document.getElementById('told').innerText") == "Cancelled."
+        browser.wait(
+            lambda: browser.run("document.getElementById('message').innerText") != "Working…"
+        )
+        assert browser.run("document.getElementById('message').innerText") == "Cancelled."
         browser.wait(lambda: browser.run(f"{button} === null"))
         assert "cancelled" in browser.run("document.getElementById('replay').innerText")
         assert browser.complaints == []

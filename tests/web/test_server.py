@@ -54,7 +54,7 @@ def process(tmp_path):
 )
 def test_before_there_is_a_token_it_listens_to_this_machine_alone(tmp_path, host):
     settings = Settings(database=f"sqlite:///{tmp_path / 'acquire.db'}", host=host)
-    with pytest.raises(BadConfiguration, match=r"beyond this machine.*acquire token create"):
+    with pytest.raises(BadConfiguration, match=r"not a loopback address.*acquire token create"):
         serve(settings)
 
 

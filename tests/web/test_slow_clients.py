@@ -160,7 +160,7 @@ def read_all(connection, pause_s):
 def test_an_answer_is_given_up_when_nothing_of_it_is_read_but_not_where_it_is_read_slowly(
     address, monkeypatch
 ):
-    monkeypatch.setattr("service.web.connection.UNREAD_S", 0.5)
+    monkeypatch.setattr("service.web.slow_clients.UNREAD_S", 0.5)
     with asking_much(address) as slow, asking_much(address) as deaf:
         begun = time.monotonic()
         assert read_all(slow, pause_s=0.01) == LONG
@@ -196,7 +196,7 @@ def closed_after_s(connection, every_s=0.1, byte=b"x"):
     ids=["nothing", "a head", "a second head", "a body that was refused"],
 )
 def test_a_client_that_trickles_where_a_head_should_come_is_let_go(address, monkeypatch, sent):
-    monkeypatch.setattr("service.web.connection.HEAD_S", 0.8)
+    monkeypatch.setattr("service.web.slow_clients.HEAD_S", 0.8)
     url = httpx.URL(address)
     with socket.create_connection((url.host, url.port)) as connection:
         connection.sendall(sent.encode())
@@ -211,8 +211,8 @@ def test_a_client_that_trickles_where_a_head_should_come_is_let_go(address, monk
 
 def test_the_rest_of_a_refused_body_is_taken_off_slowly_and_to_its_end(address, monkeypatch):
     """Longer than a client may dawdle: it is not the client who does."""
-    monkeypatch.setattr("service.web.connection.HEAD_S", 2.0)
-    monkeypatch.setattr("service.web.connection.DISCARDED_PER_S", 10e6)
+    monkeypatch.setattr("service.web.slow_clients.HEAD_S", 2.0)
+    monkeypatch.setattr("service.web.slow_clients.DISCARDED_PER_S", 10e6)
     url = httpx.URL(address)
     with socket.create_connection((url.host, url.port), timeout=30) as connection:
         connection.sendall(HEAD.replace("100000", "40000000")[:-1].encode())
@@ -227,7 +227,7 @@ def test_the_rest_of_a_refused_body_is_taken_off_slowly_and_to_its_end(address, 
 
 
 def test_a_client_that_asks_now_and_then_is_kept(address, monkeypatch):
-    monkeypatch.setattr("service.web.connection.HEAD_S", 0.8)
+    monkeypatch.setattr("service.web.slow_clients.HEAD_S", 0.8)
     url = httpx.URL(address)
     with socket.create_connection((url.host, url.port), timeout=10) as connection:
         for _ in range(8):
@@ -238,7 +238,7 @@ def test_a_client_that_asks_now_and_then_is_kept(address, monkeypatch):
 
 def test_a_request_may_take_longer_than_the_next_head(address, monkeypatch):
     """Here a body that comes slowly: it has deadlines of its own."""
-    monkeypatch.setattr("service.web.connection.HEAD_S", 0.5)
+    monkeypatch.setattr("service.web.slow_clients.HEAD_S", 0.5)
     url = httpx.URL(address)
     with socket.create_connection((url.host, url.port), timeout=30) as connection:
         connection.sendall(

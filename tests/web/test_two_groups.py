@@ -47,7 +47,7 @@ def test_an_answer_with_two_groups_of_stars_is_suspect_and_names_the_rival(post,
 
     page = client.get(f"/batches/{answer['id']}").text
     text = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", page))
-    assert "Two groups of stars have each an attitude" in text
+    assert "Two groups of stars give two attitudes" in text
 
     listed = client.get("/api/v1/batches", params={"run": RUN, "status": "suspect"}).json()
     assert answer["id"] in [item["id"] for item in listed["items"]]

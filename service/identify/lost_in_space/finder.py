@@ -1,7 +1,7 @@
 """The attitude of a batch of which nothing is known, from one of its trackers.
 
-It stands for the a priori attitude that was not given, or was wrong: zones,
-identities and the solution then come of it the way they always do.
+It takes the place of the a priori attitude that was not given, or was wrong: zones,
+identities and the solution then follow as always.
 """
 
 import math
@@ -14,23 +14,29 @@ import numpy.typing as npt
 from msgspec.structs import replace
 
 from service.attitude.solution import NoAttitude
+from service.identify.budget import WorkBudget
 from service.identify.lost_in_space.solver import FieldOfView, LostInSpace, LostInSpaceResult
 from service.missions.mission import Mission, Tracker
-from service.observe.correct import CorrectedObservations
-from service.sky.run_catalog import RunCatalog
-from service.sky.sky_index import SkyIndex
-from service.sky.view import Sky
+from service.observations.calibrate import CorrectedObservations
+from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.model import SkyModel
+from service.sky.whole_sky.index import SkyIndex
 from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector
 
 SIGMA_FLOOR_ARCSEC = 1.5
 """No star is taken as better known: a run catalog serves a year, and parallax is left out."""
-STILL = np.zeros(3)
+AT_REST = np.zeros(3)
 COLOR_SIGMA_MAG = 0.3
 """What a magnitude is off by beside its noise: colour, and stars that vary."""
+FEW_MATCHES, LARGEST_SCATTER_MAG = 4, 0.5
+"""So few stars found without their magnitudes must have about the same offset of magnitude.
+
+Otherwise chance gives three random points an attitude in 1 of 15,000 batches.
+"""
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundAttitude:
     """An attitude (3, 3), inertial to body, or why there is none.
 
     `bounded`: a search ended at its bound on the work.  `explained` (n,) of every
@@ -38,7 +44,8 @@ class Found:
     refused.  `corrected` is what the
     stars are to be identified from about the attitude: the observations, without
     their magnitudes where the attitude was found without them; `warnings` then
-    says so.
+    says so.  `star` (n,) of every tracker are the rows of the run catalog that the
+    attitude was found with, -1 for the others, and `probability` that they are right.
     """
 
     attitude: Matrix | None
@@ -47,10 +54,12 @@ class Found:
     explained: tuple[npt.NDArray[np.bool_], ...]
     corrected: Sequence[CorrectedObservations]
     warnings: tuple[str, ...] = ()
+    star: tuple[npt.NDArray[np.int64], ...] = ()
+    probability: float = math.nan
 
 
-class Search(NamedTuple):
-    """What a search in the whole sky came to.
+class SkySearch(NamedTuple):
+    """The result of a search of the whole sky.
 
     `magnitudes_used` is false where it succeeded only without the magnitudes.
     """
@@ -65,9 +74,10 @@ def find_attitude(
     velocity_c: Vector,
     run_catalog: RunCatalog,
     mission: Mission,
-    sky: Sky,
-) -> Found:
-    """Look in the whole sky, tracker by tracker, the one with the most stars first.
+    sky: SkyModel,
+    budget: WorkBudget,
+) -> FoundAttitude:
+    """Search the whole sky, tracker by tracker, the one with the most stars first.
 
     The refusal is that of the tracker with the most stars.
     """
@@ -85,13 +95,23 @@ def find_attitude(
             each.magnitude_mag,
             np.maximum(each.sigma_arcsec, SIGMA_FLOOR_ARCSEC) / ARCSEC_PER_RADIAN,
             velocity_c,
+            budget,
         )
         bounded |= search.bounded
         explained[place] = search.result.star >= 0
         if search.result.attitude is not None:
             attitude = tracker.body_from_tracker @ search.result.attitude
+            # The index has stars beyond the run catalog's limit, behind those within it.
+            known = search.result.star < len(run_catalog)
+            rows = [np.full(len(one.magnitude_mag), -1) for one in corrected]
+            rows[place] = np.where(known, search.result.star, -1)
+            stars = tuple(rows)
+            probability = 1.0 / (1.0 + math.exp(-min(search.result.log_odds, 700.0)))
             if search.magnitudes_used:
-                return Found(attitude, None, bounded, tuple(explained), corrected)
+                return FoundAttitude(
+                    *(attitude, None, bounded, tuple(explained), corrected, ()),
+                    *(stars, probability),
+                )
             warning = (
                 "magnitudes_not_used: the whole sky was searched and the stars identified without "
                 "magnitudes"
@@ -100,9 +120,12 @@ def find_attitude(
             if off_mag is not None:
                 warning += f"; those of {tracker.name} have an offset of about {off_mag:.1f} mag"
             unmeasured = _without_magnitudes(corrected)
-            return Found(attitude, None, bounded, tuple(explained), unmeasured, (warning,))
+            return FoundAttitude(
+                *(attitude, None, bounded, tuple(explained), unmeasured, (warning,)),
+                *(stars, probability),
+            )
         refusals.append(search.result.refusal)
-    return Found(None, refusals[0], bounded, tuple(explained), corrected)
+    return FoundAttitude(None, refusals[0], bounded, tuple(explained), corrected)
 
 
 def search_sky(
@@ -110,33 +133,49 @@ def search_sky(
     direction: Vector,
     magnitude_mag: Vector,
     sigma_rad: Vector,
-    velocity_c: Vector = STILL,
-) -> Search:
+    velocity_c: Vector = AT_REST,
+    budget: WorkBudget | None = None,
+) -> SkySearch:
     """Search the whole sky, and again without the magnitudes where that finds nothing.
 
     Magnitudes without a zero point, or with one that is off by a magnitude or
     more, refuse every match.  The refusal is that of the first search.
     """
-    first = solver.solve(direction, magnitude_mag, sigma_rad, velocity_c)
+    budget = budget or WorkBudget()
+
+    def solve(magnitude_mag: Vector) -> LostInSpaceResult:
+        result = solver.solve(direction, magnitude_mag, sigma_rad, velocity_c, budget.left)
+        budget.spend(result.work)
+        return result
+
+    first = solve(magnitude_mag)
     if first.refusal not in (NoAttitude.NO_MATCH, NoAttitude.DOUBTFUL_MATCH) or (
         np.isnan(magnitude_mag).all()
     ):
-        return Search(first, True, first.bounded)
+        return SkySearch(first, True, first.bounded)
     unknown = np.full(len(magnitude_mag), math.nan)
-    second = solver.solve(direction, unknown, sigma_rad, velocity_c)
+    second = solve(unknown)
     bounded = first.bounded or second.bounded
     if second.attitude is None:
-        return Search(first, True, bounded)
-    return Search(second, False, bounded)
+        return SkySearch(first, True, bounded)
+    off_mag = _magnitude_offsets(second, magnitude_mag, solver.index)
+    if 2 <= len(off_mag) <= FEW_MATCHES and off_mag.std(ddof=1) > LARGEST_SCATTER_MAG:
+        return SkySearch(first, True, bounded)
+    return SkySearch(second, False, bounded)
 
 
 def magnitude_offset(
     result: LostInSpaceResult, magnitude_mag: Vector, index: SkyIndex
 ) -> float | None:
     """The median of observed minus catalog magnitude of the matched stars; None without any."""
+    off_mag = _magnitude_offsets(result, magnitude_mag, index)
+    return float(np.median(off_mag)) if len(off_mag) else None
+
+
+def _magnitude_offsets(result: LostInSpaceResult, magnitude_mag: Vector, index: SkyIndex) -> Vector:
+    """Observed minus catalog magnitude of the matched stars that have one."""
     matched = (result.star >= 0) & ~np.isnan(magnitude_mag)
-    catalog_mag = index.arrays.stars[result.star[matched], 3]
-    return float(np.median(magnitude_mag[matched] - catalog_mag)) if matched.any() else None
+    return np.asarray(magnitude_mag[matched] - index.arrays.stars[result.star[matched], 3])
 
 
 def _without_magnitudes(

@@ -5,18 +5,18 @@ import math
 import numpy as np
 from numba import njit
 
-from service.attitude.kernels import inverse_symmetric
-from service.identify.fitting import turn
-from service.identify.hypotheses import log_sum
-from service.identify.lost_in_space import weighing
-from service.sky.sky_index import patch_of
-from service.sky.star_grid import CELL
+from service.attitude.covariance import inverse_symmetric
+from service.identify.hypotheses.evidence import log_sum
+from service.identify.hypotheses.fitting import turn
+from service.identify.lost_in_space import posterior
+from service.sky.geometry.star_grid import CELL
+from service.sky.whole_sky.index import patch_of
 
 MATCH_GATE = 4.5
 """In sigmas of a point's own noise and of the attitude at its place."""
 LARGEST_GATE_RAD = 0.006
 ROUNDS = 5
-HOPELESS = -4.0
+REJECT_LOG = -4.0
 """Log evidence of the points alone, before the last fit, that no further fit makes good."""
 EDGE = 0.985
 """A star is expected in the field only within this share of its half widths."""
@@ -28,7 +28,7 @@ def nearest_stars(  # type: ignore[no-untyped-def]
 ):
     """The two stars nearest to a direction of length one, within a gate and two magnitudes.
 
-    The arrays are those of the index, one by one: to hand over all of them
+    The arrays are those of the index, one by one: to pass all of them
     costs more than the look-up.
 
     Returns the rows, -1 where there is none, and the nearer one's chord^2.
@@ -80,13 +80,13 @@ def faintest_star(limit_mag, magnitude, gate):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def fit(points, stars, hand):  # type: ignore[no-untyped-def]
+def gauss_newton_step(points, stars, candidate):  # type: ignore[no-untyped-def]
     """One Gauss-Newton step of T towards the matched stars.
 
     Returns chi^2 before the step and ln det N, the latter -inf where the
     geometry gives no attitude.  The covariance becomes that of the fit, radians^2.
     """
-    match, t, matrix, inverse = hand.match, hand.t, hand.matrix, hand.covariance
+    match, t, matrix, inverse = candidate.match, candidate.t, candidate.matrix, candidate.covariance
     m00 = m11 = m22 = m01 = m02 = m12 = 0.0
     g0 = g1 = g2 = chi2 = 0.0
     moving = points.velocity[0] != 0.0 or points.velocity[1] != 0.0 or points.velocity[2] != 0.0
@@ -139,13 +139,13 @@ def fit(points, stars, hand):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def match_at(points, index, magnitude_gate, hand):  # type: ignore[no-untyped-def]
+def match_at(points, index, magnitude_gate, candidate):  # type: ignore[no-untyped-def]
     """Match every point at an attitude known to a covariance; how many, and whether any changed."""
     faces, cell_place = index.face, index.cell_place
     cell_start, cell_rows = index.cell_start, index.cell_rows
     limit_mag = index.class_edge[-1, 0]
     velocity, sigma, observed = points.velocity, points.sigma, points.observed
-    match, near, t, p = hand.match, hand.near, hand.t, hand.covariance
+    match, near, t, p = candidate.match, candidate.near, candidate.t, candidate.covariance
     trace = p[0, 0] + p[1, 1] + p[2, 2]
     matched, changed = 0, False
     for k in range(len(match)):
@@ -185,32 +185,32 @@ def match_at(points, index, magnitude_gate, hand):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def settle(points, index, field, magnitude_gate, hand):  # type: ignore[no-untyped-def]
-    """Fit to the match in hand, then match and fit until nothing changes.
+def refine(points, index, field, magnitude_gate, candidate):  # type: ignore[no-untyped-def]
+    """Fit to the present match, then match and fit until nothing changes.
 
     Returns the number of stars and the log evidence, -inf where there is no
-    attitude; `hand` gets what was settled on.
+    attitude; `candidate` gets the result.
     """
-    chi2, log_det = fit(points, index.stars, hand)
+    chi2, log_det = gauss_newton_step(points, index.stars, candidate)
     if log_det == -math.inf:
         return 0, -math.inf
     matched = 0
     for attempt in range(ROUNDS):
-        matched, changed = match_at(points, index, magnitude_gate, hand)
+        matched, changed = match_at(points, index, magnitude_gate, candidate)
         if matched < 3:
             return matched, -math.inf
         if attempt == 0:
             at_most, _, _ = points_alone(
-                points, index.stars, field, hand.match, matched, chi2, log_det
+                points, index.stars, field, candidate.match, matched, chi2, log_det
             )
-            if at_most < HOPELESS:
+            if at_most < REJECT_LOG:
                 return matched, -math.inf
         if not changed:
             break
-        chi2, log_det = fit(points, index.stars, hand)
+        chi2, log_det = gauss_newton_step(points, index.stars, candidate)
         if log_det == -math.inf:
             return 0, -math.inf
-    return matched, evidence(points, index, field, hand, matched, chi2, log_det)
+    return matched, evidence(points, index, field, candidate, matched, chi2, log_det)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
@@ -242,11 +242,11 @@ def points_alone(points, stars, field, match, matched, chi2, log_det):  # type: 
             compared += 1
             total += difference
             square += difference * difference
-            any_magnitude += weighing.log_any_magnitude(points.magnitude[k], faintest_point)
+            any_magnitude += posterior.log_any_magnitude(points.magnitude[k], faintest_point)
     weight = (
-        weighing.log_positions(matched, log_spots, chi2, log_det)
-        + weighing.log_labels(n, matched)
-        + weighing.log_magnitudes(compared, total, square, field.magnitude_sigma)
+        posterior.log_positions(matched, log_spots, chi2, log_det)
+        + posterior.log_labels(n, matched)
+        + posterior.log_magnitudes(compared, total, square, field.magnitude_sigma)
         - any_magnitude
     )
     return weight, compared, faintest
@@ -282,19 +282,19 @@ def stars_inside(place, patch_rows, at, end, reach, t, field, inside):  # type: 
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def evidence(points, index, field, hand, matched, chi2, log_det):  # type: ignore[no-untyped-def]
-    """The log weight of a fitted match against all points being clutter; see `weighing`.
+def evidence(points, index, field, candidate, matched, chi2, log_det):  # type: ignore[no-untyped-def]
+    """The log weight of a fitted match against all points being clutter; see `posterior`.
 
     Exact where it is above zero; below, the search for missing stars may end early.
     """
-    match, t = hand.match, hand.t
+    match, t = candidate.match, candidate.t
     weight, compared, faintest = points_alone(
         points, index.stars, field, match, matched, chi2, log_det
     )
     if weight < 0.0:
         return weight
     n = len(match)
-    place, patch_rows, inside = index.place, index.patch_rows, hand.inside
+    place, patch_rows, inside = index.place, index.patch_rows, candidate.inside
     # As the magnitudes it is held against.
     faintest = np.float32(faintest)
     # The field: stars that should be seen, in order of brightness.
@@ -306,7 +306,7 @@ def evidence(points, index, field, hand, matched, chi2, log_det):  # type: ignor
                 limit = points.magnitude[k]
     log_missing, expected = 0.0, 0
     sigma_mag = field.magnitude_sigma
-    reach = limit + weighing.FAINT_REACH * sigma_mag
+    reach = limit + posterior.FAINT_REACH * sigma_mag
     if not reach > faintest:
         reach = faintest
     patch = patch_of(t[2])
@@ -325,13 +325,13 @@ def evidence(points, index, field, hand, matched, chi2, log_det):  # type: ignor
                     break
             if taken:
                 continue
-            log_missing += weighing.log_missing((limit - magnitude) / sigma_mag)
+            log_missing += posterior.log_missing((limit - magnitude) / sigma_mag)
             if compared < matched or log_missing < -weight:
-                shares = weighing.log_any_share(matched, max(expected, matched))
+                shares = posterior.log_any_share(matched, max(expected, matched))
                 if shares < -weight:
                     return -1.0
-    shares = weighing.log_any_share(matched, max(expected, matched))
+    shares = posterior.log_any_share(matched, max(expected, matched))
     complete = -math.inf
     if compared == matched:
-        complete = matched * math.log(weighing.DETECTED) + log_missing
+        complete = matched * math.log(posterior.DETECTED) + log_missing
     return weight + log_sum(shares, complete) - math.log(2.0)

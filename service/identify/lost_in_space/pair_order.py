@@ -5,9 +5,9 @@ import math
 import numpy as np
 from numba import njit
 
-from service.identify.lost_in_space import weighing
+from service.identify.lost_in_space import posterior
 from service.identify.lost_in_space.predictors import GATE, SLACK_RAD
-from service.sky.sky_index import BRIGHTEST_MAG, BUCKET_RAD, STEP_MAG
+from service.sky.whole_sky.index import BRIGHTEST_MAG, BUCKET_RAD, STEP_MAG
 
 LEAST_PAIR_RAD = 0.006
 """A shorter pair fixes the turn about itself too poorly to predict anything."""
@@ -58,13 +58,13 @@ def rows_within(brighter, magnitude, gate):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def look_at_points(points, index, sigma_mag, gate, pairs):  # type: ignore[no-untyped-def]
+def describe_points(points, index, sigma_mag, gate, pairs):  # type: ignore[no-untyped-def]
     """What every point brings to a pair, into `pairs`: its classes, and the chance to be beyond.
 
     Noise shows more faint stars as bright than bright ones as faint, for there
     are more of them: of a magnitude the likely truth is fainter.
     """
-    limit = index.class_edge[-1, 0] - weighing.COUNT_SLOPE * sigma_mag * sigma_mag
+    limit = index.class_edge[-1, 0] - posterior.COUNT_SLOPE * sigma_mag * sigma_mag
     for k in range(len(points.magnitude)):
         first, last = classes_of(points.magnitude[k], index.class_edge, gate)
         pairs.first[k], pairs.last[k] = first, last

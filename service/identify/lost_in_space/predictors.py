@@ -22,14 +22,19 @@ BEYOND, DEEP_COST = 0.02, 1.5
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def predict(points, beyond, i, j, largest, sieve):  # type: ignore[no-untyped-def]
-    """Coefficients and gates of all points into `sieve`, and their order, the most telling first.
+def predict(points, beyond, i, j, largest, prefilter):  # type: ignore[no-untyped-def]
+    """Coefficients and gates of all points, and their order, the most telling first.
 
-    `beyond` (n,): the chance of each to be a star beyond the limit.
+    They go into `prefilter`.  `beyond` (n,): the chance of each to be a star beyond the limit.
     Returns how many have a gate of at most `largest`.
     """
     observed, sigma = points.observed, points.sigma
-    coefficients, gate, order, cost = sieve.coefficients, sieve.gate, sieve.order, sieve.cost
+    coefficients, gate, order, cost = (
+        prefilter.coefficients,
+        prefilter.gate,
+        prefilter.order,
+        prefilter.cost,
+    )
     n = len(observed)
     i0, i1, i2 = observed[i, 0], observed[i, 1], observed[i, 2]
     j0, j1, j2 = observed[j, 0], observed[j, 1], observed[j, 2]

@@ -1,6 +1,6 @@
-"""The search: pairs in the order of their cost, candidates sieved by bitmap and by exact place.
+"""The search: pairs in the order of their cost, candidates filtered by bitmap and by exact place.
 
-What survives is settled to an attitude and weighed.  The search ends with the
+Those that survive are refined to an attitude and weighed.  The search ends with the
 first attitude that is beyond doubt, else when all pairs are tried or the bound
 on the work is reached.
 """
@@ -11,32 +11,32 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from service.attitude.kernels import triad
-from service.identify.lost_in_space import weighing
-from service.identify.lost_in_space.matching import faintest_star, nearest_stars, settle
+from service.attitude.triad import triad
+from service.identify.lost_in_space import posterior
+from service.identify.lost_in_space.matching import faintest_star, nearest_stars, refine
 from service.identify.lost_in_space.pair_order import (
     buckets_of,
     cheapest_pair,
     classes_of,
-    look_at_points,
+    describe_points,
     magnitude_gate,
     pair_costs,
     rows_within,
 )
 from service.identify.lost_in_space.predictors import GATE, predict
-from service.identify.lost_in_space.room import (
+from service.identify.lost_in_space.prefilter import candidates_of, possible_of, ranked, stars_near
+from service.identify.lost_in_space.workspace import (
+    MAX_DEFERRED,
     MOST_POINTS,
-    MOST_PUT_OFF,
+    candidate_in,
     chunk_in,
-    hand_in,
-    later_in,
+    counters_in,
+    deferred_in,
     ledger_in,
-    pairs_in,
-    sieve_in,
-    tally_in,
+    point_pairs_in,
+    prefilter_in,
 )
-from service.identify.lost_in_space.sieve import candidates_of, possible_of, ranked, stars_near
-from service.sky.sky_index import BITMAP_RADII_RAD
+from service.sky.whole_sky.index import BITMAP_RADII_RAD
 
 FIRST_POINTS = 7
 """Of many points pairs are made of the brightest first, later of `MOST_POINTS`."""
@@ -47,38 +47,42 @@ NARROW_GATE, NARROW_MAG = 2.8, 0.75
 One in fifty true pairs is missed for half the work.  Of few points all is tried again in full."""
 FEW_POINTS, MOST_FIRST = 6, 4
 """Of so few points a candidate is first held against all others; of more against three."""
-SIEVES_IN_TURN = 6
+PREFILTERED_IN_TURN = 6
 """Points of which three at a time are the first that a candidate is held against.
 Later all are: the most telling are bright, and the bright ones may all be no stars."""
-MOST_SIEVES = 12
+MAX_PREFILTERED = 12
 """Further points that a candidate is held against."""
-SETTLE_WORK = 60
-"""What settling costs, in candidates."""
+REFINE_WORK = 60
+"""What refining a candidate costs, in candidates."""
 MAX_WORK = 600_000
 """Candidates, at most: some 30 ms."""
-SURE = 7.5
-SURE_PER_CLUTTER = 0.5
+ACCEPT_LOG = 7.5
+ACCEPT_LOG_PER_CLUTTER = 0.5
 """Log evidence, and more for every point left unexplained, that ends the search."""
 SAME_ATTITUDE_RAD = 2e-3
 
 
-WORK, COUNT, PUT_OFF, BEST = 0, 1, 2, 3
-"""The tally: candidates looked at, entries in the ledger, those put off, the most stars matched."""
-GOING_ON, SURE_OF_ONE, AT_BOUND = 0, 1, 2
+WORK, COUNT, DEFERRED, BEST, LIMIT = 0, 1, 2, 3, 4
+"""The counters: candidates looked at, ledger entries, deferred candidates, most stars matched,
+and the candidates that may be looked at."""
+PAIR, STAR_I, STAR_J, NEAR = 0, 1, 2, 3
+"""Columns of a deferred candidate: its points as i * MOST_POINTS + j, their stars, and a bit for
+each further point that may have a star."""
+GOING_ON, ACCEPTED, AT_BOUND = 0, 1, 2
 
 
 class Plan(NamedTuple):
     """How the candidates of a pair of points (i, j) are tried.
 
     At least `needed` of the `firsts` points in `turn` must possibly have a star,
-    at least `further` of the first `sieves` in `order` must have one; `strong` are
-    enough to be settled at once.  `gate` is for the separation in sigmas,
+    at least `further` of the first `prefiltered` in `order` must have one; `strong` are
+    enough to be refined at once.  `gate` is for the separation in sigmas,
     `gate_mag` for the magnitudes.
     """
 
     i: Any
     j: Any
-    sieves: Any
+    prefiltered: Any
     firsts: Any
     needed: Any
     further: Any
@@ -88,7 +92,7 @@ class Plan(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def search(points, index, field, room):  # type: ignore[no-untyped-def]
+def search(points, index, field, max_work, workspace):  # type: ignore[no-untyped-def]
     """Fill the ledger with weighed matches.
 
     Returns how many there are, the work done and whether it reached its bound; no
@@ -96,18 +100,23 @@ def search(points, index, field, room):  # type: ignore[no-untyped-def]
     """
     n = len(points.observed)
     gate_mag = magnitude_gate(field.magnitude_sigma)
-    tally, pairs, sieve = tally_in(room), pairs_in(room), sieve_in(room)
-    tally[:] = 0
-    fewest = weighing.fewest_stars(points, field.area, field.magnitude_sigma)
+    counters, pairs, prefilter = (
+        counters_in(workspace),
+        point_pairs_in(workspace),
+        prefilter_in(workspace),
+    )
+    counters[:] = 0
+    counters[LIMIT] = min(MAX_WORK, max_work)
+    fewest = posterior.fewest_stars(points, field.area, field.magnitude_sigma)
     if fewest > n:
         return 0, 0, False
     further = fewest - 2
     most = min(n, MOST_POINTS)
-    look_at_points(points, index, field.magnitude_sigma, gate_mag, pairs)
+    describe_points(points, index, field.magnitude_sigma, gate_mag, pairs)
     pairs.used[:] = 1.0
     pairs.covered[:] = 0
     done = tries = 0
-    hasty = n - 3 if n <= FEW_POINTS else 0
+    narrow_tries = n - 3 if n <= FEW_POINTS else 0
     state = GOING_ON
     while done < most and state == GOING_ON:
         top = min(FIRST_POINTS, most) if done == 0 and n > 2 * further + 2 else most
@@ -116,7 +125,7 @@ def search(points, index, field, room):  # type: ignore[no-untyped-def]
         while state == GOING_ON:
             # Any attitude that explains so many points has two of them in one of so many groups;
             # of few points pairs that share none will do.
-            groups = max(further + 1, tally[BEST] - 1)
+            groups = max(further + 1, counters[BEST] - 1)
             if n <= 2 * groups:
                 groups = 0
             elif tries < FIRST_TRIES:
@@ -124,9 +133,9 @@ def search(points, index, field, room):  # type: ignore[no-untyped-def]
             elif done < most:
                 break
             i, j = cheapest_pair(pairs, top, groups)
-            if hasty > 0 and (i < 0 or tries == hasty):
+            if narrow_tries > 0 and (i < 0 or tries == narrow_tries):
                 # Of few points every pair is needed: now all that count, in full.
-                hasty = 0
+                narrow_tries = 0
                 pairs.used[:] = 1.0
                 pairs.covered[:] = 0
                 pair_costs(points, index, 0, top, pairs)
@@ -134,55 +143,59 @@ def search(points, index, field, room):  # type: ignore[no-untyped-def]
             if i < 0:
                 break
             tries += 1
-            sieves = predict(points, pairs.beyond, i, j, BITMAP_RADII_RAD[-1], sieve)
-            if sieves < further:
+            prefiltered = predict(points, pairs.beyond, i, j, BITMAP_RADII_RAD[-1], prefilter)
+            if prefiltered < further:
                 continue
             # A poor lever does not reach all points: others must try again.
-            pairs.covered[i] = pairs.covered[j] = pairs.covered[i] or sieves == n - 2
-            in_haste = tries <= (hasty if n <= FEW_POINTS else FIRST_TRIES)
-            plan = plan_of(n, i, j, sieves, tries, in_haste, further, gate_mag, sieve)
-            state = try_pair(points, index, field, gate_mag, plan, room)
+            pairs.covered[i] = pairs.covered[j] = pairs.covered[i] or prefiltered == n - 2
+            may_be_narrow = tries <= (narrow_tries if n <= FEW_POINTS else FIRST_TRIES)
+            plan = plan_of(n, i, j, prefiltered, tries, may_be_narrow, further, gate_mag, prefilter)
+            state = try_pair(points, index, field, gate_mag, plan, workspace)
     if state == GOING_ON:
-        state = try_put_off(points, index, field, gate_mag, further, room)
-    return tally[COUNT], tally[WORK], state == AT_BOUND
+        state = try_deferred(points, index, field, gate_mag, further, workspace)
+    return counters[COUNT], counters[WORK], state == AT_BOUND
 
 
 @njit(cache=True, nogil=True)
-def strong_of(further, sieves):  # type: ignore[no-untyped-def]
-    """How many further points make a candidate worth settling before others."""
-    return min(further + 2, (3 * sieves + 3) // 4)
+def strong_of(further, prefiltered):  # type: ignore[no-untyped-def]
+    """How many further points make a candidate worth refining before others."""
+    return min(further + 2, (3 * prefiltered + 3) // 4)
 
 
 @njit(cache=True, nogil=True)
-def plan_of(n, i, j, sieves, tries, in_haste, further, gate_mag, sieve):  # type: ignore[no-untyped-def]
-    """How a pair's candidates are tried; which ranks are asked first goes to `sieve.turn`."""
-    sieves = min(sieves, MOST_SIEVES)
-    narrow = sieves >= 2 and in_haste
+def plan_of(n, i, j, prefiltered, tries, may_be_narrow, further, gate_mag, prefilter):  # type: ignore[no-untyped-def]
+    """How a pair's candidates are tried; which ranks are asked first goes to `prefilter.turn`."""
+    prefiltered = min(prefiltered, MAX_PREFILTERED)
+    narrow = prefiltered >= 2 and may_be_narrow
     # Other points every time: those that tell most may be no stars.  Of few points all.
     if narrow and (tries == 1 or n <= FEW_POINTS):
         firsts = needed = 2
     elif n <= FEW_POINTS:
-        firsts, needed = sieves, further
+        firsts, needed = prefiltered, further
     elif tries <= FIRST_TRIES:
-        firsts, needed = min(sieves, 3), min(sieves, 2)
+        firsts, needed = min(prefiltered, 3), min(prefiltered, 2)
     else:
         # Where half of the points are no stars, two of three is too much to ask.
-        firsts, needed = min(sieves, 2), 1
-    turns = min(sieves, SIEVES_IN_TURN) if tries <= FIRST_TRIES else sieves
+        firsts, needed = min(prefiltered, 2), 1
+    turns = min(prefiltered, PREFILTERED_IN_TURN) if tries <= FIRST_TRIES else prefiltered
     for s in range(firsts):
-        sieve.turn[s] = (firsts * (tries - 1) + s) % turns
-    strong = strong_of(further, sieves)
+        prefilter.turn[s] = (firsts * (tries - 1) + s) % turns
+    strong = strong_of(further, prefiltered)
     gate = NARROW_GATE if narrow else GATE
     gate_mag = NARROW_MAG * gate_mag if narrow else gate_mag
-    return Plan(i, j, sieves, firsts, needed, further, strong, gate, gate_mag)
+    return Plan(i, j, prefiltered, firsts, needed, further, strong, gate, gate_mag)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def try_pair(points, index, field, gate_mag, plan, room):  # type: ignore[no-untyped-def]
+def try_pair(points, index, field, gate_mag, plan, workspace):  # type: ignore[no-untyped-def]
     """Try every star pair that a pair of points may be; whether the search goes on."""
     i, j = plan.i, plan.j
-    sieve, chunk, tally = sieve_in(room), chunk_in(room), tally_in(room)
-    ranked(sieve, pairs_in(room).beyond, plan.sieves)
+    prefilter, chunk, counters = (
+        prefilter_in(workspace),
+        chunk_in(workspace),
+        counters_in(workspace),
+    )
+    ranked(prefilter, point_pairs_in(workspace).beyond, plan.prefiltered)
     low, high = buckets_of(points, index, i, j, plan.gate)
     first, last = classes_of(points.magnitude[j], index.class_edge, plan.gate_mag)
     rows_i = rows_within(index.brighter, points.magnitude[i], plan.gate_mag)
@@ -193,32 +206,32 @@ def try_pair(points, index, field, gate_mag, plan, room):  # type: ignore[no-unt
         at, end = np.int64(index.offset[c, low]), np.int64(index.offset[c, high + 1])
         while at < end:
             count, at = candidates_of(index.pairs, index.place, at, end, rows_i, rows_j, chunk)
-            tally[WORK] += count
-            for left in range(possible_of(index.bits, count, asked, sieve, chunk)):
+            counters[WORK] += count
+            for left in range(possible_of(index.bits, count, asked, prefilter, chunk)):
                 q = chunk.possible[left]
-                near = stars_near(index.bits, sieve, plan, chunk.places, q)
-                possible = ones(near)
+                near = stars_near(index.bits, prefilter, plan, chunk.places, q)
+                possible = bit_count(near)
                 if possible < plan.further:
                     continue
                 a, b = np.int64(chunk.rows[0, q]), np.int64(chunk.rows[1, q])
-                if possible < plan.strong and tally[PUT_OFF] < MOST_PUT_OFF:
-                    put_off(room, i, j, a, b, near)
+                if possible < plan.strong and counters[DEFERRED] < MAX_DEFERRED:
+                    defer(workspace, i, j, a, b, near)
                     continue
-                hits = hits_of(points, index, gate_mag, plan, a, b, near, room)
+                hits = hits_of(points, index, gate_mag, plan, a, b, near, workspace)
                 if hits < plan.further:
                     continue
-                if hits < plan.strong and tally[PUT_OFF] < MOST_PUT_OFF:
-                    put_off(room, i, j, a, b, near)
+                if hits < plan.strong and counters[DEFERRED] < MAX_DEFERRED:
+                    defer(workspace, i, j, a, b, near)
                     continue
-                if weigh(points, index, field, gate_mag, i, j, room):
-                    return SURE_OF_ONE
-            if tally[WORK] > MAX_WORK:
+                if weigh(points, index, field, gate_mag, i, j, workspace):
+                    return ACCEPTED
+            if counters[WORK] > counters[LIMIT]:
                 return AT_BOUND
     return GOING_ON
 
 
 @njit(cache=True, nogil=True)
-def ones(bits):  # type: ignore[no-untyped-def]
+def bit_count(bits):  # type: ignore[no-untyped-def]
     """How many bits are set."""
     count = 0
     while bits:
@@ -228,14 +241,18 @@ def ones(bits):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def hits_of(points, index, gate_mag, plan, a, b, near, room):  # type: ignore[no-untyped-def]
+def hits_of(points, index, gate_mag, plan, a, b, near, workspace):  # type: ignore[no-untyped-def]
     """How many further points have a star in their place where i and j are a and b.
 
     Of those that may, one by one until they are `strong`, or cannot be enough
-    any more; their stars go to the match in hand.
+    any more; their stars go to the candidate's match.
     """
-    sieve, match, tally = sieve_in(room), hand_in(room).match, tally_in(room)
-    coefficients, gate, order = sieve.coefficients, sieve.gate, sieve.order
+    prefilter, match, counters = (
+        prefilter_in(workspace),
+        candidate_in(workspace).match,
+        counters_in(workspace),
+    )
+    coefficients, gate, order = prefilter.coefficients, prefilter.gate, prefilter.order
     stars = index.stars
     limit_mag = index.class_edge[-1, 0]
     x0, x1, x2 = stars[a, 0], stars[a, 1], stars[a, 2]
@@ -243,8 +260,8 @@ def hits_of(points, index, gate_mag, plan, a, b, near, room):  # type: ignore[no
     z0, z1, z2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
     hits = 0
     match[:] = -1
-    for s in range(plan.sieves):
-        if hits + plan.sieves - s < plan.further or hits == plan.strong:
+    for s in range(plan.prefiltered):
+        if hits + plan.prefiltered - s < plan.further or hits == plan.strong:
             break
         if (near >> s) & 1 == 0:
             continue
@@ -258,7 +275,7 @@ def hits_of(points, index, gate_mag, plan, a, b, near, room):  # type: ignore[no
             *(p0 * norm, p1 * norm, p2 * norm, gate[k]),
             *(m - gate_mag, faintest_star(limit_mag, m, gate_mag)),
         )
-        tally[WORK] += 2
+        counters[WORK] += 2
         if row >= 0 and row != a and row != b:
             match[k] = row
             hits += 1
@@ -267,63 +284,76 @@ def hits_of(points, index, gate_mag, plan, a, b, near, room):  # type: ignore[no
 
 
 @njit(cache=True, nogil=True)
-def put_off(room, i, j, a, b, near):  # type: ignore[no-untyped-def]
+def defer(workspace, i, j, a, b, near):  # type: ignore[no-untyped-def]
     """Put off the candidate in which points i and j are stars a and b, with what is near."""
-    later, tally = later_in(room), tally_in(room)
-    at = tally[PUT_OFF]
-    later[at, 0], later[at, 1], later[at, 2], later[at, 3] = i * MOST_POINTS + j, a, b, near
-    tally[PUT_OFF] += 1
+    deferred, counters = deferred_in(workspace), counters_in(workspace)
+    at = counters[DEFERRED]
+    deferred[at, PAIR] = i * MOST_POINTS + j
+    deferred[at, STAR_I], deferred[at, STAR_J], deferred[at, NEAR] = a, b, near
+    counters[DEFERRED] += 1
 
 
 @njit(cache=True, nogil=True, forceinline=True)
-def try_put_off(points, index, field, gate_mag, further, room):  # type: ignore[no-untyped-def]
+def try_deferred(points, index, field, gate_mag, further, workspace):  # type: ignore[no-untyped-def]
     """Try the candidates that were put off, in their order; whether the search goes on."""
-    sieve, tally, later = sieve_in(room), tally_in(room), later_in(room)
-    beyond = pairs_in(room).beyond
+    prefilter, counters, deferred = (
+        prefilter_in(workspace),
+        counters_in(workspace),
+        deferred_in(workspace),
+    )
+    beyond = point_pairs_in(workspace).beyond
     last_i = last_j = np.int64(-1)
-    sieves = 0
-    for at in range(tally[PUT_OFF]):
-        i, j = np.int64(later[at, 0] // MOST_POINTS), np.int64(later[at, 0] % MOST_POINTS)
-        a, b, near = np.int64(later[at, 1]), np.int64(later[at, 2]), np.int64(later[at, 3])
+    prefiltered = 0
+    for at in range(counters[DEFERRED]):
+        pair = np.int64(deferred[at, PAIR])
+        i, j = pair // MOST_POINTS, pair % MOST_POINTS
+        a, b = np.int64(deferred[at, STAR_I]), np.int64(deferred[at, STAR_J])
+        near = np.int64(deferred[at, NEAR])
         if i != last_i or j != last_j:
-            sieves = predict(points, beyond, i, j, BITMAP_RADII_RAD[-1], sieve)
-            sieves = min(sieves, MOST_SIEVES)
+            prefiltered = predict(points, beyond, i, j, BITMAP_RADII_RAD[-1], prefilter)
+            prefiltered = min(prefiltered, MAX_PREFILTERED)
             last_i, last_j = i, j
-        plan = Plan(i, j, sieves, 0, 0, further, strong_of(further, sieves), GATE, gate_mag)
-        if hits_of(points, index, gate_mag, plan, a, b, near, room) < further:
+        plan = Plan(
+            i, j, prefiltered, 0, 0, further, strong_of(further, prefiltered), GATE, gate_mag
+        )
+        if hits_of(points, index, gate_mag, plan, a, b, near, workspace) < further:
             continue
-        if weigh(points, index, field, gate_mag, i, j, room):
-            return SURE_OF_ONE
-        if tally[WORK] > MAX_WORK:
+        if weigh(points, index, field, gate_mag, i, j, workspace):
+            return ACCEPTED
+        if counters[WORK] > counters[LIMIT]:
             return AT_BOUND
     return GOING_ON
 
 
 @njit(cache=True, nogil=True)
-def weigh(points, index, field, gate_mag, i, j, room):  # type: ignore[no-untyped-def]
-    """Settle the candidate in hand and enter it in the ledger; whether it is beyond doubt."""
-    hand, ledger, tally = hand_in(room), ledger_in(room), tally_in(room)
-    match, stars = hand.match, index.stars
-    tally[WORK] += SETTLE_WORK
-    for h in range(tally[COUNT]):
+def weigh(points, index, field, gate_mag, i, j, workspace):  # type: ignore[no-untyped-def]
+    """Refine the candidate and enter it in the ledger; whether it is beyond doubt."""
+    candidate, ledger, counters = (
+        candidate_in(workspace),
+        ledger_in(workspace),
+        counters_in(workspace),
+    )
+    match, stars = candidate.match, index.stars
+    counters[WORK] += REFINE_WORK
+    for h in range(counters[COUNT]):
         if ledger.match[h, i] == match[i] and ledger.match[h, j] == match[j]:
             return False
     triad(
         *(points.observed[i], points.observed[j]),
-        *(stars[match[i], :3], stars[match[j], :3], hand.t),
+        *(stars[match[i], :3], stars[match[j], :3], candidate.t),
     )
-    matched, weight = settle(points, index, field, gate_mag, hand)
+    matched, weight = refine(points, index, field, gate_mag, candidate)
     if matched < 3 or weight < 0.0:
         return False
-    tally[COUNT] = enter(hand, weight, ledger, tally[COUNT])
-    tally[BEST] = max(tally[BEST], matched)
-    return weight > SURE + SURE_PER_CLUTTER * (len(match) - matched)
+    counters[COUNT] = enter(candidate, weight, ledger, counters[COUNT])
+    counters[BEST] = max(counters[BEST], matched)
+    return weight > ACCEPT_LOG + ACCEPT_LOG_PER_CLUTTER * (len(match) - matched)
 
 
 @njit(cache=True, nogil=True)
-def enter(hand, weight, ledger, count):  # type: ignore[no-untyped-def]
+def enter(candidate, weight, ledger, count):  # type: ignore[no-untyped-def]
     """Enter a match in the ledger, for the lightest where it is full; how many there are."""
-    match, weights = hand.match, ledger.weight
+    match, weights = candidate.match, ledger.weight
     for h in range(count):
         same = True
         for k in range(len(match)):
@@ -339,6 +369,6 @@ def enter(hand, weight, ledger, count):  # type: ignore[no-untyped-def]
             return count
     ledger.match[at] = match
     weights[at] = weight
-    ledger.attitude[at] = hand.t
-    ledger.covariance[at] = hand.covariance
+    ledger.attitude[at] = candidate.t
+    ledger.covariance[at] = candidate.covariance
     return max(count, at + 1)

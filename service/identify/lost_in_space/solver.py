@@ -13,41 +13,41 @@ import numpy.typing as npt
 from numba import njit
 
 from service.attitude.solution import NoAttitude
-from service.identify.lost_in_space import verdict, weighing
-from service.identify.lost_in_space.matching import match_at, settle
+from service.compiled.views import borrowed_view
+from service.identify.lost_in_space import decision, posterior
+from service.identify.lost_in_space.matching import match_at, refine
+from service.identify.lost_in_space.observations import Field, Points
 from service.identify.lost_in_space.pair_order import magnitude_gate
-from service.identify.lost_in_space.room import (
+from service.identify.lost_in_space.search import MAX_WORK, enter, search
+from service.identify.lost_in_space.workspace import (
     USUAL_POINTS,
-    Room,
-    hand_in,
+    Workspace,
+    candidate_in,
     ledger_in,
     order_in,
     points_in,
     words_for,
 )
-from service.identify.lost_in_space.search import enter, search
-from service.identify.lost_in_space.seen import Field, Points
-from service.sky.sky_index import SkyIndex, index_in
-from service.uncounted import uncounted
+from service.sky.whole_sky.index import SkyIndex, index_in
 from service.vectors import Matrix, Vector
 
 Rows = npt.NDArray[np.int64]
-_STILL = np.zeros(3)
+_AT_REST = np.zeros(3)
 _BLOCKS: list[Vector] = []
-"""Blocks to search in that nobody uses at the moment: as many as searches ever ran at once."""
+"""Blocks that no search uses at the moment: as many as searches ever ran at once."""
 FEWEST_POINTS = 3
 """Two stars alone tell no attitude from another."""
 
 
-SURELY_NO_MIRROR = 25.0
+NO_MIRROR_ABOVE = 25.0
 """Log odds beyond which a field in a mirror is not thought of."""
 
 _REFUSALS = {
-    verdict.FOUND: None,
-    verdict.TOO_FEW: NoAttitude.FEWER_THAN_THREE_STARS,
-    verdict.NOTHING: NoAttitude.NO_MATCH,
-    verdict.DOUBTFUL: NoAttitude.DOUBTFUL_MATCH,
-    verdict.DEGENERATE: NoAttitude.DEGENERATE_GEOMETRY,
+    decision.FOUND: None,
+    decision.TOO_FEW: NoAttitude.FEWER_THAN_THREE_STARS,
+    decision.NOTHING: NoAttitude.NO_MATCH,
+    decision.DOUBTFUL: NoAttitude.DOUBTFUL_MATCH,
+    decision.DEGENERATE: NoAttitude.DEGENERATE_GEOMETRY,
 }
 
 
@@ -141,17 +141,19 @@ class LostInSpace:
         direction: Vector,
         magnitude_mag: Vector,
         sigma_rad: Vector,
-        velocity_c: Vector = _STILL,
+        velocity_c: Vector = _AT_REST,
+        max_work: int = MAX_WORK,
     ) -> LostInSpaceResult:
         """The attitude of points (n, 3) in tracker axes; magnitudes may be NaN.
 
         `sigma_rad` (n,) is one standard deviation per tangent axis.
         `velocity_c` of the observer, inertial, in units of c, makes the stars
-        apparent; zero leaves them geometric.
+        apparent; zero leaves them geometric.  At most `max_work` candidates are looked at.
         """
         block = _BLOCKS.pop() if _BLOCKS else np.empty(words_for(USUAL_POINTS))
         code, *rest = _solve(
-            direction, magnitude_mag, sigma_rad, velocity_c, self.index.store, self._field, block
+            *(direction, magnitude_mag, sigma_rad, velocity_c),
+            *(self.index.store, self._field, max_work, block),
         )
         _BLOCKS.append(block)
         return LostInSpaceResult(_REFUSALS[code], *rest)
@@ -163,7 +165,7 @@ class LostInSpace:
         direction: Vector,
         magnitude_mag: Vector,
         sigma_rad: Vector,
-        velocity_c: Vector = _STILL,
+        velocity_c: Vector = _AT_REST,
     ) -> LostInSpaceResult:
         """The same at an attitude that is known to a covariance: no search, the same judgement."""
         block = np.empty(words_for(len(direction)))
@@ -179,14 +181,14 @@ class LostInSpace:
         direction: Vector,
         magnitude_mag: Vector,
         sigma_rad: Vector,
-        velocity_c: Vector = _STILL,
+        velocity_c: Vector = _AT_REST,
     ) -> StarChances:
         """How sure the star of every point is, at the attitude that was found."""
         points = Points(direction, magnitude_mag, sigma_rad, velocity_c)
         doubt = 1.0 / (1.0 + math.exp(min(result.log_odds, 700.0)))
         gate = magnitude_gate(self.field.magnitude_sigma_mag)
         return StarChances(
-            *verdict.star_probabilities(
+            *decision.star_probabilities(
                 *(points, self.index.arrays, self.field.as_field(), gate),
                 *(*result.matrices, result.star, doubt),
             )
@@ -194,14 +196,14 @@ class LostInSpace:
 
 
 @njit(cache=True, nogil=True)
-def _take_in(direction, magnitude, sigma, velocity, room):  # type: ignore[no-untyped-def]
+def _sort_points(direction, magnitude, sigma, velocity, workspace):  # type: ignore[no-untyped-def]
     """The points brightest first, those of unknown magnitude last, each in the order given.
 
     What was given may be of many kinds of array, for each of which this is
     compiled; what comes after is compiled once.
     """
     n = len(direction)
-    order, points = order_in(room), points_in(room)
+    order, points = order_in(workspace), points_in(workspace)
     for k in range(n):
         m = magnitude[k]
         at = k
@@ -220,10 +222,10 @@ def _take_in(direction, magnitude, sigma, velocity, room):  # type: ignore[no-un
 
 
 @njit(cache=True, nogil=True)
-def _judged(n, count, work, bounded, room, matrices, star):  # type: ignore[no-untyped-def]
-    """The verdict, rows back in the order given: see `LostInSpaceResult`."""
-    ledger, order = ledger_in(room), order_in(room)
-    best, log_odds, code = verdict.judge(ledger, count)
+def _decided(n, count, work, bounded, workspace, matrices, star):  # type: ignore[no-untyped-def]
+    """The decision, rows back in the order given: see `LostInSpaceResult`."""
+    ledger, order = ledger_in(workspace), order_in(workspace)
+    best, log_odds, code = decision.decide(ledger, count)
     matched = 0
     if best >= 0:
         for i in range(3):
@@ -234,10 +236,10 @@ def _judged(n, count, work, bounded, room, matrices, star):  # type: ignore[no-u
             star[order[k]] = ledger.match[best, k]
             matched += ledger.match[best, k] >= 0
     if n < FEWEST_POINTS:
-        code = verdict.TOO_FEW
+        code = decision.TOO_FEW
     elif work == 0:
         # Not searched: so few points, so coarsely known, are matched somewhere by chance.
-        code = verdict.DOUBTFUL
+        code = decision.DOUBTFUL
     return code, log_odds, matched, work, bounded
 
 
@@ -247,35 +249,37 @@ def _field_in(values):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _solve(direction, magnitude, sigma, velocity, store, field, block):  # type: ignore[no-untyped-def]
+def _solve(direction, magnitude, sigma, velocity, store, field, max_work, block):  # type: ignore[no-untyped-def]
     n = len(direction)
     matrices, star = np.zeros((2, 3, 3)), np.full(n, -1, np.int64)
     if len(block) < words_for(n):
         block = np.empty(words_for(n))
-    _take_in(direction, magnitude, sigma, velocity, Room(block, n))
+    _sort_points(direction, magnitude, sigma, velocity, Workspace(block, n))
     # What is made here is held here, so that what is called may borrow it.
-    code, log_odds, matched, work, bounded = _searched(n, store, field, block, matrices, star)
+    code, log_odds, matched, work, bounded = _searched(
+        *(n, store, field, max_work, block, matrices, star)
+    )
     return code, matrices, star, log_odds, matched, work, bounded
 
 
 @njit(cache=True, nogil=True)
-def _searched(n, store, field, block, matrices, star):  # type: ignore[no-untyped-def]
-    matrices, star = uncounted(matrices), uncounted(star)
+def _searched(n, store, field, max_work, block, matrices, star):  # type: ignore[no-untyped-def]
+    matrices, star = borrowed_view(matrices), borrowed_view(star)
     index, field = index_in(store), _field_in(field)
-    room = Room(block, n)
-    points, ledger = points_in(room), ledger_in(room)
-    count, work, bounded = search(points, index, field, room)
-    told = _judged(n, count, work, bounded, room, matrices, star)
+    workspace = Workspace(block, n)
+    points, ledger = points_in(workspace), ledger_in(workspace)
+    count, work, bounded = search(points, index, field, max_work, workspace)
+    told = _decided(n, count, work, bounded, workspace, matrices, star)
     code, log_odds, matched, _, _ = told
-    if code != verdict.FOUND or log_odds > SURELY_NO_MIRROR or n - matched < 2:
+    if code != decision.FOUND or log_odds > NO_MIRROR_ABOVE or n - matched < 2:
         return told
     # Stars that lie alike on both sides of a line are found in a mirror too, though not all others.
     weight = ledger.weight[:count].max()
     for k in range(n):
         points.observed[k, 0] = -points.observed[k, 0]
-    count, more, bounded = search(points, index, field, room)
-    if count > 0 and ledger.weight[:count].max() > weight + math.log(weighing.DOUBT):
-        code = verdict.DOUBTFUL
+    count, more, bounded = search(points, index, field, max_work, workspace)
+    if count > 0 and ledger.weight[:count].max() > weight + math.log(posterior.DOUBT):
+        code = decision.DOUBTFUL
     return code, log_odds, matched, work + more, bounded
 
 
@@ -286,7 +290,7 @@ def _solve_near(  # type: ignore[no-untyped-def]
     n = len(direction)
     matrices, star = np.zeros((2, 3, 3)), np.full(n, -1, np.int64)
     matrices[0], matrices[1] = attitude, covariance
-    _take_in(direction, magnitude, sigma, velocity, Room(block, n))
+    _sort_points(direction, magnitude, sigma, velocity, Workspace(block, n))
     code, log_odds, matched, work, bounded = _weighed(n, store, field, block, matrices, star)
     return code, matrices, star, log_odds, matched, work, bounded
 
@@ -295,16 +299,16 @@ def _solve_near(  # type: ignore[no-untyped-def]
 def _weighed(n, store, field, block, matrices, star):  # type: ignore[no-untyped-def]
     """What the attitude and covariance in `matrices` come to."""
     index, field = index_in(store), _field_in(field)
-    room = Room(block, n)
-    hand, points = hand_in(room), points_in(room)
-    hand.match[:] = -1
-    hand.t[:], hand.covariance[:] = matrices[0], matrices[1]
+    workspace = Workspace(block, n)
+    candidate, points = candidate_in(workspace), points_in(workspace)
+    candidate.match[:] = -1
+    candidate.t[:], candidate.covariance[:] = matrices[0], matrices[1]
     matrices[:] = 0.0
     gate = magnitude_gate(field.magnitude_sigma)
-    matched, _ = match_at(points, index, gate, hand)
+    matched, _ = match_at(points, index, gate, candidate)
     count = 0
     if matched >= 3:
-        matched, weight = settle(points, index, field, gate, hand)
+        matched, weight = refine(points, index, field, gate, candidate)
         if matched >= 3 and weight > 0.0:
-            count = enter(hand, weight, ledger_in(room), 0)
-    return _judged(n, count, n, False, room, matrices, star)
+            count = enter(candidate, weight, ledger_in(workspace), 0)
+    return _decided(n, count, n, False, workspace, matrices, star)

@@ -1,0 +1,1 @@
+"""Tokens, sessions, rate limits, and the audit list."""

@@ -1,0 +1,295 @@
+"""A picture from anybody's lens: its attitude, its lens and its stars, with no mission at all."""
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+
+from service.acquire.picture_diagnosis import advice_without_attitude, remarks_on
+from service.identify.blind.lens import Lens, LensFit
+from service.identify.blind.solver import (
+    WIDEST_FIELD_DEG,
+    BlindResult,
+    BlindSolver,
+    FocalRange,
+    rotation_between,
+)
+from service.identify.blind.verify import LEAST_SIGMA_PX, Points, Verified
+from service.imaging.detection.points import (
+    FIRST_THRESHOLD,
+    SECOND_THRESHOLD,
+    PointSources,
+    find_points,
+)
+from service.imaging.frames.frame import Frame, require_light
+from service.imaging.sky_overlay import DrawnStar, SkyView, draw_sky
+from service.sky.catalog.proper_names import PROPER_NAMES
+from service.sky.catalog.star_catalog import Catalog
+from service.sky.ephemeris import apparent, observer_velocity
+from service.sky.whole_sky.bright_stars import BrightStars, bright_stars
+from service.times import parse_utc, utc_now
+from service.vectors import (
+    ARCSEC_PER_RADIAN,
+    Matrix,
+    Vector,
+    attitude_error_arcsec,
+    quaternion_from_matrix,
+    ra_dec_of,
+    rotate_about,
+)
+
+GUESS_SHARE = 0.25
+"""How far off a focal length or field of view that is told may be."""
+REFINED_POINTS = 200
+ENOUGH_FREEDOM = 10
+"""Residuals less their parameters from which the sigmas are scaled down as well as up."""
+
+
+@dataclass(frozen=True)
+class PictureStar:
+    """A star on a picture, in pixels: where it is seen, and that minus where it should be."""
+
+    id: str
+    name: str | None
+    row: int
+    """Of the bright stars that the picture was held against."""
+    magnitude_v_mag: float
+    u_px: float
+    v_px: float
+    residual_u_px: float
+    residual_v_px: float
+
+
+@dataclass(frozen=True)
+class PictureAttitude:
+    """The attitude and the lens of a picture.
+
+    `attitude` (3, 3) turns ICRS into the camera's axes: x to the right of the picture, y
+    down, z to the sky through the middle of the picture.  `covariance_rad2` (3, 3) is of the
+    small rotation about these axes.  Sigmas are scaled by `sigma_scale`, which the residuals gave.
+    """
+
+    attitude: Matrix
+    covariance_rad2: Matrix
+    fit: LensFit
+    sigma_scale: float
+    log_odds: float
+    rms_px: float
+    stars: tuple[PictureStar, ...]
+    zero_point_mag: float
+    zero_point_sigma_mag: float
+    aberration_corrected: bool
+
+    @property
+    def lens(self) -> Lens:
+        """The lens that was fitted; its own axis need not be in the middle of the picture."""
+        return self.fit.lens
+
+    @cached_property
+    def quaternion(self) -> Vector:
+        """Scalar last, inertial to camera."""
+        return quaternion_from_matrix(self.attitude)
+
+    @property
+    def sigma_arcsec(self) -> Vector:
+        """One standard deviation (3,) about each axis of the camera."""
+        return np.asarray(np.sqrt(np.diag(self.covariance_rad2)) * ARCSEC_PER_RADIAN)
+
+    @property
+    def boresight_deg(self) -> tuple[float, float]:
+        """Right ascension and declination of the middle of the picture."""
+        return ra_dec_of(self.attitude[2])
+
+    @property
+    def roll_deg(self) -> float:
+        """The position angle of the picture's upper edge: from north through east, 0 to 360."""
+        toward, up = self.attitude[2], -self.attitude[1]
+        east = np.array([-toward[1], toward[0], 0.0])
+        north = np.cross(toward, east)
+        return math.degrees(math.atan2(float(up @ east), float(up @ north))) % 360.0
+
+    @property
+    def field_deg(self) -> tuple[float, float]:
+        """The angles that the picture's width and height span through its middle."""
+        lens = self.lens
+        u = np.array([-0.5, lens.width_px - 0.5])
+        v = np.array([-0.5, lens.height_px - 0.5])
+        middle_u, middle_v = _middle(lens)
+        across = lens.directions(u, np.full(2, middle_v))
+        down = lens.directions(np.full(2, middle_u), v)
+        return _angle_deg(*across), _angle_deg(*down)
+
+    def directions(self, u_px: Vector, v_px: Vector) -> Vector:
+        """Unit vectors (n, 3) in the camera's axes of places (n,) on the picture."""
+        return self.lens.directions(u_px, v_px) @ _of_the_middle(self.lens, np.eye(3)).T
+
+    def sigma_of(self, number: int) -> float:
+        """One standard deviation of a parameter of the fit by its number; NaN if not fitted."""
+        if number >= self.fit.parameters:
+            return math.nan
+        return float(math.sqrt(self.fit.covariance[number, number])) * self.sigma_scale
+
+
+@dataclass(frozen=True)
+class PictureResult:
+    """What became of a picture: candidates, attitude or None, and remarks in words."""
+
+    frame: Frame
+    points: PointSources
+    attitude: PictureAttitude | None
+    search: BlindResult
+    remarks: tuple[str, ...]
+
+
+def solve_picture(
+    frame: Frame, sky: BrightStars, solver: BlindSolver, guess_px: float | None = None
+) -> PictureResult:
+    """Find the attitude and the lens of a picture; `guess_px` is a rough focal length.
+
+    Where what is told leads to nothing all other focal lengths are tried, and where the
+    clear candidates do, so are fainter ones.  Raises `BadFile` for a picture without light.
+    """
+    require_light(frame, math.inf)
+    side = max(frame.width_px, frame.height_px)
+    anything = FocalRange.of_fields(side, WIDEST_FIELD_DEG)
+    ranges = [anything]
+    if guess_px is not None:
+        ranges.insert(0, FocalRange.about(guess_px, GUESS_SHARE))
+    for threshold in (FIRST_THRESHOLD, SECOND_THRESHOLD):
+        points = find_points(frame.counts, threshold)
+        places = places_of(points)
+        for focal in ranges:
+            search = solver.solve(places, focal)
+            if search.found is not None:
+                found = solver.refined(search.found, places.first(REFINED_POINTS), focal)
+                attitude = _attitude(found, places, points, frame, sky)
+                remarks = remarks_on(attitude.lens, found, points, guess_px, GUESS_SHARE)
+                return PictureResult(frame, points, attitude, search, tuple(remarks))
+    return PictureResult(frame, points, None, search, tuple(advice_without_attitude(points)))
+
+
+@lru_cache(maxsize=2)
+def blind_sky(catalog: Catalog, year: int | None = None) -> tuple[BrightStars, BlindSolver]:
+    """The bright stars of a catalog in a year, by default this one, and the solver over them."""
+    sky = bright_stars(catalog, round(utc_now().julian_year) if year is None else year)
+    return sky, BlindSolver(sky.direction)
+
+
+def overlay_of(result: PictureResult, title: str) -> bytes:
+    """The picture as PNG with its stars, their names, a grid and a scale."""
+    points, found = result.points, result.attitude
+    candidates = list(zip(points.u_px.tolist(), points.v_px.tolist(), strict=True))
+    view, stars = None, []
+    if found is not None:
+        ra_deg, dec_deg = found.boresight_deg
+        width_deg, height_deg = found.field_deg
+        title += (
+            f"   RA {ra_deg:.3f}° Dec {dec_deg:+.3f}° roll {found.roll_deg:.2f}°   "
+            f"{width_deg:.2f}° x {height_deg:.2f}°"
+        )
+        optical_axis = _of_the_middle(found.lens, np.eye(3)).T @ found.attitude
+        view = SkyView(found.lens.places, optical_axis, found.boresight_deg, found.field_deg)
+        stars = [DrawnStar(star.u_px, star.v_px, star.name or star.id) for star in found.stars]
+    return draw_sky(
+        points.light, points.noise_counts, points.binning, candidates, stars, view, title
+    )
+
+
+def places_of(points: PointSources) -> Points:
+    """The candidates as the solver takes them."""
+    return Points(points.u_px, points.v_px, points.sigma_px, points.width_px, points.height_px)
+
+
+def _attitude(
+    found: Verified, places: Points, points: PointSources, frame: Frame, sky: BrightStars
+) -> PictureAttitude:
+    fit, seen = found.fit, np.flatnonzero(found.star >= 0)
+    row = found.star[seen]
+    pull = found.residual_px / np.maximum(places.sigma_px[seen], LEAST_SIGMA_PX)[:, None]
+    freedom = pull.size - fit.parameters
+    scale = math.sqrt(float((pull**2).sum()) / max(freedom, 1))
+    if freedom < ENOUGH_FREEDOM:
+        scale = max(scale, 1.0)
+    about = fit.attitude
+    if frame.time is not None:
+        time = parse_utc(frame.time)
+        velocity_c = observer_velocity(time, None)
+        moved = apparent(sky.direction[row], velocity_c, time)
+        about = fit.attitude @ rotation_between(sky.direction[row], moved)
+    jacobian = _turns_of_the_middle(fit)
+    flux = points.flux_counts[seen] / (frame.exposure_s or 1.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        zero = sky.magnitude_mag[row] + 2.5 * np.log10(flux)
+    zero = zero[np.isfinite(zero)]
+    middle = float(np.median(zero)) if len(zero) else math.nan
+    spread = 1.48 * float(np.median(np.abs(zero - middle))) if len(zero) > 1 else math.nan
+    return PictureAttitude(
+        attitude=_of_the_middle(fit.lens, about),
+        covariance_rad2=scale**2 * jacobian @ fit.covariance @ jacobian.T,
+        fit=fit,
+        sigma_scale=scale,
+        log_odds=found.log_odds,
+        rms_px=found.rms_px,
+        stars=tuple(_stars(found, seen, points, sky)),
+        zero_point_mag=middle,
+        zero_point_sigma_mag=spread,
+        aberration_corrected=frame.time is not None,
+    )
+
+
+def _stars(found: Verified, seen: Any, points: PointSources, sky: BrightStars) -> Any:
+    """The matched stars, brightest first."""
+    order = np.argsort(sky.magnitude_mag[found.star[seen]], kind="stable")
+    for k in order.tolist():
+        point, row = int(seen[k]), int(found.star[seen[k]])
+        place = int(sky.row[row])
+        yield PictureStar(
+            sky.catalog.star_id(place),
+            PROPER_NAMES.get(int(sky.catalog.hip[place])),
+            row,
+            float(sky.magnitude_mag[row]),
+            float(points.u_px[point]),
+            float(points.v_px[point]),
+            *found.residual_px[k].tolist(),
+        )
+
+
+def _middle(lens: Lens) -> tuple[float, float]:
+    return 0.5 * (lens.width_px - 1), 0.5 * (lens.height_px - 1)
+
+
+def _of_the_middle(lens: Lens, attitude: Matrix) -> Matrix:
+    """The attitude whose z goes through the middle of the picture, turned on the shortest way."""
+    u, v = _middle(lens)
+    x, y, z = lens.directions(np.array([u]), np.array([v]))[0].tolist()
+    turn = np.array(
+        [
+            [1.0 - x * x / (1.0 + z), -x * y / (1.0 + z), -x],
+            [-x * y / (1.0 + z), 1.0 - y * y / (1.0 + z), -y],
+            [x, y, z],
+        ]
+    )
+    return np.asarray(turn @ attitude)
+
+
+def _turns_of_the_middle(fit: LensFit) -> Matrix:
+    """How the attitude of the middle (3, p) turns, in radians, with every parameter of the fit."""
+    turns = np.zeros((3, fit.parameters))
+    here = _of_the_middle(fit.lens, fit.attitude)
+    step = 1e-6
+    for column in range(fit.parameters):
+        lens, attitude = fit.lens, fit.attitude
+        if column < 3:
+            attitude = rotate_about(step * np.eye(3)[column], attitude.T).T
+        elif column > 3:
+            name = ("bend", "off_u", "off_v")[column - 4]
+            lens = replace(lens, **{name: getattr(lens, name) + step})
+        moved = _of_the_middle(lens, attitude)
+        turns[:, column] = attitude_error_arcsec(moved, here) / ARCSEC_PER_RADIAN / step
+    return turns
+
+
+def _angle_deg(one: Vector, other: Vector) -> float:
+    return math.degrees(math.atan2(float(np.linalg.norm(np.cross(one, other))), float(one @ other)))

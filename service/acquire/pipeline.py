@@ -1,0 +1,96 @@
+"""The pipeline of one batch: calibrate, search for the stars, solve for the attitude.
+
+Single posts, bulk, replays, the simulator and what-if all use it.  It is pure: an
+answer depends on the batch, the mission and the catalog alone.  Not finding a
+star is a result; only bad input raises.
+"""
+
+from service import __version__
+from service.acquire.choices import aberration_velocity, choices_of
+from service.acquire.result import (
+    Acquisition,
+    Provenance,
+    outcome_counts,
+    tracker_results,
+    unmatched_results,
+)
+from service.acquire.rivals import find_groups
+from service.acquire.search import Search, StepTimer
+from service.acquire.warnings import (
+    WORK_BOUND_HIT,
+    warning_of_rival,
+    warnings_of_attitude,
+    warnings_of_batch,
+    warnings_of_trackers,
+)
+from service.attitude.solution import AttitudeSolution, NoAttitude
+from service.identify.budget import WorkBudget
+from service.identify.prior_attitude import prior_attitude
+from service.missions.mission import Mission
+from service.observations.batch import ObservationBatch
+from service.observations.calibrate import correct
+from service.sky.ephemeris import sun_distance_au
+from service.sky.model import SkyModel
+
+
+def acquire(batch: ObservationBatch, mission: Mission, sky: SkyModel) -> Acquisition:
+    """Identify a batch's stars and solve for the attitude.
+
+    Without a priori knowledge, or where it leads to nothing good, the whole sky
+    gives the attitude to search about.  Raises `BadInput` for what does not fit
+    the mission: a tracker that it has not, a kind of a priori knowledge that its
+    zone cannot use.
+    """
+    choices = choices_of(batch, mission)
+    corrected = correct(batch, mission)
+    given = batch.a_priori
+    prior = None if given is None else prior_attitude(given, batch.time, mission, batch.position_km)
+    velocity_c = aberration_velocity(batch)
+    sun_au = sun_distance_au(batch.time)
+
+    timer = StepTimer()
+    run_catalog = sky.run_catalog(mission, batch.time)
+    search = Search(
+        *(batch, mission, choices, prior, velocity_c, sun_au, run_catalog, sky),
+        *(timer, WorkBudget()),
+    )
+    found, rival = find_groups(search, corrected)
+    in_zones = found.in_zones
+
+    solved = found.refusal if in_zones is None else in_zones.solved
+    solution = solved if isinstance(solved, AttitudeSolution) else None
+    warnings = found.warnings + warnings_of_batch(batch, mission)
+    if in_zones is None:
+        trackers = unmatched_results(corrected)
+    else:
+        trackers = tracker_results(corrected, in_zones.places, in_zones.identifications, solution)
+        if solution is not None:
+            warnings += warnings_of_attitude(solution, mission, prior)
+        if rival is not None:
+            warnings.append(warning_of_rival(rival))
+        attitude = in_zones.prior.attitude if solution is None else solution.matrix
+        warnings += warnings_of_trackers(trackers, attitude)
+    if search.budget.was_hit and not any(each.startswith(WORK_BOUND_HIT) for each in warnings):
+        warnings.append(f"{WORK_BOUND_HIT}: the search for a second group of stars was cut short")
+    return Acquisition(
+        batch=batch,
+        mission=mission,
+        choices=choices,
+        prior=prior,
+        path=found.path,
+        run_catalog=run_catalog,
+        trackers=trackers,
+        counts=outcome_counts(trackers),
+        solution=solution,
+        rival=rival,
+        reason=solved if isinstance(solved, NoAttitude) else None,
+        warnings=tuple(warnings),
+        timings_us={step: ns // 1000 for step, ns in timer.ns.items()},
+        provenance=Provenance(
+            sky.catalog.digest,
+            run_catalog.digest,
+            run_catalog.epoch_year,
+            mission.digest,
+            __version__,
+        ),
+    )

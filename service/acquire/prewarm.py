@@ -1,0 +1,113 @@
+"""Preparation: compile the kernels before the service is ready, build zones on request.
+
+python -m service.acquire.prewarm    compiles the kernels, so that nothing waits for it later
+"""
+
+import json
+from collections.abc import Mapping
+
+import numpy as np
+
+from service.acquire import acquire
+from service.identify.prior_attitude import prior_attitude, search_region
+from service.missions.identifiers import IDENTIFIERS
+from service.missions.mission import Band, Mission
+from service.observations.batch import APriori, BoresightPrior, SunPointedPrior
+from service.observations.schema import submission_from_json
+from service.sky.cache import LruCache
+from service.sky.model import SkyModel
+from service.sky.zones import Zone
+from service.times import Utc, parse_utc
+from service.vectors import quaternion_from_matrix
+
+ORION = 84.0, -1.0
+"""Where there are many bright stars: right ascension and declination, in degrees."""
+BRIGHT_MAG = 4.0
+"""So few stars are enough for every kernel, and are soon built from."""
+BRIGHTEST_MAG = 3.0
+"""And so few where every pair and every patch of the whole sky is to be indexed."""
+
+
+def prewarm_zones(sky: SkyModel, mission: Mission, prior: APriori, time: Utc) -> list[Zone]:
+    """Cache the zones that a batch of this a priori knowledge will need."""
+    presumed = prior_attitude(prior, time, mission)
+    run_catalog = sky.run_catalog(mission, time)
+    return [
+        sky.zone(
+            mission,
+            run_catalog,
+            search_region(tracker, presumed, mission, "a_priori"),
+            mission.tolerances.pair_separation_max_deg,
+            mission.zone.grid_deg,
+        )[0]
+        for tracker in mission.trackers
+    ]
+
+
+def prewarm_kernels(sky: SkyModel, missions: Mapping[str, Mission]) -> None:
+    """Compile every kernel by running a batch of real stars of each kind of zone.
+
+    What is built for it goes into a cache of its own, which is dropped.
+    """
+    moment = parse_utc("2000-01-01T12:00:00Z")
+    # Large enough that nothing is built twice on the way.
+    apart = SkyModel(sky.catalog, LruCache(max_bytes=256 << 20))
+    kinds = {mission.zone.kind: mission for mission in missions.values()}
+    first = next(iter(kinds), None)
+    for kind, given in kinds.items():
+        mission = _of_bright_stars(given, BRIGHT_MAG)
+        tracker = mission.trackers[0]
+        attitude = prior_attitude(
+            SunPointedPrior(None, None)
+            if isinstance(mission.zone, Band)
+            else BoresightPrior(*ORION),
+            moment,
+            mission,
+        ).attitude
+        run_catalog = apart.run_catalog(mission, moment)
+        boresight = attitude.T @ tracker.body_from_tracker[:, 2]
+        stars = np.argsort(-(run_catalog.direction @ boresight))[:5]
+        seen = run_catalog.direction[stars] @ attitude.T @ tracker.body_from_tracker
+        body = {
+            "spacecraft": mission.name,
+            "batch": "warm-up",
+            "time": moment.text,
+            "a_priori": {"quaternion": quaternion_from_matrix(attitude).tolist()},
+            "body_rates_deg_per_s": [0.0, 0.0, 0.01],
+            "observations": [
+                {
+                    "tracker": tracker.name,
+                    "stars": [
+                        {"vector": vector, "magnitude": magnitude, "time_offset_s": 0.1}
+                        for vector, magnitude in zip(
+                            seen.tolist(), run_catalog.magnitude_mag[stars].tolist(), strict=True
+                        )
+                    ],
+                }
+            ],
+        }
+        for identifier in IDENTIFIERS.values():
+            if not identifier.searches_zone and kind != first:
+                continue  # the same kernels
+            # From JSON, as batches are posted: kernels are compiled for that kind of array.
+            # One zone on the mission's grid, where more is to be worked out; the others are small.
+            exact = {} if identifier.name == "starid" else {"zone_grid_deg": 0.0}
+            options = {"identifier": identifier.name} | exact
+            batch = submission_from_json(json.dumps(body | {"options": options})).batch
+            brightest = _of_bright_stars(given, BRIGHTEST_MAG)
+            acquire(batch, mission if identifier.uses_prior else brightest, apart)
+
+
+def _of_bright_stars(mission: Mission, to_mag: float) -> Mission:
+    limit_mag = min(to_mag, mission.catalog.magnitude_limit_mag)
+    settings = mission.catalog.model_copy(update={"magnitude_limit_mag": limit_mag})
+    return mission.model_copy(update={"catalog": settings})
+
+
+if __name__ == "__main__":
+    from service.acquire.kernel_build import mark_built
+    from service.missions.mission import load_missions
+    from service.sky.catalog.star_catalog import load_embedded
+
+    prewarm_kernels(SkyModel(load_embedded(), LruCache(64 << 20)), load_missions())
+    mark_built()

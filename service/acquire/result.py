@@ -1,0 +1,146 @@
+"""The result of one batch: per tracker, the attitude, a rival attitude, and where it came from."""
+
+from collections.abc import Mapping, Sequence
+from enum import StrEnum
+
+from msgspec import Struct
+
+from service.acquire.choices import Choices
+from service.attitude.solution import AttitudeSolution, NoAttitude
+from service.identify.identification import (
+    Identification,
+    Integers,
+    Outcome,
+    not_known,
+    nothing_known,
+)
+from service.identify.prior_attitude import PriorAttitude
+from service.missions.mission import Mission
+from service.observations.batch import ObservationBatch
+from service.observations.calibrate import CorrectedObservations
+from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.zones import SearchRegion, Zone, counts_within
+from service.vectors import Vector
+
+_COUNTED = [
+    (int(each), each.word) for each in (Outcome.UNIQUE, Outcome.AMBIGUOUS, Outcome.UNMATCHED)
+]
+
+
+class TrackerResult(Struct, frozen=True, eq=False, gc=False):
+    """One tracker's part: where its stars were looked for, and what was found.
+
+    `stars` and `pairs` are those within the region, the paper's NCAP and NTOT;
+    `zone`, from the cache, may hold more.  Region and zone are None where the
+    whole sky gave no attitude to search about.  `residual_arcsec` is NaN for
+    stars that are not unique and where there is no attitude.
+    """
+
+    corrected: CorrectedObservations
+    region: SearchRegion | None
+    zone: Zone | None
+    zone_cached: bool
+    stars: int
+    pairs: int
+    identification: Identification
+    residual_arcsec: Vector
+
+
+class Path(StrEnum):
+    """The searches that led to an answer."""
+
+    ZONE = "zone"
+    LOST_IN_SPACE = "lost_in_space"
+    """No a priori attitude was given, or it was not to be used."""
+    ZONE_THEN_LOST_IN_SPACE = "zone_then_lost_in_space"
+    """Nothing good was found about the a priori attitude, and the whole sky was searched."""
+
+
+class Provenance(Struct, frozen=True, eq=False, gc=False):
+    """The catalogs, the mission file and the program that an answer was made with."""
+
+    catalog: str
+    run_catalog: str
+    epoch_year: float
+    mission: str
+    version: str
+
+
+class RivalAttitude(Struct, frozen=True, eq=False, gc=False):
+    """A second attitude, which explains a group of stars that the first one leaves unexplained.
+
+    `star` (n,) of every tracker are rows of the run catalog, -1 for stars that are
+    not in its group.  `probability` is its share of the two; `angle_deg` the
+    rotation between them.
+    """
+
+    solution: AttitudeSolution
+    star: tuple[Integers, ...]
+    probability: float
+    angle_deg: float
+
+
+class Acquisition(Struct, frozen=True, eq=False, gc=False):
+    """The result of one batch.
+
+    `solution` is None where `reason` says why; never an older attitude.  Where a
+    `rival` is named, the stars that the solution leaves unexplained have an
+    attitude of their own, and the solution is suspect.
+    `prior` is the batch's a priori attitude, None without any.
+    `counts` are of the stars observed, and of them unique, ambiguous and unmatched.
+    """
+
+    batch: ObservationBatch
+    mission: Mission
+    choices: Choices
+    prior: PriorAttitude | None
+    path: Path
+    run_catalog: RunCatalog
+    trackers: tuple[TrackerResult, ...]
+    counts: dict[str, int]
+    solution: AttitudeSolution | None
+    rival: RivalAttitude | None
+    reason: NoAttitude | None
+    warnings: tuple[str, ...]
+    timings_us: Mapping[str, int]
+    provenance: Provenance
+
+
+def tracker_results(
+    corrected: Sequence[CorrectedObservations],
+    places: Sequence[tuple[SearchRegion, Zone, bool]],
+    identifications: Sequence[Identification],
+    solution: AttitudeSolution | None,
+) -> tuple[TrackerResult, ...]:
+    """The results of the trackers, whose zones and identifications are in the same order."""
+    results = []
+    first = 0
+    for each, (region, zone, cached), identification in zip(
+        corrected, places, identifications, strict=True
+    ):
+        n = len(each.magnitude_mag)
+        residual = not_known(n) if solution is None else solution.residual_arcsec[first : first + n]
+        first += n
+        stars, pairs = counts_within(zone, region)
+        results.append(
+            TrackerResult(each, region, zone, cached, stars, pairs, identification, residual)
+        )
+    return tuple(results)
+
+
+def unmatched_results(corrected: Sequence[CorrectedObservations]) -> tuple[TrackerResult, ...]:
+    """The results of trackers whose stars could not be searched for: all are unmatched."""
+    counts = [len(each.magnitude_mag) for each in corrected]
+    return tuple(
+        TrackerResult(each, None, None, False, 0, 0, nothing_known(n), not_known(n))
+        for each, n in zip(corrected, counts, strict=True)
+    )
+
+
+def outcome_counts(trackers: Sequence[TrackerResult]) -> dict[str, int]:
+    """The number of stars observed, and of each outcome by its word."""
+    found = [outcome for each in trackers for outcome in each.identification.outcome.tolist()]
+    counts = {"observed": len(found)}
+    for number, word in _COUNTED:
+        counts[word] = found.count(number)
+    return counts

@@ -1,0 +1,161 @@
+"""Two groups of stars in one batch, each with an attitude of its own.
+
+Reflections double every star, and a slew within a batch halves them.  The
+heavier group becomes the answer, the lighter one its rival.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from msgspec.structs import replace
+
+from service.acquire.result import RivalAttitude
+from service.acquire.search import Search, SearchResult
+from service.attitude.solution import AttitudeSolution
+from service.identify.hypotheses.groups import (
+    Mask,
+    log_weight_of_group,
+    may_be_a_group,
+    of_all,
+    part_of,
+    share_of,
+    shared,
+)
+from service.missions.identifiers import IDENTIFIERS
+from service.observations.calibrate import CorrectedObservations
+from service.vectors import attitude_error_arcsec, read_only
+
+FEWEST_NAMED = 2
+"""One tracker must name so many stars of a second group: two vectors have an attitude."""
+DIFFERENT_CHI_SQUARE = 30.0
+"""Of chi-square with three degrees of freedom: two attitudes of noise alone pass it in 1e-6."""
+
+
+def find_groups(
+    search: Search, corrected: tuple[CorrectedObservations, ...]
+) -> tuple[SearchResult, RivalAttitude | None]:
+    """Identify the stars; where two groups have each an attitude, the lighter is the rival.
+
+    The stars that the answer leaves unexplained are acquired by themselves, the
+    same way.  Where nothing good was found for all, so are those of the
+    likeliest hypothesis: two groups of like weight leave every star ambiguous.
+    """
+    found = search.find(corrected)
+    if not IDENTIFIERS[search.choices.identifier].weighs_hypotheses or not any(
+        mask.any() for mask in found.explained
+    ):
+        return found, None
+    other = _group(search, corrected, [~mask for mask in found.explained])
+    if other is None:
+        return found, None
+    first = found
+    if not found.good:
+        explained = _group(search, corrected, found.explained)
+        if explained is None:
+            return found, None
+        # The likeliest hypothesis may have stars of the other group, and not all of its own.
+        other = _group(search, corrected, [~mask for mask in explained.unique]) or other
+        first = _group(search, corrected, [~mask for mask in other.unique]) or explained
+    elif not _differ(found.solution, other.solution):
+        # Another tracker decided for this group: then the hypothesis is what is left over.
+        left = [mask & ~each for mask, each in zip(found.explained, found.unique, strict=True)]
+        other = _group(search, corrected, left)
+    if other is None or not _differ(first.solution, other.solution):
+        # The same attitude twice: every star was sent twice, say.
+        return found, None
+    return _weigh(search, corrected, first, other)
+
+
+def _group(
+    search: Search, corrected: tuple[CorrectedObservations, ...], masks: Sequence[Mask]
+) -> SearchResult | None:
+    """The search for these stars alone, as of all; None where they have no attitude.
+
+    There must be three stars, two of which are named: the others may lie beyond the zone.
+    An attitude that its residuals speak against counts: one sound group in a thousand has such.
+    """
+    if not may_be_a_group(masks):
+        return None
+    found = search.find(part_of(corrected, masks))
+    if found.in_zones is None or not isinstance(found.in_zones.solved, AttitudeSolution):
+        return None
+    has_attitude = any(int(mask.sum()) >= FEWEST_NAMED for mask in found.unique)
+    return _of_all(found, masks) if has_attitude else None
+
+
+def _weigh(
+    search: Search,
+    corrected: tuple[CorrectedObservations, ...],
+    one: SearchResult,
+    other: SearchResult,
+) -> tuple[SearchResult, RivalAttitude]:
+    """The heavier of two groups as the answer, the lighter as its rival."""
+    weights = _log_weight(search, corrected, one), _log_weight(search, corrected, other)
+    if weights[0] < weights[1]:
+        one, other, weights = other, one, weights[::-1]
+    first, second = one.in_zones, other.in_zones
+    assert first is not None
+    assert second is not None
+    stars = tuple(each.star for each in second.identifications)
+    share = share_of(*weights, sum(int((rows >= 0).sum()) for rows in stars))
+    apart_arcsec = attitude_error_arcsec(other.solution.matrix, one.solution.matrix)
+    identifications = [
+        shared(mine, its, share)
+        for mine, its in zip(first.identifications, second.identifications, strict=True)
+    ]
+    in_zones = replace(
+        first, identifications=identifications, solved=replace(one.solution, suspect=True)
+    )
+    angle_deg = math.hypot(*apart_arcsec) / 3600.0
+    rival = RivalAttitude(other.solution, stars, 1.0 - share, angle_deg)
+    return replace(one, in_zones=in_zones), rival
+
+
+def _log_weight(
+    search: Search, corrected: tuple[CorrectedObservations, ...], found: SearchResult
+) -> float:
+    """The log weight of all stars under the attitude of one group, up to a common constant.
+
+    The prior is the a priori attitude; without one, the attitude that was found.
+    """
+    in_zones = found.in_zones
+    assert in_zones is not None
+    prior = in_zones.prior if search.prior is None else search.prior
+    return sum(
+        log_weight_of_group(
+            search.sighting(each, prior, region, zone), identification.star, search.run_catalog
+        )
+        for each, (region, zone, _), identification in zip(
+            corrected, in_zones.places, in_zones.identifications, strict=True
+        )
+    )
+
+
+def _differ(one: AttitudeSolution, other: AttitudeSolution) -> bool:
+    """Whether two attitudes of different stars differ by more than their noise explains."""
+    apart_arcsec = attitude_error_arcsec(other.matrix, one.matrix)
+    covariance_arcsec2 = one.covariance_arcsec2 + other.covariance_arcsec2
+    weighted = float(apart_arcsec @ np.linalg.solve(covariance_arcsec2, apart_arcsec))
+    return weighted > DIFFERENT_CHI_SQUARE
+
+
+def _of_all(found: SearchResult, masks: Sequence[Mask]) -> SearchResult:
+    """The search for a part of the stars as one of all, the others unmatched."""
+    in_zones, solution = found.in_zones, found.solution
+    assert in_zones is not None
+    every = np.concatenate(masks)
+    residual = np.full(len(every), np.nan)
+    residual[every] = solution.residual_arcsec
+    return replace(
+        found,
+        in_zones=replace(
+            in_zones,
+            identifications=[
+                of_all(each, mask)
+                for each, mask in zip(in_zones.identifications, masks, strict=True)
+            ],
+            solved=replace(solution, residual_arcsec=read_only(residual)),
+        ),
+        explained=tuple(masks),
+    )

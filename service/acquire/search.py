@@ -1,0 +1,280 @@
+"""The search for the stars of a batch: about the a priori attitude, or in the whole sky."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from time import perf_counter_ns
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+
+from service.acquire.choices import Choices
+from service.acquire.result import Path
+from service.acquire.warnings import WORK_BOUND_HIT
+from service.attitude.solution import AttitudeSolution, NoAttitude
+from service.identify.attitude_from_matches import attitude_of
+from service.identify.budget import WorkBudget
+from service.identify.hypotheses.groups import Mask
+from service.identify.identification import Identification, Outcome, nothing_known
+from service.identify.lost_in_space.finder import FoundAttitude, find_attitude
+from service.identify.lost_in_space.solver import FEWEST_POINTS
+from service.identify.prior_attitude import PriorAttitude, prior_attitude, search_region
+from service.identify.sighting import Sighting
+from service.missions.identifiers import IDENTIFIERS
+from service.missions.mission import Mission
+from service.observations.batch import ObservationBatch, QuaternionPrior
+from service.observations.calibrate import CorrectedObservations
+from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.model import SkyModel
+from service.sky.zones import SearchRegion, Zone
+from service.vectors import Vector, quaternion_from_matrix, read_only
+
+
+class ZoneResult(Struct, frozen=True, eq=False, gc=False):
+    """What was found in the zones about one presumed attitude.
+
+    `places` are the region of each tracker, the zone that serves it, and whether
+    that zone was cached.
+    """
+
+    prior: PriorAttitude
+    places: list[tuple[SearchRegion, Zone, bool]]
+    identifications: list[Identification]
+    solved: AttitudeSolution | NoAttitude
+
+    @property
+    def good(self) -> bool:
+        """Whether there is an attitude that its own residuals do not speak against."""
+        return isinstance(self.solved, AttitudeSolution) and not self.solved.suspect
+
+
+class SearchResult(Struct, frozen=True, eq=False, gc=False):
+    """What was found for some stars of a batch: the path, the result in zones, or why none.
+
+    `explained` (n,) of every tracker marks the stars of the likeliest hypothesis.
+    """
+
+    path: Path
+    in_zones: ZoneResult | None
+    refusal: NoAttitude | None
+    warnings: list[str]
+    explained: tuple[Mask, ...]
+
+    @property
+    def good(self) -> bool:
+        """Whether there is an attitude that its own residuals do not speak against."""
+        return self.in_zones is not None and self.in_zones.good
+
+    @property
+    def unique(self) -> list[Mask]:
+        """The stars (n,) of every tracker that are unique; only where zones were searched."""
+        assert self.in_zones is not None
+        return [each.unique for each in self.in_zones.identifications]
+
+    @property
+    def solution(self) -> AttitudeSolution:
+        """The attitude; only where there is one."""
+        assert self.in_zones is not None
+        assert isinstance(self.in_zones.solved, AttitudeSolution)
+        return self.in_zones.solved
+
+
+class StepTimer:
+    """Time spent in each step, summed where a step is taken again."""
+
+    def __init__(self) -> None:
+        self.ns = dict.fromkeys(("zone", "identify", "solve"), 0)
+        self._last = perf_counter_ns()
+
+    def end(self, step: str) -> None:
+        """Add the time since the last call to a step."""
+        now = perf_counter_ns()
+        self.ns[step] += now - self._last
+        self._last = now
+
+
+@dataclass(frozen=True)
+class Search:
+    """Searches for the stars of one batch, all of them or a part."""
+
+    batch: ObservationBatch
+    mission: Mission
+    choices: Choices
+    prior: PriorAttitude | None
+    velocity_c: Vector
+    sun_au: float
+    run_catalog: RunCatalog
+    sky: SkyModel
+    timer: StepTimer
+    budget: WorkBudget
+
+    def find(self, corrected: tuple[CorrectedObservations, ...]) -> SearchResult:
+        """Identify these stars about the a priori attitude, else in the whole sky."""
+        prior, path = self.prior, Path.LOST_IN_SPACE
+        in_zones = refusal = None
+        warnings: list[str] = []
+        explained: tuple[Mask, ...] | None = None
+        if prior is not None and IDENTIFIERS[self.choices.identifier].uses_prior:
+            # The rest is for the whole sky, and for the stars that the answer leaves.
+            budget = self.budget.share(3, 4)
+            path, in_zones = Path.ZONE, self.find_about(corrected, prior, budget)
+            warnings += prior.warnings
+            if self._falls_back(corrected, in_zones):
+                path = Path.ZONE_THEN_LOST_IN_SPACE
+        if path is not Path.ZONE:
+            found = find_attitude(
+                corrected,
+                self.velocity_c,
+                self.run_catalog,
+                self.mission,
+                self.sky,
+                self.budget,
+            )
+            self.timer.end("identify")
+            refusal, explained = found.refusal, found.explained
+            if found.attitude is not None:
+                quaternion = QuaternionPrior(read_only(quaternion_from_matrix(found.attitude)))
+                again = self.find_about(
+                    found.corrected,
+                    prior_attitude(
+                        quaternion, self.batch.time, self.mission, self.batch.position_km
+                    ),
+                    self.budget,
+                )
+                warnings_found = found.warnings
+                if not isinstance(again.solved, AttitudeSolution):
+                    again = self._with_found_stars(found, again)
+                    kept = (
+                        "zone_without_attitude: none was found in the zone about that of the whole "
+                        "sky, which is kept with its own stars"
+                    )
+                    warnings_found = (*found.warnings, kept)
+                # The zone's result stands unless the whole sky gives a better one.
+                if in_zones is None or again.good:
+                    in_zones = again
+                    warnings = [*again.prior.warnings, *warnings_found]
+            elif in_zones is not None:
+                warnings.append(f"lost_in_space_refused: {refusal}")
+            if found.bounded:
+                warnings.append(f"{WORK_BOUND_HIT}: the search in the whole sky ended at its bound")
+        if in_zones is not None:
+            explained = tuple(each.explained for each in in_zones.identifications)
+        assert explained is not None
+        return SearchResult(path, in_zones, refusal, warnings, explained)
+
+    def _with_found_stars(self, found: FoundAttitude, in_zones: ZoneResult) -> ZoneResult:
+        """The result in zones with the stars of the whole sky in place of those of the zones."""
+        identifications = [
+            replace(
+                nothing_known(len(star)),
+                outcome=np.where(star >= 0, int(Outcome.UNIQUE), int(Outcome.UNMATCHED)),
+                star=star,
+                probability=np.where(star >= 0, found.probability, np.nan),
+            )
+            for star in found.star
+        ]
+        solved = self._solve(found.corrected, identifications)
+        self.timer.end("solve")
+        return ZoneResult(in_zones.prior, in_zones.places, identifications, solved)
+
+    def find_about(
+        self,
+        corrected: Sequence[CorrectedObservations],
+        prior: PriorAttitude,
+        budget: WorkBudget,
+    ) -> ZoneResult:
+        """Identify stars in the zones about a presumed attitude, and solve for theirs.
+
+        Every tracker may spend its equal part of what the trackers before it left.
+        """
+        places = [self._place(each, index, prior) for index, each in enumerate(corrected)]
+        sightings = [
+            self.sighting(each, prior, region, zone)
+            for each, (region, zone, _) in zip(corrected, places, strict=True)
+        ]
+        trackers = len(sightings)
+        self.timer.end("zone")
+        identify = IDENTIFIERS[self.choices.identifier].identify
+        identifications = [
+            identify(replace(sighting, budget=budget.share(1, trackers - index)))
+            for index, sighting in enumerate(sightings)
+        ]
+        self.timer.end("identify")
+        solved = self._solve(corrected, identifications)
+        self.timer.end("solve")
+        return ZoneResult(prior, places, identifications, solved)
+
+    def _place(
+        self, corrected: CorrectedObservations, index: int, prior: PriorAttitude
+    ) -> tuple[SearchRegion, Zone, bool]:
+        region = search_region(
+            corrected.tracker, prior, self.mission, f"observations.{index}.tracker"
+        )
+        zone, cached = self.sky.zone(
+            self.mission,
+            self.run_catalog,
+            region,
+            self.choices.tolerances.pair_separation_max_deg,
+            self.choices.zone_grid_deg,
+        )
+        return region, zone, cached
+
+    def sighting(
+        self,
+        corrected: CorrectedObservations,
+        prior: PriorAttitude,
+        region: SearchRegion,
+        zone: Zone,
+    ) -> Sighting:
+        """What the identifier is given of one tracker."""
+        guide = None
+        if IDENTIFIERS[self.choices.identifier].needs_guide:
+            guide = self.sky.guide(self.run_catalog, corrected.tracker.field_of_view_radius_deg)
+        return Sighting(
+            np.dot(corrected.direction_body, prior.attitude),
+            corrected.magnitude_mag,
+            corrected.sigma_rad,
+            # numba compiles anew for a read-only array, which the client's own is.
+            None if prior.known_axis is None else prior.known_axis.copy(),
+            self.velocity_c,
+            # A cap is searched about the boresight itself.
+            region.axis
+            if region.kind == "cap"
+            else np.dot(corrected.tracker.boresight_body, prior.attitude),
+            region,
+            zone,
+            self.choices.rules,
+            guide,
+        )
+
+    def _solve(
+        self, corrected: Sequence[CorrectedObservations], identifications: Sequence[Identification]
+    ) -> AttitudeSolution | NoAttitude:
+        direction, sigma_rad = corrected[0].direction_body, corrected[0].sigma_rad
+        star, tracker_of = identifications[0].star, None
+        if len(corrected) > 1:
+            direction = read_only(np.concatenate([each.direction_body for each in corrected]))
+            sigma_rad = np.concatenate([each.sigma_rad for each in corrected])
+            star = np.concatenate([each.star for each in identifications])
+            counts = [len(each.sigma_rad) for each in corrected]
+            tracker_of = np.repeat(np.arange(len(corrected)), counts)
+        return attitude_of(
+            direction,
+            sigma_rad,
+            star,
+            tracker_of,
+            tuple(each.tracker.name for each in corrected),
+            self.run_catalog.direction,
+            self.velocity_c,
+            self.sun_au,
+            self.choices.solver,
+        )
+
+    def _falls_back(self, corrected: Sequence[CorrectedObservations], in_zones: ZoneResult) -> bool:
+        """Whether the result about the a priori attitude is so poor that the sky is searched."""
+        return (
+            not in_zones.good
+            and IDENTIFIERS[self.choices.identifier].falls_back
+            and self.mission.lost_in_space_fallback
+            and any(len(each.magnitude_mag) >= FEWEST_POINTS for each in corrected)
+        )

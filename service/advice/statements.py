@@ -1,0 +1,319 @@
+"""Findings as sentences, with the lines of the mission file to change."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from service.advice.advice import Advice
+from service.advice.intervals import Interval
+from service.advice.tolerances import KEPT, LEAST_BATCHES, LEAST_DIFFERENCES, ToleranceFinding
+from service.advice.trackers import AlignmentFinding, MagnitudeFinding, NoiseFinding
+from service.advice.trials import ALL_RECOMMENDED, PRESENT, Trial
+from service.missions.mission import Mission
+
+Action = Literal["widen", "tighten", "keep", "correct", "wait"]
+_APRIORI = ("cross_product_deg", "pole_difference_deg", "pole_angle_deg")
+"""Tolerances that bound errors of the a priori attitude, not of the tracker."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """A line for the mission file: its table, of a tracker where `tracker` names one, and why."""
+
+    table: str
+    tracker: str | None
+    line: str
+
+
+@dataclass(frozen=True)
+class Statement:
+    """The action that a finding asks for, its sentence, and the lines that carry it out.
+
+    A line is meant to be written unchanged; there is none where the sentence
+    recommends to keep the setting or to correct something else first.
+    """
+
+    action: Action
+    text: str
+    changes: tuple[Change, ...] = ()
+
+
+def group_statements(advice: Advice) -> list[Statement]:
+    """Statements on batches with two groups of stars, and on mirrored batches."""
+    statements = []
+    if advice.with_rival:
+        statements.append(
+            Statement(
+                "correct",
+                f"In {advice.with_rival} of {advice.sampled} batches two groups of stars have each "
+                "an attitude of their own, and the attitude is suspect: look for reflections in "
+                "the tracker, or for a slew while the stars of a batch were observed.",
+            )
+        )
+    if advice.mirrored:
+        statements.append(
+            Statement(
+                "correct",
+                f"In {advice.mirrored} of {advice.sampled} batches the stars fit better in a "
+                "mirror: look whether an axis of the tracker has the wrong sign, or two are "
+                "exchanged.",
+            )
+        )
+    return statements
+
+
+def tolerance_statement(finding: ToleranceFinding, advice: Advice) -> Statement:
+    """The statement on one tolerance."""
+    name, unit = finding.tolerance.name, finding.tolerance.unit
+    now = _quantity(finding.now, unit)
+    start = f"{finding.symbol} ({name})"
+    if finding.verdict == "not_used":
+        return Statement("keep", f"{start}: its test is off, so it has no effect.")
+    if finding.verdict == "no_verdict" or finding.needed is None or finding.beyond is None:
+        return Statement(
+            "wait",
+            f"{start}: too little data to judge it: {finding.differences} differences of "
+            f"{finding.batches} batches. At least {LEAST_BATCHES} batches and "
+            f"{LEAST_DIFFERENCES} differences are needed, more where they scatter widely.",
+        )
+    needed = _with_bounds(finding.needed, unit)
+    kept = f"{100 * KEPT:.0f} % of the {finding.tolerance.what} agree with the catalog within"
+    if finding.verdict == "fits":
+        times = finding.now / finding.needed.value if finding.needed.value else math.inf
+        return Statement(
+            "keep", f"{start} fits: {kept} {needed}, and {now} leaves {times:.1f} times that."
+        )
+    present, with_it = _present_and_recommended(finding, advice.trials)
+    effect = _effect(present, with_it)
+    if finding.verdict == "too_tight":
+        beyond = _percent_with_bounds(finding.beyond)
+        text = (
+            f"{start} is too tight: {now} loses {beyond} of the true {finding.tolerance.what}; "
+            f"{kept} {needed}. {effect}"
+        )
+        if name == "magnitude_mag" and any(m.verdict == "off" for m in advice.magnitudes):
+            return Statement(
+                "wait",
+                text + " Part of it is the offset of the magnitudes: correct that first, "
+                "then ask again.",
+            )
+        if name == "separation_deg" and any(n.before_arcsec for n in advice.noise):
+            return Statement(
+                "wait",
+                text + " The noise changed meanwhile: correct that first, then ask again for a "
+                "period in which it is constant.",
+            )
+        return _change_statement("widen", text, finding, advice)
+    text = f"{start} is wide: {kept} {needed}, and {now} is far more than that. {effect}"
+    if not _gains(present, with_it):
+        return Statement("keep", text + " A smaller value gains nothing certain: keep it.")
+    if name in _APRIORI:
+        text += " That holds while the a priori attitude stays as good as in this sample."
+    return _change_statement("tighten", text, finding, advice)
+
+
+def _change_statement(
+    action: Action, text: str, finding: ToleranceFinding, advice: Advice
+) -> Statement:
+    if not advice.uses_voting:
+        return Statement(
+            "keep",
+            f"{text} {advice.mission.name} identifies by {advice.mission.identifier}, which does "
+            f"not use it: keep it. By votes it should be {finding.recommended:g}.",
+        )
+    line = f"{finding.tolerance.name} = {finding.recommended:g}"
+    change = Change("tolerances", None, f"{line:<32} # {finding.symbol}, was {finding.now:g}")
+    return Statement(action, text, (change,))
+
+
+def _present_and_recommended(
+    finding: ToleranceFinding, trials: Sequence[Trial]
+) -> tuple[Trial | None, Trial | None]:
+    """The votes with the present settings, and with this tolerance as recommended."""
+    present = next((t for t in trials if t.variant.name == PRESENT), None)
+    alone = {finding.tolerance.name: finding.recommended}
+    found = (
+        t
+        for t in trials
+        if dict(t.variant.tolerances) == alone and t.variant.name != ALL_RECOMMENDED
+    )
+    return present, next(found, None)
+
+
+def _effect(present: Trial | None, with_it: Trial | None) -> str:
+    if present is None or with_it is None or with_it.change is None or not with_it.observed:
+        return "There was no time to try another value."
+    change = with_it.change
+    value = next(iter(with_it.variant.tolerances.values()))
+    return (
+        f"With {value:g} the votes would have left {with_it.not_unique_percent:.2f} % of "
+        f"{with_it.observed} stars ambiguous or unmatched instead of "
+        f"{present.not_unique_percent:.2f} % (a change of {change.low:+.2f} to "
+        f"{change.high:+.2f} points)."
+    )
+
+
+def _gains(present: Trial | None, with_it: Trial | None) -> bool:
+    if present is None or with_it is None or with_it.change is None:
+        return False
+    return with_it.change.high < 0.0 and with_it.other_star <= present.other_star
+
+
+def noise_statement(finding: NoiseFinding) -> Statement:
+    """The statement on one tracker's noise."""
+    start = f"Noise of {finding.tracker}"
+    if finding.sigma_arcsec is None:
+        return Statement("wait", _too_few(start, finding.batches, "an attitude of its own"))
+    found = f"{_with_bounds(finding.sigma_arcsec, 'arcsec')} per tangent axis"
+    now = f"{finding.now_arcsec:.2f}″"
+    if finding.before_arcsec is not None and finding.since is not None:
+        found += (
+            f" in the latest {finding.batches} batches, since {finding.since.text}, and was "
+            f"{_with_bounds(finding.before_arcsec, 'arcsec')} before"
+        )
+    if finding.verdict == "fits":
+        return Statement("keep", f"{start} is {found}: the mission's {now} fits.")
+    ratio = finding.sigma_arcsec.value / finding.now_arcsec
+    told = "too small" if finding.verdict == "too_small" else "too large"
+    follows = (
+        "attitudes are given as better than they are, and too many are called suspect"
+        if finding.verdict == "too_small"
+        else "attitudes are given as worse than they are, and misnamed stars pass unnoticed"
+    )
+    text = f"{start} is {found}, {ratio:.2f} times the mission's {now}, which is {told}: {follows}."
+    if finding.before_arcsec is not None and finding.since is not None:
+        return Statement(
+            "correct",
+            f"{text} Look at the tracker first: no sigma holds while its noise changes. Once it "
+            f"is steady, ask again of a stretch that begins after {finding.since.text}.",
+        )
+    line = f"sigma_arcsec = {finding.sigma_arcsec.value:.3g}"
+    return Statement(
+        "correct",
+        text,
+        (Change("trackers", finding.tracker, f"{line:<32} # was {finding.now_arcsec:g}"),),
+    )
+
+
+def magnitude_statement(finding: MagnitudeFinding, advice: Advice) -> Statement:
+    """The statement on one tracker's magnitudes."""
+    start = f"Magnitudes of {finding.tracker}"
+    if finding.offset_mag is None or finding.scale is None or finding.scatter_mag is None:
+        return Statement("wait", f"{start}: too little data to judge them: {finding.stars} stars.")
+    offset, scale = finding.offset_mag, finding.scale
+    text = (
+        f"{start}: at {finding.pivot_mag:.1f} mag the tracker measures "
+        f"{abs(offset.value):.3f} mag ({_bounds(offset, 3)}) "
+        f"{'fainter' if offset.value > 0 else 'brighter'} than the catalog; a difference of one "
+        f"magnitude is measured as {scale.value:.3f} ({scale.low:.3f} to {scale.high:.3f}); they "
+        f"scatter by {finding.scatter_mag.value:.3f} mag "
+        f"({_bounds(finding.scatter_mag, 3)})."
+    )
+    changes: list[Change] = []
+    if finding.verdict == "off" and abs(offset.value) > finding.now_sigma_mag / 4:
+        line = _color_line(advice.mission, finding, advice.magnitudes)
+        if line is None:
+            text += (
+                " The trackers differ, and the catalog's magnitudes serve all of them: "
+                "correct the offset before the magnitudes are sent."
+            )
+        else:
+            changes.append(line)
+            text += " Correct the offset in the catalog's magnitudes."
+    if finding.verdict == "off" and not scale.holds(1.0):
+        text += " No setting undoes a scale: look at the instrument's magnitude calibration."
+    if finding.scatter_verdict in ("too_small", "too_large"):
+        told = finding.scatter_verdict.replace("_", " ")
+        text += f" The mission's sigma of {finding.now_sigma_mag:g} mag is {told}."
+        line_text = f"magnitude_sigma_mag = {finding.scatter_mag.value:.2g}"
+        changes.append(
+            Change(
+                "trackers",
+                finding.tracker,
+                f"{line_text:<32} # SIGMAG, was {finding.now_sigma_mag:g}",
+            )
+        )
+    if not changes and finding.verdict == "fits":
+        text += " That fits."
+    return Statement(
+        "correct" if changes or finding.verdict == "off" else "keep", text, tuple(changes)
+    )
+
+
+def _color_line(
+    mission: Mission, finding: MagnitudeFinding, all_of_them: Sequence[MagnitudeFinding]
+) -> Change | None:
+    """The colour polynomial with the offset in its constant; None where trackers disagree."""
+    for other in all_of_them:
+        if other is finding or other.offset_mag is None or finding.offset_mag is None:
+            continue
+        if abs(other.offset_mag.value - finding.offset_mag.value) > finding.now_sigma_mag / 2:
+            return None
+    assert finding.offset_mag is not None
+    constant, *rest = mission.catalog.color_polynomial_mag or (0.0,)
+    terms = [round(constant + finding.offset_mag.value, 3), *rest]
+    was = list(mission.catalog.color_polynomial_mag) or "V itself"
+    return Change("catalog", None, f"{f'color_polynomial_mag = {terms}':<32} # was {was}")
+
+
+def alignment_statement(finding: AlignmentFinding) -> Statement:
+    """The statement on the alignment of one tracker with another."""
+    start = f"Alignment of {finding.tracker} with {finding.reference}"
+    if finding.rotation_arcsec is None:
+        return Statement("wait", _too_few(start, finding.batches, "an attitude of each"))
+    parts = ", ".join(
+        f"{axis} {each.value:+.1f}″ ({each.low:+.1f} to {each.high:+.1f})"
+        for axis, each in zip("xyz", finding.rotation_arcsec, strict=True)
+    )
+    if finding.verdict == "fits":
+        return Statement("keep", f"{start} fits: turned about the body axes by {parts}.")
+    changes = tuple(
+        Change(
+            "trackers",
+            finding.tracker,
+            f"{name}_axis_body = [{', '.join(f'{part:.9f}' for part in axis)}]",
+        )
+        for name, axis in zip("xyz", finding.axes_body or (), strict=True)
+    )
+    return Statement(
+        "correct",
+        f"{start} is off: {finding.tracker} is turned about the body axes by {parts} from where "
+        "the mission file has it.",
+        changes,
+    )
+
+
+def _too_few(start: str, batches: int, what: str) -> str:
+    return (
+        f"{start}: too little data to judge it: {batches} batches give {what}, "
+        f"{LEAST_BATCHES} are needed."
+    )
+
+
+def _quantity(value: float, unit: str) -> str:
+    if unit == "deg":
+        small = f" ({3600 * value:.1f}″)" if value < 0.1 else ""
+        return f"{value:.4g}°{small}"
+    return f"{value:.3g} mag" if unit == "mag" else f"{value:.2f}″"
+
+
+def _with_bounds(found: Interval, unit: str) -> str:
+    high = "unknown" if math.isinf(found.high) else _number(found.high, unit)
+    return f"{_quantity(found.value, unit)} ({_number(found.low, unit)} to {high})"
+
+
+def _number(value: float, unit: str) -> str:
+    return f"{value:.2f}" if unit == "arcsec" else f"{value:.3g}"
+
+
+def _bounds(found: Interval, decimals: int) -> str:
+    # Of the size of an offset, whichever way it goes.
+    low, high = found.low, found.high
+    if found.value < 0:
+        low, high = -high, -low
+    return f"{low:.{decimals}f} to {high:.{decimals}f}"
+
+
+def _percent_with_bounds(share: Interval) -> str:
+    return f"{100 * share.value:.1f} % ({100 * share.low:.1f} to {100 * share.high:.1f})"

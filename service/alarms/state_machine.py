@@ -1,0 +1,161 @@
+"""The states of an alarm: raised, latched, acknowledged, shelved, cleared.
+
+        out of limits                 acknowledged and back in limits
+    ───────────────────► ACTIVE ─────────────────────────────────────► CLEARED
+                           │  open ◄──── worse than it was ──┐
+                           │    └── acknowledge ──► acknowledged
+                           └  shelved until a time: either of them, set aside
+
+An alarm is cleared when both are true, in either order: somebody acknowledged
+it, and the quantity is back in limits.  An alarm that becomes worse than ever is
+open again.  Shelving has an end and does not keep an alarm from clearing.
+
+Each function returns the columns of the alarm that change and the actions to
+note; nothing is changed in place.
+"""
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from service.alarms.limits import LimitSettings, Severity
+from service.alarms.window import Point
+from service.errors import WrongState
+
+State = Literal["open", "acknowledged", "shelved", "cleared"]
+Action = Literal[
+    "raised",
+    "escalated",
+    "eased",
+    "returned",
+    "left_again",
+    "acknowledged",
+    "shelved",
+    "unshelved",
+    "shelf_expired",
+    "commented",
+    "cleared",
+]
+Alarm = Mapping[str, Any]
+Changes = dict[str, Any]
+Step = tuple[Changes, list[Action]]
+
+
+def state_of(alarm: Alarm, now: str) -> State:
+    """The state of an alarm at a time; times are UTC texts of one form."""
+    if alarm["cleared_at"] is not None:
+        return "cleared"
+    if alarm["shelved_until"] is not None and alarm["shelved_until"] > now:
+        return "shelved"
+    return "open" if alarm["acknowledged_at"] is None else "acknowledged"
+
+
+def raised(
+    severity: Severity, limits: LimitSettings, point: Point, now: str, worst: Point | None = None
+) -> Step:
+    """A new alarm; `worst` is the worst value since it went out of limits, if not this one."""
+    columns = {
+        "severity": severity.word,
+        "current_severity": severity.word,
+        "raised_at": now,
+        "bound": limits.bound(severity, point.value),
+        **_at("raised", point),
+        **_at("worst", worst or point),
+        **_at("latest", point),
+        "returned_at": None,
+        "acknowledged_at": None,
+        "acknowledged_by": None,
+        "shelved_at": None,
+        "shelved_by": None,
+        "shelved_until": None,
+        "cleared_at": None,
+    }
+    return columns, ["raised"]
+
+
+def observed(
+    alarm: Alarm,
+    severity: Severity | None,
+    limits: LimitSettings,
+    point: Point,
+    now: str,
+    worst: Point | None = None,
+) -> Step:
+    """A new value for an active alarm: out of limits by a severity, or within them (None).
+
+    `worst` is the worst value since it went out of them, if not this one.
+    """
+    was = _severity(alarm["current_severity"])
+    changes: Changes = _at("latest", point)
+    if severity is None:
+        if was is None:
+            return changes, []
+        changes |= {"current_severity": None, "returned_at": now}
+        return _cleared(alarm, changes, ["returned"], now)
+    changes |= {"current_severity": severity.word, "returned_at": None}
+    worst = worst or point
+    if limits.beyond(severity, worst.value) > limits.beyond(severity, alarm["worst_value"]):
+        changes |= _at("worst", worst)
+    actions: list[Action] = []
+    if severity > Severity[alarm["severity"].upper()]:
+        changes |= {"severity": severity.word, "bound": limits.bound(severity, point.value)}
+        changes |= {"acknowledged_at": None, "acknowledged_by": None}
+        actions = ["escalated"]
+    elif was is None:
+        actions = ["left_again"]
+    elif severity < was:
+        actions = ["eased"]
+    return changes, actions
+
+
+def acknowledged(alarm: Alarm, who: str, now: str) -> Step:
+    """Acknowledged by `who`; raises `WrongState` if it was already, or is cleared."""
+    _require_active(alarm)
+    if alarm["acknowledged_at"] is not None:
+        raise WrongState(f"the alarm is already acknowledged by {alarm['acknowledged_by']}")
+    changes = {"acknowledged_at": now, "acknowledged_by": who}
+    return _cleared({**alarm, **changes}, changes, ["acknowledged"], now)
+
+
+def shelved(alarm: Alarm, who: str, until: str, now: str) -> Step:
+    """Shelved until a time; shelving it again replaces that time."""
+    _require_active(alarm)
+    return {"shelved_at": now, "shelved_by": who, "shelved_until": until}, ["shelved"]
+
+
+def unshelved(alarm: Alarm) -> Step:
+    """No longer shelved; raises `WrongState` if it was not."""
+    _require_active(alarm)
+    if alarm["shelved_until"] is None:
+        raise WrongState("the alarm is not shelved")
+    return {"shelved_at": None, "shelved_by": None, "shelved_until": None}, ["unshelved"]
+
+
+def expired(alarm: Alarm, now: str) -> Step:
+    """No longer shelved, if that time is over; otherwise nothing changes."""
+    over = alarm["cleared_at"] is None and (alarm["shelved_until"] or "~") <= now
+    changes: Changes = {"shelved_at": None, "shelved_by": None, "shelved_until": None}
+    return (changes, ["shelf_expired"]) if over else ({}, [])
+
+
+def _cleared(alarm: Alarm, changes: Changes, actions: list[Action], now: str) -> Step:
+    whole = {**alarm, **changes}
+    if whole["acknowledged_at"] is not None and whole["current_severity"] is None:
+        return changes | {"cleared_at": now}, [*actions, "cleared"]
+    return changes, actions
+
+
+def _require_active(alarm: Alarm) -> None:
+    if alarm["cleared_at"] is not None:
+        raise WrongState(f"the alarm was cleared at {alarm['cleared_at']}")
+
+
+def _at(which: str, point: Point) -> Changes:
+    return {
+        f"{which}_value": point.value,
+        f"{which}_time": point.time,
+        f"{which}_batch_id": point.batch_id,
+    }
+
+
+def _severity(word: str | None) -> Severity | None:
+    return None if word is None else Severity[word.upper()]

@@ -1,0 +1,1 @@
+"""The app: what every entrance (web, command, replay, demo) uses, split by subject."""

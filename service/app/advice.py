@@ -1,0 +1,77 @@
+"""Advice on a mission's settings from recorded batches; see `service.advice`."""
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+
+from service.advice.advice import WorkLimit, advise
+from service.advice.report import advice_record
+from service.app.context import Context
+from service.app.submissions import Submissions
+from service.errors import Busy
+from service.missions.mission import mission_named
+from service.observations.schema import TolerancesIn
+from service.storage.queries.future_dated import LIVE
+from service.storage.queries.pages import ResultFilter
+from service.storage.queries.recorded_batch import sample_batches
+from service.storage.recording.unsaved_result import Row
+from service.times import Utc
+
+ADVICE_SAMPLE = 200
+"""Enough batches to know a sigma to about five percent; they run again in seconds."""
+ADVICE_RETRY_S = 10
+NO_TOLERANCES = TolerancesIn()
+
+
+class AdviceService:
+    """Works out advice, for one caller at a time."""
+
+    def __init__(self, context: Context, submissions: Submissions) -> None:
+        self._context = context
+        self._submissions = submissions
+        self._lock = threading.Lock()
+
+    def of_spacecraft(
+        self,
+        name: str,
+        *,
+        run: str | None = None,
+        start: Utc | None = None,
+        end: Utc | None = None,
+        sample: int = ADVICE_SAMPLE,
+        tolerances: TolerancesIn = NO_TOLERANCES,
+        limit_s: float = math.inf,
+        step: Callable[[], object] = lambda: None,
+    ) -> Row:
+        """What the batches of a run say of a mission's settings; see `service.advice`.
+
+        Of the batches at most `sample` are run again, fewer where `limit_s`
+        seconds run out; `step` is called after each, twice a batch.  `tolerances`
+        are tried as well.  Raises `Busy` while the service is computing other advice.
+        """
+        mission = mission_named(self._context.missions, name)
+        own = tolerances.model_dump(exclude_none=True)
+        if not self._lock.acquire(blocking=False):
+            raise Busy("the service is computing other advice", ADVICE_RETRY_S)
+        try:
+            with self._context.reading() as connection:
+                drawn = sample_batches(
+                    connection, ResultFilter(run or LIVE, name, start, end), sample
+                )
+            began = time.monotonic()
+            pace = WorkLimit(lambda share: time.monotonic() - began < share * limit_s, step)
+            # Were the worst looked up in the whole sky, the others would look too good.
+            run_again = partial(self._submissions.ingest.run_again, mission=mission.within_zones)
+            advice = advise(mission, drawn.batches, run_again, own, pace)
+        finally:
+            self._lock.release()
+        return {
+            "spacecraft": name,
+            "run": run or LIVE,
+            "first": drawn.first,
+            "last": drawn.last,
+            "batches_in_range": drawn.total,
+            **advice_record(advice),
+        }

@@ -1,0 +1,71 @@
+"""What every part of the app works with: settings, missions, sky and records."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+from sqlalchemy import Connection
+
+from service.access.audit import Entry
+from service.errors import BadBatch, Fault, NotFound, shown_value
+from service.missions.mission import Mission
+from service.observations.schema import RunName
+from service.settings import Settings
+from service.sky.model import SkyModel
+from service.storage.recording.ids import is_ulid
+from service.storage.sql.database import Store
+
+ALL_RUNS = "*"
+"""In place of the name of a run: every run, the live one included."""
+
+_RUN_NAME = TypeAdapter(RunName)
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Context:
+    """Settings, missions, sky and store, shared by every part of the app."""
+
+    settings: Settings
+    missions: dict[str, Mission]
+    sky: SkyModel
+    store: Store
+
+    def reading(self) -> AbstractContextManager[Connection]:
+        """A connection that sees one moment of the database; see `Readers.reading`."""
+        return self.store.reading()
+
+    def change(self, change: Callable[[Connection], T]) -> T:
+        """Change the database in one transaction, and wait until it is committed."""
+        return self.store.writer.change(change).result()
+
+    def change_audited(self, change: Callable[[Connection], T], entry: Entry | None) -> T:
+        """`change`, together with its entry in the audit list: both are stored, or neither."""
+
+        def audited(connection: Connection) -> T:
+            changed = change(connection)
+            if entry is not None:
+                entry.add_to(connection)
+            return changed
+
+        return self.change(audited)
+
+
+def known_id(id: str, what: str) -> str:
+    """An id as it was given; raises `NotFound` for a text that cannot be one, such as `x`."""
+    # The form tells without asking the database.
+    if not is_ulid(id):
+        raise NotFound(f"there is no {what} with the id {shown_value(id)}")
+    return id
+
+
+def checked_run_name(text: str) -> str:
+    """The name of a run; raises `BadBatch` for a text that names none."""
+    try:
+        return _RUN_NAME.validate_python(text)
+    except ValidationError as error:
+        message = str(error.errors()[0]["msg"])
+        raise BadBatch(Fault("run", message, shown_value(text))) from None

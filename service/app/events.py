@@ -1,0 +1,32 @@
+"""The log of events that the records keep."""
+
+from collections.abc import Callable, Sequence
+
+from service.app.context import Context
+from service.storage.recording import events
+from service.storage.recording.events import Event
+
+
+class Events:
+    """Reads events, and calls listeners when something was written."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+
+    def last(self) -> int:
+        """The number of the latest event."""
+        with self._context.reading() as connection:
+            return events.last_event(connection)
+
+    def after(self, last: int, limit: int) -> Sequence[Event] | None:
+        """The events after a number, oldest first; None where some of them are no longer kept."""
+        with self._context.reading() as connection:
+            return events.events_after(connection, last, limit)
+
+    def listen(self, listener: Callable[[], object]) -> None:
+        """Have a function called, from any thread, whenever something was written."""
+        self._context.store.writer.after_commit.append(listener)
+
+    def unlisten(self, listener: Callable[[], object]) -> None:
+        """Stop calling it."""
+        self._context.store.writer.after_commit.remove(listener)

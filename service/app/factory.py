@@ -1,0 +1,111 @@
+"""The app: every part of the service, put together in one place."""
+
+from service.access.sessions import Access
+from service.acquire.kernel_build import KernelBuild
+from service.app.advice import AdviceService
+from service.app.alarms import Alarms
+from service.app.audit import Audit
+from service.app.comparisons import Comparisons
+from service.app.context import Context
+from service.app.events import Events
+from service.app.frames import Frames
+from service.app.limits import Limits
+from service.app.replays import Replays
+from service.app.results import Results
+from service.app.runs import Runs
+from service.app.service import Service
+from service.app.spacecraft import Spacecraft
+from service.app.submissions import Submissions
+from service.app.zones import Zones
+from service.ingest.replays import mark_interrupted
+from service.missions.mission import Mission, load_missions
+from service.settings import Settings, is_loopback
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import open_catalog
+from service.sky.model import SkyModel
+from service.storage.recording.results import register
+from service.storage.sql.database import Store
+from service.times import utc_now
+
+
+class App:
+    """Everything the service does, over one sky, one set of missions and one database.
+
+    Its attributes are the parts by subject.  Where no run is named they read the
+    live one, so replays never show in live lists and rates.
+    """
+
+    def __init__(self, context: Context, kernels: KernelBuild | None = None) -> None:
+        self.context = context
+        self.settings = context.settings
+        self.missions = context.missions
+        self.sky = context.sky
+        self.store = context.store
+        self.access = Access(
+            context.reading, context.change, is_loopback(context.settings.host), utc_now
+        )
+        self.submissions = Submissions(context, kernels)
+        self.frames = Frames(context, self.submissions)
+        self.results = Results(context, self.submissions)
+        self.spacecraft = Spacecraft(context)
+        self.limits = Limits(context)
+        self.alarms = Alarms(context)
+        self.runs = Runs(context)
+        self.replays = Replays(context, self.submissions)
+        self.advice = AdviceService(context, self.submissions)
+        self.comparisons = Comparisons(context, self.submissions)
+        self.zones = Zones(context)
+        self.events = Events(context)
+        self.audit = Audit(context)
+        self.service = Service(context, self.submissions, self.replays, kernels)
+
+    def close(self) -> None:
+        """Stop the replays, write what is queued, and close the database."""
+        self.replays.stop()
+        self.submissions.close()
+        self.store.close()
+
+
+def open_app(
+    settings: Settings,
+    mission: Mission | None = None,
+    *,
+    create: bool = True,
+    serving: bool = False,
+) -> App:
+    """Read missions and catalog, open the database, start writing.
+
+    `mission`, where given, takes the place of the one of that name.  `create`
+    and `serving` are about the database; see `Store`.
+    Raises `BadConfiguration` for whatever of these cannot be used.
+    """
+    missions = load_missions(settings.missions)
+    if mission is not None:
+        missions[mission.name] = mission
+    sky = SkyModel(open_catalog(settings.catalog), LruCache(settings.shelf_mb << 20))
+    store = Store(settings.database, create=create, serving=serving)
+    app = App(Context(settings, missions, sky, store), KernelBuild() if serving else None)
+    try:
+        _register(app.context)
+    except BaseException:
+        app.close()
+        raise
+    return app
+
+
+def _register(context: Context) -> None:
+    """Record the missions and the catalog in use; replays of an earlier process have ended."""
+    moment = utc_now().text
+    mission_rows = [
+        {
+            "digest": mission.digest,
+            "spacecraft": mission.name,
+            "settings": mission.model_dump_json(),
+            "first_used": moment,
+        }
+        for mission in context.missions.values()
+    ]
+    catalog = context.sky.catalog
+    catalog_row = {"digest": catalog.digest, "name": catalog.name, "first_used": moment}
+    context.change(lambda connection: register(connection, mission_rows, catalog_row))
+    context.change(lambda connection: mark_interrupted(connection, moment))

@@ -1,0 +1,84 @@
+"""Frames of star trackers: submit one, and the overlay of a recorded one."""
+
+import json
+from concurrent.futures import Future
+from typing import IO
+
+from service.access.tokens import Caller, own_key
+from service.app.context import Context, known_id
+from service.app.submissions import Submissions
+from service.imaging.frames.files import digest_of
+from service.imaging.overlay import draw_overlay
+from service.imaging.overlay_marks import marks_of
+from service.imaging.submit import FrameIn
+from service.missions.mission import Mission, mission_named
+from service.observations.schema import Submission, submission_from_json
+from service.storage.queries.results import answer_from_json, frame_of_result
+from service.storage.recording.unsaved_result import Answered
+
+FRAME_WAIT_S = 30.0
+"""The longest that a frame waits for a thread: others may take seconds."""
+
+
+class Frames:
+    """Finds the stars on frames, in the solver pool: a frame takes about twenty bytes a pixel."""
+
+    def __init__(self, context: Context, submissions: Submissions) -> None:
+        self._context = context
+        self._submissions = submissions
+
+    def submit(
+        self,
+        spacecraft: str,
+        known: FrameIn,
+        file: IO[bytes],
+        idempotency_key: str | None = None,
+        caller: Caller | None = None,
+    ) -> Answered:
+        """Find the stars on a frame, then `submit` the batch of them; see `imaging.submit`.
+
+        The same frame with the same fields is a repeat and is not searched again.
+        The file is closed at the end.
+        Raises `NotFound` for an unknown spacecraft, `BadInput` for a file that is no
+        frame of its tracker's, and whatever `submit` raises.
+        """
+        self._submissions.require_kernels()
+        with file:
+            mission = mission_named(self._context.missions, spacecraft)
+            digest = digest_of(file)
+            max_pixels = self._context.settings.frame_megapixels * 1_000_000
+
+            def make() -> Submission:
+                # What this imports takes a third of the service's start.
+                from service.acquire.frame_submission import submit_frame
+
+                catalog = self._context.sky.catalog
+                return submit_frame(file, digest, known, mission, catalog, max_pixels)
+
+            return self._submissions.ingest.submit_made(
+                (mission.name, known.run, known.batch_of(digest)),
+                known.fingerprint(mission.name, digest),
+                make,
+                own_key(caller, idempotency_key),
+                caller,
+                Future(),
+                is_long=True,
+                wait_s=FRAME_WAIT_S,
+            ).result()
+
+    def overlay(self, id: str) -> bytes:
+        """A PNG of the frame that a result was made of, with its stars, names and residuals."""
+        with self._context.reading() as connection:
+            row = frame_of_result(connection, known_id(id, "batch"))
+        # As it was for that result, whatever its file says now.
+        mission = Mission.model_validate_json(row["settings"])
+        answer, batch = answer_from_json(row["answer"]), submission_from_json(row["input"]).batch
+        tracker, camera = mission.camera_tracker(batch.observations[0].tracker, "tracker")
+        run_catalog = None
+        if row["catalog_digest"] == self._context.sky.catalog.digest:
+            run_catalog = self._context.sky.run_catalog(mission, batch.time)
+        detections = json.loads(row["detections"])
+        marks = marks_of(answer, batch, tracker, camera, detections, run_catalog)
+        state = answer.attitude.status if answer.attitude else answer.reason
+        title = f"{mission.name} {tracker.name}  {batch.batch}  {batch.time.text}  {state}"
+        return draw_overlay(row["preview"], row["preview_step"], marks, title)

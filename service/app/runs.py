@@ -1,0 +1,102 @@
+"""Named runs: lists, alarms on or off, comparisons, and reprocessing into one."""
+
+import hashlib
+from collections.abc import Callable, Mapping
+
+from service.access.audit import Entry
+from service.app.context import Context, checked_run_name
+from service.errors import BadBatch, Fault
+from service.ingest.reprocess import Plan, Progress, reprocess
+from service.missions.mission import Mission, mission_named
+from service.storage.models.runs import Run, RunState
+from service.storage.queries import histories, overview
+from service.storage.queries.compare_runs import compare_runs
+from service.storage.queries.future_dated import LIVE
+from service.storage.queries.pages import ResultFilter
+from service.storage.recording.results import set_run_alarms
+from service.storage.recording.unsaved_result import Row
+from service.times import Utc, utc_now
+
+
+class Runs:
+    """Reads and compares runs."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+
+    def all(self) -> list[Run]:
+        """Every run with batches."""
+        with self._context.reading() as connection:
+            return histories.list_runs(connection)
+
+    def default(self) -> str:
+        """The run to show first: live, or the newest while that is empty."""
+        with self._context.reading() as connection:
+            return overview.default_run(connection)
+
+    def watch(self, run: str, alarms: bool = True, entry: Entry | None = None) -> RunState:
+        """Turn the evaluation of limits on or off for the batches that a run gets from now on."""
+        name = checked_run_name(run)
+        if name == LIVE and not alarms:
+            raise BadBatch(Fault("alarms", "alarms are always on for live batches", "False"))
+        self._context.change_audited(
+            lambda connection: set_run_alarms(connection, name, alarms, utc_now().text), entry
+        )
+        return RunState(run=name, alarms=alarms)
+
+    def compare(
+        self,
+        run: str,
+        other: str,
+        spacecraft: str | None = None,
+        start: Utc | None = None,
+        end: Utc | None = None,
+    ) -> Row:
+        """The outcomes of the same stars in two runs, and the angles between their attitudes."""
+        with self._context.reading() as connection:
+            return compare_runs(connection, ResultFilter(run, spacecraft, start, end), other)
+
+    def reprocess(
+        self,
+        run: str | None,
+        *,
+        source: str = LIVE,
+        spacecraft: str | None = None,
+        start: Utc | None = None,
+        end: Utc | None = None,
+        processes: int = 0,
+        step: Callable[[Progress], object] = lambda progress: None,
+    ) -> tuple[Progress, Row]:
+        """Run the batches of a run again into another, and compare both.
+
+        The settings are those of this app.  `run` None takes a name
+        that tells the settings.  What the run holds already is not run again.
+        Raises `BadBatch` where the run holds results of other settings.
+        """
+        if spacecraft is not None:
+            mission_named(self._context.missions, spacecraft)
+        chosen = {
+            name: each
+            for name, each in self._context.missions.items()
+            if spacecraft in (None, name)
+        }
+        stretch = ResultFilter(source, spacecraft, start, end)
+        plan = Plan(
+            stretch=stretch,
+            run=checked_run_name(run or self._run_of_settings(source, chosen)),
+            missions=chosen,
+            catalog=self._context.settings.catalog,
+            shelf_bytes=self._context.settings.shelf_mb << 20,
+            processes=processes,
+        )
+        progress = reprocess(self._context.store, plan, self._context.sky.catalog.digest, step)
+        return progress, self.compare(source, plan.run, spacecraft, start, end)
+
+    def _run_of_settings(self, source: str, missions: Mapping[str, Mission]) -> str:
+        """A name that the same settings give again, so that an interrupted run can continue."""
+        digests = [
+            self._context.sky.catalog.digest,
+            *sorted(each.digest for each in missions.values()),
+        ]
+        short = hashlib.sha256("".join(digests).encode()).hexdigest()[:8]
+        return f"{source[:50]}-again-{short}"

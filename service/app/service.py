@@ -1,0 +1,120 @@
+"""The service itself: readiness, and what runs here."""
+
+import gc
+import logging
+import threading
+
+from msgspec import structs
+
+from service import __version__
+from service.acquire.kernel_build import KernelBuild
+from service.acquire.prewarm import prewarm_kernels
+from service.app.context import Context
+from service.app.replays import Replays
+from service.app.submissions import Submissions
+from service.errors import Busy
+from service.observations.schema import submission_from_json
+from service.storage.recording.alarm_evaluation import latest_inputs
+from service.storage.recording.ids import Ulids
+from service.storage.recording.unsaved_result import Row
+from service.times import utc_now
+
+log = logging.getLogger(__name__)
+
+WARM_UP_RUNS = 8
+"""Runs of a recorded batch at the start, after which the interpreter has specialised its code."""
+CREDITS = (
+    "Hipparcos and Tycho-2 catalogs: ESA 1997, ESA/ESTEC; Hog et al. 2000",
+    "Method: D. Fink and D. Shoup, Goddard Space Flight Center, 1994",
+    "Earth orientation, aberration and time: ERFA, derived from the IAU SOFA software",
+)
+
+
+class Service:
+    """Prepares the service for its first batch, and describes it."""
+
+    def __init__(
+        self,
+        context: Context,
+        submissions: Submissions,
+        replays: Replays,
+        kernels: KernelBuild | None,
+    ) -> None:
+        self._context = context
+        self._submissions = submissions
+        self._replays = replays
+        self._kernels = kernels
+        self._warming = threading.Lock()
+        self._is_warm = False
+        self._ids = Ulids()
+        self.started = utc_now()
+
+    def ready(self) -> None:
+        """Return once batches run at full speed; the first call compiles and prewarms.
+
+        Raises `Busy` while another call is at that, where the database cannot be
+        read, and where the last write failed and another that is tried now does too.
+        """
+        if not self._is_warm:
+            if not self._warming.acquire(blocking=False):
+                raise Busy("the service is warming up")
+            try:
+                if self._kernels is not None:
+                    self._kernels.run(self._context.missions)
+                prewarm_kernels(self._context.sky, self._context.missions)
+                self._prewarm_recent_pointings()
+                # Collecting what exists by now, again and again, would cost more than a batch.
+                gc.freeze()
+                self._is_warm = True
+                if self._kernels is not None:
+                    # A service, and no command beside one.
+                    self._replays.resume()
+            finally:
+                gc.enable()
+                self._warming.release()
+        self._context.store.writer.require()
+        self._context.store.writer.require_written()
+        with self._context.reading() as connection:
+            connection.exec_driver_sql("SELECT 1")
+
+    def cancel_warmup(self) -> None:
+        """End the compiling of kernels, which may take minutes."""
+        if self._kernels is not None:
+            self._kernels.cancel()
+
+    def _prewarm_recent_pointings(self) -> None:
+        """Build what the next batch of each live spacecraft will most likely need.
+
+        The latest batch of each runs again, under a new id, and is rolled back; where
+        there are few, several times, because code runs slowly at first.
+        """
+        with self._context.reading() as connection:
+            inputs = latest_inputs(connection)
+        for text in inputs:
+            try:
+                sent = submission_from_json(text)
+                for _ in range(1 + WARM_UP_RUNS // len(inputs)):
+                    batch = structs.replace(sent.batch, batch=self._ids.new())
+                    self._submissions.ingest.rehearse(structs.replace(sent, batch=batch))
+            except Exception as error:
+                # A batch that no longer runs must not prevent the start.
+                log.warning("the latest batch of a spacecraft could not be run again: %s", error)
+
+    def about(self) -> Row:
+        """What answers: version, catalog, missions, kind of database."""
+        catalog = self._context.sky.catalog
+        return {
+            "version": __version__,
+            "started": self.started.text,
+            "database": self._context.store.url.get_backend_name(),
+            "catalog": {
+                "digest": catalog.digest,
+                "name": catalog.name,
+                "stars": len(catalog.magnitude_v_mag),
+            },
+            "missions": [
+                {"name": each.name, "description": each.description, "digest": each.digest}
+                for each in self._context.missions.values()
+            ],
+            "credits": list(CREDITS),
+        }

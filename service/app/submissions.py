@@ -1,0 +1,83 @@
+"""Batches to identify, solve and record."""
+
+import asyncio
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+
+from service.access.tokens import Caller
+from service.acquire.kernel_build import KernelBuild
+from service.app.context import Context
+from service.errors import AcquisitionError
+from service.ingest.submit import Observer, SubmissionService
+from service.observations.schema import Submission, submission_from_json
+from service.storage.recording.unsaved_result import Answered, Row
+
+READ_HERE_BYTES, READ_HERE_OBJECTS = 4_096, 64
+"""Bounds of a batch that the event loop reads itself: more than thirty stars."""
+
+
+class Submissions:
+    """Takes batches: each is identified, solved and recorded once, however often it is sent."""
+
+    def __init__(self, context: Context, kernels: KernelBuild | None) -> None:
+        self.ingest = SubmissionService(context.missions, context.sky, context.store)
+        self._kernels = kernels
+        self._reader = ThreadPoolExecutor(1, "read")
+
+    @property
+    def observers(self) -> list[Observer]:
+        """Called with every batch that is new, after its commit."""
+        return self.ingest.observers
+
+    def require_kernels(self) -> None:
+        """Raise `Busy` while kernels are compiled: no answer depends on what is."""
+        if self._kernels is not None:
+            self._kernels.require_built()
+
+    def submit(
+        self,
+        submission: Submission,
+        idempotency_key: str | None = None,
+        caller: Caller | None = None,
+    ) -> Answered:
+        """Record a batch and answer it; a repeat gets the stored answer.
+
+        Raises `KeyReused` and `Conflict` for another body under a key or a
+        batch that is taken, `BadBatch` for an unknown spacecraft and for what
+        does not fit its mission, `Busy` when too much is waiting.
+        """
+        return self.ingest.submit(submission, idempotency_key, caller, Future()).result()
+
+    async def answered(
+        self, sent: bytes, idempotency_key: str | None = None, caller: Caller | None = None
+    ) -> Answered:
+        """`submit` of a JSON body, for an event loop.
+
+        A small batch is read in the event loop.  A larger one is not: every other request
+        would wait for it.
+        """
+        self.require_kernels()
+        loop = asyncio.get_running_loop()
+        if len(sent) <= READ_HERE_BYTES and sent.count(b"{") <= READ_HERE_OBJECTS:
+            submission = submission_from_json(sent)
+        else:
+            submission = await loop.run_in_executor(self._reader, submission_from_json, sent)
+        future: asyncio.Future[Answered] = loop.create_future()
+        return await self.ingest.submit(submission, idempotency_key, caller, future)
+
+    def submit_many(self, submissions: Sequence[Submission]) -> list[Answered | AcquisitionError]:
+        """`submit` of each in one transaction; an error stands in the place of what is refused."""
+        return self.ingest.submit_many(submissions)
+
+    def backlog(self) -> Row:
+        """What waits to be answered and to be written, and whether the last write succeeded."""
+        return self.ingest.backlog()
+
+    def require_alive(self) -> None:
+        """Raise `Stopping` where submissions are not worked on any more."""
+        self.ingest.require_alive()
+
+    def close(self) -> None:
+        """Answer what waits, and stop."""
+        self._reader.shutdown(cancel_futures=True)
+        self.ingest.close()

@@ -1,0 +1,130 @@
+"""`acquire camera`: calibrate a camera from pictures of the sky."""
+
+import sys
+from argparse import Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from service.cli.arguments import add_command, add_group, degrees, positive
+from service.cli.configuration import settings_of
+from service.errors import BadInput, Fault, shown_value
+
+if TYPE_CHECKING:
+    from service.acquire.picture import PictureResult
+
+
+def add(commands: Any) -> None:
+    """Declare the command."""
+    group = add_group(
+        commands,
+        "camera",
+        "Cameras: from pictures of the sky to a mission file.",
+        "acquire camera calibrate pictures/*.jpg -o missions/mycam.toml",
+    )
+    parser = add_command(
+        group,
+        "calibrate",
+        "Fit focal length, optical centre and radial distortion to pictures of the sky, measure "
+        "star images, noise and zero point, and write the mission file of the camera.  A few "
+        "pictures of different fields are enough; nothing needs to be known of them.  Residual "
+        "maps before and after are written beside the mission file.",
+        """
+        acquire camera calibrate pictures/*.jpg -o missions/mycam.toml
+        acquire camera calibrate a.png b.png c.png --fov 12 --name MYCAM -o mycam.toml
+        """,
+        run,
+    )
+    parser.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="CAMERA.toml", help="mission file"
+    )
+    parser.add_argument("--name", metavar="NAME", help="of the mission; default: from the output")
+    parser.add_argument("--fov", type=degrees, metavar="DEG", help="rough field of view")
+    parser.add_argument("--focal-px", type=positive, metavar="PX", help="rough focal length")
+    parser.add_argument("--focal-mm", type=positive, metavar="MM", help="with --pixel-um")
+    parser.add_argument("--pixel-um", type=positive, metavar="UM", help="pixel pitch")
+
+
+def run(parsed: Namespace) -> int:
+    """Calibrate, write the files and print the result; 1 where a picture could not be used."""
+    from service.acquire.camera_calibration import calibrate_camera, mission_text
+    from service.acquire.picture import blind_sky, solve_picture
+    from service.cli.pictures import LEAST_MEGAPIXELS, focal_guess_px
+    from service.imaging.frames.files import read_frame
+    from service.imaging.frames.frame import FrameLimits
+    from service.imaging.residual_map import draw_residuals
+    from service.missions.mission import parse_mission
+    from service.sky.catalog.star_catalog import open_catalog
+
+    settings = settings_of(parsed)
+    sky, solver = blind_sky(open_catalog(settings.catalog))
+    max_pixels = 1_000_000 * max(settings.frame_megapixels, LEAST_MEGAPIXELS)
+    used: list[PictureResult] = []
+    refused, shape = 0, None
+    for file in parsed.files:
+        try:
+            with file.open("rb") as opened:
+                frame = read_frame(opened, FrameLimits(max_pixels, shape, "the first picture"))
+            guess_px = focal_guess_px(parsed, frame.width_px, frame.height_px)
+            if used and used[0].attitude is not None:
+                guess_px = used[0].attitude.lens.focal_px
+            result = solve_picture(frame, sky, solver, guess_px)
+        except BadInput as error:
+            refused += 1
+            print(f"acquire: {file}: {error}", file=sys.stderr)
+            continue
+        if result.attitude is None:
+            refused += 1
+            reason = "; ".join(result.remarks)
+            print(f"acquire: {file}: no attitude: {reason}", file=sys.stderr)
+            continue
+        shape = (frame.height_px, frame.width_px)
+        used.append(result)
+        print(f"{file}: {len(result.attitude.stars)} stars, {result.attitude.rms_px:.2f} px rms")
+    if not used:
+        message = "none of the pictures has an attitude: there is nothing to calibrate with"
+        raise BadInput(Fault("FILE", message, shown_value(len(parsed.files))))
+    stars = [
+        sky.direction[[star.row for star in each.attitude.stars]] for each in used if each.attitude
+    ]
+    found = calibrate_camera(used, stars)
+    name = (
+        parsed.name
+        or "".join(
+            letter if letter.isalnum() or letter in "_-" else "_" for letter in parsed.output.stem
+        )
+        .lstrip("_-")
+        .upper()
+    )
+    text = mission_text(name or "CAMERA", found)
+    parse_mission(text, str(parsed.output))
+    parsed.output.write_text(text, encoding="utf-8")
+    size = found.lens.width_px, found.lens.height_px
+    before, after = found.rms_px
+    maps = []
+    for word, residual in (("before", found.before_px), ("after", found.after_px)):
+        path = parsed.output.with_name(f"{parsed.output.stem}-residuals-{word}.png")
+        # Before, the places are of all stars; after, without those that were left out.
+        place = found.place_px if word == "after" else found.before_place_px
+        path.write_bytes(draw_residuals(place, residual, size, max(after, 1e-3), word))
+        maps.append(path)
+    lens = found.lens
+    center_u, center_v = lens.center_px
+    print(
+        f"focal length {lens.focal_px:.2f} +- {found.sigma(0) * lens.focal_px:.2f} px, centre "
+        f"({center_u:.1f}, {center_v:.1f}) +- {found.sigma(2) * lens.radius_px:.1f} px, "
+        f"distortion {lens.bend * lens.radius_px:+.2f} +- {found.sigma(1) * lens.radius_px:.2f} "
+        "px at the corners"
+    )
+    print(
+        f"residuals {before:.3f} px rms with a focal length alone, {after:.3f} px fitted; places "
+        f"were expected to {found.centroid_sigma_px:.3f} px"
+    )
+    print(
+        f"star images {found.psf_sigma_px:.2f} px (one sigma), noise {found.noise_counts:.2f} "
+        f"counts, zero point {found.zero_point_mag:.2f} mag"
+    )
+    for remark in found.remarks:
+        print(remark)
+    print(f"{parsed.output}: mission {name}; residual maps: {maps[0]}, {maps[1]}")
+    return 1 if refused else 0

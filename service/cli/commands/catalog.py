@@ -1,0 +1,169 @@
+"""`acquire catalog`: star catalogs."""
+
+import sys
+from argparse import Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from service.cli.arguments import MISSION, add_command, add_group
+from service.cli.configuration import mission_and_catalog
+from service.errors import BadInput, Fault, NotAvailable, shown_value
+
+if TYPE_CHECKING:
+    from service.sky.catalog.run_catalog import RunCatalog
+
+
+def add(commands: Any) -> None:
+    """Declare the command."""
+    group = add_group(
+        commands,
+        "catalog",
+        "Star catalogs: build the embedded one, import your own, export run catalogs.",
+        """
+        acquire catalog import skymap.csv skymap.npz
+        acquire catalog export --spacecraft XTE --epoch 1996 xte-1996.csv
+        """,
+    )
+    parser = add_command(
+        group,
+        "build",
+        "Build the embedded catalog from its source packages (only in a checkout).",
+        """
+        acquire catalog build
+        acquire catalog build downloads/ stars.npz
+        """,
+        build,
+    )
+    parser.add_argument(
+        "packages",
+        type=Path,
+        nargs="?",
+        default=Path("packages"),
+        help="folder with the source packages; default: ./packages",
+    )
+    parser.add_argument("output", type=Path, nargs="?", help="default: the file in the checkout")
+    parser = add_command(
+        group,
+        "import",
+        "Check your own catalog and convert it for the service: CSV (id, ra_deg, dec_deg, "
+        "magnitude), or fixed-width records of SKYMAP's SKY2000 (CDS V/109), whose numbers "
+        "become the stars' ids.",
+        """
+        acquire catalog import skymap.csv
+        acquire catalog import sky2kv4.dat.gz skymap.npz
+        ACQUIRE_CATALOG=skymap.npz acquire serve
+        """,
+        import_catalog,
+    )
+    parser.add_argument("file", type=Path, metavar="FILE", help="SKY2000 may be compressed by gzip")
+    parser.add_argument(
+        "output", type=Path, nargs="?", metavar="OUT.npz", help="default: FILE's name with .npz"
+    )
+    parser.add_argument(
+        "--format", choices=("csv", "sky2000"), help="default: recognised from the first bytes"
+    )
+    for name, function, summary, what in (
+        (
+            "export",
+            export,
+            "Write the run catalog of an epoch: exactly the stars that the identifier uses.",
+            "used",
+        ),
+        (
+            "rejected",
+            rejected,
+            "Write the stars that a run catalog rejects, with the reasons.",
+            "rejected",
+        ),
+    ):
+        parser = add_command(
+            group,
+            name,
+            summary,
+            f"acquire catalog {name} --spacecraft SOHO --epoch 1996 {what}.csv",
+            function,
+        )
+        parser.add_argument("--spacecraft", required=True, metavar="NAME", help=MISSION)
+        parser.add_argument(
+            "--epoch",
+            required=True,
+            type=float,
+            metavar="YEAR",
+            help="rounded like the time of a batch: to a whole year for the shipped missions",
+        )
+        parser.add_argument("output", type=Path, metavar="OUT.csv")
+
+
+def build(parsed: Namespace) -> int:
+    """Build the embedded catalog, where its build is at hand."""
+    try:
+        from catalogs.build import HERE
+        from catalogs.build import build as build_catalog
+    except ModuleNotFoundError as missing:
+        if missing.name == "pyarrow":
+            message = "needs the packages of `pip install 'attitude-acquisition[catalog-build]'`"
+        else:
+            message = (
+                "works in a checkout only: an installed service has the catalog, not its build"
+            )
+        raise NotAvailable(Fault("catalog build", message)) from None
+    output = parsed.output or HERE / "stars.npz"
+    print(build_catalog(parsed.packages, output, lambda text: print(text, file=sys.stderr)))
+    return 0
+
+
+def import_catalog(parsed: Namespace) -> int:
+    """Check a site's catalog and store it."""
+    from tqdm import tqdm
+
+    from service.sky.catalog.star_catalog import form_of, import_csv, import_sky2000, save
+
+    # Of night.dat.gz the name is night.
+    name = parsed.file.name.removesuffix(".gz").rpartition(".")[0] or parsed.file.name
+    output = parsed.output or parsed.file.with_name(f"{name}.npz")
+    left_out: tuple[str, ...] = ()
+    if (parsed.format or form_of(parsed.file)) == "sky2000":
+        with tqdm(unit=" stars", desc="reading", disable=None, leave=False) as bar:
+            catalog, left_out = import_sky2000(parsed.file, bar.update)
+    else:
+        catalog = import_csv(parsed.file)
+    save(catalog, output)
+    print(f"{output}: {len(catalog)} stars")
+    if left_out:
+        shown = ", ".join(left_out[:5]) + (", ..." if len(left_out) > 5 else "")
+        print(f"left out: {len(left_out)} stars that have no visual magnitude ({shown})")
+    print(f"use it with ACQUIRE_CATALOG={output}")
+    return 0
+
+
+def export(parsed: Namespace) -> int:
+    """Write a run catalog."""
+    from service.sky.catalog.run_catalog import export_csv
+
+    run_catalog = _run_catalog(parsed)
+    export_csv(run_catalog, parsed.output)
+    print(f"{parsed.output}: {len(run_catalog)} stars, epoch {run_catalog.epoch_year:g}")
+    return 0
+
+
+def rejected(parsed: Namespace) -> int:
+    """Write what a run catalog leaves out."""
+    from service.sky.catalog.run_catalog import export_rejected_csv
+
+    run_catalog = _run_catalog(parsed)
+    export_rejected_csv(run_catalog, parsed.output)
+    count = len(run_catalog.rejected)
+    print(f"{parsed.output}: {count} stars left out, epoch {run_catalog.epoch_year:g}")
+    return 0
+
+
+def _run_catalog(parsed: Namespace) -> "RunCatalog":
+    from service.sky.catalog.run_catalog import build_run_catalog
+    from service.times import FIRST_YEAR, LAST_YEAR
+
+    if not FIRST_YEAR <= parsed.epoch <= LAST_YEAR + 1:
+        message = f"must be from {FIRST_YEAR} to {LAST_YEAR + 1}, as the time of a batch"
+        raise BadInput(Fault("--epoch", message, shown_value(parsed.epoch)))
+    mission, catalog = mission_and_catalog(parsed.spacecraft)
+    epoch_year = mission.catalog.epoch_of(parsed.epoch)
+    return build_run_catalog(catalog, mission.catalog, epoch_year)

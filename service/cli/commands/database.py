@@ -1,0 +1,180 @@
+"""`acquire database`: the records as a whole."""
+
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+from service.cli.arguments import add_command, add_database, add_group
+from service.cli.configuration import settings_of, settings_of_existing
+
+MAX_PROBLEMS = 100
+
+
+def add(commands: Any) -> None:
+    """Declare the command."""
+    group = add_group(
+        commands,
+        "database",
+        "Maintain the database: schema, backup, verification, and deleting old batches.",
+        """
+        acquire database upgrade --database postgresql+psycopg://user@host/attitudes
+        acquire database backup night.db
+        acquire database verify
+        """,
+    )
+    parser = add_command(
+        group,
+        "upgrade",
+        "Create missing tables and migrate the schema to this version; all data are kept.",
+        "acquire database upgrade",
+        upgrade,
+    )
+    add_database(parser)
+    parser = add_command(
+        group,
+        "check",
+        "Compare the schema with the code; exit code 1 if they differ.",
+        """
+        acquire database check
+        acquire database check --fresh
+        """,
+        check,
+    )
+    parser.add_argument(
+        "--fresh", action="store_true", help="check the migrations on an empty database"
+    )
+    add_database(parser)
+    parser = add_command(
+        group,
+        "backup",
+        "Copy the whole database as it is now, also while the service is running: SQLite to a "
+        "database file, PostgreSQL to a file for pg_restore.",
+        """
+        acquire database backup night.db
+        acquire database backup night.dump --database postgresql://user@host/attitudes
+        """,
+        backup,
+    )
+    parser.add_argument("output", type=Path, metavar="FILE", help="must not exist yet")
+    add_database(parser)
+    parser = add_command(
+        group,
+        "verify",
+        "Read everything and report faults: the file, the schema, every batch with its results, "
+        "the trends.  Exit code 1 if there is a fault.  Changes nothing.",
+        """
+        acquire database verify
+        acquire database verify --database sqlite:///night.db
+        """,
+        verify,
+    )
+    add_database(parser)
+    parser = add_command(
+        group,
+        "prune",
+        "Delete the batches before a time, with their results and their part in the trends, "
+        "also while the service is running.  This cannot be undone: make a backup first.",
+        """
+        acquire database prune --before 1996-01-01T00:00:00Z --dry-run
+        acquire database prune --before 1996-001T00:00:00Z --run pass-7
+        """,
+        prune,
+    )
+    parser.add_argument(
+        "--before", required=True, metavar="UTC", help="delete batches before this batch time"
+    )
+    parser.add_argument("--run", metavar="NAME", help="only this run; default: all runs")
+    parser.add_argument("--dry-run", action="store_true", help="only print the number of batches")
+    add_database(parser)
+
+
+def upgrade(parsed: Namespace) -> int:
+    """Bring the schema up to date."""
+    from service.storage.sql.migrations import upgrade as upgrade_schema
+
+    upgrade_schema(settings_of(parsed).database)
+    print("the schema is up to date")
+    return 0
+
+
+def check(parsed: Namespace) -> int:
+    """Tell how the schema differs from the code."""
+    from service.storage.sql.migrations import check as check_schema
+    from service.storage.sql.migrations import check_fresh
+
+    differences = check_fresh() if parsed.fresh else check_schema(settings_of(parsed).database)
+    for difference in differences:
+        print(difference if len(difference) <= 120 else difference[:119] + "…")
+    if not differences:
+        print("the schema is that of the code")
+    return 1 if differences else 0
+
+
+def backup(parsed: Namespace) -> int:
+    """Copy the database."""
+    from tqdm import tqdm
+
+    from service.storage.upkeep.backup import back_up
+
+    with tqdm(total=None, unit=" pages", desc="copying", disable=None, leave=False) as bar:
+
+        def step(left: int, total: int) -> None:
+            bar.total = total
+            bar.update(total - left - bar.n)
+
+        back_up(settings_of(parsed).database, parsed.output, step)
+    print(f"{parsed.output}: {parsed.output.stat().st_size} bytes")
+    return 0
+
+
+def verify(parsed: Namespace) -> int:
+    """Tell what is wrong with the database."""
+    from tqdm import tqdm
+
+    from service.storage.upkeep.verify import verify as verify_records
+
+    seen = 0
+    with tqdm(total=None, unit=" batches", desc="reading", disable=None, leave=False) as bar:
+
+        def step(done: int, total: int) -> None:
+            nonlocal seen
+            bar.total = total
+            bar.update(done - seen)
+            seen = done
+
+        problems = verify_records(settings_of(parsed).database, step)
+    for problem in problems[:MAX_PROBLEMS]:
+        print(problem)
+    if len(problems) > MAX_PROBLEMS:
+        print(f"and {len(problems) - MAX_PROBLEMS} more")
+    if not problems:
+        print(f"nothing is wrong with {seen} batches")
+    return 1 if problems else 0
+
+
+def prune(parsed: Namespace) -> int:
+    """Delete old batches."""
+    from tqdm import tqdm
+
+    from service.storage.sql.database import Store
+    from service.storage.upkeep.prune import Pruned
+    from service.storage.upkeep.prune import prune as prune_records
+    from service.times import parse_utc
+
+    before = parse_utc(parsed.before, "--before")
+    store = Store(settings_of_existing(parsed).database, create=False)
+    try:
+        with tqdm(total=None, unit=" batches", desc="deleting", disable=None, leave=False) as bar:
+
+            def step(pruned: Pruned) -> None:
+                bar.total = pruned.total
+                bar.update(pruned.batches - bar.n)
+
+            pruned = prune_records(store, before, parsed.run, dry_run=parsed.dry_run, step=step)
+    finally:
+        store.close()
+    if parsed.dry_run:
+        print(f"{pruned.total} batches are before {before.text}; nothing was deleted")
+    else:
+        print(f"{pruned.batches} batches before {before.text} were deleted")
+    return 0

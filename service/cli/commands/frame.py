@@ -1,0 +1,180 @@
+"""`acquire frame`: find the stars on frames, identify them, solve for the attitude."""
+
+import json
+import math
+import sys
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+from typing import Any
+
+from service.cli.arguments import (
+    CAMERA_MISSION,
+    LOCAL,
+    add_command,
+    add_database,
+    degrees,
+    positive,
+)
+from service.cli.configuration import settings_of
+from service.cli.frame_submitters import FrameRefused, frame_submitter
+from service.errors import BadInput, Fault, shown_value
+
+SIDECAR = """\
+What is known of a frame stands in a JSON file of its name beside it, FILE.json for
+FILE.fits, as `acquire simulate frames` writes it: the fields of a batch but its stars
+(time, a_priori, body_rates_deg_per_s, ...).  Options of the command come first."""
+
+
+def add(commands: Any) -> None:
+    """Declare the command."""
+    parser = add_command(
+        commands,
+        "frame",
+        "Detect the stars in frames and pictures (FITS, TIFF, PNG, JPEG, BMP, .npy), identify "
+        "them and solve for the attitude.  Frames of a spacecraft are recorded; one that is sent "
+        "again returns the first answer.  Without a spacecraft a picture may be from any camera: "
+        "its lens is fitted with the attitude, and nothing is recorded.",
+        """
+        acquire frame holiday.jpg                    any camera, any lens
+        acquire frame holiday.jpg --focal-mm 50 --pixel-um 4.8 --overlay stars.png
+        acquire frame frames/*.fits --spacecraft IMAGER --overlay pictures/
+        acquire frame one.fits --spacecraft IMAGER --in-process --overlay one.png
+        acquire frame one.png --spacecraft IMAGER --time 2026-03-01T00:00:00Z --json
+        """,
+        run,
+        SIDECAR,
+    )
+    parser.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    parser.add_argument("--spacecraft", metavar="NAME", help=f"{CAMERA_MISSION}; none: any camera")
+    _add_lens(parser)
+    parser.add_argument(
+        "--tracker", metavar="NAME", help="default: the first tracker with a camera"
+    )
+    parser.add_argument(
+        "--time",
+        metavar="UTC",
+        help="time of mid exposure; default: from FILE.json, else from the FITS header",
+    )
+    parser.add_argument(
+        "--batch",
+        metavar="ID",
+        help="batch id of a single frame; default: from FILE.json, else from the file's digest",
+    )
+    parser.add_argument("--run", metavar="NAME", help="default: from FILE.json, else live")
+    parser.add_argument(
+        "--a-priori", metavar="JSON", help="JSON as in a batch; null: lost in space"
+    )
+    parser.add_argument(
+        "--centroid",
+        choices=("window", "scan", "matched", "recursive"),
+        help="default: the mission's method",
+    )
+    way = parser.add_mutually_exclusive_group()
+    way.add_argument("--url", default=LOCAL, help=f"the service; default {LOCAL}")
+    way.add_argument(
+        "--in-process",
+        action="store_true",
+        help="process the files in this process, without a server",
+    )
+    parser.add_argument(
+        "--overlay",
+        type=Path,
+        metavar="OUT.png",
+        help="write an image of the frame with stars, names and residuals; for several frames, "
+        "a folder; without a spacecraft the default is FILE-stars.png",
+    )
+    parser.add_argument("--json", action="store_true", help="print the answers, one per line")
+    add_database(parser)
+
+
+def _add_lens(parser: ArgumentParser) -> None:
+    """What may be known of the lens of a picture without a spacecraft."""
+    lens = parser.add_argument_group(
+        "without a spacecraft", "what is known of the lens, if anything, within a quarter"
+    )
+    lens.add_argument("--fov", type=degrees, metavar="DEG", help="field of view, the longer side")
+    lens.add_argument("--focal-px", type=positive, metavar="PX", help="focal length in pixels")
+    lens.add_argument("--focal-mm", type=positive, metavar="MM", help="with --pixel-um")
+    lens.add_argument("--pixel-um", type=positive, metavar="UM", help="the pitch of the pixels")
+
+
+def run(parsed: Namespace) -> int:
+    """Send every file and print its result; 1 where one was refused."""
+    if parsed.spacecraft is None:
+        from service.cli.pictures import solve_pictures
+
+        return solve_pictures(parsed, settings_of(parsed))
+    if parsed.batch is not None and len(parsed.files) > 1:
+        message = "names one frame; leave it out for several"
+        raise BadInput(Fault("--batch", message, shown_value(parsed.batch)))
+    if parsed.database is not None and not parsed.in_process:
+        message = "goes with --in-process; a running service has its own"
+        raise BadInput(Fault("--database", message, shown_value(parsed.database)))
+    refused = 0
+    with frame_submitter(parsed, settings_of(parsed)) as submitter:
+        for file in parsed.files:
+            try:
+                body = submitter.submit(parsed.spacecraft, _known(parsed, file), file)
+            except (BadInput, FrameRefused) as error:
+                refused += 1
+                print(f"acquire: {file}: {error}", file=sys.stderr)
+                continue
+            answer = json.loads(body)
+            print(body.decode() if parsed.json else _summary(file, answer))
+            if parsed.overlay is not None:
+                _write_overlay(parsed, file, submitter.overlay(answer["id"]))
+    return 1 if refused else 0
+
+
+def _known(parsed: Namespace, file: Path) -> dict[str, Any]:
+    """The fields of the JSON file beside a frame, overridden by the command's options."""
+    known: dict[str, Any] = {}
+    beside = file.with_suffix(".json")
+    if beside.is_file():
+        known = _object(beside.read_text(encoding="utf-8"), str(beside))
+    if parsed.a_priori is not None:
+        known["a_priori"] = _json(parsed.a_priori, "--a-priori")
+    for name in ("tracker", "time", "batch", "run", "centroid"):
+        if getattr(parsed, name) is not None:
+            known[name] = getattr(parsed, name)
+    return known
+
+
+def _json(text: str, field: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise BadInput(Fault(field, f"is not JSON: {error}", shown_value(text))) from None
+
+
+def _object(text: str, field: str) -> dict[str, Any]:
+    value = _json(text, field)
+    if not isinstance(value, dict):
+        raise BadInput(Fault(field, "must hold one JSON object", shown_value(value)))
+    return value
+
+
+def _summary(file: Path, answer: dict[str, Any]) -> str:
+    frame, counts, attitude = answer["frame"], answer["counts"], answer["attitude"]
+    found = (
+        f"{file}: {frame['candidates']} candidates, {frame['used']} in the batch: "
+        f"{counts['unique']} unique, {counts['ambiguous']} ambiguous, "
+        f"{counts['unmatched']} unmatched"
+    )
+    lines = [found]
+    if attitude is None:
+        lines.append(f"  no attitude: {answer['reason']}")
+    else:
+        quaternion = " ".join(f"{each:.9f}" for each in attitude["quaternion"])
+        covariance = attitude["covariance_arcsec2"]
+        sigmas = " ".join(f"{math.sqrt(covariance[k][k]):.2f}" for k in range(3))
+        lines.append(f"  {attitude['status']}  {quaternion}  sigma {sigmas} arcsec")
+    return "\n".join([*lines, *(f"  {each}" for each in answer["warnings"]), f"  {answer['id']}"])
+
+
+def _write_overlay(parsed: Namespace, file: Path, picture: bytes) -> None:
+    target: Path = parsed.overlay
+    if len(parsed.files) > 1 or target.is_dir():
+        target.mkdir(parents=True, exist_ok=True)
+        target = target / f"{file.stem}.png"
+    target.write_bytes(picture)

@@ -1,0 +1,46 @@
+"""`acquire openapi`: print, write or check the API's description."""
+
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+from service.cli.arguments import add_command
+
+
+def add(commands: Any) -> None:
+    """Declare the command."""
+    parser = add_command(
+        commands,
+        "openapi",
+        "Print the description of the API (OpenAPI 3.1, YAML).",
+        """
+        acquire openapi --output openapi.yaml
+        acquire openapi --check                        compare with ./openapi.yaml
+        """,
+        run,
+    )
+    way = parser.add_mutually_exclusive_group()
+    way.add_argument("--output", type=Path, metavar="FILE")
+    way.add_argument(
+        "--check",
+        type=Path,
+        nargs="?",
+        const=Path("openapi.yaml"),
+        metavar="FILE",
+        help="exit code 1 if FILE (default openapi.yaml) differs from the description",
+    )
+
+
+def run(parsed: Namespace) -> int:
+    """Print, write or check the API's description."""
+    from service.web.openapi.text import openapi_yaml
+
+    text = openapi_yaml()
+    if parsed.output is not None:
+        parsed.output.write_text(text, encoding="utf-8")
+    elif parsed.check is None:
+        print(text, end="")
+    elif parsed.check.read_text(encoding="utf-8") != text:
+        print(f"{parsed.check} is not what the service describes: run `make openapi`")
+        return 1
+    return 0

@@ -1,0 +1,119 @@
+"""`acquire simulate paper`: the experiments of the papers beside their tables."""
+
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+from service.cli.arguments import add_command, count, table
+from service.errors import BadInput, Fault, shown_value
+from service.missions.identifiers import IDENTIFIERS
+
+IN_ZONES = [name for name, entry in IDENTIFIERS.items() if entry.searches_zone]
+"""The identifiers that search a zone, as the paper's does."""
+
+PTP_HELP = """\
+tables by name, each algorithm on the same fields (10 deg square, stars to V 6):
+  ptp-5       slave stars of the guide database: memory, rate, time
+  ptp-6       PTP, P-vector, planar triangle, Liebe's triangles, pyramid at 1 px, 0.5 mag
+  figure-10   stars in the field of view; the paper's figure cannot be reproduced
+  figure-11   rate against the stars in the field
+  figure-12   rate against the noise of position
+  figure-13   rate against the noise of magnitude
+  ptp         all of these
+strict: all stars that the algorithm names are correct, at least three; checked: the
+same after the attitude check of the identifier `ptp`."""
+
+
+def add(group: Any) -> None:
+    """Declare the command."""
+    parser = add_command(
+        group,
+        "paper",
+        "Repeat the experiments of a paper and compare its tables with our results: Fink & "
+        "Shoup 1994 by table number, Zhou & Ye 2015 (PTP, lost in space) by table name.",
+        """
+        acquire simulate paper --table 3 --stars 2000
+        acquire simulate paper --table ptp-6 --scenes 2000 --seed 7
+        acquire simulate paper --table ptp --plots docs/plots --report docs/ptp.md
+        acquire simulate paper --json rates.json
+        acquire simulate paper --identifier starid --seed 1 2 3 --plots docs/plots --report paper.md
+        acquire simulate paper --identifier verified --report verified.md
+        """,
+        run,
+        PTP_HELP,
+    )
+    parser.add_argument(
+        "--table", type=table, metavar="N|NAME", help="2 to 14 (default: all of these), or a name"
+    )
+    parser.add_argument(
+        "--stars", type=count, metavar="N", help="minimum number of stars per run; default 20000"
+    )
+    parser.add_argument(
+        "--scenes",
+        type=count,
+        metavar="N",
+        help="named tables: fields per condition; default 10000",
+    )
+    parser.add_argument("--seed", type=int, nargs="+", default=[1], metavar="S", help="default 1")
+    parser.add_argument("--json", type=Path, metavar="OUT", help="write the rates, one row per run")
+    parser.add_argument("--plots", type=Path, metavar="FOLDER", help="write the figures")
+    parser.add_argument(
+        "--report",
+        type=Path,
+        metavar="FILE",
+        help="write everything to a page instead of printing it",
+    )
+    parser.add_argument(
+        "--identifier",
+        choices=IN_ZONES,
+        nargs="+",
+        default=IN_ZONES,
+        metavar="NAME",
+        help=f"{', '.join(IN_ZONES)}; default all of these",
+    )
+    parser.add_argument("--processes", type=count, metavar="N", help="default: one per core")
+
+
+def run(parsed: Namespace) -> int:
+    """Fly the experiments of a paper and print its tables."""
+    if isinstance(parsed.table, str):
+        return _run_ptp(parsed)
+    if parsed.scenes is not None:
+        raise BadInput(
+            Fault(
+                "--scenes", "goes with a table by name, such as --table ptp-6", str(parsed.scenes)
+            )
+        )
+    from service.studies.paper_1994.command import DEFAULT_STARS, run_paper
+
+    run_paper(
+        parsed.table,
+        parsed.stars or DEFAULT_STARS,
+        parsed.seed,
+        parsed.json,
+        parsed.identifier,
+        processes=parsed.processes,
+        plots=parsed.plots,
+        report_path=parsed.report,
+    )
+    return 0
+
+
+def _run_ptp(parsed: Namespace) -> int:
+    from service.studies.ptp_2015.command import DEFAULT_SCENES, run_ptp
+
+    if parsed.stars is not None:
+        message = "goes with a table by number; a named one takes --scenes"
+        raise BadInput(Fault("--stars", message, str(parsed.stars)))
+    if len(parsed.seed) > 1:
+        raise BadInput(Fault("--seed", "is one with a table by name", shown_value(parsed.seed)))
+    run_ptp(
+        parsed.table,
+        parsed.scenes or DEFAULT_SCENES,
+        parsed.seed[0],
+        parsed.json,
+        parsed.processes,
+        parsed.plots,
+        parsed.report,
+    )
+    return 0

@@ -1,0 +1,152 @@
+"""`acquire simulate telemetry`: a pass of telemetry with its truth."""
+
+from argparse import Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from service.cli.arguments import MISSION, add_command, count
+from service.cli.configuration import mission_and_catalog
+from service.errors import BadInput, Fault, shown_value
+
+if TYPE_CHECKING:
+    from service.observations.batch import Aberration
+    from service.simulate.stretches import Pass
+
+_SIZES = {
+    "attitude_error": "attitude_error_deg",
+    "spurious": "spurious_stars",
+    "magnitude_error": "magnitude_error_mag",
+    "position_error": "position_error_arcsec",
+}
+_SERIOUS_SHARE = 0.1
+
+
+def add(group: Any) -> None:
+    """Declare the command."""
+    parser = add_command(
+        group,
+        "telemetry",
+        "Simulate a pass with the real sky: NDJSON (or CSV if the name ends in .csv), with the "
+        "truth in OUT.truth.ndjson.  The same arguments always give the same pass.",
+        """
+        acquire simulate telemetry --spacecraft XTE --batches 2000 --seed 7 xte.ndjson
+        acquire simulate telemetry --spacecraft SOHO --batches 300 --seed 1 --nominal soho.csv
+        acquire simulate telemetry --spacecraft SWAS --batches 500 --seed 2 --serious swas.ndjson
+        acquire simulate telemetry --spacecraft XTE --batches 9 --aberration ignore xte.ndjson
+        """,
+        run,
+    )
+    parser.add_argument("output", type=Path, metavar="OUT.ndjson")
+    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=MISSION)
+    parser.add_argument("--batches", required=True, type=count, metavar="N")
+    parser.add_argument("--seed", type=int, default=1, metavar="S", help="default 1")
+    parser.add_argument(
+        "--start",
+        metavar="UTC",
+        help="time of the first batch; default 1999-03-01, bands 1996-04-16",
+    )
+    parser.add_argument(
+        "--cadence", type=float, metavar="S", help="seconds between batches; default 30, bands 300"
+    )
+    parser.add_argument(
+        "--stars",
+        type=count,
+        default=5,
+        metavar="N",
+        help="maximum number of stars per tracker; default 5",
+    )
+    parser.add_argument(
+        "--prior",
+        choices=("quaternion", "direction", "mixed"),
+        default="quaternion",
+        help="a priori attitude: full (quaternion), boresight or sun_pointed only (direction), "
+        "or both kinds (mixed)",
+    )
+    parser.add_argument(
+        "--angles",
+        type=float,
+        default=0.25,
+        metavar="SHARE",
+        help="share of stars sent as h_deg, v_deg; default 0.25",
+    )
+    parser.add_argument(
+        "--aberration",
+        default="to_correct",
+        metavar="WORD[=SHARE],...",
+        help="to_correct, applied_upstream, ignore; default to_correct",
+    )
+    serious = parser.add_argument_group(
+        "periods with errors",
+        "share of the pass with each error, from 0 to 1, and its size",
+    )
+    preset = serious.add_mutually_exclusive_group()
+    preset.add_argument("--nominal", action="store_true", help="no errors")
+    preset.add_argument(
+        "--serious", action="store_true", help="each kind of error for a tenth of the pass"
+    )
+    for flag, unit, share, size, text in (
+        ("attitude-error", "DEG", "0.1", "10, bands 5", "growing a priori attitude error"),
+        ("spurious", "N", "0.1", "1", "false stars in the place of real ones"),
+        ("magnitude-error", "MAG", "0", "0.5", "standard deviation of magnitudes"),
+        ("position-error", "ARCSEC", "0", "12", "standard deviation per tangent axis"),
+    ):
+        name = f"--{flag}-share"
+        serious.add_argument(name, type=float, metavar="SHARE", help=f"{text}; default {share}")
+        kind: Any = count if unit == "N" else float
+        name = f"--{flag}-{'stars' if unit == 'N' else unit.lower()}"
+        serious.add_argument(name, type=kind, metavar=unit, help=f"default {size}")
+
+
+def run(parsed: Namespace) -> int:
+    """Draw a pass and write it with its truth."""
+    from service.simulate.files import truth_path, write_pass
+    from service.simulate.telemetry import draw_pass
+    from service.sky.cache import LruCache
+    from service.sky.model import SkyModel
+
+    wanted = _pass_of(parsed)
+    mission, catalog = mission_and_catalog(parsed.spacecraft)
+    count = write_pass(
+        draw_pass(mission, SkyModel(catalog, LruCache(64 << 20)), wanted), parsed.output
+    )
+    print(f"{parsed.output}: {count} batches of {mission.name}; truth: {truth_path(parsed.output)}")
+    return 0
+
+
+def _pass_of(parsed: Namespace) -> "Pass":
+    """The pass that the arguments describe; raises `BadInput` for an impossible one."""
+    from service.simulate.stretches import Pass, Trouble, Troubles
+
+    troubles = {}
+    for kind, size_name in _SIZES.items():
+        usual: Trouble = getattr(Troubles(), kind)
+        size, share = getattr(parsed, size_name), getattr(parsed, f"{kind}_share")
+        if share is None:
+            # A size alone asks for the stretch, too.
+            asked = parsed.serious or size is not None
+            share = 0.0 if parsed.nominal else max(usual.share, _SERIOUS_SHARE * asked)
+        troubles[kind] = Trouble(share, usual.size if size is None else size)
+    return Pass(
+        batches=parsed.batches,
+        seed=parsed.seed,
+        start=parsed.start,
+        cadence_s=parsed.cadence,
+        stars=parsed.stars,
+        prior=parsed.prior,
+        angles_share=parsed.angles,
+        aberration=_shares(parsed.aberration),
+        troubles=Troubles(**troubles),
+    )
+
+
+def _shares(text: str) -> "dict[Aberration, float]":
+    """Words with their shares, as in `to_correct=0.5,ignore=0.5`; a word alone has all."""
+    shares: dict[str, float] = {}
+    for part in text.split(","):
+        word, _, share = part.partition("=")
+        try:
+            shares[word.strip()] = float(share) if share else 1.0
+        except ValueError:
+            message = "must be a word, or words with shares such as to_correct=0.5,ignore=0.5"
+            raise BadInput(Fault("--aberration", message, shown_value(text))) from None
+    return cast("dict[Aberration, float]", shares)

@@ -1,0 +1,104 @@
+"""`acquire token`: who may use the service.
+
+The commands write straight into the database, also while a service is using it.
+"""
+
+from argparse import Namespace
+from typing import Any
+
+from service.cli.arguments import add_command, add_database, add_group, count
+from service.cli.configuration import settings_of, settings_of_existing
+
+
+def add(commands: Any) -> None:
+    """Declare the command."""
+    group = add_group(
+        commands,
+        "token",
+        "Tokens for programs and people.  Until the first token is created, access is open on "
+        "this machine; from then on, every request needs one, except for /livez, /readyz, "
+        "signing in and the API description.",
+        """
+        acquire token create pipeline --scope submit --spacecraft XTE
+        acquire token create "J. Operator" --scope read --scope operate --days 30
+        acquire token list
+        acquire token revoke pipeline
+        """,
+    )
+    parser = add_command(
+        group,
+        "create",
+        "Create a token and print it once: the database keeps only its digest.  The audit list "
+        "records changes under the token's name.",
+        """
+        acquire token create pipeline --scope submit --spacecraft XTE
+        ACQUIRE_TOKEN=acq_... acquire replay pass.ndjson
+        curl -H "Authorization: Bearer acq_..." http://127.0.0.1:8000/api/v1/spacecraft
+        """,
+        create,
+    )
+    parser.add_argument("name", metavar="NAME", help="name of a program or a person")
+    parser.add_argument(
+        "--scope",
+        action="append",
+        required=True,
+        choices=("read", "submit", "operate"),
+        help="read: read everything; submit: send batches; operate: change limits, acknowledge "
+        "alarms, record what-ifs, drop zones.  May be repeated",
+    )
+    parser.add_argument(
+        "--spacecraft",
+        action="append",
+        metavar="NAME",
+        help="bind the token to this spacecraft; may be repeated",
+    )
+    parser.add_argument(
+        "--days",
+        type=count,
+        default=365,
+        metavar="N",
+        help="days until the token expires; default 365",
+    )
+    parser.add_argument(
+        "--rate",
+        type=float,
+        metavar="N",
+        help="maximum number of requests per second; default: no limit",
+    )
+    add_database(parser)
+    parser = add_command(
+        group, "list", "Show every token, without its secret.", "acquire token list", show
+    )
+    add_database(parser)
+    parser = add_command(
+        group,
+        "revoke",
+        "End a token and its browser sessions, within a second.",
+        "acquire token revoke pipeline",
+        revoke,
+    )
+    parser.add_argument("name", metavar="NAME")
+    add_database(parser)
+
+
+def create(parsed: Namespace) -> int:
+    """Make a token and print it."""
+    from service.cli import tokens
+
+    return tokens.create(
+        settings_of(parsed), parsed.name, parsed.scope, parsed.spacecraft, parsed.days, parsed.rate
+    )
+
+
+def show(parsed: Namespace) -> int:
+    """Print every token."""
+    from service.cli import tokens
+
+    return tokens.show(settings_of_existing(parsed))
+
+
+def revoke(parsed: Namespace) -> int:
+    """End a token."""
+    from service.cli import tokens
+
+    return tokens.revoke(settings_of_existing(parsed), parsed.name)

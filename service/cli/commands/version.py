@@ -1,0 +1,18 @@
+"""`acquire version`."""
+
+from argparse import Namespace
+from typing import Any
+
+from service import __version__
+from service.cli.arguments import add_command
+
+
+def add(commands: Any) -> None:
+    """Declare the command."""
+    add_command(commands, "version", "Print the version.", "acquire version", run)
+
+
+def run(parsed: Namespace) -> int:
+    """Print the version."""
+    print(f"acquire {__version__}")
+    return 0

@@ -1,0 +1,56 @@
+"""What commands need beside their arguments: settings, missions, catalogs, periods."""
+
+import dataclasses
+from argparse import Namespace
+from typing import TYPE_CHECKING
+
+from service.errors import BadInput, Fault, shown_value
+from service.settings import Settings
+
+if TYPE_CHECKING:
+    from service.missions.mission import Mission
+    from service.sky.catalog.star_catalog import Catalog
+    from service.times import Utc
+
+
+def settings_of(parsed: Namespace) -> Settings:
+    """The settings of the environment, overridden by the command's options."""
+    given = {
+        name: value
+        for name in ("database", "host", "port")
+        if (value := getattr(parsed, name, None)) is not None
+    }
+    return dataclasses.replace(Settings.from_environment(), **given)
+
+
+def settings_of_existing(parsed: Namespace) -> Settings:
+    """`settings_of` a command that reads records; raises `BadConfiguration` without a database.
+
+    Opening a SQLite file that does not exist would create it.
+    """
+    from service.storage.sql.migrations import require_records
+
+    settings = settings_of(parsed)
+    require_records(settings.database)
+    return settings
+
+
+def period_of(parsed: Namespace) -> "tuple[Utc | None, Utc | None]":
+    """The times of `--from` and `--to`; raises `BadInput` where they are out of order."""
+    from service.times import parse_utc
+
+    start = None if parsed.start is None else parse_utc(parsed.start, "--from")
+    end = None if parsed.end is None else parse_utc(parsed.end, "--to")
+    if start is not None and end is not None and start.tai_ns > end.tai_ns:
+        raise BadInput(Fault("--to", "must not be before --from", shown_value(parsed.end)))
+    return start, end
+
+
+def mission_and_catalog(name: str) -> "tuple[Mission, Catalog]":
+    """The mission of that name and the star catalog that the environment chooses."""
+    from service.missions.mission import load_missions, mission_named
+    from service.sky.catalog.star_catalog import open_catalog
+
+    settings = Settings.from_environment()
+    mission = mission_named(load_missions(settings.missions), name)
+    return mission, open_catalog(settings.catalog)

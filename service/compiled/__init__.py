@@ -1,0 +1,1 @@
+"""Everything about numba: how kernels are compiled, views without owners, the kernel cache."""

@@ -1,0 +1,36 @@
+"""How kernels are compiled: without counting references to what their callers hold.
+
+numba counts, by an atomic increment and decrement, every array that a function
+is given or that is taken from a tuple or cut out of another.  It leaves out what
+it can prove to be in vain, but proves nothing in large functions.  In kernels
+that work for a microsecond that was the largest single cost.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from numba import njit
+
+
+def njit_no_refcount(kernel: Callable[..., Any]) -> Any:
+    """Compile a kernel that counts no references: its caller holds all that it is given.
+
+    Without numba's runtime it cannot make an array either: one that tries to
+    does not compile.  Only for kernels that return no array, and call none that
+    returns one: that array would never be freed.
+    """
+    return _compiled(kernel, error_model="numpy", _nrt=False)
+
+
+def njit_allocating(kernel: Callable[..., Any]) -> Any:
+    """Compile a kernel that makes arrays for itself although its caller counts no references.
+
+    Without this it would be compiled as its caller is.  It returns numbers alone,
+    as that does.
+    """
+    return _compiled(kernel, _nrt=True)
+
+
+def _compiled(kernel: Callable[..., Any], **options: Any) -> Any:
+    compile_it: Any = njit  # its stubs do not have `_nrt`, numba's own word for it
+    return compile_it(kernel, cache=True, nogil=True, **options)

@@ -1,0 +1,192 @@
+"""A lens fitted to stars whose directions are known: focal length, centre, radial distortion."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from service.vectors import Matrix, Vector, rotate_about
+
+BEND_PRIOR = 0.04
+"""One standard deviation of the radial displacement at the corner, as a share of the radius."""
+CENTER_PRIOR = 0.03
+"""One standard deviation of the optical axis from the middle, as a share of the half diagonal."""
+FREE_SCALE, SCALE_BEND, SCALE_CENTER = 4, 5, 7
+"""Parameters fitted: rotation and focal length; with the distortion; with the centre too."""
+PARAMETERS = ("focal_px", "bend", "off_u", "off_v")
+"""Of a lens, in the order in which they are fitted."""
+_ROUNDS = 12
+_STEPS = np.array([1e-7, 1e-7, 1e-7, 1e-7, 1e-6, 1e-6, 1e-6])
+_CONVERGED = 1e-9
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera of a focal length, an optical axis off the middle, and a radial distortion.
+
+    `bend` is the radial displacement at the half diagonal `radius_px`, as a share of the radius:
+    the true distance from the axis is r (1 + bend (r / radius_px)^2).  `off_u` and
+    `off_v` are those of the axis from the middle, in units of `radius_px`.
+    """
+
+    width_px: int
+    height_px: int
+    focal_px: float
+    bend: float = 0.0
+    off_u: float = 0.0
+    off_v: float = 0.0
+
+    @property
+    def radius_px(self) -> float:
+        """Half the diagonal."""
+        return 0.5 * math.hypot(self.width_px, self.height_px)
+
+    @property
+    def center_px(self) -> tuple[float, float]:
+        """Where the optical axis meets the sensor; the first pixel's centre is (0, 0)."""
+        return (
+            0.5 * (self.width_px - 1) + self.off_u * self.radius_px,
+            0.5 * (self.height_px - 1) + self.off_v * self.radius_px,
+        )
+
+    def plane(self, u_px: Vector, v_px: Vector) -> Vector:
+        """True coordinates (n, 2) on the plane at unit distance."""
+        center_u, center_v = self.center_px
+        x, y = np.asarray(u_px) - center_u, np.asarray(v_px) - center_v
+        scale = (1.0 + self.bend * (x * x + y * y) / self.radius_px**2) / self.focal_px
+        return np.stack([x * scale, y * scale], axis=-1)
+
+    def directions(self, u_px: Vector, v_px: Vector) -> Vector:
+        """Unit vectors (n, 3): x to the right of the picture, y down, z the boresight."""
+        plane = self.plane(u_px, v_px)
+        vectors = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1)
+        return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+    def places(self, directions: Vector) -> tuple[Vector, Vector]:
+        """Where directions (n, 3) fall; NaN for those behind or far outside the picture."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x = np.where(directions[:, 2] > 0.0, directions[:, 0] / directions[:, 2], np.nan)
+            y = np.where(directions[:, 2] > 0.0, directions[:, 1] / directions[:, 2], np.nan)
+            true = np.hypot(x, y) * self.focal_px / self.radius_px
+            true[~(true < 1.6)] = np.nan
+            seen = true.copy()
+            for _ in range(8):
+                seen -= (seen * (1.0 + self.bend * seen**2) - true) / (
+                    1.0 + 3.0 * self.bend * seen**2
+                )
+            share = np.where(true > 0.0, seen / true, 1.0) * self.focal_px
+        center_u, center_v = self.center_px
+        return x * share + center_u, y * share + center_v
+
+
+@dataclass(frozen=True)
+class LensFit:
+    """A lens with the attitude (3, 3), catalog to camera, and what is known of both.
+
+    `covariance` (p, p) is of the small rotation about the camera's axes in radians, of the
+    logarithm of the focal length and, as far as they were fitted, of the lens's bend,
+    off_u and off_v.  It holds for sigmas as given, times `residual_scale` where that is
+    above 1.  `residual_px` (n, 2): observed minus predicted place.
+    """
+
+    lens: Lens
+    attitude: Matrix
+    covariance: Matrix
+    residual_px: Vector
+
+    @property
+    def parameters(self) -> int:
+        """How many were fitted."""
+        return len(self.covariance)
+
+
+def fit_lens(
+    lens: Lens,
+    attitude: Matrix,
+    u_px: Vector,
+    v_px: Vector,
+    sigma_px: Vector,
+    star: Vector,
+    parameters: int,
+    focal_sigma: float = math.inf,
+    weight: Vector | None = None,
+) -> LensFit:
+    """The lens and attitude that put stars (n, 3) nearest to where they are seen.
+
+    Least squares from a start that is near, with the priors of distortion and centre;
+    `focal_sigma` is that of the logarithm of the start's focal length.
+    """
+    names = PARAMETERS[: parameters - 3]
+    start = np.array([0.0, *(getattr(lens, name) for name in names[1:])])
+    prior = np.array([focal_sigma, BEND_PRIOR, CENTER_PRIOR, CENTER_PRIOR])[: len(names)]
+    weights = np.repeat((1.0 if weight is None else weight) / sigma_px**2, 2)
+    free = start.copy()
+    for _ in range(_ROUNDS):
+        residual, jacobian = linearised(lens, names, free, attitude, u_px, v_px, star)
+        normal = jacobian.T @ (jacobian * weights[:, None])
+        right = jacobian.T @ (residual * weights)
+        normal[3:, 3:] += np.diag(1.0 / prior**2)
+        right[3:] -= free / prior**2
+        step = np.linalg.solve(normal, right)
+        attitude = rotate_about(step[:3], attitude.T).T
+        free = free + step[3:]
+        free[0] = np.clip(free[0], -0.5, 0.5)
+        free[1:] = np.clip(free[1:], -0.15, 0.15)
+        if np.abs(step).max() < _CONVERGED:
+            break
+    fitted = lens_of(lens, names, free)
+    residual = _residual(fitted, attitude, u_px, v_px, star)
+    covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    return LensFit(fitted, attitude, covariance, residual.reshape(-1, 2))
+
+
+def lens_of(lens: Lens, names: tuple[str, ...], free: Vector) -> Lens:
+    """A lens with other parameters: the first value is of the logarithm of the focal length."""
+    values = dict(zip(names[1:], free[1:].tolist(), strict=True))
+    values["focal_px"] = lens.focal_px * math.exp(free[0])
+    return Lens(lens.width_px, lens.height_px, **{**_bends(lens), **values})
+
+
+def _bends(lens: Lens) -> dict[str, float]:
+    return {"bend": lens.bend, "off_u": lens.off_u, "off_v": lens.off_v}
+
+
+def _residual(lens: Lens, attitude: Matrix, u_px: Vector, v_px: Vector, star: Vector) -> Vector:
+    """Observed minus predicted (2 n,), in pixels of the undistorted plane."""
+    body = star @ attitude.T
+    return np.asarray(
+        ((lens.plane(u_px, v_px) - body[:, :2] / body[:, 2:]) * lens.focal_px).ravel()
+    )
+
+
+def linearised(
+    lens: Lens,
+    names: tuple[str, ...],
+    free: Vector,
+    attitude: Matrix,
+    u_px: Vector,
+    v_px: Vector,
+    star: Vector,
+) -> tuple[Vector, Matrix]:
+    """The residuals (2 n,) in pixels, and by how much each parameter takes them down (2 n, p).
+
+    Parameters are the small rotation about the camera's axes, then those of `lens_of`.
+    """
+    here = lens_of(lens, names, free)
+    residual = _residual(here, attitude, u_px, v_px, star)
+    columns = []
+    for k in range(3 + len(free)):
+        step = _STEPS[k]
+        if k < 3:
+            turned = rotate_about(np.eye(3)[k] * step, attitude.T).T
+            moved = _residual(here, turned, u_px, v_px, star)
+        else:
+            other = free.copy()
+            other[k - 3] += step
+            # In pixels of one focal length: else a longer one would make all residuals longer.
+            lens_k = lens_of(lens, names, other)
+            moved = _residual(lens_k, attitude, u_px, v_px, star) * (
+                here.focal_px / lens_k.focal_px
+            )
+        columns.append((residual - moved) / step)
+    return residual, np.column_stack(columns)

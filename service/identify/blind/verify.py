@@ -1,0 +1,256 @@
+"""Whether the stars of the catalog stand where an attitude and a lens have them: the evidence."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from service.identify.blind.lens import (
+    BEND_PRIOR,
+    CENTER_PRIOR,
+    FREE_SCALE,
+    SCALE_BEND,
+    SCALE_CENTER,
+    Lens,
+    LensFit,
+    fit_lens,
+)
+from service.vectors import Matrix, Vector
+
+Rows = npt.NDArray[np.int64]
+
+GATE_SIGMAS = 3.5
+LEAST_SIGMA_PX = 0.15
+"""No place is taken as better known than this before the residuals have spoken."""
+FAINTEST_SHARE = 2.5
+"""Catalog stars looked for, for every point: clutter and gaps move the limits apart."""
+LEAST_STARS, MOST_STARS = 12, 400
+MODELS = (FREE_SCALE, SCALE_BEND, SCALE_CENTER)
+LEAST_MATCHES = {FREE_SCALE: 4, SCALE_BEND: 7, SCALE_CENTER: 12}
+"""Matches from which a model is fitted; of those that are, the evidence chooses."""
+LEAST_REFINED = {FREE_SCALE: 4, SCALE_BEND: 6, SCALE_CENTER: 8}
+"""The same once the attitude is known: priors hold what the stars do not."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """The candidates of a picture (n), the likeliest star first: places and sigmas in pixels."""
+
+    u_px: Vector
+    v_px: Vector
+    sigma_px: Vector
+    width_px: int
+    height_px: int
+
+    def __len__(self) -> int:
+        return len(self.u_px)
+
+    def first(self, count: int) -> "Points":
+        """The likeliest so many."""
+        return replace(
+            self,
+            u_px=self.u_px[:count],
+            v_px=self.v_px[:count],
+            sigma_px=self.sigma_px[:count],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Stars:
+    """The catalog (n, 3), brightest first, with the tree of its directions."""
+
+    direction: Vector
+    tree: cKDTree
+
+    def near(self, attitude: Matrix, lens: Lens, most: int) -> tuple[Rows, Vector, Vector]:
+        """The brightest so many on a picture: rows, and where they stand (n)."""
+        reach = math.atan(lens.radius_px / lens.focal_px * (1.0 + abs(lens.bend))) + 0.002
+        rows = np.sort(
+            np.asarray(self.tree.query_ball_point(attitude[2], 2.0 * math.sin(0.5 * reach)), int)
+        )
+        # Before their places are known: a picture holds most of the cap about it.
+        rows = rows[: 3 * most]
+        u, v = lens.places(self.direction[rows] @ attitude.T)
+        with np.errstate(invalid="ignore"):
+            inside = (u > -0.5) & (v > -0.5) & (u < lens.width_px) & (v < lens.height_px)
+        first = np.flatnonzero(inside)[:most]
+        return rows[first], u[first], v[first]
+
+
+@dataclass(frozen=True)
+class Verified:
+    """An attitude with its lens, the star of every point (-1: none), and what it weighs.
+
+    `log_odds` is the evidence against the points being clutter, everywhere and at every
+    scale that was to be expected.  `residual_px` (m, 2) of the matched points: seen minus
+    predicted; `rms_px` is theirs per axis, the freedom of the fit allowed for.
+    """
+
+    fit: LensFit
+    star: Rows
+    log_odds: float
+    residual_px: Vector
+    rms_px: float
+
+    @property
+    def matched(self) -> int:
+        """How many points have a star."""
+        return int((self.star >= 0).sum())
+
+
+def verify(
+    points: Points,
+    stars: Stars,
+    attitude: Matrix,
+    lens: Lens,
+    log_focal_range: float,
+    gate_px: float,
+) -> Verified | None:
+    """The attitude and lens refined from what they match; None where they match too little."""
+    sigma = np.maximum(points.sigma_px, LEAST_SIGMA_PX)
+    best = None
+    for parameters in (0, 0, 0, *MODELS):
+        rows, at, seen = _matches(points, stars, attitude, lens, gate_px)
+        if len(seen) < LEAST_MATCHES[parameters or FREE_SCALE]:
+            return best
+        fit = _refit(points, stars, attitude, lens, rows[at], seen, sigma, parameters)
+        scale = _scale(fit, sigma[seen])
+        found = _weighed(points, stars, fit, sigma * scale, log_focal_range)
+        if found is not None and (best is None or found.log_odds > best.log_odds):
+            best = found
+        if not parameters:
+            # Towards the matches that the next round is to find; the models start from the last.
+            attitude, lens = fit.attitude, fit.lens
+            gate_px = min(gate_px, max(GATE_SIGMAS * scale * float(np.median(sigma[seen])), 0.8))
+    return best
+
+
+def refine(
+    points: Points, stars: Stars, found: Verified, log_focal_range: float, gate_px: float
+) -> Verified | None:
+    """What was verified with more points, and with every parameter of the lens that they allow.
+
+    What the evidence did not ask for is fitted too: the sigmas then know of it.
+    """
+    sigma = np.maximum(points.sigma_px, LEAST_SIGMA_PX)
+    attitude, lens, refined = found.fit.attitude, found.fit.lens, None
+    for _ in range(3):
+        rows, at, seen = _matches(points, stars, attitude, lens, gate_px)
+        allowed = [each for each in MODELS if len(seen) >= LEAST_REFINED[each]]
+        if not allowed:
+            return refined
+        fit = _refit(points, stars, attitude, lens, rows[at], seen, sigma, allowed[-1])
+        scale = _scale(fit, sigma[seen])
+        refined = _weighed(points, stars, fit, sigma * scale, log_focal_range)
+        attitude, lens = fit.attitude, fit.lens
+        gate_px = min(gate_px, max(GATE_SIGMAS * scale * float(np.median(sigma[seen])), 0.8))
+    return refined
+
+
+def _refit(
+    points: Points,
+    stars: Stars,
+    attitude: Matrix,
+    lens: Lens,
+    rows: Rows,
+    seen: Rows,
+    sigma: Vector,
+    parameters: int,
+) -> LensFit:
+    """The lens of a model, or of that with the distortion where the matches allow it."""
+    if not parameters:
+        parameters = SCALE_BEND if len(seen) >= LEAST_MATCHES[SCALE_BEND] else FREE_SCALE
+    start = replace(lens, off_u=0.0, off_v=0.0, bend=lens.bend if parameters > FREE_SCALE else 0.0)
+    return fit_lens(
+        start,
+        attitude,
+        points.u_px[seen],
+        points.v_px[seen],
+        sigma[seen],
+        stars.direction[rows],
+        parameters,
+        weight=_weights(points, stars, attitude, lens, rows, seen, sigma),
+    )
+
+
+def _scale(fit: LensFit, sigma: Vector) -> float:
+    """How much longer the residuals are than their sigmas, at least 1, by their median."""
+    pull = np.abs(fit.residual_px) / sigma[:, None]
+    # Of few stars the fit takes a part of the residuals away.
+    freedom = max(pull.size - fit.parameters, 1) / pull.size
+    return max(float(np.median(pull)) / 0.674 / math.sqrt(freedom), 1.0)
+
+
+def _weights(
+    points: Points,
+    stars: Stars,
+    attitude: Matrix,
+    lens: Lens,
+    rows: Rows,
+    seen: Rows,
+    sigma: Vector,
+) -> Vector:
+    """Those of Cauchy about the median: a wrong match pulls little."""
+    u, v = lens.places(stars.direction[rows] @ attitude.T)
+    off = np.hypot(points.u_px[seen] - u, points.v_px[seen] - v)
+    usual = max(2.0 * float(np.median(off)), float(np.median(sigma[seen])))
+    return np.asarray(1.0 / (1.0 + (off / usual) ** 2))
+
+
+def _matches(
+    points: Points, stars: Stars, attitude: Matrix, lens: Lens, gate_px: float
+) -> tuple[Rows, Rows, Rows]:
+    """Catalog rows on the picture, and of every match its place among them and its point."""
+    most = int(np.clip(FAINTEST_SHARE * len(points), LEAST_STARS, MOST_STARS))
+    rows, u, v = stars.near(attitude, lens, most)
+    if len(rows) == 0:
+        nothing = np.empty(0, np.int64)
+        return nothing, nothing, nothing
+    at, seen = matched(points, u, v, gate_px)
+    return rows, at, seen
+
+
+def matched(points: Points, u_px: Vector, v_px: Vector, gate_px: float) -> tuple[Rows, Rows]:
+    """Stars and points that are each other's nearest, within a gate."""
+    apart = (points.u_px[:, None] - u_px) ** 2 + (points.v_px[:, None] - v_px) ** 2
+    star_of, point_of = apart.argmin(axis=1), apart.argmin(axis=0)
+    here = np.arange(len(star_of))
+    good = (point_of[star_of] == here) & (apart[here, star_of] < gate_px**2)
+    return star_of[good], here[good]
+
+
+def _weighed(
+    points: Points, stars: Stars, fit: LensFit, sigma: Vector, log_focal_range: float
+) -> Verified | None:
+    """The evidence of a fit, by Laplace's approximation over its parameters."""
+    lens = fit.lens
+    gate_px = GATE_SIGMAS * float(np.median(sigma))
+    rows, at, seen = _matches(points, stars, fit.attitude, lens, max(gate_px, 0.8))
+    if len(seen) < 4:
+        return None
+    u, v = lens.places(stars.direction[rows[at]] @ fit.attitude.T)
+    residual = np.column_stack([points.u_px[seen] - u, points.v_px[seen] - v])
+    off2 = (residual**2).sum(axis=1)
+    variance = sigma[seen] ** 2
+    # As deep as the faintest match but for a few: fainter ones cost more.
+    depth = float(np.sort(at)[-1 - len(at) // 10]) + 1.0
+    expected = np.maximum(at + 1.0, depth)
+    share = len(seen) / (len(points) + 1.0)
+    area = float(lens.width_px * lens.height_px)
+    gain = area / (expected * 2.0 * math.pi * variance) * np.exp(-0.5 * off2 / variance)
+    weight = float(np.log(1.0 - share + share * gain).sum())
+    weight += (len(points) - len(seen)) * math.log(1.0 - share)
+    # The covariance is for sigmas as told; what they turned out to be widens it.
+    covariance = (
+        fit.covariance * float(np.median(sigma / np.maximum(points.sigma_px, LEAST_SIGMA_PX))) ** 2
+    )
+    prior = [8.0 * math.pi**2, log_focal_range]
+    prior += [math.sqrt(2.0 * math.pi) * s for s in (BEND_PRIOR, CENTER_PRIOR, CENTER_PRIOR)]
+    spread = 0.5 * np.linalg.slogdet(2.0 * math.pi * covariance)[1]
+    log_odds = weight + float(spread) - sum(math.log(p) for p in prior[: fit.parameters - 2])
+    star = np.full(len(points), -1)
+    star[seen] = rows[at]
+    freedom = max(2 * len(seen) - fit.parameters, 1)
+    return Verified(fit, star, log_odds, residual, math.sqrt(float(off2.sum()) / freedom))

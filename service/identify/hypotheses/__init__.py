@@ -1,0 +1,1 @@
+"""Identification by weighing hypotheses: the identifier `verified`."""

@@ -1,0 +1,170 @@
+"""The ledger of hypotheses: which are known, and which are kept when it is full."""
+
+import math
+
+import numpy as np
+
+from service.compiled.jit import njit_allocating, njit_no_refcount
+from service.identify.hypotheses.evidence import log_sum
+from service.identify.hypotheses.scene import Progress
+from service.vectors import Vector
+
+FEW = 32
+"""Hypotheses that are looked through one by one; of more there is a table by hash."""
+LEAST_GROUP = 3
+"""So many stars that one attitude leaves unexplained may have another attitude of their own."""
+
+
+@njit_no_refcount
+def known(match, ledger, count):  # type: ignore[no-untyped-def]
+    """Whether the ledger, of so many hypotheses, holds this one."""
+    if count <= FEW:
+        for h in range(count):  # noqa: SIM110 - compiled, without a generator
+            if _same(match, ledger, h):
+                return True
+        return False
+    table = ledger.table
+    at = _hash(match) & (len(table) - 1)
+    while table[at] >= 0:
+        if _same(match, ledger, table[at]):
+            return True
+        at = (at + 1) & (len(table) - 1)
+    return False
+
+
+@njit_no_refcount
+def _same(match, ledger, h):  # type: ignore[no-untyped-def]
+    """Whether hypothesis h of the ledger names the same stars."""
+    for k in range(len(match)):  # noqa: SIM110 - compiled, without a generator
+        if ledger.match[h, k] != match[k]:
+            return False
+    return True
+
+
+@njit_no_refcount
+def _hash(match):  # type: ignore[no-untyped-def]
+    """A number that scatters hypotheses, also those that differ in one star."""
+    hashed = 0
+    for row in match:
+        hashed = (hashed ^ (row + 1)) * 73856093
+    return hashed ^ (hashed >> 17)
+
+
+@njit_no_refcount
+def _enter(ledger, h):  # type: ignore[no-untyped-def]
+    """Write the place of hypothesis h into the table by hash."""
+    table = ledger.table
+    at = _hash(ledger.match[h]) & (len(table) - 1)
+    while table[at] >= 0:
+        at = (at + 1) & (len(table) - 1)
+    table[at] = h
+
+
+@njit_no_refcount
+def part_of(match, whole):  # type: ignore[no-untyped-def]
+    """Whether every star of a match is the same in another."""
+    apart = 0
+    for k in range(len(match)):
+        apart += match[k] >= 0 and match[k] != whole[k]
+    return apart == 0
+
+
+@njit_no_refcount
+def leaves_a_group(match):  # type: ignore[no-untyped-def]
+    """Whether a match leaves so many stars unexplained that another attitude may explain them.
+
+    A reflection doubles every star, and a slew halves them: chance explains
+    neither half, so that the first hypothesis beyond chance is not the only one.
+    """
+    unexplained = 0
+    for row in match:
+        unexplained += row < 0
+    return unexplained >= LEAST_GROUP
+
+
+@njit_allocating
+def _smallest(values: Vector, at: int) -> float:
+    """The value before which so many are smaller."""
+    found: float = np.partition(values, at)[at]
+    return found
+
+
+@njit_no_refcount
+def clear(ledger):  # type: ignore[no-untyped-def]
+    """Forget the heaviest hypotheses of an earlier search; the others go with its count."""
+    ledger.heaviest_match[:] = -1
+    ledger.heaviest[0] = ledger.heaviest_dropped[0] = -math.inf
+
+
+@njit_no_refcount
+def spent(progress, work):  # type: ignore[no-untyped-def]
+    """The progress after so much more work."""
+    return Progress(
+        *(progress.count, progress.unexplored_weight, progress.best),
+        *(progress.work + work, progress.max_work),
+    )
+
+
+@njit_no_refcount
+def at_bound(progress):  # type: ignore[no-untyped-def]
+    """Whether the search has done all the work that it may."""
+    return progress.work >= progress.max_work
+
+
+@njit_no_refcount
+def left_unexplored(progress, log_weight):  # type: ignore[no-untyped-def]
+    """The progress with a log weight added to what is not kept."""
+    total = log_sum(progress.unexplored_weight, log_weight)
+    return Progress(progress.count, total, progress.best, progress.work, progress.max_work)
+
+
+@njit_no_refcount
+def keep(match, value, ledger, progress):  # type: ignore[no-untyped-def]
+    """Keep a weighed hypothesis; the progress after it.
+
+    Where the ledger is full, the lightest quarter goes to the unexplored weight, and
+    from then on whatever is no heavier.
+    """
+    log_weight, count, unexplored = ledger.log_weight, progress.count, progress.unexplored_weight
+    best, work, max_work = progress.best, progress.work, progress.max_work
+    if value <= ledger.heaviest_dropped[0]:
+        return left_unexplored(progress, value)
+    if value > ledger.heaviest[0]:
+        ledger.heaviest[0] = value
+        for k in range(len(match)):
+            ledger.heaviest_match[k] = match[k]
+    if count == len(log_weight):
+        count, unexplored = _drop_lightest(ledger, count, unexplored)
+        if value <= ledger.heaviest_dropped[0]:
+            return Progress(count, log_sum(unexplored, value), best, work, max_work)
+    for k in range(len(match)):
+        ledger.match[count, k] = match[k]
+    log_weight[count] = value
+    if count > FEW:
+        _enter(ledger, count)
+    elif count == FEW:
+        ledger.table[:] = -1
+        for h in range(count + 1):
+            _enter(ledger, h)
+    return Progress(count + 1, unexplored, best, work, max_work)
+
+
+@njit_no_refcount
+def _drop_lightest(ledger, count, unexplored):  # type: ignore[no-untyped-def]
+    """Drop the lightest quarter; how many are left, and the unexplored weight with theirs."""
+    log_weight = ledger.log_weight
+    quarter = count // 4
+    floor = ledger.heaviest_dropped[0] = _smallest(log_weight, quarter)
+    stay = 0
+    for h in range(count):
+        if log_weight[h] <= floor and h - stay <= quarter:
+            unexplored = log_sum(unexplored, log_weight[h])
+            continue
+        for k in range(ledger.match.shape[1]):
+            ledger.match[stay, k] = ledger.match[h, k]
+        log_weight[stay] = log_weight[h]
+        stay += 1
+    ledger.table[:] = -1
+    for h in range(stay):
+        _enter(ledger, h)
+    return stay, unexplored

@@ -1,0 +1,197 @@
+"""The search for hypotheses: which stars these could be, all together.
+
+Every candidate pair of an observed pair predicts every other star; what it
+predicts well becomes a hypothesis and is weighed (see `evidence`).  Pairs are
+not gated by steps 1 to 10: the prior and the magnitudes weigh, they do not
+reject.
+
+Pairs are scanned so that single stars grow into groups, the cheapest cross
+pairs first.  A hypothesis with two stars of one group has been seen when the
+group grew together.  So a scan looks only for stars of other groups, and with
+g groups left what was not seen matches at most one star of each, g in all: at
+two groups all those of three stars are seen.
+"""
+
+import math
+
+import numpy as np
+
+from service.compiled.jit import njit_allocating, njit_no_refcount
+from service.identify.hypotheses import evidence
+from service.identify.hypotheses.ledger import at_bound, clear, leaves_a_group, left_unexplored
+from service.identify.hypotheses.pair_hypotheses import ObservedPair, weigh_pairs
+from service.identify.hypotheses.scan_pair import scan_pair, weight_bound
+from service.identify.hypotheses.scene import (
+    MAX_SEEDS,
+    PREDICTION_GATE,
+    Progress,
+    with_magnitude,
+)
+from service.sky.geometry.pairs import separation_rad
+
+SHORT_PAIR_RAD = math.radians(0.35)
+CHANCE_PER_STAR, CHANCE_MARGIN = math.log(3.0), 12.0
+"""Stop early once a hypothesis of three stars or more outweighs the null by 3^n e^12.
+
+Only after a whole observed pair: the stars of an empty sky may stand so evenly
+that a half turn matches four of them, and it is found first as often as not.
+And only where it leaves so few stars unexplained that no other attitude can
+explain them: see `leaves_a_group`.
+"""
+LARGEST_LOG = 1e5
+"""In the place of an infinite log weight."""
+CONVERGED_LOG = 10.0
+"""Exhaustive, stop once all that was not seen is lighter than the best by this, in logarithms."""
+
+
+@njit_no_refcount
+def search(observed, stars, pairs, exhaustive, max_work, scratch, ledger):  # type: ignore[no-untyped-def]
+    """Search for hypotheses and weigh them into the ledger; the progress, and whether bounded.
+
+    `scratch` and `ledger` are of as many stars; those of an earlier search will do.
+    `exhaustive`: go on after a hypothesis that outweighs chance.  Where the search ends
+    at `max_work` with nothing beyond chance, what it did not see may weigh more than
+    all that it found, and counts as unexplored.
+    """
+    n = len(observed.direction)
+    scratch.weight_bounds[:] = np.nan
+    clear(ledger)
+    null = evidence.log_null(n, with_magnitude(observed))
+    accept_threshold = null + n * CHANCE_PER_STAR + CHANCE_MARGIN
+    # No plain zeros: numba would compile all below for those constants as well.
+    progress = Progress(0 * n, null, -math.inf, 0 * n, max_work)
+    seeds, group, group_of = scratch.seeds, scratch.group, scratch.group_of
+    first_pair, last_pair = scratch.first_pair, scratch.last_pair
+    s = len(seeds)
+    _choose_seeds(observed.magnitude, seeds)
+    _find_candidates(observed, pairs, scratch)
+    # By observed star; those that are no seeds are each by themselves.
+    for k in range(n):
+        group_of[k] = s + k
+    for x in range(s):
+        group[x] = x
+        group_of[seeds[x]] = x
+    for groups in range(s, 2, -1):
+        left, right = _cheapest(scratch)
+        for x in range(s):
+            for y in range(x + 1, s):
+                joins = (group[x] == left and group[y] == right) or (
+                    group[x] == right and group[y] == left
+                )
+                if not joins or first_pair[x, y] >= last_pair[x, y]:
+                    continue
+                pair = ObservedPair(seeds[x], seeds[y], first_pair[x, y], last_pair[x, y])
+                threshold = math.inf if exhaustive else accept_threshold
+                progress = scan_pair(
+                    observed, stars, pairs, pair, threshold, scratch, ledger, progress
+                )
+                if progress.best > accept_threshold and not (
+                    exhaustive or leaves_a_group(ledger.heaviest_match)
+                ):
+                    return progress, False
+                if at_bound(progress):
+                    if progress.best <= accept_threshold:
+                        unseen = _most_unseen(observed, stars, groups, scratch)
+                        progress = left_unexplored(progress, min(unseen, LARGEST_LOG))
+                    return progress, True
+        for x in range(s):
+            if group[x] == right:
+                group[x] = left
+                group_of[seeds[x]] = left
+        if progress.best > accept_threshold:
+            unseen = _most_unseen(observed, stars, groups - 1, scratch)
+            if unseen < progress.best - CONVERGED_LOG:
+                return left_unexplored(progress, unseen), False
+    if progress.best > accept_threshold:
+        return progress, False
+    return weigh_pairs(observed, stars, pairs, scratch, ledger, progress)
+
+
+@njit_no_refcount
+def _most_unseen(observed, stars, groups, scratch):  # type: ignore[no-untyped-def]
+    """The most that all hypotheses can weigh that have at most one star of each group.
+
+    Each holds a candidate of a pair across groups, either way round; a third
+    star that it predicts is rarely more than one.
+    """
+    group, first_pair, last_pair = scratch.group, scratch.first_pair, scratch.last_pair
+    s = len(group)
+    candidates = 0
+    least = math.pi
+    for x in range(s):
+        for y in range(x + 1, s):
+            if group[x] != group[y]:
+                candidates += 2 * (last_pair[x, y] - first_pair[x, y])
+                least = min(least, scratch.separation[x, y])
+    sine = math.sin(least)
+    if sine <= 0.0:
+        return math.inf
+    count = groups + len(observed.direction) - s
+    bound = weight_bound(count, observed, stars, scratch.weight_bounds)
+    return bound - math.log(sine) + math.log(max(candidates, 1))
+
+
+@njit_allocating
+def _choose_seeds(magnitude, seeds):  # type: ignore[no-untyped-def]
+    """The stars whose pairs are scanned: all, or the brightest; those without a magnitude last."""
+    if len(magnitude) <= MAX_SEEDS:
+        for x in range(len(seeds)):
+            seeds[x] = x
+        return
+    ranked = np.argsort(np.where(np.isnan(magnitude), 99.0, magnitude), kind="mergesort")
+    seeds[:] = np.sort(ranked[:MAX_SEEDS])
+
+
+@njit_no_refcount
+def _find_candidates(observed, pairs, scratch):  # type: ignore[no-untyped-def]
+    """Per pair of seeds the range of candidate pairs by separation, and the separation."""
+    seeds, direction, sigma_rad = scratch.seeds, observed.direction, observed.sigma_rad
+    s = len(seeds)
+    for x in range(s):
+        for y in range(x + 1, s):
+            i, j = seeds[x], seeds[y]
+            angle = separation_rad(direction[i], direction[j])
+            gate = PREDICTION_GATE * math.sqrt(sigma_rad[i] ** 2 + sigma_rad[j] ** 2)
+            scratch.first_pair[x, y] = _first_at(angle - gate, pairs)
+            scratch.last_pair[x, y] = _first_at(angle + gate, pairs)
+            scratch.separation[x, y] = angle
+
+
+@njit_no_refcount
+def _first_at(angle, pairs):  # type: ignore[no-untyped-def]
+    """The first pair not closer than an angle."""
+    k = min(max(int(angle * pairs.bins_per_rad), 0), len(pairs.bin_start) - 1)
+    at = pairs.bin_start[k]
+    while at > 0 and pairs.separation[at - 1] >= angle:
+        at -= 1
+    while at < len(pairs.separation) and pairs.separation[at] < angle:
+        at += 1
+    return at
+
+
+@njit_no_refcount
+def _cheapest(scratch):  # type: ignore[no-untyped-def]
+    """The two groups whose cross pairs cost least to scan.
+
+    Short pairs predict badly and cost more than their number.
+    """
+    group, separation, cost = scratch.group, scratch.separation, scratch.cost
+    first, last = scratch.first_pair, scratch.last_pair
+    s = len(group)
+    cost[:] = -1.0
+    for x in range(s):
+        for y in range(x + 1, s):
+            low, high = min(group[x], group[y]), max(group[x], group[y])
+            if low == high:
+                continue
+            if cost[low, high] < 0.0:
+                cost[low, high] = 0.0
+            apart = max(separation[x, y], 1e-6)
+            cost[low, high] += (last[x, y] - first[x, y]) * (1.0 + (SHORT_PAIR_RAD / apart) ** 2)
+    left = right = -1
+    least = math.inf
+    for low in range(s):
+        for high in range(low + 1, s):
+            if 0.0 <= cost[low, high] < least:
+                least, left, right = cost[low, high], low, high
+    return left, right

@@ -1,0 +1,164 @@
+"""The a priori knowledge as a presumed attitude, and the search region of each tracker.
+
+The presumed attitude carries observed vectors to inertial axes for the tests
+of geometry.  Where the roll is unknown it is made up, and the tests that would
+depend on it are switched off or, in a band, only vote.
+"""
+
+import numpy as np
+from msgspec import Struct
+
+from service.attitude.quaternions import to_matrix
+from service.errors import BadBatch, Fault, shown_value
+from service.missions.mission import Band, Cap, Mission, Tracker
+from service.observations.batch import APriori, BoresightPrior, QuaternionPrior, SunPointedPrior
+from service.sky.ephemeris import ecliptic_north, sun_direction
+from service.sky.zones import SearchRegion
+from service.times import Utc
+from service.vectors import Matrix, Vector, from_ra_dec, separation_deg, to_ra_dec, unit
+
+POLE_FROM_SUN_WARNING_DEG = 1.0
+SUN_FROM_EARTH_GROWTH_DEG = 0.3
+"""From Earth's centre the Sun is up to 0.26 deg from where a halo orbit about L1 sees it."""
+SAME_BORESIGHT_DEG = 0.01
+PARALLEL_COS = 0.999999
+"""The cosine beyond which one direction does not fix a plane with another."""
+
+
+class PriorAttitude(Struct, frozen=True, eq=False, gc=False):
+    """The presumed attitude (3, 3), inertial to body, and what is not known of it.
+
+    `axis` (inertial) is where it has the zone's body axis.  `known_axis`
+    (inertial) is what alone is known where the roll is not: the boresight, or in
+    a band the pole, about which any rotation may come.
+    """
+
+    attitude: Matrix
+    axis: Vector
+    roll_known: bool
+    known_axis: Vector | None
+    growth_deg: float = 0.0
+    warnings: tuple[str, ...] = ()
+
+
+def prior_attitude(
+    prior: APriori, time: Utc, mission: Mission, position_km: Vector | None = None
+) -> PriorAttitude:
+    """The presumed attitude of a batch of that time, seen from a geocentric position where known.
+
+    Raises `BadBatch` where the kind of prior does not fit the mission's zone.
+    """
+    if isinstance(prior, QuaternionPrior):
+        attitude = np.empty((3, 3))
+        to_matrix(prior.quaternion, attitude)
+        axis = np.dot(mission.axis_body, attitude)
+        if not isinstance(mission.zone, Band):
+            return PriorAttitude(attitude, axis, True, None)
+        warnings = _pole_warnings(axis, time, position_km)
+        return PriorAttitude(attitude, axis, True, axis, warnings=warnings)
+    if isinstance(prior, BoresightPrior):
+        if not isinstance(mission.zone, Cap):
+            raise BadBatch(
+                Fault(
+                    "a_priori.boresight",
+                    f"{mission.name} has a band; give quaternion or sun_pointed",
+                    shown_value({"ra_deg": prior.ra_deg, "dec_deg": prior.dec_deg}),
+                )
+            )
+        boresight = from_ra_dec(prior.ra_deg, prior.dec_deg)
+        attitude = _any_roll(mission.axis_body, boresight)
+        return PriorAttitude(attitude, np.dot(mission.axis_body, attitude), False, boresight)
+    if not isinstance(mission.zone, Band):
+        raise BadBatch(
+            Fault(
+                "a_priori.sun_pointed",
+                f"{mission.name} has a cap; give quaternion or boresight",
+                "True",
+            )
+        )
+    return _sun_pointed(prior, time, mission)
+
+
+def _sun_pointed(prior: SunPointedPrior, time: Utc, mission: Mission) -> PriorAttitude:
+    warnings: tuple[str, ...] = ()
+    growth_deg = 0.0
+    pole = prior.sun_vector
+    if pole is not None:
+        warnings = _pole_warnings(pole, time, prior.position_km)
+    else:
+        pole = sun_direction(time, prior.position_km)
+        if not np.isfinite(pole).all():
+            raise BadBatch(
+                Fault("position_km", "is that of the Sun itself", shown_value(prior.position_km))
+            )
+        if prior.position_km is None:
+            growth_deg = SUN_FROM_EARTH_GROWTH_DEG
+            warned = (
+                "sun_seen_from_earth: neither sun_vector nor position_km was given; "
+                f"the band is {growth_deg} deg wider on either side"
+            )
+            warnings = (warned,)
+    # Body Z is presumed along the projection of ecliptic north.
+    body = _frame(mission.axis_body, np.array([0.0, 0.0, 1.0]))
+    inertial = _frame(pole, ecliptic_north(time))
+    attitude = body.T @ inertial
+    axis = np.dot(mission.axis_body, attitude)
+    return PriorAttitude(attitude, axis, False, pole, growth_deg, warnings)
+
+
+def _frame(first: Vector, second: Vector) -> Matrix:
+    """Rows: the first direction, the normal to both, and the third of the right-handed set.
+
+    A second direction along the first gives way to a coordinate axis.
+    """
+    if abs(float(first @ second)) > PARALLEL_COS:
+        second = np.eye(3)[int(np.argmin(np.abs(first)))]
+    normal = unit(np.cross(first, second))
+    return np.stack([first, normal, np.cross(first, normal)])
+
+
+def _any_roll(body_axis: Vector, inertial_axis: Vector) -> Matrix:
+    """Some attitude that carries an inertial direction to a body axis."""
+    return _frame(body_axis, body_axis).T @ _frame(inertial_axis, inertial_axis)
+
+
+def _pole_warnings(pole: Vector, time: Utc, position_km: Vector | None) -> tuple[str, ...]:
+    off_deg = separation_deg(pole, sun_direction(time, position_km))
+    if off_deg <= POLE_FROM_SUN_WARNING_DEG:
+        return ()
+    return (f"pole_off_sun: the a priori pole is {off_deg:.2f} deg from the Sun",)
+
+
+def search_region(
+    tracker: Tracker, presumed: PriorAttitude, mission: Mission, field_name: str
+) -> SearchRegion:
+    """The region in which the stars of a tracker are searched for.
+
+    In a cap, about the tracker's own presumed boresight; in a band, at the
+    boresight's coelevation from the pole.  Raises `BadBatch` for a tracker
+    whose boresight an a priori direction with unknown roll does not tell.
+    """
+    zone = mission.zone
+    if isinstance(zone, Band):
+        coelevation_deg = tracker.coelevation_deg or zone.coelevation_deg
+        half_width_deg = zone.half_width_deg + presumed.growth_deg
+        return SearchRegion(
+            "band",
+            presumed.axis,
+            max(0.0, coelevation_deg - half_width_deg),
+            min(180.0, coelevation_deg + half_width_deg),
+        )
+    if not presumed.roll_known and (
+        (off_deg := separation_deg(tracker.boresight_body, mission.axis_body)) > SAME_BORESIGHT_DEG
+    ):
+        ra_deg, dec_deg = to_ra_dec(presumed.axis)
+        raise BadBatch(
+            Fault(
+                field_name,
+                f"{tracker.name} looks {off_deg:.2f} deg away from the spacecraft's boresight: "
+                "an a priori boresight does not tell where; give a quaternion",
+                f"boresight {float(ra_deg):.3f}, {float(dec_deg):.3f} deg",
+            )
+        )
+    axis = np.dot(tracker.boresight_body, presumed.attitude)
+    return SearchRegion("cap", axis, 0.0, zone.radius_deg)

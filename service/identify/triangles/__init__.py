@@ -1,0 +1,1 @@
+"""Identification by planar triangles: the identifier `ptp`."""

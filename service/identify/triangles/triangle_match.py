@@ -1,0 +1,148 @@
+"""Observed triangles and the guide triangles that they could be (PTP, section 2.2).
+
+The sides of an observed triangle are uncertain because its stars are.  What
+that means for its projection tells how wide a range of guide triangles to look
+at; what it means for each side tells which of those to believe.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from service.sky.geometry.kvector import rows_within
+from service.sky.geometry.triangles import SIDE_SCALE, TriangleIndex, chord
+
+SIGMAS = 3.0
+"""How far a true triangle may be off, in its own standard deviations: 99.7 % are nearer."""
+MAX_MATCHES = 20_000
+"""What is kept for one sighting; a real field leaves tens, at a pixel of noise."""
+
+
+@njit(cache=True, nogil=True)
+def spread_along(h0, h1, h2, b, sigma):  # type: ignore[no-untyped-def]
+    """The variance along a gradient h of a unit vector b that has noise across it alone.
+
+    h R h^T with R = sigma^2 (I - b b^T), the tangent-plane model of equation 12.
+    """
+    along = h0 * b[0] + h1 * b[1] + h2 * b[2]
+    return sigma * sigma * (h0 * h0 + h1 * h1 + h2 * h2 - along * along)
+
+
+@njit(cache=True, nogil=True)
+def side_sigma(a, b, sigma_a, sigma_b):  # type: ignore[no-untyped-def]
+    """The standard deviation of the scaled chord between two observed stars."""
+    length = chord(a, b) / SIDE_SCALE
+    x, y, z = (a[0] - b[0]) / length, (a[1] - b[1]) / length, (a[2] - b[2]) / length
+    return SIDE_SCALE * math.sqrt(
+        spread_along(x, y, z, a, sigma_a) + spread_along(x, y, z, b, sigma_b)
+    )
+
+
+@njit(cache=True, nogil=True)
+def projection_sigma(m, i, j, axis, sigma_m, sigma_i, sigma_j):  # type: ignore[no-untyped-def]
+    """sigma_P, the standard deviation of an observed triangle's projection; equations 6 to 14.
+
+    `m`, `i` and `j` are the unit vectors of the master and its two slaves,
+    `axis` the principal axis w.
+    """
+    ab, ac, bc = chord(m, i) / SIDE_SCALE, chord(m, j) / SIDE_SCALE, chord(i, j) / SIDE_SCALE
+    h_m, h_i, h_j = np.empty(3), np.empty(3), np.empty(3)
+    for k in range(3):
+        e_ab, e_ac, e_bc = (m[k] - i[k]) / ab, (m[k] - j[k]) / ac, (i[k] - j[k]) / bc
+        h_m[k] = axis[0] * e_ab + axis[1] * e_ac
+        h_i[k] = -axis[0] * e_ab + axis[2] * e_bc
+        h_j[k] = -axis[1] * e_ac - axis[2] * e_bc
+    return SIDE_SCALE * math.sqrt(
+        spread_along(h_m[0], h_m[1], h_m[2], m, sigma_m)
+        + spread_along(h_i[0], h_i[1], h_i[2], i, sigma_i)
+        + spread_along(h_j[0], h_j[1], h_j[2], j, sigma_j)
+    )
+
+
+class ImageTriangles(NamedTuple):
+    """The triangles (t) of n observed stars.
+
+    `direction` (n, 3) are unit vectors in any axes, `sigma_rad` (n,) their noise.
+    `speed_c` is the observer's: aberration changes a side by at most this share of it.
+    `star` (t, 3) are rows of `direction`: master, nearer slave, farther slave; `side`
+    (t, 3) as in `TriangleIndex`.
+    """
+
+    direction: Any
+    sigma_rad: Any
+    speed_c: Any
+    star: Any
+    side: Any
+
+
+class GuideTriangles(NamedTuple):
+    """A `TriangleIndex` as kernels take it: sides, projection with its k-vector, axis and mean."""
+
+    side: Any
+    value: Any
+    below: Any
+    slope: Any
+    intercept: Any
+    axis: Any
+    mean: Any
+
+
+def guide_triangles(index: TriangleIndex) -> GuideTriangles:
+    """The guide triangles of an index."""
+    projection = index.projection
+    return GuideTriangles(
+        side=index.side,
+        value=projection.value,
+        below=projection.below,
+        slope=projection.slope,
+        intercept=projection.intercept,
+        axis=index.axis,
+        mean=index.mean,
+    )
+
+
+@njit(cache=True, nogil=True)
+def match_triangles(image, guide, matched_image, matched_guide):  # type: ignore[no-untyped-def]
+    """Every pair of an observed and a guide triangle that agree in all three sides.
+
+    Their rows go to `matched_image` and `matched_guide`.  Returns how many there
+    are, how many guide triangles were looked at, and whether more would have
+    agreed than can be kept.
+    """
+    count = searched = 0
+    tolerance = np.empty(3)
+    direction, speed_c, axis = image.direction, image.speed_c, guide.axis
+    for t in range(len(image.star)):
+        one, two, three = image.star[t, 0], image.star[t, 1], image.star[t, 2]
+        m, i, j = direction[one], direction[two], direction[three]
+        sm, si, sj = image.sigma_rad[one], image.sigma_rad[two], image.sigma_rad[three]
+        side = image.side[t]
+        if not (side[0] > 0.0 and side[1] > 0.0 and side[2] > 0.0):
+            continue
+        projection = 0.0
+        shift = 0.0
+        for k in range(3):
+            projection += axis[k] * (side[k] - guide.mean[k])
+            shift += abs(axis[k]) * side[k] * speed_c
+        reach = SIGMAS * projection_sigma(m, i, j, axis, sm, si, sj) + shift
+        tolerance[0] = SIGMAS * side_sigma(m, i, sm, si) + speed_c * side[0]
+        tolerance[1] = SIGMAS * side_sigma(m, j, sm, sj) + speed_c * side[1]
+        tolerance[2] = SIGMAS * side_sigma(i, j, si, sj) + speed_c * side[2]
+        first, end = rows_within(
+            *(guide.value, guide.below, guide.slope, guide.intercept),
+            *(projection - reach, projection + reach),
+        )
+        searched += end - first
+        for row in range(first, end):
+            if (
+                abs(guide.side[row, 0] - side[0]) <= tolerance[0]
+                and abs(guide.side[row, 1] - side[1]) <= tolerance[1]
+                and abs(guide.side[row, 2] - side[2]) <= tolerance[2]
+            ):
+                if count == len(matched_guide):
+                    return count, searched, True
+                matched_image[count], matched_guide[count] = t, row
+                count += 1
+    return count, searched, False

@@ -1,0 +1,1 @@
+"""Fink & Shoup's STARID steps: pair tests, match groups, votes."""

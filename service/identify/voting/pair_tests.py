@@ -1,0 +1,386 @@
+"""STARID, steps 1 to 10: which candidate pairs survive, and the votes that they cast.
+
+Source: Fink & Shoup 1994, sections 2.1 and 2.2.  The names of the paper stand
+in the comments.  `cast_votes` allocates nothing, holds no state and releases the
+interpreter's lock.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from service.compiled.jit import njit_no_refcount
+from service.identify.identification import Outcome
+from service.identify.voting.fov_rotation import rotation_rad
+from service.sky.geometry.pairs import separation_rad
+
+UNMATCHED, UNIQUE, AMBIGUOUS = (int(outcome) for outcome in Outcome)
+
+# What a difference of polar angles that is kept in single precision may be off, in radians.
+_SINGLE = 1e-6
+# On a right angle, where the order of a pair turns, rounding shall reject neither.
+_ROUNDING = 1e-14
+
+REJECTED = 2
+"""In the place of an order: a test rejects the candidate."""
+
+
+class Rulebook(NamedTuple):
+    """The rules of `Rules` as kernels take them: the tests that are made, and their tolerances.
+
+    No votes are cast where that takes more than `max_comparisons`.
+    """
+
+    limits: Any
+    switches: Any
+    max_comparisons: Any
+
+
+class Ballots(NamedTuple):
+    """The votes of n observed stars for m zone stars.
+
+    `votes` (n, m) are counted up; `voted` (n, m) lists the zone stars that got
+    votes, `counts` (n,) of them.  `edges` (0, 4), or as many rows as half the votes,
+    gets the observed star, zone row, other observed star and zone row of each pair.
+    """
+
+    votes: Any
+    voted: Any
+    counts: Any
+    edges: Any
+
+
+class Tallies(NamedTuple):
+    """What the votes come to, for each of n observed stars.
+
+    The `outcome`, the winner's `star` (-1: none) and the `highest` and `second`
+    tally, all (n,); `rivals` (R, n) those who share an ambiguous star's highest
+    tally, the brightest first, then -1.
+    """
+
+    outcome: Any
+    star: Any
+    highest: Any
+    second: Any
+    rivals: Any
+
+
+class ObservedPair(NamedTuple):
+    """Observed stars i and j as the tests see them.
+
+    `separation` in radians; the unit normal n0, n1, n2 to both, and `normal` the
+    sine of their angle; their angles `polar_i` and `polar_j` to the axis, zero where
+    there is no pole test, and the size of their difference.  `bright` and `dim` are
+    the stars by magnitude, and `ordered` whether the magnitudes tell their order.
+    """
+
+    i: Any
+    j: Any
+    separation: Any
+    n0: Any
+    n1: Any
+    n2: Any
+    normal: Any
+    polar_i: Any
+    polar_j: Any
+    polar_difference: Any
+    bright: Any
+    dim: Any
+    ordered: Any
+
+
+@njit_no_refcount
+def cast_votes(sighted, zone, polar, bounds, rules, ballots):  # type: ignore[no-untyped-def]
+    """Cast the votes of every observed pair's surviving candidate pairs; how many were compared.
+
+    Where they are more than allowed, some pairs have not been looked at.
+    `sighted`, `zone` and `bounds` are those of `Sighting`; `polar` (m,) keeps a zone
+    star's angle to the axis, -1 where it is not worked out yet.
+    """
+    separation_tolerance, switches = rules.limits.separation, rules.switches
+    pair_separation, pair_difference = zone.pair_separation, zone.polar_difference
+    pair_brighter, pair_dimmer = zone.pair_rows[0], zone.pair_rows[1]
+    kept = compared = 0
+    n = len(sighted.direction)
+    # Cheap, and never too strict: the test itself follows.
+    look_at_difference = switches.pole and len(pair_difference) > 0
+    difference_tolerance = rules.limits.pole_difference + 2.0 * bounds.off_axis + _SINGLE
+    cross_square = 4.0 * math.sin(0.5 * rules.limits.cross_product) ** 2 + _ROUNDING
+    last_bin = len(zone.bin_start) - 2
+    for i in range(n - 1):
+        for j in range(i + 1, n):
+            pair = _observed_pair(sighted, i, j, bounds.axis, rules)
+            separation = pair.separation
+            high = separation + separation_tolerance
+            first_bin = int((separation - separation_tolerance) * zone.bins_per_rad)
+            if first_bin > last_bin:
+                continue
+            for k in range(zone.bin_start[max(first_bin, 0)], len(pair_separation)):
+                if pair_separation[k] > high:
+                    break
+                compared += 1
+                if abs(pair_separation[k] - separation) > separation_tolerance:
+                    continue
+                if (
+                    look_at_difference
+                    and abs(pair.polar_difference - abs(pair_difference[k])) > difference_tolerance
+                ):
+                    continue
+                a, b = pair_brighter[k], pair_dimmer[k]
+                order = _order_of(sighted, zone, polar, bounds, rules, pair, cross_square, a, b)
+                if order == REJECTED:
+                    continue
+                if order >= 0:
+                    kept = _vote(ballots, kept, i, a, j, b)
+                if order <= 0:
+                    kept = _vote(ballots, kept, i, b, j, a)
+            if compared > rules.max_comparisons:
+                return compared
+    return compared
+
+
+@njit_no_refcount
+def _observed_pair(sighted, i, j, axis, rules):  # type: ignore[no-untyped-def]
+    direction, magnitude = sighted.direction, sighted.magnitude
+    n0 = direction[i, 1] * direction[j, 2] - direction[i, 2] * direction[j, 1]
+    n1 = direction[i, 2] * direction[j, 0] - direction[i, 0] * direction[j, 2]
+    n2 = direction[i, 0] * direction[j, 1] - direction[i, 1] * direction[j, 0]
+    normal = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+    if normal > 0.0:
+        n0, n1, n2 = n0 / normal, n1 / normal, n2 / normal
+    polar_i = polar_j = 0.0
+    if rules.switches.pole:
+        polar_i = separation_rad(direction[i], axis)
+        polar_j = separation_rad(direction[j], axis)
+    # Steps 1 and 2: is the order of the observed pair told by the magnitudes? (LMAGT)
+    bright, dim = i, j
+    if magnitude[j] < magnitude[i]:
+        bright, dim = j, i
+    ordered = (
+        rules.switches.magnitude
+        and magnitude[dim] - magnitude[bright] >= rules.limits.magnitude_order
+    )
+    return ObservedPair(
+        *(i, j, separation_rad(direction[i], direction[j]), n0, n1, n2, normal),
+        *(polar_i, polar_j, abs(polar_i - polar_j), bright, dim, ordered),
+    )
+
+
+@njit_no_refcount
+def _order_of(sighted, zone, polar, bounds, rules, pair, cross_square, a, b):  # type: ignore[no-untyped-def]
+    """LORD of a candidate pair: 1 when i goes with a and j with b, -1 the other way round.
+
+    0 where both may be, and `REJECTED` where a test says neither.
+    """
+    star, switches = zone.vector_mag, rules.switches
+    order = 0
+    # Steps 2 and 3: brighter to brighter, dimmer to dimmer within XMTOL.
+    if pair.ordered:
+        magnitude, tolerance = sighted.magnitude, rules.limits.magnitude
+        if abs(magnitude[pair.bright] - star[a, 3]) > tolerance:
+            return REJECTED
+        if abs(magnitude[pair.dim] - star[b, 3]) > tolerance:
+            return REJECTED
+        order = 1 if pair.bright == pair.i else -1
+
+    # The cached zone may be wider than the one that was asked for.
+    if switches.pole or not bounds.all_inside:
+        if polar[a] < 0.0:
+            polar[a] = separation_rad(star[a], bounds.axis)
+        if polar[b] < 0.0:
+            polar[b] = separation_rad(star[b], bounds.axis)
+    if not bounds.all_inside and (
+        polar[a] < bounds.least
+        or polar[a] > bounds.most
+        or polar[b] < bounds.least
+        or polar[b] > bounds.most
+    ):
+        return REJECTED
+
+    by_pole = False
+    if switches.pole:
+        # Step 6: GTODIF and GTRDIF.
+        candidate_difference, tolerance = abs(polar[a] - polar[b]), rules.limits.pole_difference
+        if abs(pair.polar_difference - candidate_difference) > tolerance:
+            return REJECTED
+        by_pole = pair.polar_difference > tolerance and candidate_difference > tolerance
+    if by_pole:
+        order = _order_by_pole(pair, polar[a], polar[b], rules.limits.pole_angle, order)
+    elif switches.cross_product:
+        order = _order_by_cross_product(pair, star[a], star[b], cross_square, order)
+    if switches.fov_rotation and order != REJECTED:
+        order = _order_by_rotation(
+            sighted, bounds, rules.limits.fov_rotation, pair, star, a, b, order
+        )
+    return order
+
+
+@njit_no_refcount
+def _order_by_pole(pair, polar_a, polar_b, tolerance, order):  # type: ignore[no-untyped-def]
+    """Step 7: greater angle with greater, lesser with lesser, within BANTOL2."""
+    greater = max(pair.polar_i, pair.polar_j) - max(polar_a, polar_b)
+    lesser = min(pair.polar_i, pair.polar_j) - min(polar_a, polar_b)
+    if abs(greater) > tolerance or abs(lesser) > tolerance:
+        return REJECTED
+    same = (pair.polar_i > pair.polar_j) == (polar_a > polar_b)
+    pole_order = 1 if same else -1
+    # Steps 8 and 9: the magnitudes, where they told an order, must agree.
+    return REJECTED if order != 0 and order != pole_order else pole_order
+
+
+@njit_no_refcount
+def _order_by_cross_product(pair, a, b, cross_square, order):  # type: ignore[no-untyped-def]
+    """Steps 4, 5 and 10: CRSSEP, or its supplement CRSSEN for the other order."""
+    c0 = a[1] * b[2] - a[2] * b[1]
+    c1 = a[2] * b[0] - a[0] * b[2]
+    c2 = a[0] * b[1] - a[1] * b[0]
+    square = c0 * c0 + c1 * c1 + c2 * c2
+    if pair.normal == 0.0 or square == 0.0:
+        return REJECTED
+    # By chords, which need no arc sine.
+    norm = math.sqrt(square)
+    d0, d1, d2 = pair.n0 * norm - c0, pair.n1 * norm - c1, pair.n2 * norm - c2
+    along = d0 * d0 + d1 * d1 + d2 * d2 <= cross_square * square
+    d0, d1, d2 = pair.n0 * norm + c0, pair.n1 * norm + c1, pair.n2 * norm + c2
+    against = d0 * d0 + d1 * d1 + d2 * d2 <= cross_square * square
+    if order != 0:
+        return order if (along if order == 1 else against) else REJECTED
+    if not (along or against):
+        return REJECTED
+    # Beyond 90 deg both may pass: the order stays open, both pairings vote.
+    return 0 if along == against else 1 if along else -1
+
+
+@njit_no_refcount
+def _order_by_rotation(sighted, bounds, tolerance, pair, star, a, b, order):  # type: ignore[no-untyped-def]
+    """Of both orders, where nothing told one, the one that turns the field little."""
+    first, second = sighted.direction[pair.i], sighted.direction[pair.j]
+    boresight, axis, is_band = sighted.boresight, bounds.axis, bounds.is_band
+    along, against = order >= 0, order <= 0
+    if along:
+        turn = rotation_rad(first, second, star[a], star[b], boresight, axis, is_band)
+        along = turn <= tolerance
+    if against:
+        turn = rotation_rad(first, second, star[b], star[a], boresight, axis, is_band)
+        against = turn <= tolerance
+    if not (along or against):
+        return REJECTED
+    return order if along and against else 1 if along else -1
+
+
+@njit_no_refcount
+def _vote(ballots, kept, i, a, j, b):  # type: ignore[no-untyped-def]
+    """A vote that observed star i is a and j is b; how many pairs are kept as edges."""
+    _count_up(ballots, i, a)
+    _count_up(ballots, j, b)
+    edges = ballots.edges
+    if len(edges):
+        edges[kept, 0], edges[kept, 1] = i, a
+        edges[kept, 2], edges[kept, 3] = j, b
+        kept += 1
+    return kept
+
+
+@njit_no_refcount
+def _count_up(ballots, i, row):  # type: ignore[no-untyped-def]
+    if ballots.votes[i, row] == 0:
+        ballots.voted[i, ballots.counts[i]] = row
+        ballots.counts[i] += 1
+    ballots.votes[i, row] += 1
+
+
+@njit(cache=True)
+def tally(sighted, zone, bounds, rules, star_of, tallies):  # type: ignore[no-untyped-def]
+    """`cast_votes`, `count_votes` and, where a star is ambiguous, `name_rivals` in one call.
+
+    Whether any star is ambiguous, and how many pairs were compared.  It keeps the
+    interpreter's lock: where others wait for that, it takes longer to get it back than
+    to count a few votes.
+    """
+    n, stars = len(sighted.direction), len(zone.direction)
+    polar = polar_angles(zone.polar, stars, bounds, rules)
+    ballots = Ballots(
+        votes=np.zeros((n, stars), np.int32),
+        voted=np.empty((n, stars), np.int32),
+        counts=np.zeros(n, np.int32),
+        edges=np.empty((0, 4), np.int32),
+    )
+    compared = cast_votes(sighted, zone, polar, bounds, rules, ballots)
+    if compared > rules.max_comparisons:
+        discard_votes(ballots)
+    any_tie = count_votes(ballots, star_of, tallies)
+    if any_tie:
+        name_rivals(ballots.votes, star_of, tallies)
+    return any_tie, compared
+
+
+@njit(cache=True, nogil=True)
+def tally_without_gil(sighted, zone, bounds, rules, star_of, tallies):  # type: ignore[no-untyped-def]
+    """`tally` of many stars or pairs, without the interpreter's lock."""
+    return tally(sighted, zone, bounds, rules, star_of, tallies)
+
+
+@njit(cache=True, nogil=True)
+def polar_angles(zone_polar, stars, bounds, rules):  # type: ignore[no-untyped-def]
+    """The zone stars' angles to the axis for `cast_votes`: known ones, or -1; (0,) if not asked."""
+    if bounds.all_inside and not rules.switches.pole:
+        return np.empty(0)
+    polar = np.full(stars, -1.0)
+    if bounds.all_inside and len(zone_polar):
+        polar[:] = zone_polar
+    return polar
+
+
+@njit_no_refcount
+def discard_votes(ballots):  # type: ignore[no-untyped-def]
+    """Leave no votes: of those of some pairs alone a winner would not be the winner of all."""
+    ballots.votes[:] = 0
+    ballots.counts[:] = 0
+
+
+@njit_no_refcount
+def count_votes(ballots, star_of, tallies):  # type: ignore[no-untyped-def]
+    """All of the tallies but the rivals; winners by their `star_of`.
+
+    True where any star is ambiguous.
+    """
+    votes = ballots.votes
+    any_tie = False
+    for i in range(votes.shape[0]):
+        best = runner = 0
+        row = -1
+        share = 0
+        for place in range(ballots.counts[i]):
+            k = ballots.voted[i, place]
+            count = votes[i, k]
+            if count > best:
+                runner, best, row, share = best, count, k, 1
+            elif count == best and count > 0:
+                runner = best
+                share += 1
+            elif count > runner:
+                runner = count
+        tallies.highest[i], tallies.second[i] = best, runner
+        tallies.star[i] = star_of[row] if share == 1 else -1
+        tallies.outcome[i] = UNMATCHED if share == 0 else UNIQUE if share == 1 else AMBIGUOUS
+        any_tie = any_tie or share > 1
+    return any_tie
+
+
+@njit_no_refcount
+def name_rivals(votes, star_of, tallies):  # type: ignore[no-untyped-def]
+    """The rivals of the tallies: the `star_of` of those who share an ambiguous star's highest."""
+    rivals = tallies.rivals
+    rivals[:] = -1
+    for i in range(votes.shape[0]):
+        if tallies.outcome[i] != AMBIGUOUS:
+            continue
+        place = 0
+        for row in range(votes.shape[1]):
+            if place == len(rivals):
+                break
+            if votes[i, row] == tallies.highest[i]:
+                rivals[place, i] = star_of[row]
+                place += 1

@@ -1,0 +1,1 @@
+"""Centroids of stars with predicted errors, by four methods."""

@@ -1,0 +1,155 @@
+"""Shapes on pixels from any image of a point of light: the Airy disc, the cross of a wire mesh."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import RectBivariateSpline
+from scipy.ndimage import gaussian_filter
+from scipy.special import j1
+
+from service.errors import BadInput, Fault
+from service.imaging.centroids.psf import Array
+from service.imaging.optics.pupil import between_wires, disc
+from service.imaging.optics.spectrum import Spectrum, monochromatic
+from service.imaging.optics.transfer import image_of
+
+LEAST_SAMPLES_PER_PX = 3
+
+
+@dataclass(frozen=True)
+class SampledPsf:
+    """The shape of an image that was computed on a grid finer than the pixels.
+
+    `image` is odd in both directions, the star in its middle, and should be even;
+    `total` is the light in all directions, beyond the image as well, in the units of its
+    sum: by default nothing is beyond.  `jitter_px` smears it by a Gaussian.
+    """
+
+    image: Array = field(repr=False)
+    samples_per_px: float
+    total: float | None = None
+    jitter_px: float = 0.0
+
+    def __post_init__(self) -> None:
+        rows, columns = self.image.shape
+        if rows % 2 == 0 or columns % 2 == 0:
+            raise BadInput(
+                Fault("image", "must be odd, the star in its middle", f"{rows, columns}")
+            )
+        if self.samples_per_px < LEAST_SAMPLES_PER_PX:
+            raise BadInput(
+                Fault(
+                    "samples_per_px",
+                    f"must be at least {LEAST_SAMPLES_PER_PX}",
+                    str(self.samples_per_px),
+                )
+            )
+
+    @cached_property
+    def fwhm_px(self) -> float:
+        """Where half of the peak is left along u, twice, without the pixel."""
+        middle = self.image.shape[1] // 2
+        along = self.image[self.image.shape[0] // 2, middle:] / self.image.max()
+        first = int(np.argmax(along < 0.5))
+        whole = first - 1 + (along[first - 1] - 0.5) / (along[first - 1] - along[first])
+        return 2.0 * float(whole) / self.samples_per_px
+
+    @cached_property
+    def reach_px(self) -> tuple[float, float]:
+        """How far the shape is known from the star, along u and v; beyond it is zero."""
+        rows, columns = self.image.shape
+        return (columns // 2) / self.samples_per_px - 0.5, (rows // 2) / self.samples_per_px - 0.5
+
+    @cached_property
+    def _spline(self) -> Any:
+        rows, columns = self.image.shape
+        fine = self.image / (self.image.sum() if self.total is None else self.total)
+        if self.jitter_px > 0.0:
+            fine = gaussian_filter(fine, self.jitter_px * self.samples_per_px, mode="constant")
+        # The pixel is a box; as a transform it is exact for any number of samples a pixel.
+        box = np.outer(
+            np.sinc(np.fft.fftfreq(rows) * self.samples_per_px),
+            np.sinc(np.fft.rfftfreq(columns) * self.samples_per_px),
+        )
+        share = np.fft.irfft2(np.fft.rfft2(fine) * box, s=fine.shape) * self.samples_per_px**2
+        v = np.arange(-(rows // 2), rows // 2 + 1) / self.samples_per_px
+        u = np.arange(-(columns // 2), columns // 2 + 1) / self.samples_per_px
+        return RectBivariateSpline(v, u, share, kx=3, ky=3)
+
+    def pixel(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> Array:
+        """See `psf.Psf`."""
+        return self._at(du_px, dv_px, 0, 0)
+
+    def slopes(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> tuple[Array, Array]:
+        """See `psf.Psf`."""
+        return self._at(du_px, dv_px, 1, 0), self._at(du_px, dv_px, 0, 1)
+
+    def _at(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike, in_u: int, in_v: int) -> Array:
+        u, v = np.broadcast_arrays(
+            np.asarray(du_px, dtype=np.float64), np.asarray(dv_px, dtype=np.float64)
+        )
+        known = (np.abs(u) <= self.reach_px[0]) & (np.abs(v) <= self.reach_px[1])
+        found = self._spline.ev(v, u, dx=in_v, dy=in_u)
+        return np.where(known, found, 0.0)
+
+
+def airy_psf(
+    lambda_over_d_px: float,
+    obscuration: float = 0.0,
+    reach_px: int = 24,
+    jitter_px: float = 0.0,
+) -> SampledPsf:
+    """The image of a clear circle, or of a ring, in light of one colour.
+
+    `lambda_over_d_px` is lambda f / D in pixels; `obscuration` the dark share of the
+    diameter.  [A(q) - e² A(e q)]² / (1 - e²)² with A(q) = 2 J1(q) / q.
+    """
+    if not 0.0 <= obscuration < 1.0:
+        raise BadInput(Fault("obscuration", "must be from 0 to below 1", str(obscuration)))
+    if not lambda_over_d_px > 0.0:
+        raise BadInput(Fault("lambda_over_d_px", "must be above zero", str(lambda_over_d_px)))
+    samples = max(LEAST_SAMPLES_PER_PX + 1, math.ceil(6.0 / lambda_over_d_px))
+    place = np.arange(-reach_px * samples, reach_px * samples + 1) / samples
+    q = math.pi * np.hypot(place[None, :], place[:, None]) / lambda_over_d_px
+
+    def amplitude(x: Array) -> Array:
+        return np.where(x == 0.0, 1.0, 2.0 * j1(x) / np.where(x == 0.0, 1.0, x))
+
+    ring = 1.0 - obscuration**2
+    image = ((amplitude(q) - obscuration**2 * amplitude(obscuration * q)) / ring) ** 2
+    # The light of the whole plane: the open area, by Parseval.
+    total = 4.0 / math.pi * (lambda_over_d_px * samples) ** 2 / ring
+    return SampledPsf(image, samples, total, jitter_px)
+
+
+def cross_psf(
+    diameter_m: float,
+    wires_x_m: Sequence[tuple[float, float]],
+    wires_y_m: Sequence[tuple[float, float]],
+    pixel_rad: float,
+    spectrum: Spectrum | float,
+    reach_px: int = 32,
+    jitter_px: float = 0.0,
+    cells_across: int = 512,
+) -> SampledPsf:
+    """The cross of wires before a circular aperture (report, part IV).
+
+    `wires_x_m`: (place along x, diameter) of wires that run along y, and the like for
+    `wires_y_m`; `spectrum` a wavelength in metres, or the light by number of photons.
+    """
+    light = monochromatic(spectrum) if isinstance(spectrum, (int, float)) else spectrum
+    clear = disc(cells_across, diameter_m / cells_across, diameter_m / 2.0)
+    place = clear.places_m
+    open_x = between_wires(place, clear.cell_m, wires_x_m)
+    open_y = between_wires(place, clear.cell_m, wires_y_m)
+    pupil = clear.behind(open_y[:, None] * open_x[None, :])
+    shortest = float(light.wavelength_m.min())
+    samples = max(LEAST_SAMPLES_PER_PX + 1, math.ceil(6.0 * pixel_rad * diameter_m / shortest))
+    image = image_of(pupil, light, pixel_rad / samples, reach_px * samples, photons=True)
+    total = pupil.open_area_m2 / image.step_rad**2
+    return SampledPsf(image.intensity, samples, total, jitter_px)

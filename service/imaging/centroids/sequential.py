@@ -1,0 +1,84 @@
+"""Linear estimation, one measurement at a time (report, part VI).
+
+A measurement is r = c . A + k: a row c, a state A that stays the same, noise k.
+Everything the report derives for it is here; what the rows are for a star's image is
+in `hump`.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from service.imaging.centroids.window import Array
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A state (m,) with its covariance (m, m) after a number of measurements."""
+
+    state: Array
+    covariance: Array
+    measurements: int = 0
+
+    @property
+    def sigma(self) -> Array:
+        """One standard deviation of every part of the state."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def updated(self, row: Array, value: float, variance: float) -> "Estimate":
+        """The estimate after one more measurement (6.20, 6.26).
+
+        Only a number is inverted.  The report concludes that the covariance goes to zero
+        because the matrices of 6.26 are positive definite; the one that is subtracted has
+        rank one, and measuring one point for ever teaches one direction only.  It goes
+        to zero where the rows, summed as c^T c, grow without bound in every direction.
+        """
+        gain = self.covariance @ row
+        spread = variance + float(row @ gain)
+        gain_over = gain / spread
+        state = self.state + gain_over * (value - float(row @ self.state))
+        covariance = self.covariance - np.outer(gain_over, gain)
+        return Estimate(state, 0.5 * (covariance + covariance.T), self.measurements + 1)
+
+    def replayed(self, rows: Array, values: Array, variances: npt.ArrayLike) -> "Estimate":
+        """The estimate after many measurements, one after another; rows (n, m)."""
+        estimate = self
+        for row, value, variance in zip(
+            rows, values, np.broadcast_to(variances, values.shape), strict=True
+        ):
+            estimate = estimate.updated(row, float(value), float(variance))
+        return estimate
+
+
+def diffuse(sigmas: Iterable[float]) -> Estimate:
+    """The start that knows nothing: zero, give or take `sigmas`."""
+    spread = np.asarray(tuple(sigmas), dtype=np.float64)
+    return Estimate(np.zeros(len(spread)), np.diag(spread**2))
+
+
+def batch(rows: Array, values: Array, variances: npt.ArrayLike) -> Estimate:
+    """Weighted least squares of all at once: (C^T Q C)^-1 C^T Q R with Q of 1/variance (6.13).
+
+    Raises `numpy.linalg.LinAlgError` where the rows leave a direction unknown.
+    """
+    root = 1.0 / np.sqrt(np.broadcast_to(variances, values.shape))
+    weighted = rows * root[:, None]
+    if np.linalg.matrix_rank(weighted) < rows.shape[1]:
+        raise np.linalg.LinAlgError(
+            f"{rows.shape[1]} unknowns, but the measurements tell only "
+            f"{np.linalg.matrix_rank(weighted)} of them apart"
+        )
+    covariance = np.linalg.inv(weighted.T @ weighted)
+    return Estimate(covariance @ weighted.T @ (values * root), covariance, len(values))
+
+
+def least_norm(rows: Array, values: Array, norm: Array) -> Array:
+    """The state of least A^T Q A that fits fewer measurements than unknowns exactly (6.11).
+
+    Q^-1 C^T (C Q^-1 C^T)^-1 R: what the recursion gives that starts at zero with the
+    covariance Q^-1 and is told that the measurements have no noise.
+    """
+    spread = np.linalg.solve(norm, rows.T)
+    return np.asarray(spread @ np.linalg.solve(rows @ spread, values))

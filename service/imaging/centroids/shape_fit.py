@@ -1,0 +1,155 @@
+"""The matched centroid: where the derivative of the correlation with the star's shape is zero.
+
+The report locates by the peak of a correlation, or by the zero of the correlation
+with the derivative (part III).  Weighted by the noise of each pixel, the second is the
+condition of greatest likelihood, and its slope the Fisher information: the predicted
+sigmas are the Cramér-Rao bound.  It is found by Gauss-Newton steps, the square of
+pixels moving with the star.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from service.imaging.centroids.psf import Psf
+from service.imaging.centroids.region import Region, square_about
+from service.imaging.centroids.window import Array, Window
+
+MOST_STEPS = 30
+ENOUGH_SIGMAS = 0.01
+"""A step this small against its own uncertainty is the last; the next would be its square."""
+LONGEST_STEP_PX = 0.7
+MOVE_BEYOND_PX = 0.75
+"""Beyond half a pixel, so that a star between two pixels does not toss the square about."""
+FARTHEST_IN_HALF_WIDTHS = 2.0
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Place (pixels of the window) and light of the shape that fits best, with covariance.
+
+    `covariance` is of (u, v, light) and holds what the error of the background level adds.
+    """
+
+    u_px: float
+    v_px: float
+    flux_counts: float
+    covariance: Array
+    region: Region
+    steps: int
+    converged: bool
+
+    @property
+    def signal_ratio(self) -> float:
+        """The light over its own noise."""
+        return self.flux_counts / math.sqrt(self.covariance[2, 2])
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Pixels of a square against the shape at a presumed place and light.
+
+    `rows` (n, 3) are the changes with u, v and light; `left` is what the shape does not
+    explain; `variance` per pixel is that of the model, never of the noisy counts, which
+    would favour pixels that happened to be low.
+    """
+
+    rows: Array
+    left: Array
+    variance: Array
+
+    def sigmas_of(self, step: Array) -> float:
+        """The length of a step in its own standard deviations."""
+        return math.sqrt(float(((self.rows @ step) ** 2 / self.variance).sum()))
+
+
+def linearised(region: Region, psf: Psf, u_px: float, v_px: float, flux: float) -> Linearised:
+    """The usable pixels about a presumed place, (u, v) in pixels of the window."""
+    du, dv = region.du - (u_px - region.column), region.dv - (v_px - region.row)
+    image = psf.pixel(du, dv)
+    u_slope, v_slope = psf.slopes(du, dv)
+    model = flux * image
+    variance = region.floor_variance + (
+        np.maximum(model, 0.0) / region.window.detector.gain_e_per_count
+    )
+    good = region.usable & (variance > 0.0)
+    rows = np.stack([-flux * u_slope[good], -flux * v_slope[good], image[good]], axis=1)
+    return Linearised(rows, (region.light - model)[good], variance[good])
+
+
+def first_flux(region: Region, psf: Psf, u_px: float, v_px: float) -> float:
+    """The light of a star at a presumed place, by the sum of the pixels that may be believed.
+
+    Where that sum is not above zero, its noise: the first step then finds the light.
+    """
+    image = psf.pixel(region.du - (u_px - region.column), region.dv - (v_px - region.row))
+    held = float(image[region.usable].sum())
+    light = float(region.light.sum())
+    noise = math.sqrt(float(region.floor_variance.sum())) or 1.0
+    return light / held if held > 0.0 and light > 0.0 else noise
+
+
+def fit(
+    window: Window, psf: Psf, start: tuple[float, float], half_width_px: int, recentre: bool = True
+) -> Fit | None:
+    """The best place from a start in pixels of the window; None where there is none to be had."""
+    u, v = start
+    region = square_about(window, round(u), round(v), half_width_px)
+    if region is None:
+        return None
+    flux = first_flux(region, psf, u, v)
+    taken, converged = 0, False
+    while not converged and taken < MOST_STEPS:
+        taken += 1
+        seen = linearised(region, psf, u, v, flux)
+        step = _solve(seen)
+        if step is None:
+            return None
+        converged = seen.sigmas_of(step) < ENOUGH_SIGMAS
+        u, v, flux = stepped(u, v, flux, step)
+        if math.hypot(u - start[0], v - start[1]) > FARTHEST_IN_HALF_WIDTHS * half_width_px:
+            return None
+        if recentre and max(abs(u - region.column), abs(v - region.row)) > MOVE_BEYOND_PX:
+            moved = square_about(window, round(u), round(v), half_width_px)
+            if moved is None:
+                return None
+            region = moved
+    seen = linearised(region, psf, u, v, flux)
+    covariance = _covariance(seen, window.background_sigma_counts)
+    if covariance is None:
+        return None
+    return Fit(u, v, flux, covariance, region, taken, converged)
+
+
+def stepped(u: float, v: float, flux: float, step: Array) -> tuple[float, float, float]:
+    """Place and light after a step, which is shortened where it leaves the linear range."""
+    length = math.hypot(step[0], step[1])
+    shorten = min(1.0, LONGEST_STEP_PX / length) if length > 0.0 else 1.0
+    # Light cannot be negative; a star that fades on the way is too faint at its end.
+    flux = max(flux + shorten * float(step[2]), 0.1 * flux)
+    return u + shorten * float(step[0]), v + shorten * float(step[1]), flux
+
+
+def _solve(seen: Linearised) -> Array | None:
+    weighted = seen.rows / seen.variance[:, None]
+    normal: Array = weighted.T @ seen.rows
+    try:
+        return np.asarray(np.linalg.solve(normal, weighted.T @ seen.left))
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _covariance(seen: Linearised, level_sigma: float) -> Array | None:
+    weighted = seen.rows / seen.variance[:, None]
+    try:
+        covariance: Array = np.asarray(np.linalg.inv(weighted.T @ seen.rows), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        return None
+    return with_level_error(covariance, seen, level_sigma)
+
+
+def with_level_error(covariance: Array, seen: Linearised, level_sigma: float) -> Array:
+    """The covariance with what an error of the background, common to all pixels, adds."""
+    response = covariance @ (seen.rows / seen.variance[:, None]).sum(axis=0)
+    return np.asarray(covariance + level_sigma**2 * np.outer(response, response))

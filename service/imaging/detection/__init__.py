@@ -1,0 +1,1 @@
+"""From the counts of a frame to measured stars."""

@@ -1,0 +1,139 @@
+"""Stars that a cosmic ray struck, or that lie on a hot pixel.
+
+Some are found again only once the pixels that were struck are taken off; others are
+placed, and what stands out from their own image is then no longer believed.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from service.imaging.centroids.psf import GaussianPsf, Psf
+from service.imaging.centroids.record import CentroidRecord
+from service.imaging.centroids.window import Mask, Window
+from service.imaging.detection.shapes import is_sharp, patches_of
+from service.imaging.frames.frame import Counts
+from service.vectors import Vector
+
+HALF_PX = 5
+ROUNDS = 6
+_CORE = np.arange(-1.0, 2.0)
+MARGIN = 1.4
+"""How much brighter than the image of a point could be over its neighbours a pixel is hot."""
+LEAST_SIGMAS = 5.0
+CERTAIN_SIGMAS = 12.0
+"""Of what is left of a star that was struck, so that the rest of a track is none."""
+
+HIT_SHARE = 0.1
+"""Of a star's brightest pixel: less may be a shape that is not quite the one presumed."""
+
+_ASIDE = ((-1, 0), (1, 0), (0, -1), (0, 1))
+
+
+@dataclass(frozen=True)
+class Behind:
+    """Stars (n,) that were hidden, and every pixel (m,) that hid them."""
+
+    u_px: Vector
+    v_px: Vector
+    flux_counts: Vector
+    hot_u_px: npt.NDArray[np.intp]
+    hot_v_px: npt.NDArray[np.intp]
+
+
+def stars_behind(
+    light: Counts, u_px: Vector, v_px: Vector, psf_sigma_px: float, noise_counts: float
+) -> Behind:
+    """What lies behind candidates (k,) that are sharper than a star.
+
+    About each, pixel by pixel, what stands out from its four neighbours more than the
+    middle of a star's image can is taken off, the brightest first, until nothing does.
+    Where a star is left, it was struck.
+    """
+    core = GaussianPsf(psf_sigma_px).pixel(_CORE[None, :], _CORE[:, None])
+    patches = patches_of(light, u_px, v_px, HALF_PX)
+    hot = _hot(patches, float(core[1, 1] / core[0, 1]), noise_counts)
+    left = np.where(hot, 0.0, patches)
+    row, column, ratio = _best(left, core, noise_counts)
+    struck = [
+        k
+        for k in np.flatnonzero(ratio >= CERTAIN_SIGMAS).tolist()
+        if not is_sharp(left[k], column[k : k + 1], row[k : k + 1], psf_sigma_px)[0]
+    ]
+    corner_u, corner_v = (np.round(each).astype(np.intp) - HALF_PX for each in (u_px, v_px))
+    patch, hot_row, hot_column = np.nonzero(hot[struck])
+    hot_u = corner_u[struck][patch] + hot_column
+    hot_v = corner_v[struck][patch] + hot_row
+    rows, columns = light.shape
+    inside = (hot_u >= 0) & (hot_u < columns) & (hot_v >= 0) & (hot_v < rows)
+    return Behind(
+        corner_u[struck] + column[struck],
+        corner_v[struck] + row[struck],
+        ratio[struck] * noise_counts / np.sqrt((core**2).sum()),
+        hot_u[inside],
+        hot_v[inside],
+    )
+
+
+def hits_under(window: Window, psf: Psf, star: CentroidRecord) -> Mask:
+    """Pixels (rows, columns) of a window that stand out from a placed star as no light can.
+
+    The star is taken off at the place that it was given; a pixel was hit where more is
+    left of it than of its neighbours by a factor that no image of a point reaches.
+    """
+    rows, columns = window.counts.shape
+    du = np.arange(columns)[None, :] + window.corner_u_px - star.u_px
+    dv = np.arange(rows)[:, None] + window.corner_v_px - star.v_px
+    model = np.maximum(star.flux_counts * psf.pixel(du, dv), 0.0)
+    variance = window.floor_variance + model / window.detector.gain_e_per_count
+    left = np.where(window.usable, window.light_counts - model, 0.0)
+    middle, beside, above = psf.pixel(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+    ratio = float(middle / max(beside, above))
+    hot = _hot(left[None], ratio, np.sqrt(variance)[None])[0]
+    return np.asarray(hot & (left > HIT_SHARE * model.max()))
+
+
+def _hot(
+    patches: npt.NDArray[np.float64],
+    peak_over_next: float,
+    noise_counts: float | npt.NDArray[np.float64],
+) -> npt.NDArray[np.bool_]:
+    """Pixels of (k, rows, columns) that stand out from their neighbours more than a star's can."""
+    hot = np.zeros(patches.shape, dtype=np.bool_)
+    for _ in range(ROUNDS):
+        # What is hot already says nothing of its neighbours.
+        known = np.pad(~hot, ((0, 0), (1, 1), (1, 1))).astype(np.float64)
+        light = np.pad(np.where(hot, 0.0, patches), ((0, 0), (1, 1), (1, 1)))
+        count = sum(_aside(known, *step) for step in _ASIDE)
+        around = sum(_aside(light, *step) for step in _ASIDE) / np.maximum(count, 1.0)
+        more = patches - MARGIN * peak_over_next * around > LEAST_SIGMAS * noise_counts
+        more &= ~hot
+        if not more.any():
+            break
+        hot |= more
+    return hot
+
+
+def _aside(padded: npt.NDArray[np.float64], rows: int, columns: int) -> npt.NDArray[np.float64]:
+    """The inner part of padded patches, moved."""
+    height, width = padded.shape[1:]
+    return padded[:, 1 + rows : height - 1 + rows, 1 + columns : width - 1 + columns]
+
+
+def _best(
+    patches: npt.NDArray[np.float64], core: npt.NDArray[np.float64], noise_counts: float
+) -> tuple[Vector, Vector, Vector]:
+    """The place (row, column) in each patch of the most starlike light, and its ratio to noise."""
+    size = patches.shape[1] - 2
+    filtered = np.zeros((len(patches), size, size))
+    for row in range(3):
+        for column in range(3):
+            moved = patches[:, row : row + size, column : column + size]
+            filtered += core[row, column] * moved
+    flat = filtered.reshape(len(patches), size * size)
+    at = flat.argmax(axis=1)
+    # The filter lacks the rim.
+    row, column = (each.astype(np.float64) + 1.0 for each in np.divmod(at, size))
+    best = flat[np.arange(len(flat)), at]
+    return row, column, best / (np.sqrt((core**2).sum()) * noise_counts)

@@ -1,0 +1,148 @@
+"""From counts to candidates: background, threshold, detection by SEP, what is no star left out.
+
+The search itself is that of SExtractor (Bertin & Arnouts 1996), in SEP: a mesh of
+clipped medians for the background, a filter of the shape of a star's image, a
+threshold in the noise behind that filter, and deblending.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import sep
+
+from service.imaging.centroids.psf import GaussianPsf
+from service.imaging.detection.cosmic_rays import stars_behind
+from service.imaging.detection.shapes import is_sharp
+from service.imaging.frames.frame import Counts, Frame, refused
+from service.missions.camera import Camera
+from service.vectors import Vector, read_only
+
+MESH_PX = 64
+LEAST_PIXELS = 3
+DEBLEND_LEVELS, DEBLEND_CONTRAST = 32, 0.005
+HOT_SIGMAS = 5.0
+TRACK_PIXELS = 9
+BEHIND_SIGMAS = 15.0
+_CLOSE_PX = 6.0
+
+
+@dataclass(frozen=True)
+class Detections:
+    """Candidates, the most light first, and what they stand on.
+
+    `light` is the frame above its background, `background` the level below it with the
+    bias taken off, `noise_counts` one standard deviation of a pixel of it.  `good` is
+    False where a pixel holds no number or something sharper than a star.
+    """
+
+    light: Counts
+    background_counts: Counts
+    noise_counts: float
+    good: npt.NDArray[np.bool_]
+    u_px: Vector
+    v_px: Vector
+    flux_counts: Vector
+    """The light above the threshold: somewhat less than all of it."""
+    sharp_u_px: Vector
+    sharp_v_px: Vector
+    """Hot pixels and cosmic rays: what was found and is no star."""
+
+    @property
+    def count(self) -> int:
+        """How many candidates there are."""
+        return len(self.u_px)
+
+
+def detect(frame: Frame, camera: Camera) -> Detections:
+    """The candidates on a frame; raises `BadFile` for one that is bright nearly everywhere."""
+    light = frame.counts - np.asarray(camera.bias_counts, dtype=frame.counts.dtype)
+    known = np.isfinite(light)
+    # SEP takes a mask of what to pass by; without one it is quicker.
+    mask = None if known.all() else ~known
+    if mask is not None:
+        light[mask] = 0.0
+    background = sep.Background(light, mask=mask, bw=MESH_PX, bh=MESH_PX)
+    noise = float(background.globalrms)
+    if not noise > 0.0:
+        # Most pixels are equal, as in a frame cut off at its background: a count is the least step.
+        noise = 1.0
+    level = background.back(dtype=light.dtype)
+    light -= level
+    found = _extracted(light, noise, mask, camera)
+    u, v = found["x"].astype(np.float64), found["y"].astype(np.float64)
+    sharp = is_sharp(light, u, v, camera.psf_sigma_px)
+    good = _good(light, known, noise, found[~sharp], found[sharp])
+    # Light beside the brightest pixel: without it no star can be behind.
+    dense = sharp & (found["flux"] - found["peak"] > BEHIND_SIGMAS * noise)
+    behind = stars_behind(light, u[dense], v[dense], camera.psf_sigma_px, noise)
+    good[behind.hot_v_px, behind.hot_u_px] = False
+    stars = np.concatenate(
+        [
+            np.stack([found[name][~sharp] for name in ("x", "y", "flux")]),
+            np.stack([behind.u_px, behind.v_px, behind.flux_counts]),
+        ],
+        axis=1,
+    )
+    u_px, v_px, flux = stars[:, np.argsort(-stars[2], kind="stable")]
+    return Detections(
+        light=light,
+        background_counts=level,
+        noise_counts=noise,
+        good=good,
+        u_px=read_only(u_px),
+        v_px=read_only(v_px),
+        flux_counts=read_only(flux),
+        sharp_u_px=read_only(u[sharp]),
+        sharp_v_px=read_only(v[sharp]),
+    )
+
+
+def detection_kernel(camera: Camera) -> npt.NDArray[np.float32]:
+    """The filter: the core of a star's image, pixel by pixel.
+
+    A wider one finds no more, and fills the gap between a star and a bright neighbour.
+    """
+    half = max(1, round(1.2 * camera.psf_sigma_px))
+    steps = np.arange(-half, half + 1, dtype=np.float64)
+    image = GaussianPsf(camera.psf_sigma_px).pixel(steps[None, :], steps[:, None])
+    return np.asarray(image, dtype=np.float32)
+
+
+def _extracted(
+    light: Counts, noise: float, mask: npt.NDArray[np.bool_] | None, camera: Camera
+) -> npt.NDArray[np.void]:
+    try:
+        found: npt.NDArray[np.void] = sep.extract(
+            light,
+            camera.threshold_sigma,
+            err=noise,
+            mask=mask,
+            minarea=LEAST_PIXELS,
+            filter_kernel=detection_kernel(camera),
+            deblend_nthresh=DEBLEND_LEVELS,
+            deblend_cont=DEBLEND_CONTRAST,
+        )
+    except Exception as error:
+        # SEP has one exception for all: its buffers are full of bright pixels.
+        raise refused(f"is bright nearly everywhere: {str(error)[:100]}") from None
+    return found
+
+
+def _good(
+    light: Counts,
+    known: npt.NDArray[np.bool_],
+    noise: float,
+    stars: npt.NDArray[np.void],
+    others: npt.NDArray[np.void],
+) -> npt.NDArray[np.bool_]:
+    """Where a pixel may be believed: the bright ones of what is no star are not."""
+    good = known.copy()
+    good[others["ypeak"], others["xpeak"]] = False
+    # Of a track all pixels, unless a star is among them.
+    tracks = others[others["npix"] > TRACK_PIXELS]
+    away = np.hypot(tracks["x"][:, None] - stars["x"], tracks["y"][:, None] - stars["y"])
+    for each in tracks[away.min(axis=1, initial=np.inf) > _CLOSE_PX]:
+        box = slice(each["ymin"], each["ymax"] + 1), slice(each["xmin"], each["xmax"] + 1)
+        good[box] &= light[box] < HOT_SIGMAS * noise
+    return good

@@ -1,0 +1,183 @@
+"""From candidates to stars: place with predicted errors, flags, light and magnitude."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from service.imaging.centroids.centroid import centroid
+from service.imaging.centroids.psf import GaussianPsf, Psf
+from service.imaging.centroids.record import CentroidRecord
+from service.imaging.centroids.window import Detector, Window, cutout
+from service.imaging.detection.cosmic_rays import hits_under
+from service.imaging.detection.detect import MESH_PX, Detections
+from service.imaging.detection.trail import TrailPsf, trails_px
+from service.imaging.frames.frame import Frame
+from service.missions.camera import Camera, CentroidMethod
+from service.missions.mission import Tracker
+from service.vectors import Vector
+
+SHORT_TRAIL_PX = 0.1
+MARGIN_PX = 2
+"""Of a window beyond the square that a centroid sums, so that the square may follow the star."""
+FAINT_SHARE = 0.4
+"""Light above the threshold of the faintest star that is wanted: the rest of it lies below."""
+
+
+@dataclass(frozen=True)
+class MeasuredStar:
+    """One candidate: its centroid, its instrument magnitude, and why it is in no batch, if so."""
+
+    record: CentroidRecord
+    magnitude_mag: float
+    left_out: str | None = None
+
+
+def measure(
+    frame: Frame,
+    found: Detections,
+    tracker: Tracker,
+    camera: Camera,
+    rates_deg_per_s: Vector,
+    method: CentroidMethod,
+    faintest_mag: float,
+) -> list[MeasuredStar]:
+    """The candidates bright enough to matter, the brightest first.
+
+    Each is placed alone; those with others in their window are then placed once more
+    with the light of the others taken away, and those on pixels that were hit without these.
+    """
+    exposure_s = frame.exposure_s or camera.exposure_s
+    detector = detector_of(frame, found, camera)
+    wanted = FAINT_SHARE * camera.flux_counts(np.array(faintest_mag), exposure_s)
+    # Without a zero point no candidate is known to be too faint.
+    bright = np.count_nonzero(~(found.flux_counts < wanted))
+    count = min(int(bright), 2 * camera.most_stars)
+    psfs = _psfs(found, count, tracker, camera, rates_deg_per_s, exposure_s)
+    half = camera.centroid_half_width_px
+    windows = [
+        cutout(
+            frame.counts,
+            float(found.u_px[k]),
+            float(found.v_px[k]),
+            half + MARGIN_PX,
+            detector,
+            found.background_counts,
+            found.noise_counts / MESH_PX,
+            found.good,
+        )
+        for k in range(count)
+    ]
+    windows = [dataclasses.replace(w, counts=w.counts - camera.bias_counts) for w in windows]
+    starts = list(zip(found.u_px.tolist(), found.v_px.tolist(), strict=True))
+    records = [centroid(windows[k], method, psfs[k], starts[k], half) for k in range(count)]
+    for k, near in enumerate(_neighbours(found, count, half + MARGIN_PX + 2)):
+        window = _without(windows[k], near, records, found, psfs) if near else windows[k]
+        if near:
+            records[k] = centroid(window, method, psfs[k], starts[k], half)
+        if records[k].usable and (hits := hits_under(window, psfs[k], records[k])).any():
+            clean = dataclasses.replace(window, good=window.usable & ~hits)
+            records[k] = centroid(clean, method, psfs[k], starts[k], half)
+    flux = np.array([record.flux_counts for record in records], dtype=np.float64)
+    magnitudes = camera.magnitude(flux, exposure_s)
+    return _chosen(records, magnitudes.tolist(), faintest_mag, camera.most_stars)
+
+
+def detector_of(frame: Frame, found: Detections, camera: Camera) -> Detector:
+    """The detector with the noise that the frame itself shows beyond that of its light."""
+    gain = camera.gain_e_per_count
+    level = max(float(np.median(found.background_counts)), 0.0)
+    variance_e = (found.noise_counts * gain) ** 2 - level * gain
+    full = min(camera.saturation_counts, frame.full_scale) - camera.bias_counts
+    return Detector(gain, math.sqrt(max(variance_e, 0.0)), full)
+
+
+def _psfs(
+    found: Detections,
+    count: int,
+    tracker: Tracker,
+    camera: Camera,
+    rates_deg_per_s: Vector,
+    exposure_s: float,
+) -> list[Psf]:
+    still = GaussianPsf(camera.psf_sigma_px)
+    along_u, along_v = trails_px(
+        camera,
+        tracker.body_from_tracker,
+        rates_deg_per_s,
+        found.u_px[:count],
+        found.v_px[:count],
+        exposure_s,
+    )
+    return [
+        TrailPsf(still, u, v) if math.hypot(u, v) > SHORT_TRAIL_PX else still
+        for u, v in zip(along_u.tolist(), along_v.tolist(), strict=True)
+    ]
+
+
+def _neighbours(found: Detections, count: int, reach_px: float) -> list[list[int]]:
+    """For each of the first `count` candidates, the others whose light falls into its window."""
+    u, v = found.u_px, found.v_px
+    return [
+        [
+            int(other)
+            for other in np.flatnonzero(np.maximum(abs(u - u[k]), abs(v - v[k])) < reach_px)
+            if other != k
+        ]
+        for k in range(count)
+    ]
+
+
+def _without(
+    window: Window,
+    others: Sequence[int],
+    records: Sequence[CentroidRecord],
+    found: Detections,
+    psfs: Sequence[Psf],
+) -> Window:
+    """The window with the images of other stars taken off."""
+    rows, columns = window.counts.shape
+    u = np.arange(columns)[None, :] + window.corner_u_px
+    v = np.arange(rows)[:, None] + window.corner_v_px
+    counts = window.counts.copy()
+    for other in others:
+        at_u, at_v, flux = found.u_px[other], found.v_px[other], found.flux_counts[other]
+        if other < len(records) and records[other].usable:
+            record = records[other]
+            at_u, at_v, flux = record.u_px, record.v_px, record.flux_counts
+        shape = psfs[other] if other < len(psfs) else psfs[0]
+        counts -= flux * shape.pixel(u - at_u, v - at_v)
+    return dataclasses.replace(window, counts=counts)
+
+
+def _chosen(
+    records: Sequence[CentroidRecord],
+    magnitudes: Sequence[float],
+    faintest_mag: float,
+    most: int,
+) -> list[MeasuredStar]:
+    """The stars by magnitude; those that a batch takes come first."""
+    used: list[MeasuredStar] = []
+    left: list[MeasuredStar] = []
+    for record, magnitude in sorted(
+        zip(records, magnitudes, strict=True),
+        key=lambda each: _by_magnitude_else_light(each[1], each[0].flux_counts),
+    ):
+        if not record.usable:
+            left.append(MeasuredStar(record, magnitude, record.refused))
+        elif magnitude > faintest_mag or not record.flux_counts > 0.0:
+            left.append(MeasuredStar(record, magnitude, f"fainter than {faintest_mag:g} mag"))
+        elif len(used) == most:
+            left.append(MeasuredStar(record, magnitude, f"{most} are brighter"))
+        else:
+            used.append(MeasuredStar(record, magnitude))
+    return used + left
+
+
+def _by_magnitude_else_light(magnitude_mag: float, flux_counts: float) -> tuple[bool, float]:
+    """Where a star is put in the order: those without a magnitude behind, the most light first."""
+    if math.isnan(magnitude_mag):
+        return True, -flux_counts if flux_counts > 0.0 else math.inf
+    return False, magnitude_mag

@@ -1,0 +1,204 @@
+"""Points of light on a picture of which nothing is known, by signal to noise alone.
+
+The picture is filtered with the image of a star less what is about it, so that
+what is wider than a star (a tree, the Moon, a cloud, the horizon) leaves little; each
+place is compared with the noise of its own neighbourhood behind the same filter.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import sep
+from scipy.ndimage import gaussian_filter
+
+from service.imaging.frames.frame import Counts
+from service.vectors import Vector, read_only
+
+MESH_PX = 32
+GUESSED_PSF_PX = 1.2
+"""For the first look, from which the width of a star's image is measured."""
+LIKE_PSF = 1.35
+"""A filter that is no more than this too wide or too narrow loses hardly any signal."""
+LEAST_PSF_PX, MOST_PSF_PX = 0.7, 5.0
+SURROUND = 3.0
+"""The width of what is taken off, in widths of a star's image."""
+MAX_WORKING_PIXELS = 4_000_000
+"""Larger pictures are binned; a star's image is then narrower and no fainter."""
+MAX_POINTS = 300
+FIRST_THRESHOLD, SECOND_THRESHOLD = 5.0, 3.5
+FULL_SHARE = 0.9
+"""Of the largest count: images with a higher peak may be cut off, and tell no width."""
+_LEAST_SIGMA_PX = 0.05
+_CENTROID_ROUNDS = 6
+
+
+@dataclass(frozen=True)
+class PointSources:
+    """Candidates for stars (n), the clearest first, and the picture that they stand on.
+
+    Places and sigmas are in pixels of the picture, the centre of its first being (0, 0).
+    `signal_ratio` is of the filtered light to the noise about it.  `light` is the picture
+    above its background, each of its pixels `binning` a side.
+    """
+
+    u_px: Vector
+    v_px: Vector
+    sigma_px: Vector
+    signal_ratio: Vector
+    flux_counts: Vector
+    psf_sigma_px: float
+    noise_counts: float
+    background_counts: float
+    clipped_share: float
+    """Of the pixels, those at the lowest count: where it is large, the background was cut off."""
+    light: Counts
+    binning: int
+    width_px: int
+    height_px: int
+
+    @property
+    def count(self) -> int:
+        """How many candidates there are."""
+        return len(self.u_px)
+
+
+def find_points(counts: Counts, threshold: float = FIRST_THRESHOLD) -> PointSources:
+    """The candidates on a picture (rows, columns); their images are measured on it first."""
+    height, width = counts.shape
+    binning = max(1, math.ceil(math.sqrt(counts.size / MAX_WORKING_PIXELS)))
+    working = _filled(_binned(counts, binning))
+    # Counts of a file are integers, and finer than that where they were summed.
+    step = 1.0 / binning if binning > 1 else 1.0
+    background = sep.Background(working, bw=MESH_PX, bh=MESH_PX)
+    light = working - background.back(dtype=np.float32)
+    peaks = _peaks(light, GUESSED_PSF_PX, threshold, step)
+    psf = _measured_psf(light, *peaks)
+    if not 1.0 / LIKE_PSF < psf / GUESSED_PSF_PX < LIKE_PSF:
+        peaks = _peaks(light, psf, threshold, step)
+    u, v, ratio = peaks
+    order = np.argsort(-ratio, kind="stable")[:MAX_POINTS]
+    u, v, ratio = u[order], v[order], ratio[order]
+    weight = max(psf, 1.0)
+    shapes = _moments(light, u, v, weight)
+    sigma = np.maximum(1.2 * psf / np.maximum(ratio, 1.0), _LEAST_SIGMA_PX)
+    offset = 0.5 * (binning - 1)
+    return PointSources(
+        u_px=read_only(shapes.u_px * binning + offset),
+        v_px=read_only(shapes.v_px * binning + offset),
+        sigma_px=read_only(sigma * binning),
+        signal_ratio=read_only(ratio),
+        flux_counts=read_only(shapes.weighted * (1.0 + (psf / weight) ** 2) * binning**2),
+        psf_sigma_px=psf * binning,
+        noise_counts=max(float(background.globalrms), step / math.sqrt(12.0)),
+        background_counts=float(background.globalback),
+        clipped_share=float((counts <= np.nanmin(counts)).mean()),
+        light=light,
+        binning=binning,
+        width_px=width,
+        height_px=height,
+    )
+
+
+@dataclass(frozen=True)
+class _Shapes:
+    """Of every image its place, width, lack of roundness (0 to 1), and light under the weight."""
+
+    u_px: Vector
+    v_px: Vector
+    sigma_px: Vector
+    ellipticity: Vector
+    weighted: Vector
+
+
+def _binned(counts: Counts, binning: int) -> Counts:
+    """The means of blocks; an incomplete one at the edge is left out."""
+    if binning == 1:
+        return np.array(counts, dtype=np.float32)
+    rows, columns = (side // binning for side in counts.shape)
+    blocks = counts[: rows * binning, : columns * binning]
+    shape = (rows, binning, columns, binning)
+    return np.asarray(blocks.reshape(shape).mean(axis=(1, 3)), dtype=np.float32)
+
+
+def _filled(counts: Counts) -> Counts:
+    """Pixels without a number at the median of the others."""
+    unknown = ~np.isfinite(counts)
+    if unknown.any():
+        counts[unknown] = np.median(counts[~unknown]) if not unknown.all() else 0.0
+    return counts
+
+
+def _measured_psf(
+    light: Counts, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64], ratio: Vector
+) -> float:
+    """One standard deviation of a star's image: the median of clear, round, whole ones."""
+    order = np.argsort(-ratio)[:60]
+    u, v, ratio = u[order], v[order], ratio[order]
+    shapes = _moments(light, u, v, GUESSED_PSF_PX)
+    round_ = (shapes.ellipticity < 0.3) & (shapes.sigma_px < MOST_PSF_PX)
+    whole = light[v, u] < FULL_SHARE * light.max(initial=0.0)
+    clear = ratio > FIRST_THRESHOLD + 1.0
+    for good in (round_ & whole & (ratio > 10.0), round_ & whole & clear, round_ & clear):
+        if np.count_nonzero(good) >= 3:
+            width = float(np.median(shapes.sigma_px[good]))
+            return min(max(width, LEAST_PSF_PX), MOST_PSF_PX)
+    return GUESSED_PSF_PX
+
+
+def _peaks(
+    light: Counts, psf: float, threshold: float, step: float
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Vector]:
+    """Columns and rows of local maxima behind the filter, and their signal to noise."""
+    filtered = gaussian_filter(light, psf, truncate=3.0)
+    filtered -= gaussian_filter(light, SURROUND * psf, truncate=2.0)
+    noise = sep.Background(filtered, bw=MESH_PX, bh=MESH_PX).rms(dtype=np.float32)
+    # Rounding alone makes this much noise, however flat the counts look.
+    noise = np.maximum(noise, 0.7 * step / (2.0 * math.sqrt(math.pi) * psf))
+    edge = int(2.0 * psf) + 1
+    inner = filtered[edge:-edge, edge:-edge] > threshold * noise[edge:-edge, edge:-edge]
+    v, u = (place + edge for place in np.nonzero(inner))
+    # Only few pixels are that bright: each is compared with those about it.
+    value, highest = filtered[v, u], np.ones(len(u), dtype=bool)
+    reach = min(math.ceil(1.5 * psf), edge)
+    for down in range(-reach, reach + 1):
+        for across in range(-reach, reach + 1):
+            highest &= value >= filtered[v + down, u + across]
+    u, v = u[highest], v[highest]
+    return u, v, np.asarray(filtered[v, u] / noise[v, u], dtype=np.float64)
+
+
+def _moments(
+    light: Counts, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64], weight_px: float
+) -> _Shapes:
+    """Centroids and second moments under a Gaussian weight that follows each image."""
+    half = max(3, math.ceil(3.0 * weight_px))
+    steps = np.arange(-half, half + 1)
+    rows = np.clip(v[:, None] + steps, 0, light.shape[0] - 1)
+    columns = np.clip(u[:, None] + steps, 0, light.shape[1] - 1)
+    window = light[rows[:, :, None], columns[:, None, :]].astype(np.float64)
+    x, y = np.zeros(len(u)), np.zeros(len(u))
+    reach = 1.5 * weight_px
+    for _ in range(_CENTROID_ROUNDS):
+        along_u, along_v = steps - x[:, None], steps - y[:, None]
+        weight_u = np.exp(-0.5 * (along_u / weight_px) ** 2)
+        weight_v = np.exp(-0.5 * (along_v / weight_px) ** 2)
+        weighted = window * weight_v[:, :, None] * weight_u[:, None, :]
+        total = weighted.sum(axis=(1, 2))
+        safe = np.where(total > 0.0, total, np.inf)
+        over_v, over_u = weighted.sum(axis=2), weighted.sum(axis=1)
+        mean_u = (over_u * along_u).sum(axis=1) / safe
+        mean_v = (over_v * along_v).sum(axis=1) / safe
+        # The weight holds a centroid back: by a half where it is as wide as the image.
+        x = np.clip(x + 1.5 * mean_u, -reach, reach)
+        y = np.clip(y + 1.5 * mean_v, -reach, reach)
+    uu = (over_u * along_u**2).sum(axis=1) / safe - mean_u**2
+    vv = (over_v * along_v**2).sum(axis=1) / safe - mean_v**2
+    both = weighted * along_v[:, :, None] * along_u[:, None, :]
+    uv = both.sum(axis=(1, 2)) / safe - mean_u * mean_v
+    size = np.maximum(0.5 * (uu + vv), 0.04)
+    # What the weight took from the width.
+    sigma = np.sqrt(1.0 / np.clip(1.0 / size - 1.0 / weight_px**2, 0.01, 25.0))
+    stretch = np.hypot(uu - vv, 2.0 * uv) / (2.0 * size)
+    return _Shapes(u + x, v + y, sigma, stretch, np.maximum(total, 0.0))

@@ -1,0 +1,1 @@
+"""Frames from image files: FITS, TIFF, PNG, JPEG, BMP and numpy arrays."""

@@ -1,0 +1,73 @@
+"""Frames from files: FITS, TIFF, PNG, JPEG, BMP and numpy arrays, told apart by how they begin.
+
+A file is not to be believed.  Its size in pixels is read from its header and held
+against the limits before anything is decoded; what is read is bounded by that size
+and by the file's own length.  Whatever is wrong raises `BadFile` with the reason.
+"""
+
+import hashlib
+from collections.abc import Callable, Mapping
+from typing import IO
+
+from service.imaging.frames.frame import Frame, FrameLimits, refused
+
+Reader = Callable[[IO[bytes], FrameLimits, str], Frame]
+
+FORMATS = "FITS, TIFF, PNG, JPEG, BMP or a numpy array (.npy)"
+_LONGEST_MAGIC = 16
+
+
+def read_frame(file: IO[bytes], limits: FrameLimits, digest: str | None = None) -> Frame:
+    """The frame in a file that can be read from any place of it; `digest` where it is known.
+
+    Raises `BadFile` for what is no frame, or none that the limits allow.
+    """
+    digest = digest or digest_of(file)
+    file.seek(0)
+    start = file.read(_LONGEST_MAGIC)
+    if not start:
+        raise refused("is empty; it must hold a file: " + FORMATS)
+    for magics, reader in _READERS.items():
+        if start.startswith(magics):
+            file.seek(0)
+            return reader(file, limits, digest)
+    if start.startswith((b"II+\0", b"MM\0+")):
+        raise refused("is a BigTIFF file; a frame fits an ordinary one")
+    raise refused(f"is not {FORMATS}", f"its first bytes are {start[:8].hex(' ')}")
+
+
+def digest_of(file: IO[bytes]) -> str:
+    """`sha256:` of all that is in a file."""
+    file.seek(0)
+    return "sha256:" + hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
+
+
+def _fits(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
+    from service.imaging.frames.fits import read_fits
+
+    return read_fits(file, limits, digest)
+
+
+def _pictures(file_format: str) -> Reader:
+    def read(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
+        from service.imaging.frames.pictures import read_picture
+
+        return read_picture(file, file_format, limits, digest)
+
+    return read
+
+
+def _npy(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
+    from service.imaging.frames.arrays import read_npy
+
+    return read_npy(file, limits, digest)
+
+
+_READERS: Mapping[tuple[bytes, ...], Reader] = {
+    (b"SIMPLE  =",): _fits,
+    (b"II*\0", b"MM\0*"): _pictures("TIFF"),
+    (b"\x89PNG\r\n\x1a\n",): _pictures("PNG"),
+    (b"\xff\xd8\xff",): _pictures("JPEG"),
+    (b"BM",): _pictures("BMP"),
+    (b"\x93NUMPY",): _npy,
+}

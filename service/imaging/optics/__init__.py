@@ -1,0 +1,1 @@
+"""Images of a point source through an aperture."""

@@ -1,0 +1,1 @@
+"""From submissions to recorded answers: single posts, bulk, replays, reprocessing."""

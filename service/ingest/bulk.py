@@ -1,0 +1,195 @@
+"""Many batches at once, from lines of telemetry to stored answers.
+
+Workers compute, where there are some; else this process does, a line whenever
+nobody waits who posts one by one.  The database is this process's own.
+"""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, wait
+from functools import cached_property
+
+from service.errors import AcquisitionError, Busy
+from service.ingest.local_workers import ChunkEndsWorkers, LocalWorkers, WorkerConfig, WorkerLost
+from service.ingest.solver_pool import Solver
+from service.ingest.submit import Answers, SubmissionService
+from service.ingest.telemetry_lines import Found, Lines, Refused, Seen, found_in, named_in
+from service.observations.schema import Submission, submission_from_json
+from service.storage.recording.identity import Registry, look_up, stored_answers
+from service.storage.recording.unsaved_result import Answered, Draft
+from service.storage.sql.database import Store
+
+AHEAD = 2
+"""Chunks a worker that it has, or that wait for it."""
+
+Check = Callable[[str], None]
+"""Raises an `AcquisitionError` where batches of a spacecraft are not to be taken."""
+
+Require = Callable[[], object]
+"""Raises an `AcquisitionError` where no more is to be computed."""
+
+
+def work(solver: Solver, lines: Lines) -> list[Found]:
+    """What a worker makes of some lines."""
+    return found_in(lines, lambda fresh: [solver.solve_one_of_many(each) for each in fresh])
+
+
+INTERACTIVE_WINDOW_S = 0.5
+"""After a single batch bulk gives way for so long: another may follow."""
+LINES, FEW_LINES = 64, 8
+"""Of a chunk: the more, the less each costs; but a single post waits for one chunk at most."""
+
+
+class Bulk:
+    """Takes chunks of lines in, by the submission service and by workers of its own."""
+
+    def __init__(
+        self, submissions: SubmissionService, store: Store, config: WorkerConfig, workers: int
+    ) -> None:
+        self._submissions = submissions
+        self._store = store
+        self.workers: LocalWorkers[Lines, Found] = LocalWorkers(config, work, workers)
+
+    def close(self) -> None:
+        """End the workers; what they were at comes to nothing."""
+        self.workers.close()
+
+    @property
+    def ahead(self) -> int:
+        """How many chunks should be begun before the first of them is recorded.
+
+        While batches come one by one as well, a worker less is given to do, so that
+        theirs find a processor free.
+        """
+        up = self.workers.up
+        return up - 2 if up > 1 and self._gives_way else AHEAD * up
+
+    @property
+    def lines(self) -> int:
+        """How many lines a chunk should have."""
+        return FEW_LINES if self._gives_way else LINES
+
+    @property
+    def _gives_way(self) -> bool:
+        """Whether batches come one by one as well."""
+        return self._submissions.idle_s < INTERACTIVE_WINDOW_S
+
+    def begin(
+        self, texts: Sequence[bytes], run: str, check: Check, require: Require = lambda: None
+    ) -> "Chunk":
+        """Let a chunk be computed; raises `Busy` where the time has not come.
+
+        `require` is called before each batch that this process computes itself, and
+        ends that where it raises.
+        """
+        self.workers.start()
+        self._submissions.yield_to_interactive()
+        named = [named_in(text, run) for text in texts]
+        with self._store.reading() as connection:
+            registry = look_up(connection, {each for each in named if each is not None})
+            ids = {each.result_id for each in registry.identities.values()}
+            stored = stored_answers(connection, ids)
+        known = frozenset(k for k, each in enumerate(named) if each in registry.identities)
+        return Chunk(self, Lines(run, texts, known), check, require, registry, stored)
+
+    def compute(self, lines: Lines, require: Require) -> "Future[list[Found]]":
+        """What the lines come to, as soon as a worker has found it out, or at once."""
+        if self.workers.up:
+            return self.workers.submit(lines)
+        done: Future[list[Found]] = Future()
+        done.set_result(self.compute_here(lines, require))
+        return done
+
+    def compute_here(self, lines: Lines, require: Require) -> list[Found]:
+        """The same in this process, which nobody who posts one by one shall feel."""
+
+        def drafts(fresh: Sequence[Submission]) -> list[Draft | AcquisitionError]:
+            made = []
+            for each in fresh:
+                require()
+                made.append(self.draft_here(each))
+            return made
+
+        return found_in(lines, drafts)
+
+    def draft_here(self, submission: Submission) -> Draft | AcquisitionError:
+        """One of them, when nobody waits."""
+        return self._submissions.solve_one_of_many(submission)
+
+    def begin_writing(self, drafts: Sequence[Draft]) -> Callable[[], Answers]:
+        """Queue drafts for a transaction of their own; to call what it gives waits for that."""
+        return self._submissions.begin_writing(drafts)
+
+
+class Chunk:
+    """A chunk on its way: computed first, then recorded."""
+
+    def __init__(
+        self,
+        bulk: Bulk,
+        lines: Lines,
+        check: Check,
+        require: Require,
+        registry: Registry,
+        stored: dict[str, bytes],
+    ) -> None:
+        self._bulk, self._lines, self._check = bulk, lines, check
+        self._require = require
+        self._registry, self._stored = registry, stored
+        self._computed = bulk.compute(lines, require)
+
+    def is_computed(self, within_s: float) -> bool:
+        """Whether it is computed, or comes to be within so many seconds."""
+        return bool(wait([self._computed], within_s).done)
+
+    def hand_on(self) -> None:
+        """Queue what was computed for the writer; raises `Busy` where it must be called again."""
+        drafts = [each for each in self._decided if isinstance(each, Draft)]
+        self._finish = self._bulk.begin_writing(drafts)
+
+    def give_up(self) -> None:
+        """Let it not be computed, where that has not begun."""
+        self._computed.cancel()
+
+    def answers(self) -> Answers:
+        """The answer to each line, or what is wrong with it, when all is recorded."""
+        written = iter(self._finish())
+        return [next(written) if isinstance(each, Draft) else each for each in self._decided]
+
+    @cached_property
+    def _decided(self) -> list[Draft | Answered | AcquisitionError]:
+        try:
+            found = self._computed.result()
+        except ChunkEndsWorkers as error:
+            # Computed here it might end this process as well.
+            names = named_in(self._lines.texts[0], self._lines.run)
+            refusal = AcquisitionError(f"computing the lines from {names} on failed: {error}")
+            return [refusal] * len(self._lines.texts)
+        except WorkerLost:
+            found = self._bulk.compute_here(self._lines, self._require)
+        return [
+            self._decision(text, each) for text, each in zip(self._lines.texts, found, strict=True)
+        ]
+
+    def _decision(self, text: bytes, found: Found) -> Draft | Answered | AcquisitionError:
+        try:
+            if isinstance(found, Refused):
+                if found.spacecraft is not None:
+                    self._check(found.spacecraft)
+                return found.error
+            if isinstance(found, Draft):
+                self._check(found.identity[0])
+                return found
+            self._check(found.identity[0])
+            return self._repeat(text, found)
+        except Busy:
+            # Says nothing about the line.
+            raise
+        except AcquisitionError as error:
+            return error
+
+    def _repeat(self, text: bytes, seen: Seen) -> Draft | Answered | AcquisitionError:
+        first = self._registry.first(seen.identity, None, seen.fingerprint)
+        if first is None:
+            # It is not called what it seemed to be called.
+            return self._bulk.draft_here(submission_from_json(text, run=self._lines.run))
+        return Answered(first.result_id, self._stored[first.result_id], replayed=True)

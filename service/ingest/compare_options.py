@@ -1,0 +1,172 @@
+"""Two sets of options over the same recorded batches, side by side; nothing is kept.
+
+Both sides run anew what was sent, so that they differ in their options alone
+and not in when they were recorded.  A star's outcome is compared with the same
+star's on the other side.
+"""
+
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from statistics import fmean, median
+
+from service.acquire import Acquisition
+from service.alarms.quantities import QUANTITIES
+from service.observations.batch import ObservationBatch
+from service.storage.recording.answer import StarRow, star_rows
+from service.storage.recording.result_metrics import metrics_of
+from service.storage.recording.unsaved_result import Row
+from service.vectors import attitude_error_arcsec, matrix_from_quaternion
+
+MAX_SHOWN = 100
+"""Batches that are shown star by star; the others are counted."""
+
+RunAgain = Callable[[ObservationBatch], Acquisition]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One recorded batch with the options of either side in place of its own."""
+
+    id: str
+    a: ObservationBatch
+    b: ObservationBatch
+
+
+@dataclass
+class _Side:
+    """Results of all batches with one set of options."""
+
+    counts: "Counter[str]" = field(default_factory=Counter)
+    ratios: list[float] = field(default_factory=list)
+    work_us: list[int] = field(default_factory=list)
+
+    def add(self, acquisition: Acquisition) -> None:
+        solution = acquisition.solution
+        self.counts.update(acquisition.counts)
+        self.counts["solved"] += solution is not None
+        self.counts["suspect"] += solution is not None and solution.suspect
+        ratio = QUANTITIES["residual_ratio"].value_of(metrics_of(acquisition))
+        if ratio is not None:
+            self.ratios.append(ratio)
+        self.work_us.append(sum(acquisition.timings_us.values()))
+
+    def row(self, options: Row) -> Row:
+        names = ("observed", "unique", "ambiguous", "unmatched", "solved", "suspect")
+        return {
+            "options": options,
+            **{name: int(self.counts[name]) for name in names},
+            "residual_ratio_mean": fmean(self.ratios) if self.ratios else None,
+            "us_per_batch": median(self.work_us) if self.work_us else None,
+        }
+
+
+@dataclass
+class Comparison:
+    """Both sides so far, star by star."""
+
+    a: _Side = field(default_factory=_Side)
+    b: _Side = field(default_factory=_Side)
+    compared: int = 0
+    transitions: "Counter[tuple[str, str]]" = field(default_factory=Counter)
+    renamed: int = 0
+    attitudes: "Counter[str]" = field(default_factory=Counter)
+    angles_arcsec: list[float] = field(default_factory=list)
+    changed: list[Row] = field(default_factory=list)
+    changed_batches: int = 0
+
+    def add(self, pair: Pair, a: Acquisition, b: Acquisition) -> None:
+        """Take one batch's two results."""
+        self.compared += 1
+        self.a.add(a)
+        self.b.add(b)
+        angle_arcsec = _angle_arcsec(a, b)
+        has = a.solution is not None, b.solution is not None
+        self.attitudes[_WHICH[has]] += 1
+        if angle_arcsec is not None:
+            self.angles_arcsec.append(angle_arcsec)
+        stars = [(one, other) for one, other in zip(star_rows(a), star_rows(b), strict=True)]
+        self.transitions.update((one.outcome, other.outcome) for one, other in stars)
+        differing = [each for each in stars if _named(each[0]) != _named(each[1])]
+        self.renamed += sum(one.outcome == other.outcome == "unique" for one, other in differing)
+        if differing or has[0] != has[1]:
+            self.changed_batches += 1
+            if len(self.changed) < MAX_SHOWN:
+                self.changed.append(_changed(pair, a, b, differing, angle_arcsec))
+
+    def row(self, a: Row, b: Row) -> Row:
+        """The whole comparison as the interface shows it."""
+        angles = self.angles_arcsec
+        return {
+            "compared": self.compared,
+            "a": self.a.row(a),
+            "b": self.b.row(b),
+            "transitions": [
+                {"from": one, "to": other, "stars": stars}
+                for (one, other), stars in sorted(self.transitions.items())
+            ],
+            "renamed": self.renamed,
+            "attitudes": {
+                **{name: self.attitudes[name] for name in _WHICH.values()},
+                "angle_arcsec_median": median(angles) if angles else None,
+                "angle_arcsec_max": max(angles) if angles else None,
+            },
+            "changed_batches": self.changed_batches,
+            "changed": sorted(self.changed, key=lambda each: str(each["time"])),
+        }
+
+
+_WHICH = {
+    (True, True): "both",
+    (True, False): "only_a",
+    (False, True): "only_b",
+    (False, False): "neither",
+}
+
+
+def compare(pairs: Sequence[Pair], run_again: RunAgain, limit_s: float) -> tuple[Comparison, bool]:
+    """Run both sides of each batch; whether `limit_s` seconds cut it short."""
+    found, end_s = Comparison(), time.monotonic() + limit_s
+    for pair in pairs:
+        if time.monotonic() > end_s:
+            return found, True
+        found.add(pair, run_again(pair.a), run_again(pair.b))
+    return found, False
+
+
+def _changed(
+    pair: Pair,
+    a: Acquisition,
+    b: Acquisition,
+    differing: Sequence[tuple[StarRow, StarRow]],
+    angle_arcsec: float | None,
+) -> Row:
+    return {
+        "id": pair.id,
+        "batch": pair.a.batch,
+        "time": pair.a.time.text,
+        "a": a.counts,
+        "b": b.counts,
+        "attitude_angle_arcsec": angle_arcsec,
+        "stars": [
+            {"tracker": one.tracker, "position": one.position, "a": _star(one), "b": _star(other)}
+            for one, other in differing
+        ],
+    }
+
+
+def _star(star: StarRow) -> Row:
+    return {"outcome": star.outcome, "star": star.star_id}
+
+
+def _named(star: StarRow) -> tuple[str, str | None]:
+    return star.outcome, star.star_id
+
+
+def _angle_arcsec(a: Acquisition, b: Acquisition) -> float | None:
+    if a.solution is None or b.solution is None:
+        return None
+    one, other = (matrix_from_quaternion(each.quaternion) for each in (a.solution, b.solution))
+    return math.hypot(*attitude_error_arcsec(one, other).tolist())

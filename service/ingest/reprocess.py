@@ -1,0 +1,249 @@
+"""Recorded batches run again into a named run: over all cores, and resumable.
+
+Workers compute; this process alone reads and writes, since SQLite has one
+writer.  What the run holds already is left out of the reading, so that a
+reprocessing that was stopped, however hard, goes on where it was.
+"""
+
+import json
+import os
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+from sqlalchemy import ColumnElement, and_, exists, func, select
+
+from service.errors import AcquisitionError, BadBatch, Busy, Fault, shown_value
+from service.ingest.local_workers import ChunkEndsWorkers, LocalWorkers, WorkerConfig, WorkerLost
+from service.ingest.solver_pool import Solver
+from service.missions.mission import Mission
+from service.observations.schema import BatchIn, OptionsIn, submission_from_model
+from service.storage.queries.pages import PLACE, ResultFilter
+from service.storage.recording.unsaved_result import Answered, Draft
+from service.storage.sql.database import Store
+from service.storage.sql.tables import batches, results
+
+CHUNK = 100
+"""Batches that a worker takes, and that a transaction records."""
+AHEAD = 2
+"""Chunks a worker that wait for it, or for being written."""
+REFUSALS_KEPT = 20
+
+Stored = tuple[str, str]
+"""A batch's input and the options of its result, as the JSON texts that are kept."""
+
+
+@dataclass
+class Progress:
+    """How far a reprocessing is: `total` are the batches of the stretch, `before` those done."""
+
+    run: str
+    total: int
+    before: int
+    recorded: int = 0
+    refused: int = 0
+    refusals: list[str] = field(default_factory=list)
+    """The first of them, each naming its batch."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to run again: the stretch, the run that takes it, and with which settings."""
+
+    stretch: ResultFilter
+    run: str
+    missions: Mapping[str, Mission]
+    catalog: Path | None
+    shelf_bytes: int
+    processes: int = 0
+    """How many workers; 0: one a core, 1: none but this process."""
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A batch that the settings cannot take, and why."""
+
+    batch: str
+    why: str
+
+
+def reprocess(
+    store: Store, plan: Plan, catalog_digest: str, step: Callable[[Progress], object]
+) -> Progress:
+    """Run every batch of the plan's stretch that its run does not hold yet.
+
+    `step` is called at the start and after each transaction.  Raises `BadBatch`
+    for a run that is the source itself, or holds results of other settings.
+    """
+    _require_same_settings(store, plan, catalog_digest)
+    progress = _counted(store, plan)
+    step(progress)
+    with closing(_ChunkSolver(plan, catalog_digest)) as solver:
+        waiting: deque[Callable[[], list[Draft | Refused]]] = deque()
+        most = AHEAD * solver.count
+        for chunk in _chunks(store, plan):
+            waiting.append(solver.take(chunk))
+            if len(waiting) >= most:
+                _record(store, waiting.popleft()(), progress)
+                step(progress)
+        while waiting:
+            _record(store, waiting.popleft()(), progress)
+            step(progress)
+    return progress
+
+
+def require_other_run(run: str, source: str | None) -> None:
+    """Raise `BadBatch` for a run that is the source itself."""
+    if run == source:
+        message = "must be another run than the one whose batches are run again"
+        raise BadBatch(Fault("run", message, shown_value(run)))
+
+
+def _require_same_settings(store: Store, plan: Plan, catalog_digest: str) -> None:
+    require_other_run(plan.run, plan.stretch.run)
+    made_with = select(
+        results.c.spacecraft, results.c.mission_digest, results.c.catalog_digest
+    ).where(results.c.run == plan.run, results.c.current)
+    with store.reading() as connection:
+        for spacecraft, mission, catalog in connection.execute(made_with.distinct()):
+            if spacecraft not in plan.missions:
+                continue
+            if (mission, catalog) != (plan.missions[spacecraft].digest, catalog_digest):
+                what = "mission" if catalog == catalog_digest else "catalog"
+                message = f"holds results of {spacecraft} with another {what}: name another run"
+                raise BadBatch(Fault("run", message, shown_value(plan.run)))
+
+
+def _conditions(plan: Plan) -> list[ColumnElement[bool]]:
+    return [*plan.stretch.conditions(), results.c.spacecraft.in_(sorted(plan.missions))]
+
+
+def _not_yet(plan: Plan) -> ColumnElement[bool]:
+    """Whether a batch is not in the plan's run, as SQL beside `batches`."""
+    done = batches.alias("done")
+    return ~exists().where(
+        and_(
+            done.c.spacecraft == batches.c.spacecraft,
+            done.c.run == plan.run,
+            done.c.batch == batches.c.batch,
+        )
+    )
+
+
+def _counted(store: Store, plan: Plan) -> Progress:
+    joined = (
+        select(func.count()).select_from(results).join(batches, results.c.batch_id == batches.c.id)
+    )
+    with store.reading() as connection:
+        total = connection.scalar(joined.where(*_conditions(plan))) or 0
+        left = connection.scalar(joined.where(*_conditions(plan), _not_yet(plan))) or 0
+    return Progress(plan.run, int(total), int(total) - int(left))
+
+
+def _chunks(store: Store, plan: Plan) -> Iterator[list[Stored]]:
+    """What is still to be done, in order of time; no moment of the database is held on to."""
+    place: tuple[int, str] | None = None
+    query = (
+        select(*PLACE, batches.c.input, results.c.options)
+        .join_from(results, batches, results.c.batch_id == batches.c.id)
+        .where(*_conditions(plan), _not_yet(plan))
+        .order_by(*PLACE)
+        .limit(CHUNK)
+    )
+    while True:
+        beyond = query if place is None else query.where(_after(place))
+        with store.reading() as connection:
+            rows = connection.execute(beyond).all()
+        if not rows:
+            return
+        place = rows[-1][0], rows[-1][1]
+        yield [(row[2], row[3]) for row in rows]
+
+
+def _after(place: tuple[int, str]) -> ColumnElement[bool]:
+    time_ns, batch_id = PLACE
+    return (time_ns > place[0]) | and_(time_ns == place[0], batch_id > place[1])
+
+
+def _record(store: Store, found: Sequence[Draft | Refused], progress: Progress) -> None:
+    drafts = [each for each in found if isinstance(each, Draft)]
+    refused = [each for each in found if isinstance(each, Refused)]
+    outcomes = store.writer.record(drafts).result() if drafts else []
+    for draft, outcome in zip(drafts, outcomes, strict=True):
+        if isinstance(outcome, Answered):
+            progress.recorded += 1
+        elif isinstance(outcome, AcquisitionError) and not isinstance(outcome, Busy):
+            refused.append(Refused(draft.identity[2], str(outcome)))
+        else:
+            # Trouble of the database: nothing was decided about any of them.
+            raise outcome
+    progress.refused += len(refused)
+    room = REFUSALS_KEPT - len(progress.refusals)
+    progress.refusals += [f"{each.batch}: {each.why}" for each in refused[:room]]
+
+
+# ---- workers -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What a worker takes: stored batches, and the run that they go to."""
+
+    run: str
+    stored: Sequence[Stored]
+
+
+def work(solver: Solver, part: _Part) -> list[Draft | Refused]:
+    """The drafts of stored batches in a run, with what cannot be taken."""
+    return [_again(solver, part.run, *each) for each in part.stored]
+
+
+def _again(solver: Solver, run: str, input: str, options: str) -> Draft | Refused:
+    model = BatchIn.model_validate_json(input).model_copy(
+        update={"run": run, "options": OptionsIn.model_validate(json.loads(options))}
+    )
+    try:
+        return solver.solve(submission_from_model(model))
+    except AcquisitionError as error:
+        return Refused(model.batch, str(error))
+
+
+class _ChunkSolver:
+    """Computes in workers, or where only one is wanted or they are lost, in this process."""
+
+    def __init__(self, plan: Plan, catalog_digest: str) -> None:
+        self._run = plan.run
+        self._config = WorkerConfig(plan.missions, plan.catalog, catalog_digest, plan.shelf_bytes)
+        self.count = plan.processes or os.cpu_count() or 1
+        self._workers = LocalWorkers[_Part, Draft | Refused](self._config, work, self.count)
+        if self.count > 1:
+            self._workers.start()
+
+    @cached_property
+    def _solver(self) -> Solver:
+        return self._config.solver()
+
+    def take(self, stored: Sequence[Stored]) -> Callable[[], list[Draft | Refused]]:
+        """Begin with some batches; to call what it gives waits for what comes of them."""
+        part = _Part(self._run, stored)
+        if self.count == 1:
+            return lambda: work(self._solver, part)
+        future = self._workers.submit(part)
+
+        def found() -> list[Draft | Refused]:
+            try:
+                return future.result()
+            except ChunkEndsWorkers as error:
+                batches = [json.loads(input)["batch"] for input, _ in stored]
+                return [Refused(batch, str(error)) for batch in batches]
+            except WorkerLost:
+                return work(self._solver, part)
+
+        return found
+
+    def close(self) -> None:
+        """End the workers."""
+        self._workers.close()

@@ -1,0 +1,214 @@
+"""Computing batches, and the threads that do it: kernels release the interpreter's lock."""
+
+import logging
+import os
+import threading
+import time
+from collections import OrderedDict, deque
+from collections.abc import Callable, Hashable, Mapping
+from concurrent.futures import Future
+from typing import NamedTuple, TypeVar
+
+from service.acquire import Acquisition, acquire
+from service.errors import (
+    AcquisitionError,
+    BadBatch,
+    Busy,
+    Fault,
+    NotFound,
+    Stopping,
+    shown_value,
+)
+from service.missions.mission import Mission, mission_named
+from service.observations.batch import ObservationBatch
+from service.observations.schema import Submission
+from service.sky.model import SkyModel
+from service.storage.recording.identity import OwnKey, identity_of
+from service.storage.recording.ids import Ulids
+from service.storage.recording.unsaved_result import Draft, submission_draft
+from service.storage.sql.writer import RETRY_AFTER_S
+from service.times import Utc, utc_now
+
+WAIT_S = 5.0
+"""The longest that a task waits for a thread.  A batch takes a millisecond."""
+LONG_STARS, LONG_SIGMA_ARCSEC = 60, 60.0
+"""A batch of more stars, or with less accurate ones, may take seconds."""
+
+log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+
+class Solver:
+    """Computes batches with the missions and the sky of the service, in any thread."""
+
+    def __init__(self, missions: Mapping[str, Mission], sky: SkyModel) -> None:
+        self.missions = missions
+        self.sky = sky
+        self.ids = Ulids()
+
+    def acquire(self, batch: ObservationBatch, mission: Mission | None = None) -> Acquisition:
+        """The acquisition of a batch, with other settings than its mission's where given."""
+        mission = mission or mission_in_input(self.missions, batch.spacecraft)
+        return acquire(batch, mission, self.sky)
+
+    def solve(
+        self, submission: Submission, received: Utc | None = None, key: OwnKey | None = None
+    ) -> Draft:
+        """The result of a submission; raises `BadBatch` for what does not fit its mission."""
+        received = received or utc_now()
+        acquisition = self.acquire(submission.batch)
+        return submission_draft(
+            submission, acquisition, id=self.ids.new(), received=received, key=key
+        )
+
+    def solve_one_of_many(self, submission: Submission) -> Draft | AcquisitionError:
+        """The result of a submission, or what is wrong with that one alone."""
+        try:
+            return self.solve(submission)
+        except Busy:
+            # Nothing is decided about the batch: the whole chunk may come again.
+            raise
+        except AcquisitionError as error:
+            return error
+        except Exception:
+            # A fault of the service in one batch does not keep the others from being recorded.
+            identity = identity_of(submission.batch)
+            run = {"run": submission.batch.run}
+            log.exception("%s, run %s, batch %s failed", *identity, extra=run)
+            return AcquisitionError("the fault is on the service's side; it is logged")
+
+
+def mission_in_input(missions: Mapping[str, Mission], name: str) -> Mission:
+    """The mission that an input names; raises `BadBatch` naming the field where there is none."""
+    try:
+        return mission_named(missions, name)
+    except NotFound:
+        there_are = f"there is no such spacecraft; there are {', '.join(sorted(missions))}"
+        raise BadBatch(Fault("spacecraft", there_are, shown_value(name))) from None
+
+
+def may_take_long(batch: ObservationBatch) -> bool:
+    """Whether a batch may take seconds rather than a millisecond, as far as its form tells."""
+    return (
+        batch.a_priori is None
+        or bool(batch.options.tolerances)
+        or batch.options.identifier in ("lost_in_space", "ptp")
+        or sum(each.count for each in batch.observations) > LONG_STARS
+        # NaN, where a star has the mission's sigma, is not greater.
+        or any((each.sigma_arcsec > LONG_SIGMA_ARCSEC).any() for each in batch.observations)
+    )
+
+
+class Task(NamedTuple):
+    """Work for a thread, and what is called in its place where it is not begun in time."""
+
+    work: Callable[[], object]
+    refuse: Callable[[Exception], object]
+    give_up_s: float
+    """On the clock of `time.monotonic`."""
+
+
+class TurnQueue:
+    """Tasks in turns: one of each client and spacecraft that has some, then the next."""
+
+    def __init__(self) -> None:
+        self._tasks: OrderedDict[Hashable, deque[Task]] = OrderedDict()
+
+    def __bool__(self) -> bool:
+        return bool(self._tasks)
+
+    def put(self, turn: Hashable, task: Task) -> None:
+        """Add a task to those of a turn."""
+        self._tasks.setdefault(turn, deque()).append(task)
+
+    def get(self) -> Task:
+        """The next task; its turn comes again after all others."""
+        turn, tasks = self._tasks.popitem(last=False)
+        task = tasks.popleft()
+        if tasks:
+            self._tasks[turn] = tasks
+        return task
+
+
+class SolverPool:
+    """Threads that compute; long tasks leave one of them to short ones."""
+
+    def __init__(self, threads: int | None = None) -> None:
+        """At least two threads, by default one for each processor."""
+        count = max(2, threads or os.cpu_count() or 1)
+        self._short, self._long = TurnQueue(), TurnQueue()
+        self._long_slots = count - 1
+        self._changed = threading.Condition()
+        self._closing = False
+        self._threads = [
+            threading.Thread(target=self._run, name=f"solver-{number}", daemon=True)
+            for number in range(count)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def put(self, task: Task, turn: Hashable, *, is_long: bool) -> None:
+        """Queue a task; raises `Stopping` after `close`."""
+        with self._changed:
+            if self._closing:
+                raise Stopping("the service is stopping")
+            (self._long if is_long else self._short).put(turn, task)
+            self._changed.notify()
+
+    def call(
+        self, work: Callable[[], T], turn: Hashable, *, is_long: bool, wait_s: float | None = None
+    ) -> T:
+        """Have work done by a thread and wait for what it returns or raises."""
+        done: Future[T] = Future()
+
+        def run() -> None:
+            try:
+                done.set_result(work())
+            except BaseException as error:
+                done.set_exception(error)
+
+        give_up_s = time.monotonic() + (WAIT_S if wait_s is None else wait_s)
+        self.put(Task(run, done.set_exception, give_up_s), turn, is_long=is_long)
+        return done.result()
+
+    def close(self) -> None:
+        """Finish short tasks and those that have begun, refuse the others, end the threads."""
+        with self._changed:
+            self._closing = True
+            refused = []
+            while self._long:
+                refused.append(self._long.get())
+            self._changed.notify_all()
+        for task in refused:
+            task.refuse(Stopping("the service is stopping"))
+        for thread in self._threads:
+            thread.join()
+
+    def _run(self) -> None:
+        while (taken := self._next()) is not None:
+            task, is_long = taken
+            try:
+                if time.monotonic() > task.give_up_s:
+                    task.refuse(Busy("every processor is at work on other batches", RETRY_AFTER_S))
+                else:
+                    task.work()
+            except Exception:
+                log.exception("a task failed")
+            finally:
+                if is_long:
+                    with self._changed:
+                        self._long_slots += 1
+
+    def _next(self) -> tuple[Task, bool] | None:
+        """The next task and whether it is long; None when there will be none."""
+        with self._changed:
+            while True:
+                if self._short:
+                    return self._short.get(), False
+                if self._long and self._long_slots:
+                    self._long_slots -= 1
+                    return self._long.get(), True
+                if self._closing:
+                    return None
+                self._changed.wait()

@@ -1,0 +1,389 @@
+"""From a submission to its stored answer: compute first, then one transaction, then answer."""
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
+from typing import TypeVar
+
+import msgspec
+from msgspec import Struct
+from sqlalchemy import Connection
+
+from service.access.audit import Entry
+from service.access.tokens import Caller, own_key
+from service.acquire import Acquisition
+from service.errors import AcquisitionError, BadBatch, Busy, Fault, shown_value
+from service.ingest.queue import IngestQueue, PendingBatch
+from service.ingest.solver_pool import WAIT_S, Solver, SolverPool, may_take_long
+from service.missions.mission import Mission
+from service.observations.batch import ObservationBatch
+from service.observations.schema import OptionsIn, Submission
+from service.sky.model import SkyModel
+from service.storage.queries.recorded_batch import batch_with_options
+from service.storage.queries.results import read_result
+from service.storage.recording.answer import answer_of
+from service.storage.recording.identity import (
+    ExistingResult,
+    Identity,
+    OwnKey,
+    Registry,
+    identity_of,
+    look_up,
+    remember_key,
+    stored_answers,
+)
+from service.storage.recording.results import record
+from service.storage.recording.unsaved_result import Answered, Draft, Row, what_if_draft
+from service.storage.sql.database import Store
+from service.storage.sql.transaction import Results
+from service.times import utc_now
+
+MAX_KEY_LENGTH = 255
+
+YIELD_S = 0.002
+"""Each of many batches waits at most so long for single ones that wait for their answers."""
+
+log = logging.getLogger(__name__)
+
+Answers = list[Answered | AcquisitionError]
+AnswerFuture = TypeVar("AnswerFuture", "asyncio.Future[Answered]", "Future[Answered]")
+
+
+class Recorded(Struct, frozen=True, eq=False):
+    """A batch that is newly recorded, as observers are told of it."""
+
+    spacecraft: str
+    run: str
+    batch: str
+    counts: Mapping[str, int]
+    """Its stars: observed, and of them unique, ambiguous and unmatched."""
+    has_attitude: bool
+
+
+Observer = Callable[[Recorded], None]
+
+
+class _RolledBack(Exception):
+    """Ends a transaction that is to leave nothing behind."""
+
+
+class SubmissionService:
+    """Each submission is identified, solved and recorded once, however often it is sent."""
+
+    def __init__(self, missions: Mapping[str, Mission], sky: SkyModel, store: Store) -> None:
+        self.solver = Solver(missions, sky)
+        self.pool = SolverPool()
+        self._store = store
+        self._queue = IngestQueue(
+            self._recorded_before, self._solve, self._tell, store.writer, self.pool
+        )
+        self._single_s = -float("inf")
+        self.observers: list[Observer] = []
+        """Called with every batch that is new, after its commit."""
+
+    def submit(
+        self,
+        submission: Submission,
+        idempotency_key: str | None,
+        caller: Caller | None,
+        future: AnswerFuture,
+    ) -> AnswerFuture:
+        """Queue a batch; the future, of an event loop or of threads, gives the stored answer.
+
+        Raises `Forbidden` where the caller may not ask about the spacecraft,
+        `BadBatch` for a key that cannot be one, and `Busy` where too much is waiting.
+        The future raises what else keeps the batch from being recorded.
+        """
+        identity = identity_of(submission.batch)
+        if caller is not None:
+            caller.require(identity[0])
+        return self.submit_made(
+            identity,
+            submission.fingerprint,
+            lambda: submission,
+            own_key(caller, idempotency_key),
+            caller,
+            future,
+            is_long=may_take_long(submission.batch),
+        )
+
+    def submit_made(
+        self,
+        identity: Identity,
+        fingerprint: str,
+        make: Callable[[], Submission],
+        key: OwnKey | None,
+        caller: Caller | None,
+        future: AnswerFuture,
+        *,
+        is_long: bool,
+        wait_s: float = WAIT_S,
+    ) -> AnswerFuture:
+        """`submit` of a batch that `make` makes, in the pool, unless it is recorded already."""
+        if key is not None:
+            _check_key(key)
+        turn = (None if caller is None else caller.token_id, identity[0])
+        pending = PendingBatch(identity, fingerprint, key, make, turn, is_long, future, wait_s)
+        self._single_s = pending.since_s
+        self._queue.put(pending)
+        return future
+
+    def submit_many(self, submissions: Sequence[Submission]) -> Answers:
+        """Record many in one transaction; an error stands in the place of what is refused."""
+        with self._store.reading() as connection:
+            registry = look_up(connection, {identity_of(each.batch) for each in submissions})
+            holders = [
+                _holder(registry, identity_of(each.batch), None, each.fingerprint)
+                for each in submissions
+            ]
+            repeats = {each.result_id for each in holders if isinstance(each, ExistingResult)}
+            stored = stored_answers(connection, repeats)
+        # The connection is given back: a snapshot of the database that is held for as long as
+        # five hundred batches take keeps SQLite from shortening its log.
+        found: list[Draft | ExistingResult | AcquisitionError] = []
+        for holder, each in zip(holders, submissions, strict=True):
+            found.append(holder or self.solve_one_of_many(each))
+        drafts = [each for each in found if isinstance(each, Draft)]
+        written = iter(self.begin_writing(drafts)())
+        answers: Answers = []
+        for one in found:
+            if isinstance(one, Draft):
+                answers.append(next(written))
+            elif isinstance(one, ExistingResult):
+                answers.append(Answered(one.result_id, stored[one.result_id], replayed=True))
+            else:
+                answers.append(one)
+        return answers
+
+    def what_if(
+        self,
+        id: str,
+        options: OptionsIn,
+        *,
+        record: bool,
+        adopt: bool,
+        entry: Entry | None = None,
+    ) -> Answered:
+        """Run a recorded batch again; `options` replace what they name of the result's own.
+
+        `entry` is stored in the audit list together with a result that is recorded.
+        """
+        with self._store.reading() as connection:
+            parent = read_result(connection, id)
+        batch = batch_with_options(parent["input"], parent["options"], options)
+        acquisition = self.run_again(batch)
+        if not (record or adopt):
+            answer = answer_of(acquisition, id=None, parent=id, recorded=False)
+            return Answered(None, msgspec.json.encode(answer), replayed=False)
+        draft = what_if_draft(
+            acquisition,
+            id=self.solver.ids.new(),
+            batch_id=parent["batch_id"],
+            parent=id,
+            adopt=adopt,
+            created=utc_now(),
+        )
+        if entry is not None:
+            draft.audit = entry.row()
+        _note_handed_over([draft])
+        (outcome,) = _decided(self._store.writer.record([draft]).result())
+        if isinstance(outcome, AcquisitionError):
+            raise outcome
+        return outcome
+
+    def run_again(self, batch: ObservationBatch, mission: Mission | None = None) -> Acquisition:
+        """The acquisition of a recorded batch, with other settings where given; nothing is kept.
+
+        Raises `Busy` where every thread is at work for long.
+        """
+        return self.pool.call(
+            lambda: self.solver.acquire(batch, mission),
+            ("again", batch.spacecraft),
+            is_long=may_take_long(batch),
+        )
+
+    def rehearse(self, submission: Submission) -> None:
+        """Look up, solve and record a batch, and take it back: nothing is kept or told.
+
+        Connections are opened and statements prepared that the first batch
+        would wait for.
+        """
+        pending = PendingBatch(
+            identity_of(submission.batch),
+            submission.fingerprint,
+            None,
+            lambda: submission,
+            turn=None,
+            is_long=False,
+        )
+        self._recorded_before([pending])
+        draft = self.solver.solve(submission)
+
+        def record_and_roll_back(connection: Connection) -> None:
+            record(connection, [draft])
+            raise _RolledBack
+
+        with suppress(_RolledBack):
+            self._store.writer.change(record_and_roll_back).result()
+
+    # ---- bulk --------------------------------------------------------------------------------
+
+    def solve_one_of_many(self, submission: Submission) -> Draft | AcquisitionError:
+        """The result of one of many; single submissions go first."""
+        self.yield_to_interactive()
+        return self.pool.call(
+            lambda: self.solver.solve_one_of_many(submission), "bulk", is_long=True
+        )
+
+    def begin_writing(self, drafts: Sequence[Draft]) -> Callable[[], Answers]:
+        """Queue many results for a transaction; to call what it gives waits for the answers."""
+        if not drafts:
+            return list
+        _note_handed_over(drafts)
+        future = self._store.writer.record(drafts, low_priority=True)
+
+        def finish() -> Answers:
+            outcomes = future.result()
+            for draft, outcome in zip(drafts, outcomes, strict=True):
+                self._tell(draft, outcome)
+            return _decided(outcomes)
+
+        return finish
+
+    @property
+    def idle_s(self) -> float:
+        """Seconds since a single batch was last submitted."""
+        return time.monotonic() - self._single_s
+
+    def yield_to_interactive(self) -> None:
+        """Wait a little for single batches to be answered."""
+        self._queue.wait_until_empty(YIELD_S)
+
+    # ---- state -------------------------------------------------------------------------------
+
+    def backlog(self) -> Row:
+        """What waits: `posts` that are not answered yet, and the state of the `writes`."""
+        waiting, oldest_s = self._queue.state()
+        posts = {"queued": waiting, "oldest_s": oldest_s}
+        return {"posts": posts, "writes": self._store.writer.state()}
+
+    def require_alive(self) -> None:
+        """Raise `Stopping` where submissions are not worked on any more."""
+        self._queue.require_alive()
+
+    def close(self) -> None:
+        """Answer what was submitted, and take no more."""
+        self._queue.close()
+        self.pool.close()
+
+    # ---- steps of the queue ------------------------------------------------------------------
+
+    def _solve(self, pending: PendingBatch) -> Draft:
+        draft = self.solver.solve(pending.make(), pending.received, pending.key)
+        _note_handed_over([draft])
+        return draft
+
+    def _recorded_before(
+        self, group: Sequence[PendingBatch]
+    ) -> list[Answered | AcquisitionError | None]:
+        """What is stored of each: the answer, the error where its place is taken, or nothing."""
+        # Identities before keys, each as of its moment: what is recorded in between is found by its
+        # key, or seems new, and then the transaction finds it.
+        with self._noted_failure(len(group)), self._store.glancing() as connection:
+            registry = look_up(
+                connection,
+                {each.identity for each in group},
+                {each.key for each in group if each.key is not None},
+            )
+        holders = [_holder(registry, e.identity, e.key, e.fingerprint) for e in group]
+        repeats = {each.result_id for each in holders if isinstance(each, ExistingResult)}
+        stored: Mapping[str, bytes] = {}
+        if repeats:
+            with self._store.reading() as connection:
+                stored = stored_answers(connection, repeats)
+        return [
+            self._repeat(pending, holder, stored, registry)
+            if isinstance(holder, ExistingResult)
+            else holder
+            for pending, holder in zip(group, holders, strict=True)
+        ]
+
+    def _repeat(
+        self,
+        pending: PendingBatch,
+        first: ExistingResult,
+        stored: Mapping[str, bytes],
+        registry: Registry,
+    ) -> Answered | AcquisitionError | None:
+        """The stored answer; a key that came with it belongs to its body from now on."""
+        if first.result_id not in stored:
+            # It was pruned in between: the batch is as new as any other.
+            return None
+        identity, key = pending.identity, pending.key
+        if key is not None and key not in registry.keys:
+            try:
+                self._store.writer.change(
+                    lambda connection: remember_key(connection, identity, key, first)
+                ).result()
+            except AcquisitionError as error:
+                return error
+        return Answered(first.result_id, stored[first.result_id], replayed=True)
+
+    @contextmanager
+    def _noted_failure(self, count: int) -> Iterator[None]:
+        """Batches that cannot be looked up cannot be written either."""
+        try:
+            yield
+        except Busy:
+            self._store.writer.note_failure(count)
+            raise
+
+    def _tell(self, draft: Draft, outcome: Answered | Exception) -> None:
+        """Tell the observers of a new batch; a what-if holds the stars of one that is known."""
+        is_new = isinstance(outcome, Answered) and not outcome.replayed
+        if not is_new or draft.batch is None or not self.observers:
+            return
+        recorded = Recorded(
+            *draft.identity, counts=draft.counts, has_attitude=draft.solution is not None
+        )
+        for observer in self.observers:
+            try:
+                observer(recorded)
+            except Exception:
+                # The batch is recorded and its answer due, whatever an observer does.
+                log.exception("an observer failed")
+
+
+def _note_handed_over(drafts: Sequence[Draft]) -> None:
+    moment_ns = time.perf_counter_ns()
+    for draft in drafts:
+        draft.handed_over_ns = moment_ns
+
+
+def _decided(outcomes: Results) -> Answers:
+    answers: Answers = []
+    for outcome in outcomes:
+        # Neither is an answer to the batch: both say that nothing was decided about it.
+        if isinstance(outcome, Busy) or not isinstance(outcome, Answered | AcquisitionError):
+            raise outcome
+        answers.append(outcome)
+    return answers
+
+
+def _holder(
+    registry: Registry, identity: Identity, key: OwnKey | None, fingerprint: str
+) -> ExistingResult | AcquisitionError | None:
+    try:
+        return registry.first(identity, key, fingerprint)
+    except AcquisitionError as error:
+        return error
+
+
+def _check_key(own: OwnKey) -> None:
+    _, key = own
+    if not (0 < len(key) <= MAX_KEY_LENGTH and key.isascii() and key.isprintable()):
+        message = f"must be 1 to {MAX_KEY_LENGTH} printable ASCII characters"
+        raise BadBatch(Fault("Idempotency-Key", message, shown_value(key)))

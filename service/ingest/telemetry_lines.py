@@ -1,0 +1,94 @@
+"""Lines of telemetry, a batch each: read and computed, many at once, in whichever process."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+
+from service.errors import AcquisitionError
+from service.observations.schema import Submission, submission_from_json
+from service.storage.recording.identity import Identity, identity_of
+from service.storage.recording.unsaved_result import Draft
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Some lines for one run; those `known` by their place among them seem to be recorded."""
+
+    run: str
+    texts: Sequence[bytes]
+    known: frozenset[int] = frozenset()
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A line that was read, but not computed."""
+
+    identity: Identity
+    fingerprint: str
+
+
+@dataclass(frozen=True)
+class Refused:
+    """What is wrong with a line, and whose batch it is where it can be read."""
+
+    spacecraft: str | None
+    error: AcquisitionError
+
+
+Found = Draft | Seen | Refused
+Drafting = Callable[[Sequence[Submission]], Sequence[Draft | AcquisitionError]]
+
+
+def found_in(lines: Lines, draft: Drafting) -> list[Found]:
+    """What each line comes to, in order; `draft` is given all that are to be computed."""
+    read = [_read(text, lines.run) for text in lines.texts]
+    fresh = [
+        each
+        for place, each in enumerate(read)
+        if isinstance(each, Submission) and place not in lines.known
+    ]
+    drafted = iter(draft(fresh))
+    found: list[Found] = []
+    for place, each in enumerate(read):
+        if isinstance(each, Refused):
+            found.append(each)
+        elif place in lines.known:
+            found.append(Seen(identity_of(each.batch), each.fingerprint))
+        else:
+            match next(drafted):
+                case AcquisitionError() as error:
+                    found.append(Refused(each.batch.spacecraft, error))
+                case made:
+                    found.append(made)
+    return found
+
+
+def _read(text: bytes, run: str) -> Submission | Refused:
+    try:
+        return submission_from_json(text, run=run)
+    except AcquisitionError as error:
+        return Refused(None, error)
+
+
+_Name = Annotated[str, msgspec.Meta(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\x7f]+\Z")]
+
+
+class _Named(msgspec.Struct):
+    """As much of a batch as names it."""
+
+    spacecraft: _Name
+    batch: _Name
+
+
+_NAMED = msgspec.json.Decoder(_Named)
+
+
+def named_in(text: bytes, run: str) -> Identity | None:
+    """What a line seems to be called, read in passing; None where that cannot be told."""
+    try:
+        named = _NAMED.decode(text)
+    except (msgspec.MsgspecError, UnicodeError, RecursionError):
+        return None
+    return named.spacecraft, run, named.batch

@@ -1,0 +1,185 @@
+"""From the canonical JSON of a batch, which passed every check, to the arrays of the core.
+
+The arrays are made from the text that is recorded, so that a later run of the
+record gives the same result.  One process may check and another compute: the text
+is all that passes between them.
+"""
+
+import math
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+
+from service.missions.mission import Identifier, Solver
+from service.observations.batch import (
+    Aberration,
+    APriori,
+    BoresightPrior,
+    ObservationBatch,
+    Options,
+    QuaternionPrior,
+    SunPointedPrior,
+    TrackerStars,
+)
+from service.times import parse_utc
+from service.vectors import Vector, read_only, unit_of
+
+Triple = tuple[float, float, float]
+
+_ABSENT: Final = math.nan
+_NO_VECTOR: Final = (_ABSENT, _ABSENT, _ABSENT)
+
+
+class _Told(msgspec.Struct, forbid_unknown_fields=True, gc=False):
+    """An object of the text; what a model of `wire` leaves out has the same default here."""
+
+
+class Star(_Told):
+    """One observed star; NaN for a number that is absent."""
+
+    vector: Triple = _NO_VECTOR
+    h_deg: float = _ABSENT
+    v_deg: float = _ABSENT
+    magnitude: float = _ABSENT
+    time_offset_s: float = 0.0
+    sigma_arcsec: float = _ABSENT
+
+
+class Tracker(_Told):
+    """The stars that one tracker observed."""
+
+    tracker: str
+    stars: list[Star]
+
+
+class Direction(_Told):
+    """A direction in right ascension and declination."""
+
+    ra_deg: float
+    dec_deg: float
+
+
+class Prior(_Told):
+    """A priori knowledge of one kind, the others left out."""
+
+    quaternion: tuple[float, float, float, float] | None = None
+    boresight: Direction | None = None
+    sun_pointed: bool = False
+    sun_vector: Triple | None = None
+    position_km: Triple | None = None
+    frame: str = "EME2000"
+
+
+class Chosen(_Told):
+    """Options that replace the mission's settings."""
+
+    identifier: Identifier | None = None
+    solver: Solver | None = None
+    tests: dict[str, bool] = {}
+    tolerances: dict[str, float] = {}
+    zone_grid_deg: float | None = None
+
+
+class Batch(_Told):
+    """A batch of observed stars."""
+
+    spacecraft: str
+    batch: str
+    time: str
+    observations: list[Tracker]
+    a_priori: Prior | None
+    run: str = "live"
+    body_rates_deg_per_s: Triple = (0.0, 0.0, 0.0)
+    velocity_km_per_s: Triple | None = None
+    sun_vector: Triple | None = None
+    position_km: Triple | None = None
+    aberration: Aberration = "to_correct"
+    options: Chosen = msgspec.field(default_factory=Chosen)
+
+
+_BATCH = msgspec.json.Decoder(Batch)
+_PRIOR = msgspec.json.Decoder(Prior)
+
+
+def batch_from_canonical(text: str) -> ObservationBatch:
+    """The batch as the core takes it, from a text that `wire` made."""
+    told = _BATCH.decode(text)
+    chosen, prior = told.options, told.a_priori
+    return ObservationBatch(
+        spacecraft=told.spacecraft,
+        batch=told.batch,
+        run=told.run,
+        time=parse_utc(told.time),
+        a_priori=None if prior is None else _prior_of(prior, told.sun_vector, told.position_km),
+        body_rates_deg_per_s=_array(told.body_rates_deg_per_s),
+        velocity_km_per_s=_optional_array(told.velocity_km_per_s),
+        aberration=told.aberration,
+        observations=tuple([_tracker_stars(each) for each in told.observations]),
+        options=Options(
+            identifier=chosen.identifier,
+            solver=chosen.solver,
+            tests=chosen.tests,
+            tolerances=chosen.tolerances,
+            zone_grid_deg=chosen.zone_grid_deg,
+        ),
+        position_km=_optional_array(told.position_km),
+    )
+
+
+def prior_from_canonical(text: str) -> APriori:
+    """A priori knowledge by itself, from a text that `wire` made."""
+    return _prior_of(_PRIOR.decode(text), None, None)
+
+
+def _prior_of(prior: Prior, sun_vector: Triple | None, position_km: Triple | None) -> APriori:
+    """The a priori knowledge as the core takes it; the Sun's direction may stand beside it too."""
+    if prior.quaternion is not None:
+        # By plain numbers: numpy takes as long for four as for a thousand.
+        q1, q2, q3, qc = prior.quaternion
+        norm = math.sqrt(q1 * q1 + q2 * q2 + q3 * q3 + qc * qc)
+        return QuaternionPrior(_array((q1 / norm, q2 / norm, q3 / norm, qc / norm)))
+    if prior.boresight is not None:
+        return BoresightPrior(prior.boresight.ra_deg, prior.boresight.dec_deg)
+    sun = prior.sun_vector or sun_vector
+    return SunPointedPrior(
+        None if sun is None else read_only(unit_of(np.array(sun))),
+        _optional_array(prior.position_km or position_km),
+    )
+
+
+def _tracker_stars(tracker: Tracker) -> TrackerStars:
+    stars = tracker.stars
+    vectors: list[float] = []
+    for star in stars:
+        x, y, z = star.vector
+        # The norm is near one, or NaN: nothing is divided by zero.
+        norm = math.sqrt(x * x + y * y + z * z)
+        vectors += (x / norm, y / norm, z / norm)
+    # All in one block, of which each array is a part: to make one takes longer than to fill it.
+    numbers = [
+        *vectors,
+        *[star.h_deg for star in stars],
+        *[star.v_deg for star in stars],
+        *[star.magnitude for star in stars],
+        *[star.time_offset_s for star in stars],
+        *[star.sigma_arcsec for star in stars],
+    ]
+    n = len(stars)
+    block = read_only(np.fromiter(numbers, np.float64, len(numbers)))
+    return TrackerStars(
+        tracker=tracker.tracker,
+        vector=block[: 3 * n].reshape(n, 3),
+        angles_deg=block[3 * n : 5 * n].reshape(2, n).T,
+        magnitude_mag=block[5 * n : 6 * n],
+        time_offset_s=block[6 * n : 7 * n],
+        sigma_arcsec=block[7 * n :],
+    )
+
+
+def _array(values: Any) -> Vector:
+    return read_only(np.array(values, np.float64))
+
+
+def _optional_array(values: Triple | None) -> Vector | None:
+    return None if values is None else _array(values)

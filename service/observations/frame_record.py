@@ -1,0 +1,55 @@
+"""What is kept of a frame beside the batch that was made of it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """A frame as the records keep it: what was found on it, and a small picture.
+
+    `stars` has an entry for every candidate that was measured, ready for JSON; those
+    with `used` came first, are in the batch, and stand there in the same order.  The
+    preview is a PNG of 8 bits in which `preview_step` pixels a side make one.
+    """
+
+    digest: str
+    file_format: str
+    tracker: str
+    width_px: int
+    height_px: int
+    exposure_s: float
+    centroid: str
+    background_counts: float
+    noise_counts: float
+    candidates: int
+    sharp: Sequence[tuple[float, float]]
+    """Where (u, v) hot pixels and cosmic rays were passed by."""
+    stars: Sequence[Mapping[str, Any]]
+    timings_us: Mapping[str, int]
+    preview: bytes
+    preview_step: int
+    remarks: Sequence[str] = ()
+    """Of a camera without calibration: what was fitted, or why nothing was found."""
+
+    def summary(self) -> dict[str, Any]:
+        """What the answer says of the frame."""
+        used = sum(bool(star["used"]) for star in self.stars)
+        return {
+            "digest": self.digest,
+            "format": self.file_format,
+            "tracker": self.tracker,
+            "width_px": self.width_px,
+            "height_px": self.height_px,
+            "exposure_s": self.exposure_s,
+            "centroid": self.centroid,
+            "background_counts": self.background_counts,
+            "noise_counts": self.noise_counts,
+            "candidates": self.candidates,
+            "measured": len(self.stars),
+            "used": used,
+            "hot_or_cosmic": len(self.sharp),
+            "timings_us": dict(self.timings_us),
+            **({"remarks": list(self.remarks)} if self.remarks else {}),
+        }

@@ -1,0 +1,1 @@
+"""Telemetry files and request bodies as lines, each one batch."""

@@ -1,0 +1,171 @@
+"""The columns of telemetry as comma-separated values: one row to fields and back.
+
+The columns are named after the fields of the JSON object; an empty cell is an
+absent field.  `service.observations.readers.csv_rows` makes batches of rows.
+"""
+
+import difflib
+import json
+import math
+import re
+from collections.abc import Iterable
+from typing import Any
+
+from service.errors import BadFile, Fault, shown_value
+from service.observations.schema import BatchIn, BoresightIn, QuaternionIn, SunPointedIn
+
+KEY = ("spacecraft", "run", "batch")
+REQUIRED = ("spacecraft", "batch", "time", "tracker")
+TEXTS = ("spacecraft", "batch", "run", "time", "frame", "aberration")
+VECTORS = {
+    "quaternion": ("q1", "q2", "q3", "qc"),
+    "boresight": ("boresight_ra_deg", "boresight_dec_deg"),
+    "body_rates_deg_per_s": ("rate_x_deg_per_s", "rate_y_deg_per_s", "rate_z_deg_per_s"),
+    "velocity_km_per_s": ("velocity_x_km_per_s", "velocity_y_km_per_s", "velocity_z_km_per_s"),
+    "position_km": ("position_x_km", "position_y_km", "position_z_km"),
+    "sun_vector": ("sun_vector_x", "sun_vector_y", "sun_vector_z"),
+}
+DIRECTION = ("x", "y", "z")
+STAR_NUMBERS = ("h_deg", "v_deg", "magnitude", "time_offset_s", "sigma_arcsec")
+STAR_COLUMNS = ("tracker", *DIRECTION, *STAR_NUMBERS)
+BATCH_COLUMNS = (*TEXTS, *sum(VECTORS.values(), ()), "sun_pointed", "options")
+COLUMNS = (*BATCH_COLUMNS, *STAR_COLUMNS)
+VERBATIM = (*TEXTS, "tracker")
+"""Columns whose cells are taken with their spaces; around other cells spaces do no harm."""
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+
+Row = dict[str, str]
+
+
+class BadCell(Exception):
+    """A cell that cannot be read; knows its column, not its line."""
+
+    def __init__(self, column: str, message: str, value: object = None) -> None:
+        self.column, self.message = column, message
+        self.value = None if value is None else shown_value(value)
+
+    def fault(self, line: int) -> Fault:
+        """The fault as it is reported, with the line."""
+        return Fault(f"line {line}, column {self.column}", self.message, self.value)
+
+
+def checked_header(names: list[str], where: str) -> None:
+    """Raise `BadFile` for a column that is unknown, missing or there twice."""
+    faults = [
+        Fault(f"{where}, column {name or '(empty)'}", f"there is no such column; {_near(name)}")
+        for name in names
+        if name not in COLUMNS
+    ]
+    faults += [
+        Fault(f"{where}, column {name}", "occurs twice")
+        for name in sorted({name for name in names if names.count(name) > 1})
+    ]
+    wanted = list(REQUIRED)
+    # A group of columns is there as a whole or not at all; a star needs a direction.
+    for group in (*VECTORS.values(), DIRECTION, ("h_deg", "v_deg")):
+        wanted += group if any(name in names for name in group) else ()
+    if "h_deg" not in names and "v_deg" not in names:
+        wanted += DIRECTION
+    faults += [
+        Fault(f"{where}, column {name}", "is missing")
+        for name in dict.fromkeys(wanted)
+        if name not in names
+    ]
+    if faults:
+        raise BadFile(faults)
+
+
+def _near(name: str) -> str:
+    close = difflib.get_close_matches(name, COLUMNS, n=1)
+    return f"{close[0]} is meant?" if close else f"there are {', '.join(COLUMNS)}"
+
+
+def _number(row: Row, column: str) -> float:
+    cell = row[column]
+    if not cell:
+        raise BadCell(column, "is empty, while the columns that belong to it are not")
+    if not _NUMBER.fullmatch(cell):
+        raise BadCell(column, "must be a number", cell)
+    number = float(cell)
+    if not math.isfinite(number):
+        raise BadCell(column, "must be a finite number", cell)
+    return number
+
+
+def _group(row: Row, columns: tuple[str, ...]) -> list[float] | None:
+    """The numbers of columns that are given together, or None where all are empty."""
+    if not any(row.get(column) for column in columns):
+        return None
+    return [_number(row, column) for column in columns]
+
+
+def batch_fields(row: Row) -> dict[str, Any]:
+    """The fields of the batch itself, without its stars; raises `BadCell`."""
+    fields: dict[str, Any] = {name: row[name] for name in TEXTS if row.get(name)}
+    frame = fields.pop("frame", None)
+    given = {name: _group(row, columns) for name, columns in VECTORS.items()}
+    quaternion, boresight = given.pop("quaternion"), given.pop("boresight")
+    fields.update({name: value for name, value in given.items() if value is not None})
+    priors: list[dict[str, Any]] = []
+    if quaternion is not None:
+        priors.append({"quaternion": quaternion})
+    if boresight is not None:
+        priors.append({"boresight": dict(zip(("ra_deg", "dec_deg"), boresight, strict=True))})
+    if sun_pointed := row.get("sun_pointed", ""):
+        if sun_pointed.lower() not in ("true", "false", "1", "0"):
+            raise BadCell("sun_pointed", "must be true, false or empty", sun_pointed)
+        if sun_pointed.lower() in ("true", "1"):
+            priors.append({"sun_pointed": True})
+    if len(priors) > 1:
+        kinds = " and ".join(next(iter(prior)) for prior in priors)
+        raise BadCell("batch", f"has more than one a priori attitude: {kinds}", row["batch"])
+    prior = priors[0] if priors else None
+    if prior is not None and frame is not None:
+        prior["frame"] = frame
+    fields["a_priori"] = prior
+    if options := row.get("options"):
+        try:
+            fields["options"] = json.loads(options)
+        except ValueError:
+            raise BadCell("options", "must be a JSON object", options) from None
+    return fields
+
+
+def star_of(row: Row) -> dict[str, Any]:
+    """The star of a row; raises `BadCell`."""
+    star: dict[str, Any] = {name: _number(row, name) for name in STAR_NUMBERS if row.get(name)}
+    vector = _group(row, DIRECTION)
+    return star if vector is None else {"vector": vector, **star}
+
+
+def number_cells(cells: Iterable[tuple[str, float]]) -> Row:
+    """Numbers as cells, by column."""
+    # repr gives the shortest text that reads back as the same number.
+    return {column: repr(value) for column, value in cells}
+
+
+def batch_cells(batch: BatchIn) -> Row:
+    """The cells of a checked batch that are the same in each of its rows."""
+    prior = batch.a_priori
+    cells: Row = {"spacecraft": batch.spacecraft, "batch": batch.batch, "run": batch.run}
+    cells |= {"time": batch.time, "aberration": batch.aberration}
+    vectors: dict[str, tuple[float, ...] | None] = {
+        name: getattr(batch, name, None) for name in VECTORS
+    }
+    if prior is not None:
+        cells["frame"] = prior.frame
+    if isinstance(prior, QuaternionIn):
+        vectors["quaternion"] = prior.quaternion
+    elif isinstance(prior, BoresightIn):
+        vectors["boresight"] = (prior.boresight.ra_deg, prior.boresight.dec_deg)
+    elif isinstance(prior, SunPointedIn):
+        cells["sun_pointed"] = "true"
+        vectors["sun_vector"] = prior.sun_vector or batch.sun_vector
+        vectors["position_km"] = prior.position_km or batch.position_km
+    for name, columns in VECTORS.items():
+        cells |= number_cells(zip(columns, vectors[name] or (), strict=False))
+    options = batch.options.model_dump(mode="json", exclude_defaults=True)
+    if options:
+        cells["options"] = json.dumps(options, separators=(",", ":"))
+    return cells

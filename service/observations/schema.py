@@ -1,0 +1,351 @@
+"""A batch as JSON: the object that pipelines send, checked field by field.
+
+Every entrance reads batches here, so that all refuse the same things with the
+same words.  The pydantic models are also what `openapi.yaml` shows.
+"""
+
+import hashlib
+import math
+from collections.abc import Iterable
+from typing import Annotated, Any, Literal, Self
+
+from msgspec import Struct
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    model_validator,
+)
+
+from service.errors import BadBatch, BadInput, Fault, shown_value
+from service.missions.mission import GridStep, Identifier, Solver
+from service.observations.batch import (
+    MAX_STARS_PER_TRACKER,
+    MAX_TRACKERS,
+    Aberration,
+    APriori,
+    ObservationBatch,
+    Options,
+)
+from service.observations.decode import batch_from_canonical, prior_from_canonical
+from service.observations.frame_record import FrameRecord
+from service.times import parse_utc
+
+NORM_TOLERANCE = 1e-3
+MAX_FAULTS_SHOWN = 20
+MAX_NAME_SHOWN = 80
+
+Frame = Literal["EME2000", "ICRF", "GCRF"]
+
+
+def _near_unit(components: tuple[float, ...]) -> tuple[float, ...]:
+    norm = math.hypot(*components)
+    if abs(norm - 1.0) > NORM_TOLERANCE:
+        raise ValueError(f"must have norm 1 within {NORM_TOLERANCE}; its norm is {norm:.6g}")
+    return components
+
+
+def is_time(text: str) -> str:
+    """The text, if it is a time in UTC; pydantic reports the error that it raises otherwise."""
+    try:
+        parse_utc(text)
+    except BadInput as error:
+        raise ValueError(error.faults[0].message) from None
+    return text
+
+
+Number = Annotated[float, Field(strict=True)]
+"""Strict: JSON's true and "5.3" are no numbers, though pydantic would take them for some."""
+Components = tuple[Number, Number, Number]
+UnitVector = Annotated[Components, AfterValidator(_near_unit)]
+Quaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_near_unit)]
+Key = Annotated[str, Field(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\x7f]+$")]
+RunName = Annotated[
+    str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.:-]*$")
+]
+Rate = Annotated[Number, Field(ge=-360, le=360)]
+Speed = Annotated[Number, Field(ge=-100, le=100)]
+Distance = Annotated[Number, Field(ge=-1e9, le=1e9)]
+Position = tuple[Distance, Distance, Distance]
+Tolerance = Annotated[Number, Field(ge=0, le=180)]
+
+
+class Wire(BaseModel):
+    """The ground rules of every body: nothing unknown, no NaN, no infinity."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class StarIn(Wire):
+    """One observed star: a unit vector in tracker axes, or the angles of (tan h, tan v, 1)."""
+
+    vector: UnitVector | None = None
+    h_deg: Annotated[Number, Field(gt=-89, lt=89)] | None = None
+    v_deg: Annotated[Number, Field(gt=-89, lt=89)] | None = None
+    magnitude: Annotated[Number, Field(ge=-30, le=30)] | None = None
+    time_offset_s: Annotated[Number, Field(ge=-3600, le=3600)] = 0.0
+    sigma_arcsec: Annotated[Number, Field(ge=1e-3, le=3600)] | None = None
+
+    @model_validator(mode="after")
+    def _one_direction(self) -> Self:
+        angles = (self.h_deg is not None, self.v_deg is not None)
+        if self.vector is None and not all(angles):
+            raise ValueError("needs either vector, or both h_deg and v_deg")
+        if self.vector is not None and any(angles):
+            raise ValueError("takes either vector, or h_deg and v_deg, not both")
+        return self
+
+
+class TrackerIn(Wire):
+    """The stars that one tracker observed."""
+
+    tracker: Key
+    stars: Annotated[list[StarIn], Field(max_length=MAX_STARS_PER_TRACKER)]
+
+
+class QuaternionIn(Wire):
+    """An a priori attitude: inertial to body, scalar last."""
+
+    quaternion: Quaternion
+    frame: Frame = "EME2000"
+
+
+class DirectionIn(Wire):
+    """A direction in right ascension and declination."""
+
+    ra_deg: Annotated[Number, Field(ge=-360, le=360)]
+    dec_deg: Annotated[Number, Field(ge=-90, le=90)]
+
+
+class BoresightIn(Wire):
+    """An a priori boresight with unknown roll (cap missions)."""
+
+    boresight: DirectionIn
+    frame: Frame = "EME2000"
+
+
+class SunPointedIn(Wire):
+    """A pole at the Sun with unknown roll (band missions)."""
+
+    sun_pointed: Literal[True]
+    sun_vector: UnitVector | None = None
+    position_km: Position | None = None
+    frame: Frame = "EME2000"
+
+
+class TestsIn(Wire):
+    """Tests switched on or off."""
+
+    magnitude: bool | None = None
+    cross_product: bool | None = None
+    pole: bool | None = None
+    fov_rotation: bool | None = None
+    match_groups: bool | None = None
+
+
+class TolerancesIn(Wire):
+    """Tolerances, with the names of the mission file."""
+
+    pair_separation_max_deg: Annotated[Number, Field(ge=0.01, le=60)] | None = None
+    separation_deg: Annotated[Number, Field(ge=0, le=5)] | None = None
+    magnitude_mag: Annotated[Number, Field(ge=0, le=30)] | None = None
+    magnitude_order_mag: Annotated[Number, Field(ge=0, le=30)] | None = None
+    cross_product_deg: Tolerance | None = None
+    pole_difference_deg: Tolerance | None = None
+    pole_angle_deg: Tolerance | None = None
+    fov_rotation_deg: Tolerance | None = None
+
+
+class OptionsIn(Wire):
+    """Options that replace the mission's settings."""
+
+    identifier: Identifier | None = None
+    solver: Solver | None = None
+    tests: TestsIn = TestsIn()
+    tolerances: TolerancesIn = TolerancesIn()
+    zone_grid_deg: Annotated[GridStep, Field(strict=True)] | None = None
+
+    def to_options(self) -> Options:
+        """The options as the core takes them."""
+        return Options(
+            identifier=self.identifier,
+            solver=self.solver,
+            tests=_named(self.tests),
+            tolerances=_named(self.tolerances),
+            zone_grid_deg=self.zone_grid_deg,
+        )
+
+
+def _named(model: Wire) -> dict[str, Any]:
+    """The fields that were given a value."""
+    values = ((name, getattr(model, name)) for name in model.model_fields_set)
+    return {name: value for name, value in values if value is not None}
+
+
+def _kind_of_prior(value: Any) -> str | None:
+    keys = value if isinstance(value, dict) else getattr(value, "model_fields_set", ())
+    return next((kind for kind in ("quaternion", "boresight", "sun_pointed") if kind in keys), None)
+
+
+APrioriIn = Annotated[
+    Annotated[QuaternionIn, Tag("quaternion")]
+    | Annotated[BoresightIn, Tag("boresight")]
+    | Annotated[SunPointedIn, Tag("sun_pointed")],
+    Discriminator(
+        _kind_of_prior,
+        custom_error_type="a_priori_kind",
+        custom_error_message="must hold one of quaternion, boresight, sun_pointed, or be null",
+    ),
+]
+
+
+def _stars_of_different_trackers(observations: list[TrackerIn]) -> list[TrackerIn]:
+    names = [each.tracker for each in observations]
+    if len(set(names)) != len(names):
+        raise ValueError(f"a tracker occurs twice: {', '.join(names)}")
+    if not any(each.stars for each in observations):
+        raise ValueError("there are no stars; at least one is needed")
+    return observations
+
+
+class BatchIn(Wire):
+    """A batch of observed stars."""
+
+    spacecraft: Key
+    batch: Key
+    time: Annotated[str, AfterValidator(is_time)]
+    run: RunName = "live"
+    a_priori: APrioriIn | None
+    body_rates_deg_per_s: tuple[Rate, Rate, Rate] = (0.0, 0.0, 0.0)
+    velocity_km_per_s: tuple[Speed, Speed, Speed] | None = None
+    sun_vector: UnitVector | None = None
+    position_km: Position | None = None
+    aberration: Aberration = "to_correct"
+    observations: Annotated[
+        list[TrackerIn],
+        Field(min_length=1, max_length=MAX_TRACKERS),
+        AfterValidator(_stars_of_different_trackers),
+    ]
+    options: OptionsIn = OptionsIn()
+
+
+def prior_of(prior: APrioriIn) -> APriori:
+    """The a priori knowledge as the core takes it."""
+    return prior_from_canonical(prior.model_dump_json(exclude_defaults=True))
+
+
+class Checked(Struct, frozen=True):
+    """A batch that passed every check of its form.
+
+    `text` is its canonical JSON, defaults left out: what is recorded and run
+    again.  `fingerprint` is the digest of that text, so that white space and
+    the order of keys do not make another body.
+    """
+
+    text: str
+    fingerprint: str
+
+
+class Submission(Struct, frozen=True, eq=False):
+    """A batch and the text that identifies it; see `Checked`.
+
+    A batch that was made of a frame has the fingerprint of the frame and of what
+    was told with it.
+    """
+
+    batch: ObservationBatch
+    text: str
+    fingerprint: str
+    frame: FrameRecord | None = None
+
+
+def checked_from_json(body: bytes | str, run: str | None = None) -> Checked:
+    """Check one batch; `run`, where given, takes the place of the batch's own.
+
+    Raises `BadBatch` with every fault, each naming field and value.
+    """
+    try:
+        model = BatchIn.model_validate_json(body)
+    except ValidationError as error:
+        raise BadBatch(faults_of(error)) from None
+    return checked_from_model(model if run is None else model.model_copy(update={"run": run}))
+
+
+def checked_from_model(model: BatchIn) -> Checked:
+    """What a model stands for that is already checked."""
+    text = model.model_dump_json(exclude_defaults=True)
+    return Checked(text, hashlib.sha256(text.encode()).hexdigest())
+
+
+def submission_from_json(body: bytes | str, run: str | None = None) -> Submission:
+    """Read one batch, as `checked_from_json` does."""
+    return submission_from_checked(checked_from_json(body, run))
+
+
+def submission_from_model(model: BatchIn) -> Submission:
+    """The submission of a model that is already checked."""
+    return submission_from_checked(checked_from_model(model))
+
+
+def submission_from_checked(checked: Checked) -> Submission:
+    """The submission of a batch that was checked here or elsewhere."""
+    return Submission(batch_from_canonical(checked.text), checked.text, checked.fingerprint)
+
+
+def tolerances_from_text(texts: Iterable[str], field: str) -> TolerancesIn:
+    """Tolerances written as NAME=VALUE; raises `BadBatch` naming `field`, the name and the value.
+
+    Of a name that comes twice the last one counts, as in JSON.
+    """
+    values: dict[str, float] = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            values[name.strip()] = float(value)
+        except ValueError:
+            message = "must be NAME=VALUE, such as separation_deg=0.01"
+            raise BadBatch(Fault(field, message, shown_value(text))) from None
+    try:
+        return TolerancesIn.model_validate(values)
+    except ValidationError as error:
+        raise BadBatch(faults_of(error, (field,))) from None
+
+
+def faults_of(error: ValidationError, prefix: tuple[str, ...] = ()) -> list[Fault]:
+    """What pydantic found, in the service's words: a dotted field, a message, the value."""
+    return [
+        Fault(_field((*prefix, *fault["loc"])), _message(fault), _value(fault))
+        for fault in error.errors(include_url=False)[:MAX_FAULTS_SHOWN]
+    ]
+
+
+def _field(location: tuple[str | int, ...]) -> str:
+    tags = ("quaternion", "boresight", "sun_pointed")
+    parts = [
+        # A client's own key may be of any length.
+        str(part)[:MAX_NAME_SHOWN]
+        for index, part in enumerate(location)
+        # The tag of the kind of prior is pydantic's, not a field of the body.
+        if not (
+            part in tags
+            and index
+            and location[index - 1] == "a_priori"
+            and index + 1 < len(location)
+        )
+    ]
+    return ".".join(parts) or "body"
+
+
+def _message(fault: Any) -> str:
+    if fault["type"] == "extra_forbidden":
+        return "there is no such field"
+    return str(fault["msg"]).removeprefix("Value error, ")
+
+
+def _value(fault: Any) -> str | None:
+    # A missing field or a fault of the whole has nothing to show but its surroundings.
+    return None if fault["type"] == "missing" or not fault["loc"] else shown_value(fault["input"])

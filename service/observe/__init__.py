@@ -1,1 +1,0 @@
-"""WHAT WAS SEEN: the batch, its forms as text, and its way to body vectors at one epoch."""

@@ -1,1 +1,0 @@
-"""WHAT WE KEEP: batches with their inputs, results, solutions and trends, in SQL."""

@@ -1,0 +1,173 @@
+"""The summary of a replay: results to a file, progress to the terminal, a table at the end."""
+
+import json
+import os
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Self
+
+import msgspec
+from tqdm import tqdm
+
+from service.errors import BadFile, Fault
+from service.observations.readers.telemetry import form_of
+from service.replay.items import Outcome
+
+MAX_PROBLEMS_SHOWN = 20
+STARS = ("observed", "unique", "ambiguous", "unmatched")
+
+
+class ReplaySummary:
+    """Takes every outcome of a replay in order; a context manager that closes the results.
+
+    `results` receives one line a batch: the answer exactly as given, or
+    `{"line", "problem"}` for a refused one.  `progress` None shows the bar on
+    a terminal only.
+    """
+
+    def __init__(
+        self,
+        files: Sequence[Path],
+        results: Path | None = None,
+        progress: bool | None = None,
+        title: str | None = None,
+    ) -> None:
+        self.new = self.replayed = self.refused = self.attitudes = 0
+        self.stars: Counter[str] = Counter()
+        self.seconds = 0.0
+        self._path = results
+        self._results: IO[bytes] | None = None
+        if results is not None:
+            _require_place(results)
+        self._bar = tqdm(
+            total=_lines_in(files),
+            desc=title,
+            unit=" batches",
+            file=sys.stderr,
+            disable=None if progress is None else not progress,
+            leave=False,
+        )
+        self._start = time.perf_counter()
+
+    @property
+    def batches(self) -> int:
+        """Lines that were processed."""
+        return self.new + self.replayed + self.refused
+
+    def add(self, outcome: Outcome) -> None:
+        """Count one outcome and write its line of the results."""
+        if outcome.answer is None:
+            self.refused += 1
+            self._print_problem(outcome)
+            line = json.dumps(self._refusal(outcome)).encode()
+        else:
+            self.replayed += outcome.replayed
+            self.new += not outcome.replayed
+            self._count(msgspec.json.decode(outcome.answer))
+            line = outcome.answer
+        self._write(line + b"\n")
+        self._bar.update()
+
+    def follow(self, state: dict[str, Any]) -> None:
+        """Take the counts of a replay that the service works through."""
+        counts, lines = state["counts"], state["lines"]
+        self.new, self.replayed = counts["new"], counts["repeated"]
+        self.attitudes = counts["attitudes"]
+        self.stars = Counter({each: counts[each] for each in STARS})
+        self._bar.update(lines["done"] - self._bar.n)
+        if state["state"] != "running":
+            # Refused lines with a known place are reported one by one.
+            self.refused += lines["refused"] - len(state["errors"])
+
+    def _write(self, text: bytes) -> None:
+        if self._path is None:
+            return
+        if self._results is None:
+            # An older file is overwritten only once there is something to write.
+            self._results = _opened(self._path)
+        self._results.write(text)
+
+    def _count(self, answer: dict[str, Any]) -> None:
+        self.stars.update(answer["counts"])
+        self.attitudes += answer["attitude"] is not None
+
+    def _refusal(self, outcome: Outcome) -> dict[str, Any]:
+        return {"line": outcome.item.number, "problem": outcome.problem}
+
+    def _print_problem(self, outcome: Outcome) -> None:
+        if self.refused > MAX_PROBLEMS_SHOWN:
+            return
+        where = f"{outcome.item.file}:{outcome.item.number}"
+        detail = (outcome.problem or {}).get("detail", "refused")
+        tqdm.write(f"{where}: {detail}", file=sys.stderr)
+        if self.refused == MAX_PROBLEMS_SHOWN:
+            tqdm.write("further refused lines are counted, not shown", file=sys.stderr)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.seconds = time.perf_counter() - self._start
+        self._bar.close()
+        if error is None:
+            self._write(b"")
+        if self._results is not None:
+            self._results.close()
+
+    def table(self) -> str:
+        """The summary: what was sent, what was found, how fast."""
+        observed = self.stars["observed"]
+        rows = [("batches", str(self.batches))]
+        rows += [("  new", str(self.new)), ("  already recorded", str(self.replayed))]
+        rows += [("  refused", str(self.refused)), ("stars", str(observed))]
+        rows += [
+            (f"  {word}", f"{self.stars[word]}{_share(self.stars[word], observed)}")
+            for word in ("unique", "ambiguous", "unmatched")
+        ]
+        rows += [("attitudes", str(self.attitudes))]
+        rows += [("speed", f"{self.batches / max(self.seconds, 1e-9):.0f} batches/s")]
+        return "\n".join(f"{name:<20}{value}" for name, value in rows)
+
+
+def _share(part: int, whole: int) -> str:
+    return f"  ({100.0 * part / whole:.2f} %)" if whole else ""
+
+
+def _require_place(path: Path) -> None:
+    """Raise `BadFile` for a place that cannot be written, without touching what is there."""
+    folder = path.absolute().parent
+    place = path if path.exists() else folder
+    if path.is_dir() or not folder.is_dir() or not os.access(place, os.W_OK):
+        why = "is a folder" if path.is_dir() else "the folder is missing or closed to writing"
+        raise BadFile(Fault(str(path), f"cannot be written: {why}"))
+
+
+def _opened(path: Path) -> IO[bytes]:
+    try:
+        return path.open("wb")
+    except OSError as error:
+        raise BadFile(Fault(str(path), f"cannot be written: {error.strerror}")) from None
+
+
+def _lines_in(files: Sequence[Path]) -> int | None:
+    """Lines to come, for the bar; None where a line is not a batch."""
+    count = 0
+    for file in files:
+        if form_of(file) == "csv":
+            return None
+        try:
+            with file.open("rb") as stream:
+                while piece := stream.read(1 << 20):
+                    count += piece.count(b"\n")
+        except OSError:
+            return None
+    return count

@@ -1,0 +1,202 @@
+"""The columns of a star catalog, and how a catalog file holds them.
+
+A catalog file is a zip of numpy arrays (.npz), one per column.  An integer
+array is a coded column: its value times the column's step, with one code kept
+for "unknown".  A floating-point array is taken as it is, so that a site's own
+catalog keeps its numbers to the last digit.
+"""
+
+import hashlib
+import io
+import math
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from service.errors import BadFile, Fault
+
+Column = npt.NDArray[Any]
+
+# The first moment a zip can name: a rebuild gives the same bytes.
+_ZIP_TIME = (1980, 1, 1, 0, 0, 0)
+
+
+@dataclass(frozen=True)
+class Coding:
+    """How one column is coded: value = integer times step; step None is a plain column."""
+
+    meaning: str
+    unit: str
+    dtype: str
+    step: float | None = None
+    unknown: int | None = None
+
+    def encode(self, values: Column) -> Column:
+        """Values as integers of the coding's type; NaN as the unknown code."""
+        if self.step is None:
+            return values.astype(self.dtype)
+        nothing = np.isnan(values)
+        if self.unknown is None and nothing.any():
+            raise ValueError(f"{self.meaning}: a value is missing")
+        coded = np.rint(np.where(nothing, 0.0, values) / self.step)
+        limits = np.iinfo(self.dtype)
+        if coded.size and (coded.min() < limits.min or coded.max() > limits.max):
+            raise ValueError(f"{self.meaning}: a value does not fit {self.dtype}")
+        return np.where(nothing, self.unknown or 0, coded).astype(self.dtype)
+
+    def decode(self, stored: Column) -> Column:
+        """What `encode` was given, rounded to the step; a float column comes back as it is."""
+        if self.step is None:
+            return stored.astype(self.dtype)
+        if stored.dtype.kind == "f":
+            return stored.astype(np.float64)
+        # A division by the whole number 1/step gives 4.57 where 457 * 0.01 gives 4.570000000000001.
+        values = stored / round(1.0 / self.step) if self.step < 1.0 else stored * self.step
+        if self.unknown is not None:
+            values[stored == self.unknown] = np.nan
+        return np.asarray(values, dtype=np.float64)
+
+
+_MAS_DEG = 1.0 / 3_600_000.0
+
+COLUMNS: Mapping[str, Coding] = {
+    "ra_deg": Coding("right ascension", "deg", "int32", _MAS_DEG),
+    "dec_deg": Coding("declination", "deg", "int32", _MAS_DEG),
+    "pm_ra_mas_per_year": Coding(
+        "proper motion in right ascension, times cos(declination)", "mas/year", "int32", 0.01
+    ),
+    "pm_dec_mas_per_year": Coding("proper motion in declination", "mas/year", "int32", 0.01),
+    "parallax_mas": Coding("parallax", "mas", "int32", 0.01, -(2**31)),
+    "magnitude_v_mag": Coding("V", "mag", "int16", 0.01),
+    "color_bv_mag": Coding("B-V", "mag", "int16", 0.001, -(2**15)),
+    "neighbour_arcsec": Coding(
+        "distance of the nearest neighbour", "arcsec", "uint16", 0.1, 2**16 - 1
+    ),
+    "neighbour_fainter_by_mag": Coding(
+        "that neighbour's V minus the star's", "mag", "int16", 0.01, -(2**15)
+    ),
+    "rival_arcsec": Coding(
+        "distance of the nearest neighbour not more than 2 mag fainter",
+        "arcsec",
+        "uint16",
+        0.1,
+        2**16 - 1,
+    ),
+    "rival_fainter_by_mag": Coding(
+        "that neighbour's V minus the star's", "mag", "int16", 0.01, -(2**15)
+    ),
+    "variability_mag": Coding("amplitude of variability", "mag", "uint16", 0.01, 2**16 - 1),
+    "position_sigma_arcsec": Coding(
+        "standard deviation of the position per axis", "arcsec", "uint16", 0.01, 2**16 - 1
+    ),
+    "components": Coding("components that Tycho-2 resolves within the star", "", "uint8"),
+    "light_elsewhere": Coding(
+        "true: the star's light is counted in a neighbour's magnitude already", "", "bool"
+    ),
+    "hip": Coding("Hipparcos number, 0 where there is none", "", "int32"),
+    "tyc": Coding("Tycho identifier as three numbers, 0 where there is none", "", "uint16"),
+    "hd": Coding("Henry Draper number, 0 where there is none", "", "int32"),
+    "sao": Coding("SAO number, 0 where there is none", "", "int32"),
+}
+
+ALWAYS_KNOWN = (
+    "ra_deg",
+    "dec_deg",
+    "pm_ra_mas_per_year",
+    "pm_dec_mas_per_year",
+    "magnitude_v_mag",
+)
+
+LABEL = "label"
+"""An optional further column: the identifiers of a site's own catalog, as text."""
+
+
+def digest_of(data: bytes) -> str:
+    """The digest of a file's bytes as text, "sha256:…"."""
+    return "sha256:" + hashlib.sha256(data).hexdigest()
+
+
+MAX_UNPACKED_BYTES = 1 << 30
+"""Some eight million stars: more than any catalog that trackers are run with."""
+
+
+def pack(columns: Mapping[str, Column]) -> bytes:
+    """A catalog file's bytes; the same columns always give the same bytes."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        for name, column in columns.items():
+            one = io.BytesIO()
+            np.lib.format.write_array(one, np.ascontiguousarray(column), allow_pickle=False)
+            entry = zipfile.ZipInfo(f"{name}.npy", _ZIP_TIME)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            archive.writestr(entry, one.getvalue(), compresslevel=9)
+    return out.getvalue()
+
+
+def _require_what_is_claimed(data: bytes) -> None:
+    """Raise `ValueError` for columns that claim to be larger than what is stored of them.
+
+    The reader allocates what a column claims before it reads any of it.
+    """
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        entries = archive.infolist()
+        if sum(entry.file_size for entry in entries) > MAX_UNPACKED_BYTES:
+            raise ValueError(f"holds more than {MAX_UNPACKED_BYTES} bytes")
+        for entry in entries:
+            with archive.open(entry) as column:
+                version = np.lib.format.read_magic(column)
+                header = (
+                    np.lib.format.read_array_header_1_0
+                    if version == (1, 0)
+                    else np.lib.format.read_array_header_2_0
+                )
+                shape, _, kind = header(column)
+            if math.prod(shape) * kind.itemsize > entry.file_size:
+                raise ValueError(f"{entry.filename} claims a shape of {shape}")
+
+
+def unpack(data: bytes, path: Path) -> dict[str, Column]:
+    """The decoded columns of a catalog file's bytes; `path` is for the messages.
+
+    Raises BadFile naming the column that is missing, of another length or of
+    another kind.
+    """
+    try:
+        _require_what_is_claimed(data)
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            stored = {name: archive[name] for name in archive.files}
+    except Exception as error:
+        # Both readers give up on damage in a dozen ways, each with an exception of its own.
+        raise BadFile(Fault(str(path), f"not a star catalog file: {error!r}")) from error
+    missing = [name for name in COLUMNS if name not in stored]
+    if missing:
+        raise BadFile(Fault(str(path), f"columns missing: {', '.join(missing)}"))
+    rows = len(stored["ra_deg"]) if stored["ra_deg"].ndim else 0
+    faults = []
+    columns = {}
+    for name in (*COLUMNS, *([LABEL] if LABEL in stored else [])):
+        shape = (rows, 3) if name == "tyc" else (rows,)
+        kinds = "U" if name == LABEL else "iufb"
+        if stored[name].shape != shape or stored[name].dtype.kind not in kinds:
+            shown = f"{stored[name].dtype} {stored[name].shape}"
+            faults.append(Fault(f"{path}, column {name}", f"must hold {shape} numbers", shown))
+        else:
+            columns[name] = stored[name] if name == LABEL else COLUMNS[name].decode(stored[name])
+    if not faults and rows == 0:
+        faults = [Fault(str(path), "holds no star")]
+    if not faults:
+        faults = [
+            Fault(f"{path}, column {name}", "must hold finite numbers only")
+            for name in ALWAYS_KNOWN
+            if not np.isfinite(columns[name]).all()
+        ]
+    if not faults and np.any(np.diff(columns["magnitude_v_mag"]) < 0.0):
+        faults = [Fault(f"{path}, column magnitude_v_mag", "must be sorted, brightest first")]
+    if faults:
+        raise BadFile(faults)
+    return columns

@@ -1,0 +1,204 @@
+"""The star catalog: positions and motions at J2000.0, magnitudes, neighbours, identifiers.
+
+The embedded catalog is complete to V 9.0 and travels with the service (see
+`catalogs/README.md`); a site may bring its own.  A catalog is the sky as it is
+known; what a mission's identifier uses is made from it in
+`service.sky.catalog.run_catalog`.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from service.errors import BadConfiguration, BadFile, Fault, NotFound
+from service.resources import shipped
+from service.sky.catalog import csv_file as catalog_csv
+from service.sky.catalog import sky2000
+from service.sky.catalog.coding import COLUMNS, LABEL, digest_of, pack, unpack
+from service.sky.catalog.neighbours import nearest_neighbours
+from service.vectors import Vector, from_ra_dec, read_only
+
+Form = Literal["csv", "sky2000"]
+
+
+@dataclass(frozen=True, eq=False)
+class Catalog:
+    """A star catalog; every array has one entry per star and is locked against writing.
+
+    Rows are sorted by V, brightest first, ties in a fixed order.  Positions
+    are ICRS at J2000.0 (epoch and, within 0.02 arcsec, equinox).  Magnitudes
+    and colours, neighbours and sigmas are NaN where they are not known;
+    numbers of other catalogs are 0 where there is none.
+    """
+
+    name: str
+    digest: str
+    """Of the bytes of the file that the catalog was read from, "sha256:…"."""
+    ra_deg: Vector
+    dec_deg: Vector
+    pm_ra_mas_per_year: Vector
+    """Times cos(declination): the length of an arc."""
+    pm_dec_mas_per_year: Vector
+    parallax_mas: Vector
+    magnitude_v_mag: Vector
+    color_bv_mag: Vector
+    neighbour_arcsec: Vector
+    """Nearest neighbour of any magnitude known; NaN: none within a degree."""
+    neighbour_fainter_by_mag: Vector
+    """The neighbour's V minus the star's: negative where the neighbour is brighter."""
+    rival_arcsec: Vector
+    """Nearest neighbour not more than 2 mag fainter than the star; NaN: none within a degree."""
+    rival_fainter_by_mag: Vector
+    variability_mag: Vector
+    """Amplitude between brightest and faintest; NaN: not known to vary."""
+    position_sigma_arcsec: Vector
+    components: npt.NDArray[np.uint8]
+    light_elsewhere: npt.NDArray[np.bool_]
+    """The star's light is already in a neighbour's magnitude: blending must not add it again."""
+    hip: npt.NDArray[np.int32]
+    tyc: npt.NDArray[np.uint16]
+    hd: npt.NDArray[np.int32]
+    sao: npt.NDArray[np.int32]
+    label: npt.NDArray[np.str_] | None = None
+    """Identifiers of a site's own catalog, e.g. "SKYMAP 1234"; None: HIP or TYC names the star."""
+
+    def __len__(self) -> int:
+        return len(self.ra_deg)
+
+    @cached_property
+    def direction(self) -> Vector:
+        """Unit vectors (N, 3), ICRS at J2000.0."""
+        return read_only(from_ra_dec(self.ra_deg, self.dec_deg))
+
+    def star_id(self, row: int) -> str:
+        """The identifier of one star: "HIP 26311", "TYC 1234-567-1" or the site's own text."""
+        return self.star_ids([row])[0]
+
+    def star_ids(self, rows: Sequence[int] | npt.NDArray[np.intp] | slice) -> list[str]:
+        """The identifiers of many stars, in the order asked for."""
+        if self.label is not None:
+            return [str(text) for text in self.label[rows]]
+        numbers = zip(self.hip[rows].tolist(), self.tyc[rows].tolist(), strict=True)
+        return [f"HIP {hip}" if hip else _tycho_id(tyc) for hip, tyc in numbers]
+
+    @cached_property
+    def _row_of(self) -> dict[str, int]:
+        return {star_id: row for row, star_id in enumerate(self.star_ids(slice(None)))}
+
+    def row_of(self, star_id: str) -> int:
+        """The row of an identifier; NotFound where the catalog has no such star."""
+        row = self._row_of.get(star_id)
+        if row is None:
+            raise NotFound(f"star {star_id!r} is not in catalog {self.name}")
+        return row
+
+    def cross_ids(self, row: int) -> dict[str, str]:
+        """The star's identifiers in HIP, TYC, HD and SAO, as far as they are known."""
+        numbers = {"HIP": self.hip[row], "HD": self.hd[row], "SAO": self.sao[row]}
+        known = {name: f"{name} {number}" for name, number in numbers.items() if number}
+        if self.tyc[row].any():
+            known["TYC"] = _tycho_id(self.tyc[row].tolist())
+        return known
+
+
+def _tycho_id(numbers: Sequence[int]) -> str:
+    return "TYC {}-{}-{}".format(*numbers)
+
+
+def _catalog(name: str, digest: str, columns: Mapping[str, npt.NDArray[Any]]) -> Catalog:
+    return Catalog(
+        name=name, digest=digest, **{key: read_only(array) for key, array in columns.items()}
+    )
+
+
+def load(path: Path) -> Catalog:
+    """The catalog of a file that `save` or the build wrote; its name is the file's stem.
+
+    Raises BadFile where the file is missing or damaged.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise BadFile(Fault(str(path), f"cannot be read: {error.strerror}")) from error
+    return _catalog(path.stem, digest_of(data), unpack(data, path))
+
+
+@cache
+def load_embedded() -> Catalog:
+    """The catalog that travels with the service, read once."""
+    return load(shipped("catalogs", "stars.npz"))
+
+
+def open_catalog(file: Path | None) -> Catalog:
+    """The site's catalog, or the embedded one; raises `BadConfiguration` where it is damaged."""
+    if file is None:
+        return load_embedded()
+    try:
+        return import_csv(file) if file.suffix.lower() == ".csv" else load(file)
+    except BadFile as error:
+        raise BadConfiguration(f"ACQUIRE_CATALOG: {error}") from None
+
+
+def import_csv(path: Path) -> Catalog:
+    """A site's own catalog from a CSV file with a header.
+
+    Columns `id`, `ra_deg`, `dec_deg` and `magnitude` must be there; those of
+    `service.sky.catalog.csv_file.OPTIONAL` may be.  Positions are ICRS at J2000.0.
+    Stars of equal magnitude keep the order of the file.  Neighbours are found
+    within the catalog itself.  Raises BadFile naming line, column and value of
+    up to twenty faults.
+    """
+    return _of_a_site(path, catalog_csv.read(path))
+
+
+def import_sky2000(
+    path: Path, step: Callable[[], object] = lambda: None
+) -> tuple[Catalog, tuple[str, ...]]:
+    """SKYMAP's SKY2000 catalog from its fixed-width records, and the stars without a magnitude.
+
+    Every star is known by its Skymap number, "SKYMAP 1234".  `step` is called
+    after each record.  Raises BadFile naming line, bytes and value of up to
+    twenty faults.
+    """
+    found = sky2000.read(path, step)
+    return _of_a_site(path, found.columns), found.without_magnitude
+
+
+def import_catalog(path: Path, form: Form | None = None) -> Catalog:
+    """A site's own catalog in either form; without one named, the file's beginning tells."""
+    if (form or form_of(path)) == "sky2000":
+        return import_sky2000(path)[0]
+    return import_csv(path)
+
+
+def form_of(path: Path) -> Form:
+    """The form of a site's file: SKY2000 where it begins as those records do, else CSV."""
+    return "sky2000" if sky2000.is_sky2000(path) else "csv"
+
+
+def _of_a_site(path: Path, columns: Mapping[str, npt.NDArray[Any]]) -> Catalog:
+    """The catalog of a site's columns: sorted by magnitude, neighbours found within itself."""
+    order = np.argsort(columns["magnitude_v_mag"], kind="stable")
+    columns = {key: column[order] for key, column in columns.items()}
+    direction = from_ra_dec(columns["ra_deg"], columns["dec_deg"])
+    magnitude = columns["magnitude_v_mag"]
+    columns |= nearest_neighbours(direction, magnitude, direction, magnitude)
+    return _catalog(path.stem, digest_of(_packed(columns)), columns)
+
+
+def save(catalog: Catalog, path: Path) -> None:
+    """Writes a catalog to a file for `load`, with every number as it is."""
+    columns = {name: getattr(catalog, name) for name in COLUMNS}
+    if catalog.label is not None:
+        columns[LABEL] = catalog.label
+    path.write_bytes(_packed(columns))
+
+
+def _packed(columns: Mapping[str, npt.NDArray[Any]]) -> bytes:
+    """The bytes of a site's file, its columns in the fixed order."""
+    return pack({name: columns[name] for name in (*COLUMNS, LABEL) if name in columns})

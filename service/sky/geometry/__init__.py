@@ -1,0 +1,1 @@
+"""Stars, pairs and triangles indexed by place and by separation."""

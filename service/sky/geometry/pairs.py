@@ -1,0 +1,251 @@
+"""The pair index that the paper calls SIDS (Star Identification Data Structure).
+
+Every pair of zone stars not farther apart than HMAX, the brighter star first,
+found by separation.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from service.compiled.jit import njit_no_refcount
+from service.errors import BadInput, Fault
+from service.vectors import Vector, read_only
+
+Indices = npt.NDArray[np.int32]
+
+PAIRS_PER_BIN = 4
+PARTS = 4
+"""Of a bin, into which pairs are counted to be sorted."""
+MAX_IN_PART = 64
+MAX_CUBES = 64
+"""Along an edge of the cube about the sphere."""
+MAX_PAIRS = 5_000_000
+"""In one index, 80 MB: more than those of the whole sky to V 8 within 8 degrees."""
+
+
+@dataclass(frozen=True)
+class PairIndex:
+    """Pairs in order of separation.
+
+    `separation_rad` (NTOT,) ascends; `rows` (2, NTOT) are those of the brighter
+    and of the dimmer star in the zone's arrays, the brighter being the lower
+    because zones keep the brightness order of the run catalog.  `bin_start[k]`
+    is the first pair of separation bin k; the last entry is NTOT.
+    """
+
+    separation_rad: Vector
+    rows: Indices
+    bin_start: Indices
+    bins_per_rad: float
+
+    @property
+    def brighter(self) -> Indices:
+        """The rows of the brighter stars (NTOT,)."""
+        return np.asarray(self.rows[0])
+
+    @property
+    def dimmer(self) -> Indices:
+        """The rows of the dimmer stars (NTOT,)."""
+        return np.asarray(self.rows[1])
+
+    @property
+    def count(self) -> int:
+        """The number of pairs, the paper's NTOT."""
+        return len(self.separation_rad)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held."""
+        arrays = (self.separation_rad, self.rows, self.bin_start)
+        return sum(array.nbytes for array in arrays)
+
+
+def build_pairs(direction: Vector, separation_max_deg: float) -> PairIndex:
+    """Index the pairs of unit vectors (n, 3), rows in order of brightness, up to HMAX.
+
+    Raises `BadInput` where there would be too many to keep.
+    """
+    limit = math.radians(separation_max_deg)
+    n = len(direction)
+    # A guess from how many there would be were the stars spread evenly over a tenth of the sky.
+    share = min(1.0, 10.0 * math.sin(0.5 * min(limit, math.pi)) ** 2)
+    capacity = min(MAX_PAIRS, int(0.5 * n * n * share) + 1024) + n
+    found = (np.empty(capacity), np.empty(capacity, np.int32), np.empty(capacity, np.int32))
+    count, complete = _find_pairs(direction, limit, *found)
+    if count > MAX_PAIRS:
+        raise BadInput(
+            Fault(
+                "options.tolerances.pair_separation_max_deg",
+                f"makes {count:,} pairs of {n:,} stars; at most {MAX_PAIRS:,} are kept",
+                str(separation_max_deg),
+            )
+        )
+    if not complete:
+        capacity = count + n
+        found = (np.empty(capacity), np.empty(capacity, np.int32), np.empty(capacity, np.int32))
+        count, _ = _find_pairs(direction, limit, *found)
+    bins = max(1, count // PAIRS_PER_BIN)
+    bins_per_rad = bins / limit
+    separation, rows = np.empty(count), np.empty((2, count), np.int32)
+    bin_start = np.empty(bins + 1, np.int32)
+    _sort_pairs(*found, bins_per_rad, separation, rows[0], rows[1], bin_start)
+    return PairIndex(read_only(separation), read_only(rows), read_only(bin_start), bins_per_rad)
+
+
+@njit_no_refcount
+def separation_rad(a, b):  # type: ignore[no-untyped-def]
+    """Angle in radians between two unit vectors, accurate from zero to a half turn."""
+    dx, dy, dz = a[0] - b[0], a[1] - b[1], a[2] - b[2]
+    half_chord = 0.5 * math.sqrt(dx * dx + dy * dy + dz * dz)
+    if half_chord < 0.7:
+        return 2.0 * math.asin(half_chord)
+    sx, sy, sz = a[0] + b[0], a[1] + b[1], a[2] + b[2]
+    return 2.0 * math.atan2(half_chord, 0.5 * math.sqrt(sx * sx + sy * sy + sz * sz))
+
+
+@njit(cache=True, nogil=True)
+def _find_pairs(direction, limit, separation, brighter, dimmer):  # type: ignore[no-untyped-def]
+    """The number of pairs up to a separation, and whether there was room to write all of them.
+
+    Stars are put into cubes as wide as the longest chord, so that partners are
+    in the same cube or in one that touches it.  A third of those are partners,
+    which nothing foretells: everyone is written where the next one goes, and
+    counted if it is one, for that is cheaper than to branch.
+    """
+    n, capacity = len(direction), len(separation)
+    chord = 2.0 * math.sin(0.5 * min(limit, math.pi))
+    side = max(1, min(MAX_CUBES, int(2.0 / chord))) if chord > 0.0 else MAX_CUBES
+    scale = 0.5 * side
+    cube = np.empty(n, np.int32)
+    start = np.zeros(side * side * side + 1, np.int32)
+    for row in range(n):
+        x = min(side - 1, max(0, int((direction[row, 0] + 1.0) * scale)))
+        y = min(side - 1, max(0, int((direction[row, 1] + 1.0) * scale)))
+        z = min(side - 1, max(0, int((direction[row, 2] + 1.0) * scale)))
+        cube[row] = (x * side + y) * side + z
+        start[cube[row] + 1] += 1
+    for k in range(len(start) - 1):
+        start[k + 1] += start[k]
+    place = start[:-1].copy()
+    rows = np.empty(n, np.int32)
+    ordered = np.empty((n, 3))
+    for row in range(n):
+        at = place[cube[row]]
+        rows[at] = row
+        ordered[at] = direction[row]
+        place[cube[row]] += 1
+    # A little more than the chord: the separation decides.
+    most = chord * chord * (1.0 + 1e-12)
+    count = 0
+    complete = True
+    for at in range(n):
+        row = rows[at]
+        own = cube[row]
+        x, y, z = own // (side * side), own // side % side, own % side
+        a0, a1, a2 = ordered[at, 0], ordered[at, 1], ordered[at, 2]
+        low, high = max(z - 1, 0), min(z + 1, side - 1)
+        # Cubes along z lie one after another; each pair of touching cubes is met once.
+        for part in range(5):
+            if part == 0:
+                first, last = at + 1, start[own - z + high + 1]
+            else:
+                u = x if part == 1 else x + 1
+                v = y + 1 if part == 1 else y + part - 3
+                if u >= side or v < 0 or v >= side:
+                    continue
+                base = (u * side + v) * side
+                first, last = start[base + low], start[base + high + 1]
+            complete = complete and count + last - first <= capacity
+            for other in range(first, last):
+                d0, d1, d2 = a0 - ordered[other, 0], a1 - ordered[other, 1], a2 - ordered[other, 2]
+                square = d0 * d0 + d1 * d1 + d2 * d2
+                if complete:
+                    separation[count] = square
+                    brighter[count] = row
+                    dimmer[count] = rows[other]
+                count += square <= most
+    if not complete:
+        return count, False
+    kept = 0
+    for k in range(count):
+        square, one, other = separation[k], brighter[k], dimmer[k]
+        angle = (
+            separation_of(square)
+            if square < 1.96
+            else separation_rad(direction[one], direction[other])
+        )
+        separation[kept] = angle
+        brighter[kept], dimmer[kept] = min(one, other), max(one, other)
+        kept += angle <= limit
+    return kept, True
+
+
+@njit(cache=True, nogil=True)
+def separation_of(square):  # type: ignore[no-untyped-def]
+    """The angle in radians of a squared chord; short ones by a series as exact as the arc sine."""
+    quarter = 0.25 * square
+    half = math.sqrt(quarter)
+    if quarter < 0.0064:
+        series = 1.0 / 6.0 + quarter * (
+            3.0 / 40.0
+            + quarter
+            * (
+                15.0 / 336.0
+                + quarter * (105.0 / 3456.0 + quarter * (945.0 / 42240.0 + quarter * 0.01735276))
+            )
+        )
+        return 2.0 * (half + half * quarter * series)
+    return 2.0 * math.asin(min(1.0, half))
+
+
+@njit(cache=True, nogil=True)
+def _sort_pairs(found, one, other, bins_per_rad, separation, brighter, dimmer, bin_start):  # type: ignore[no-untyped-def]
+    """Put pairs in order of separation, then of their stars, and tell where each bin starts.
+
+    They are counted into parts of bins, so few to a part that hardly any is out
+    of order.
+    """
+    count, bins = len(separation), len(bin_start) - 1
+    parts, parts_per_rad = bins * PARTS, bins_per_rad * PARTS
+    start = np.zeros(parts + 1, np.int32)
+    for k in range(count):
+        start[min(parts - 1, int(found[k] * parts_per_rad)) + 1] += 1
+    crowded = False
+    for k in range(parts):
+        crowded = crowded or start[k + 1] > MAX_IN_PART
+        start[k + 1] += start[k]
+    for k in range(bins + 1):
+        bin_start[k] = start[k * PARTS]
+    for k in range(count):
+        own = min(parts - 1, int(found[k] * parts_per_rad))
+        at = start[own]
+        separation[at], brighter[at], dimmer[at] = found[k], one[k], other[k]
+        start[own] = at + 1
+    if crowded:
+        # Stars as evenly spaced as no sky has them.
+        order = np.argsort(dimmer, kind="mergesort")
+        order = order[np.argsort(brighter[order], kind="mergesort")]
+        order = order[np.argsort(separation[order], kind="mergesort")]
+        separation[:], brighter[:], dimmer[:] = separation[order], brighter[order], dimmer[order]
+        return
+    for at in range(1, count):
+        angle = separation[at]
+        if separation[at - 1] < angle:
+            continue
+        a, b = brighter[at], dimmer[at]
+        to = at
+        while to > 0 and (
+            separation[to - 1] > angle
+            or (
+                separation[to - 1] == angle
+                and (brighter[to - 1] > a or (brighter[to - 1] == a and dimmer[to - 1] > b))
+            )
+        ):
+            separation[to] = separation[to - 1]
+            brighter[to], dimmer[to] = brighter[to - 1], dimmer[to - 1]
+            to -= 1
+        separation[to], brighter[to], dimmer[to] = angle, a, b

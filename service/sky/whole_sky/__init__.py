@@ -1,0 +1,1 @@
+"""Indexes of the whole sky, for searches without a priori attitude."""

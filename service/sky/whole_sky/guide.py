@@ -1,0 +1,79 @@
+"""What an identifier without a prior looks at: the whole sky's stars by place, and triangles."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.geometry.star_buckets import StarBuckets, build_star_buckets
+from service.sky.geometry.triangles import SLAVES, TriangleIndex, build_triangles
+from service.vectors import Vector, read_only
+
+CROWD_RAD = math.radians(1.0)
+"""How near a star's neighbours are when they tell how crowded its place is."""
+
+
+@dataclass(frozen=True)
+class Guide:
+    """The guide database of PTP: `direction` (n, 3) of a run catalog's stars in its own order.
+
+    `density` (n,) are stars per steradian where each star is: the sky's mean, or
+    in a cluster more.
+    """
+
+    direction: Vector
+    density: Vector
+    grid: StarBuckets
+    triangles: TriangleIndex
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held beyond the run catalog."""
+        return self.density.nbytes + self.grid.nbytes + self.triangles.nbytes
+
+
+@dataclass(frozen=True)
+class GuideKey:
+    """What a guide database depends on: its key in the cache."""
+
+    run_catalog: str
+    reach_deg: float
+    slaves: int
+
+
+def build_guide(run_catalog: RunCatalog, reach_deg: float, slaves: int = SLAVES) -> Guide:
+    """The guide database of a run catalog for fields of view of that radius."""
+    return Guide(
+        run_catalog.direction,
+        read_only(densities(run_catalog.direction)),
+        build_star_buckets(run_catalog.direction),
+        build_triangles(run_catalog.direction, reach_deg, slaves),
+    )
+
+
+def densities(direction: Vector) -> Vector:
+    """Stars per steradian about each star (n, 3), itself left out; the sky's mean at least."""
+    crowd = np.zeros(len(direction), np.int64)
+    _count_near(direction, 2.0 * math.sin(CROWD_RAD / 2.0), crowd)
+    mean = len(direction) / (4.0 * math.pi)
+    return np.maximum(mean, crowd / (2.0 * math.pi * (1.0 - math.cos(CROWD_RAD))))
+
+
+@njit(cache=True, nogil=True)
+def _count_near(direction, most, count):  # type: ignore[no-untyped-def]
+    """Add to `count` (n,) how many others lie within a chord of each star."""
+    order = np.argsort(direction[:, 2])
+    for at in range(len(order)):
+        one = order[at]
+        for other_at in range(at + 1, len(order)):
+            other = order[other_at]
+            if direction[other, 2] - direction[one, 2] > most:
+                break
+            chord2 = 0.0
+            for k in range(3):
+                chord2 += (direction[other, k] - direction[one, k]) ** 2
+            if chord2 <= most * most:
+                count[one] += 1
+                count[other] += 1

@@ -1,0 +1,273 @@
+"""The whole sky made ready for a search without a prior.
+
+Pairs of stars lie in classes of the fainter star's magnitude, in each by
+separation, so that an observed pair finds its candidates without looking at
+stars too faint for it; bitmaps say where no star can be; and every patch of the
+sky has a list of the stars that a field of view about it may hold.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from service.compiled.views import view_into
+from service.sky.cache import LruCache
+from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.geometry.pairs import build_pairs
+from service.sky.geometry.star_grid import build_star_grid
+from service.sky.whole_sky.bitmap import build_sky_bitmap
+from service.sky.whole_sky.store import FIRST, LAST, ROWS, Store, stored
+from service.vectors import ARCSEC_PER_RADIAN, Vector
+
+BUCKET_RAD = 4.0 / ARCSEC_PER_RADIAN
+"""Separations are found to this much."""
+MAX_PAIR_DEG = 8.0
+FURTHER_MAG = 1.0
+"""Noise shows stars beyond the limit; so far beyond it they are matched, though not looked for."""
+CLASSES_BELOW_LIMIT_MAG = (2.5, 2.0, 1.5, 1.25, 1.0, 0.75, 0.5, 0.25)
+BITMAP_RADII_RAD = tuple(
+    arcsec / ARCSEC_PER_RADIAN
+    for arcsec in (60.0, 140.0, 190.0, 240.0, 310.0, 400.0, 530.0, 700.0, 1500.0)
+)
+PATCHES = 24
+"""Along an edge of a face of the cube."""
+PATCH_RADIUS_RAD = math.sqrt(2.0) / PATCHES
+"""From the middle of a patch to its corners, at most: that of the largest, at a face's middle."""
+BRIGHTEST_MAG, STEP_MAG = -2.0, 0.05
+"""Where the table of rows by magnitude begins, and its steps."""
+MAX_STARS = 60_000
+"""Rows are kept in 16 bits."""
+MAX_PAIRS = 1_500_000
+"""6 MB.  Of a deeper catalog only its brightest stars are looked for."""
+
+
+class Index(NamedTuple):
+    """The index as the kernels take it.
+
+    `stars` (n, 4) holds x, y, z and the magnitude, `place` (n, 4) the same in single
+    precision, which is enough to look for stars, and `cell_place` as `cell_rows` has them;
+    `brighter` (k) how many are brighter than every step of the magnitude;
+    `pairs` (p, 2) the brighter and the dimmer row; `class_edge` (c, 2) the faintest
+    magnitude of a class,
+    the limit for the last one, and the share of all pairs in it and those
+    before; `face` (6, 5) the grid's box and offset.  `bits` has a bitmap for every
+    radius, of the stars within the limit, then the same of all.  Pairs are of stars
+    within the limit, the grid and the patches have those further ones as well.
+    """
+
+    stars: Any
+    pairs: Any
+    offset: Any
+    class_edge: Any
+    bits: Any
+    face: Any
+    cell_start: Any
+    cell_rows: Any
+    patch_start: Any
+    patch_rows: Any
+    place: Any
+    cell_place: Any
+    brighter: Any
+
+
+ARRAYS = len(Index._fields)
+AT = Index(*range(ARRAYS))
+"""The place of each array in the head of the store."""
+
+
+@dataclass(frozen=True, eq=False)
+class SkyIndex:
+    """The stars of a run catalog, brightest first, for fields of view up to a radius.
+
+    `offset` (classes, buckets + 1) tells where in `arrays.pairs` the pairs of a
+    class and of a bucket of separation begin; `patch_start` and `patch_rows`
+    list the stars within a field of view's reach of each patch, brightest
+    first.  Pairs are looked for among stars to `limit_mag`; the attitudes that
+    they give are held against `FURTHER_MAG` more.  Everything is in
+    `store`, one block locked against writing, of which `arrays` are views.
+    """
+
+    run_catalog: str
+    limit_mag: float
+    radius_deg: float
+    store: Store
+    arrays: Index
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held."""
+        return self.store.nbytes
+
+    @property
+    def stars(self) -> int:
+        """The number of stars."""
+        return len(self.arrays.stars)
+
+    @property
+    def pairs(self) -> int:
+        """The number of pairs."""
+        return len(self.arrays.pairs)
+
+
+@dataclass(frozen=True)
+class SkyIndexKey:
+    """What an index depends on: its key in the cache."""
+
+    run_catalog: str
+    limit_mag: float
+    radius_deg: float
+
+
+def sky_index_for(
+    cache: LruCache,
+    run_catalog: RunCatalog,
+    limit_mag: float,
+    radius_deg: float,
+    deeper: Callable[[], RunCatalog] | None = None,
+) -> tuple[SkyIndex, bool]:
+    """The index, from the cache or built, and whether it was cached.
+
+    `deeper` makes the same run catalog with the stars beyond its limit.
+    """
+    key = SkyIndexKey(run_catalog.digest, limit_mag, radius_deg)
+    return cache.get(
+        key, lambda: build_sky_index(deeper() if deeper else run_catalog, limit_mag, radius_deg)
+    )
+
+
+def build_sky_index(run_catalog: RunCatalog, limit_mag: float, radius_deg: float) -> SkyIndex:
+    """Index the stars to a limit for fields of view whose farthest corner is at `radius_deg`.
+
+    Stars of the run catalog beyond the limit are for matching alone.  Where
+    there are more stars than fit, the faintest are left out.
+    """
+    magnitude = run_catalog.magnitude_mag
+    separation_max_deg = min(MAX_PAIR_DEG, 2.0 * radius_deg)
+    # Evenly spread stars make n^2 (1 - cos(separation)) / 4 pairs, real ones somewhat more.
+    within = 1.0 - math.cos(math.radians(separation_max_deg))
+    most = min(MAX_STARS, int(math.sqrt(3.0 * MAX_PAIRS / within)))
+    count = min(int(np.searchsorted(magnitude, limit_mag, "right")), most)
+    known = min(int(np.searchsorted(magnitude, limit_mag + FURTHER_MAG, "right")), MAX_STARS)
+    # Without room for all stars within the limit those beyond it would leave a gap.
+    if count < np.searchsorted(magnitude, limit_mag, "right"):
+        known = count
+    direction = np.ascontiguousarray(run_catalog.direction[:known])
+    within_limit = direction[:count]
+    pairs = build_pairs(within_limit, separation_max_deg)
+    edge = limit_mag - np.array([*CLASSES_BELOW_LIMIT_MAG, 0.0])
+    pair_class = np.searchsorted(edge, magnitude[pairs.dimmer])
+    bucket = (pairs.separation_rad / BUCKET_RAD).astype(np.int64)
+    buckets = int(math.radians(separation_max_deg) / BUCKET_RAD) + 1
+    # Bucket by bucket, not by separation within one, so that near stars lie together.
+    order = np.lexsort((pairs.dimmer, bucket, pair_class))
+    key = (pair_class * buckets + bucket)[order]
+    start = np.searchsorted(key, np.arange(len(edge) * buckets + 1))
+    rows = np.arange(len(edge))[:, None] * buckets + np.arange(buckets + 1)[None, :]
+    share = np.cumsum(np.bincount(pair_class, minlength=len(edge))) / max(pairs.count, 1)
+    patch_start, patch_rows = _patches(direction, radius_deg)
+    grid = build_star_grid(direction)
+    place = np.column_stack([direction, magnitude[:known]]).astype(np.float32)
+    arrays = Index(
+        stars=np.column_stack([direction, magnitude[:known]]),
+        pairs=np.column_stack([pairs.brighter, pairs.dimmer])[order].astype(np.uint16),
+        offset=start[rows].astype(np.int32),
+        class_edge=np.column_stack([edge, share]),
+        bits=np.stack(
+            [
+                build_sky_bitmap(some, radius)
+                for some in (within_limit, direction)
+                for radius in BITMAP_RADII_RAD
+            ]
+        ),
+        face=np.column_stack([grid.box, grid.offset]).astype(np.int32),
+        cell_start=grid.start,
+        cell_rows=grid.rows.astype(np.uint16),
+        patch_start=patch_start,
+        patch_rows=patch_rows,
+        place=place,
+        cell_place=place[grid.rows],
+        brighter=_brighter(magnitude[:known]),
+    )
+    store, views = stored(arrays)
+    return SkyIndex(run_catalog.digest, limit_mag, radius_deg, store, Index(*views))
+
+
+def _brighter(magnitude: Vector) -> npt.NDArray[np.int32]:
+    """How many stars are brighter than each step; none before the first, which bounds nothing."""
+    steps = int((magnitude[-1] - BRIGHTEST_MAG) / STEP_MAG) + 2 if len(magnitude) else 1
+    brighter = np.searchsorted(magnitude, BRIGHTEST_MAG + STEP_MAG * np.arange(max(steps, 1)))
+    brighter[0] = 0
+    return brighter.astype(np.int32)
+
+
+@njit(cache=True, nogil=True)
+def index_in(store):  # type: ignore[no-untyped-def]
+    """The index that a store holds; the caller holds the store."""
+    head = view_into(store, 0, (ARRAYS, 3), np.int64)
+    classes, levels = head[AT.offset, ROWS], head[AT.bits, ROWS]
+    buckets = (head[AT.offset, LAST] - head[AT.offset, FIRST]) // 4 // classes
+    level_bytes = (head[AT.bits, LAST] - head[AT.bits, FIRST]) // levels
+    return Index(
+        _array(store, head, AT.stars, 4, np.float64),
+        _array(store, head, AT.pairs, 2, np.uint16),
+        view_into(store, head[AT.offset, FIRST], (classes, buckets), np.int32),
+        _array(store, head, AT.class_edge, 2, np.float64),
+        view_into(store, head[AT.bits, FIRST], (levels, level_bytes), np.uint8),
+        _array(store, head, AT.face, 5, np.int32),
+        _column(store, head, AT.cell_start, np.int32),
+        _column(store, head, AT.cell_rows, np.uint16),
+        _column(store, head, AT.patch_start, np.int32),
+        _column(store, head, AT.patch_rows, np.uint16),
+        _array(store, head, AT.place, 4, np.float32),
+        _array(store, head, AT.cell_place, 4, np.float32),
+        _column(store, head, AT.brighter, np.int32),
+    )
+
+
+@njit(cache=True, nogil=True)
+def _array(store, head, at, columns, dtype):  # type: ignore[no-untyped-def]
+    return view_into(store, head[at, FIRST], (head[at, ROWS], columns), dtype)
+
+
+@njit(cache=True, nogil=True)
+def _column(store, head, at, dtype):  # type: ignore[no-untyped-def]
+    return view_into(store, head[at, FIRST], (head[at, ROWS],), dtype)
+
+
+def _patches(
+    direction: Vector, radius_deg: float
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.uint16]]:
+    """Of every patch of the sky the stars that a field of view with its boresight there holds."""
+    least = math.cos(min(math.radians(radius_deg) + PATCH_RADIUS_RAD, math.pi))
+    middle = (np.arange(PATCHES) + 0.5) * 2.0 / PATCHES - 1.0
+    start, rows = [0], []
+    for face in range(6):
+        axis, side = divmod(face, 2)
+        for u in middle:
+            for v in middle:
+                p = np.empty(3)
+                p[axis], p[(axis + 1) % 3], p[(axis + 2) % 3] = 1.0 - 2.0 * side, u, v
+                found = np.flatnonzero(direction @ (p / math.sqrt(p @ p)) >= least)
+                start.append(start[-1] + len(found))
+                rows.append(found)
+    return np.array(start, np.int32), np.concatenate(rows).astype(np.uint16)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def patch_of(p):  # type: ignore[no-untyped-def]
+    """The patch of a direction (3,)."""
+    axis = 0
+    if abs(p[1]) > abs(p[axis]):
+        axis = 1
+    if abs(p[2]) > abs(p[axis]):
+        axis = 2
+    face = 2 * axis + (1 if p[axis] < 0.0 else 0)
+    scale = 0.5 * PATCHES / abs(p[axis])
+    u = min(int(p[(axis + 1) % 3] * scale + 0.5 * PATCHES), PATCHES - 1)
+    v = min(int(p[(axis + 2) % 3] * scale + 0.5 * PATCHES), PATCHES - 1)
+    return (face * PATCHES + u) * PATCHES + v

@@ -1,0 +1,171 @@
+"""Advice: what recorded batches say of a mission's settings."""
+
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from service.missions.mission import Identifier
+from service.storage.models.base import Components, Count, Digest, Moment, Record, doc
+
+Text = Annotated[str, doc("The finding as a sentence.")]
+Action = Annotated[
+    Literal["widen", "tighten", "keep", "correct", "wait"],
+    doc("What to do; `wait`: more batches are needed."),
+]
+Size = Literal["too_small", "fits", "too_large", "no_verdict"]
+
+
+class Estimate(Record, frozen=True, kw_only=True):
+    """An estimate with its 95 % interval; null if the sample does not bound it."""
+
+    component: ClassVar[str] = "Estimate"
+    value: float
+    low: float | None
+    high: float | None
+
+
+class ToleranceAdvice(Record, frozen=True, kw_only=True):
+    """A tolerance, compared with the differences between measurements and catalog."""
+
+    component: ClassVar[str] = "ToleranceAdvice"
+    tolerance: Annotated[str, doc("The name in the mission file.")]
+    symbol: Annotated[str, doc("The symbol of Fink & Shoup (1994).")]
+    unit: Literal["deg", "mag"]
+    now: float
+    verdict: Literal["too_tight", "fits", "too_wide", "no_verdict", "not_used"]
+    confidence: Literal["high", "moderate", "low", "none"]
+    differences: Count
+    batches: Count
+    needed: Annotated[
+        Estimate | None, doc("The value that accepts 99 % of the true pairs or stars.")
+    ]
+    share_beyond: Annotated[
+        Estimate | None, doc("Share of the true pairs or stars that the present value rejects.")
+    ]
+    recommended: float | None
+    action: Action
+    text: Text
+
+
+class GroupAdvice(Record, frozen=True, kw_only=True):
+    """Findings that no setting can correct: two groups of stars, mirrored axes."""
+
+    component: ClassVar[str] = "GroupAdvice"
+    action: Action
+    text: Text
+
+
+class NoiseAdvice(Record, frozen=True, kw_only=True):
+    """A tracker's noise, one standard deviation per tangent axis."""
+
+    component: ClassVar[str] = "NoiseAdvice"
+    tracker: str
+    now_arcsec: float
+    sigma_arcsec: Estimate | None
+    batches: Count
+    verdict: Size
+    action: Action
+    text: Text
+
+
+class MagnitudeAdvice(Record, frozen=True, kw_only=True):
+    """observed = catalog + offset + (scale - 1) (catalog - pivot)."""
+
+    component: ClassVar[str] = "MagnitudeAdvice"
+    tracker: str
+    pivot_mag: Annotated[float | None, doc("The median of the catalog magnitudes.")]
+    offset_mag: Annotated[
+        Estimate | None, doc("At the pivot; positive: the tracker measures fainter.")
+    ]
+    scale: Estimate | None
+    now_sigma_mag: float
+    scatter_mag: Annotated[Estimate | None, doc("One standard deviation about the line.")]
+    stars: Count
+    verdict: Literal["off", "fits", "no_verdict"]
+    scatter_verdict: Size
+    action: Action
+    text: Text
+
+
+class AlignmentAdvice(Record, frozen=True, kw_only=True):
+    """Rotation of a tracker from its place in the mission file, relative to the first tracker."""
+
+    component: ClassVar[str] = "AlignmentAdvice"
+    tracker: str
+    reference: str
+    rotation_arcsec: Annotated[
+        Annotated[list[Estimate], Field(min_length=3, max_length=3)] | None,
+        doc("Rotation vector about the body axes."),
+    ]
+    axes_body: Annotated[
+        Annotated[list[Components], Field(min_length=3, max_length=3)] | None,
+        doc("The measured x, y and z axis of the tracker, if the sample fixes them."),
+    ]
+    batches: Count
+    verdict: Literal["off", "fits", "no_verdict"]
+    action: Action
+    text: Text
+
+
+class Trial(Record, frozen=True, kw_only=True):
+    """Outcomes of the sample's stars with other settings."""
+
+    component: ClassVar[str] = "Tried"
+    name: str
+    identifier: Identifier
+    tolerances: dict[str, float]
+    batches: Count
+    observed: Count
+    unique: Count
+    ambiguous: Count
+    unmatched: Count
+    named_otherwise: Annotated[
+        Count,
+        doc("Stars that are unique here and under `verified`, but as different catalog stars."),
+    ]
+    change_points: Annotated[
+        Estimate | None,
+        doc(
+            "Change of the share that is not unique, in percentage points, relative to votes "
+            "with the present settings; null: not compared."
+        ),
+    ]
+
+
+class Change(Record, frozen=True, kw_only=True):
+    """A line for the mission's file."""
+
+    component: ClassVar[str] = "Change"
+    table: Literal["tolerances", "catalog", "trackers"]
+    tracker: str | None
+    line: str
+
+
+class Advice(Record, frozen=True, kw_only=True):
+    """Recommended settings of a mission, from recorded batches."""
+
+    component: ClassVar[str] = "Advice"
+    spacecraft: str
+    run: str
+    first: Annotated[Moment | None, doc("Time of the first batch of the sample.")]
+    last: Moment | None
+    batches_in_range: Count
+    batches_sampled: Annotated[Count, doc("Batches that were processed again.")]
+    batches_identified: Count
+    batches_refused: Annotated[Count, doc("Batches that the mission's present settings refuse.")]
+    refusal: str | None
+    mission: Digest
+    identifier: Identifier
+    groups: Annotated[
+        list[GroupAdvice],
+        doc(
+            "Findings on batches in which two groups of stars give two attitudes, and on "
+            "mirrored batches."
+        ),
+    ]
+    tolerances: list[ToleranceAdvice]
+    noise: list[NoiseAdvice]
+    magnitudes: list[MagnitudeAdvice]
+    alignment: list[AlignmentAdvice]
+    tried: list[Trial]
+    changes: list[Change]

@@ -1,0 +1,132 @@
+"""Limits and alarms."""
+
+from typing import Annotated, Any, ClassVar, Literal
+
+from service.alarms.limits import LimitSettings
+from service.alarms.quantities import QuantityName
+from service.alarms.state_machine import Action, State
+from service.storage.models.base import DescribedAs, Id, Moment, Record, doc
+
+SeverityName = Literal["watch", "warning", "critical"]
+
+
+class Limit(Record, frozen=True, kw_only=True):
+    """The limit of one quantity of a spacecraft."""
+
+    component: ClassVar[str] = "LimitOut"
+    spacecraft: str
+    quantity: QuantityName
+    unit: str
+    is_default: Annotated[bool, doc("Whether this is the shipped limit.")]
+    since: Annotated[Moment | None, doc("null: it was never changed.")]
+    who: str | None
+    comment: str | None
+    settings: Annotated[dict[str, Any], DescribedAs(LimitSettings)]
+
+
+class LimitList(Record, frozen=True, kw_only=True):
+    """The limits of a spacecraft."""
+
+    component: ClassVar[str] = "LimitList"
+    items: list[Limit]
+
+
+class LimitHistory(Record, frozen=True, kw_only=True):
+    """One limit, the shipped limit, and the history of changes."""
+
+    component: ClassVar[str] = "LimitHistory"
+    limit: Limit
+    default: Annotated[dict[str, Any], DescribedAs(LimitSettings)]
+    history: Annotated[list[Limit], doc("Newest first.")]
+
+
+class AlarmValue(Record, frozen=True, kw_only=True):
+    """An evaluated value with its time and its batch."""
+
+    component: ClassVar[str] = "PointOut"
+    value: float
+    time: Annotated[Moment, doc("Time of the batch; for silence, of the batch before it.")]
+    batch_id: Id | None
+
+
+class AlarmRaised(AlarmValue, frozen=True, kw_only=True):
+    """The value that raised an alarm."""
+
+    component: ClassVar[str] = "RaisedOut"
+    at: Annotated[Moment, doc("By the service's clock.")]
+    bound: Annotated[float, doc("The bound of the worst severity so far.")]
+
+
+class Acted(Record, frozen=True, kw_only=True):
+    """The author and the time of an action."""
+
+    component: ClassVar[str] = "ActedOut"
+    at: Moment
+    who: str
+
+
+class Shelved(Acted, frozen=True, kw_only=True):
+    """Shelved until a time."""
+
+    component: ClassVar[str] = "ShelfOut"
+    until: Moment
+
+
+class Alarm(Record, frozen=True, kw_only=True):
+    """An alarm. It stays until it is acknowledged and its quantity is back in limits."""
+
+    component: ClassVar[str] = "AlarmOut"
+    id: Id
+    spacecraft: str
+    run: str
+    quantity: QuantityName
+    unit: str
+    state: State
+    severity: Annotated[SeverityName, doc("The worst severity so far.")]
+    current_severity: Annotated[SeverityName | None, doc("null: the value is back in limits.")]
+    in_limits: bool
+    raised: AlarmRaised
+    worst: AlarmValue
+    latest: AlarmValue
+    returned_at: Moment | None
+    acknowledged: Acted | None
+    shelved: Shelved | None
+    cleared_at: Moment | None
+
+
+class AlarmPage(Record, frozen=True, kw_only=True):
+    """A page of alarms."""
+
+    component: ClassVar[str] = "AlarmPage"
+    items: list[Alarm]
+    next_cursor: str | None
+
+
+class AlarmAction(Record, frozen=True, kw_only=True):
+    """A change of an alarm, by its value or by a person."""
+
+    component: ClassVar[str] = "ActionOut"
+    at: Moment
+    action: Action
+    who: str | None
+    comment: str | None
+    severity: SeverityName | None
+    value: float | None
+    time: Moment | None
+
+
+class AlarmWithActions(Alarm, frozen=True, kw_only=True):
+    """An alarm with its history."""
+
+    component: ClassVar[str] = "AlarmRecord"
+    actions: Annotated[list[AlarmAction], doc("Oldest first.")]
+
+
+class AlarmSummary(Record, frozen=True, kw_only=True):
+    """How many alarms are active, by state."""
+
+    component: ClassVar[str] = "AlarmSummary"
+    open: int
+    acknowledged: int
+    shelved: int
+    worst: Annotated[SeverityName | None, doc("Worst severity of the alarms that are not shelved.")]

@@ -1,0 +1,403 @@
+"""The answer to a batch, and answers in lists."""
+
+from functools import cache
+from typing import Annotated, Any, ClassVar, Literal
+
+from msgspec import UNSET, Struct, UnsetType
+from pydantic import BaseModel, Field, GetCoreSchemaHandler, create_model
+from pydantic_core import CoreSchema
+
+from service.alarms.quantities import QUANTITIES, value_names
+from service.missions.mission import Identifier
+from service.observations.schema import BatchIn
+from service.storage.models.base import (
+    Count,
+    Covariance,
+    DescribedAs,
+    Digest,
+    Id,
+    Moment,
+    Outcome,
+    Quaternion,
+    Reason,
+    Record,
+    Settings,
+    Shape,
+    Status,
+    doc,
+)
+
+
+class StarRef(Record, frozen=True, kw_only=True):
+    """A star of the catalog."""
+
+    component: ClassVar[str] = "StarRef"
+    catalog: Annotated[str, Field(examples=["HIP"])]
+    id: Annotated[str, Field(examples=["HIP 26311"])]
+
+
+class Star(Record, frozen=True, kw_only=True):
+    """The result for one observed star."""
+
+    component: ClassVar[str] = "StarOut"
+    outcome: Outcome
+    star: StarRef | None
+    votes: Annotated[Count, doc("Highest number of votes (STARID).")]
+    runner_up: Annotated[Count, doc("Second highest number of votes; equal to `votes` in a tie.")]
+    rivals: (
+        Annotated[
+            list[str],
+            doc(
+                "Catalog stars that it can be, if it is not unique: those with equal votes or, "
+                "with probabilities, the probable ones, most probable first."
+            ),
+        ]
+        | UnsetType
+    ) = UNSET
+    rival_probabilities: (
+        Annotated[
+            list[float],
+            doc("Probability of each entry of `rivals`, if the identifier gives probabilities."),
+        ]
+        | UnsetType
+    ) = UNSET
+    probability: Annotated[
+        float | None,
+        doc(
+            "Probability of `star`; for an ambiguous star, of its most probable rival; for an "
+            "unmatched star, that it is no star of the zone. null: the identifier gives none."
+        ),
+    ]
+    residual_arcsec: Annotated[float | None, doc("null if the attitude does not use the star.")]
+    flags: list[Annotated[str, DescribedAs(Literal["outside_field_of_view", "no_magnitude"])]]
+
+
+ZoneKind = Annotated[str, DescribedAs(Literal["cap", "band"])]
+ZoneRightAscension = Annotated[float, doc("Centre of the cap, or pole of the band.")]
+ZoneStars = Annotated[Count, doc("Number of stars (NCAP).")]
+ZonePairs = Annotated[Count, doc("Number of pairs (NTOT).")]
+
+
+class ZoneSummary(Record, frozen=True, kw_only=True):
+    """The part of the sky in which the service searched for stars."""
+
+    component: ClassVar[str] = "ZoneSummary"
+    kind: ZoneKind
+    ra_deg: ZoneRightAscension
+    dec_deg: float
+    stars: ZoneStars
+    pairs: ZonePairs
+
+
+class SearchedZone(ZoneSummary, frozen=True, kw_only=True):
+    """The zone of a batch."""
+
+    component: ClassVar[str] = "ZoneOut"
+    cached: bool
+
+
+class TrackerStars(Record, frozen=True, kw_only=True):
+    """One tracker's stars, in the order observed."""
+
+    component: ClassVar[str] = "TrackerOut"
+    tracker: str
+    zone: Annotated[
+        SearchedZone | None,
+        doc("null if the whole sky gave no attitude."),
+    ]
+    stars: list[Star]
+
+
+class StarCounts(Record, frozen=True, kw_only=True):
+    """Stars by outcome."""
+
+    component: ClassVar[str] = "CountsOut"
+    observed: Count
+    unique: Count
+    ambiguous: Count
+    unmatched: Count
+
+
+class TrackerFit(Record, frozen=True, kw_only=True):
+    """Agreement of one tracker with the attitude from all trackers."""
+
+    component: ClassVar[str] = "TrackerFitOut"
+    tracker: str
+    stars: Count
+    taste: float
+    outlier: bool
+
+
+class Rival(Record, frozen=True, kw_only=True):
+    """A second attitude, from stars that the first one leaves unexplained."""
+
+    component: ClassVar[str] = "RivalOut"
+    quaternion: Quaternion
+    covariance_arcsec2: Covariance
+    probability: Annotated[float, doc("Its probability, relative to the first attitude.")]
+    angle_deg: Annotated[float, doc("The rotation between the two attitudes.")]
+    stars: Annotated[
+        list[list[str | None]],
+        doc(
+            "For each tracker, its stars in the order observed; null for a star that is not in "
+            "the group."
+        ),
+    ]
+
+
+class Attitude(Record, frozen=True, kw_only=True):
+    """An attitude with its accuracy and its consistency."""
+
+    component: ClassVar[str] = "AttitudeOut"
+    quaternion: Quaternion
+    frame: Annotated[str, DescribedAs(Literal["EME2000"])]
+    covariance_arcsec2: Covariance
+    method: Annotated[str, DescribedAs(Literal["quest", "triad"])]
+    residual_rms_arcsec: float
+    predicted_rms_arcsec: float
+    taste: Annotated[float, doc("Weighted sum of squared residuals; follows chi-square.")]
+    degrees_of_freedom: Count
+    status: Annotated[
+        Status,
+        doc("`suspect`: `taste` exceeds its 99.9 % point, or there is a `rival`."),
+    ]
+    triad: Quaternion
+    quest: Quaternion
+    triad_quest_angle_arcsec: float
+    trackers: Annotated[list[TrackerFit], doc("If there are several trackers.")] | UnsetType = UNSET
+    outlier: Annotated[str | None, doc("The tracker that disagrees.")] | UnsetType = UNSET
+    rival: (
+        Annotated[
+            Rival | None,
+            doc("If two groups of stars give two attitudes: the less probable one."),
+        ]
+        | UnsetType
+    ) = UNSET
+
+
+class Timings(Record, frozen=True, kw_only=True):
+    """Microseconds per step."""
+
+    component: ClassVar[str] = "TimingsOut"
+    zone: Count
+    identify: Count
+    solve: Count
+    record: Annotated[int | None, doc("null if nothing was recorded.")]
+
+
+class Provenance(Record, frozen=True, kw_only=True):
+    """The versions of the data and the program that made the answer."""
+
+    component: ClassVar[str] = "ProvenanceOut"
+    catalog: Digest
+    run_catalog: Digest
+    epoch_year: float
+    mission: Digest
+    version: str
+
+
+class FrameTimings(Record, frozen=True, kw_only=True):
+    """Microseconds per step from file to stars."""
+
+    component: ClassVar[str] = "FrameTimingsOut"
+    read: Count
+    detect: Count
+    centroid: Count
+
+
+class Frame(Record, frozen=True, kw_only=True):
+    """The frame of a batch, and the numbers of detected stars."""
+
+    component: ClassVar[str] = "FrameOut"
+    digest: Digest
+    format: Annotated[str, DescribedAs(Literal["FITS", "TIFF", "PNG", "NPY", "JPEG", "BMP"])]
+    tracker: str
+    width_px: Count
+    height_px: Count
+    exposure_s: float
+    centroid: Annotated[str, DescribedAs(Literal["window", "scan", "matched", "recursive"])]
+    background_counts: Annotated[float, doc("Median background above the bias.")]
+    noise_counts: Annotated[float, doc("Standard deviation of a background pixel.")]
+    candidates: Annotated[Count, doc("Detections above the threshold, without hot pixels.")]
+    measured: Annotated[Count, doc("The brightest of these, whose positions were measured.")]
+    used: Annotated[Count, doc("Of these, the stars in the batch.")]
+    hot_or_cosmic: Annotated[Count, doc("Detections that are sharper than a star.")]
+    timings_us: FrameTimings
+    remarks: (
+        Annotated[list[str], doc("Of a camera without calibration: what was fitted or failed.")]
+        | UnsetType
+    ) = UNSET
+
+
+class Detection(Record, frozen=True, kw_only=True):
+    """One measured candidate.  The centre of the first pixel is (0, 0); u counts columns."""
+
+    component: ClassVar[str] = "DetectionOut"
+    u_px: Annotated[
+        float | None,
+        doc("null if the position could not be measured; `left_out` states the reason."),
+    ]
+    v_px: float | None
+    sigma_u_px: Annotated[float | None, doc("Predicted, one standard deviation.")]
+    sigma_v_px: float | None
+    flux_counts: float | None
+    magnitude: float | None
+    signal_ratio: Annotated[float | None, doc("Signal divided by its noise.")]
+    flags: list[
+        Annotated[
+            str,
+            DescribedAs(
+                Literal[
+                    "saturated",
+                    "edge",
+                    "blended",
+                    "too_faint",
+                    "outside_hump",
+                    "masked_pixels",
+                    "truncated",
+                    "not_converged",
+                ]
+            ),
+        ]
+    ]
+    used: Annotated[bool, doc("Whether it is in the batch. The batch has the same order.")]
+    left_out: Annotated[str | None, doc("Why it is not in the batch.")]
+
+
+class FrameWithStars(Frame, frozen=True, kw_only=True):
+    """A frame with every candidate."""
+
+    component: ClassVar[str] = "FrameRecordOut"
+    stars: Annotated[list[Detection], doc("The stars in the batch come first.")]
+    hot_or_cosmic_px: Annotated[
+        list[Annotated[list[float], Field(min_length=2, max_length=2)]],
+        doc("Positions (u, v) of rejected hot pixels and cosmic rays; the first 500."),
+    ]
+
+
+class Answer(Record, frozen=True, kw_only=True):
+    """The answer to a batch, as it is recorded."""
+
+    component: ClassVar[str] = "Answer"
+    id: Annotated[Id | None, doc("null for a what-if that was not recorded.")]
+    spacecraft: str
+    batch: str
+    run: str
+    time: Moment
+    identifier: Annotated[str, DescribedAs(Identifier)]
+    path: Annotated[
+        str,
+        DescribedAs(Literal["zone", "lost_in_space", "zone_then_lost_in_space"]),
+        doc(
+            "`zone`: the service searched about the a priori attitude. `lost_in_space`: without "
+            "an a priori attitude, it searched about an attitude from the whole sky. "
+            "`zone_then_lost_in_space`: the first search found nothing good, so the service "
+            "made the second."
+        ),
+    ]
+    observations: list[TrackerStars]
+    counts: StarCounts
+    attitude: Attitude | None
+    reason: Annotated[Reason | None, doc("Why there is no attitude.")]
+    warnings: list[str]
+    timings_us: Timings
+    provenance: Provenance
+    parent: (
+        Annotated[
+            Id | None,
+            doc("Only for a what-if: the result that it started from."),
+        ]
+        | UnsetType
+    ) = UNSET
+    recorded: Annotated[bool, doc("For a what-if: whether it was recorded.")] | UnsetType = UNSET
+    frame: (
+        Annotated[Frame | None, doc("Only for a batch that was made from a frame.")] | UnsetType
+    ) = UNSET
+
+
+class _MeasuresShape:
+    """Describes the measures by the registry of quantities."""
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return handler(_measures_shape(value_names()))
+
+
+@cache
+def _measures_shape(names: tuple[str, ...]) -> type[BaseModel]:
+    fields: dict[str, Any] = {
+        name: (float | None, Field(description=QUANTITIES[name].description or None))
+        for name in names
+    }
+    text = "Quantities of a result; null: not measurable, or unknown."
+    return create_model("MeasuresOut", __base__=Shape, __doc__=text, **fields)
+
+
+Measures = Annotated[dict[str, float | None], DescribedAs(_MeasuresShape)]
+
+
+class Summary(Record, frozen=True, kw_only=True):
+    """A result in a list, without its stars and its attitude."""
+
+    component: ClassVar[str] = "Summary"
+    id: Id
+    spacecraft: str
+    batch: str
+    run: str
+    time: Moment
+    received: Annotated[Moment, doc("Time at which the service first received the batch.")]
+    created: Annotated[Moment, doc("Time at which this result was recorded.")]
+    identifier: str
+    options: Annotated[Settings, doc("Options that replaced the mission's settings.")]
+    counts: StarCounts
+    status: Annotated[Status | None, doc("Status of the attitude; null without an attitude.")]
+    reason: Reason | None
+    measures: Measures
+    parent: Annotated[Id | None, doc("For a what-if: the result that it started from.")]
+    current: Annotated[bool, doc("Whether this is the current result of its batch.")]
+
+
+class BatchPage(Record, frozen=True, kw_only=True):
+    """A page of results."""
+
+    component: ClassVar[str] = "BatchPage"
+    items: list[Summary]
+    next_cursor: str | None
+
+
+class Result(Record, frozen=True, kw_only=True):
+    """A result with its batch, and the other results of that batch."""
+
+    component: ClassVar[str] = "Record"
+    answer: Answer
+    input: Annotated[
+        dict[str, Any],
+        DescribedAs(BatchIn),
+        doc("The batch as it was sent, without default values."),
+    ]
+    options: Annotated[
+        Settings,
+        doc(
+            "Options of this result that replaced the mission's settings; `provenance.mission` "
+            "identifies those settings."
+        ),
+    ]
+    measures: Measures
+    current: bool
+    parent: Id | None
+    what_ifs: list[Summary]
+    frame: (
+        Annotated[
+            FrameWithStars | None,
+            doc("Only for a batch that was made from a frame."),
+        ]
+        | UnsetType
+    ) = UNSET
+
+
+class Neighbours(Struct, frozen=True):
+    """The results next to one in time, and the id of the result that stands for its batch."""
+
+    current: str | None
+    earlier: Summary | None
+    later: Summary | None

@@ -1,0 +1,142 @@
+"""What all records have in common, and how OpenAPI describes them.
+
+A record is a msgspec struct: storage functions make it, and the API encodes it as
+it is.  Its annotations carry pydantic's `Field` for descriptions and bounds, which
+msgspec ignores; the schema in the OpenAPI document is made of them.
+"""
+
+from functools import cache
+from types import UnionType
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Generic,
+    Literal,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+from msgspec import NODEFAULT, Struct, UnsetType, structs
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, create_model
+from pydantic_core import CoreSchema
+
+Components = Annotated[list[float], Field(min_length=3, max_length=3)]
+Quaternion = Annotated[
+    list[float],
+    Field(
+        min_length=4,
+        max_length=4,
+        description="Transforms inertial into body components; scalar last, qc >= 0.",
+    ),
+]
+Moment = Annotated[str, Field(description="UTC.", examples=["1996-01-10T12:00:00.000Z"])]
+Id = Annotated[
+    str, Field(min_length=26, max_length=26, description="Ids sort by the time of recording.")
+]
+Digest = Annotated[str, Field(pattern=r"^sha256:[0-9a-f]{64}$")]
+Count = Annotated[int, Field(ge=0)]
+Settings = Annotated[dict[str, Any], Field(description="With the names of the mission file.")]
+Covariance = Annotated[
+    list[Components],
+    Field(
+        min_length=3,
+        max_length=3,
+        description="Covariance of the small error rotation about the body axes.",
+    ),
+]
+
+
+def doc(description: str) -> Any:
+    """The description of a field in the OpenAPI document."""
+    return Field(description=description)
+
+
+class DescribedAs:
+    """Describes a field by another type than that of its value, such as a request's model."""
+
+    def __init__(self, shape: Any) -> None:
+        self._shape = shape
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        """The schema of that type."""
+        return handler.generate_schema(self._shape)
+
+
+# Stored answers may hold words of their day: texts are read as they are.
+Outcome = Annotated[str, DescribedAs(Literal["unique", "ambiguous", "unmatched"])]
+Status = Annotated[str, DescribedAs(Literal["good", "suspect"])]
+Reason = Annotated[
+    str,
+    DescribedAs(
+        Literal[
+            "fewer_than_two_unique_stars",
+            "degenerate_geometry",
+            "fewer_than_three_stars",
+            "no_match",
+            "doubtful_match",
+        ]
+    ),
+]
+
+
+class Record(Struct, frozen=True, kw_only=True):
+    """A record; `component` is its name in the OpenAPI document, where that differs."""
+
+    component: ClassVar[str] = ""
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """The schema of the record's fields, for the OpenAPI document."""
+        return handler(described(cls))
+
+
+R_co = TypeVar("R_co", covariant=True)
+
+
+class Page(Struct, Generic[R_co], frozen=True):
+    """A part of a list; `next_cursor` leads to the part after it, None at the end."""
+
+    items: list[R_co]
+    next_cursor: str | None
+
+
+def _without_defaults(schema: dict[str, Any]) -> None:
+    # A default here says that a field may be absent, not what is meant where it is.
+    for each in schema.get("properties", {}).values():
+        each.pop("default", None)
+
+
+class Shape(BaseModel):
+    """A description of JSON that has no properties but those described."""
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra=_without_defaults)
+
+
+def component_name(shape: type[BaseModel] | type[Record]) -> str:
+    """The name of a shape in the OpenAPI document."""
+    return vars(shape).get("component") or shape.__name__
+
+
+@cache
+def described(record: type[Record]) -> type[BaseModel]:
+    """The pydantic model that describes a record; a field that may be absent has a default."""
+    hints = get_type_hints(record, include_extras=True)
+    fields: dict[str, Any] = {}
+    for each in structs.fields(record):
+        is_required = each.default is NODEFAULT and each.default_factory is NODEFAULT
+        default = ... if is_required else None
+        alias = each.encode_name if each.encode_name != each.name else None
+        fields[each.name] = _without_unset(hints[each.name]), Field(default, alias=alias)
+    return create_model(component_name(record), __base__=Shape, __doc__=record.__doc__, **fields)
+
+
+def _without_unset(kind: Any) -> Any:
+    if get_origin(kind) not in (Union, UnionType):
+        return kind
+    return Union[tuple(each for each in get_args(kind) if each is not UnsetType)]  # noqa: UP007

@@ -1,0 +1,96 @@
+"""Two sets of options side by side."""
+
+from typing import Annotated, ClassVar
+
+from msgspec import field
+
+from service.storage.models.answers import StarCounts
+from service.storage.models.base import Count, Id, Moment, Outcome, Record, Settings, doc
+
+
+class ComparedSide(StarCounts, frozen=True, kw_only=True):
+    """Results of all batches with one set of options."""
+
+    component: ClassVar[str] = "SideOut"
+    options: Settings
+    solved: Count
+    suspect: Count
+    residual_ratio_mean: float | None
+    us_per_batch: Annotated[
+        float | None, doc("Median time for zones, identification and attitude.")
+    ]
+
+
+class Transition(Record, frozen=True, kw_only=True):
+    """Number of stars with an outcome on side a and an outcome on side b, including equal ones."""
+
+    component: ClassVar[str] = "Transition"
+    from_: Outcome = field(name="from")
+    to: Outcome
+    stars: Count
+
+
+class ComparedAttitudes(Record, frozen=True, kw_only=True):
+    """How many batches have an attitude on either side, and the angles between them."""
+
+    component: ClassVar[str] = "AttitudesOut"
+    both: Count
+    only_a: Count
+    only_b: Count
+    neither: Count
+    angle_arcsec_median: float | None
+    angle_arcsec_max: float | None
+
+
+class StarSide(Record, frozen=True, kw_only=True):
+    """One star on one side."""
+
+    component: ClassVar[str] = "StarSide"
+    outcome: Outcome
+    star: str | None
+
+
+class StarChange(Record, frozen=True, kw_only=True):
+    """One star that differs."""
+
+    component: ClassVar[str] = "StarChange"
+    tracker: str
+    position: Annotated[Count, doc("Position among the tracker's stars, from 0.")]
+    a: StarSide
+    b: StarSide
+
+
+class BatchChange(Record, frozen=True, kw_only=True):
+    """One batch of which a star or the attitude differs."""
+
+    component: ClassVar[str] = "BatchChange"
+    id: Id
+    batch: str
+    time: Moment
+    a: StarCounts
+    b: StarCounts
+    attitude_angle_arcsec: float | None
+    stars: list[StarChange]
+
+
+class Comparison(Record, frozen=True, kw_only=True):
+    """The results of both sides, and their differences."""
+
+    component: ClassVar[str] = "Comparison"
+    spacecraft: str
+    run: str
+    start: Annotated[Moment | None, doc("Time of the earliest batch of the sample.")]
+    end: Moment | None
+    batches_in_stretch: Count
+    sampled: Count
+    compared: Count
+    cut_short: Annotated[bool, doc("Whether the time limit ended the comparison early.")]
+    a: ComparedSide
+    b: ComparedSide
+    transitions: list[Transition]
+    renamed: Annotated[
+        Count, doc("Stars that are unique on both sides, but as different catalog stars.")
+    ]
+    attitudes: ComparedAttitudes
+    changed_batches: Count
+    changed: Annotated[list[BatchChange], doc("The first hundred, oldest first.")]

@@ -1,0 +1,102 @@
+"""Runs and replays."""
+
+from typing import Annotated, ClassVar, Literal
+
+from msgspec import UNSET, UnsetType
+from pydantic import Field
+
+from service.storage.models.base import Count, Id, Moment, Record, doc
+from service.storage.models.problems import FieldFault
+
+
+class Run(Record, frozen=True, kw_only=True):
+    """A run."""
+
+    component: ClassVar[str] = "RunRow"
+    run: str
+    created: Moment
+    alarms: Annotated[bool, doc("Whether its batches can raise alarms.")]
+    batches: Count
+    spacecraft: list[str]
+    first_day: Annotated[str, Field(examples=["1999-03-01"])]
+    last_day: str
+
+
+class RunList(Record, frozen=True, kw_only=True):
+    """Every run with batches."""
+
+    component: ClassVar[str] = "RunList"
+    items: list[Run]
+
+
+class ReplayLines(Record, frozen=True, kw_only=True):
+    """The lines of a replay."""
+
+    component: ClassVar[str] = "ReplayLines"
+    total: Annotated[int | None, doc("null if the number is not known in advance.")]
+    done: Count
+    refused: Count
+
+
+class ReplayCounts(Record, frozen=True, kw_only=True):
+    """Results of the lines so far."""
+
+    component: ClassVar[str] = "ReplayCounts"
+    new: Annotated[Count, doc("Batches that this replay recorded.")]
+    repeated: Annotated[Count, doc("Batches that were already recorded.")]
+    observed: Annotated[
+        Count, doc("Stars of these batches; the next fields count them by outcome.")
+    ]
+    unique: Count
+    ambiguous: Count
+    unmatched: Count
+    attitudes: Annotated[Count, doc("Batches with an attitude.")]
+
+
+class LineProblem(Record, frozen=True, kw_only=True):
+    """The faults of a line."""
+
+    component: ClassVar[str] = "LineProblem"
+    detail: str
+    errors: Annotated[list[FieldFault], doc("Every fault, field by field.")] | UnsetType = UNSET
+
+
+class RefusedLine(Record, frozen=True, kw_only=True):
+    """A refused line; the replay continues with the next one."""
+
+    component: ClassVar[str] = "RefusedLine"
+    line: Annotated[int, doc("Line number, from 1.")]
+    problem: LineProblem
+
+
+class Replay(Record, frozen=True, kw_only=True):
+    """A replay and its progress."""
+
+    component: ClassVar[str] = "ReplayState"
+    id: Id
+    run: str
+    name: str
+    state: Literal["running", "done", "interrupted", "failed", "cancelled"]
+    lines: ReplayLines
+    counts: ReplayCounts
+    errors: Annotated[
+        list[RefusedLine],
+        doc("The first thousand refused lines; then, for a failed replay, the reason."),
+    ]
+    started: Moment
+    finished: Moment | None
+
+
+class ReplayList(Record, frozen=True, kw_only=True):
+    """The latest replays, newest first."""
+
+    component: ClassVar[str] = "ReplayList"
+    items: list[Replay]
+
+
+class RunState(Record, frozen=True, kw_only=True):
+    """A run, and whether its batches can raise alarms."""
+
+    component: ClassVar[str] = "RunState"
+    run: str
+    alarms: bool

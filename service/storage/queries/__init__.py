@@ -1,0 +1,1 @@
+"""Reading results, trends, alarms and settings."""

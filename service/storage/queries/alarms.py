@@ -1,0 +1,216 @@
+"""Alarms in the records: lists, one with all that was done about it, and what people do."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+from sqlalchemy import ColumnElement, Connection, and_, insert, or_, select, update
+
+from service.alarms.limits import Severity
+from service.alarms.quantities import quantity_named
+from service.alarms.state_machine import Action, Changes, Step, state_of
+from service.errors import BadBatch, Fault, NotFound, shown_value
+from service.storage.models.alarms import (
+    Acted,
+    Alarm,
+    AlarmAction,
+    AlarmRaised,
+    AlarmSummary,
+    AlarmValue,
+    AlarmWithActions,
+    SeverityName,
+    Shelved,
+)
+from service.storage.models.base import Page
+from service.storage.recording import events
+from service.storage.recording.ids import is_ulid
+from service.storage.recording.unsaved_result import Row
+from service.storage.sql.tables import alarm_actions, alarms
+
+StateFilter = Literal["open", "acknowledged", "shelved", "active", "cleared", "all"]
+
+_ACTIVE = alarms.c.cleared_at.is_(None)
+
+
+def list_alarms(
+    connection: Connection,
+    *,
+    run: str | None,
+    spacecraft: str | None,
+    state: StateFilter,
+    limit: int,
+    cursor: str | None,
+    now: str,
+) -> Page[Alarm]:
+    """Alarms, the newest first; without a run those of every run."""
+    chosen = _in_state(state, now)
+    if run is not None:
+        chosen.append(alarms.c.run == run)
+    if spacecraft is not None:
+        chosen.append(alarms.c.spacecraft == spacecraft)
+    if cursor is not None:
+        if not is_ulid(cursor):
+            raise BadBatch(Fault("cursor", "is not a cursor of this list", shown_value(cursor)))
+        chosen.append(alarms.c.id < cursor)
+    query = select(alarms).where(*chosen).order_by(alarms.c.id.desc()).limit(limit + 1)
+    rows = list(connection.execute(query).mappings())
+    more = len(rows) > limit
+    items = [shown_alarm(row, now) for row in rows[:limit]]
+    return Page(items, items[-1].id if more else None)
+
+
+def active_alarms(connection: Connection, run: str, now: str) -> list[Alarm]:
+    """The alarms of a run that are not cleared, the worst first."""
+    query = select(alarms).where(alarms.c.run == run, _ACTIVE).order_by(alarms.c.id.desc())
+    found = [shown_alarm(row, now) for row in connection.execute(query).mappings()]
+    return sorted(found, key=lambda each: -_rank(each.severity))
+
+
+def summary(found: Sequence[Alarm]) -> AlarmSummary:
+    """How many active alarms there are by state, and the worst of those not shelved."""
+    states = ("open", "acknowledged", "shelved")
+    worst: list[SeverityName] = [each.severity for each in found if each.state != "shelved"]
+    return AlarmSummary(
+        **{state: sum(each.state == state for each in found) for state in states},
+        worst=max(worst, key=_rank, default=None),
+    )
+
+
+def _rank(severity: str | None) -> Severity:
+    return Severity[(severity or "").upper()]
+
+
+def read_alarm(connection: Connection, id: str, now: str) -> AlarmWithActions:
+    """An alarm with all that was noted of it, oldest first; raises `NotFound`."""
+    alarm = _stored(connection, id)
+    query = select(alarm_actions).where(alarm_actions.c.alarm_id == id).order_by(alarm_actions.c.id)
+    shown = ("at", "action", "who", "comment", "severity", "value", "time")
+    actions = [
+        AlarmAction(**{name: row[name] for name in shown})
+        for row in connection.execute(query).mappings()
+    ]
+    return AlarmWithActions(**_fields(alarm, now), actions=actions)
+
+
+def act(
+    connection: Connection,
+    id: str,
+    step: Callable[[Row], Step],
+    *,
+    who: str,
+    comment: str | None,
+    now: str,
+) -> AlarmWithActions:
+    """Apply a step of the state machine to an alarm, and note who did it and their comment."""
+    alarm = _stored(connection, id, lock=True)
+    changes, actions = step(alarm)
+    change(connection, alarm, changes, actions, now, who=who, comment=comment)
+    return read_alarm(connection, id, now)
+
+
+def change(
+    connection: Connection,
+    alarm: Row,
+    changes: Changes,
+    actions: Sequence[Action],
+    now: str,
+    *,
+    who: str | None = None,
+    comment: str | None = None,
+) -> Row:
+    """Change a stored alarm, note what was done and tell of it; the alarm as it is then."""
+    if changes:
+        connection.execute(update(alarms).where(alarms.c.id == alarm["id"]).values(changes))
+    whole = {**alarm, **changes}
+    note(connection, whole, actions, now, who=who, comment=comment)
+    return whole
+
+
+def note(
+    connection: Connection,
+    alarm: Row,
+    actions: Sequence[Action],
+    now: str,
+    *,
+    who: str | None = None,
+    comment: str | None = None,
+) -> None:
+    """Write down what was done about an alarm, and tell of it."""
+    if not actions:
+        return
+    point = {"value": alarm["latest_value"], "time": alarm["latest_time"]}
+    severity = {"severity": alarm["current_severity"]}
+    # Of several things at once the first is what somebody did; the others follow from it.
+    by = [{"who": who, "comment": comment}] + [{"who": None, "comment": None}] * len(actions)
+    rows = [
+        {"alarm_id": alarm["id"], "at": now, "action": action, **point, **severity, **whom}
+        for action, whom in zip(actions, by, strict=False)
+    ]
+    connection.execute(insert(alarm_actions), rows)
+    shown = shown_alarm(alarm, now)
+    events.note(connection, "alarm", shown, run=alarm["run"], spacecraft=alarm["spacecraft"])
+
+
+def shown_alarm(alarm: Any, now: str) -> Alarm:
+    """A stored alarm as the interface shows it."""
+    return Alarm(**_fields(alarm, now))
+
+
+def _fields(alarm: Any, now: str) -> Row:
+    raised = {"at": alarm["raised_at"], "bound": alarm["bound"]}
+    return {
+        **{name: alarm[name] for name in ("id", "spacecraft", "run", "quantity")},
+        "unit": quantity_named(alarm["quantity"]).unit,
+        "state": state_of(alarm, now),
+        "severity": alarm["severity"],
+        "current_severity": alarm["current_severity"],
+        "in_limits": alarm["current_severity"] is None,
+        "raised": AlarmRaised(**_value(alarm, "raised"), **raised),
+        "worst": AlarmValue(**_value(alarm, "worst")),
+        "latest": AlarmValue(**_value(alarm, "latest")),
+        "returned_at": alarm["returned_at"],
+        "acknowledged": _acted(alarm, "acknowledged"),
+        "shelved": _shelved(alarm),
+        "cleared_at": alarm["cleared_at"],
+    }
+
+
+def _value(alarm: Any, which: str) -> Row:
+    return {name: alarm[f"{which}_{name}"] for name in ("value", "time", "batch_id")}
+
+
+def _acted(alarm: Any, which: str) -> Acted | None:
+    at = alarm[f"{which}_at"]
+    return None if at is None else Acted(at=at, who=alarm[f"{which}_by"])
+
+
+def _shelved(alarm: Any) -> Shelved | None:
+    at = alarm["shelved_at"]
+    if at is None:
+        return None
+    return Shelved(at=at, who=alarm["shelved_by"], until=alarm["shelved_until"])
+
+
+def _stored(connection: Connection, id: str, lock: bool = False) -> Row:
+    query = select(alarms).where(alarms.c.id == id)
+    row = connection.execute(query.with_for_update() if lock else query).mappings().first()
+    if row is None:
+        raise NotFound(f"there is no alarm with the id {shown_value(id)}")
+    return dict(row)
+
+
+def _in_state(state: StateFilter, now: str) -> list[ColumnElement[bool]]:
+    until, seen = alarms.c.shelved_until, alarms.c.acknowledged_at
+    off_shelf = or_(until.is_(None), until <= now)
+    match state:
+        case "all":
+            return []
+        case "cleared":
+            return [alarms.c.cleared_at.is_not(None)]
+        case "active":
+            return [_ACTIVE]
+        case "shelved":
+            return [_ACTIVE, until > now]
+        case "open":
+            return [and_(_ACTIVE, off_shelf, seen.is_(None))]
+        case "acknowledged":
+            return [and_(_ACTIVE, off_shelf, seen.is_not(None))]

@@ -1,0 +1,133 @@
+"""Two runs side by side: what became of the same stars, and how far the attitudes differ."""
+
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection, Subquery, and_, case, func, select
+
+from service.storage.queries.pages import ResultFilter
+from service.storage.recording.unsaved_result import Row
+from service.storage.sql.tables import batches, results, solutions, star_results
+from service.vectors import ARCSEC_PER_RADIAN, Vector
+
+OUTCOMES = ("unique", "ambiguous", "unmatched")
+_READ_AT_ONCE = 10_000
+_QUATERNION = ("q1", "q2", "q3", "qc")
+
+
+def compare_runs(connection: Connection, selected: ResultFilter, other: str) -> Row:
+    """The current results of a period beside those of the same batches in another run.
+
+    `stars` counts what became of each, from the one run (`before`) to the other
+    (`after`); `same_star` tells whether both name it, and alike.  `attitudes`
+    compares what both have.
+    """
+    pairs = _pairs(selected, other)
+    transitions = _transitions(connection, pairs)
+    return {
+        "run": selected.run,
+        "other": other,
+        "batches": int(connection.scalar(select(func.count()).select_from(pairs)) or 0),
+        "stars": {
+            "observed": sum(each["stars"] for each in transitions),
+            "before": _sums(transitions, "before"),
+            "after": _sums(transitions, "after"),
+            "transitions": transitions,
+        },
+        "attitudes": _attitudes(connection, pairs),
+    }
+
+
+def _pairs(selected: ResultFilter, other: str) -> Subquery:
+    """The ids and states of the two current results of each batch that is in both runs."""
+    again, new = batches.alias("again"), results.alias("new")
+    return (
+        select(
+            results.c.id.label("before"),
+            new.c.id.label("after"),
+            results.c.status.label("status_before"),
+            new.c.status.label("status_after"),
+        )
+        .join_from(results, batches, results.c.batch_id == batches.c.id)
+        .join(
+            again,
+            and_(
+                again.c.spacecraft == batches.c.spacecraft,
+                again.c.run == other,
+                again.c.batch == batches.c.batch,
+            ),
+        )
+        .join(new, and_(new.c.batch_id == again.c.id, new.c.current))
+        .where(*selected.conditions())
+        .subquery()
+    )
+
+
+def _transitions(connection: Connection, pairs: Subquery) -> list[Row]:
+    """How many stars went from which outcome to which, the most first."""
+    old, new = star_results.alias("old_star"), star_results.alias("new_star")
+    same = case((old.c.star_id == new.c.star_id, 1), else_=0)
+    query = (
+        select(old.c.outcome, new.c.outcome, same, func.count())
+        .select_from(pairs)
+        .join(old, old.c.result_id == pairs.c.before)
+        .join(
+            new,
+            and_(
+                new.c.result_id == pairs.c.after,
+                new.c.tracker == old.c.tracker,
+                new.c.position == old.c.position,
+            ),
+        )
+        .group_by(old.c.outcome, new.c.outcome, same)
+    )
+    found = [
+        {"before": before, "after": after, "same_star": bool(alike), "stars": int(stars)}
+        for before, after, alike, stars in connection.execute(query)
+    ]
+    return sorted(found, key=lambda each: (-each["stars"], each["before"], each["after"]))
+
+
+def _sums(transitions: list[Row], side: str) -> dict[str, int]:
+    return {
+        outcome: sum(each["stars"] for each in transitions if each[side] == outcome)
+        for outcome in OUTCOMES
+    }
+
+
+def _attitudes(connection: Connection, pairs: Subquery) -> Row:
+    """How many attitudes each has, and the angle between those that both have."""
+    states = select(pairs.c.status_before, pairs.c.status_after, func.count()).group_by(
+        pairs.c.status_before, pairs.c.status_after
+    )
+    before: dict[str, int] = {"good": 0, "suspect": 0, "none": 0}
+    after = dict(before)
+    for old, new, count in connection.execute(states):
+        before[old or "none"] += int(count)
+        after[new or "none"] += int(count)
+    angles = _angles_arcsec(connection, pairs)
+    found: Row = {"before": before, "after": after, "in_both": len(angles), "angle_arcsec": None}
+    if len(angles):
+        median, p95 = np.quantile(angles, (0.5, 0.95)).tolist()
+        found["angle_arcsec"] = {"median": median, "p95": p95, "max": float(angles.max())}
+    return found
+
+
+def _angles_arcsec(connection: Connection, pairs: Subquery) -> Vector:
+    old, new = solutions.alias("old_solution"), solutions.alias("new_solution")
+    query = (
+        select(*(each.c[name] for each in (old, new) for name in _QUATERNION))
+        .select_from(pairs)
+        .join(old, old.c.result_id == pairs.c.before)
+        .join(new, new.c.result_id == pairs.c.after)
+    )
+    read: Any = connection.execution_options(yield_per=_READ_AT_ONCE).execute(query)
+    parts = [_between(np.array(rows, dtype=float)) for rows in read.partitions(_READ_AT_ONCE)]
+    return np.concatenate(parts) if parts else np.empty(0)
+
+
+def _between(rows: Vector) -> Vector:
+    """The angle between the attitudes of each row, eight numbers: accurate near zero."""
+    one, other = rows[:, :4], rows[:, 4:]
+    apart = np.minimum(np.linalg.norm(one - other, axis=1), np.linalg.norm(one + other, axis=1))
+    return np.asarray(4.0 * np.arcsin(np.minimum(1.0, apart / 2.0)) * ARCSEC_PER_RADIAN)

@@ -1,0 +1,132 @@
+"""Histories: attitudes, the state of a spacecraft, its settings, and the runs there are."""
+
+import json
+from itertools import groupby
+from typing import Any
+
+from sqlalchemy import Connection, Select, func, select
+
+from service.missions.mission import Mission
+from service.storage.models.base import Page
+from service.storage.models.runs import Run
+from service.storage.models.spacecraft import AttitudeRow, MissionThen, SpacecraftRow
+from service.storage.queries.future_dated import LIVE
+from service.storage.queries.pages import PLACE, ResultFilter, newest, oldest_first, page_of
+from service.storage.queries.results import summary_of, summary_query
+from service.storage.sql.rollup_tables import rollups_daily
+from service.storage.sql.tables import batches, mission_uses, missions, results, runs, solutions
+from service.times import DAY_S, Utc, bucket_start
+
+
+def list_attitudes(
+    connection: Connection, selected: ResultFilter, *, limit: int, cursor: str | None
+) -> Page[AttitudeRow]:
+    """The attitudes of current results, oldest batch time first."""
+    chosen = [*selected.conditions(), results.c.status.is_not(None)]
+    return page_of(connection, oldest_first(attitudes().where(*chosen), cursor), limit, attitude_of)
+
+
+def live_state(connection: Connection, mission: Mission, run: str, now: Utc) -> SpacecraftRow:
+    """How a spacecraft stands in a run: its newest batch and its newest attitude.
+
+    `state` is that of the newest batch: good, suspect, no_attitude, or
+    no_batches.  `attitude` is that batch's own, or None; `last_attitude` is the
+    newest there is, which may be of an older batch.
+    """
+    selected = ResultFilter(run, mission.name)
+    batch = newest(connection, summary_query(), selected, now)
+    solved = attitudes().where(results.c.status.is_not(None))
+    row = newest(connection, solved, selected, now)
+    last = None if row is None else attitude_of(row)
+    is_latest = batch is not None and last is not None and last.id == batch["id"]
+    return SpacecraftRow(
+        name=mission.name,
+        description=mission.description,
+        state="no_batches" if batch is None else batch["status"] or "no_attitude",
+        latest_batch=None if batch is None else summary_of(batch),
+        attitude=last if is_latest else None,
+        last_attitude=last,
+    )
+
+
+def mission_history(connection: Connection, spacecraft: str) -> list[MissionThen]:
+    """The settings that a spacecraft was served with, oldest first.
+
+    Who goes back to earlier settings uses them anew.
+    """
+    query = (
+        select(missions.c.digest, missions.c.settings, mission_uses.c.since)
+        .join_from(mission_uses, missions, mission_uses.c.digest == missions.c.digest)
+        .where(mission_uses.c.spacecraft == spacecraft)
+        .order_by(mission_uses.c.id)
+    )
+    # Two processes that begin together may both have noted one change.
+    uses = groupby(connection.execute(query).mappings(), key=lambda row: row["digest"])
+    return [
+        MissionThen(digest=digest, since=row["since"], settings=json.loads(row["settings"]))
+        for digest, (row, *_) in ((digest, list(rows)) for digest, rows in uses)
+    ]
+
+
+def list_runs(connection: Connection) -> list[Run]:
+    """Every run with its number of batches, its spacecraft and the days it covers."""
+    daily = rollups_daily.c
+    query = select(
+        daily.spacecraft,
+        daily.run,
+        func.sum(daily.batches).label("batches"),
+        func.min(daily.bucket).label("first"),
+        func.max(daily.bucket).label("last"),
+    ).group_by(daily.run, daily.spacecraft)
+    parts: dict[str, list[Any]] = {}
+    for part in connection.execute(query.order_by(daily.run, daily.spacecraft)).mappings():
+        parts.setdefault(part["run"], []).append(part)
+    return [
+        Run(
+            run=row["name"],
+            created=row["created"],
+            alarms=row["alarms"] or row["name"] == LIVE,
+            batches=int(sum(part["batches"] for part in parts[row["name"]])),
+            spacecraft=[part["spacecraft"] for part in parts[row["name"]]],
+            first_day=_day(min(part["first"] for part in parts[row["name"]])),
+            last_day=_day(max(part["last"] for part in parts[row["name"]])),
+        )
+        for row in connection.execute(select(runs).order_by(runs.c.name)).mappings()
+        if row["name"] in parts
+    ]
+
+
+def _day(number: int) -> str:
+    return bucket_start(number, DAY_S).text[:10]
+
+
+def attitudes() -> Select[Any]:
+    """The query for what `attitude_of` shows."""
+    place = [results.c.id, *PLACE, batches.c.batch, batches.c.time]
+    return (
+        select(*place, *(column for column in solutions.c if column.name != "result_id"))
+        .join_from(results, batches, results.c.batch_id == batches.c.id)
+        .join(solutions, solutions.c.result_id == results.c.id)
+    )
+
+
+def attitude_of(row: Any) -> AttitudeRow:
+    """An attitude in a history: of which batch, at what time, how good."""
+    p = {name: row[name] for name in ("p11", "p12", "p13", "p22", "p23", "p33")}
+    return AttitudeRow(
+        id=row["id"],
+        batch=row["batch"],
+        time=row["time"],
+        quaternion=[row[name] for name in ("q1", "q2", "q3", "qc")],
+        frame=row["frame"],
+        covariance_arcsec2=[
+            [p["p11"], p["p12"], p["p13"]],
+            [p["p12"], p["p22"], p["p23"]],
+            [p["p13"], p["p23"], p["p33"]],
+        ],
+        residual_rms_arcsec=row["residual_rms_arcsec"],
+        predicted_rms_arcsec=row["predicted_rms_arcsec"],
+        taste=row["taste"],
+        method=row["method"],
+        status=row["status"],
+    )

@@ -1,0 +1,123 @@
+"""The limits of spacecraft: those in force, and every one that was set before."""
+
+import json
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
+
+from sqlalchemy import Connection, bindparam, insert, select, update
+
+from service.alarms.limits import LimitSettings
+from service.alarms.quantities import QUANTITIES, QuantityName, default_limits, limited_names
+from service.missions.mission import Mission
+from service.storage.models.alarms import Limit, LimitHistory
+from service.storage.recording import events
+from service.storage.recording.unsaved_result import Row
+from service.storage.sql.prepared import prepared
+from service.storage.sql.tables import limits
+
+Limits = Mapping[QuantityName, LimitSettings]
+
+_SHIPPED: dict[tuple[str, tuple[str, ...]], Limits] = {}
+# Run with every batch of a live spacecraft.
+_IN_FORCE = prepared(
+    select(limits).where(
+        limits.c.spacecraft == bindparam("of_spacecraft"), limits.c.until.is_(None)
+    )
+)
+
+
+def limits_of(connection: Connection, mission: Mission) -> Limits:
+    """The limits in force for a spacecraft: its own in place of the shipped ones."""
+    # Read with every batch; a process meets few missions.
+    key = mission.digest, limited_names()
+    shipped = _SHIPPED.get(key)
+    if shipped is None:
+        shipped = _SHIPPED[key] = default_limits(mission)
+    own = {
+        row["quantity"]: _read(row["settings"])
+        for row in _in_force(connection, mission.name)
+        if row["settings"] is not None and row["quantity"] in shipped
+    }
+    return {**shipped, **own}
+
+
+@lru_cache(maxsize=256)
+def _read(settings: str) -> LimitSettings:
+    # One object for one text: a window remembers by identity the limits that it is within.
+    return LimitSettings.model_validate_json(settings)
+
+
+def list_limits(connection: Connection, mission: Mission) -> list[Limit]:
+    """The limit of every quantity, with its time and who set it."""
+    rows = {row["quantity"]: row for row in _in_force(connection, mission.name)}
+    return [
+        shown_limit(mission.name, name, settings, rows.get(name))
+        for name, settings in default_limits(mission).items()
+    ]
+
+
+def limit_history(connection: Connection, mission: Mission, quantity: QuantityName) -> LimitHistory:
+    """The limit in force for a quantity, the shipped one, and every one set, newest first."""
+    shipped = default_limits(mission)[quantity]
+    query = (
+        select(limits)
+        .where(limits.c.spacecraft == mission.name, limits.c.quantity == quantity)
+        .order_by(limits.c.id.desc())
+    )
+    rows = [dict(row) for row in connection.execute(query).mappings()]
+    latest = next((row for row in rows if row["until"] is None), None)
+    return LimitHistory(
+        limit=shown_limit(mission.name, quantity, shipped, latest),
+        default=shipped.model_dump(mode="json"),
+        history=[shown_limit(mission.name, quantity, shipped, row) for row in rows],
+    )
+
+
+def set_limit(
+    connection: Connection,
+    mission: Mission,
+    quantity: QuantityName,
+    settings: LimitSettings | None,
+    *,
+    who: str,
+    comment: str | None,
+    now: str,
+) -> Limit:
+    """Set a limit from now on; None restores the shipped one.  The one before stays in history."""
+    place = (limits.c.spacecraft == mission.name, limits.c.quantity == quantity)
+    connection.execute(update(limits).where(*place, limits.c.until.is_(None)).values(until=now))
+    row = {
+        "spacecraft": mission.name,
+        "quantity": quantity,
+        "settings": None if settings is None else settings.model_dump_json(),
+        "who": who,
+        "comment": comment,
+        "since": now,
+        "until": None,
+    }
+    connection.execute(insert(limits), row)
+    shown = shown_limit(mission.name, quantity, default_limits(mission)[quantity], row)
+    events.note(connection, "limit", shown, spacecraft=mission.name)
+    return shown
+
+
+def shown_limit(
+    spacecraft: str, quantity: QuantityName, shipped: LimitSettings, row: Any | None
+) -> Limit:
+    """A limit as the interface shows it; without a row the shipped one."""
+    own = None if row is None else row["settings"]
+    return Limit(
+        spacecraft=spacecraft,
+        quantity=quantity,
+        unit=QUANTITIES[quantity].unit,
+        is_default=own is None,
+        since=row and row["since"],
+        who=row and row["who"],
+        comment=row and row["comment"],
+        settings=shipped.model_dump(mode="json") if own is None else json.loads(own),
+    )
+
+
+def _in_force(connection: Connection, spacecraft: str) -> list[Row]:
+    return _IN_FORCE.read(connection, {"of_spacecraft": spacecraft})

@@ -1,0 +1,115 @@
+"""Recorded batches, ready to run again: one, or a sample of many."""
+
+import json
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from sqlalchemy import Connection, bindparam, func, select
+
+from service.missions.mission import Mission
+from service.observations.batch import ObservationBatch
+from service.observations.schema import OptionsIn, submission_from_json
+from service.storage.models.answers import Answer
+from service.storage.queries.pages import PLACE, ResultFilter
+from service.storage.queries.results import answer_from_json, read_result
+from service.storage.recording.unsaved_result import Row
+from service.storage.sql.tables import batches, missions, results
+
+_SENT = ("input", "time", "time_ns")
+# SQLite takes 32,766 values in a statement.
+_READ_AT_ONCE = 1_000
+
+
+@dataclass(frozen=True)
+class BatchSample:
+    """Some of the batches of a period, in random order; `total` is how many there are.
+
+    `first` and `last` are the times of the earliest and the latest batch of the
+    sample, None where there are none.
+    """
+
+    total: int
+    batches: tuple[ObservationBatch, ...]
+    first: str | None
+    last: str | None
+    rows: tuple[Row, ...] = ()
+    """Of each batch, in the same order: result id, input and options as they are stored."""
+
+
+def recorded_batch(connection: Connection, id: str) -> tuple[ObservationBatch, Answer]:
+    """The batch that a result was made of, with the result's own options, and the answer."""
+    row = read_result(connection, id)
+    options = OptionsIn.model_validate_json(row["options"]).to_options()
+    batch = submission_from_json(row["input"]).batch
+    return msgspec.structs.replace(batch, options=options), answer_from_json(row["answer"])
+
+
+def recorded_mission(connection: Connection, digest: str) -> Mission:
+    """A mission as its settings were when their digest was recorded."""
+    query = select(missions.c.settings).where(missions.c.digest == digest)
+    return Mission.model_validate_json(connection.execute(query).scalar_one())
+
+
+def batch_with_options(input: str, own: str, options: OptionsIn | None = None) -> ObservationBatch:
+    """A recorded batch with the options of its result; `options` replace what they name of those.
+
+    `input` and `own` are the JSON texts that are stored.
+    """
+    batch = submission_from_json(input).batch
+    merged = merged_options(json.loads(own), options or OptionsIn())
+    return msgspec.structs.replace(batch, options=merged.to_options())
+
+
+def merged_options(own: Row, options: OptionsIn) -> OptionsIn:
+    """A result's own options with others in place of what they name."""
+    merged = dict(own)
+    for name, value in options.model_dump(exclude_none=True).items():
+        merged[name] = merged.get(name, {}) | value if isinstance(value, dict) else value
+    return OptionsIn.model_validate(merged)
+
+
+def sample_batches(
+    connection: Connection, selected: ResultFilter, size: int, seed: int = 0
+) -> BatchSample:
+    """At most `size` batches of a period: all, or one drawn from each of as many equal parts.
+
+    Drawn and not every n-th, so that nothing periodic in the telemetry is met
+    always or never; the same seed draws the same.
+    """
+    conditions = selected.conditions()
+    total = int(connection.scalar(select(func.count()).where(*conditions)) or 0)
+    rng = np.random.default_rng(seed)
+    count = min(size, total)
+    ranks = np.arange(1, count + 1)
+    if count < total:
+        ranks = 1 + np.floor((np.arange(count) + rng.random(count)) * total / count).astype(int)
+    rows = [
+        row
+        for start in range(0, count, _READ_AT_ONCE)
+        for row in _at_ranks(connection, selected, ranks[start : start + _READ_AT_ONCE].tolist())
+    ]
+    times = [(row["time_ns"], row["time"]) for row in rows]
+    drawn = tuple(rows[k] for k in rng.permutation(len(rows)))
+    return BatchSample(
+        total,
+        tuple(batch_with_options(row["input"], row["options"]) for row in drawn),
+        min(times)[1] if times else None,
+        max(times)[1] if times else None,
+        drawn,
+    )
+
+
+def _at_ranks(connection: Connection, selected: ResultFilter, ranks: list[int]) -> list[Row]:
+    """The batches at these places, from 1, in the period's order of time."""
+    # The index holds all that the ranking needs; inputs are read of the chosen alone.
+    rank = func.row_number().over(order_by=PLACE).label("rank")
+    ranked = select(results.c.batch_id, rank).where(*selected.conditions()).subquery()
+    chosen = select(ranked.c.batch_id).where(ranked.c.rank.in_(bindparam("ranks", expanding=True)))
+    query = (
+        select(results.c.id, results.c.options, *(batches.c[name] for name in _SENT))
+        .join_from(results, batches, results.c.batch_id == batches.c.id)
+        .where(results.c.current, results.c.batch_id.in_(chosen))
+        .order_by(*PLACE)
+    )
+    return [dict(row) for row in connection.execute(query, {"ranks": ranks}).mappings()]

@@ -1,0 +1,155 @@
+"""Reading results: lists of them, and one with all that belongs to it."""
+
+import json
+from typing import Any, Literal
+
+import msgspec
+from msgspec import UNSET
+from sqlalchemy import Connection, Select, select
+
+from service.alarms.quantities import QUANTITIES, value_names
+from service.errors import NotFound, shown_value
+from service.storage.models.answers import Answer, FrameWithStars, Result, StarCounts, Summary
+from service.storage.models.base import Page
+from service.storage.queries.pages import ResultFilter, newest_first, page_of
+from service.storage.recording.unsaved_result import STARS, Row
+from service.storage.sql.tables import batches, frames, missions, results
+
+OutcomeName = Literal["unique", "ambiguous", "unmatched"]
+Status = Literal["good", "suspect", "none"]
+
+
+def list_batches(
+    connection: Connection,
+    selected: ResultFilter,
+    *,
+    outcome: OutcomeName | None,
+    status: Status | None,
+    limit: int,
+    cursor: str | None,
+) -> Page[Summary]:
+    """Current results, newest batch time first.
+
+    `outcome` keeps batches with at least one star of it; `status` those whose
+    attitude is good or suspect, or that have none.
+    """
+    chosen = selected.conditions()
+    if outcome is not None:
+        chosen.append(results.c[outcome] > 0)
+    if status is not None:
+        chosen.append(results.c.status == (None if status == "none" else status))
+    query = newest_first(summary_query().where(*chosen), cursor)
+    return page_of(connection, query, limit, summary_of)
+
+
+def read_result(connection: Connection, id: str) -> Row:
+    """A result by its id with its batch's input; raises `NotFound`."""
+    query = select(results, batches.c.input).join_from(results, batches).where(results.c.id == id)
+    row = connection.execute(query).mappings().first()
+    if row is None:
+        raise NotFound(f"there is no batch with the id {shown_value(id)}")
+    return dict(row)
+
+
+def spacecraft_of(connection: Connection, id: str) -> str | None:
+    """The spacecraft of a result; None where there is none of that id."""
+    found = connection.execute(select(results.c.spacecraft).where(results.c.id == id)).scalar()
+    return None if found is None else str(found)
+
+
+def read_record(connection: Connection, id: str) -> Result:
+    """A result with its input and the what-ifs of its batch; raises `NotFound`."""
+    row = read_result(connection, id)
+    what_ifs = (
+        summary_query()
+        .where(results.c.batch_id == row["batch_id"], results.c.parent_id.is_not(None))
+        .order_by(results.c.id)
+    )
+    of_frame = select(frames.c.summary, frames.c.detections).where(
+        frames.c.batch_id == row["batch_id"]
+    )
+    frame = connection.execute(of_frame).mappings().first()
+    return Result(
+        answer=answer_from_json(row["answer"]),
+        input=json.loads(row["input"]),
+        options=json.loads(row["options"]),
+        measures=measured(row),
+        current=row["current"],
+        parent=row["parent_id"],
+        what_ifs=[summary_of(each) for each in connection.execute(what_ifs).mappings()],
+        frame=UNSET if frame is None else _frame_of(frame),
+    )
+
+
+def answer_from_json(text: str | bytes) -> Answer:
+    """A stored answer, which may be of an earlier version of the service."""
+    return _ANSWERS.decode(text)
+
+
+_ANSWERS = msgspec.json.Decoder(Answer)
+
+
+def _frame_of(row: Any) -> FrameWithStars:
+    told = json.loads(row["summary"]) | json.loads(row["detections"])
+    return msgspec.convert(told, FrameWithStars)
+
+
+def frame_of_result(connection: Connection, id: str) -> Row:
+    """What an overlay of a result is drawn from; raises `NotFound`, also where there is no frame.
+
+    The `settings` are those of the mission as they were for that result.
+    """
+    read_result(connection, id)
+    query = (
+        select(
+            results.c.answer,
+            results.c.catalog_digest,
+            batches.c.input,
+            frames.c.detections,
+            frames.c.preview,
+            frames.c.preview_step,
+            missions.c.settings,
+        )
+        .select_from(
+            results.join(batches, results.c.batch_id == batches.c.id)
+            .join(frames, frames.c.batch_id == batches.c.id)
+            .join(missions, missions.c.digest == results.c.mission_digest)
+        )
+        .where(results.c.id == id)
+    )
+    row = connection.execute(query).mappings().first()
+    if row is None:
+        raise NotFound(f"batch {shown_value(id)} was not made of a frame")
+    return dict(row)
+
+
+def summary_query() -> Select[Any]:
+    """The query for what `summary_of` shows."""
+    kept = [column for column in results.c if column.name not in ("answer", "spacecraft", "run")]
+    named = [batches.c[name] for name in ("spacecraft", "run", "batch", "time", "received")]
+    return select(*kept, *named).join_from(results, batches)
+
+
+def summary_of(row: Any) -> Summary:
+    """A result in a list, without its stars and its attitude."""
+    return Summary(**summary_fields(row))
+
+
+def summary_fields(row: Any) -> Row:
+    """The fields of a `Summary`."""
+    taken = ("id", "spacecraft", "batch", "run", "time", "received", "created", "identifier")
+    return {
+        **{name: row[name] for name in taken},
+        "options": json.loads(row["options"]),
+        "counts": StarCounts(**{name: row[name] for name in STARS}),
+        "status": row["status"],
+        "reason": row["reason"],
+        "measures": measured(row),
+        "parent": row["parent_id"],
+        "current": row["current"],
+    }
+
+
+def measured(row: Any) -> dict[str, float | None]:
+    """The values of a result's measured quantities and their ratios, by name."""
+    return {name: QUANTITIES[name].value_of(row) for name in value_names()}

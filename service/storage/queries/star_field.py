@@ -1,0 +1,191 @@
+"""The stars of a batch in each tracker's field of view: the data of its chart.
+
+Nothing is identified here: the outcomes are those of the answer that is shown, so
+that the chart of an old result shows that result.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from erfa import ufunc
+
+from service.errors import BadBatch, Fault
+from service.identify.prior_attitude import PriorAttitude, prior_attitude, search_region
+from service.missions.mission import Mission, Tracker
+from service.observations.batch import ObservationBatch, QuaternionPrior
+from service.observations.calibrate import CorrectedObservations, correct
+from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.ephemeris import observer_velocity, sun_distance_au
+from service.sky.model import SkyModel
+from service.sky.zones import SearchRegion
+from service.storage.models.answers import Answer, Star, TrackerStars
+from service.storage.recording.unsaved_result import Row
+from service.vectors import (
+    ARCSEC_PER_RADIAN,
+    Matrix,
+    Vector,
+    angle_between_deg,
+    matrix_from_quaternion,
+    to_ra_dec,
+    unit,
+)
+
+MARGIN = 1.25
+"""How far beyond the field of view stars are given, in fields of view."""
+WIDEST_DEG = 15.0
+"""Where stars of the answer lie far outside, the picture grows, but no further than this."""
+EDGE_STEP_DEG = 0.5
+
+
+def star_field_of(batch: ObservationBatch, mission: Mission, sky: SkyModel, answer: Answer) -> Row:
+    """The view of every tracker of a batch, as an answer to it has identified the stars.
+
+    Directions are given as `h_deg`, `v_deg`: that of (tan h, tan v, 1) in the
+    tracker's axes.  Catalog stars are carried there by the answer's attitude,
+    or, where it has none (`through` is "a_priori"), by the presumed one, and are
+    then displaced by its error.  `residual_arcsec` is observed less predicted,
+    along h and along v.  Raises `BadInput` for a batch that does not fit the
+    mission.
+    """
+    solved, prior = answer.attitude, batch.a_priori
+    if solved is not None and answer.path != "zone":
+        # The whole sky gave the attitude that stars were looked for about.
+        prior = QuaternionPrior(np.array(solved.quaternion))
+    if prior is None:
+        message = "nothing is known of the attitude, neither beforehand nor from the stars"
+        raise BadBatch(Fault("a_priori", message, "null"))
+    presumed = prior_attitude(prior, batch.time, mission, batch.position_km)
+    attitude = presumed.attitude if solved is None else matrix_from_quaternion(solved.quaternion)
+    run_catalog = sky.run_catalog(mission, batch.time)
+    rows = {name: row for row, name in enumerate(run_catalog.star_id)}
+    trackers = zip(correct(batch, mission), answer.observations, strict=True)
+    return {
+        "through": "a_priori" if solved is None else solved.method,
+        "same_catalog": run_catalog.digest == answer.provenance.run_catalog,
+        "trackers": [
+            _tracker(each, index, found, attitude, presumed, batch, mission, run_catalog, rows)
+            for index, (each, found) in enumerate(trackers)
+        ],
+    }
+
+
+def _tracker(
+    corrected: CorrectedObservations,
+    index: int,
+    found: TrackerStars,
+    attitude: Matrix,
+    presumed: PriorAttitude,
+    batch: ObservationBatch,
+    mission: Mission,
+    run_catalog: RunCatalog,
+    rows: dict[str, int],
+) -> Row:
+    tracker = corrected.tracker
+    region = search_region(tracker, presumed, mission, f"observations.{index}.tracker")
+    to_tracker = tracker.body_from_tracker.T @ attitude
+    named = {name: rows[name] for star in found.stars for name in _names(star) if name in rows}
+    seen = corrected.direction_body @ tracker.body_from_tracker
+    radius_deg = _radius_deg(tracker, seen, run_catalog.direction[list(named.values())], to_tracker)
+    near = _near(run_catalog, region, to_tracker[2], radius_deg)
+    shown = np.union1d(near, np.array(list(named.values()), np.int64))
+    natural = run_catalog.direction[shown]
+    apparent = dict(zip(shown.tolist(), _apparent(natural, batch) @ to_tracker.T, strict=True))
+    ra_deg, dec_deg = to_ra_dec(to_tracker[2])
+    return {
+        "tracker": tracker.name,
+        "boresight": {"ra_deg": float(ra_deg), "dec_deg": float(dec_deg)},
+        "field_of_view_radius_deg": tracker.field_of_view_radius_deg,
+        "radius_deg": radius_deg,
+        "magnitude_limit_mag": mission.catalog.magnitude_limit_mag,
+        "zone_edges": _zone_edges(region, to_tracker, radius_deg),
+        "catalog": [
+            {"id": run_catalog.star_id[row], "magnitude": float(run_catalog.magnitude_mag[row])}
+            | _angles(direction)
+            for row, direction in apparent.items()
+            if direction[2] > 0
+        ],
+        "observed": [
+            {"outcome": star.outcome, "star": star.star and star.star.id}
+            | {"rivals": (star.rivals or []), "magnitude": _number(corrected.magnitude_mag[k])}
+            | _angles(seen[k])
+            | _residual(seen[k], star, rows, apparent, solved=star.residual_arcsec is not None)
+            for k, star in enumerate(found.stars)
+        ],
+    }
+
+
+def _names(star: Star) -> list[str]:
+    return [*(star.rivals or []), *([star.star.id] if star.star else [])]
+
+
+def _radius_deg(tracker: Tracker, seen: Vector, named: Vector, to_tracker: Matrix) -> float:
+    """How far from the boresight the picture reaches: all that the answer speaks of, if it can."""
+    boresight = np.array([0.0, 0.0, 1.0])
+    spoken_of = np.concatenate([seen, named @ to_tracker.T])
+    farthest = float(np.max(angle_between_deg(spoken_of, boresight), initial=0.0))
+    wide = tracker.field_of_view_radius_deg * MARGIN
+    return max(wide, min(farthest * 1.05, WIDEST_DEG))
+
+
+def _near(
+    run_catalog: RunCatalog, region: SearchRegion, boresight: Vector, radius_deg: float
+) -> Vector:
+    """Rows of the stars of the zone within the picture, its corners included."""
+    most = min(90.0, radius_deg * math.sqrt(2.0))
+    near = np.flatnonzero(run_catalog.direction @ boresight >= math.cos(math.radians(most)))
+    angle = angle_between_deg(run_catalog.direction[near], region.axis)
+    return np.asarray(near[(angle >= region.least_deg) & (angle <= region.most_deg)])
+
+
+def _apparent(natural: Vector, batch: ObservationBatch) -> Vector:
+    """Catalog directions as the moving observer sees them, where the batch asks for it."""
+    if batch.aberration != "to_correct":
+        return natural
+    velocity = observer_velocity(batch.time, batch.velocity_km_per_s)
+    inverse_lorentz = math.sqrt(1.0 - float(velocity @ velocity))
+    seen = ufunc.ab(natural, velocity, sun_distance_au(batch.time), inverse_lorentz)
+    return np.asarray(seen, dtype=np.float64)
+
+
+def _zone_edges(
+    region: SearchRegion, to_tracker: Matrix, radius_deg: float
+) -> list[list[list[float]]]:
+    """The bounds of the zone where they cross the picture, as lines of [h, v] in degrees."""
+    axis = to_tracker @ region.axis
+    first = unit(np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))]))
+    second = np.cross(axis, first)
+    lines: list[list[list[float]]] = []
+    for bound_deg in (region.least_deg, region.most_deg):
+        if not 0.0 < bound_deg < 180.0:
+            continue
+        sine, cosine = math.sin(math.radians(bound_deg)), math.cos(math.radians(bound_deg))
+        turn = np.radians(np.arange(0.0, 360.0 + EDGE_STEP_DEG, EDGE_STEP_DEG))[:, None]
+        edge = axis * cosine + sine * (first * np.cos(turn) + second * np.sin(turn))
+        inside = edge[:, 2] > math.cos(math.radians(min(89.0, radius_deg * math.sqrt(2.0) + 1.0)))
+        for part in np.split(np.arange(len(edge)), np.flatnonzero(np.diff(inside)) + 1):
+            if inside[part[0]] and len(part) > 1:
+                hv = np.degrees(np.arctan(edge[part, :2] / edge[part, 2:]))
+                lines.append(np.round(hv, 4).tolist())
+    return lines
+
+
+def _residual(
+    seen: Vector, star: Star, rows: dict[str, int], apparent: dict[int, Vector], *, solved: bool
+) -> dict[str, Any]:
+    row = rows.get(star.star.id) if star.star else None
+    if not solved or row is None:
+        return {"residual_arcsec": None}
+    along_h = unit(np.array([1.0, 0.0, 0.0]) - seen[0] * seen)
+    along_v = np.cross(seen, along_h)
+    off = (seen - apparent[row]) * ARCSEC_PER_RADIAN
+    return {"residual_arcsec": [float(off @ along_h), float(off @ along_v)]}
+
+
+def _angles(direction: Vector) -> dict[str, float]:
+    x, y, z = direction.tolist()
+    return {"h_deg": math.degrees(math.atan2(x, z)), "v_deg": math.degrees(math.atan2(y, z))}
+
+
+def _number(value: float | Vector) -> float | None:
+    return None if np.isnan(value) else float(value)

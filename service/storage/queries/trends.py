@@ -1,0 +1,301 @@
+"""Histories of quantities, thinned to the number of points that can be drawn, extremes kept."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from sqlalchemy import Connection, select
+
+from service.alarms.quantities import QUANTITIES, BatchShare, QuantityName, Rate, StarShare
+from service.storage.queries.pages import (
+    PLACE,
+    ResultFilter,
+    newest,
+    newest_first,
+    oldest_first,
+    page_of,
+)
+from service.storage.queries.time_buckets import (
+    MAX_BATCHES_SUMMED,
+    BucketFilter,
+    Columns,
+    batches_about,
+    read_buckets,
+    read_steps,
+)
+from service.storage.recording.unsaved_result import Row
+from service.storage.sql.tables import MEASURED, batches, results
+from service.times import DAY_S, HOUR_S, Utc, parse_utc, shifted, unix_seconds, utc_now
+from service.vectors import Vector
+
+Integers = npt.NDArray[np.intp]
+
+Strategy = Literal["minmax", "latest"]
+Source = Literal["batch", "hour", "day"]
+MAX_SIZE = 1_500
+PAGE = 1_000
+"""Batches that are read together where all of a period are given."""
+MAX_HOURS_READ = 1_500
+"""Of one answer; a period with more is drawn from days at the finest."""
+
+WIDTHS_S = (
+    *(1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800),
+    *(HOUR_S * hours for hours in (1, 2, 3, 6, 12)),
+    *(DAY_S * days for days in (1, 2, 5, 10, 30)),
+)
+
+
+@dataclass(frozen=True)
+class HistoryRequest:
+    """Which history: the quantities, how they are thinned out, and to how many points."""
+
+    quantities: Sequence[QuantityName]
+    strategy: Strategy
+    size: int
+
+
+def history(
+    connection: Connection,
+    spacecraft: str,
+    *,
+    run: str,
+    start: Utc | None,
+    end: Utc | None,
+    request: HistoryRequest,
+) -> Row:
+    """A history, its buckets or batches in columns, oldest first.
+
+    Without an end it ends just after the latest batch, without a start it
+    begins a day before its end.
+    """
+    span = _span(connection, spacecraft, run, start, end)
+    about = {"spacecraft": spacecraft, "run": run, "strategy": request.strategy}
+    if span is None:
+        return about | {
+            "start": None if start is None else start.text,
+            "end": None if end is None else end.text,
+            **_empty(request),
+        }
+    about |= {"start": span.start.text, "end": span.end.text}
+    if request.strategy == "latest":
+        return about | _latest(connection, span, request)
+    width_s, source = _resolution(connection, span, request.size)
+    if source == "batch":
+        cells = read_steps(connection, span, width_s)
+    else:
+        cells = read_buckets(connection, span, source)
+    return about | {
+        "bucket_s": width_s,
+        "source": source,
+        **_thinned(cells, span, width_s, request),
+    }
+
+
+def latest_time(
+    connection: Connection, run: str, spacecraft: str | None = None, *, now: Utc
+) -> Utc | None:
+    """The time of the latest batch of a run, or of one spacecraft in it (see `pages.newest`)."""
+    query = select(batches.c.time).join_from(results, batches, results.c.batch_id == batches.c.id)
+    row = newest(connection, query, ResultFilter(run, spacecraft), now)
+    return None if row is None else parse_utc(row["time"])
+
+
+def _span(
+    connection: Connection, spacecraft: str, run: str, start: Utc | None, end: Utc | None
+) -> BucketFilter | None:
+    if end is None:
+        latest = latest_time(connection, run, spacecraft, now=utc_now())
+        if latest is None:
+            return None
+        end = shifted(latest, 1e-6)
+    span = BucketFilter(spacecraft, run, shifted(end, -DAY_S) if start is None else start, end)
+    return span if span.start.tai_ns <= end.tai_ns else replace(span, end=span.start)
+
+
+def _resolution(connection: Connection, span: BucketFilter, size: int) -> tuple[int, Source]:
+    """The narrowest buckets that are no more than requested, and what they are read from."""
+    first_s, end_s = unix_seconds([span.start.tai_ns, span.end.tai_ns]).tolist()
+    width_s = next((w for w in WIDTHS_S if _buckets(first_s, end_s, w) <= size), 0)
+    if not width_s:
+        # Longer than the widest of them: as many months of thirty days as it takes.
+        width_s = WIDTHS_S[-1] * (1 + int((end_s - first_s) / (WIDTHS_S[-1] * max(size - 1, 0.5))))
+    if width_s < HOUR_S:
+        if end_s - first_s <= HOUR_S or batches_about(connection, span) <= MAX_BATCHES_SUMMED:
+            return width_s, "batch"
+        width_s = HOUR_S
+    if width_s < DAY_S and end_s - first_s > MAX_HOURS_READ * HOUR_S:
+        width_s = DAY_S
+    return width_s, "day" if width_s >= DAY_S else "hour"
+
+
+def _buckets(first_s: float, end_s: float, width_s: int) -> int:
+    return int(np.ceil(end_s / width_s) - first_s // width_s)
+
+
+def _thinned(cells: Columns, span: BucketFilter, width_s: int, request: HistoryRequest) -> Row:
+    number = np.floor(cells["unix_s"] / width_s)
+    _, first = np.unique(number, return_index=True)
+    unix_s = number[first] * width_s
+    reduced = _Reduced(cells, first, _covered_h(unix_s, width_s, span))
+    counts = reduced.sum("batches").astype(int).tolist()
+    return {
+        "thinned": sum(counts) > len(counts),
+        "unix_s": unix_s.tolist(),
+        "batches": counts,
+        "series": {name: reduced.series(name) for name in request.quantities},
+    }
+
+
+def _covered_h(unix_s: Vector, width_s: int, span: BucketFilter) -> Vector:
+    """The hours of each bucket that lie within the span."""
+    begin_s, end_s = unix_seconds([span.start.tai_ns, span.end.tai_ns])
+    return np.asarray(np.minimum(unix_s + width_s, end_s) - np.maximum(unix_s, begin_s)) / HOUR_S
+
+
+class _Reduced:
+    """Narrow buckets drawn together into buckets, of which each begins at a row of `first`."""
+
+    def __init__(self, cells: Columns, first: Integers, covered_h: Vector) -> None:
+        self._cells, self._first, self._covered_h = cells, first, covered_h
+
+    def sum(self, name: str) -> Vector:
+        return self._reduce(np.add, self._cells[name])
+
+    def series(self, name: QuantityName) -> Row:
+        """One quantity: unit, how many batches have it, mean, least and greatest of a batch.
+
+        What the rollups have no columns of is not known.
+        """
+        cells, quantity = self._cells, QUANTITIES[name]
+        count = self.sum("batches")
+        low = high = np.full(len(cells["batches"]), np.nan)
+        if quantity.rolled_up:
+            low, high = cells[f"{name}_min"], cells[f"{name}_max"]
+        match quantity.source:
+            case StarShare(part):
+                mean = _over(self._reduce(np.add, part(cells)), self.sum("observed"))
+            case BatchShare(part):
+                hit = part(cells)
+                mean = _over(self._reduce(np.add, hit), count)
+                # A batch is one or is none: all of a bucket's, some, or none at all.
+                low, high = (hit == cells["batches"]).astype(float), (hit > 0).astype(float)
+            case Rate():
+                mean = _over(count, self._covered_h)
+                return _series(name, count, mean, mean, mean)
+            case _ if quantity.rolled_up:
+                count = self.sum(f"{name}_n")
+                mean = _over(self.sum(f"{name}_sum"), count)
+            case _:
+                count = np.zeros_like(count)
+                mean = _over(count, count)
+        return _series(name, count, mean, self._reduce(np.fmin, low), self._reduce(np.fmax, high))
+
+    def _reduce(self, ufunc: np.ufunc, values: Vector) -> Vector:
+        if len(self._first) == len(values):
+            return values
+        return np.asarray(ufunc.reduceat(values, self._first))
+
+
+def _over(part: Vector, whole: Vector) -> Vector:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.where(whole > 0, part / whole, np.nan))
+
+
+def _series(name: QuantityName, count: Vector, mean: Vector, low: Vector, high: Vector) -> Row:
+    return {
+        "unit": QUANTITIES[name].unit,
+        "count": count.astype(int).tolist(),
+        "mean": _listed(mean),
+        "min": _listed(low),
+        "max": _listed(high),
+    }
+
+
+def _listed(values: Vector) -> list[float | None]:
+    unknown = np.isnan(values)
+    if unknown.any():
+        values = values.astype(object)
+        values[unknown] = None
+    return list(values.tolist())
+
+
+_COUNTED = ("id", "observed", "unique", "ambiguous", "unmatched", "status", *MEASURED)
+_OF_BATCHES = select(
+    *(results.c[name] for name in _COUNTED), *PLACE, batches.c.batch, batches.c.time
+).join_from(results, batches, results.c.batch_id == batches.c.id)
+
+
+def every_batch(
+    reading: Callable[[], AbstractContextManager[Connection]],
+    spacecraft: str,
+    *,
+    run: str,
+    start: Utc | None,
+    end: Utc | None,
+    quantities: Sequence[QuantityName],
+) -> Iterator[Row]:
+    """The batches of a period as `history` gives the latest, oldest first, in pages.
+
+    At least one page is given, which may hold none.  Between two pages no
+    connection is held, so that a slow reader keeps none from others.
+    """
+    request = HistoryRequest(quantities, "latest", PAGE)
+    with reading() as connection:
+        span = _span(connection, spacecraft, run, start, end)
+    if span is None:
+        yield _of_batches([], request)
+        return
+    chosen = ResultFilter(run, spacecraft, span.start, span.end).conditions()
+    cursor: str | None = None
+    while True:
+        with reading() as connection:
+            page = page_of(connection, oldest_first(_OF_BATCHES.where(*chosen), cursor), PAGE, dict)
+        yield _of_batches(page.items, request)
+        cursor = page.next_cursor
+        if cursor is None:
+            return
+
+
+def _latest(connection: Connection, span: BucketFilter, request: HistoryRequest) -> Row:
+    chosen = ResultFilter(span.run, span.spacecraft, span.start, span.end).conditions()
+    # One more than requested tells whether there are more.
+    query = newest_first(_OF_BATCHES.where(*chosen)).limit(request.size + 1)
+    rows = list(connection.execute(query).mappings())
+    return _of_batches(rows[: request.size][::-1], request) | {"thinned": len(rows) > request.size}
+
+
+def _of_batches(rows: Sequence[Any], request: HistoryRequest) -> Row:
+    return {
+        "bucket_s": None,
+        "source": "batch",
+        "thinned": False,
+        "unix_s": unix_seconds([row["time_ns"] for row in rows]).tolist(),
+        **{name: [row[name] for row in rows] for name in ("time", "id", "batch")},
+        "series": {
+            name: {
+                "unit": QUANTITIES[name].unit,
+                "value": list(map(QUANTITIES[name].value_of, rows)),
+            }
+            for name in request.quantities
+        },
+    }
+
+
+def _empty(request: HistoryRequest) -> Row:
+    if request.strategy == "latest":
+        return _of_batches([], request)
+    columns = ("count", "mean", "min", "max")
+    return {
+        "bucket_s": None,
+        "source": "batch",
+        "thinned": False,
+        "unix_s": [],
+        "batches": [],
+        "series": {
+            name: {"unit": QUANTITIES[name].unit} | {column: [] for column in columns}
+            for name in request.quantities
+        },
+    }

@@ -1,0 +1,1 @@
+"""Writing results with their stars, trends, events and alarms."""

@@ -1,0 +1,99 @@
+"""The active alarms of one spacecraft in one run, read, changed and written in one transaction."""
+
+from sqlalchemy import Connection, bindparam, insert, select, update
+
+from service.alarms import state_machine
+from service.alarms.limits import LimitSettings, Severity
+from service.alarms.window import Point
+from service.storage.queries.alarms import change, note
+from service.storage.recording.ids import Ulids
+from service.storage.recording.unsaved_result import Row
+from service.storage.sql.prepared import prepared
+from service.storage.sql.tables import alarms
+
+_IDS = Ulids()
+
+# Run with every batch of a live spacecraft.
+_ACTIVE = prepared(
+    select(alarms)
+    .where(
+        alarms.c.run == bindparam("of_run"),
+        alarms.c.spacecraft == bindparam("of_spacecraft"),
+        alarms.c.cleared_at.is_(None),
+    )
+    .order_by(alarms.c.id)
+    .with_for_update()
+)
+_VALUES = (
+    *(f"{which}_{part}" for which in ("latest", "worst") for part in ("value", "time", "batch_id")),
+    "current_severity",
+    "returned_at",
+)
+"""The columns that a new value can change without an action to note."""
+_UPDATE_VALUES = prepared(
+    update(alarms)
+    .where(alarms.c.id == bindparam("of_id"))
+    .values({name: bindparam(name) for name in _VALUES})
+)
+
+
+class ActiveAlarms:
+    """The alarms that are not cleared, by quantity; their rows stay locked until the commit."""
+
+    def __init__(self, connection: Connection, spacecraft: str, run: str) -> None:
+        self._connection = connection
+        self._place = {"spacecraft": spacecraft, "run": run}
+        rows = _ACTIVE.read(connection, {"of_spacecraft": spacecraft, "of_run": run})
+        self._alarms: dict[str, Row] = {row["quantity"]: row for row in rows}
+        self._unsaved: set[str] = set()
+
+    def has(self, quantity: str) -> bool:
+        """Whether a quantity has an active alarm."""
+        return quantity in self._alarms
+
+    def is_out(self, quantity: str) -> bool:
+        """Whether a quantity has an active alarm and is out of limits."""
+        return self.has(quantity) and self._alarms[quantity]["current_severity"] is not None
+
+    def observe(
+        self,
+        quantity: str,
+        severity: Severity | None,
+        limits: LimitSettings,
+        point: Point,
+        now: str,
+        worst: Point | None = None,
+    ) -> None:
+        """Apply a new value to the quantity's alarm, or raise an alarm if it has none."""
+        alarm = self._alarms.get(quantity)
+        if alarm is None:
+            if severity is not None:
+                columns, actions = state_machine.raised(severity, limits, point, now, worst)
+                alarm = {"id": _IDS.new(), "quantity": quantity, **self._place, **columns}
+                self._connection.execute(insert(alarms), alarm)
+                note(self._connection, alarm, actions, now)
+                self._alarms[quantity] = alarm
+            return
+        changes, actions = state_machine.observed(alarm, severity, limits, point, now, worst)
+        if actions:
+            # The changes that were not written yet go with it.
+            values = {name: alarm[name] for name in _VALUES}
+            alarm = change(self._connection, alarm, values | changes, actions, now)
+            self._unsaved.discard(quantity)
+        else:
+            # Values alone are written once, by `save`.
+            alarm = alarm | changes
+            self._unsaved.add(quantity)
+        self._alarms[quantity] = alarm
+        if alarm["cleared_at"] is not None:
+            del self._alarms[quantity]
+
+    def save(self) -> None:
+        """Write the latest values of the alarms that did not change otherwise."""
+        if self._unsaved:
+            found = [self._alarms[quantity] for quantity in sorted(self._unsaved)]
+            rows = [
+                {name: alarm[name] for name in _VALUES} | {"of_id": alarm["id"]} for alarm in found
+            ]
+            _UPDATE_VALUES.run(self._connection, rows)
+            self._unsaved.clear()

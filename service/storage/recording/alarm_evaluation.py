@@ -1,0 +1,260 @@
+"""Evaluating limits against batches as they are recorded, each batch exactly once.
+
+The evaluation is part of the transaction that records the batches: a batch that
+is sent again is not new and is not evaluated again, and after a crash either
+both are stored or neither.  The row in `watches` is locked, so that several
+processes evaluate one after the other.
+"""
+
+from collections.abc import Sequence
+
+import msgspec
+from msgspec import Struct
+from sqlalchemy import Connection, bindparam, select, update
+
+from service.alarms.limits import LimitSettings
+from service.alarms.quantities import QUANTITIES, SILENCE, QuantityName
+from service.alarms.window import BatchRef, Point, Window
+from service.missions.mission import Mission
+from service.storage.queries.future_dated import LIVE
+from service.storage.queries.limits import limits_of
+from service.storage.recording.active_alarms import ActiveAlarms
+from service.storage.recording.silence import silence_severity
+from service.storage.recording.unsaved_result import Draft, Row
+from service.storage.sql.prepared import prepared
+from service.storage.sql.statements import insert_missing
+from service.storage.sql.tables import batches, missions, results, runs, watches
+from service.times import recorded_utc
+
+# Run with every batch of a live spacecraft, or with a few of them.
+_PLACE = (
+    watches.c.spacecraft == bindparam("of_spacecraft"),
+    watches.c.run == bindparam("of_run"),
+)
+_LOCK = prepared(select(watches).where(*_PLACE).with_for_update())
+_COLUMNS = ("time", "time_ns", "batch_id", "received", "state")
+_SAVE = prepared(
+    update(watches).where(*_PLACE).values({name: bindparam(name) for name in _COLUMNS})
+)
+
+
+def evaluate_limits(connection: Connection, new: Sequence[Draft]) -> None:
+    """Evaluate the limits against new batches of the live run and of runs with alarms."""
+    groups: dict[tuple[str, str], list[Draft]] = {}
+    for draft in new:
+        spacecraft, run, _ = draft.identity
+        if draft.batch is not None and not draft.is_ahead:
+            groups.setdefault((run, spacecraft), []).append(draft)
+    evaluated = _runs_with_alarms(connection, {run for run, _ in groups})
+    for run, spacecraft in sorted(groups):
+        if run in evaluated:
+            drafts = sorted(groups[run, spacecraft], key=lambda each: each.result["time_ns"])
+            LimitEvaluator(connection, spacecraft, run, drafts).evaluate()
+
+
+def _runs_with_alarms(connection: Connection, names: set[str]) -> set[str]:
+    others = names - {LIVE}
+    if not others:
+        return names
+    query = select(runs.c.name).where(runs.c.name.in_(sorted(others)), runs.c.alarms)
+    return set(connection.scalars(query)) | (names & {LIVE})
+
+
+def latest_inputs(connection: Connection) -> Sequence[str]:
+    """The latest batch of every live spacecraft, as it was sent."""
+    query = select(batches.c.input).join_from(watches, batches, watches.c.batch_id == batches.c.id)
+    return connection.scalars(query.where(watches.c.run == LIVE)).all()
+
+
+class LimitEvaluator:
+    """Evaluates new batches of one spacecraft in one run; its row in `watches` is locked."""
+
+    def __init__(
+        self, connection: Connection, spacecraft: str, run: str, drafts: Sequence[Draft]
+    ) -> None:
+        self._connection = connection
+        self._spacecraft, self._run = spacecraft, run
+        self._drafts = drafts
+        self._limits = limits_of(connection, _mission(connection, drafts[0]))
+        row = self._locked()
+        if row is None:
+            assert drafts[0].batch is not None
+            first = {"spacecraft": spacecraft, "run": run, "state": "{}"}
+            insert_missing(connection, watches, [first | _columns_of(drafts[0].batch)])
+            row = self._locked()
+        assert row is not None
+        self._row = row
+        self._saved = _LAST_SAVED.pop((spacecraft, run), _NOTHING_SAVED)
+        self._windows = self._saved.windows_of(row["state"])
+        self._active = ActiveAlarms(connection, spacecraft, run)
+
+    def evaluate(self) -> None:
+        """Evaluate every batch in order of time and save the state of the windows."""
+        due = self._due()
+        row, newest = self._row, None
+        latest_ns, received = row["time_ns"], row["received"]
+        received_ns = self._saved.ns_of(received)
+        for draft in self._drafts:
+            batch = draft.batch
+            assert batch is not None
+            gap_ns = batch["time_ns"] - latest_ns
+            if gap_ns >= 0:
+                newest, latest_ns = batch, batch["time_ns"]
+            # In another run an older batch that comes late ends no silence.
+            if self._run == LIVE or gap_ns >= 0:
+                since_ns = draft.received_ns - received_ns if self._run == LIVE else gap_ns
+                latest = _reference(newest) if newest else (row["time"], row["batch_id"])
+                self._check_silence(since_ns * 1e-9, latest, batch["received"])
+            if due:
+                self._evaluate_batch(draft, due)
+            if draft.received_ns > received_ns:
+                received, received_ns = batch["received"], draft.received_ns
+        self._save(newest, received, received_ns)
+        self._active.save()
+
+    def _check_silence(self, gap_s: float, latest: BatchRef, now: str) -> None:
+        """Raise an alarm for the silence before a batch, and end it with the batch.
+
+        The gap is measured by the clock for live batches, elsewhere by the
+        batches' own times.  `latest` is the latest batch: this one, unless it
+        comes late.
+        """
+        limits = self._limits[SILENCE]
+        low_s, high_s = limits.inner_bounds
+        if low_s <= gap_s <= high_s and not self._active.has(SILENCE):
+            return
+        severity = silence_severity(self._limits, gap_s)
+        if severity is not None:
+            self._active.observe(SILENCE, severity, limits, Point(gap_s, *latest), now)
+        if self._active.has(SILENCE):
+            self._active.observe(SILENCE, None, limits, Point(0.0, *latest), now)
+
+    def _due(self) -> list[tuple[QuantityName, LimitSettings]]:
+        """The quantities that need an evaluation batch by batch; the others are done here.
+
+        Most quantities are in limits all the time, and evaluating each batch by
+        itself takes as long as recording it.  An alarm that is back in limits
+        needs the latest value alone: of those before it nothing would be stored.
+        """
+        due = []
+        new = [draft.result for draft in self._drafts]
+        for name, limits in self._limits.items():
+            sample_of = QUANTITIES[name].sample_of
+            samples = [sample for each in new if (sample := sample_of(each))]
+            if not samples:
+                continue
+            window = self._windows.setdefault(name, Window())
+            if self._active.is_out(name) or not window.add_if_within(samples, limits):
+                due.append((name, limits))
+            elif self._active.has(name) and (value := window.value(limits)) is not None:
+                batch = self._latest_with(name)
+                point = Point(value, *self._latest_in_window(batch, window.samples[-1][0]))
+                self._active.observe(name, None, limits, point, batch["received"])
+        return due
+
+    def _latest_with(self, name: QuantityName) -> Row:
+        """The latest new batch that has a value of a quantity."""
+        sample_of = QUANTITIES[name].sample_of
+        return next(
+            draft.batch
+            for draft in reversed(self._drafts)
+            if draft.batch and sample_of(draft.result)
+        )
+
+    def _latest_in_window(self, batch: Row, latest_ns: int) -> BatchRef:
+        """The latest batch of a window: the one given, unless it comes late."""
+        if batch["time_ns"] >= latest_ns:
+            return _reference(batch)
+        query = (
+            select(batches.c.time, batches.c.id)
+            .join_from(results, batches, results.c.batch_id == batches.c.id)
+            .where(
+                results.c.spacecraft == batch["spacecraft"],
+                results.c.run == batch["run"],
+                results.c.time_ns == latest_ns,
+                results.c.current,
+            )
+            .order_by(batches.c.id.desc())
+            .limit(1)
+        )
+        found = self._connection.execute(query).first()
+        # It may have been pruned.
+        return (found[0], found[1]) if found else _reference(batch)
+
+    def _evaluate_batch(
+        self, draft: Draft, due: Sequence[tuple[QuantityName, LimitSettings]]
+    ) -> None:
+        assert draft.batch is not None
+        for name, limits in due:
+            sample = QUANTITIES[name].sample_of(draft.result)
+            if sample is None:
+                continue
+            window = self._windows[name]
+            latest_ns = window.samples[-1][0] if window.samples else 0
+            latest = self._latest_in_window(draft.batch, latest_ns)
+            found = window.add(sample, limits, latest)
+            if found and (found.severity is not None or self._active.has(name)):
+                point = Point(found.value, *latest)
+                now = draft.batch["received"]
+                self._active.observe(name, found.severity, limits, point, now, found.worst)
+
+    def _locked(self) -> Row | None:
+        place = {"of_spacecraft": self._spacecraft, "of_run": self._run}
+        return next(iter(_LOCK.read(self._connection, place)), None)
+
+    def _save(self, newest: Row | None, received: str, received_ns: int) -> None:
+        windows = {name: window.to_json() for name, window in self._windows.items()}
+        state = msgspec.json.encode(windows).decode()
+        row = self._row | (_columns_of(newest) if newest else {})
+        row |= {"received": received, "state": state}
+        place = {"of_spacecraft": self._spacecraft, "of_run": self._run}
+        _SAVE.run(self._connection, [place | {name: row[name] for name in _COLUMNS}])
+        if len(_LAST_SAVED) >= _MAX_SAVED:
+            _LAST_SAVED.clear()
+        saved = _SavedWindows(state, self._windows, received, received_ns)
+        _LAST_SAVED[self._spacecraft, self._run] = saved
+
+
+class _SavedWindows(Struct):
+    """The windows of one spacecraft and run as this process last wrote them.
+
+    Where the database still holds the same text, it is not decoded again.
+    """
+
+    state: str
+    windows: dict[str, Window]
+    received: str
+    received_ns: int
+
+    def windows_of(self, state: str) -> dict[str, Window]:
+        """The windows that a stored text holds."""
+        if self.state == state:
+            return self.windows
+        stored = msgspec.json.decode(state)
+        return {name: Window.from_json(each) for name, each in stored.items()}
+
+    def ns_of(self, received: str) -> int:
+        """A time of receipt as `Utc.tai_ns`."""
+        return self.received_ns if self.received == received else recorded_utc(received).tai_ns
+
+
+_NOTHING_SAVED = _SavedWindows("", {}, "", 0)
+_LAST_SAVED: dict[tuple[str, str], _SavedWindows] = {}
+_MAX_SAVED = 64
+
+
+def _mission(connection: Connection, draft: Draft) -> Mission:
+    """The mission that a draft was made with; one from another process has its digest alone."""
+    if draft.mission is not None:
+        return draft.mission
+    query = select(missions.c.settings).where(missions.c.digest == draft.result["mission_digest"])
+    return Mission.model_validate_json(connection.execute(query).scalar_one())
+
+
+def _columns_of(batch: Row) -> Row:
+    names = {"time": "time", "time_ns": "time_ns", "batch_id": "id", "received": "received"}
+    return {name: batch[column] for name, column in names.items()}
+
+
+def _reference(batch: Row) -> BatchRef:
+    return batch["time"], batch["id"]

@@ -1,0 +1,240 @@
+"""The answer to a batch, as the interface shows it and as it is recorded."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from msgspec import UNSET, UnsetType
+
+from service.acquire import Acquisition
+from service.acquire.result import RivalAttitude, TrackerResult
+from service.identify.identification import Outcome
+from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.zones import SearchRegion
+from service.storage.models.answers import (
+    Answer,
+    Attitude,
+    Frame,
+    Provenance,
+    Rival,
+    SearchedZone,
+    Star,
+    StarCounts,
+    StarRef,
+    Timings,
+    TrackerFit,
+    TrackerStars,
+)
+from service.vectors import ra_dec_of
+
+FRAME = "EME2000"
+WORDS = {int(outcome): outcome.word for outcome in Outcome}
+_AMBIGUOUS = int(Outcome.AMBIGUOUS)
+
+
+@dataclass(frozen=True)
+class StarRow:
+    """The columns of one observed star."""
+
+    tracker: str
+    position: int
+    outcome: str
+    star_id: str | None
+    votes: int
+    runner_up: int
+    probability: float | None
+    residual_arcsec: float | None
+
+
+def answer_of(
+    acquisition: Acquisition,
+    *,
+    id: str | None,
+    parent: str | UnsetType = UNSET,
+    recorded: bool | UnsetType = UNSET,
+    frame: Frame | UnsetType = UNSET,
+    warnings: Sequence[str] = (),
+) -> Answer:
+    """The answer to a batch; `id` is None for what is not recorded.
+
+    `warnings` follow those of the acquisition.  The time of recording stays None: it
+    is known when the rows are handed over.
+    """
+    batch, provenance = acquisition.batch, acquisition.provenance
+    run_catalog = acquisition.run_catalog
+    return Answer(
+        id=id,
+        spacecraft=batch.spacecraft,
+        batch=batch.batch,
+        run=batch.run,
+        time=batch.time.text,
+        identifier=acquisition.choices.identifier,
+        path=str(acquisition.path),
+        observations=[_tracker_answer(each, run_catalog) for each in acquisition.trackers],
+        counts=StarCounts(**acquisition.counts),
+        attitude=_attitude(acquisition),
+        reason=None if acquisition.reason is None else str(acquisition.reason),
+        warnings=[*acquisition.warnings, *warnings],
+        timings_us=Timings(**acquisition.timings_us, record=None),
+        provenance=Provenance(
+            catalog=provenance.catalog,
+            run_catalog=provenance.run_catalog,
+            epoch_year=provenance.epoch_year,
+            mission=provenance.mission,
+            version=provenance.version,
+        ),
+        parent=parent,
+        recorded=recorded,
+        frame=frame,
+    )
+
+
+def star_rows(acquisition: Acquisition) -> list[StarRow]:
+    """Every star of every tracker, in the order observed."""
+    return [
+        StarRow(
+            tracker=each.corrected.tracker.name,
+            position=k,
+            outcome=Outcome(outcome).word,
+            star_id=_star_id(acquisition.run_catalog, int(each.identification.star[k])),
+            votes=int(each.identification.votes[k]),
+            runner_up=int(each.identification.runner_up[k]),
+            probability=_number(float(each.identification.probability[k])),
+            residual_arcsec=_number(float(each.residual_arcsec[k])),
+        )
+        for each in acquisition.trackers
+        for k, outcome in enumerate(each.identification.outcome)
+    ]
+
+
+def rows_of_stars(answer: Answer) -> list[dict[str, Any]]:
+    """`star_rows` as rows of the table, from the answer itself."""
+    return [
+        {
+            "result_id": answer.id,
+            "tracker": tracker.tracker,
+            "position": position,
+            "outcome": star.outcome,
+            "star_id": star.star and star.star.id,
+            "votes": star.votes,
+            "runner_up": star.runner_up,
+            "probability": star.probability,
+            "residual_arcsec": star.residual_arcsec,
+        }
+        for tracker in answer.observations
+        for position, star in enumerate(tracker.stars)
+    ]
+
+
+def _tracker_answer(result: TrackerResult, run_catalog: RunCatalog) -> TrackerStars:
+    return TrackerStars(
+        tracker=result.corrected.tracker.name,
+        zone=None if result.region is None else _zone(result, result.region),
+        stars=_stars(result, run_catalog),
+    )
+
+
+def _zone(result: TrackerResult, region: SearchRegion) -> SearchedZone:
+    ra_deg, dec_deg = ra_dec_of(region.axis)
+    return SearchedZone(
+        kind=region.kind,
+        ra_deg=ra_deg,
+        dec_deg=dec_deg,
+        stars=result.stars,
+        pairs=result.pairs,
+        cached=result.zone_cached,
+    )
+
+
+def _stars(result: TrackerResult, run_catalog: RunCatalog) -> list[Star]:
+    found, seen = result.identification, result.corrected
+    # Plain numbers: taking single ones out of arrays costs more than all the rest.
+    rows = found.star.tolist()
+    columns = zip(
+        found.outcome.tolist(),
+        rows,
+        found.votes.tolist(),
+        found.runner_up.tolist(),
+        found.probability.tolist(),
+        result.residual_arcsec.tolist(),
+        seen.outside_field_of_view.tolist(),
+        seen.magnitude_mag.tolist(),
+        strict=True,
+    )
+    stars = []
+    for k, (outcome, row, votes, second, probability, residual, outside, mag) in enumerate(columns):
+        name = _star_id(run_catalog, row)
+        rivals: Any = UNSET
+        rival_probabilities: Any = UNSET
+        if outcome == _AMBIGUOUS or found.rivals[k]:
+            rivals = [_star_id(run_catalog, rival) for rival in found.rivals[k]]
+            if found.rival_probability:
+                rival_probabilities = list(found.rival_probability[k])
+        flags = ["outside_field_of_view"] if outside else []
+        # NaN is not equal to itself, and is no number of JSON.
+        if mag != mag:
+            flags.append("no_magnitude")
+        if row >= 0 and rows.count(row) > 1:
+            flags.append("same_star_twice")
+        stars.append(
+            Star(
+                outcome=WORDS[outcome],
+                star=None if name is None else StarRef(catalog=name.partition(" ")[0], id=name),
+                votes=votes,
+                runner_up=second,
+                rivals=rivals,
+                rival_probabilities=rival_probabilities,
+                probability=probability if probability == probability else None,
+                residual_arcsec=residual if residual == residual else None,
+                flags=flags,
+            )
+        )
+    return stars
+
+
+def _attitude(acquisition: Acquisition) -> Attitude | None:
+    solution, rival = acquisition.solution, acquisition.rival
+    if solution is None:
+        return None
+    several = solution.trackers
+    return Attitude(
+        quaternion=solution.quaternion.tolist(),
+        frame=FRAME,
+        covariance_arcsec2=solution.covariance_arcsec2.tolist(),
+        method=solution.method,
+        residual_rms_arcsec=solution.residual_rms_arcsec,
+        predicted_rms_arcsec=solution.predicted_rms_arcsec,
+        taste=solution.taste,
+        degrees_of_freedom=solution.degrees_of_freedom,
+        status="suspect" if solution.suspect else "good",
+        triad=solution.triad.tolist(),
+        quest=solution.quest.tolist(),
+        triad_quest_angle_arcsec=solution.triad_quest_angle_arcsec,
+        trackers=[
+            TrackerFit(tracker=fit.tracker, stars=fit.stars, taste=fit.taste, outlier=fit.outlier)
+            for fit in several
+        ]
+        if several
+        else UNSET,
+        outlier=next((fit.tracker for fit in several if fit.outlier), None) if several else UNSET,
+        rival=UNSET if rival is None else _rival(rival, acquisition.run_catalog),
+    )
+
+
+def _rival(rival: RivalAttitude, run_catalog: RunCatalog) -> Rival:
+    return Rival(
+        quaternion=rival.solution.quaternion.tolist(),
+        covariance_arcsec2=rival.solution.covariance_arcsec2.tolist(),
+        probability=rival.probability,
+        angle_deg=rival.angle_deg,
+        stars=[[_star_id(run_catalog, row) for row in rows.tolist()] for rows in rival.star],
+    )
+
+
+def _star_id(run_catalog: RunCatalog, row: int) -> str | None:
+    return None if row < 0 else run_catalog.star_id[row]
+
+
+def _number(value: float) -> float | None:
+    return None if math.isnan(value) else value

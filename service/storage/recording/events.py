@@ -1,0 +1,101 @@
+"""Recent events in order of commit, for clients that reconnect.
+
+An event is noted in the transaction of the change that it reports.  Its number
+comes from one row whose lock is held until the commit: in no process does an
+event become visible after one with a higher number, and no number is left out.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+from sqlalchemy import Connection, delete, select
+
+from service.storage.recording.unsaved_result import Row
+from service.storage.sql.prepared import execute
+from service.storage.sql.statements import insert_all
+from service.storage.sql.tables import event_counter, events
+
+KEPT = 20_000
+"""Events that are kept; a client that missed more starts anew."""
+PRUNED_EVERY = 500
+
+_OUTBOX = "events"
+_TAKE = "UPDATE event_counter SET last = last + {0} WHERE id = 1 RETURNING last"
+
+
+@dataclass(frozen=True)
+class Event:
+    """One event: its number, kind, run, spacecraft, and data as JSON."""
+
+    id: int
+    kind: str
+    run: str | None
+    spacecraft: str | None
+    data: str
+
+
+def note(
+    connection: Connection,
+    kind: str,
+    data: object,
+    *,
+    run: str | None = None,
+    spacecraft: str | None = None,
+) -> None:
+    """Add an event to the transaction; it gets its number at the end of the transaction."""
+    text = msgspec.json.encode(data).decode()
+    row = {"kind": kind, "run": run, "spacecraft": spacecraft, "data": text}
+    connection.info.setdefault(_OUTBOX, []).append(row)
+
+
+@contextmanager
+def numbered(connection: Connection) -> Iterator[None]:
+    """Number the events of a transaction when everything else in it is done.
+
+    The later the lock on the numbers is taken, the less others wait for it.
+    """
+    outbox: list[Row] = []
+    connection.info[_OUTBOX] = outbox
+    yield
+    if not outbox:
+        return
+    ((last,),) = execute(connection, _TAKE.format(len(outbox)))
+    first = last - len(outbox) + 1
+    rows = [{"id": first + place} | row for place, row in enumerate(outbox)]
+    insert_all(connection, events, rows)
+    if first // PRUNED_EVERY != (last + 1) // PRUNED_EVERY:
+        connection.execute(delete(events).where(events.c.id <= last - KEPT))
+
+
+def undone(connection: Connection, length: int) -> None:
+    """Drop the events noted since the outbox had that length: their changes were rolled back."""
+    del connection.info.get(_OUTBOX, [])[length:]
+
+
+def noted(connection: Connection) -> int:
+    """How many events wait for their numbers."""
+    return len(connection.info.get(_OUTBOX, []))
+
+
+def last_event(connection: Connection) -> int:
+    """The number of the latest event; zero before the first."""
+    return int(connection.execute(select(event_counter.c.last)).scalar_one())
+
+
+def events_after(connection: Connection, last: int, limit: int) -> Sequence[Event] | None:
+    """The events after a number, oldest first; None if some of them are no longer kept.
+
+    None too for a number that was never assigned: it is another database's.
+    """
+    query = select(events).where(events.c.id > last).order_by(events.c.id).limit(limit)
+    found = [_event(row) for row in connection.execute(query).mappings()]
+    if found:
+        return found if found[0].id == last + 1 else None
+    return [] if last_event(connection) == last else None
+
+
+def _event(row: Any) -> Event:
+    return Event(row["id"], row["kind"], row["run"], row["spacecraft"], row["data"])

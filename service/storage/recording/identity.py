@@ -1,0 +1,151 @@
+"""Who was first: which batches and Idempotency-Keys are recorded, and with what body."""
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+from sqlalchemy import Connection, insert
+
+from service.errors import Conflict, KeyReused, shown_value
+from service.observations.batch import ObservationBatch
+from service.storage.sql.prepared import execute
+from service.storage.sql.tables import idempotency_keys
+
+Identity = tuple[str, str, str]
+"""(spacecraft, run, batch): unique among submissions."""
+
+OwnKey = tuple[str, str]
+"""The id of a token and an Idempotency-Key: keys of different tokens are different keys.
+
+The id is empty where a key came without a token.
+"""
+
+# What is looked for comes as one value, so that the text of each statement never changes: to
+# make one for so many values takes longer than to run it.
+_BY_IDENTITY = {
+    "sqlite": """
+        SELECT b.spacecraft, b.run, b.batch, b.id, b.fingerprint
+        FROM json_each(:wanted) AS w CROSS JOIN batches AS b
+        WHERE b.spacecraft = json_extract(w.value, '$[0]')
+          AND b.run = json_extract(w.value, '$[1]') AND b.batch = json_extract(w.value, '$[2]')
+    """,
+    "postgresql": """
+        SELECT b.spacecraft, b.run, b.batch, b.id, b.fingerprint
+        FROM json_array_elements(CAST(%(wanted)s AS json)) AS w JOIN batches AS b
+        ON b.spacecraft = w->>0 AND b.run = w->>1 AND b.batch = w->>2
+    """,
+}
+_AMONG = {
+    "sqlite": "(SELECT value FROM json_each(:wanted))",
+    "postgresql": "(SELECT json_array_elements_text(CAST(%(wanted)s AS json)))",
+}
+_BY_KEY = {
+    "sqlite": """
+        SELECT k.token_id, k.key, k.result_id, k.fingerprint
+        FROM json_each(:wanted) AS w CROSS JOIN idempotency_keys AS k
+        WHERE k.token_id = json_extract(w.value, '$[0]') AND k.key = json_extract(w.value, '$[1]')
+    """,
+    "postgresql": """
+        SELECT k.token_id, k.key, k.result_id, k.fingerprint
+        FROM json_array_elements(CAST(%(wanted)s AS json)) AS w JOIN idempotency_keys AS k
+        ON k.token_id = w->>0 AND k.key = w->>1
+    """,
+}
+_ANSWERS = "SELECT id, answer FROM results WHERE id IN "
+
+
+class ExistingResult(Struct, frozen=True):
+    """The result that holds an identity or a key, and the fingerprint of its body."""
+
+    result_id: str
+    fingerprint: str
+
+
+def identity_of(batch: ObservationBatch) -> Identity:
+    """What is unique among submissions."""
+    return batch.spacecraft, batch.run, batch.batch
+
+
+@dataclass
+class Registry:
+    """What is already there of some identities and keys."""
+
+    identities: dict[Identity, ExistingResult] = field(default_factory=dict)
+    keys: dict[OwnKey, ExistingResult] = field(default_factory=dict)
+
+    def first(
+        self, identity: Identity, key: OwnKey | None, fingerprint: str
+    ) -> ExistingResult | None:
+        """Who recorded this body before; None: nobody did.
+
+        Raises `KeyReused` where the key belongs to another body, which is
+        looked at first, and `Conflict` where the identity does.
+        """
+        by_key = None if key is None else self.keys.get(key)
+        if key is not None and by_key is not None:
+            if by_key.fingerprint != fingerprint:
+                raise KeyReused(f"Idempotency-Key {shown_value(key[1])} was used with another body")
+            return by_key
+        by_identity = self.identities.get(identity)
+        if by_identity is not None and by_identity.fingerprint != fingerprint:
+            spacecraft, run, batch = identity
+            raise Conflict(
+                f"{spacecraft}, run {run}: batch {shown_value(batch)} is recorded with another body"
+            )
+        return by_identity
+
+    def enter(self, identity: Identity, key: OwnKey | None, taken: ExistingResult) -> None:
+        """Note a new holder, so that whoever comes next finds it."""
+        self.identities[identity] = taken
+        if key is not None:
+            self.keys[key] = taken
+
+
+def look_up(
+    connection: Connection, identities: Collection[Identity], keys: Collection[OwnKey] = ()
+) -> Registry:
+    """What is recorded under these identities and keys."""
+    registry = Registry()
+    dialect = connection.dialect.name
+    if identities:
+        rows = _rows(connection, _BY_IDENTITY[dialect], identities)
+        for spacecraft, run, batch, id, fingerprint in rows:
+            registry.identities[spacecraft, run, batch] = ExistingResult(id, fingerprint)
+    if keys:
+        rows = _rows(connection, _BY_KEY[dialect], keys)
+        registry.keys = {
+            (token_id, key): ExistingResult(id, fingerprint)
+            for token_id, key, id, fingerprint in rows
+        }
+    return registry
+
+
+def _rows(connection: Connection, sql: str, wanted: Collection[object]) -> Iterable[Any]:
+    return execute(connection, sql, {"wanted": msgspec.json.encode(list(wanted)).decode()})
+
+
+def remember_key(
+    connection: Connection, identity: Identity, key: OwnKey, taken: ExistingResult
+) -> None:
+    """Give a key to a body that is recorded without it; raises `KeyReused` if another has it."""
+    if look_up(connection, (), [key]).first(identity, key, taken.fingerprint) is None:
+        connection.execute(insert(idempotency_keys), key_row(key, taken))
+
+
+def key_row(key: OwnKey, taken: ExistingResult) -> dict[str, str]:
+    """A row of the table of keys."""
+    token_id, name = key
+    return {
+        "token_id": token_id,
+        "key": name,
+        "fingerprint": taken.fingerprint,
+        "result_id": taken.result_id,
+    }
+
+
+def stored_answers(connection: Connection, ids: Collection[str]) -> dict[str, bytes]:
+    """The answers of recorded results, byte for byte as first sent."""
+    rows = _rows(connection, _ANSWERS + _AMONG[connection.dialect.name], ids) if ids else ()
+    return {id: answer.encode() for id, answer in rows}

@@ -1,0 +1,293 @@
+"""A record in the making: everything of a result but the last number of its answer.
+
+The rows are taken from the answer itself, so that what a list or a trend says
+cannot differ from what the client was told.  Whoever drafts puts the answer into
+JSON as well: a worker's answer comes to whoever writes as one text and not as a
+hundred small objects.
+"""
+
+import json
+import time
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
+
+import msgspec
+from msgspec import UNSET, Struct, structs
+
+from service.acquire import Acquisition
+from service.missions.mission import Identifier, Mission, Solver
+from service.observations.frame_record import FrameRecord
+from service.observations.schema import Submission
+from service.storage.models.answers import Answer, Frame, FrameTimings
+from service.storage.queries.future_dated import AHEAD_NS, LIVE
+from service.storage.recording.answer import answer_of, rows_of_stars
+from service.storage.recording.result_metrics import metrics_of
+from service.times import DAY_S, HOUR_S, Utc
+
+Row = dict[str, Any]
+
+STARS = ("observed", "unique", "ambiguous", "unmatched")
+"""What is counted of a result's stars."""
+
+_RECORD = b'"record":'
+_NOT_RECORDED = _RECORD + b"null"
+"""Of `timings_us`; within a text of the client's there would be a backslash before its quotes."""
+
+
+class Answered(Struct, frozen=True):
+    """An answer as it is stored and sent; `replayed` where it was stored before this request."""
+
+    id: str | None
+    """None for a what-if that was not to be recorded."""
+    body: bytes
+    replayed: bool
+
+
+class Buckets(Struct, frozen=True):
+    """Where in the trends a result counts: spacecraft, run, and the hour and day of its batch."""
+
+    spacecraft: str
+    run: str
+    hour: int
+    day: int
+
+
+class Draft(Struct, eq=False):
+    """A result that is computed and not yet recorded.
+
+    `batch` is the row of a first submission and None for a what-if.  `answer` is JSON
+    and lacks the time that recording took.  `mission` is None where another process
+    made the draft.
+    """
+
+    mission: Mission | None
+    identity: tuple[str, str, str]
+    """(spacecraft, run, batch): what is unique among submissions."""
+    answer: bytes
+    batch: Row | None
+    result: Row
+    stars: list[Row]
+    solution: Row | None
+    buckets: Buckets
+    key: tuple[str, str] | None
+    received_ns: int
+    """When it came, as `Utc.tai_ns`."""
+    frame: Row | None = None
+    is_ahead: bool = False
+    """Of a live batch: dated so far ahead that its time cannot be believed."""
+    handed_over_ns: int | None = None
+    """When it was handed to the writer, on the clock of `time.perf_counter_ns`."""
+    audit: Row | None = None
+    """The entry of the audit list that is stored with it, of a what-if that somebody recorded."""
+
+    def __reduce__(self) -> tuple[type["Draft"], tuple[Any, ...]]:
+        # To another process without what stands first, the settings of its mission: they are many.
+        return Draft, (None, *structs.astuple(self)[1:])
+
+    @property
+    def id(self) -> str:
+        """The result's id."""
+        return str(self.result["id"])
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Its stars: observed, and of them unique, ambiguous and unmatched."""
+        return {name: self.result[name] for name in STARS}
+
+    def to_json(self, together: int) -> bytes:
+        """The answer's JSON; `timings_us.record` is its share of the time since it was handed over.
+
+        Of so many results in one transaction none is recorded before the last: the whole time
+        would be counted once for each.
+        """
+        if self.handed_over_ns is None:
+            return self.answer
+        waited_ns = time.perf_counter_ns() - self.handed_over_ns
+        head, _, tail = self.answer.rpartition(_NOT_RECORDED)
+        assert head
+        return b"%b%b%d%b" % (head, _RECORD, waited_ns // (1000 * together), tail)
+
+
+def submission_draft(
+    submission: Submission,
+    acquisition: Acquisition,
+    *,
+    id: str,
+    received: Utc,
+    key: tuple[str, str] | None = None,
+) -> Draft:
+    """The draft of a batch's first result, which is current and gives the batch its id."""
+    batch = acquisition.batch
+    row = {
+        "id": id,
+        "spacecraft": batch.spacecraft,
+        "run": batch.run,
+        "batch": batch.batch,
+        "time": batch.time.text,
+        "time_ns": batch.time.tai_ns,
+        "received": received.text,
+        "fingerprint": submission.fingerprint,
+        "input": submission.text,
+    }
+    is_ahead = batch.run == LIVE and batch.time.tai_ns > received.tai_ns + AHEAD_NS
+    warning = (
+        f"dated_ahead: the batch is dated {batch.time.text} and came at {received.text}; it is "
+        "not shown as the latest"
+    )
+    answer = answer_of(
+        acquisition,
+        id=id,
+        frame=UNSET if submission.frame is None else _frame_of(submission.frame),
+        warnings=[warning] if is_ahead else (),
+    )
+    result = _result_row(
+        acquisition, answer, batch_id=id, parent=None, current=True, created=received
+    )
+    draft = _draft(acquisition, answer, row, result, key, received)
+    draft.is_ahead = is_ahead
+    if submission.frame is not None:
+        draft.frame = _frame_row(submission.frame, id)
+    return draft
+
+
+def what_if_draft(
+    acquisition: Acquisition,
+    *,
+    id: str,
+    batch_id: str,
+    parent: str,
+    adopt: bool,
+    created: Utc,
+) -> Draft:
+    """The draft of a further result of a batch, current if it is to be adopted."""
+    answer = answer_of(acquisition, id=id, parent=parent, recorded=True)
+    result = _result_row(
+        acquisition, answer, batch_id=batch_id, parent=parent, current=adopt, created=created
+    )
+    return _draft(acquisition, answer, None, result, None, created)
+
+
+def _draft(
+    acquisition: Acquisition,
+    answer: Answer,
+    batch_row: Row | None,
+    result: Row,
+    key: tuple[str, str] | None,
+    received: Utc,
+) -> Draft:
+    batch = acquisition.batch
+    stars = rows_of_stars(answer)
+    buckets = Buckets(
+        batch.spacecraft, batch.run, batch.time.bucket(HOUR_S), batch.time.bucket(DAY_S)
+    )
+    solution = _solution_row(acquisition, answer, result["id"])
+    return Draft(
+        acquisition.mission,
+        (batch.spacecraft, batch.run, batch.batch),
+        msgspec.json.encode(answer),
+        batch_row,
+        result,
+        stars,
+        solution,
+        buckets,
+        key,
+        received.tai_ns,
+    )
+
+
+def _frame_of(frame: FrameRecord) -> Frame:
+    """What the answer tells of the frame."""
+    told = frame.summary()
+    return Frame(**(told | {"timings_us": FrameTimings(**told["timings_us"])}))
+
+
+def _frame_row(frame: FrameRecord, batch_id: str) -> Row:
+    return {
+        "batch_id": batch_id,
+        "digest": frame.digest,
+        "summary": json.dumps(frame.summary()),
+        "detections": json.dumps({"stars": list(frame.stars), "hot_or_cosmic_px": frame.sharp}),
+        "preview": frame.preview,
+        "preview_step": frame.preview_step,
+    }
+
+
+def _result_row(
+    acquisition: Acquisition,
+    answer: Answer,
+    *,
+    batch_id: str,
+    parent: str | None,
+    current: bool,
+    created: Utc,
+) -> Row:
+    batch = acquisition.batch
+    attitude = answer.attitude
+    return {
+        "id": answer.id,
+        "batch_id": batch_id,
+        "parent_id": parent,
+        "current": current,
+        "created": created.text,
+        "spacecraft": batch.spacecraft,
+        "run": batch.run,
+        "time_ns": batch.time.tai_ns,
+        "identifier": answer.identifier,
+        "options": options_text(acquisition),
+        "mission_digest": answer.provenance.mission,
+        "catalog_digest": answer.provenance.catalog,
+        **structs.asdict(answer.counts),
+        "status": attitude and attitude.status,
+        "reason": answer.reason,
+        **metrics_of(acquisition),
+    }
+
+
+def options_text(acquisition: Acquisition) -> str:
+    """The options that a result was computed with, as JSON, what was not named left out."""
+    options = acquisition.batch.options
+    if not (options.tests or options.tolerances):
+        return _few_options(options.identifier, options.solver, options.zone_grid_deg)
+    return _options_text(structs.asdict(options))
+
+
+@lru_cache(maxsize=256, typed=True)
+def _few_options(
+    identifier: Identifier | None, solver: Solver | None, zone_grid_deg: float | None
+) -> str:
+    # The same text again and again: to put it together takes longer than to insert a star.
+    return _options_text(
+        {"identifier": identifier, "solver": solver, "zone_grid_deg": zone_grid_deg}
+    )
+
+
+def _options_text(named: Mapping[str, object]) -> str:
+    return json.dumps({name: value for name, value in named.items() if value not in (None, {})})
+
+
+def _solution_row(acquisition: Acquisition, answer: Answer, result_id: str) -> Row | None:
+    attitude, solution = answer.attitude, acquisition.solution
+    if attitude is None or solution is None:
+        return None
+    q1, q2, q3, qc = attitude.quaternion
+    (p11, p12, p13), (_, p22, p23), (_, _, p33) = attitude.covariance_arcsec2
+    return {
+        "result_id": result_id,
+        "q1": q1,
+        "q2": q2,
+        "q3": q3,
+        "qc": qc,
+        "frame": attitude.frame,
+        "p11": p11,
+        "p12": p12,
+        "p13": p13,
+        "p22": p22,
+        "p23": p23,
+        "p33": p33,
+        "residual_rms_arcsec": attitude.residual_rms_arcsec,
+        "predicted_rms_arcsec": solution.predicted_rms_arcsec,
+        "taste": attitude.taste,
+        "method": attitude.method,
+        "status": attitude.status,
+    }

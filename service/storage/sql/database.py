@@ -1,0 +1,152 @@
+"""The database, open: who writes to it, and how to read from it."""
+
+import logging
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from sqlalchemy import Connection
+from sqlalchemy.exc import DBAPIError, TimeoutError
+
+from service.errors import Busy
+from service.storage.sql.database_file import DatabaseFile
+from service.storage.sql.engines import (
+    TO_COMMIT,
+    TO_LOOK_UP,
+    TO_READ,
+    TO_SHOW,
+    TURN_S,
+    Kept,
+    database_file,
+    database_url,
+    reading_engine,
+    writing_engine,
+)
+from service.storage.sql.migrations import bring_up_to_date, require_up_to_date
+from service.storage.sql.transaction import may_pass
+from service.storage.sql.writer import RETRY_AFTER_S, Writer
+
+log = logging.getLogger(__name__)
+
+# Two connections that write and checkpoint at the same moment can lose a transaction.
+_WAL_RESET_BUG = (3, 7, 0), (3, 51, 2)
+
+
+class Readers:
+    """Connections that see one moment of a database each, and cannot write."""
+
+    def __init__(
+        self,
+        database: str,
+        *,
+        serving: bool = False,
+        file: DatabaseFile | None = None,
+    ) -> None:
+        """Nothing is connected yet; raises `BadConfiguration` for what is no database's URL.
+
+        While `serving`, nobody waits long for a database that does not answer.  Of SQLite
+        the file that is there now must stay the same.
+        """
+        self.url = database_url(database)
+        self.file = file or database_file(self.url)
+        if self.file is not None:
+            self.file.remember()
+        self._readers = reading_engine(self.url, TO_SHOW if serving else None)
+        self._glancing = self._readers
+        if serving and self.file is None:
+            self._glancing = reading_engine(self.url, TO_LOOK_UP, 1)
+        self._glances = Kept(self._glancing, TO_READ, self.file, TURN_S if serving else None)
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """A connection that sees one moment of the database and cannot write.
+
+        Raises `Busy` where the database is out of reach or every reader taken.
+        """
+        if self.file is not None:
+            self.file.require()
+        with _reported(), self._readers.connect() as connection, connection.begin():
+            yield connection
+
+    @contextmanager
+    def glancing(self) -> Iterator[Connection]:
+        """`reading` by prepared statements, each of which may see another moment.
+
+        Others who glance wait for it.
+        """
+        with _reported(), self._glances.looking() as connection:
+            yield connection
+
+    def close(self) -> None:
+        """Let go of the database."""
+        self._glances.close()
+        self._glancing.dispose()
+        self._readers.dispose()
+
+
+@contextmanager
+def _reported() -> Iterator[None]:
+    """Say `Busy` of trouble with the database that may pass."""
+    try:
+        yield
+    except TimeoutError as error:
+        raise Busy("every connection to the database is in use") from error
+    except DBAPIError as error:
+        if not may_pass(error):
+            raise
+        log.error("the database could not be read: %s", error.orig)
+        raise Busy("the database cannot be read now", RETRY_AFTER_S) from error
+
+
+class Store(Readers):
+    """The one connection that writes, behind its thread, and the readers."""
+
+    def __init__(
+        self,
+        database: str,
+        *,
+        create: bool = True,
+        serving: bool = False,
+    ) -> None:
+        """Open a database: SQLite is created and migrated, PostgreSQL must be up to date.
+
+        Without `create` SQLite's file must be there.
+        `serving` is for who must answer in time; see `Readers`.
+        Raises `BadConfiguration` with what to do.
+        """
+        url = database_url(database)
+        file = database_file(url)
+        if file is not None and not create:
+            file.require_there()
+        bounds = TO_COMMIT if serving else None
+        self._writing = writing_engine(url, file=file, create=create, bounds=bounds)
+        try:
+            if self._writing.dialect.name == "sqlite":
+                bring_up_to_date(self._writing)
+            else:
+                require_up_to_date(self._writing)
+        except BaseException:
+            self._writing.dispose()
+            raise
+        super().__init__(database, serving=serving, file=file)
+        self.writer = Writer(self._writing, file=file, wait_s=TURN_S if serving else None)
+
+    def close(self) -> None:
+        """Write what is queued, then let go of the database."""
+        self.writer.close()
+        # The writer goes last: the last connection to leave checkpoints the log.
+        super().close()
+        self._writing.dispose()
+
+
+def warn_of_old_sqlite(database: str) -> None:
+    """Log that a database's SQLite is one whose file two processes must not write to."""
+    first, last = _WAL_RESET_BUG
+    if database_url(database).drivername != "sqlite":
+        return
+    if first <= sqlite3.sqlite_version_info <= last:
+        log.warning(
+            "this SQLite (%s) has a known fault when two processes write to one file at the same "
+            "moment, mended in 3.51.3: let one process at a time use the database",
+            sqlite3.sqlite_version,
+        )

@@ -1,0 +1,71 @@
+"""The file of a SQLite database, which must stay the one that was opened.
+
+Moved, replaced or deleted, it goes on taking what is written through an open
+connection, and nobody finds that again.
+"""
+
+import logging
+import os
+from pathlib import Path
+
+from service.errors import BadConfiguration, Busy
+
+FileIdentity = tuple[int, int]
+"""Device and inode."""
+
+RETRY_S = 5
+
+log = logging.getLogger(__name__)
+
+
+class DatabaseFile:
+    """A path, and which file was there when it was opened."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._log_path = f"{path}-wal"
+        self.identity: FileIdentity | None = None
+        self._told = False
+
+    def remember(self) -> None:
+        """Note which file is there, unless that is known."""
+        if self.identity is None:
+            self.identity = _identity(self.path)
+
+    def require_there(self) -> None:
+        """Raise `BadConfiguration` unless there is a file."""
+        if _identity(self.path) is None:
+            raise BadConfiguration(f"ACQUIRE_DATABASE: {self.path}: there is no such file")
+
+    def require(self) -> None:
+        """Raise `Busy` unless the path still leads to the file that was opened."""
+        if self.identity is None or _identity(self.path) == self.identity:
+            self._told = False
+            return
+        if not self._told:
+            self._told = True
+            log.error("%s was moved, replaced or deleted while it is being served", self.path)
+        raise Busy(
+            "the database file was moved, replaced or deleted while the service runs; nothing is "
+            "read or written until it is back, or the service is started again",
+            RETRY_S,
+        )
+
+    def log_identity(self) -> FileIdentity | None:
+        """Which file is SQLite's write-ahead log: it stays the same while a connection is open."""
+        return _identity(self._log_path)
+
+    def require_log(self, opened: FileIdentity | None) -> None:
+        """Raise `Busy` unless file and log are those that a transaction began with."""
+        self.require()
+        if self.log_identity() != opened:
+            log.error("%s was moved, replaced or deleted while in use", self._log_path)
+            raise Busy("the database's log was moved, replaced or deleted", RETRY_S)
+
+
+def _identity(path: Path | str) -> FileIdentity | None:
+    try:
+        found = os.stat(path)
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino

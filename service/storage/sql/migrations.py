@@ -1,0 +1,175 @@
+"""The schema's migrations: bringing a database up to date, and telling whether it is.
+
+alembic is loaded only where there is something to change or to compare: a
+service that starts would wait for it.
+"""
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sqlalchemy import URL, Connection, Engine, inspect
+from sqlalchemy.exc import SQLAlchemyError
+
+from service.errors import BadConfiguration
+from service.resources import shipped
+from service.storage.sql.columns import metadata
+from service.storage.sql.engines import database_url, reading_engine, shown_url, writing_engine
+
+if TYPE_CHECKING:
+    from alembic.config import Config
+
+HEAD = "0007"
+"""The latest revision of `migrations/`."""
+
+
+def upgrade(database: str) -> None:
+    """Create what is missing and bring the schema to this version's; data is kept.
+
+    Raises `BadConfiguration` for a database that cannot be reached, is none,
+    or was written by a newer version.
+    """
+    with _disposed(writing_engine(database_url(database))) as engine:
+        bring_up_to_date(engine)
+
+
+def require_there(database: str) -> None:
+    """Raise `BadConfiguration` where a SQLite file is missing.
+
+    To open it would create it; a command that reads must not.
+    """
+    url = database_url(database)
+    if url.drivername != "sqlite":
+        return
+    file = Path(url.database or "")
+    if not file.is_file():
+        raise BadConfiguration(f"ACQUIRE_DATABASE: {file}: there is no such file")
+
+
+def require_records(database: str) -> None:
+    """Raise `BadConfiguration` for a SQLite file that is missing or was never the service's.
+
+    What opens a database to write would make the service's tables in it.
+    """
+    require_there(database)
+    url = database_url(database)
+    if url.drivername != "sqlite":
+        return
+    with _disposed(reading_engine(url)) as engine, reported(url), engine.begin() as connection:
+        if _revision(connection) is None:
+            raise BadConfiguration(
+                f"ACQUIRE_DATABASE: {shown_url(url)}: holds no records of this service"
+            )
+
+
+def check(database: str) -> list[str]:
+    """How the schema of a database differs from the tables of the code; empty: not at all.
+
+    Nothing is written and nothing created: raises `BadConfiguration` where
+    there is no database.
+    """
+    require_there(database)
+    url = database_url(database)
+    with _disposed(reading_engine(url)) as engine, reported(url), engine.begin() as connection:
+        found = _revision(connection)
+        if found != HEAD:
+            return [_behind(found)]
+        from alembic.autogenerate import compare_metadata
+        from alembic.runtime.migration import MigrationContext
+
+        # Every table must be known to the metadata.
+        from service.storage.sql import access_tables, tables  # noqa: F401
+
+        context = MigrationContext.configure(connection, opts={"compare_type": True})
+        return [_in_words(difference) for difference in compare_metadata(context, metadata)]
+
+
+def check_fresh() -> list[str]:
+    """How the migrations, run from nothing, differ from the tables of the code."""
+    with tempfile.TemporaryDirectory() as folder:
+        database = f"sqlite:///{Path(folder, 'fresh.db')}"
+        upgrade(database)
+        return check(database)
+
+
+def bring_up_to_date(engine: Engine) -> None:
+    """Run the migrations that are missing, in one transaction."""
+    with reported(engine.url), engine.begin() as connection:
+        if _revision(connection) == HEAD:
+            return
+        from alembic import command
+        from alembic.util import CommandError
+
+        config = _config()
+        config.attributes["connection"] = connection
+        try:
+            command.upgrade(config, "head")
+        except CommandError:
+            raise BadConfiguration(
+                f"ACQUIRE_DATABASE: {shown_url(engine.url)}: was written by another version of "
+                "the service"
+            ) from None
+
+
+def require_up_to_date(engine: Engine) -> None:
+    """Raise `BadConfiguration` unless the schema is this version's."""
+    with reported(engine.url), engine.begin() as connection:
+        found = _revision(connection)
+    if found != HEAD:
+        raise BadConfiguration(f"ACQUIRE_DATABASE: {shown_url(engine.url)}: {_behind(found)}")
+
+
+@contextmanager
+def reported(url: URL) -> Iterator[None]:
+    """Turn what a database says of itself on opening into a `BadConfiguration`."""
+    try:
+        yield
+    except SQLAlchemyError as error:
+        said = str(getattr(error, "orig", None) or error).strip()
+        raise BadConfiguration(f"ACQUIRE_DATABASE: {shown_url(url)}: {said}") from error
+
+
+@contextmanager
+def _disposed(engine: Engine) -> Iterator[Engine]:
+    try:
+        yield engine
+    finally:
+        engine.dispose()
+
+
+def _config() -> "Config":
+    from alembic.config import Config
+
+    config = Config()
+    # A percent sign in a path would be taken for the start of a variable.
+    config.set_main_option("script_location", str(shipped("migrations")).replace("%", "%%"))
+    return config
+
+
+def _revision(connection: Connection) -> str | None:
+    if not inspect(connection).has_table("alembic_version"):
+        return None
+    revisions = connection.exec_driver_sql("SELECT version_num FROM alembic_version").scalars()
+    return next(iter(revisions), None)
+
+
+def _behind(found: str | None) -> str:
+    return (
+        f"its schema is at {found or 'nothing'}, this version needs {HEAD}: "
+        "run `acquire database upgrade`"
+    )
+
+
+def _in_words(difference: Any) -> str:
+    """One difference as alembic tells it: a verb, then what it is about, perhaps in a list."""
+    if isinstance(difference, list):
+        return "; ".join(_in_words(each) for each in difference)
+    verb, *about = difference
+    names = [str(getattr(each, "name", each)) for each in about if isinstance(each, str)] or [
+        str(getattr(about[0], "name", about[0]))
+    ]
+    last = getattr(about[-1], "name", None)
+    where = ".".join([*names, str(last)] if last and last not in names else names)
+    return f"to be as the code says: {verb.replace('_', ' ')} {where}"

@@ -1,0 +1,374 @@
+"""The tables, the same on SQLite and PostgreSQL.
+
+    frames ──┐
+    runs ── batches ── results ── star_results
+                         │    └── solutions        no attitude, no row
+    missions, catalogs ──┘
+    idempotency_keys ── results
+    mission_uses ── missions                       from when each settings were in use
+    rollups_hourly, rollups_daily                  of current results (rollup_tables.py)
+    limits                                         every setting ever made; one per quantity is open
+    watches, alarms ── alarm_actions               state of the evaluation, alarms, actions
+    events, event_counter                          recent events in order of commit
+    replays
+    access_tokens ── access_sessions, audit        who may ask, who changed what (access_tables.py)
+
+A batch is what was sent; a result is what was made of it.  The first result of
+a batch has the batch's own id; recorded what-ifs add others, and exactly one
+result of a batch is current.  Results repeat the spacecraft, run and time of
+their batch, so that one index answers a list, a history or a trend.
+
+A batch that was made of a frame has a row in `frames`: what was found on it, and a
+small picture.  The frame itself is not kept.
+
+A batch's time is kept as the text of its UTC and as `time_ns`, nanoseconds of
+TAI from 2000-01-01T12:00:00 TAI, for order and ranges.
+"""
+
+from typing import Any
+
+from sqlalchemy import (
+    BigInteger,
+    Boolean,
+    Column,
+    Double,
+    ForeignKey,
+    Index,
+    Integer,
+    LargeBinary,
+    SmallInteger,
+    String,
+    Table,
+    Text,
+    UniqueConstraint,
+    false,
+    text,
+)
+
+from service.alarms.quantities import QUANTITIES, Measured
+from service.storage.sql.columns import Digest, Id, Moment, Name, RunName, metadata
+from service.storage.sql.rollup_tables import rollups_daily, rollups_hourly
+
+runs = Table(
+    "runs",
+    metadata,
+    Column("name", RunName, primary_key=True),
+    Column("created", Moment, nullable=False),
+    # Whether limits are held against the run; live batches are watched in any case.
+    Column("alarms", Boolean, nullable=False, server_default=false()),
+)
+
+missions = Table(
+    "missions",
+    metadata,
+    Column("digest", Digest, primary_key=True),
+    Column("spacecraft", Name, nullable=False, index=True),
+    Column("settings", Text, nullable=False),
+    Column("first_used", Moment, nullable=False),
+)
+
+mission_uses = Table(
+    "mission_uses",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("spacecraft", Name, nullable=False, index=True),
+    Column("digest", Digest, ForeignKey(missions.c.digest), nullable=False),
+    Column("since", Moment, nullable=False),
+)
+
+catalogs = Table(
+    "catalogs",
+    metadata,
+    Column("digest", Digest, primary_key=True),
+    Column("name", Text, nullable=False),
+    Column("first_used", Moment, nullable=False),
+)
+
+batches = Table(
+    "batches",
+    metadata,
+    Column("id", Id, primary_key=True),
+    Column("spacecraft", Name, nullable=False),
+    Column("run", RunName, ForeignKey(runs.c.name), nullable=False),
+    Column("batch", Name, nullable=False),
+    Column("time", Moment, nullable=False),
+    Column("time_ns", BigInteger, nullable=False),
+    Column("received", Moment, nullable=False),
+    Column("fingerprint", String(64), nullable=False),
+    Column("input", Text, nullable=False),
+    UniqueConstraint("spacecraft", "run", "batch"),
+)
+
+frames = Table(
+    "frames",
+    metadata,
+    Column("batch_id", Id, ForeignKey(batches.c.id), primary_key=True),
+    Column("digest", Digest, nullable=False, index=True),
+    # JSON: what the answer says of the frame, and what was found on it.
+    Column("summary", Text, nullable=False),
+    Column("detections", Text, nullable=False),
+    # PNG; so many pixels a side of the frame make one of it.
+    Column("preview", LargeBinary, nullable=False),
+    Column("preview_step", Integer, nullable=False),
+)
+
+MEASURED = tuple(n for n, each in QUANTITIES.items() if isinstance(each.source, Measured))
+"""The columns of measured quantities."""
+
+results = Table(
+    "results",
+    metadata,
+    Column("id", Id, primary_key=True),
+    Column("batch_id", Id, ForeignKey(batches.c.id), nullable=False),
+    Column("parent_id", Id, ForeignKey("results.id")),
+    Column("current", Boolean, nullable=False),
+    Column("created", Moment, nullable=False),
+    Column("spacecraft", Name, nullable=False),
+    Column("run", RunName, nullable=False),
+    Column("time_ns", BigInteger, nullable=False),
+    Column("identifier", String(32), nullable=False),
+    Column("options", Text, nullable=False),
+    Column("mission_digest", Digest, ForeignKey(missions.c.digest), nullable=False),
+    Column("catalog_digest", Digest, ForeignKey(catalogs.c.digest), nullable=False),
+    Column("observed", Integer, nullable=False),
+    Column("unique", Integer, nullable=False),
+    Column("ambiguous", Integer, nullable=False),
+    Column("unmatched", Integer, nullable=False),
+    # Of the attitude: good or suspect; null where there is none, and then a reason.
+    Column("status", String(16)),
+    Column("reason", String(64)),
+    # Null where the quantity is not known.
+    *(Column(name, Double) for name in MEASURED),
+    # The answer's JSON, byte for byte as it was sent.
+    Column("answer", Text, nullable=False),
+)
+
+# Lists, histories and trends look at current results alone, newest or oldest first; what they
+# filter by stands in the index, so that a page touches the table only for the rows it shows.
+_FILTERS = [results.c[name] for name in ("status", "unique", "ambiguous", "unmatched")]
+# SQLite uses a partial index only where the query repeats its words.
+_CURRENT: dict[str, Any] = {
+    "sqlite_where": text("current = 1"),
+    "postgresql_where": text("current"),
+}
+Index(
+    "ix_results_current_by_spacecraft",
+    results.c.spacecraft,
+    results.c.run,
+    results.c.time_ns,
+    results.c.batch_id,
+    *_FILTERS,
+    # A trend over batches is drawn from the index alone.
+    *(results.c[name] for name in MEASURED),
+    **_CURRENT,
+)
+Index(
+    "ix_results_current_by_run",
+    results.c.run,
+    results.c.time_ns,
+    results.c.batch_id,
+    *_FILTERS,
+    **_CURRENT,
+)
+Index(
+    "ix_results_current_by_time",
+    results.c.time_ns,
+    results.c.batch_id,
+    results.c.spacecraft,
+    *_FILTERS,
+    **_CURRENT,
+)
+Index("uq_results_current", results.c.batch_id, unique=True, **_CURRENT)
+Index(
+    "ix_results_what_ifs",
+    results.c.batch_id,
+    sqlite_where=results.c.parent_id.is_not(None),
+    postgresql_where=results.c.parent_id.is_not(None),
+)
+
+# Whoever deletes a result is asked who refers to it.
+Index(
+    "ix_results_parent",
+    results.c.parent_id,
+    sqlite_where=results.c.parent_id.is_not(None),
+    postgresql_where=results.c.parent_id.is_not(None),
+)
+
+star_results = Table(
+    "star_results",
+    metadata,
+    Column("result_id", Id, ForeignKey(results.c.id), primary_key=True),
+    Column("tracker", Name, primary_key=True),
+    Column("position", SmallInteger, primary_key=True),
+    Column("outcome", String(16), nullable=False),
+    Column("star_id", Text),
+    Column("votes", Integer, nullable=False),
+    Column("runner_up", Integer, nullable=False),
+    Column("probability", Double),
+    Column("residual_arcsec", Double),
+    sqlite_with_rowid=False,
+)
+
+solutions = Table(
+    "solutions",
+    metadata,
+    Column("result_id", Id, ForeignKey(results.c.id), primary_key=True),
+    *(Column(name, Double, nullable=False) for name in ("q1", "q2", "q3", "qc")),
+    Column("frame", String(16), nullable=False),
+    # The upper triangle of the covariance, arcsec^2 about the body axes.
+    *(Column(name, Double, nullable=False) for name in ("p11", "p12", "p13", "p22", "p23", "p33")),
+    Column("residual_rms_arcsec", Double, nullable=False),
+    Column("predicted_rms_arcsec", Double, nullable=False),
+    Column("taste", Double, nullable=False),
+    Column("method", String(32), nullable=False),
+    Column("status", String(16), nullable=False),
+    sqlite_with_rowid=False,
+)
+
+idempotency_keys = Table(
+    "idempotency_keys",
+    metadata,
+    # The token whose key it is; empty: none, for keys sent while access was open.
+    Column("token_id", String(26), primary_key=True, server_default=text("''")),
+    Column("key", String(255), primary_key=True),
+    Column("fingerprint", String(64), nullable=False),
+    Column("result_id", Id, ForeignKey(results.c.id), nullable=False, index=True),
+)
+
+replays = Table(
+    "replays",
+    metadata,
+    Column("id", Id, primary_key=True),
+    Column("run", RunName, nullable=False),
+    Column("name", Text, nullable=False),
+    Column("state", String(16), nullable=False),
+    Column("lines_total", BigInteger),
+    Column("lines_done", BigInteger, nullable=False),
+    Column("lines_refused", BigInteger, nullable=False),
+    Column("errors", Text, nullable=False),
+    Column("counts", Text),
+    Column("started", Moment, nullable=False),
+    Column("finished", Moment),
+)
+
+limits = Table(
+    "limits",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("spacecraft", Name, nullable=False),
+    Column("quantity", String(32), nullable=False),
+    # JSON; null: the shipped ones hold again.
+    Column("settings", Text),
+    Column("who", String(64), nullable=False),
+    Column("comment", Text),
+    Column("since", Moment, nullable=False),
+    Column("until", Moment),
+)
+_OPEN_LIMIT: dict[str, Any] = {
+    "sqlite_where": limits.c.until.is_(None),
+    "postgresql_where": limits.c.until.is_(None),
+}
+Index("uq_limits_open", limits.c.spacecraft, limits.c.quantity, unique=True, **_OPEN_LIMIT)
+Index("ix_limits_history", limits.c.spacecraft, limits.c.quantity, limits.c.id)
+
+watches = Table(
+    "watches",
+    metadata,
+    Column("spacecraft", Name, primary_key=True),
+    Column("run", RunName, primary_key=True),
+    # The latest batch looked at: its time, its id, and when it came.
+    Column("time", Moment, nullable=False),
+    Column("time_ns", BigInteger, nullable=False),
+    Column("batch_id", Id, nullable=False),
+    Column("received", Moment, nullable=False),
+    # The latest batches' values, and since when each quantity is out of its limits.
+    Column("state", Text, nullable=False),
+)
+
+alarms = Table(
+    "alarms",
+    metadata,
+    Column("id", Id, primary_key=True),
+    Column("spacecraft", Name, nullable=False),
+    Column("run", RunName, nullable=False),
+    Column("quantity", String(32), nullable=False),
+    # The worst so far, and that of now: null is back in limits.
+    Column("severity", String(16), nullable=False),
+    Column("current_severity", String(16)),
+    Column("raised_at", Moment, nullable=False),
+    Column("bound", Double, nullable=False),
+    *(
+        Column(f"{which}_{name}", kind, nullable=name == "batch_id")
+        for which in ("raised", "worst", "latest")
+        for name, kind in (("value", Double), ("time", Moment), ("batch_id", Id))
+    ),
+    Column("returned_at", Moment),
+    Column("acknowledged_at", Moment),
+    Column("acknowledged_by", String(64)),
+    Column("shelved_at", Moment),
+    Column("shelved_by", String(64)),
+    Column("shelved_until", Moment),
+    Column("cleared_at", Moment),
+)
+_ACTIVE: dict[str, Any] = {
+    "sqlite_where": alarms.c.cleared_at.is_(None),
+    "postgresql_where": alarms.c.cleared_at.is_(None),
+}
+Index(
+    "uq_alarms_active",
+    alarms.c.run,
+    alarms.c.spacecraft,
+    alarms.c.quantity,
+    unique=True,
+    **_ACTIVE,
+)
+Index("ix_alarms_run", alarms.c.run, alarms.c.id)
+
+alarm_actions = Table(
+    "alarm_actions",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("alarm_id", Id, ForeignKey(alarms.c.id), nullable=False, index=True),
+    Column("at", Moment, nullable=False),
+    Column("action", String(16), nullable=False),
+    Column("who", String(64)),
+    Column("comment", Text),
+    Column("severity", String(16)),
+    Column("value", Double),
+    Column("time", Moment),
+)
+
+events = Table(
+    "events",
+    metadata,
+    Column("id", BigInteger, primary_key=True, autoincrement=False),
+    Column("kind", String(16), nullable=False),
+    Column("run", RunName),
+    Column("spacecraft", Name),
+    Column("data", Text, nullable=False),
+)
+
+event_counter = Table(
+    "event_counter",
+    metadata,
+    # One row, whose lock orders the events of several processes as they are committed.
+    Column("id", SmallInteger, primary_key=True, autoincrement=False),
+    Column("last", BigInteger, nullable=False),
+)
+
+WRITTEN_BY_POSTS = (
+    runs,
+    batches,
+    results,
+    star_results,
+    solutions,
+    rollups_hourly,
+    rollups_daily,
+    idempotency_keys,
+    watches,
+    alarms,
+    alarm_actions,
+    events,
+    event_counter,
+)
+"""The tables that a batch may be written to."""

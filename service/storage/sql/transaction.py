@@ -1,0 +1,138 @@
+"""One transaction of the writer: much work at once, and no failure reaches its neighbours."""
+
+import sqlite3
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from sqlalchemy import Connection
+from sqlalchemy.exc import (
+    DataError,
+    DBAPIError,
+    IntegrityError,
+    InterfaceError,
+    OperationalError,
+    ProgrammingError,
+)
+
+from service.storage.recording import events
+from service.storage.recording.results import Outcome, record
+from service.storage.recording.unsaved_result import Draft
+from service.storage.sql.prepared import execute
+
+Results = list[Outcome | Exception]
+
+MAX_LOOKS = 5
+
+
+@dataclass(eq=False)
+class QueuedJob:
+    """Results to record, or another change to make, and what is called with what comes of it."""
+
+    settle: Callable[[Any], object]
+    """Called with the `Results`, with what the change returns, or with an error."""
+    drafts: Sequence[Draft] = ()
+    change: Callable[[Connection], Any] | None = None
+    low_priority: bool = False
+    """As a bulk load has: it is written by itself, after what else waits."""
+    since_s: float = field(default_factory=time.monotonic)
+
+    @property
+    def weight(self) -> int:
+        """How much there is to write."""
+        return len(self.drafts) or 1
+
+
+def transact(connection: Connection, jobs: Sequence[QueuedJob], careful: bool) -> list[Any]:
+    """One outcome for each job: what comes of it, or the error that concerns it alone.
+
+    A first try assumes that every result is new and looks nothing up, and it has no
+    savepoints, for which SQLite keeps each page as it was: whatever fails ends the
+    transaction.  A `careful` try finds what is recorded, and keeps each failure to itself.
+    """
+    with events.numbered(connection):
+        drafts = [draft for job in jobs for draft in job.drafts]
+        recorded: Sequence[Outcome | Exception]
+        if careful:
+            recorded = _record(connection, drafts)
+        else:
+            recorded = record(connection, drafts, assume_new=True)
+        outcomes = iter(recorded)
+        return [
+            [next(outcomes) for _ in job.drafts]
+            if job.change is None
+            else _change(connection, job.change, careful)
+            for job in jobs
+        ]
+
+
+def _record(connection: Connection, drafts: Sequence[Draft]) -> Results:
+    """All drafts together; where that fails, each by itself, so that one spoils no other."""
+    if not drafts:
+        return []
+    failure: Exception
+    for _ in range(MAX_LOOKS):
+        try:
+            with _savepoint(connection):
+                return list(record(connection, drafts))
+        except IntegrityError as error:
+            failure = error  # perhaps another process was faster: look again
+        except Exception as error:
+            if is_of_the_database(error):
+                raise
+            failure = error
+            break
+    if len(drafts) == 1:
+        return [failure]
+    return [outcome for draft in drafts for outcome in _record(connection, [draft])]
+
+
+def _change(connection: Connection, change: Callable[[Connection], Any], careful: bool) -> Any:
+    if not careful:
+        return change(connection)
+    try:
+        with _savepoint(connection):
+            return change(connection)
+    except Exception as error:
+        if is_of_the_database(error):
+            raise
+        return error
+
+
+@contextmanager
+def _savepoint(connection: Connection) -> Iterator[None]:
+    """Keep what the block does whole, or none of it.
+
+    Trouble of the database itself ends the whole transaction: SQLite, its disk
+    full, may have rolled it back already, and what came before would be lost.
+    """
+    noted = events.noted(connection)
+    execute(connection, "SAVEPOINT block")
+    try:
+        yield
+    except BaseException as error:
+        events.undone(connection, noted)
+        if not is_of_the_database(error):
+            execute(connection, "ROLLBACK TO SAVEPOINT block")
+            execute(connection, "RELEASE SAVEPOINT block")
+        raise
+    execute(connection, "RELEASE SAVEPOINT block")
+
+
+def is_of_the_database(error: BaseException) -> bool:
+    """Whether an error is the database's, its disk's or its connection's, and no single row's."""
+    about_a_row = (IntegrityError, DataError, ProgrammingError)
+    return isinstance(error, DBAPIError) and not isinstance(error, about_a_row)
+
+
+def may_pass(error: DBAPIError) -> bool:
+    """Whether the trouble is with the database's disk or connection, and not with what was asked.
+
+    SQLite says of a table that is missing, and of a write through a connection
+    for readers, that they are operational errors too.
+    """
+    code = getattr(error.orig, "sqlite_errorcode", None)
+    ours = code is not None and code & 0xFF in (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_READONLY)
+    return isinstance(error, OperationalError | InterfaceError) and not ours

@@ -1,0 +1,299 @@
+"""The one connection that writes, and the thread behind it.
+
+The thread takes whatever is queued, writes it in one transaction, commits, and only
+then answers: under load many share a commit, and alone nothing waits for others.
+There is no timer.  Chunks of a bulk load are written by themselves, in turn with
+everything else.
+"""
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
+from contextlib import contextmanager, nullcontext
+from typing import Any, TypeVar
+
+from sqlalchemy import Connection, Engine, update
+from sqlalchemy.exc import DBAPIError
+
+from service.errors import Busy, Stopping
+from service.storage.recording.unsaved_result import Draft, Row
+from service.storage.sql.database_file import DatabaseFile
+from service.storage.sql.engines import TO_WRITE, Kept, TakenBack, patience
+from service.storage.sql.tables import WRITTEN_BY_POSTS, event_counter
+from service.storage.sql.transaction import QueuedJob, Results, is_of_the_database, transact
+
+log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+MAX_QUEUED = 10_000
+"""Results that may wait: a matter of seconds."""
+MAX_ATTEMPTS = 5
+RETRY_AFTER_S = 5
+
+# PostgreSQL's codes for two writers that crossed; it stopped one, which begins again.
+_CROSSED = ("40001", "40P01")
+
+
+class Writer:
+    """Writes what is queued, from one thread over one connection."""
+
+    def __init__(
+        self,
+        engine: Engine,
+        max_queued: int = MAX_QUEUED,
+        *,
+        file: DatabaseFile | None = None,
+        wait_s: float | None = None,
+    ) -> None:
+        """`file` is that of SQLite; `wait_s` bounds how long results wait to be written.
+
+        Those of a bulk load, and other changes, wait as long as it takes.
+        """
+        self._connection = Kept(engine, TO_WRITE, file)
+        self._max_queued = max_queued
+        self._wait_s = wait_s
+        self._failures = 0
+        self._is_failing = False
+        self._queue: deque[QueuedJob] = deque()
+        self._low_priority: deque[QueuedJob] = deque()
+        self._has_waited = False
+        self._queued = 0
+        self._closing = False
+        self._changed = threading.Condition()
+        self.after_commit: list[Callable[[], object]] = []
+        """Called by the writer's thread, which waits for it, after each transaction."""
+        self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
+        self._thread.start()
+
+    def queue(
+        self,
+        drafts: Sequence[Draft],
+        settle: Callable[[Results | Exception], object],
+        low_priority: bool = False,
+    ) -> None:
+        """Queue results for one transaction; raises `Busy` when too much is waiting.
+
+        Those of `low_priority` get a transaction of their own, and what else is queued
+        goes first.  `settle` is called by the writer's thread with one outcome for each, in
+        order: an answer, stored, or the error that kept this result, and no other, from
+        being recorded.  Where the database itself fails it is called with `Busy`.
+        """
+        self._put(QueuedJob(settle, drafts, low_priority=low_priority))
+
+    def record(self, drafts: Sequence[Draft], low_priority: bool = False) -> "Future[Results]":
+        """`queue` with a future that gives the outcomes, or raises `Busy`."""
+        done: Future[Results] = Future()
+        self.queue(drafts, _settling(done), low_priority)
+        return done
+
+    def change(self, change: Callable[[Connection], T]) -> "Future[T]":
+        """Queue another change, which is kept whole or not at all, and may be made twice over."""
+        done: Future[T] = Future()
+        self._put(QueuedJob(_settling(done), change=change))
+        return done
+
+    def require(self) -> None:
+        """Raise `Stopping` unless what is queued will be written."""
+        with self._changed:
+            if self._closing or not self._thread.is_alive():
+                raise Stopping("nothing is written any more: the service must be started again")
+
+    def note_failure(self, count: int) -> None:
+        """Count work that could not be written, or not even be looked up before that."""
+        with self._changed:
+            self._failures += count
+            self._is_failing = True
+
+    def require_written(self) -> None:
+        """Raise `Busy` where the last write failed, and one that is tried now fails too.
+
+        Otherwise only the next client's batch could show that the database can be
+        written again.
+        """
+        if self._is_failing:
+            self.change(_try_to_write).result()
+
+    def state(self) -> Row:
+        """Whether the last write `succeeded`, how many `failed`, and what waits, since when."""
+        with self._changed:
+            heads = [queue[0].since_s for queue in (self._queue, self._low_priority) if queue]
+            return {
+                "succeeded": not self._is_failing,
+                "failed": self._failures,
+                "queued": self._queued,
+                "oldest_s": time.monotonic() - min(heads) if heads else 0.0,
+            }
+
+    def close(self) -> None:
+        """Refuse new work, write what is queued, and end the thread."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        self._thread.join()
+        self._connection.close()
+
+    def _put(self, job: QueuedJob) -> None:
+        with self._changed:
+            if self._closing:
+                raise Stopping("the service is stopping")
+            # A job that alone is larger than the queue is still taken by an empty one.
+            if self._queued and self._queued + job.weight > self._max_queued:
+                raise Busy(f"{self._queued} records are waiting to be written")
+            (self._low_priority if job.low_priority else self._queue).append(job)
+            self._queued += job.weight
+            self._changed.notify()
+
+    # ---- the writer's thread -----------------------------------------------------------------
+
+    def _run(self) -> None:
+        try:
+            while jobs := self._take():
+                self._settle(jobs)
+                self._tell()
+        finally:
+            # Empty after closing in order; otherwise nothing that is queued will be written.
+            with self._changed:
+                self._closing = True
+                left = [*self._queue, *self._low_priority]
+                self._queue.clear()
+                self._low_priority.clear()
+            for job in left:
+                job.settle(Stopping("the writer has ended"))
+            self._tell()
+
+    def _take(self) -> list[QueuedJob]:
+        """What is written next, in one transaction; nothing when all is over."""
+        with self._changed:
+            while not (self._queue or self._low_priority) and not self._closing:
+                self._changed.wait()
+            # What has low priority lets the rest pass, but for one transaction only.
+            if self._low_priority and (self._has_waited or not self._queue):
+                jobs = [self._low_priority.popleft()]
+                self._has_waited = False
+            else:
+                jobs = list(self._queue)
+                self._queue.clear()
+                self._has_waited = bool(self._low_priority)
+            self._queued -= sum(job.weight for job in jobs)
+        return jobs
+
+    def _settle(self, jobs: Sequence[QueuedJob]) -> None:
+        jobs = self._in_time(jobs)
+        if not jobs:
+            return
+        try:
+            outcomes = self._write(jobs)
+        except BaseException as error:
+            cause = error.orig if isinstance(error, DBAPIError) else repr(error)
+            log.error("%d pieces of work could not be written: %s", len(jobs), cause)
+            told = _told(error)
+            if isinstance(told, Busy) and not isinstance(told, Stopping):
+                self.note_failure(sum(job.weight for job in jobs))
+            for job in jobs:
+                job.settle(told)
+            if not isinstance(error, Exception):
+                raise
+            return
+        # Read first: the lock is for the rare case that something changes.
+        if self._is_failing:
+            with self._changed:
+                self._is_failing = False
+        for job, outcome in zip(jobs, outcomes, strict=True):
+            job.settle(outcome)
+
+    def _in_time(self, jobs: Sequence[QueuedJob]) -> Sequence[QueuedJob]:
+        """The jobs that have not waited too long; clients of the others are told."""
+        if self._wait_s is None:
+            return jobs
+        since_s = time.monotonic() - self._wait_s
+        late = [j for j in jobs if j.since_s < since_s and j.drafts and not j.low_priority]
+        if not late:
+            return jobs
+        self.note_failure(sum(job.weight for job in late))
+        for job in late:
+            job.settle(Busy("what was to be written before is not written yet", RETRY_AFTER_S))
+        return [job for job in jobs if job not in late]
+
+    def _write(self, jobs: Sequence[QueuedJob]) -> list[Any]:
+        """Write the jobs in one transaction; a second try is made with care, see `transact`."""
+        attempt = 1
+        while True:
+            try:
+                with self._transaction(jobs) as connection:
+                    return self._transact(connection, jobs, careful=attempt > 1)
+            except TakenBack:
+                pass
+            except DBAPIError as error:
+                if getattr(error.orig, "sqlstate", None) not in _CROSSED or attempt == MAX_ATTEMPTS:
+                    raise
+            attempt += 1
+
+    def _transact(
+        self, connection: Connection, jobs: Sequence[QueuedJob], careful: bool
+    ) -> list[Any]:
+        try:
+            return transact(connection, jobs, careful)
+        except Exception as error:
+            if careful or is_of_the_database(error):
+                raise
+            log.debug("a transaction is made again, with care: %s", type(error).__name__)
+            raise TakenBack from error
+
+    @contextmanager
+    def _transaction(self, jobs: Sequence[QueuedJob]) -> Iterator[Connection]:
+        has_time = all(job.low_priority for job in jobs)
+        with (
+            self._connection.transaction() as connection,
+            patience(connection) if has_time else nullcontext(),
+        ):
+            yield connection
+
+    def _tell(self) -> None:
+        for told in self.after_commit:
+            try:
+                told()
+            except Exception:
+                # What is written is written, whatever a listener does.
+                log.exception("a listener failed after a commit")
+
+
+def _settling(done: "Future[Any]") -> Callable[[Any], None]:
+    """What sets a future: the change of a client that has gone is made all the same."""
+    done.set_running_or_notify_cancel()
+
+    def settle(outcome: Any) -> None:
+        if isinstance(outcome, Exception):
+            done.set_exception(outcome)
+        else:
+            done.set_result(outcome)
+
+    return settle
+
+
+def _try_to_write(connection: Connection) -> None:
+    """Take the locks that a post takes, and write a row as it is."""
+    if connection.dialect.name == "postgresql":
+        names = ", ".join(sorted(table.name for table in WRITTEN_BY_POSTS))
+        connection.exec_driver_sql(f"LOCK TABLE {names} IN ROW EXCLUSIVE MODE")
+    # There and back: of a row that gets the value it has SQLite writes nothing.
+    for step in (1, -1):
+        connection.execute(update(event_counter).values(last=event_counter.c.last + step))
+
+
+def _told(error: BaseException) -> Exception:
+    """The error as clients get it: trouble of the database may pass, so it is `Busy`.
+
+    Its words name files and hosts, which are for the log alone.
+    """
+    if isinstance(error, DBAPIError) and is_of_the_database(error):
+        told: Exception = Busy("the database cannot be written now", RETRY_AFTER_S)
+    elif isinstance(error, Exception):
+        return error
+    else:
+        told = Stopping("the writer has ended")
+    told.__cause__ = error
+    return told

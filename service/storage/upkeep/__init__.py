@@ -1,0 +1,1 @@
+"""Backup, pruning and verification of a database."""

@@ -1,0 +1,230 @@
+"""Checks a database for consistency; reads all of it and changes nothing.
+
+Batches are read a few at a time, each time as of one moment, so that it can be
+done while the database is being served.
+"""
+
+import hashlib
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, get_args
+
+import msgspec
+from sqlalchemy import Connection, Engine, func, select
+from sqlalchemy.exc import DatabaseError
+
+from service.errors import BadInput
+from service.observations.batch import ObservationBatch
+from service.observations.schema import submission_from_json
+from service.storage.recording import rollups
+from service.storage.recording.unsaved_result import Row
+from service.storage.sql.engines import database_url, reading_engine
+from service.storage.sql.migrations import check, reported
+from service.storage.sql.tables import batches, frames, results, solutions, star_results
+
+AT_ONCE = 500
+OUTCOMES = ("unique", "ambiguous", "unmatched")
+TOLERANCE = 1e-9
+"""Relative, for sums of the same numbers in another order."""
+
+Step = Callable[[int, int], object]
+"""Called with the batches that were looked at and those there are."""
+
+
+def verify(database: str, step: Step = lambda done, total: None) -> list[str]:
+    """What is wrong with a database, a sentence each; empty: nothing.
+
+    Looks at the file itself (SQLite), the schema, every batch with all that
+    was made of it, and the trends.  Raises `BadConfiguration` where there is
+    no database.
+    """
+    problems = check(database)
+    if problems:
+        return problems
+    url = database_url(database)
+    engine = reading_engine(url)
+    try:
+        with reported(url):
+            found = _of_the_file(engine)
+            # What a damaged file gives to read says nothing of what was written.
+            if not found:
+                found += _of_the_batches(engine, step)
+                found += _of_the_trends(engine)
+    finally:
+        engine.dispose()
+    return found
+
+
+def _of_the_file(engine: Engine) -> list[str]:
+    if engine.dialect.name != "sqlite":
+        return []
+    found = []
+    try:
+        with engine.begin() as connection:
+            said = connection.exec_driver_sql("PRAGMA integrity_check(20)").scalars().all()
+            found = [f"the file is damaged: {each}" for each in said if each != "ok"]
+            if not found:
+                found = [
+                    f"{table}: row {row} refers to what is not in {parent}"
+                    for table, row, parent, _ in connection.exec_driver_sql(
+                        "PRAGMA foreign_key_check"
+                    )
+                ]
+    except DatabaseError as error:
+        found.append(f"the file is damaged: {error.orig}")
+    return found
+
+
+def _of_the_batches(engine: Engine, step: Step) -> list[str]:
+    problems: list[str] = []
+    with engine.begin() as connection:
+        total = int(connection.scalar(select(func.count()).select_from(batches)) or 0)
+    done, last = 0, ""
+    while True:
+        with engine.begin() as connection:
+            rows = connection.execute(
+                select(batches).where(batches.c.id > last).order_by(batches.c.id).limit(AT_ONCE)
+            ).mappings()
+            chunk = {row["id"]: dict(row) for row in rows}
+            if not chunk:
+                return problems
+            problems += _of_a_chunk(connection, chunk)
+        done, last = done + len(chunk), max(chunk)
+        step(done, max(total, done))
+
+
+def _of_a_chunk(connection: Connection, chunk: Mapping[str, Row]) -> Iterator[str]:
+    made = [
+        dict(row)
+        for row in connection.execute(
+            select(results).where(results.c.batch_id.in_(chunk))
+        ).mappings()
+    ]
+    ids = [row["id"] for row in made]
+    stars: dict[str, Counter[str]] = {}
+    counted = (
+        select(star_results.c.result_id, star_results.c.outcome, func.count())
+        .where(star_results.c.result_id.in_(ids))
+        .group_by(star_results.c.result_id, star_results.c.outcome)
+    )
+    for id, outcome, count in connection.execute(counted):
+        stars.setdefault(id, Counter())[outcome] += count
+    solved = set(
+        connection.scalars(select(solutions.c.result_id).where(solutions.c.result_id.in_(ids)))
+    )
+    framed = {
+        row["batch_id"]: dict(row)
+        for row in connection.execute(
+            select(frames.c.batch_id, frames.c.digest, frames.c.detections).where(
+                frames.c.batch_id.in_(chunk)
+            )
+        ).mappings()
+    }
+    of_batch: dict[str, list[Row]] = {id: [] for id in chunk}
+    for row in made:
+        of_batch[row["batch_id"]].append(row)
+    for id, batch in chunk.items():
+        yield from _of_a_batch(batch, of_batch[id], framed.get(id))
+        for row in of_batch[id]:
+            yield from _of_a_result(row, batch, stars.get(row["id"], Counter()), solved)
+
+
+def _of_a_batch(batch: Row, made: Sequence[Row], frame: Row | None) -> Iterator[str]:
+    """The faults of a batch; `frame` is the row of the frame it was made of, if any."""
+    name = f"batch {batch['id']}"
+    current = sum(bool(row["current"]) for row in made)
+    if current != 1:
+        yield f"{name}: {current} of its results are current, not one"
+    # The fingerprint of a batch made of a frame is that of the frame and of what was told with it.
+    is_own = hashlib.sha256(batch["input"].encode()).hexdigest() == batch["fingerprint"]
+    if frame is None and not is_own:
+        yield f"{name}: its input is not the one that was fingerprinted"
+    try:
+        read = submission_from_json(batch["input"]).batch
+    except BadInput as error:
+        yield f"{name}: its input cannot be read: {error}"
+        return
+    identity = (read.spacecraft, read.run, read.batch, read.time.tai_ns)
+    if identity != tuple(batch[key] for key in ("spacecraft", "run", "batch", "time_ns")):
+        yield f"{name}: its input is of {read.spacecraft}, run {read.run}, batch {read.batch}"
+    if frame is not None:
+        yield from _of_a_frame(name, frame, read, made)
+
+
+def _of_a_frame(
+    name: str, frame: Row, read: ObservationBatch, made: Sequence[Row]
+) -> Iterator[str]:
+    """The faults of a batch made of a frame.
+
+    What was told with the frame is not kept, so its fingerprint cannot be computed again.
+    """
+    sent = [mag for each in read.observations for mag in each.magnitude_mag.tolist()]
+    try:
+        stars = msgspec.json.decode(frame["detections"])["stars"]
+        found = [star["magnitude"] for star in stars if star["used"]]
+    except (msgspec.DecodeError, KeyError, TypeError):
+        yield f"{name}: what was found on its frame cannot be read"
+        return
+    if sent != found:
+        yield f"{name}: the stars of its input are not those of its frame"
+    for row in made:
+        if row["id"] == row["batch_id"] and _frame_digest(row["answer"]) != frame["digest"]:
+            yield f"{name}: its answer is about another frame than the one that is kept"
+
+
+def _frame_digest(answer: str) -> object:
+    try:
+        return msgspec.json.decode(answer)["frame"]["digest"]
+    except (msgspec.DecodeError, KeyError, TypeError):
+        return None
+
+
+def _of_a_result(row: Row, batch: Row, stars: "Counter[str]", solved: set[Any]) -> Iterator[str]:
+    name = f"result {row['id']}"
+    copied = ("spacecraft", "run", "time_ns")
+    if any(row[key] != batch[key] for key in copied):
+        yield f"{name}: its spacecraft, run or time is not that of its batch"
+    counts = {outcome: row[outcome] for outcome in OUTCOMES}
+    if counts != {outcome: stars[outcome] for outcome in OUTCOMES}:
+        yield f"{name}: its counts are not those of its stars"
+    if row["observed"] != sum(counts.values()):
+        yield f"{name}: the outcomes of its stars do not add up"
+    if (row["id"] in solved) != (row["status"] is not None):
+        yield f"{name}: its attitude is missing, or there is one that its status denies"
+    try:
+        answer = msgspec.json.decode(row["answer"])
+        told = answer["id"], answer["counts"], (answer["attitude"] or {}).get("status")
+    except (msgspec.DecodeError, KeyError, TypeError, AttributeError):
+        yield f"{name}: its answer cannot be read"
+        return
+    if told != (row["id"], {"observed": row["observed"], **counts}, row["status"]):
+        yield f"{name}: its answer says otherwise than its row"
+
+
+def _of_the_trends(engine: Engine) -> Iterator[str]:
+    for bucket in get_args(rollups.Bucket):
+        with engine.begin() as connection:
+            stored, counted = (
+                {key: row for key, row in found.items() if row["batches"]}
+                for found in (
+                    rollups.stored(connection, bucket),
+                    rollups.recount(connection, bucket),
+                )
+            )
+        for key in sorted(stored.keys() | counted.keys()):
+            if not _alike(stored.get(key), counted.get(key)):
+                of = f"trends of {key[0]}, run {key[1]}, {bucket} {key[2]}"
+                yield f"{of}: not those of the results"
+
+
+def _alike(one: Row | None, other: Row | None) -> bool:
+    if one is None or other is None or one.keys() != other.keys():
+        return False
+    return all(_same(one[name], other[name]) for name in one)
+
+
+def _same(one: float | None, other: float | None) -> bool:
+    if one is None or other is None:
+        return one is other
+    return math.isclose(one, other, rel_tol=TOLERANCE, abs_tol=TOLERANCE)

@@ -1,0 +1,1 @@
+"""Reproductions of three published documents; the service does not need them."""

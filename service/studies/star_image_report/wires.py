@@ -1,0 +1,170 @@
+"""Wire meshes before the lens, which make a cross of every star (report, part IV).
+
+Wires along y diffract light along x, into a tail of dashes.  Angles are in radians,
+p along x and q along y; lengths in metres.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from service.imaging.centroids.window import Array
+from service.imaging.optics.pupil import Pupil, between_wires, disc
+from service.imaging.optics.transfer import image_at, image_by_fft
+
+INCH_M = 0.0254
+Wires = Sequence[tuple[float, float]]
+"""(place, diameter) of parallel wires."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A square mesh: wires every `pitch_m`, each `wire_m` thick."""
+
+    pitch_m: float
+    wire_m: float
+
+    @property
+    def opening_m(self) -> float:
+        """Between two wires: s = d - wire."""
+        return self.pitch_m - self.wire_m
+
+    @property
+    def blocked(self) -> float:
+        """The share of one axis that wires cover, e = 1 - s / d."""
+        return self.wire_m / self.pitch_m
+
+    def wires(self, number: int) -> Wires:
+        """This many neighbouring wires about the middle."""
+        places = (np.arange(number) - (number - 1) / 2.0) * self.pitch_m
+        return [(float(place), self.wire_m) for place in places]
+
+    def across(self, diameter_m: float) -> Wires:
+        """The wires that cross an aperture, an opening in its middle."""
+        return self.wires(2 * math.floor(diameter_m / (2.0 * self.pitch_m) + 0.5))
+
+    def shares(self) -> tuple[float, float, float]:
+        """Transmitted light in the middle, on the tails and off them, for a full mesh.
+
+        (1 - e)², 2 e (1 - e), e²: the spreading grows as the product of what the two
+        axes block.  The report lets it depend on the total number of wires, which is
+        the same thing while that total is split evenly.
+        """
+        e = self.blocked
+        return (1.0 - e) ** 2, 2.0 * e * (1.0 - e), e**2
+
+
+def filtered(
+    diameter_m: float, across_x: Wires, across_y: Wires, cells: int = 1500, width: float = 1.0
+) -> Pupil:
+    """A circular aperture behind wires at places along x, and along y.
+
+    `cells` a diameter: a tenth of the thinnest wire, or finer.  The grid is `width`
+    diameters wide; twice or more where the image is to be had by `image_by_fft`.
+    """
+    cell = diameter_m / cells
+    clear = disc(2 * math.ceil(width * cells / 2), cell, diameter_m / 2.0)
+    place = clear.places_m
+    return clear.behind(
+        between_wires(place, cell, across_y)[:, None]
+        * between_wires(place, cell, across_x)[None, :]
+    )
+
+
+def mesh_intensity(
+    p_rad: npt.ArrayLike,
+    q_rad: npt.ArrayLike,
+    wavelength_m: float,
+    mesh: Mesh,
+    openings: int,
+) -> Array:
+    """The report's 4.1 for N x N openings, as irradiance per direction.
+
+    C [sin(N k d p / 2) / sin(k d p / 2)]² [sin(k s p / 2) / (k s p / 2)]² and the same
+    of q.  The report has its C grow with s^4, with the aperture's diameter and with
+    1 / lambda; it is s^4 / lambda² (over f² per area), N^4 being in the first factors.
+    """
+    scale = mesh.opening_m**4 / wavelength_m**2
+    return (
+        scale
+        * _factor(p_rad, wavelength_m, mesh, openings)
+        * _factor(q_rad, wavelength_m, mesh, openings)
+    )
+
+
+def _factor(angle_rad: npt.ArrayLike, wavelength_m: float, mesh: Mesh, openings: int) -> Array:
+    angle = np.asarray(angle_rad, dtype=np.float64)
+    half = math.pi * mesh.pitch_m * angle / wavelength_m
+    # sin(N x) / sin(x) is +-N where x is a multiple of pi.
+    sine = np.sin(half)
+    at_order = np.abs(sine) < 1e-9
+    array = np.where(
+        at_order, float(openings), np.sin(openings * half) / np.where(at_order, 1.0, sine)
+    )
+    return np.asarray((array * np.sinc(mesh.opening_m * angle / wavelength_m)) ** 2)
+
+
+def along_p(pupil: Pupil, wavelength_m: float, p_rad: Array) -> Array:
+    """Intensity along the tail of the wires across x, over that at the star."""
+    here = image_at(pupil, wavelength_m, np.concatenate([[0.0], p_rad]), np.zeros(1))[0]
+    return np.asarray(here[1:] / here[0])
+
+
+def tail(
+    pupil: Pupil, wavelength_m: float, p_rad: Array, fringe_rad: float, samples: int = 9
+) -> Array:
+    """`along_p` averaged over a fringe: the tail without its fine structure.
+
+    That is lambda / D for one wire, and lambda over their separation for two.
+    """
+    steps = (np.arange(samples) + 0.5) / samples - 0.5
+    fine = np.asarray(p_rad)[:, None] + fringe_rad * steps[None, :]
+    return np.asarray(along_p(pupil, wavelength_m, fine.ravel()).reshape(fine.shape).mean(axis=1))
+
+
+def first_tail_null_rad(
+    pupil: Pupil, wavelength_m: float, diameter_m: float, low_rad: float, high_rad: float
+) -> float:
+    """Where the tail is darkest between two angles, to a small part of a fringe."""
+    p = np.linspace(low_rad, high_rad, 241)
+    light = tail(pupil, wavelength_m, p, wavelength_m / diameter_m)
+    at = int(np.clip(np.argmin(light), 1, len(p) - 2))
+    before, here, after = light[at - 1 : at + 2]
+    bend = before - 2.0 * here + after
+    return float(p[at] + (0.5 * (before - after) / bend if bend > 0.0 else 0.0) * (p[1] - p[0]))
+
+
+def shares_of_light(
+    pupil: Pupil, wavelength_m: float, half_width_rad: float
+) -> tuple[float, float, float]:
+    """Light of an image in the middle, on the two tails, and off them, of all that is transmitted.
+
+    The middle is the square within `half_width_rad` (half of lambda / d parts the orders
+    of a mesh), the tails are the bands of that width about both axes.
+    """
+    image = image_by_fft(pupil, wavelength_m)
+    near = np.abs(image.angles_rad) <= half_width_rad
+    light = image.intensity / image.intensity.sum()
+    middle = float(light[np.ix_(near, near)].sum())
+    tails = float(light[near, :].sum() + light[:, near].sum()) - 2.0 * middle
+    return middle, tails, 1.0 - middle - tails
+
+
+def order_angle_rad(order: int, wavelength_m: float, mesh: Mesh) -> float:
+    """Where the principal maxima of the mesh stand: m lambda / d."""
+    return order * wavelength_m / mesh.pitch_m
+
+
+def order_place_m(
+    order: int, wavelength_m: float, mesh: Mesh, focal_length_m: float, sensor_distance_m: float
+) -> float:
+    """The same on the sensor, for a mesh `sensor_distance_m` before it.
+
+    Before the lens that is the focal length; behind it the tails shrink with the
+    distance, and the same light is brighter.
+    """
+    distance = min(sensor_distance_m, focal_length_m)
+    return order_angle_rad(order, wavelength_m, mesh) * distance

@@ -1,0 +1,311 @@
+"""Access to routes: which scope each requires, and for which spacecraft.
+
+`POLICIES` has the policy of every route by its name.  A route without one is
+refused to every caller, so a new route cannot be forgotten.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Literal, TypeVar
+from urllib.parse import quote
+
+from anyio import CapacityLimiter, fail_after
+from anyio.to_thread import run_sync
+from fastapi import Depends
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.types import Scope as HttpScope
+
+from service import logs
+from service.access.audit import Entry
+from service.access.sessions import OPEN_CALLER, Access
+from service.access.tokens import Caller
+from service.app.factory import App
+from service.errors import Forbidden, NotFound, Unauthenticated
+from service.storage.models.access import Scope
+
+COOKIE = "acquire_session"
+SIGN_IN = "/sign-in"
+SAFE_METHODS = ("GET", "HEAD")
+
+T = TypeVar("T")
+SpacecraftPlace = Literal["nothing", "path", "query", "result", "body", "every"]
+
+
+@dataclass(frozen=True)
+class Policy:
+    """What a route requires of its caller.
+
+    `spacecraft_in` says which part of the request names the spacecraft, for tokens
+    bound to some: the `path`; the `query`, which must then name it; the recorded
+    `result` of the path; or the `body`, which the handler itself checks with
+    `Caller.require`.  `every` is for tokens bound to none; `nothing` is for what
+    concerns no spacecraft, or where the handler hides those of others.  `or_scope`
+    is accepted in place of the scope.  `open` requires no token.  `audited` marks
+    a change of more than the caller's own records.
+    """
+
+    scope: Scope
+    spacecraft_in: SpacecraftPlace = "every"
+    or_scope: Scope | None = None
+    open: bool = False
+    audited: bool = False
+
+    @property
+    def scopes(self) -> tuple[Scope, ...]:
+        """The scopes of which the caller must have one."""
+        return (self.scope,) if self.or_scope is None else (self.scope, self.or_scope)
+
+
+READ, SUBMIT, OPERATE = Policy("read"), Policy("submit"), Policy("operate")
+OPEN = Policy("read", "nothing", open=True)
+
+POLICIES: dict[str, Policy] = {
+    "livez": OPEN,
+    "readyz": OPEN,
+    "metrics": READ,
+    "sign_in": OPEN,
+    "sign_out": OPEN,
+    "session": Policy("read", "nothing"),
+    "submit_batch": Policy("submit", "body"),
+    "list_batches": Policy("read", "query"),
+    "get_batch": Policy("read", "result"),
+    "what_if": Policy("read", "result"),
+    "list_spacecraft": Policy("read", "nothing"),
+    "get_spacecraft": Policy("read", "path"),
+    "submit_frame": Policy("submit", "path"),
+    "get_overlay": Policy("read", "result"),
+    "list_attitudes": Policy("read", "path"),
+    "list_rates": Policy("read", "path"),
+    "get_history": Policy("read", "path"),
+    "list_worst": Policy("read", "path"),
+    "get_advice": Policy("read", "path"),
+    "list_zones": READ,
+    "warm_zones": Policy("operate", "body"),
+    "drop_zones": Policy("operate", "query"),
+    "list_runs": READ,
+    "start_replay": Policy("submit", "body"),
+    "list_replays": READ,
+    # Its id can be known only from having started it, or from somebody who may read everything:
+    # see `lone_ulid`.
+    "get_replay": Policy("read", "nothing", or_scope="submit"),
+    # Of tokens that are bound to spacecraft only the one that started it: see the handler.
+    "cancel_replay": Policy("submit", "nothing", audited=True),
+    "watch_run": Policy("submit", audited=True),
+    "compare": Policy("read", "body"),
+    "list_limits": Policy("read", "path"),
+    "get_limit": Policy("read", "path"),
+    "set_limit": Policy("operate", "path"),
+    "reset_limit": Policy("operate", "path"),
+    "list_alarms": Policy("read", "query"),
+    "get_alarm": Policy("read", "nothing"),
+    "acknowledge_alarm": Policy("operate", "nothing"),
+    "shelve_alarm": Policy("operate", "nothing"),
+    "unshelve_alarm": Policy("operate", "nothing"),
+    "comment_alarm": Policy("operate", "nothing"),
+    "get_about": Policy("read", "nothing"),
+    "get_overview": Policy("read", "nothing"),
+    "events": Policy("read", "query"),
+    "list_audit": OPERATE,
+}
+"""The policy of every route by its name; the console's pages add theirs."""
+
+_LINK_NAVIGATION = (
+    ("sec-fetch-mode", "navigate"),
+    ("sec-fetch-dest", "document"),
+    ("sec-fetch-user", "?1"),
+)
+"""What a browser sends when its user follows a link; scripts and frames send other values."""
+
+_CALLER_THREADS = CapacityLimiter(8)
+"""Apart from those of handlers, which may wait for a commit: looking up a caller must not."""
+_OWNER_THREADS = CapacityLimiter(8)
+_LOOK_UP_S = 1.5
+"""The longest look-up of a caller in the database: probes are due within 2 s."""
+
+
+async def authorize(request: Request) -> None:
+    """Let a request through to its handler, or raise what it lacks.
+
+    What a caller with the scope `operate` changes, and what a policy says is
+    `noted`, is noted with the change (`AuditDep`), or once it is answered
+    (`service.web.middleware`) where it was refused or changed no record.
+    """
+    route = request.scope["route"]
+    policy = POLICIES.get(route.name)
+    if policy is None:
+        raise Forbidden(f"no policy is known for {route.name}")
+    app: App = request.app.state.app
+    if policy.open:
+        request.state.caller = None
+        return
+    token, session = credentials(request)
+    caller = app.access.cached_caller(token, session)
+    try:
+        if caller is None:
+            caller = await _within_deadline(app.access, app.access.caller, token, session)
+    except Unauthenticated:
+        if _is_page(request):
+            wanted = quote(
+                request.url.path + (f"?{request.url.query}" if request.url.query else "")
+            )
+            raise HTTPException(
+                303, "sign in first", {"Location": f"{SIGN_IN}?next={wanted}"}
+            ) from None
+        raise
+    if caller is OPEN_CALLER:
+        _refuse_other_sites(request)
+    elif token is None and request.method not in SAFE_METHODS:
+        _require_same_origin(request)
+    request.state.caller = caller
+    if (about := logs.request.get()) is not None:
+        about.caller = caller.name
+    app.access.count_request(caller)
+    require_scope(caller, *policy.scopes)
+    if caller.spacecraft is not None:
+        await _require_spacecraft_access(request, app, caller, policy.spacecraft_in)
+    if (policy.scope == "operate" or policy.audited) and request.method not in SAFE_METHODS:
+        request.state.changes = route.name
+
+
+async def is_open(access: Access) -> bool:
+    """`Access.is_open`, without waiting for the database in the event loop."""
+    if access.cached_is_open is not None:
+        return access.cached_is_open
+    return await _within_deadline(access, lambda: access.is_open)
+
+
+async def _within_deadline(access: Access, ask: Callable[..., T], *given: object) -> T:
+    """Run a look-up in a thread; raises `Busy` where it takes too long, or just did."""
+    access.require_database()
+    try:
+        with fail_after(_LOOK_UP_S):
+            return await run_sync(ask, *given, limiter=_CALLER_THREADS, abandon_on_cancel=True)
+    except TimeoutError:
+        access.database_timed_out()
+        access.require_database()
+        raise
+
+
+async def _caller(request: Request) -> Caller:
+    caller = request.state.caller
+    assert isinstance(caller, Caller)
+    return caller
+
+
+CallerDep = Annotated[Caller, Depends(_caller)]
+
+
+def entry_of(scope: HttpScope, access: Access, status: int) -> Entry:
+    """The entry in the audit list of a request that is answered with this status."""
+    state = scope["state"]
+    query = scope["query_string"].decode("latin-1")
+    about = scope["path"] + (f"?{query}" if query else "")
+    body = state.get("body")
+    text = None if not body else body.decode("utf-8", "replace")
+    return access.entry(state["caller"].name, state["changes"], about, text, status)
+
+
+class AuditEntries:
+    """Gives a handler the audit entry to store with its change."""
+
+    def __init__(self, request: Request) -> None:
+        self._request = request
+
+    def entry(self, status: int = 200) -> Entry:
+        """The entry for a change that is answered with this status.
+
+        The handler stores it with the change; no other entry is made then.
+        """
+        request = self._request
+        request.state.noted = True
+        return entry_of(request.scope, request.app.state.app.access, status)
+
+
+async def _audit_entries(request: Request) -> AuditEntries:
+    return AuditEntries(request)
+
+
+AuditDep = Annotated[AuditEntries, Depends(_audit_entries)]
+
+
+def require_scope(caller: Caller, *scopes: Scope) -> None:
+    """Raise `Forbidden` unless a caller has one of the scopes."""
+    if caller.scopes.isdisjoint(scopes):
+        raise Forbidden(
+            f"{caller.name} may {', '.join(sorted(caller.scopes))}; "
+            f"this needs the scope {' or '.join(scopes)}"
+        )
+
+
+def require_all_spacecraft(caller: Caller) -> None:
+    """Raise `Forbidden` where a caller is bound to spacecraft."""
+    if caller.spacecraft is not None:
+        raise Forbidden(f"{caller.name} is bound to spacecraft; this request is about all of them")
+
+
+def bearer(request: Request) -> str | None:
+    """The token in the header, if there is one."""
+    kind, _, token = request.headers.get("authorization", "").partition(" ")
+    return token.strip() if kind.lower() == "bearer" else None
+
+
+def credentials(request: Request) -> tuple[str | None, str | None]:
+    """The token and the session that a request shows, each None where there is none."""
+    return bearer(request), request.cookies.get(COOKIE)
+
+
+def _is_page(request: Request) -> bool:
+    route = request.scope["route"]
+    return not route.include_in_schema and request.method in SAFE_METHODS
+
+
+def _site(request: Request) -> str | None:
+    """The site of the page that sent the request, as in `Sec-Fetch-Site`; None: unknown."""
+    site = request.headers.get("sec-fetch-site")
+    if site is None and (origin := request.headers.get("origin")) is not None:
+        host = request.headers.get("host")
+        site = "same-origin" if origin.partition("://")[2] == host else "cross-site"
+    return site
+
+
+def _require_same_origin(request: Request) -> None:
+    """Refuse changes from pages of other sites: a browser sends its cookie by itself."""
+    if _site(request) != "same-origin":
+        raise Forbidden("with a session, only the service's own pages can change something")
+
+
+def _refuse_other_sites(request: Request) -> None:
+    """While access is open, refuse requests from pages of other sites.
+
+    Following a link to a page is allowed.  Programs other than browsers send no site.
+    """
+    if _site(request) in (None, "same-origin", "none"):
+        return
+    followed = _is_page(request) and all(
+        request.headers.get(name) == value for name, value in _LINK_NAVIGATION
+    )
+    if not followed:
+        raise Forbidden("while access is open, only the service's own pages may send this request")
+
+
+async def _require_spacecraft_access(
+    request: Request, app: App, caller: Caller, place: SpacecraftPlace
+) -> None:
+    if place == "path":
+        caller.require(request.path_params["name"])
+    elif place == "query":
+        named = request.query_params.getlist("spacecraft")
+        for each in named:
+            caller.require(each)
+        if not named:
+            theirs = " or ".join(f"?spacecraft={each}" for each in sorted(caller.spacecraft or ()))
+            raise Forbidden(f"{caller.name} must name a spacecraft: {theirs}")
+    elif place == "result":
+        id = request.path_params["id"]
+        owner = await run_sync(app.results.spacecraft_of, id, limiter=_OWNER_THREADS)
+        if owner is None or not caller.may_see(owner):
+            # As if it did not exist: probing for ids of others must tell nothing.
+            raise NotFound(f"there is no batch with the id {id[:80]!r}")
+    elif place == "every":
+        require_all_spacecraft(caller)

@@ -1,0 +1,253 @@
+"""Limits, and the alarms that they raise."""
+
+from typing import Annotated, ClassVar
+
+from fastapi import APIRouter, Path
+from fastapi import Query as InQuery
+from pydantic import ConfigDict, Field
+from starlette.requests import Request
+from starlette.responses import Response
+
+from service.access.tokens import Caller
+from service.alarms.limits import LimitSettings
+from service.alarms.quantities import QuantityName, limited_names
+from service.errors import BadBatch, Fault, NotFound
+from service.observations.schema import Wire
+from service.storage.models.alarms import (
+    AlarmPage,
+    AlarmWithActions,
+    Limit,
+    LimitHistory,
+    LimitList,
+)
+from service.web.api.access import AuditDep, CallerDep
+from service.web.api.dependencies import AppDep, json_response, page_response
+from service.web.api.query_parameters import NO_QUERY, AlarmQuery, Comment, StatementQuery, Who
+from service.web.api.request_body import JsonBody, read_model
+from service.web.openapi.route import LINK, ResponseDoc, route_docs
+
+router = APIRouter(prefix="/api/v1", tags=["alarms"])
+
+Name = Annotated[str, Path(description="The spacecraft's name, such as `XTE`.")]
+Quantity = Annotated[str, Path(description="A quantity, such as `ambiguous_share`.")]
+AlarmId = Annotated[str, Path(description="The `id` of an alarm.")]
+LIMITS = "/spacecraft/{name}/limits"
+
+
+class StatementIn(Wire):
+    """The author of an action, and a comment."""
+
+    component: ClassVar[str] = "Said"
+    model_config = ConfigDict(title=component)
+
+    who: Who = None
+    comment: Comment = None
+
+
+class ShelveIn(StatementIn):
+    """How long to shelve an alarm."""
+
+    component: ClassVar[str] = "ShelveIn"
+    model_config = ConfigDict(title=component)
+
+    minutes: Annotated[int, Field(ge=1, le=10_080, description="At most a week.")]
+
+
+class CommentIn(StatementIn):
+    """A comment on an alarm."""
+
+    component: ClassVar[str] = "CommentIn"
+    model_config = ConfigDict(title=component)
+
+    comment: Annotated[str, Field(min_length=1, max_length=2_000)]
+
+
+class LimitIn(StatementIn):
+    """A new limit."""
+
+    component: ClassVar[str] = "LimitIn"
+    model_config = ConfigDict(title=component)
+
+    settings: LimitSettings
+
+
+@router.get(
+    LIMITS,
+    dependencies=[NO_QUERY],
+    **route_docs({200: ResponseDoc("Every limit.", LimitList)}, problems=(404,)),
+)
+def list_limits(name: Name, app: AppDep) -> Response:
+    """The limits of every quantity of a spacecraft, set or shipped."""
+    return json_response({"items": app.limits.all(name)})
+
+
+@router.get(
+    LIMITS + "/{quantity}",
+    dependencies=[NO_QUERY],
+    **route_docs({200: ResponseDoc("The limit and its history.", LimitHistory)}, problems=(404,)),
+)
+def get_limit(name: Name, quantity: Quantity, app: AppDep) -> Response:
+    """The limit of one quantity, the shipped limit, and the history of changes."""
+    return json_response(app.limits.get(name, _quantity_with_limits(quantity)))
+
+
+@router.put(
+    LIMITS + "/{quantity}",
+    dependencies=[NO_QUERY],
+    **route_docs(
+        {200: ResponseDoc("The limit, which applies from the next batch on.", Limit)},
+        body=LimitIn,
+        problems=(404, 503),
+    ),
+)
+def set_limit(
+    name: Name,
+    quantity: Quantity,
+    body: JsonBody,
+    app: AppDep,
+    caller: CallerDep,
+    audited: AuditDep,
+) -> Response:
+    """Set a limit; the previous one stays in the history."""
+    asked = read_model(LimitIn, body)
+    limited, who = _quantity_with_limits(quantity), _who(caller, asked.who)
+    return json_response(
+        app.limits.set(
+            name, limited, asked.settings, who=who, comment=asked.comment, entry=audited.entry()
+        )
+    )
+
+
+@router.delete(
+    LIMITS + "/{quantity}",
+    **route_docs(
+        {200: ResponseDoc("The shipped limit, which applies again.", Limit)}, problems=(404, 503)
+    ),
+)
+def reset_limit(
+    name: Name,
+    quantity: Quantity,
+    query: Annotated[StatementQuery, InQuery()],
+    app: AppDep,
+    caller: CallerDep,
+    audited: AuditDep,
+) -> Response:
+    """Restore the shipped limit; earlier limits stay in the history."""
+    limited, who = _quantity_with_limits(quantity), _who(caller, query.who)
+    return json_response(
+        app.limits.set(name, limited, None, who=who, comment=query.comment, entry=audited.entry())
+    )
+
+
+@router.get("/alarms", **route_docs({200: ResponseDoc("A page of alarms.", AlarmPage, LINK)}))
+def list_alarms(request: Request, query: Annotated[AlarmQuery, InQuery()], app: AppDep) -> Response:
+    """Alarms, newest first; by default those that are not cleared."""
+    return page_response(request, app.alarms.page(**query.asked()))
+
+
+@router.get(
+    "/alarms/{id}",
+    dependencies=[NO_QUERY],
+    **route_docs({200: ResponseDoc("The alarm.", AlarmWithActions)}, problems=(404,)),
+)
+def get_alarm(id: AlarmId, app: AppDep, caller: CallerDep) -> Response:
+    """One alarm with its history."""
+    return json_response(_visible_alarm(app, id, caller))
+
+
+@router.post(
+    "/alarms/{id}/acknowledge",
+    dependencies=[NO_QUERY],
+    **route_docs(
+        {200: ResponseDoc("The alarm, now acknowledged.", AlarmWithActions)},
+        body=StatementIn,
+        problems=(404, 409, 503),
+    ),
+)
+def acknowledge_alarm(
+    id: AlarmId, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
+) -> Response:
+    """Acknowledge an alarm; it is cleared if the quantity is back in limits."""
+    asked = read_model(StatementIn, body)
+    _visible_alarm(app, id, caller)
+    who = _who(caller, asked.who)
+    return json_response(app.alarms.acknowledge(id, who, asked.comment, audited.entry()))
+
+
+@router.post(
+    "/alarms/{id}/shelve",
+    dependencies=[NO_QUERY],
+    **route_docs(
+        {200: ResponseDoc("The alarm, now shelved.", AlarmWithActions)},
+        body=ShelveIn,
+        problems=(404, 409, 503),
+    ),
+)
+def shelve_alarm(
+    id: AlarmId, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
+) -> Response:
+    """Shelve an alarm for some minutes; it returns by itself."""
+    asked = read_model(ShelveIn, body)
+    _visible_alarm(app, id, caller)
+    who = _who(caller, asked.who)
+    return json_response(app.alarms.shelve(id, who, asked.minutes, asked.comment, audited.entry()))
+
+
+@router.post(
+    "/alarms/{id}/unshelve",
+    dependencies=[NO_QUERY],
+    **route_docs(
+        {200: ResponseDoc("The alarm.", AlarmWithActions)},
+        body=StatementIn,
+        problems=(404, 409, 503),
+    ),
+)
+def unshelve_alarm(
+    id: AlarmId, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
+) -> Response:
+    """Unshelve an alarm."""
+    asked = read_model(StatementIn, body)
+    _visible_alarm(app, id, caller)
+    who = _who(caller, asked.who)
+    return json_response(app.alarms.unshelve(id, who, asked.comment, audited.entry()))
+
+
+@router.post(
+    "/alarms/{id}/comment",
+    dependencies=[NO_QUERY],
+    **route_docs(
+        {200: ResponseDoc("The alarm.", AlarmWithActions)}, body=CommentIn, problems=(404, 503)
+    ),
+)
+def comment_alarm(
+    id: AlarmId, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
+) -> Response:
+    """Add a comment to an alarm."""
+    asked = read_model(CommentIn, body)
+    _visible_alarm(app, id, caller)
+    who = _who(caller, asked.who)
+    return json_response(app.alarms.comment(id, who, asked.comment, audited.entry()))
+
+
+def _quantity_with_limits(quantity: str) -> QuantityName:
+    if quantity not in limited_names():
+        known = ", ".join(limited_names())
+        raise NotFound(f"limits do not apply to {quantity[:80]!r}, only to {known}")
+    return quantity
+
+
+def _who(caller: Caller, named: str | None) -> str:
+    """The name of the token; without tokens, the name that the request gives."""
+    if caller.token_id is not None:
+        return caller.name
+    if named is None:
+        raise BadBatch(Fault("who", "is required while access is open: 1 to 64 characters"))
+    return named
+
+
+def _visible_alarm(app: AppDep, id: str, caller: Caller) -> AlarmWithActions:
+    """An alarm of the caller's spacecraft; raises `NotFound` for those of others."""
+    found = app.alarms.get(id)
+    if not caller.may_see(found.spacecraft):
+        raise NotFound(f"there is no alarm with the id {id[:80]!r}")
+    return found

@@ -1,0 +1,143 @@
+"""Batches: submit, list, look at one, try it with other options."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Path
+from fastapi import Query as InQuery
+from pydantic import Field, StrictBool
+from starlette.requests import Request
+from starlette.responses import Response
+
+from service.errors import BadInput
+from service.observations.schema import BatchIn, OptionsIn, Wire
+from service.storage.models.answers import Answer, BatchPage, Result
+from service.web.api.access import AuditDep, CallerDep, require_scope
+from service.web.api.dependencies import AppDep, answer_response, json_response, page_response
+from service.web.api.headers import NO_IDEMPOTENCY_KEY, idempotency_key
+from service.web.api.query_parameters import NO_QUERY, BatchQuery, require_no_query
+from service.web.api.request_body import BINARY, JsonBody, json_body, read_model, refused
+from service.web.openapi.route import (
+    IDEMPOTENCY_KEY,
+    LINK,
+    LOCATION,
+    REPLAYED,
+    ResponseDoc,
+    route_docs,
+)
+
+router = APIRouter(prefix="/api/v1/batches", tags=["batches"])
+
+PNG = "image/png"
+
+ResultId = Annotated[str, Path(description="The `id` of a recorded result.")]
+
+
+class WhatIfIn(Wire):
+    """The same batch with other options."""
+
+    options: Annotated[
+        OptionsIn, Field(description="Options that replace those of the result.")
+    ] = OptionsIn()
+    record: Annotated[
+        StrictBool, Field(description="Record the result in addition to the first one.")
+    ] = False
+    adopt: Annotated[
+        StrictBool,
+        Field(description="Record the result, and make it the current one of its batch."),
+    ] = False
+
+
+@router.post(
+    "",
+    **route_docs(
+        {
+            201: ResponseDoc("The answer, now recorded.", Answer, LOCATION),
+            200: ResponseDoc("The answer that was recorded before.", Answer, REPLAYED),
+        },
+        body=BatchIn,
+        problems=(409, 503),
+        parameters=(IDEMPOTENCY_KEY,),
+    ),
+)
+async def submit_batch(request: Request) -> Response:
+    """Identify the stars of a batch, solve for the attitude, and record both."""
+    await require_no_query(request)
+    body = await json_body(request)
+    key = await idempotency_key(request)
+    held = request.app.state
+    try:
+        answered = await held.app.submissions.answered(body, key, request.state.caller)
+    except BadInput as error:
+        raise refused(body, error) from None
+    if answered.replayed:
+        held.metrics.count_repeat()
+    return answer_response(answered)
+
+
+@router.get("", **route_docs({200: ResponseDoc("A page of results.", BatchPage, LINK)}))
+def list_batches(
+    request: Request, query: Annotated[BatchQuery, InQuery()], app: AppDep
+) -> Response:
+    """The current results of recorded batches, newest first by batch time."""
+    return page_response(request, app.results.page(**query.asked()))
+
+
+@router.get(
+    "/{id}",
+    dependencies=[NO_QUERY],
+    **route_docs({200: ResponseDoc("The result and its batch.", Result)}, problems=(404,)),
+)
+def get_batch(id: ResultId, app: AppDep) -> Response:
+    """One recorded result with its batch."""
+    return json_response(app.results.get(id))
+
+
+@router.get(
+    "/{id}/overlay",
+    dependencies=[NO_QUERY],
+    **route_docs(
+        {200: ResponseDoc("The image.", media_type=PNG, also=BINARY)},
+        problems=(404,),
+    ),
+)
+def get_overlay(request: Request, id: ResultId, app: AppDep) -> Response:
+    """An image of a frame's result: the stars, their names, and residual arrows.
+
+    The PNG is sent as `application/octet-stream` if `Accept` asks for that type.
+    """
+    # Generated clients know no media type of pictures.
+    media_type = BINARY if BINARY in request.headers.get("accept", "").lower() else PNG
+    return Response(app.frames.overlay(id), media_type=media_type, headers={"Vary": "Accept"})
+
+
+@router.post(
+    "/{id}/what-if",
+    dependencies=[NO_QUERY, NO_IDEMPOTENCY_KEY],
+    **route_docs(
+        {
+            200: ResponseDoc("The answer, which was not recorded.", Answer),
+            201: ResponseDoc(
+                "The answer, now recorded in addition to the first one.", Answer, LOCATION
+            ),
+        },
+        body=WhatIfIn,
+        problems=(404, 503),
+    ),
+)
+def what_if(
+    request: Request,
+    id: ResultId,
+    body: JsonBody,
+    app: AppDep,
+    caller: CallerDep,
+    audited: AuditDep,
+) -> Response:
+    """Process a recorded batch again with other options; recording the result needs `operate`."""
+    asked = read_model(WhatIfIn, body)
+    record, entry = asked.record or asked.adopt, None
+    if record:
+        require_scope(caller, "operate")
+        request.state.changes = "what_if"
+        entry = audited.entry(201)
+    answered = app.results.what_if(id, asked.options, record=record, adopt=asked.adopt, entry=entry)
+    return answer_response(answered, recorded=record)

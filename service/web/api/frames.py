@@ -1,0 +1,135 @@
+"""Frames of star trackers: submit one."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import IO, Annotated, Any
+
+from fastapi import APIRouter, Depends
+from fastapi import Query as InQuery
+from pydantic import Field
+from pydantic_core import from_json
+from starlette.requests import Request
+from starlette.responses import Response
+
+from service.errors import BadBatch, Fault, shown_value
+from service.imaging.submit import FrameIn, read_known
+from service.missions.mission import mission_named
+from service.storage.models.answers import Answer
+from service.web.api.access import CallerDep
+from service.web.api.dependencies import AppDep, MetricsDep, answer_response
+from service.web.api.headers import IdempotencyKey
+from service.web.api.query_parameters import Query
+from service.web.api.request_body import frame_body
+from service.web.api.spacecraft import Name
+from service.web.openapi.route import IDEMPOTENCY_KEY, LOCATION, REPLAYED, ResponseDoc, route_docs
+
+router = APIRouter(prefix="/api/v1/spacecraft", tags=["frames"])
+
+_A_PRIORI = '{"quaternion": [0.1, 0.2, 0.3, 0.9273618495495703]}'
+
+
+class FrameQuery(Query):
+    """The fields of a frame's batch, as JSON where they are not plain text."""
+
+    batch: Annotated[
+        str | None, Field(description="The batch id. Default: made from the digest of the frame.")
+    ] = None
+    time: Annotated[
+        str | None,
+        Field(description="UTC of mid exposure. Default: DATE-AVG, or DATE-OBS, of a FITS file."),
+    ] = None
+    run: Annotated[str, Field(description="The run; `live` for the batches of pipelines.")] = "live"
+    tracker: Annotated[
+        str | None, Field(description="The tracker. Default: the first tracker with a camera.")
+    ] = None
+    a_priori: Annotated[
+        str | None,
+        Field(
+            description="JSON, as in a batch. Default: none (lost in space).", examples=[_A_PRIORI]
+        ),
+    ] = None
+    body_rates_deg_per_s: Annotated[
+        str | None, Field(description="JSON, as in a batch.", examples=["[0.01, 0, 0]"])
+    ] = None
+    velocity_km_per_s: Annotated[str | None, Field(description="JSON, as in a batch.")] = None
+    sun_vector: Annotated[str | None, Field(description="JSON, as in a batch.")] = None
+    position_km: Annotated[str | None, Field(description="JSON, as in a batch.")] = None
+    aberration: Annotated[str, Field(description="As in a batch.")] = "to_correct"
+    exposure_s: Annotated[
+        str | None,
+        Field(description="Exposure time. Default: EXPTIME of the file, else the mission's value."),
+    ] = None
+    centroid: Annotated[
+        str | None,
+        Field(description="window, scan, matched or recursive. Default: the mission's method."),
+    ] = None
+    options: Annotated[str | None, Field(description="JSON, as in a batch.")] = None
+
+    def known(self) -> FrameIn:
+        """The same, checked as a batch's fields are; raises `BadBatch` with every fault."""
+        given = {name: text for name, text in self.asked().items() if text is not None}
+        return read_known({name: _value(name, text) for name, text in given.items()})
+
+
+_TEXTS = ("batch", "time", "run", "tracker", "aberration", "centroid")
+
+
+def _value(name: str, text: str) -> Any:
+    if name in _TEXTS:
+        return text
+    try:
+        return from_json(text)
+    except ValueError:
+        raise BadBatch(Fault(name, "must be JSON, as in a batch", shown_value(text))) from None
+
+
+@dataclass(frozen=True)
+class FrameUpload:
+    """A frame's file and the fields of its batch."""
+
+    known: FrameIn
+    file: IO[bytes]
+
+    @contextmanager
+    def opened(self) -> Iterator[IO[bytes]]:
+        """The file, which is deleted afterwards."""
+        with self.file:
+            yield self.file
+
+
+async def _frame(
+    request: Request, query: Annotated[FrameQuery, InQuery()], app: AppDep
+) -> FrameUpload:
+    # Name and query are checked before the frame is read.
+    mission_named(app.missions, request.path_params["name"])
+    known = query.known()
+    return FrameUpload(known, await frame_body(request, app.settings.frame_mb << 20))
+
+
+@router.post(
+    "/{name}/frames",
+    **route_docs(
+        {
+            201: ResponseDoc("The answer, now recorded.", Answer, LOCATION),
+            200: ResponseDoc("The answer that was recorded before.", Answer, REPLAYED),
+        },
+        frame=True,
+        problems=(404, 409, 503),
+        parameters=(IDEMPOTENCY_KEY,),
+    ),
+)
+def submit_frame(
+    name: Name,
+    upload: Annotated[FrameUpload, Depends(_frame)],
+    key: IdempotencyKey,
+    app: AppDep,
+    metrics: MetricsDep,
+    caller: CallerDep,
+) -> Response:
+    """Detect the stars in a frame, identify them, solve for the attitude, and record everything."""
+    with upload.opened() as file:
+        answered = app.frames.submit(name, upload.known, file, key, caller)
+    if answered.replayed:
+        metrics.count_repeat()
+    return answer_response(answered)

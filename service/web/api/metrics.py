@@ -1,0 +1,228 @@
+"""Counters for Prometheus, in a registry of the app's own: no state is shared between apps."""
+
+import collections
+import logging
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from itertools import product
+from typing import Any
+
+from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+from starlette.types import Scope
+
+from service.alarms.limits import Severity
+from service.app.factory import App
+from service.ingest.submit import Recorded
+from service.storage.models.alarms import Alarm
+from service.storage.queries.future_dated import LIVE
+from service.storage.recording.unsaved_result import Row
+
+log = logging.getLogger(__name__)
+
+WAIT_S = 1.0
+"""The deadline of all reads: the scrape is due within two seconds."""
+OUTCOMES = ("unique", "ambiguous", "unmatched")
+ALARM_STATES = ("open", "acknowledged", "shelved")
+_METHODS = ("GET", "POST", "DELETE", "PUT", "PATCH", "OPTIONS")
+_SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
+
+
+class _TimedReads:
+    """Reads values in threads, all at once, with a deadline.
+
+    A read that has not returned yet is not repeated: while the database hangs, threads
+    would pile up.
+    """
+
+    def __init__(self, **asked: Callable[[], Any]) -> None:
+        self._asked = asked
+        self._threads = ThreadPoolExecutor(len(asked), "metrics")
+        self._lock = threading.Lock()
+        self._answers: dict[str, Future[Any]] = {}
+
+    def __call__(self) -> dict[str, Any]:
+        """The values that arrived within `WAIT_S`, by name."""
+        with self._lock:
+            for name, ask in self._asked.items():
+                before = self._answers.get(name)
+                if before is None or before.done():
+                    self._answers[name] = self._threads.submit(ask)
+            answers = dict(self._answers)
+        wait(answers.values(), WAIT_S)
+        found = {}
+        for name, answer in answers.items():
+            if not answer.done():
+                log.warning("%s: no answer within %g s", name, WAIT_S)
+            elif (error := answer.exception()) is not None:
+                # A missing gauge is noticed; zero would look healthy.
+                log.warning("%s cannot be counted: %s", name, error)
+            else:
+                found[name] = answer.result()
+        return found
+
+
+class _GaugeCollector(Collector):
+    """Gauges that are read from other threads when the metrics are scraped."""
+
+    def __init__(self, app: App) -> None:
+        self._app = app
+        self._asked = _TimedReads(
+            zones=app.zones.state,
+            processes=app.replays.processes,
+            alarms=app.alarms.active,
+            backlog=app.submissions.backlog,
+        )
+
+    def collect(self) -> Iterator[Metric]:
+        found = self._asked()
+        if "zones" in found:
+            yield from _of_zones(found["zones"])
+        if "processes" in found:
+            yield GaugeMetricFamily(
+                "starid_replay_processes",
+                "Processes that are ready to compute replays, each with a cache of its own.",
+                value=found["processes"],
+            )
+        if "alarms" in found:
+            yield _of_alarms(self._app, found["alarms"])
+        if "backlog" in found:
+            yield from _of_backlog(found["backlog"])
+
+
+def _of_zones(cache: Row) -> Iterator[Metric]:
+    """The cache of zones and run catalogs."""
+    yield CounterMetricFamily(
+        "starid_zone_cache_hits",
+        "Zones and run catalogs found in the cache; replays have others.",
+        value=cache["hits"],
+    )
+    yield CounterMetricFamily(
+        "starid_zone_cache_misses",
+        "Zones and run catalogs built.",
+        value=cache["misses"],
+    )
+    yield CounterMetricFamily(
+        "starid_zone_build_seconds",
+        "Time spent building them.",
+        value=cache["build_us"] / 1e6,
+    )
+    yield GaugeMetricFamily(
+        "starid_zone_cache_bytes",
+        "Memory that the cache holds.",
+        value=cache["bytes"],
+    )
+
+
+def _of_alarms(app: App, active: Sequence[Alarm]) -> Metric:
+    """The live alarms that are not cleared."""
+    family = GaugeMetricFamily(
+        "starid_alarms",
+        "Alarms of live batches that are not cleared.",
+        labels=("spacecraft", "severity", "state"),
+    )
+    found = collections.Counter[tuple[str, str, str]](
+        (each.spacecraft, each.severity, each.state) for each in active
+    )
+    severities = [each.word for each in Severity]
+    for labels in product(app.missions, severities, ALARM_STATES):
+        family.add_metric(labels, found[labels])
+    return family
+
+
+def _of_backlog(backlog: Row) -> Iterator[Metric]:
+    """The queues, and the state of the writes."""
+    posts, writes = backlog["posts"], backlog["writes"]
+    yield CounterMetricFamily(
+        "starid_writes_failed",
+        "Batches and changes that could not be written, or not be looked up before that.",
+        value=writes["failed"],
+    )
+    yield GaugeMetricFamily(
+        "starid_last_write_succeeded",
+        "1 where the last write succeeded, 0 where it failed.",
+        value=float(writes["succeeded"]),
+    )
+    depth = GaugeMetricFamily(
+        "starid_queue_depth",
+        "Posted batches that are not answered yet, and records that wait to be written.",
+        labels=("queue",),
+    )
+    age = GaugeMetricFamily(
+        "starid_queue_oldest_seconds", "The age of the oldest of them.", labels=("queue",)
+    )
+    for name, queue in (("posts", posts), ("writes", writes)):
+        depth.add_metric((name,), queue["queued"])
+        age.add_metric((name,), queue["oldest_s"])
+    yield depth
+    yield age
+
+
+class Metrics:
+    """The counters, and their text form."""
+
+    def __init__(self, app: App) -> None:
+        self.registry = CollectorRegistry()
+        self._stars = Counter(
+            "starid_stars",
+            "Observed stars of live batches by outcome.",
+            ("spacecraft", "outcome"),
+            registry=self.registry,
+        )
+        self._batches = Counter(
+            "starid_batches",
+            "Recorded batches: live or of a named run, with an attitude or without.",
+            ("spacecraft", "run", "result"),
+            registry=self.registry,
+        )
+        self._repeats = Counter(
+            "starid_batches_repeated",
+            "Submissions that were answered with what is recorded already.",
+            registry=self.registry,
+        )
+        self._requests = Histogram(
+            "starid_request_seconds",
+            "Time from a request's first byte to its answer's last.",
+            ("method", "route", "status"),
+            buckets=_SECONDS,
+            registry=self.registry,
+        )
+        # `Histogram.labels` checks its labels on every call.
+        self._by_labels: dict[tuple[str, str, int], Histogram] = {}
+        self.registry.register(_GaugeCollector(app))
+        app.submissions.observers.append(self.count_batch)
+        for name in app.missions:
+            # A counter that exists from the start shows its first increase.
+            for outcome in OUTCOMES:
+                self._stars.labels(name, outcome)
+
+    def count_batch(self, recorded: Recorded) -> None:
+        """Count one newly recorded batch."""
+        spacecraft, live = recorded.spacecraft, recorded.run == LIVE
+        result = "attitude" if recorded.has_attitude else "no_attitude"
+        self._batches.labels(spacecraft, LIVE if live else "named", result).inc()
+        if live:
+            for outcome in OUTCOMES:
+                self._stars.labels(spacecraft, outcome).inc(recorded.counts[outcome])
+
+    def count_repeat(self) -> None:
+        """Count one submission that was recorded before."""
+        self._repeats.inc()
+
+    def count_request(self, scope: Scope, status: int, seconds: float) -> None:
+        """Count one request under its route's template, so that ids make no new series."""
+        if getattr(scope.get("route"), "name", None) == "events":
+            return  # a stream lasts as long as somebody listens
+        method = scope["method"] if scope["method"] in _METHODS else "other"
+        route = getattr(scope.get("route"), "path", "none")
+        labels = method, route, status
+        histogram = self._by_labels.get(labels)
+        if histogram is None:
+            histogram = self._by_labels[labels] = self._requests.labels(method, route, str(status))
+        histogram.observe(seconds)
+
+    def text(self) -> bytes:
+        """The exposition text."""
+        return generate_latest(self.registry)

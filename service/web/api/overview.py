@@ -1,0 +1,37 @@
+"""All spacecraft at a glance."""
+
+from typing import Annotated
+
+from fastapi import APIRouter
+from fastapi import Query as InQuery
+from msgspec import structs
+from starlette.responses import Response
+
+from service.storage.models.overview import About, Overview
+from service.storage.queries.alarms import summary
+from service.web.api.access import CallerDep
+from service.web.api.dependencies import AppDep, json_response
+from service.web.api.query_parameters import NO_QUERY, RunQuery
+from service.web.openapi.route import ResponseDoc, route_docs
+
+router = APIRouter(prefix="/api/v1", tags=["spacecraft"])
+
+
+@router.get("/overview", **route_docs({200: ResponseDoc("Every spacecraft in the run.", Overview)}))
+def get_overview(query: Annotated[RunQuery, InQuery()], app: AppDep, caller: CallerDep) -> Response:
+    """Every spacecraft in a run: state, last attitude, the last hour and day, active alarms."""
+    found = app.spacecraft.overview(query.run)
+    items = [each for each in found.items if caller.may_see(each.name)]
+    alarms = summary([alarm for each in items for alarm in each.alarms])
+    found = structs.replace(found, items=items, alarms=alarms)
+    return json_response(found)
+
+
+@router.get(
+    "/about",
+    dependencies=[NO_QUERY],
+    **route_docs({200: ResponseDoc("The version of the service and its data.", About)}),
+)
+def get_about(app: AppDep) -> Response:
+    """Version, catalog, missions, database and credits."""
+    return json_response(app.service.about())

@@ -1,0 +1,60 @@
+"""Probes: alive, ready, and the metrics."""
+
+import asyncio
+import logging
+
+import anyio.to_thread
+from fastapi import APIRouter
+from prometheus_client import CONTENT_TYPE_LATEST
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+
+from service.errors import Busy
+from service.web.api.dependencies import AppDep, MetricsDep
+from service.web.api.query_parameters import NO_QUERY
+from service.web.openapi.route import ResponseDoc, route_docs
+
+router = APIRouter(tags=["probes"], dependencies=[NO_QUERY])
+
+TEXT = "text/plain"
+READY_WAIT_S = 1.5
+"""The answer is due within two seconds, whatever the database does."""
+
+log = logging.getLogger(__name__)
+
+
+@router.get("/livez", **route_docs({200: ResponseDoc("Alive.", media_type=TEXT)}))
+async def livez(app: AppDep) -> Response:
+    """Whether the process answers, and works on what is submitted."""
+    app.submissions.require_alive()
+    return PlainTextResponse("alive\n")
+
+
+@router.get("/readyz", **route_docs({200: ResponseDoc("Ready.", media_type=TEXT)}, problems=(503,)))
+async def readyz(request: Request, app: AppDep) -> Response:
+    """Whether the service is ready: catalog loaded, database reachable, last write succeeded."""
+    state = request.app.state
+    if getattr(state, "getting_ready", None) is None or state.getting_ready.done():
+        # A thread apart from those of handlers, which may all be busy; one for all probes:
+        # while the database does not answer, threads would pile up.
+        ready = anyio.to_thread.run_sync(app.service.ready, limiter=anyio.CapacityLimiter(1))
+        state.getting_ready = asyncio.ensure_future(ready)
+        # Every waiting probe may have given up by then.
+        state.getting_ready.add_done_callback(lambda done: done.cancelled() or done.exception())
+    done, _ = await asyncio.wait([state.getting_ready], timeout=READY_WAIT_S)
+    if not done:
+        raise Busy("the service is starting, or the database does not answer", 5)
+    try:
+        state.getting_ready.result()
+    except Busy:
+        raise
+    except Exception as error:
+        log.warning("not ready: %s", error)
+        raise Busy("the service is not ready; its log says why", retry_after_s=5) from None
+    return PlainTextResponse("ready\n")
+
+
+@router.get("/metrics", **route_docs({200: ResponseDoc("The counters.", media_type=TEXT)}))
+def metrics(counted: MetricsDep) -> Response:
+    """Counters in the text format of Prometheus."""
+    return Response(counted.text(), media_type=CONTENT_TYPE_LATEST)

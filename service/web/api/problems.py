@@ -1,0 +1,203 @@
+"""Errors as problems (RFC 9457): the one place that maps an error to its status.
+
+A client's error names the field and the value.  An internal error is logged, and
+its answer tells nothing about the inside of the service.
+"""
+
+import json
+import logging
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import Response
+from starlette.routing import Match
+
+from service.errors import (
+    AcquisitionError,
+    BadInput,
+    Busy,
+    Conflict,
+    Fault,
+    Forbidden,
+    KeyReused,
+    NotAvailable,
+    NotFound,
+    RateLimited,
+    Unauthenticated,
+    WrongState,
+    problem_of,
+    problem_of_faults,
+    shown_value,
+)
+
+MEDIA_TYPE = "application/problem+json"
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ProblemType:
+    """What all problems of one type share; a `slug` gives the type an address of its own."""
+
+    status: int
+    title: str
+    slug: str | None = None
+
+    @property
+    def type(self) -> str:
+        """The problem's `type`; without a slug the status says all."""
+        return "about:blank" if self.slug is None else f"/problems/{self.slug}"
+
+
+PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
+    BadInput: ProblemType(422, "Invalid input", "bad-input"),
+    NotAvailable: ProblemType(422, "Not available", "not-available"),
+    Unauthenticated: ProblemType(401, "Unauthorized", "not-admitted"),
+    Forbidden: ProblemType(403, "Forbidden", "not-allowed"),
+    RateLimited: ProblemType(429, "Too many requests", "too-often"),
+    NotFound: ProblemType(404, "Not found", "not-found"),
+    Conflict: ProblemType(409, "The batch is already recorded with another body", "conflict"),
+    WrongState: ProblemType(409, "The state does not allow this", "not-now"),
+    KeyReused: ProblemType(422, "The Idempotency-Key was used with another body", "key-reused"),
+    Busy: ProblemType(503, "The service is busy", "busy"),
+}
+INTERNAL_ERROR = ProblemType(500, HTTPStatus(500).phrase)
+
+
+def problem_type_of(error: AcquisitionError) -> ProblemType:
+    """The problem type of an error: that of its class, or of the nearest base class."""
+    return next(
+        (PROBLEM_TYPES[each] for each in type(error).__mro__ if each in PROBLEM_TYPES),
+        INTERNAL_ERROR,
+    )
+
+
+class NotJson(BadInput):
+    """A body that is not JSON: truncated, empty, or in another encoding."""
+
+
+PROBLEM_TYPES[NotJson] = ProblemType(400, "The body is not JSON", "not-json")
+
+
+def problem_response(
+    request: Request,
+    kind: ProblemType,
+    details: Mapping[str, Any],
+    headers: dict[str, str] | None = None,
+) -> Response:
+    """The response for a problem: its type, the address, and `details` with its `detail`."""
+    content: dict[str, object] = {
+        "type": kind.type,
+        "title": kind.title,
+        "status": kind.status,
+        "detail": details["detail"],
+        "instance": request.url.path,
+        **details,
+    }
+    # ASCII only: a client's text may hold lone surrogates, which UTF-8 cannot carry.
+    body = json.dumps(content, ensure_ascii=True, separators=(",", ":"))
+    return Response(body, kind.status, headers, media_type=MEDIA_TYPE)
+
+
+async def _on_acquisition_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, AcquisitionError)
+    kind = problem_type_of(error)
+    if kind.status == 500:
+        return internal_error(request, error)
+    return problem_response(request, kind, problem_of(error), _headers_of(error))
+
+
+def _headers_of(error: AcquisitionError) -> dict[str, str] | None:
+    if isinstance(error, Busy | RateLimited):
+        return {"Retry-After": str(error.retry_after_s)}
+    if isinstance(error, Unauthenticated):
+        return {"WWW-Authenticate": 'Bearer realm="attitude acquisition"'}
+    return None
+
+
+def faults_in_query(error: RequestValidationError) -> list[Fault]:
+    """The faults of a query, parameter by parameter."""
+    return [
+        Fault(
+            # Below the parameter, `loc` names the form of it that was tried.
+            str(each["loc"][min(1, len(each["loc"]) - 1)])[:80],
+            str(each["msg"]).removeprefix("Value error, "),
+            None if each["type"] == "missing" else shown_value(each["input"]),
+        )
+        for each in error.errors()
+    ]
+
+
+async def _on_query_fault(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    return problem_response(
+        request, PROBLEM_TYPES[BadInput], problem_of_faults(faults_in_query(error))
+    )
+
+
+async def _on_http_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    phrase = HTTPStatus(error.status_code).phrase
+    headers = dict(error.headers or {})
+    detail = error.detail
+    if error.status_code == 405:
+        headers["Allow"] = ", ".join(_methods_at(request))
+        detail = f"{request.method} is not allowed here; allowed: {headers['Allow']}"
+    if error.status_code == 404 and detail == phrase:
+        detail = "There is nothing at this address; the routes are in /api/v1/openapi.json"
+    return problem_response(
+        request, ProblemType(error.status_code, phrase), {"detail": detail}, headers
+    )
+
+
+def _methods_at(request: Request) -> list[str]:
+    # The router knows the methods of one route only; a path may have several.
+    methods: set[str] = set()
+    for route in request.app.state.routes:
+        match, _ = route.matches(request.scope)
+        if match is not Match.NONE:
+            methods |= route.methods
+    if not methods or "GET" in methods:
+        methods |= {"GET", "HEAD"}
+    return sorted(methods)
+
+
+def internal_error(request: Request, error: Exception) -> Response:
+    """Log an unexpected error, and answer without details of it."""
+    log.error("%s %s failed", request.method, request.url.path, exc_info=error)
+    return problem_response(
+        request, INTERNAL_ERROR, {"detail": "The service has failed; its log contains the cause."}
+    )
+
+
+async def _on_disconnect(request: Request, error: Exception) -> Response:
+    # The client has gone.
+    return Response(status_code=400)
+
+
+_HANDLERS: Mapping[type[Exception], Callable[[Request, Exception], Awaitable[Response]]] = {
+    AcquisitionError: _on_acquisition_error,
+    RequestValidationError: _on_query_fault,
+    HTTPException: _on_http_error,
+    ClientDisconnect: _on_disconnect,
+}
+
+
+def add_error_handlers(app: FastAPI) -> None:
+    """Answer every expected error as a problem."""
+    for kind, handler in _HANDLERS.items():
+        app.add_exception_handler(kind, handler)
+
+
+async def error_response(request: Request, error: Exception) -> Response:
+    """The response to an expected error; any other is raised again."""
+    for kind in type(error).__mro__:
+        if kind in _HANDLERS:
+            return await _HANDLERS[kind](request, error)
+    raise error

@@ -1,0 +1,278 @@
+"""Request bodies: type checked, size and time bounded while they stream.
+
+The server has no deadline for a body, and the framework would buffer a body
+of any size.  A body that is too large is refused as soon as
+it passes the bound; what still arrives of it is dropped unread.  All JSON bodies
+together may take `Limits.budget_bytes` of memory until their requests are answered.
+"""
+
+import asyncio
+import ctypes
+import tempfile
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
+from typing import IO, Annotated, TypeVar
+
+from fastapi import Depends
+from pydantic import BaseModel, ValidationError
+from pydantic_core import from_json
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect, Request
+from starlette.types import Scope
+
+from service.errors import BadBatch, BadInput, Busy, Fault
+from service.observations.readers.decompress import Coding
+from service.observations.schema import faults_of
+from service.web.api.problems import NotJson
+
+JSON = "application/json"
+BINARY = "application/octet-stream"
+FRAMES = (
+    "application/fits",
+    "image/fits",
+    "image/tiff",
+    "image/png",
+    "application/x-npy",
+    BINARY,
+)
+"""Media types of frames; the first bytes tell the format."""
+NDJSON = ("application/x-ndjson", "application/ndjson", "application/jsonl", BINARY)
+"""Generated clients can send the last one: most know no type for lines."""
+
+MAX_JSON_BYTES = 2 << 20
+"""Enough for ten thousand stars, so that the error names their number and not the size."""
+
+Body = TypeVar("Body", bound=BaseModel)
+
+
+@dataclass(frozen=True)
+class BodyLimits:
+    """How large and how slow a body may be."""
+
+    json_bytes: int = MAX_JSON_BYTES
+    session_bytes: int = 4 << 10
+    """Of `POST /session`, which asks for no token."""
+    small_bytes: int = 8 << 10
+    """Bytes of each body that `budget_bytes` leaves out: a batch of 60 stars is never
+    refused because of others."""
+    budget_bytes: int = 8 << 20
+    replay_bytes: int = 1 << 30
+    pause_s: float = 20.0
+    """The longest wait for the next piece of a body."""
+    json_s: float = 60.0
+    replay_s: float = 3600.0
+    frame_s: float = 120.0
+
+
+DEFAULT_LIMITS = BodyLimits()
+COUNTED = "counted_bytes"
+"""Key in the state of a request: the bytes of its body that `BodyBudget` counts."""
+RETRY_S = 1
+TRIM_AFTER_BYTES, TRIM_AFTER_S = 4 << 20, 5.0
+"""Memory is returned this long after this many bytes of large bodies: it takes about 5 ms."""
+
+
+class BodyBudget:
+    """Counts the bytes of all bodies that are held in memory."""
+
+    def __init__(self, limits: BodyLimits) -> None:
+        self._small_bytes = limits.small_bytes
+        self._most_bytes = limits.budget_bytes
+        self._bytes = self._freed_bytes = 0
+        self._is_trim_due = False
+
+    def add(self, request: Request, received: int) -> None:
+        """Count the bytes that have arrived of a body; raises `Busy` beyond the bound."""
+        state = request.scope.setdefault("state", {})
+        counted = state.get(COUNTED, 0)
+        more = max(received - self._small_bytes, 0) - counted
+        if self._bytes + more > self._most_bytes:
+            raise Busy("too many large bodies are being read at once", RETRY_S)
+        self._bytes += more
+        state[COUNTED] = counted + more
+
+    def remove(self, scope: Scope) -> None:
+        """Release the body of an answered request, which its connection would keep."""
+        state = scope.get("state", {})
+        state.pop("body", None)
+        counted = state.pop(COUNTED, 0)
+        if not counted:
+            return
+        self._bytes -= counted
+        self._freed_bytes += counted
+        if self._freed_bytes >= TRIM_AFTER_BYTES and not self._is_trim_due:
+            self._is_trim_due = True
+            asyncio.get_running_loop().call_later(TRIM_AFTER_S, self._trim)
+
+    def _trim(self) -> None:
+        self._freed_bytes, self._is_trim_due = 0, False
+        trim_memory()
+
+
+def trim_memory() -> None:
+    """Return freed memory that the C library keeps to the system; only glibc can."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
+
+
+def _limits(request: Request) -> BodyLimits:
+    limits = request.app.state.limits
+    assert isinstance(limits, BodyLimits)
+    return limits
+
+
+def _require_type(request: Request, allowed: tuple[str, ...]) -> None:
+    # Also a protection: pages of other sites can send only form types without a preflight.
+    sent = request.headers.get("content-type", "")
+    kind, _, parameters = sent.partition(";")
+    kind, parameters = kind.strip().lower(), parameters.strip().lower().replace('"', "")
+    json_like = JSON in allowed and kind.startswith("application/") and kind.endswith("+json")
+    if kind not in allowed and not json_like:
+        raise HTTPException(415, f"Content-Type must be {allowed[0]}, not {sent[:80] or 'absent'}")
+    if parameters.startswith("charset=") and parameters not in ("charset=utf-8", "charset=utf8"):
+        raise HTTPException(415, f"the body must be in UTF-8, not {parameters[:40]}")
+
+
+def _coding(request: Request, allowed: tuple[Coding, ...]) -> Coding:
+    sent = request.headers.get("content-encoding", "identity").strip().lower()
+    for coding in allowed:
+        if sent == coding:
+            return coding
+    known = ", ".join(allowed)
+    detail = f"Content-Encoding {sent[:40]} is not supported here; there is {known}"
+    raise HTTPException(415, detail, {"Accept-Encoding": known})
+
+
+async def _pieces(
+    request: Request, max_bytes: int, pause_s: float, total_s: float
+) -> AsyncIterator[bytes]:
+    too_large = HTTPException(413, f"the body may have at most {max_bytes} bytes")
+    declared = request.headers.get("content-length", "")
+    if (
+        declared.isascii()
+        and declared.isdigit()
+        and (len(declared) > 15 or int(declared) > max_bytes)
+    ):
+        raise too_large
+    received = 0
+    clock = asyncio.get_running_loop().time
+    deadline, more = clock() + total_s, True
+    while more:
+        try:
+            async with asyncio.timeout_at(min(clock() + pause_s, deadline)):
+                message = await request.receive()
+        except TimeoutError:
+            detail = f"the body did not arrive in time ({received} bytes did)"
+            raise HTTPException(408, detail, {"Connection": "close"}) from None
+        if message["type"] == "http.disconnect":
+            raise ClientDisconnect
+        piece: bytes = message.get("body", b"")
+        more = message.get("more_body", False)
+        received += len(piece)
+        if received > max_bytes:
+            raise too_large
+        yield piece
+
+
+async def json_body(request: Request) -> bytes:
+    """The bytes of a JSON body."""
+    return await _json_body(request, _limits(request).json_bytes)
+
+
+async def session_body(request: Request) -> bytes:
+    """The bytes of a JSON body that begins a session; it needs no token."""
+    return await _json_body(request, _limits(request).session_bytes)
+
+
+async def _json_body(request: Request, max_bytes: int) -> bytes:
+    _require_type(request, (JSON,))
+    _coding(request, ("identity",))
+    limits = _limits(request)
+    budget: BodyBudget = request.app.state.body_budget
+    pieces: list[bytes] = []
+    received = 0
+    async for piece in _pieces(request, max_bytes, limits.pause_s, limits.json_s):
+        received += len(piece)
+        budget.add(request, received)
+        pieces.append(piece)
+    request.state.body = body = b"".join(pieces)
+    return body
+
+
+@dataclass(frozen=True)
+class Spooled:
+    """A body in a rewound file, with its number of lines where it is not compressed."""
+
+    file: IO[bytes]
+    coding: Coding
+    lines: int | None
+
+
+async def ndjson_body(
+    request: Request,
+    new_file: Callable[[], IO[bytes]],
+    discard: Callable[[IO[bytes]], object],
+) -> Spooled:
+    """An NDJSON body, possibly compressed, in a new file; one that did not arrive is discarded."""
+    _require_type(request, NDJSON)
+    coding = _coding(request, ("identity", "gzip", "zstd"))
+    limits = _limits(request)
+    file = new_file()
+    lines, last = 0, b"\n"
+    try:
+        async for piece in _pieces(request, limits.replay_bytes, limits.pause_s, limits.replay_s):
+            file.write(piece)
+            lines, last = lines + piece.count(b"\n"), piece[-1:] or last
+    except OSError as error:
+        discard(file)
+        raise Busy(f"the upload cannot be stored now: {error.strerror}", RETRY_S) from None
+    except BaseException:
+        discard(file)
+        raise
+    if file.tell() == 0:
+        discard(file)
+        raise BadBatch(Fault("body", "has no lines; it must hold one batch per line"))
+    file.seek(0)
+    # The last line may lack its newline.
+    return Spooled(file, coding, lines + (last != b"\n") if coding == "identity" else None)
+
+
+async def frame_body(request: Request, max_bytes: int) -> IO[bytes]:
+    """A frame in a rewound temporary file that closing deletes."""
+    _require_type(request, FRAMES)
+    _coding(request, ("identity",))
+    limits = _limits(request)
+    file = tempfile.TemporaryFile()  # noqa: SIM115 - its reader closes it
+    try:
+        async for piece in _pieces(request, max_bytes, limits.pause_s, limits.frame_s):
+            file.write(piece)
+    except BaseException:
+        file.close()
+        raise
+    file.seek(0)
+    return file
+
+
+def read_model(model: type[Body], body: bytes) -> Body:
+    """The checked object of a body; an empty body gives every default."""
+    try:
+        return model.model_validate_json(body or b"{}")
+    except ValidationError as error:
+        raise refused(body, BadBatch(faults_of(error))) from None
+
+
+def refused(body: bytes, refusal: BadInput) -> BadInput:
+    """The error of a body: `NotJson` where its text is not JSON.
+
+    The text is parsed for this only after an error.
+    """
+    try:
+        from_json(body)
+    except ValueError:
+        return NotJson(refusal.faults)
+    return refusal
+
+
+JsonBody = Annotated[bytes, Depends(json_body)]
+SessionBody = Annotated[bytes, Depends(session_body)]

@@ -1,0 +1,153 @@
+"""Named runs, and replays of telemetry files into them."""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Path
+from fastapi import Query as InQuery
+from pydantic import Field, StrictBool
+from starlette.requests import Request
+from starlette.responses import Response
+
+from service.app.replays import discard_upload
+from service.observations.schema import BatchIn, RunName, Wire
+from service.storage.models.runs import Replay, ReplayList, RunList, RunState
+from service.web.api.access import AuditDep, CallerDep, require_all_spacecraft
+from service.web.api.dependencies import AppDep, json_response
+from service.web.api.query_parameters import NO_QUERY, Query
+from service.web.api.request_body import MAX_JSON_BYTES, JsonBody, Spooled, ndjson_body, read_model
+from service.web.openapi.route import LOCATION, ResponseDoc, route_docs
+
+router = APIRouter(prefix="/api/v1", tags=["runs and replays"])
+
+Run = Annotated[str, Path(description="The run's name.")]
+ReplayId = Annotated[str, Path(description="The `id` of a replay.")]
+
+
+class RunIn(Wire):
+    """Settings of a run."""
+
+    alarms: Annotated[
+        StrictBool,
+        Field(description="Whether its new batches can raise alarms. Live batches always can."),
+    ]
+
+
+class _ReplayQuery(Query):
+    """Where the batches of a replay go."""
+
+    run: Annotated[
+        RunName, Field(description="The run for every batch, in place of the batch's own.")
+    ]
+    alarms: Annotated[bool, Field(description="Raise alarms for the run.")] = False
+
+
+ReplayQuery = Annotated[_ReplayQuery, InQuery()]
+
+
+@dataclass(frozen=True)
+class ReplayUpload:
+    """A telemetry file and the run it goes to."""
+
+    run: str
+    alarms: bool
+    body: Spooled
+
+
+async def _telemetry(
+    request: Request, query: ReplayQuery, caller: CallerDep, app: AppDep
+) -> ReplayUpload:
+    # The query is checked before the file is read.
+    if query.alarms:
+        # Like `watch_run`: the run may hold batches of every spacecraft.
+        require_all_spacecraft(caller)
+        request.state.changes = request.scope["route"].name
+    body = await ndjson_body(request, partial(app.replays.new_upload, caller), discard_upload)
+    return ReplayUpload(query.run, query.alarms, body)
+
+
+@router.get(
+    "/runs", dependencies=[NO_QUERY], **route_docs({200: ResponseDoc("Every run.", RunList)})
+)
+def list_runs(app: AppDep) -> Response:
+    """Every run with batches."""
+    return json_response({"items": app.runs.all()})
+
+
+@router.put(
+    "/runs/{run}",
+    dependencies=[NO_QUERY],
+    **route_docs({200: ResponseDoc("The run.", RunState)}, body=RunIn),
+)
+def watch_run(run: Run, body: JsonBody, app: AppDep, audited: AuditDep) -> Response:
+    """Switch the alarms of a run on or off; creates the run if it does not exist."""
+    asked = read_model(RunIn, body)
+    return json_response(app.runs.watch(run, asked.alarms, audited.entry()))
+
+
+@router.get(
+    "/replays",
+    dependencies=[NO_QUERY],
+    **route_docs({200: ResponseDoc("The latest hundred replays.", ReplayList)}),
+)
+def list_replays(app: AppDep) -> Response:
+    """The latest replays and their progress, newest first."""
+    return json_response({"items": app.replays.all()})
+
+
+@router.post(
+    "/replays",
+    **route_docs(
+        {202: ResponseDoc("The replay, now running.", Replay, LOCATION)},
+        lines_of=BatchIn,
+        problems=(503,),
+    ),
+)
+def start_replay(
+    upload: Annotated[ReplayUpload, Depends(_telemetry)],
+    app: AppDep,
+    caller: CallerDep,
+    audited: AuditDep,
+) -> Response:
+    """Accept a telemetry file with one batch per line, and process it in the background."""
+    id = app.replays.start_upload(
+        upload.body.file,
+        upload.body.coding,
+        upload.run,
+        name=upload.run,
+        total=upload.body.lines,
+        longest_bytes=MAX_JSON_BYTES,
+        caller=caller,
+        alarms=upload.alarms,
+        entry=audited.entry(202) if upload.alarms else None,
+    )
+    location = {"Location": f"/api/v1/replays/{id}"}
+    return json_response(app.replays.get(id), 202, location)
+
+
+@router.get(
+    "/replays/{id}",
+    dependencies=[NO_QUERY],
+    **route_docs({200: ResponseDoc("The replay.", Replay)}, problems=(404,)),
+)
+def get_replay(id: ReplayId, app: AppDep) -> Response:
+    """A replay and its progress."""
+    return json_response(app.replays.get(id))
+
+
+@router.delete(
+    "/replays/{id}",
+    dependencies=[NO_QUERY],
+    **route_docs(
+        {
+            200: ResponseDoc("The replay, now cancelled.", Replay),
+            202: ResponseDoc("The replay, which will end soon.", Replay),
+        },
+        problems=(404, 409, 503),
+    ),
+)
+def cancel_replay(id: ReplayId, app: AppDep, caller: CallerDep) -> Response:
+    """Cancel a replay; the batches that it recorded stay."""
+    state = app.replays.cancel(id, caller)
+    return json_response(state, 202 if state["state"] == "running" else 200)

@@ -1,0 +1,114 @@
+"""Spacecraft: their settings and state, attitude history, and star rates."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Path
+from fastapi import Query as InQuery
+from starlette.requests import Request
+from starlette.responses import Response
+
+from service.app.history_table import batch_table, history_table
+from service.storage.models.spacecraft import (
+    AttitudePage,
+    RateList,
+    SpacecraftList,
+    SpacecraftState,
+)
+from service.storage.models.trends import History, Ranking
+from service.web.api.access import CallerDep
+from service.web.api.dependencies import AppDep, json_response, page_response
+from service.web.api.history_files import THINNED, history_file, streamed_file, thinned_header
+from service.web.api.query_parameters import (
+    JSON_FORMAT,
+    HistoryQuery,
+    PeriodPageQuery,
+    RatesQuery,
+    RunQuery,
+    WorstQuery,
+)
+from service.web.openapi.route import LINK, ResponseDoc, route_docs
+
+router = APIRouter(prefix="/api/v1/spacecraft", tags=["spacecraft"])
+
+DEFAULT_SIZE = 500
+
+Name = Annotated[str, Path(description="The spacecraft's name, such as `XTE`.")]
+
+
+@router.get("", **route_docs({200: ResponseDoc("Every spacecraft.", SpacecraftList)}))
+def list_spacecraft(
+    query: Annotated[RunQuery, InQuery()], app: AppDep, caller: CallerDep
+) -> Response:
+    """Every spacecraft with a mission file, with its state in a run."""
+    theirs = [each for each in app.spacecraft.states(query.run) if caller.may_see(each.name)]
+    return json_response({"items": theirs})
+
+
+@router.get(
+    "/{name}",
+    **route_docs({200: ResponseDoc("The spacecraft.", SpacecraftState)}, problems=(404,)),
+)
+def get_spacecraft(name: Name, query: Annotated[RunQuery, InQuery()], app: AppDep) -> Response:
+    """One spacecraft: state in a run, mission settings and their history."""
+    return json_response(app.spacecraft.state(name, query.run))
+
+
+@router.get(
+    "/{name}/attitudes",
+    **route_docs({200: ResponseDoc("A page of attitudes.", AttitudePage, LINK)}, problems=(404,)),
+)
+def list_attitudes(
+    request: Request, name: Name, query: Annotated[PeriodPageQuery, InQuery()], app: AppDep
+) -> Response:
+    """The attitudes of a run, oldest first by batch time."""
+    return page_response(request, app.spacecraft.attitudes(name, **query.asked()))
+
+
+@router.get(
+    "/{name}/rates",
+    **route_docs({200: ResponseDoc("The buckets with batches.", RateList)}, problems=(404,)),
+)
+def list_rates(name: Name, query: Annotated[RatesQuery, InQuery()], app: AppDep) -> Response:
+    """Stars by outcome, in at most 20,000 buckets of batch time."""
+    return json_response({"items": app.spacecraft.rates(name, **query.asked())})
+
+
+@router.get(
+    "/{name}/history",
+    **route_docs(
+        {200: ResponseDoc("The history, in the requested format.", History, THINNED, tables=True)},
+        problems=(404,),
+    ),
+)
+def get_history(name: Name, query: Annotated[HistoryQuery, InQuery()], app: AppDep) -> Response:
+    """Quantities over a period.
+
+    Thinned out to as many points as can be drawn, or as a table of every batch.
+    """
+    where = query.run_and_times
+    file = f"{name}-{query.run}-history"
+    if query.of_every_batch:
+        pages = app.spacecraft.every_batch(name, quantities=query.quantity, **where)
+        return streamed_file(batch_table(pages), query.format, file)
+    history = app.spacecraft.history(
+        name,
+        quantities=query.quantity,
+        strategy=query.strategy or "minmax",
+        size=query.size or DEFAULT_SIZE,
+        **where,
+    )
+    thinned = history["thinned"]
+    if query.format != JSON_FORMAT:
+        return history_file(history_table(history), query.format, file, is_thinned=thinned)
+    return json_response(history, headers=thinned_header(thinned))
+
+
+@router.get(
+    "/{name}/worst",
+    **route_docs({200: ResponseDoc("The worst batches.", Ranking)}, problems=(404,)),
+)
+def list_worst(name: Name, query: Annotated[WorstQuery, InQuery()], app: AppDep) -> Response:
+    """The batches with the worst values of a quantity in a period, worst first."""
+    return json_response(
+        {"by": query.by, "items": app.spacecraft.worst_batches(name, **query.asked())}
+    )

@@ -1,0 +1,64 @@
+"""Zones: what is cached; build some ahead; drop them."""
+
+from typing import Annotated
+
+from fastapi import APIRouter
+from fastapi import Query as InQuery
+from pydantic import Field
+from starlette.responses import Response
+
+from service.observations.schema import APrioriIn, Key, Wire
+from service.storage.models.zones import Dropped, ZoneCache, ZoneList
+from service.web.api.access import CallerDep
+from service.web.api.dependencies import AppDep, json_response
+from service.web.api.query_parameters import NO_QUERY, Query, Spacecraft, Time
+from service.web.api.request_body import JsonBody, read_model
+from service.web.openapi.route import ResponseDoc, route_docs
+
+router = APIRouter(prefix="/api/v1/zones", tags=["zones"])
+
+MAX_WARMED = 1000
+
+
+class WarmIn(Wire):
+    """Zones to build before a batch needs them."""
+
+    spacecraft: Key
+    time: Annotated[
+        Time, Field(description="UTC; determines the epoch and the direction of the Sun.")
+    ]
+    a_priori: Annotated[list[APrioriIn], Field(min_length=1, max_length=MAX_WARMED)]
+
+
+class DropQuery(Query):
+    """Which zones to drop."""
+
+    spacecraft: Spacecraft = None
+
+
+@router.get("", dependencies=[NO_QUERY], **route_docs({200: ResponseDoc("The cache.", ZoneCache)}))
+def list_zones(app: AppDep) -> Response:
+    """The cached zones, their size, hits, misses and build times.
+
+    The worker processes for replays have their own caches, which are not included.
+    """
+    return json_response(app.zones.state())
+
+
+@router.post(
+    "",
+    dependencies=[NO_QUERY],
+    **route_docs({200: ResponseDoc("The zones, now cached.", ZoneList)}, body=WarmIn),
+)
+def warm_zones(body: JsonBody, app: AppDep, caller: CallerDep) -> Response:
+    """Build the zones that batches with these a priori attitudes will use."""
+    asked = read_model(WarmIn, body)
+    caller.require(asked.spacecraft)
+    warmed = app.zones.warm(asked.spacecraft, asked.a_priori, asked.time)
+    return json_response({"items": warmed})
+
+
+@router.delete("", **route_docs({200: ResponseDoc("The number of dropped zones.", Dropped)}))
+def drop_zones(query: Annotated[DropQuery, InQuery()], app: AppDep) -> Response:
+    """Drop cached zones; the next batch builds its zones again."""
+    return json_response({"dropped": app.zones.drop(query.spacecraft)})

@@ -1,0 +1,15 @@
+"""The console: pages on which operators see how well stars are identified, and act on it."""
+
+from fastapi import APIRouter
+
+from service.web.console import pages as pages
+from service.web.console.registry import PAGES
+from service.web.console.rendering import PageRoute
+
+
+def console_router() -> APIRouter:
+    """The routes of every registered page."""
+    router = APIRouter(include_in_schema=False, route_class=PageRoute)
+    for name, page in PAGES.items():
+        router.add_api_route(page.path, page.handler, name=name)
+    return router

@@ -1,0 +1,257 @@
+"""The geometry of the picture of a star field: places, sizes and arrows in pixels, no markup.
+
+The picture is the tracker's tangent plane, h to the right and v upwards, as
+the tracker sees the sky.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from service.web.console.charts.sky_labels import Box, Label, Labels, Place, points_along, text_box
+
+SIZE = 640
+"""Width and height of the picture."""
+FIELD_MARGIN = 1.12
+LONGEST_ARROW = 70.0
+"""Pixels of the longest residual arrow."""
+ROUND = (1.0, 2.0, 5.0)
+MARK_RADIUS = 13.0
+"""Of the mark about an observed star; a triangle's corners reach a little farther."""
+RIVAL_MARGIN = 6.0
+AXES: tuple[Box, ...] = (
+    (SIZE - 30.0, SIZE / 2 - 20.0, SIZE, SIZE / 2 - 2.0),
+    (SIZE / 2, 0.0, SIZE / 2 + 34.0, 18.0),
+)
+"""Where the names of the axes stand."""
+
+
+@dataclass(frozen=True)
+class CatalogStar:
+    """A star of the zone; `role` is chosen, rival or none."""
+
+    id: str
+    magnitude: float
+    x: float
+    y: float
+    radius: float
+    role: str
+
+
+@dataclass(frozen=True)
+class ChartLine:
+    """A line from one place to another."""
+
+    x1: float
+    y1: float
+    x2: float
+    y2: float
+
+
+@dataclass(frozen=True)
+class ObservedStar:
+    """An observed star with its number, its residual arrow and its lines to rivals."""
+
+    number: int
+    outcome: str
+    star: str | None
+    magnitude: float | None
+    x: float
+    y: float
+    arrow: ChartLine | None
+    head: str
+    rivals: tuple[ChartLine, ...]
+    label: Label
+
+
+@dataclass(frozen=True)
+class Ring:
+    """A circle of the grid with its label."""
+
+    radius: float
+    label: str
+
+    @property
+    def label_at(self) -> tuple[float, float]:
+        """Where the label begins: at the top of the circle."""
+        return SIZE / 2 + 3, SIZE / 2 - self.radius - 3
+
+
+@dataclass(frozen=True)
+class SkyChart:
+    """One tracker's picture; `key_px` is the length of the arrow that stands for `key_arcsec`."""
+
+    tracker: str
+    boresight: Mapping[str, float]
+    field_of_view: Ring
+    rings: tuple[Ring, ...]
+    edges: tuple[str, ...]
+    catalog: tuple[CatalogStar, ...]
+    observed: tuple[ObservedStar, ...]
+    names: tuple[Label, ...]
+    key_arcsec: float | None
+    key_px: float
+    magnitudes: tuple[tuple[int, float], ...]
+    through: str
+    size: int = SIZE
+
+
+@dataclass(frozen=True)
+class _Projection:
+    """The gnomonic projection of a chart, whose radius is `radius_deg`, to pixels."""
+
+    radius_deg: float
+
+    @property
+    def scale(self) -> float:
+        """Pixels of the tangent of an angle of 45 degrees."""
+        return SIZE / 2 / math.tan(math.radians(self.radius_deg))
+
+    def place(self, h_deg: float, v_deg: float) -> Place:
+        """The pixel of a direction: x to the right, y downwards."""
+        x = SIZE / 2 + self.scale * math.tan(math.radians(h_deg))
+        return x, SIZE / 2 - self.scale * math.tan(math.radians(v_deg))
+
+    def ring(self, radius_deg: float) -> Ring:
+        """A circle about the boresight."""
+        return Ring(self.scale * math.tan(math.radians(radius_deg)), f"{radius_deg:g}°")
+
+
+def sky_chart(tracker: Mapping[str, Any], through: str, view: str = "all") -> SkyChart:
+    """The chart of one tracker of a star field (see `star_field.star_field_of`).
+
+    `view` is "all", which shows everything that the answer names, or "field" of view.
+    """
+    field_deg = tracker["field_of_view_radius_deg"]
+    limit_mag = tracker["magnitude_limit_mag"]
+    projection = _Projection(tracker["radius_deg"] if view == "all" else field_deg * FIELD_MARGIN)
+    catalog = _catalog_stars(tracker, projection)
+    named = [star for star in catalog if star.role != "none"]
+    places = [projection.place(each["h_deg"], each["v_deg"]) for each in tracker["observed"]]
+    residuals = [each["residual_arcsec"] for each in tracker["observed"]]
+    px_per_arcsec, key_arcsec = _arrow_scale([math.hypot(*each) for each in residuals if each])
+    arrows = [
+        _arrow(place, residual, px_per_arcsec)
+        for place, residual in zip(places, residuals, strict=True)
+    ]
+    rings = tuple(projection.ring(each) for each in _rings(projection.radius_deg, field_deg))
+    labels = Labels(
+        SIZE,
+        marks=[(x, y, MARK_RADIUS) for x, y in places]
+        + [(star.x, star.y, star.radius + RIVAL_MARGIN) for star in named],
+        taken=[*AXES, *(text_box(each.label, *each.label_at) for each in rings)],
+        lines=[
+            point
+            for each in arrows
+            if each is not None
+            for point in points_along((each.x1, each.y1), (each.x2, each.y2))
+        ],
+    )
+    # Numbers first: the table has a name by its number.
+    observed = _observed_stars(tracker["observed"], places, arrows, catalog, labels)
+    names = [labels.name(star.id, (star.x, star.y)) for star in named]
+    brightest = min((star.magnitude for star in catalog), default=limit_mag)
+    steps = range(math.ceil(brightest), math.floor(limit_mag) + 1)
+    return SkyChart(
+        tracker=tracker["tracker"],
+        boresight=tracker["boresight"],
+        field_of_view=projection.ring(field_deg),
+        rings=rings,
+        edges=tuple(
+            " ".join("{:.1f},{:.1f}".format(*projection.place(h, v)) for h, v in line)
+            for line in tracker["zone_edges"]
+        ),
+        catalog=catalog,
+        observed=observed,
+        names=tuple(each for each in names if each is not None),
+        key_arcsec=key_arcsec,
+        key_px=0.0 if key_arcsec is None else key_arcsec * px_per_arcsec,
+        magnitudes=tuple((step, star_radius(step, limit_mag)) for step in steps)[-6:],
+        through=through,
+    )
+
+
+def _catalog_stars(tracker: Mapping[str, Any], projection: _Projection) -> tuple[CatalogStar, ...]:
+    roles = {name: "rival" for each in tracker["observed"] for name in each["rivals"]}
+    roles |= {each["star"]: "chosen" for each in tracker["observed"] if each["star"]}
+    return tuple(
+        CatalogStar(
+            star["id"],
+            star["magnitude"],
+            *projection.place(star["h_deg"], star["v_deg"]),
+            star_radius(star["magnitude"], tracker["magnitude_limit_mag"]),
+            roles.get(star["id"], "none"),
+        )
+        for star in tracker["catalog"]
+    )
+
+
+def _observed_stars(
+    observed: Sequence[Mapping[str, Any]],
+    places: Sequence[Place],
+    arrows: Sequence[ChartLine | None],
+    catalog: Sequence[CatalogStar],
+    labels: Labels,
+) -> tuple[ObservedStar, ...]:
+    at = {star.id: (star.x, star.y) for star in catalog}
+    return tuple(
+        ObservedStar(
+            number,
+            each["outcome"],
+            each["star"],
+            each["magnitude"],
+            x,
+            y,
+            arrow,
+            "" if arrow is None else _head(arrow),
+            tuple(ChartLine(x, y, *at[name]) for name in each["rivals"] if name in at),
+            labels.number(str(number), (x, y)),
+        )
+        for number, (each, (x, y), arrow) in enumerate(
+            zip(observed, places, arrows, strict=True), start=1
+        )
+    )
+
+
+def _arrow(
+    place: Place, residual_arcsec: Sequence[float] | None, px_per_arcsec: float
+) -> ChartLine | None:
+    if not residual_arcsec or not px_per_arcsec:
+        return None
+    (x, y), (along_h, along_v) = place, residual_arcsec
+    return ChartLine(x, y, x + along_h * px_per_arcsec, y - along_v * px_per_arcsec)
+
+
+def star_radius(magnitude_mag: float, limit_mag: float) -> float:
+    """Pixels of a star's disc: a magnitude brighter is 0.9 px more, the faintest are still seen."""
+    return min(9.0, 1.3 + 0.9 * max(0.0, limit_mag - magnitude_mag))
+
+
+def _arrow_scale(lengths_arcsec: Sequence[float]) -> tuple[float, float | None]:
+    """Pixels per arcsecond, and a round length for the key that is no longer than the longest."""
+    longest = max(lengths_arcsec, default=0.0)
+    if longest <= 0.0:
+        return 0.0, None
+    power = 10.0 ** math.floor(math.log10(longest))
+    key = max((factor * power for factor in ROUND if factor * power <= longest), default=power)
+    return LONGEST_ARROW / longest, key
+
+
+def _rings(radius_deg: float, field_deg: float) -> list[float]:
+    """Two or three round radii within the picture, other than the field of view's own."""
+    step = next(s for s in (0.25, 0.5, 1.0, 2.0, 5.0, 10.0) if radius_deg / s <= 4.0)
+    count = int(radius_deg / step)
+    return [step * k for k in range(1, count + 1) if abs(step * k - field_deg) > step / 4]
+
+
+def _head(arrow: ChartLine) -> str:
+    """The corners of an arrow's head."""
+    length = math.hypot(arrow.x2 - arrow.x1, arrow.y2 - arrow.y1)
+    if length == 0.0:
+        return ""
+    u, v = (arrow.x2 - arrow.x1) / length, (arrow.y2 - arrow.y1) / length
+    back, wide = min(8.0, length), min(3.2, length * 0.4)
+    x, y = arrow.x2 - u * back, arrow.y2 - v * back
+    corners = ((arrow.x2, arrow.y2), (x - v * wide, y + u * wide), (x + v * wide, y - u * wide))
+    return " ".join(f"{a:.1f},{b:.1f}" for a, b in corners)

@@ -1,0 +1,192 @@
+"""How the console writes values: UTC with the day of the year, numbers with units, states as words.
+
+A state has a word and a shape, so that colour is never needed.  An unknown value is
+a dash, never a zero.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from markupsafe import Markup
+
+from service.alarms.quantities import quantity_named
+from service.times import Utc, recorded_utc, utc_now
+
+DASH = "–"
+THIN = "\N{NARROW NO-BREAK SPACE}"
+
+STATES: Mapping[str, tuple[str, str]] = {
+    "good": ("●", "good"),
+    "suspect": ("▲", "suspect"),
+    "no_attitude": ("○", "no attitude"),
+    "no_batches": ("–", "no batches"),
+    "unique": ("●", "unique"),
+    "ambiguous": ("▲", "ambiguous"),
+    "unmatched": ("✕", "unmatched"),
+    "watch": ("△", "watch"),
+    "warning": ("▲", "warning"),
+    "critical": ("◆", "critical"),
+    "open": ("!", "open"),
+    "acknowledged": ("✓", "acknowledged"),
+    "shelved": ("‖", "shelved"),
+    "cleared": ("○", "cleared"),
+    "running": ("▸", "running"),
+    "done": ("●", "done"),
+    "interrupted": ("‖", "interrupted"),
+    "cancelled": ("‖", "cancelled"),
+    "failed": ("✕", "failed"),
+}
+"""Shape and word of every state there is."""
+
+
+def present() -> Utc:
+    """This moment, to the second."""
+    return recorded_utc(utc_now().text[:19])
+
+
+def with_day_of_year(moment: Utc | str, seconds: bool = True) -> str:
+    """UTC for reading: date, day of the year, time of day."""
+    moment = recorded_utc(moment) if isinstance(moment, str) else moment
+    day, _, clock = moment.text.partition("T")
+    return f"{day} ({moment.day_of_year:03d}) {clock[: 8 if seconds else 5]}"
+
+
+def utc(moment: Utc | str | None, seconds: bool = True) -> Markup:
+    """The same as an element that programs can read; a dash where there is none."""
+    if moment is None:
+        return Markup(DASH)
+    moment = recorded_utc(moment) if isinstance(moment, str) else moment
+    return Markup('<time datetime="{}">{}</time>').format(
+        moment.text, with_day_of_year(moment, seconds)
+    )
+
+
+def age(seconds: float | None) -> str:
+    """A length of time in its two largest units."""
+    if seconds is None:
+        return DASH
+    whole = max(0, round(seconds))
+    for size, unit, below, smaller in (
+        (86400, "d", 3600, "h"),
+        (3600, "h", 60, "min"),
+        (60, "min", 1, "s"),
+    ):
+        if whole >= size:
+            large, small = whole // size, whole % size // below
+            return (
+                f"{large}{THIN}{unit} {small}{THIN}{smaller}" if small else f"{large}{THIN}{unit}"
+            )
+    return f"{whole}{THIN}s"
+
+
+def share(part: float | None, whole: float | None = 1) -> str:
+    """Percent to two or three digits; without a whole there is no share."""
+    if part is None or not whole:
+        return DASH
+    percent = 100 * part / whole
+    decimals = 0 if percent >= 99.95 or percent == 0 else 1 if percent >= 9.995 else 2
+    return f"{percent:.{decimals}f}{THIN}%"
+
+
+def number(value: float | None, decimals: int = 2) -> str:
+    """A number with so many decimals, and a true minus sign."""
+    if value is None or not math.isfinite(value):
+        return DASH
+    return f"{value:.{decimals}f}".replace("-", "−")
+
+
+def arcsec(value: float | None) -> str:
+    """Arcseconds to three digits; degrees where they become many."""
+    if value is None or not math.isfinite(value):
+        return DASH
+    if abs(value) >= 3600:
+        return f"{number(value / 3600)}°"
+    decimals = 0 if abs(value) >= 99.95 else 1 if abs(value) >= 9.995 else 2
+    return f"{number(value, decimals)}″"
+
+
+def degrees(value: float | None, decimals: int = 3) -> str:
+    """Degrees."""
+    return DASH if value is None else f"{number(value, decimals)}°"
+
+
+def magnitude(value: float | None, decimals: int = 2) -> str:
+    """Magnitudes."""
+    return DASH if value is None else f"{number(value, decimals)}{THIN}mag"
+
+
+def count(value: int | None) -> str:
+    """A whole number in groups of three."""
+    return DASH if value is None else f"{value:,}".replace(",", THIN)
+
+
+def microseconds(value: float | None) -> str:
+    """Microseconds, or milliseconds where they become many."""
+    if value is None:
+        return DASH
+    if value >= 10_000:
+        return f"{value / 1000:.1f}{THIN}ms"
+    return f"{count(round(value))}{THIN}µs"
+
+
+def size(value: int) -> str:
+    """Bytes in kB and MB."""
+    for least, unit in ((1_000_000, "MB"), (1_000, "kB")):
+        if value >= least:
+            return f"{value / least:.1f}{THIN}{unit}"
+    return f"{value}{THIN}B"
+
+
+def sigmas(covariance_arcsec2: Sequence[Sequence[float]]) -> list[float]:
+    """One standard deviation about each body axis."""
+    return [math.sqrt(max(covariance_arcsec2[k][k], 0.0)) for k in range(3)]
+
+
+def plain(word: str | None) -> str:
+    """A word of the interface for reading: `no_attitude` without its underscore."""
+    return (word or "").replace("_", " ")
+
+
+def state(name: str | None) -> Markup:
+    """Shape and word of a state, with a class to colour it by."""
+    name = name or "no_attitude"
+    shape, word = STATES[name]
+    return Markup('<span class="state {}"><span aria-hidden="true">{}</span> {}</span>').format(
+        name, shape, word
+    )
+
+
+UNITS: Mapping[str, Callable[[float], str]] = {
+    "arcsec": arcsec,
+    "deg": degrees,
+    "mag": magnitude,
+    "s": age,
+}
+
+
+def quantity(value: float | None, name: str) -> str:
+    """A value of a quantity with its unit."""
+    if value is None:
+        return DASH
+    known = quantity_named(name)
+    return share(value) if known.is_share else UNITS.get(known.unit, number)(value)
+
+
+FILTERS: Mapping[str, Callable[..., Any]] = {
+    "utc": utc,
+    "age": age,
+    "share": share,
+    "num": number,
+    "arcsec": arcsec,
+    "deg": degrees,
+    "mag": magnitude,
+    "cnt": count,
+    "us": microseconds,
+    "size": size,
+    "sigmas": sigmas,
+    "plain": plain,
+    "state": state,
+    "quantity": quantity,
+    "called": lambda name: quantity_named(name).label,
+}

@@ -1,0 +1,180 @@
+"""Options from the fields of a form, and the fields to show.
+
+A form sends every field; only a changed value is an option.  Names are those of the
+mission file, in a query string dotted and prefixed: `b.tolerances.separation_deg`.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, get_args
+
+from pydantic import ValidationError
+
+from service.acquire.choices import Choices
+from service.errors import BadBatch, Fault, shown_value
+from service.missions.identifiers import IDENTIFIERS
+from service.missions.mission import Mission, Solver, Tests, Tolerances
+from service.observations.schema import OptionsIn
+
+SYMBOLS: Mapping[str, str] = {
+    "pair_separation_max_deg": "HMAX",
+    "separation_deg": "SEPTOL",
+    "magnitude_mag": "XMTOL",
+    "magnitude_order_mag": "TMAGMX",
+    "cross_product_deg": "CAPMAX, BANMAX",
+    "pole_difference_deg": "BANTOL1",
+    "pole_angle_deg": "BANTOL2",
+}
+"""The paper's symbols (Fink & Shoup 1994, Table 1)."""
+
+SWITCH = {"on": True, "off": False}
+
+
+@dataclass(frozen=True)
+class FormField:
+    """One setting in a form: its name in the query, its value now, and the value it had."""
+
+    name: str
+    label: str
+    symbol: str
+    unit: str
+    value: Any
+    before: Any
+    choices: tuple[str, ...] = ()
+    group: str = ""
+
+    @property
+    def changed(self) -> bool:
+        """Whether the value in the form differs from the setting."""
+        return bool(self.value != self.before)
+
+
+def asked_options(query: Mapping[str, str], prefix: str = "") -> dict[str, Any]:
+    """The options in a query string, nested as in the API; empty fields are left out.
+
+    Raises `BadBatch` for an unknown name and an impossible value.
+    """
+    nested: dict[str, Any] = {}
+    for name, text in query.items():
+        if not name.startswith(prefix) or not text.strip():
+            continue
+        group, _, leaf = name.removeprefix(prefix).rpartition(".")
+        place = nested.setdefault(group, {}) if group else nested
+        place[leaf] = _value(name, group, leaf, text.strip())
+    _checked(nested, prefix)
+    return nested
+
+
+def _value(name: str, group: str, leaf: str, text: str) -> Any:
+    if group == "tests":
+        if text not in SWITCH:
+            raise BadBatch(Fault(name[:80], "must be on or off", shown_value(text)))
+        return SWITCH[text]
+    if group == "tolerances" or leaf == "zone_grid_deg":
+        try:
+            return float(text)
+        except ValueError:
+            raise BadBatch(Fault(name[:80], "must be a number", shown_value(text))) from None
+    return text
+
+
+def _checked(nested: Mapping[str, Any], prefix: str) -> OptionsIn:
+    try:
+        return OptionsIn.model_validate(nested)
+    except ValidationError as error:
+        raise BadBatch(
+            Fault(
+                prefix + ".".join(str(part)[:80] for part in each["loc"]),
+                str(each["msg"]),
+                shown_value(each["input"]),
+            )
+            for each in error.errors()
+        ) from None
+
+
+def changed_options(asked: Mapping[str, Any], choices: Choices) -> OptionsIn:
+    """The requested options that differ from the settings in force."""
+    held = settings_of(choices)
+    changed: dict[str, Any] = {}
+    for name, value in asked.items():
+        if isinstance(value, dict):
+            differing = {leaf: each for leaf, each in value.items() if each != held[name][leaf]}
+            if differing:
+                changed[name] = differing
+        elif value != held[name]:
+            changed[name] = value
+    return OptionsIn.model_validate(changed)
+
+
+def settings_of(choices: Choices) -> dict[str, Any]:
+    """The settings in force for a batch, nested like options."""
+    return {
+        "identifier": choices.identifier,
+        "solver": choices.solver,
+        "tests": choices.tests.model_dump(),
+        "tolerances": choices.tolerances.model_dump(),
+        "zone_grid_deg": choices.zone_grid_deg,
+    }
+
+
+def settings_of_mission(mission: Mission) -> dict[str, Any]:
+    """The settings in force where neither batch nor form has others."""
+    return {
+        "identifier": mission.identifier,
+        "solver": mission.solver,
+        "tests": mission.tests.model_dump(),
+        "tolerances": mission.tolerances.model_dump(),
+        "zone_grid_deg": mission.zone.grid_deg,
+    }
+
+
+def fields_of(
+    asked: Mapping[str, Any], before: Mapping[str, Any] | None, prefix: str = ""
+) -> list[FormField]:
+    """The fields of a form; without settings `before`, they start empty."""
+    held = before or {}
+
+    def field(leaf: str, group: str = "", choices: Iterable[str] = ()) -> FormField:
+        at = held.get(group, {}) if group else held
+        wanted = asked.get(group, {}) if group else asked
+        was = at.get(leaf)
+        label, _, unit = leaf.rpartition("_")
+        if group != "tolerances" and leaf != "zone_grid_deg":
+            label, unit = leaf, ""
+        name = f"{prefix}{group}.{leaf}" if group else f"{prefix}{leaf}"
+        value = wanted.get(leaf, was)
+        words = label.replace("_", " ")
+        symbol = SYMBOLS.get(leaf, "") if group == "tolerances" else ""
+        return FormField(name, words, symbol, unit, value, was, tuple(choices), group or "method")
+
+    return [
+        field("identifier", choices=tuple(IDENTIFIERS)),
+        field("solver", choices=get_args(Solver)),
+        field("zone_grid_deg"),
+        *(field(leaf, "tests", SWITCH) for leaf in Tests.model_fields),
+        *(field(leaf, "tolerances") for leaf in Tolerances.model_fields),
+    ]
+
+
+def toml_of(fields: Iterable[FormField]) -> str:
+    """The changed settings as lines of a mission file, each with the value that it replaces."""
+    tables: dict[str, list[str]] = {"": [], "zone": [], "tests": [], "tolerances": []}
+    for each in fields:
+        if not each.changed:
+            continue
+        group, _, leaf = each.name.rpartition(".")
+        if leaf == "zone_grid_deg":
+            group, leaf = "zone", "grid_deg"
+        tables[group].append(f"{leaf} = {_toml(each.value)}  # was {_toml(each.before)}")
+    parts = [
+        "\n".join([*([f"[{name}]"] if name else []), *lines])
+        for name, lines in tables.items()
+        if lines
+    ]
+    return "\n\n".join(parts) + "\n" if parts else ""
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return f'"{value}"' if isinstance(value, str) else repr(value)

@@ -1,0 +1,127 @@
+"""What every page is given: the app and the reader, and the layout around its content."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from fastapi import Depends
+from pydantic import Field
+from starlette.requests import Request
+
+from service.access.tokens import Caller
+from service.app.factory import App
+from service.observations.schema import RunName
+from service.storage.queries.future_dated import LIVE
+from service.times import Utc
+from service.web.api.access import CallerDep
+from service.web.api.dependencies import AppDep
+from service.web.api.query_parameters import Query
+from service.web.console.formatting import present
+from service.web.console.registry import PAGES, ConsolePage, navigation
+
+__all__ = ["EMPTY_LAYOUT", "LIVE", "ContextDep", "Layout", "PageContext", "PageQuery"]
+
+
+class PageQuery(Query):
+    """The run that a page shows; every page takes it."""
+
+    run: Annotated[RunName, Field(description="The run; `live` for the batches of pipelines.")] = (
+        LIVE
+    )
+
+
+@dataclass(frozen=True)
+class RunChoice:
+    """A run to choose; `batches` is None where it holds none."""
+
+    name: str
+    batches: int | None
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What surrounds the content of a page: its title, run, reader and time."""
+
+    run: str
+    runs: tuple[RunChoice, ...]
+    title: str
+    section: str
+    now: Utc
+    last_event: int | None = None
+    """The number of the latest event when the page was begun; the page asks for later ones."""
+    stream: str | None = None
+    """The spacecraft whose events the page follows; None: all; "none": there is no such stream."""
+    reader: str | None = None
+    """The name of the signed-in token; None while access is open."""
+    may_operate: bool = False
+
+    @property
+    def is_live(self) -> bool:
+        """Whether live batches are shown and not those of a named run."""
+        return self.run == LIVE
+
+    @property
+    def navigation(self) -> list[ConsolePage]:
+        """The pages of the navigation, in its order."""
+        return navigation()
+
+    @property
+    def other_runs(self) -> tuple[RunChoice, ...]:
+        """The runs that hold batches, other than the one shown."""
+        return tuple(run for run in self.runs if run.batches and run.name != self.run)
+
+
+EMPTY_LAYOUT = Layout(LIVE, (RunChoice(LIVE, None),), "", "", present())
+"""Of pages without a reader: sign in, and errors."""
+
+
+@dataclass(frozen=True)
+class PageContext:
+    """What the handler of a page works with.
+
+    `last_event` is read before anything else: the page may hear of something
+    that it shows already, but never misses anything.
+    """
+
+    app: App
+    caller: Caller
+    page: ConsolePage
+    last_event: int
+
+    def layout(self, run: str) -> Layout:
+        """The layout of the page that shows a run."""
+        batches = {
+            each.run: each.batches
+            for each in self.app.runs.all()
+            if any(self.caller.may_see(name) for name in each.spacecraft)
+        }
+        names = sorted({LIVE, run, *batches}, key=lambda name: (name != LIVE, name))
+        return Layout(
+            run=run,
+            runs=tuple(RunChoice(name, batches.get(name)) for name in names),
+            title=self.page.title,
+            section=self.page.section,
+            now=present(),
+            last_event=self.last_event,
+            stream=self._stream(),
+            reader=self.caller.name if self.caller.token_id else None,
+            may_operate="operate" in self.caller.scopes,
+        )
+
+    def _stream(self) -> str | None:
+        bound = self.caller.spacecraft
+        if bound is None:
+            return None
+        return next(iter(bound)) if len(bound) == 1 else "none"
+
+    @property
+    def spacecraft(self) -> list[str]:
+        """The spacecraft that the reader may see."""
+        return [name for name in sorted(self.app.missions) if self.caller.may_see(name)]
+
+
+def _page_context(request: Request, app: AppDep, caller: CallerDep) -> PageContext:
+    page = PAGES[request.scope["route"].name]
+    return PageContext(app, caller, page, app.events.last())
+
+
+ContextDep = Annotated[PageContext, Depends(_page_context)]

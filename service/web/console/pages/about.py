@@ -1,0 +1,19 @@
+"""The page about the service: versions, catalog, missions, credits."""
+
+from typing import Annotated
+
+from fastapi import Query as InQuery
+from starlette.responses import Response
+
+from service.web.api.access import Policy
+from service.web.console.page_context import ContextDep, PageQuery
+from service.web.console.registry import console_page
+from service.web.console.rendering import rendered
+
+
+@console_page("/about", "About", Policy("read", "nothing"), position=80)
+def about_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
+    """Version, catalog, missions, database and credits."""
+    about = context.app.service.about()
+    about["missions"] = [each for each in about["missions"] if context.caller.may_see(each["name"])]
+    return rendered("about.html.jinja", context.layout(query.run), about=about)

@@ -1,0 +1,141 @@
+"""The page of one batch: its star field, the votes, and a what-if with other settings."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+from urllib.parse import quote, urlencode
+
+from fastapi import Path
+from fastapi import Query as InQuery
+from msgspec import structs
+from starlette.requests import Request
+from starlette.responses import RedirectResponse, Response
+
+from service.errors import BadBatch, Fault, shown_value
+from service.storage.models.answers import Answer
+from service.storage.models.answers import Star as FoundStar
+from service.storage.queries.results import answer_from_json
+from service.vectors import matrix_from_quaternion, to_ra_dec
+from service.web.api.access import Policy
+from service.web.console.charts.sky_chart import sky_chart
+from service.web.console.options import (
+    asked_options,
+    changed_options,
+    fields_of,
+    settings_of,
+    toml_of,
+)
+from service.web.console.page_context import ContextDep, PageQuery
+from service.web.console.registry import console_page
+from service.web.console.rendering import rendered
+
+VIEWS = ("all", "field")
+"""What the chart shows: all candidates of the answer, or the field of view alone."""
+
+ResultId = Annotated[str, Path()]
+
+
+@dataclass(frozen=True)
+class StarRow:
+    """One row of the vote table: the observed star, its identification, and the one before."""
+
+    tracker: str
+    number: int
+    seen: Mapping[str, Any]
+    found: FoundStar
+    before: FoundStar | None
+    catalog_magnitude: float | None
+
+    @property
+    def changed(self) -> bool:
+        """Whether a what-if identifies it differently."""
+        return self.before is not None and (
+            (self.found.outcome, self.found.star) != (self.before.outcome, self.before.star)
+        )
+
+
+@console_page("/batches/{id}", "Batch", Policy("read", "result"), section="/batches")
+def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
+    """One result: star field, votes, attitude, provenance; with options in the query, a what-if."""
+    query = dict(request.query_params)
+    view = query.pop("view", "all")
+    if view not in VIEWS:
+        raise BadBatch(Fault("view", f"must be {' or '.join(VIEWS)}", shown_value(view)))
+    query.pop("run", None)
+    record = context.app.results.get(id)
+    answer = record.answer
+    asked = asked_options(query)
+    held = context.app.results.settings_for(id)
+    options = changed_options(asked, held)
+    tried = None
+    if options.model_fields_set:
+        tried = answer_from_json(context.app.results.what_if(id, options).body)
+    shown = tried or answer
+    field = context.app.results.star_field(id, tried)
+    fields = fields_of(asked, settings_of(held))
+    layout = context.layout(answer.run)
+    return rendered(
+        "batch.html.jinja",
+        layout,
+        record=record,
+        answer=answer,
+        tried=tried,
+        shown=shown,
+        stars=_stars(shown, answer if tried else None, field),
+        charts=[sky_chart(each, field["through"], view) for each in field["trackers"]],
+        view=view,
+        here=lambda **more: f"/batches/{id}?{urlencode(query | more)}",
+        field=field,
+        fields=fields,
+        options=options.model_dump(exclude_none=True, exclude_unset=True),
+        toml=toml_of(fields),
+        pointing=_pointing(shown),
+        timings_us=structs.asdict(shown.timings_us),
+        around=context.app.results.neighbours(id),
+        other_settings=context.app.missions[answer.spacecraft].digest != answer.provenance.mission,
+    )
+
+
+@console_page("/latest/{name}", "Latest batch", Policy("read", "path"), section="/batches")
+def latest_batch(
+    name: str, query: Annotated[PageQuery, InQuery()], context: ContextDep
+) -> Response:
+    """Redirect to the latest batch of a spacecraft in a run."""
+    items = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
+    address = f"/batches/{items[0].id}" if items else f"/spacecraft/{quote(name)}"
+    return RedirectResponse(f"{address}?{urlencode({'run': query.run})}", 303)
+
+
+def _stars(shown: Answer, before: Answer | None, field: Mapping[str, Any]) -> list[StarRow]:
+    stars = []
+    for index, tracker in enumerate(shown.observations):
+        drawn = field["trackers"][index]
+        magnitudes = {each["id"]: each["magnitude"] for each in drawn["catalog"]}
+        for k, found in enumerate(tracker.stars):
+            stars.append(
+                StarRow(
+                    tracker.tracker,
+                    k + 1,
+                    drawn["observed"][k],
+                    found,
+                    None if before is None else before.observations[index].stars[k],
+                    magnitudes.get(found.star.id) if found.star else None,
+                )
+            )
+    return stars
+
+
+def _pointing(shown: Answer) -> list[dict[str, Any]]:
+    """The directions of the body axes by each method, which a quaternion does not show."""
+    solved = shown.attitude
+    if solved is None:
+        return []
+    rows = []
+    for method in ("quest", "triad"):
+        attitude = matrix_from_quaternion(getattr(solved, method))
+        axes = {}
+        for name, axis in zip("XYZ", attitude, strict=True):
+            ra_deg, dec_deg = to_ra_dec(axis)
+            axes[name] = (float(ra_deg), float(dec_deg))
+        rows.append({"method": method, "quaternion": getattr(solved, method), "axes": axes})
+    return rows

@@ -1,0 +1,97 @@
+"""The page of missions: their settings and the history of these."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from fastapi import Query as InQuery
+from starlette.responses import Response
+
+from service.storage.models.spacecraft import MissionThen
+from service.web.api.access import Policy
+from service.web.console.options import SYMBOLS
+from service.web.console.page_context import ContextDep, PageQuery
+from service.web.console.registry import console_page
+from service.web.console.rendering import rendered
+
+
+@dataclass(frozen=True)
+class SettingDifference:
+    """One setting that changed; None where it did not exist."""
+
+    name: str
+    before: Any
+    after: Any
+
+
+@dataclass(frozen=True)
+class SettingsEntry:
+    """Settings that came into force, and how they differ from those before them."""
+
+    digest: str
+    since: str
+    changes: tuple[SettingDifference, ...]
+    is_first: bool
+
+
+@console_page("/missions", "Missions", Policy("read", "nothing"), position=70)
+def missions_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
+    """Every mission's settings, section by section, with their history."""
+    missions = []
+    for name in context.spacecraft:
+        state = context.app.spacecraft.state(name)
+        settings = state.mission.settings
+        missions.append(
+            {
+                "name": name,
+                "description": state.description,
+                "digest": state.mission.digest,
+                "sections": list(_sections(settings)),
+                "history": list(reversed(_entries(state.history))),
+            }
+        )
+    return rendered(
+        "missions.html.jinja",
+        context.layout(query.run),
+        missions=missions,
+        symbols=SYMBOLS,
+    )
+
+
+def _sections(settings: Mapping[str, Any]) -> Iterator[tuple[str, list[tuple[str, Any]]]]:
+    """Titles with their settings, flat: a tracker is a section of its own."""
+    plain = [(k, v) for k, v in settings.items() if not isinstance(v, dict | list)]
+    yield "general", [each for each in plain if each[0] not in ("name", "description")]
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            yield name, list(_flat(value))
+        elif isinstance(value, list):
+            for tracker in value:
+                rest = {key: each for key, each in tracker.items() if key != "name"}
+                yield f"tracker {tracker['name']}", list(_flat(rest))
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            for each in value:
+                yield from _flat(each, f"{prefix}{name}.{each.get('name', '')}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _entries(history: Sequence[MissionThen]) -> list[SettingsEntry]:
+    entries: list[SettingsEntry] = []
+    before: dict[str, Any] = {}
+    for each in history:
+        after = dict(_flat(each.settings))
+        changes = tuple(
+            SettingDifference(name, before.get(name), after.get(name))
+            for name in sorted({*before, *after})
+            if before.get(name) != after.get(name)
+        )
+        entries.append(SettingsEntry(each.digest, each.since, changes, is_first=not entries))
+        before = after
+    return entries

@@ -1,0 +1,32 @@
+"""The pages of runs and replays."""
+
+from typing import Annotated
+
+from fastapi import Query as InQuery
+from starlette.responses import Response
+
+from service.web.api.access import READ
+from service.web.console.page_context import ContextDep, PageQuery
+from service.web.console.registry import console_page
+from service.web.console.rendering import rendered
+
+
+@console_page("/runs", "Runs", READ, position=50)
+def runs_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
+    """Every run, and the replays with their progress."""
+    return rendered(
+        "runs.html.jinja",
+        context.layout(query.run),
+        runs=context.app.runs.all(),
+        replays=context.app.replays.all(),
+    )
+
+
+@console_page("/replays/{id}", "Replay", READ, section="/runs")
+def replay_page(id: str, query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
+    """One replay: how far it is, and every line that was refused."""
+    return rendered(
+        "replay.html.jinja",
+        context.layout(query.run),
+        replay=context.app.replays.get(id),
+    )

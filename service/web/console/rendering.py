@@ -1,0 +1,108 @@
+"""Turning a page into HTML: one environment, one set of headers, errors as pages of their own."""
+
+import dataclasses
+from collections.abc import Callable, Coroutine, Mapping
+from typing import Any
+from urllib.parse import quote, urlencode
+
+import msgspec
+from fastapi.exceptions import RequestValidationError
+from fastapi.routing import APIRoute
+from jinja2 import Environment, PackageLoader, StrictUndefined, pass_context
+from jinja2.runtime import Context
+from markupsafe import Markup
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, Response
+
+from service import __version__
+from service.errors import AcquisitionError, BadInput, Busy, problem_of, problem_of_faults
+from service.web.api.problems import (
+    INTERNAL_ERROR,
+    PROBLEM_TYPES,
+    ProblemType,
+    faults_in_query,
+    problem_type_of,
+)
+from service.web.console.formatting import FILTERS, present
+from service.web.console.page_context import EMPTY_LAYOUT, LIVE, Layout
+
+HEADERS: Mapping[str, str] = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+        "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+    ),
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+
+
+@pass_context
+def _to(context: Context, path: str, /, **query: object) -> str:
+    """An address of the console that keeps the shown run."""
+    run = query.pop("run", context["layout"].run)
+    asked = {} if run == LIVE else {"run": run}
+    asked |= {name: value for name, value in query.items() if value is not None}
+    return f"{quote(path)}?{urlencode(asked)}" if asked else quote(path)
+
+
+def _data(value: object) -> Markup:
+    """Values for a script, in a `template` element: escaped like any text."""
+    return Markup("<template data-json>{}</template>").format(msgspec.json.encode(value).decode())
+
+
+def _environment() -> Environment:
+    # Text from clients is escaped; a misspelt name is an error, not an empty string.
+    environment = Environment(
+        loader=PackageLoader("service.web.console"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(FILTERS)
+    environment.globals.update(to=_to, data=_data, version=__version__)
+    return environment
+
+
+_ENVIRONMENT = _environment()
+
+
+def rendered(template: str, layout: Layout, status: int = 200, **values: Any) -> Response:
+    """A page of the console."""
+    text = _ENVIRONMENT.get_template(template).render(layout=layout, **values)
+    return HTMLResponse(text, status, headers=dict(HEADERS))
+
+
+class PageRoute(APIRoute):
+    """A route whose errors are pages for people."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        """The handler, with every expected error turned into a page."""
+        inner = super().get_route_handler()
+
+        async def handler(request: Request) -> Response:
+            try:
+                return await inner(request)
+            except RequestValidationError as error:
+                return _error_page(
+                    PROBLEM_TYPES[BadInput], problem_of_faults(faults_in_query(error))
+                )
+            except AcquisitionError as error:
+                if (kind := problem_type_of(error)) is INTERNAL_ERROR:
+                    raise
+                answer = _error_page(kind, problem_of(error))
+                if isinstance(error, Busy):
+                    answer.headers["Retry-After"] = str(error.retry_after_s)
+                return answer
+
+        return handler
+
+
+def _error_page(kind: ProblemType, problem: Mapping[str, Any]) -> Response:
+    return rendered(
+        "error.html.jinja",
+        dataclasses.replace(EMPTY_LAYOUT, now=present()),
+        kind.status,
+        kind=kind,
+        problem=problem,
+    )

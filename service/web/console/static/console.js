@@ -1,0 +1,57 @@
+// What every page has: the theme, the choice of a run, copying, and the live connection.
+import { keepFresh } from "./live_updates.js";
+import { attempt, send } from "./actions.js";
+
+const theme = document.getElementById("theme");
+const system = matchMedia("(prefers-color-scheme: dark)");
+
+function isDark() {
+  const chosen = document.documentElement.dataset.theme;
+  return chosen ? chosen === "dark" : system.matches;
+}
+
+function nameTheme() {
+  theme.textContent = isDark() ? "Light" : "Dark";
+  theme.setAttribute("aria-label", `Switch to the ${isDark() ? "light" : "dark"} theme`);
+}
+
+theme.hidden = false;
+theme.addEventListener("click", () => {
+  document.documentElement.dataset.theme = isDark() ? "light" : "dark";
+  localStorage.setItem("theme", document.documentElement.dataset.theme);
+  nameTheme();
+  document.dispatchEvent(new Event("theme"));
+});
+system.addEventListener("change", () => {
+  nameTheme();
+  document.dispatchEvent(new Event("theme"));
+});
+nameTheme();
+
+const runs = document.querySelector("[data-run-form]");
+runs.querySelector("button:not([type])").hidden = true;
+// The menu itself is put anew where there are other runs.
+runs.addEventListener("change", () => runs.requestSubmit());
+
+document.addEventListener("click", async (event) => {
+  const button = event.target.closest("[data-copy]");
+  if (!button) return;
+  const source = document.getElementById(button.dataset.copy);
+  try {
+    await navigator.clipboard.writeText(source.textContent);
+    button.textContent = "Copied";
+  } catch {
+    // Without leave to write there: mark the text, so that the keyboard can copy it.
+    getSelection().selectAllChildren(source);
+    button.textContent = "Marked: press Ctrl-C";
+  }
+});
+
+document.getElementById("sign-out")?.addEventListener("click", (event) => {
+  attempt(event.target, document.getElementById("connection"), async () => {
+    await send("DELETE", "/api/v1/session");
+    location.href = "/sign-in";
+  });
+});
+
+keepFresh();

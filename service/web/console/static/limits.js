@@ -1,0 +1,62 @@
+// Changing limits: one quantity at a time, with who did it and why.
+import { refreshSoon } from "./live_updates.js";
+import { attempt, rememberWho, send } from "./actions.js";
+
+const message = document.getElementById("message");
+const signed = document.getElementById("signed");
+
+rememberWho(signed.elements.who);
+signed.addEventListener("submit", (event) => event.preventDefault());
+
+// An empty field is no bound.
+function numberIn(field) {
+  const text = field.value.trim();
+  if (text === "") return null;
+  const value = Number(text);
+  if (Number.isNaN(value)) throw new Error(`${field.name} must be a number, not ${text}`);
+  return value;
+}
+
+function settingsIn(form) {
+  const { elements } = form;
+  const settings = { enabled: elements.enabled.checked };
+  for (const severity of ["watch", "warning", "critical"]) {
+    settings[severity] = { low: numberIn(elements[`${severity}.low`]), high: numberIn(elements[`${severity}.high`]) };
+  }
+  for (const name of ["hysteresis", "minimum_count", "duration_s"]) settings[name] = numberIn(elements[name]);
+  return settings;
+}
+
+function addressOf(form) {
+  return `/api/v1/spacecraft/${encodeURIComponent(form.dataset.spacecraft)}/limits/${form.dataset.limit}`;
+}
+
+function change(button, form, work) {
+  if (!signed.reportValidity()) return;
+  attempt(button, message, async () => {
+    const changed = await work({ who: signed.elements.who.value.trim(), comment: signed.elements.comment.value.trim() });
+    document.activeElement?.blur();
+    refreshSoon();
+    return changed;
+  });
+}
+
+document.addEventListener("submit", (event) => {
+  const form = event.target.closest("[data-limit]");
+  if (!form) return;
+  event.preventDefault();
+  change(event.submitter, form, async (who) => {
+    await send("PUT", addressOf(form), JSON.stringify({ settings: settingsIn(form), ...who }));
+    return `Changed: ${form.dataset.limit}.`;
+  });
+});
+
+document.addEventListener("click", (event) => {
+  const button = event.target.closest("[data-default]");
+  if (!button) return;
+  const form = button.closest("form");
+  change(button, form, async (who) => {
+    await send("DELETE", `${addressOf(form)}?${new URLSearchParams(who)}`);
+    return `Shipped limit restored: ${form.dataset.limit}.`;
+  });
+});

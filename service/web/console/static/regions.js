@@ -1,0 +1,63 @@
+// Replaces parts of a page by newer ones without disturbing the reader.
+import { request, unexpected } from "./requests.js";
+
+// The page at an address, as the server draws it now; an error page is an error here too.
+export async function fetchPage(address) {
+  const { answer, text } = await request(address, { headers: { Accept: "text/html" } });
+  // The session has ended: sign in again and return here.
+  if (new URL(answer.url).pathname === "/sign-in") location.href = answer.url;
+  const fresh = new DOMParser().parseFromString(text, "text/html");
+  if (!answer.ok) {
+    const problem = fresh.getElementById("problem");
+    throw new Error(problem ? problem.querySelector("p").textContent : unexpected(answer));
+  }
+  return fresh;
+}
+
+let asked = 0;
+
+// The same, or null where another page was asked for since: what comes late is not shown.
+export async function fetchLatest(address) {
+  const mine = ++asked;
+  try {
+    const fresh = await fetchPage(address);
+    return mine === asked ? fresh : null;
+  } catch (error) {
+    if (mine === asked) throw error;
+    return null;
+  }
+}
+
+// Somebody types in here, or has text marked: it is not pulled away.
+function isBusy(region) {
+  const active = document.activeElement;
+  const marked = document.getSelection();
+  const typing = region.contains(active) && active.matches("input, textarea, select");
+  return typing || (marked && !marked.isCollapsed && region.contains(marked.anchorNode));
+}
+
+// Replaces every region of the page that has changed; focus and open details stay where they were.
+export function swapRegions(fresh, selector = "[data-region]") {
+  for (const region of document.querySelectorAll(selector)) {
+    const next = fresh.getElementById(region.id);
+    if (!next || isBusy(region)) continue;
+    for (const open of region.querySelectorAll("details[open][id]")) {
+      const same = next.querySelector(`#${CSS.escape(open.id)}`);
+      if (same) same.open = true;
+    }
+    if (next.isEqualNode(region)) continue;
+    const focused = region.contains(document.activeElement) && placeOf(document.activeElement, region);
+    region.replaceWith(document.adoptNode(next));
+    if (focused) focused(next)?.focus({ preventScroll: true });
+  }
+}
+
+// How to find the like of an element in a fresh region: by its id, its address, or its label.
+function placeOf(element, region) {
+  if (element.id) return (next) => next.querySelector(`#${CSS.escape(element.id)}`);
+  const kind = element.tagName.toLowerCase();
+  const name = element.getAttribute("href") ?? element.getAttribute("aria-label");
+  const attribute = element.hasAttribute("href") ? "href" : "aria-label";
+  if (name === null) return null;
+  return (next) => next.querySelector(`${kind}[${attribute}="${CSS.escape(name)}"]`);
+}

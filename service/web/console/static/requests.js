@@ -1,0 +1,35 @@
+// Requests to the service; an error says what happened and what to do.
+
+const NO_ANSWER = "the service does not answer; check that it is running and reachable, then try again";
+
+// The answer and its text; throws where there is none, or where it ends in the middle.
+export async function request(address, options) {
+  try {
+    const answer = await fetch(address, options);
+    return { answer, text: await answer.text() };
+  } catch {
+    throw new Error(NO_ANSWER);
+  }
+}
+
+// The answer's JSON; throws with the service's own words where it refused.
+export async function requestJson(address, options) {
+  const { answer, text } = await request(address, options);
+  const content = parsed(text);
+  if (!answer.ok) throw new Error(content?.detail ?? unexpected(answer));
+  if (content === null && text !== "") throw new Error(unexpected(answer));
+  return content;
+}
+
+// A proxy in between may answer in its own way.
+export function unexpected(answer) {
+  return `unexpected answer ${answer.status} of the service; try again in a minute`;
+}
+
+function parsed(text) {
+  try {
+    return JSON.parse(text);
+  } catch {
+    return null;
+  }
+}

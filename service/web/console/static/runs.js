@@ -1,0 +1,29 @@
+// Starting a replay, and having a run watched for alarms.
+import { refreshSoon } from "./live_updates.js";
+import { attempt, send } from "./actions.js";
+
+const message = document.getElementById("message");
+
+document.getElementById("replay").addEventListener("submit", (event) => {
+  event.preventDefault();
+  const { file, run, alarms } = event.target.elements;
+  attempt(event.submitter, message, async () => {
+    const query = new URLSearchParams({ run: run.value.trim() });
+    if (alarms.checked) query.set("alarms", "true");
+    const headers = { "Content-Type": "application/x-ndjson" };
+    const replay = await send("POST", `/api/v1/replays?${query}`, file.files[0], headers);
+    refreshSoon();
+    return `Replaying ${file.files[0].name}: ${replay.lines.total} lines into run ${replay.run}.`;
+  });
+});
+
+document.addEventListener("click", (event) => {
+  const button = event.target.closest("[data-watch]");
+  if (!button) return;
+  attempt(button, message, async () => {
+    const alarms = button.dataset.alarms === "true";
+    await send("PUT", `/api/v1/runs/${encodeURIComponent(button.dataset.watch)}`, JSON.stringify({ alarms }));
+    refreshSoon();
+    return `Alarms of run ${button.dataset.watch} are ${alarms ? "on" : "off"}.`;
+  });
+});

@@ -1,0 +1,100 @@
+// The trends of one spacecraft: charts of a stretch of time that the address names.
+import { requestJson } from "./requests.js";
+import { fetchLatest, swapRegions } from "./regions.js";
+import { Trend } from "./trend.js";
+
+const stretch = () => document.getElementById("stretch");
+const status = document.getElementById("charts-status");
+
+const LINES = [{ tone: "--accent" }, { tone: "--soft", dash: [5, 4] }];
+
+let trends = [];
+let asked = 0;
+let shown = null;
+
+const posix = (text) => Date.parse(text.replace(":60", ":59").replace(/(\.\d{3})\d*/, "$1")) / 1000;
+const asText = (seconds) => new Date(seconds * 1000).toISOString();
+
+function make() {
+  const { limits, charts } = JSON.parse(document.querySelector("[data-json]").content.textContent);
+  trends = charts.map(({ id, quantities, ...chart }) => {
+    const holder = document.querySelector(`[data-chart="${id}"]`);
+    const readout = document.querySelector(`[data-readout="${id}"]`);
+    const lines = quantities.map((each, index) => ({ ...each, ...LINES[index % LINES.length] }));
+    return new Trend(holder, readout, { ...chart, quantities: lines }, limits, "trends", zoom);
+  });
+}
+
+async function draw() {
+  const mine = ++asked;
+  const { history, start, end } = stretch().dataset;
+  delete document.getElementById("charts").dataset.drawn;
+  try {
+    const found = await requestJson(history);
+    if (mine !== asked) return;
+    shown = found;
+    for (const trend of trends) trend.show(shown, posix(start), posix(end));
+    status.textContent = "";
+    document.getElementById("charts").dataset.drawn = String(found.unix_s.length);
+  } catch (error) {
+    if (mine !== asked) return;
+    status.className = "problem";
+    status.textContent = `The trends could not be read: ${error.message}. The page shows the previous ones.`;
+  }
+}
+
+async function go(address, push = true) {
+  if (push) history.pushState(null, "", address);
+  try {
+    const fresh = await fetchLatest(address);
+    if (fresh === null) return;
+    swapRegions(fresh);
+  } catch (error) {
+    status.className = "problem";
+    status.textContent = `Not shown: ${error.message}`;
+    return;
+  }
+  await draw();
+}
+
+function zoom(bounds) {
+  if (bounds === null) {
+    go(document.querySelector('[data-key="-"]').href);
+    return;
+  }
+  const address = new URL(location.href);
+  address.searchParams.delete("range");
+  address.searchParams.set("start", asText(bounds[0]));
+  address.searchParams.set("end", asText(bounds[1]));
+  go(address.href);
+}
+
+if (stretch()) {
+  make();
+  draw();
+  document.addEventListener("click", (event) => {
+    const link = event.target.closest("[data-go]");
+    if (!link || event.ctrlKey || event.metaKey) return;
+    event.preventDefault();
+    go(link.href);
+  });
+  document.addEventListener("keydown", (event) => {
+    if (!event.target.matches?.("[data-chart]")) return;
+    const link = document.querySelector(`[data-key="${CSS.escape(event.key)}"]`);
+    if (!link) return;
+    event.preventDefault();
+    go(link.href);
+  });
+  document.addEventListener("change", (event) => {
+    const form = event.target.closest("[data-worst]");
+    if (!form) return;
+    event.target.blur();
+    go(`${form.getAttribute("action")}?${new URLSearchParams(new FormData(form))}`);
+  });
+  addEventListener("popstate", () => go(location.href, false));
+  document.addEventListener("drawn", draw);
+  document.addEventListener("theme", () => shown && draw());
+} else {
+  // With the first batch there is a page of another kind to show.
+  document.addEventListener("drawn", () => document.querySelector("#state .empty") ?? location.reload());
+}

@@ -1,0 +1,238 @@
+"""Live events: what the records note, passed on to whoever listens, and nothing lost between.
+
+The same task looks every second for what no batch tells of: silence.
+
+One task reads new events, at once when this process wrote them and every second
+for what others wrote.  The latest are held in memory; each listener takes them
+at its own pace and, when it has fallen far behind, reads from the records.  So
+there is no queue that a slow listener could fill.
+"""
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+from anyio import CapacityLimiter
+from anyio.to_thread import run_sync
+
+from service.access.tokens import Caller
+from service.app.factory import App
+from service.errors import Busy, RateLimited, Unauthenticated
+from service.storage.recording.events import Event
+
+HELD = 2_000
+READ_AT_ONCE = 500
+POLL_S = 1.0
+GATHER_S = 0.05
+"""After a commit: under load many are read at once."""
+HEARTBEAT_S = 15.0
+LONGEST_S = 900.0
+"""Of one stream; who listens comes again by itself, and is asked anew who it is."""
+MAX_LISTENERS = 100
+MAX_OF_ONE_TOKEN = 10
+"""Streams at a time: some pages in some browsers, and no more that would keep out others."""
+ADMITTED_EVERY_S = 1.0
+"""How often the database is asked whether those who listen may still do so."""
+RETRY_MS = 2_000
+
+log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+
+@dataclass(eq=False)
+class Listener:
+    """Who follows a stream, and by what they were let in."""
+
+    caller: Caller
+    token: str | None = None
+    session: str | None = None
+    is_admitted: bool = True
+
+
+class Live:
+    """The events of the records, for any number of listeners up to a bound."""
+
+    def __init__(self, app: App) -> None:
+        self._app = app
+        self._held: deque[Event] = deque(maxlen=HELD)
+        self._last = 0
+        self._news = asyncio.Event()
+        self._poke = asyncio.Event()
+        self._tasks: list[asyncio.Task[None]] = []
+        self._listeners: set[Listener] = set()
+        self._stopping = False
+        self._swept_s = 0.0
+        self._threads = CapacityLimiter(4)
+        self._on_commit: Callable[[], object] = lambda: None
+
+    async def start(self) -> None:
+        """Begin to follow the records."""
+        loop = asyncio.get_running_loop()
+        self._last = await self._read(self._app.events.last)
+        self._on_commit = lambda: loop.call_soon_threadsafe(self._poke.set)
+        self._app.events.listen(self._on_commit)
+        self._tasks = [
+            asyncio.create_task(each) for each in (self._follow(), self._end_what_is_revoked())
+        ]
+
+    def stop(self) -> None:
+        """End every stream; new ones are refused."""
+        self._stopping = True
+        self._tell()
+
+    async def close(self) -> None:
+        """Stop following."""
+        self.stop()
+        if self._tasks:
+            self._app.events.unlisten(self._on_commit)
+            for task in self._tasks:
+                task.cancel()
+            await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    async def stream(
+        self, listener: "Listener", last: int | None, run: str | None, spacecraft: str | None
+    ) -> AsyncIterator[bytes]:
+        """Events after `last`, or from now on, as lines of an event stream.
+
+        It ends when the listener's token or session does; the caller says when the
+        listener has left.  Raises `RateLimited` where
+        the token has as many streams as it may, `Busy` where there are too many of all.
+        """
+        if self._stopping:
+            raise Busy("the service is stopping")
+        token_id = listener.caller.token_id
+        of_token = sum(each.caller.token_id == token_id for each in self._listeners)
+        if token_id is not None and of_token >= MAX_OF_ONE_TOKEN:
+            message = f"{listener.caller.name} has {of_token} event streams open; close one first"
+            raise RateLimited(message, 30)
+        if len(self._listeners) >= MAX_LISTENERS:
+            raise Busy(f"{len(self._listeners)} event streams are open already", 30)
+        self._listeners.add(listener)
+        return self._lines(listener, last, run, spacecraft)
+
+    def leave(self, listener: "Listener") -> None:
+        """Make room for another listener."""
+        self._listeners.discard(listener)
+
+    async def _lines(
+        self, listener: "Listener", last: int | None, run: str | None, spacecraft: str | None
+    ) -> AsyncIterator[bytes]:
+        clock = asyncio.get_running_loop().time
+        end_s = clock() + LONGEST_S
+        yield f"retry: {RETRY_MS}\n\n".encode()
+        if last is None:
+            last = await self._read(self._app.events.last)
+        yield _line(last, "hello", f'{{"last":{last}}}')
+        heard_s = clock()
+        while not self._stopping and listener.is_admitted and clock() < end_s:
+            news = self._news
+            found = await self._after(last)
+            if found is None:
+                last = await self._read(self._app.events.last)
+                yield _line(last, "reset", f'{{"last":{last}}}')
+                continue
+            if found:
+                last = found[-1].id
+                lines = b"".join(_told(e) for e in found if _concerns(e, run, spacecraft))
+                if lines:
+                    heard_s = clock()
+                    yield lines
+                continue
+            if clock() - heard_s >= HEARTBEAT_S:
+                # A number alone: the listener comes again from here, and hears of nothing.
+                heard_s = clock()
+                yield f": {HEARTBEAT_S:g} s without news\nid: {last}\n\n".encode()
+            wait_s = min(heard_s + HEARTBEAT_S, end_s) - clock()
+            try:
+                async with asyncio.timeout(max(wait_s, 0.0)):
+                    await news.wait()
+            except TimeoutError:
+                pass
+
+    async def _after(self, last: int) -> Sequence[Event] | None:
+        if last == self._last:
+            return []
+        if self._held and self._held[0].id <= last + 1 and last <= self._last:
+            return [event for event in self._held if event.id > last]
+        return await self._read(self._app.events.after, last, READ_AT_ONCE)
+
+    async def _follow(self) -> None:
+        while True:
+            try:
+                async with asyncio.timeout(POLL_S):
+                    await self._poke.wait()
+                await asyncio.sleep(GATHER_S)
+            except TimeoutError:
+                pass
+            self._poke.clear()
+            try:
+                await self._sweep()
+                await self._take()
+            except Exception as error:
+                # The records are out of reach for a while: nothing is lost, it comes later.
+                log.warning("events could not be read: %s", error)
+
+    async def _end_what_is_revoked(self) -> None:
+        """End the streams of tokens and sessions that were revoked or are past their time."""
+        while True:
+            await asyncio.sleep(ADMITTED_EVERY_S)
+            asked = {(each.token, each.session) for each in self._listeners}
+            for token, session in asked:
+                try:
+                    await run_sync(
+                        self._app.access.look_up_again, token, session, limiter=self._threads
+                    )
+                except Unauthenticated:
+                    for each in self._listeners:
+                        if (each.token, each.session) == (token, session):
+                            each.is_admitted = False
+                    self._tell()
+                except Exception as error:
+                    # Nothing is known of anybody while the records are out of reach.
+                    log.warning("listeners could not be looked up: %s", error)
+                    break
+
+    async def _sweep(self) -> None:
+        now_s = asyncio.get_running_loop().time()
+        if now_s >= self._swept_s + POLL_S:
+            self._swept_s = now_s
+            await self._read(self._app.alarms.evaluate_by_clock)
+
+    async def _take(self) -> None:
+        while found := await self._read(self._app.events.after, self._last, READ_AT_ONCE):
+            self._held.extend(found)
+            self._last = found[-1].id
+            self._tell()
+        if found is None:
+            self._held.clear()
+            self._last = await self._read(self._app.events.last)
+            self._tell()
+
+    def _tell(self) -> None:
+        self._news.set()
+        self._news = asyncio.Event()
+
+    async def _read(self, ask: Callable[..., T], *arguments: int) -> T:
+        return await run_sync(ask, *arguments, limiter=self._threads)
+
+
+def _concerns(event: Event, run: str | None, spacecraft: str | None) -> bool:
+    """What names no run concerns every run; of a replay only who asks for all spacecraft is told.
+
+    It names none, its lines may be about any, and its id lets one ask for their faults.
+    """
+    return (event.run is None or run is None or event.run == run) and (
+        spacecraft is None or event.spacecraft == spacecraft
+    )
+
+
+def _told(event: Event) -> bytes:
+    return _line(event.id, event.kind, event.data)
+
+
+def _line(id: int, kind: str, data: str) -> bytes:
+    return f"id: {id}\nevent: {kind}\ndata: {data}\n\n".encode()

@@ -1,0 +1,156 @@
+"""The API's reference as OpenAPI 3.1: the routes as they describe themselves, schemas, examples."""
+
+import json
+from collections.abc import Iterator, Sequence
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+from pydantic import BaseModel
+from pydantic.json_schema import GenerateJsonSchema, models_json_schema
+
+from service import __version__
+from service.observations.schema import BatchIn
+from service.storage.models.base import Record, component_name, described
+from service.web.api.access import POLICIES
+from service.web.api.alarms import CommentIn, LimitIn, ShelveIn, StatementIn
+from service.web.api.batches import WhatIfIn
+from service.web.api.compare import CompareIn
+from service.web.api.runs import RunIn
+from service.web.api.tokens import SignIn
+from service.web.api.zones import WarmIn
+from service.web.openapi.route import SCHEMAS, add_table_formats, auth_responses
+
+DESCRIPTION = """\
+Send the stars that a star tracker observed; the service identifies them, solves for
+the spacecraft's attitude, records both, and returns them.
+
+Quaternions have the scalar part last and transform inertial (EME2000) components into
+body components. Times are UTC, in calendar form or with the day of the year. Names end
+in their unit. Every error is a problem (RFC 9457, `application/problem+json`). Long
+lists come in pages; the `Link` header holds the address of the next page. The service
+refuses parameters and fields that are not described here.
+"""
+
+TAGS = {
+    "batches": "Batches of observed stars, and their results.",
+    "frames": "Frames of star trackers.",
+    "spacecraft": "Settings, state, attitude history and star rates.",
+    "zones": "The cached zones in which the service searches for stars.",
+    "runs and replays": "Named runs, which are separate from live batches, and the files "
+    "replayed into them.",
+    "access": "The caller, the session of a browser, and the audit list.",
+    "alarms": "Limits, alarms, and actions on alarms.",
+    "events": "Live events.",
+    "probes": "Probes and metrics for operation and monitoring.",
+}
+
+
+SECURITY = {
+    "token": {
+        "type": "http",
+        "scheme": "bearer",
+        "description": "A token from `acquire token create`; not needed while access is open.",
+    },
+    "session": {"type": "apiKey", "in": "cookie", "name": "acquire_session"},
+}
+
+
+class _Plain(GenerateJsonSchema):
+    """Schemas without titles made up from field names."""
+
+    def field_title_should_be_set(self, schema: Any) -> bool:
+        return False
+
+
+@cache
+def examples() -> dict[str, Any]:
+    """Requests and answers of a real run: by operation, then `request` or status."""
+    text = (files("service.web") / "examples.json").read_text(encoding="utf-8")
+    found: dict[str, Any] = json.loads(text)
+    return found
+
+
+def add_reference(app: FastAPI) -> None:
+    """Let the app describe itself as `openapi.yaml` does."""
+    app.openapi = cache(lambda: reference_of(app))  # type: ignore[method-assign]
+
+
+def reference_of(app: FastAPI) -> dict[str, Any]:
+    """The whole description of an app's routes."""
+    described = get_openapi(
+        title="Attitude acquisition",
+        version=__version__,
+        openapi_version="3.1.0",
+        description=DESCRIPTION,
+        license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"},
+        tags=[{"name": name, "description": text} for name, text in TAGS.items()],
+        routes=app.routes,
+    )
+    described["components"] = {"schemas": _schemas(), "securitySchemes": SECURITY}
+    for path in described["paths"].values():
+        for operation in path.values():
+            _finish(operation)
+    return described
+
+
+REQUESTS: Sequence[type[BaseModel]] = (
+    BatchIn,
+    WhatIfIn,
+    WarmIn,
+    RunIn,
+    CompareIn,
+    StatementIn,
+    ShelveIn,
+    CommentIn,
+    LimitIn,
+    SignIn,
+)
+
+
+def _schemas() -> dict[str, Any]:
+    answers = [described(each) for each in _records(Record)]
+    _, found = models_json_schema(
+        [(shape, "validation") for shape in (*REQUESTS, *answers)],
+        ref_template=SCHEMAS + "{model}",
+        schema_generator=_Plain,
+    )
+    names = {shape.__name__: component_name(shape) for shape in REQUESTS}
+    defined = {names.get(name, name): schema for name, schema in found["$defs"].items()}
+    return dict(sorted(defined.items()))
+
+
+def _records(kind: type[Record]) -> Iterator[type[Record]]:
+    for each in kind.__subclasses__():
+        yield each
+        yield from _records(each)
+
+
+def _finish(operation: dict[str, Any]) -> None:
+    operation["summary"] = operation.pop("description").rstrip(".")
+    policy = POLICIES[operation["operationId"]]
+    if not policy.open:
+        operation["security"] = [{"token": []}, {"session": []}, {}]
+        operation["x-scope"] = policy.scope
+        if policy.or_scope is not None:
+            operation["x-scope-or"] = policy.or_scope
+        operation["responses"] = dict(
+            sorted({**auth_responses(), **operation["responses"]}.items())
+        )
+    known = examples().get(operation["operationId"], {})
+    for parameter in operation.get("parameters", []):
+        for repeated in ("title", "description"):
+            parameter["schema"].pop(repeated, None)
+    request = operation.get("requestBody", {})
+    _put_examples(request, known.get("request"))
+    for status, response in operation["responses"].items():
+        add_table_formats(response)
+        _put_examples(response, known.get(status))
+
+
+def _put_examples(part: dict[str, Any], known: dict[str, Any] | None) -> None:
+    for kind, content in part.get("content", {}).items():
+        if known and kind.endswith("json"):
+            content["examples"] = {name: {"value": value} for name, value in known.items()}

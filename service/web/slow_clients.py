@@ -1,0 +1,379 @@
+"""One client's connection: HTTP/1.1 with a bound on everything that a client may send or hold.
+
+uvicorn's protocol on top of httptools does the work.  It has no bound for the head of a
+request, none for what a connection may keep in memory, and a single deadline, for the
+seconds between two requests.
+"""
+
+import asyncio
+import time
+from http import HTTPStatus
+from typing import Any, cast
+
+import uvicorn
+from uvicorn._types import ASGI3Application
+from uvicorn.protocols.http.flow_control import FlowControl
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
+from uvicorn.server import ServerState
+
+from service.web.connection_limits import Admission
+from service.web.raw_responses import MAX_FIELDS, MAX_HEAD_BYTES, RAW_RESPONSES
+
+MAX_PIPELINED = 128
+"""Requests that wait on one connection until the one before them is answered."""
+READ_BYTES = 16 << 10
+"""The most that is read at a time: a connection holds no more that the app has not asked for."""
+
+FIRST_BYTE_S = 5
+"""How long a client may be connected before it sends its first byte."""
+HEAD_S = 30
+"""How long a client may take from the end of a request to the end of the next head."""
+UNREAD_S = 60
+"""A connection whose client reads nothing of an answer for this long is closed."""
+LINGER_S = 1
+"""How long the answer to a refused head can still be read before the connection is closed."""
+
+DISCARDED_PER_S = 50e6
+"""Bytes of bodies that are answered already, over all connections.
+
+They are read to their end, because many clients look for an answer only then; read as fast
+as clients can send them, they would keep the processor from all other requests.
+"""
+DISCARDING_SHARE = 0.1
+"""The share of the event loop's time that such bodies may take: small chunks are expensive."""
+LEAST_PAUSE_S = 0.005
+
+
+class State(ServerState):
+    """What the connections of a server share."""
+
+    def __init__(self, admission: Admission) -> None:
+        super().__init__()
+        self.admission = admission
+        self.buffer = memoryview(bytearray(READ_BYTES))
+        self.discarding_until_s = 0.0
+
+
+class Connection(asyncio.BufferedProtocol):
+    """Reads a connection in small pieces.
+
+    uvloop would otherwise read up to 256 KiB at a time; with hundreds of connections that is
+    too much memory, and parsing it takes too long in one turn of the event loop.
+    """
+
+    def __init__(
+        self,
+        config: uvicorn.Config,
+        server_state: State,
+        app_state: dict[str, Any],
+        _loop: asyncio.AbstractEventLoop | None = None,
+        admission: Admission | None = None,
+    ) -> None:
+        """`admission` counts the connection in place of the server's own."""
+        self._buffer = server_state.buffer
+        self._http = _Http(config, server_state, app_state, _loop, admission)
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """A client has connected."""
+        self._http.connection_made(cast(asyncio.Transport, transport))
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The connection is closed."""
+        self._http.connection_lost(exc)
+
+    def pause_writing(self) -> None:
+        """More is to be sent than the client has read."""
+        self._http.pause_writing()
+
+    def resume_writing(self) -> None:
+        """The client has read most of it."""
+        self._http.resume_writing()
+
+    def eof_received(self) -> None:
+        """The client sends nothing more."""
+        self._http.eof_received()
+
+    def get_buffer(self, sizehint: int) -> memoryview:
+        """The buffer of all connections: what it holds is copied before the next read."""
+        return self._buffer
+
+    def buffer_updated(self, nbytes: int) -> None:
+        """Bytes have arrived."""
+        self._http.data_received(bytes(self._buffer[:nbytes]))
+
+
+class _Flow(FlowControl):
+    """Pauses reading while the app asks for it, or while the connection itself is on hold."""
+
+    def __init__(self, transport: asyncio.Transport) -> None:
+        super().__init__(transport)
+        self._on_hold = False
+        self._stopped = False
+
+    def pause_reading(self) -> None:
+        self.read_paused = True
+        self._apply()
+
+    def resume_reading(self) -> None:
+        self.read_paused = False
+        self._apply()
+
+    def hold(self, on_hold: bool) -> None:
+        self._on_hold = on_hold
+        self._apply()
+
+    def _apply(self) -> None:
+        stop = self.read_paused or self._on_hold
+        if stop == self._stopped or self._transport.is_closing():
+            return
+        self._stopped = stop
+        if stop:
+            self._transport.pause_reading()
+        else:
+            self._transport.resume_reading()
+
+
+class _Http(HttpToolsProtocol):
+    """uvicorn's protocol with bounds and deadlines."""
+
+    flow: _Flow
+    _unread_timer: asyncio.TimerHandle | None = None
+    _discard_timer: asyncio.TimerHandle | None = None
+    _close_timer: asyncio.TimerHandle | None = None
+    _head_timer: asyncio.TimerHandle | None = None
+    _held_since_s = 0.0
+    _no_head_since_s: float | None = None
+    _has_sent = False
+    _is_over = False
+    """Nothing that still arrives is looked at."""
+    _answering: RequestResponseCycle | None = None
+    _in_body = False
+    _section_bytes = _fields = 0
+    """Of the head or the trailers, as far as the parser has reported them."""
+    _head_bytes = 0
+    """As read, with up to `READ_BYTES` of what came before: the parser reports whole fields."""
+    _body_bytes = _framing_bytes = 0
+
+    def __init__(
+        self,
+        config: uvicorn.Config,
+        server_state: State,
+        app_state: dict[str, Any],
+        _loop: asyncio.AbstractEventLoop | None,
+        admission: Admission | None,
+    ) -> None:
+        super().__init__(config, server_state, app_state, _loop)
+        self._state = server_state
+        self._admission = admission or server_state.admission
+
+    # ---- the connection ------------------------------------------------------------------------
+
+    # uvicorn narrows what asyncio's protocol takes, and ignores that as well.
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self.flow = _Flow(transport)
+        if not self._admission.admit(self, self.client[0] if self.client else ""):
+            self._is_over = True
+            transport.write(RAW_RESPONSES[HTTPStatus.SERVICE_UNAVAILABLE])
+            transport.close()
+            return
+        self._no_head_since_s = self.loop.time()
+        self._head_timer = self.loop.call_later(FIRST_BYTE_S, self._check_head_deadline)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._is_over = True
+        self._admission.remove(self)
+        self._stop_unread_timer()
+        for each in (self._head_timer, self._discard_timer, self._close_timer):
+            if each is not None:
+                each.cancel()
+        super().connection_lost(exc)
+
+    def abort(self) -> None:
+        self._is_over = True
+        self._disconnect()
+        self.transport.abort()
+
+    def _disconnect(self) -> None:
+        """Tell the handlers at work that their client is gone: what they send is dropped."""
+        for cycle in (self._answering, self.cycle, *(each for each, _ in self.pipeline)):
+            if cycle is not None and not cycle.response_complete:
+                cycle.disconnected = True
+                cycle.message_event.set()
+
+    # ---- what arrives --------------------------------------------------------------------------
+
+    def data_received(self, data: bytes) -> None:
+        if self._is_over:
+            return
+        self._has_sent = True
+        discarded = self._is_answered_early()
+        begun_s = time.thread_time() if discarded else 0.0
+        super().data_received(data)
+        if not self.transport.is_closing():
+            self._count(data, discarded, begun_s)
+
+    def _count(self, data: bytes, discarded: bool, begun_s: float) -> None:
+        """Hold what was read against the bounds; `discarded` began at a processor time."""
+        if self._is_over:
+            return
+        if self._in_body:
+            self._framing_bytes += len(data)
+            # Chunks of a few bytes, an endless extension of a chunk, an endless trailer.
+            free_bytes = self._body_bytes // 64 if discarded else MAX_HEAD_BYTES + self._body_bytes
+            if self._framing_bytes > READ_BYTES + free_bytes:
+                self._refuse()
+            elif self._is_answered_early():
+                taken_s = time.thread_time() - begun_s if discarded else 0.0
+                self._hold(max(len(data) / DISCARDED_PER_S, taken_s / DISCARDING_SHARE))
+            elif self.cycle.body:
+                # The app has not asked for more: the rest waits in the system's own buffers.
+                self.flow.pause_reading()
+        else:
+            self._head_bytes += len(data)
+            if self._head_bytes > MAX_HEAD_BYTES + READ_BYTES:
+                self._refuse()
+
+    def _is_answered_early(self) -> bool:
+        return self._in_body and self.cycle.response_complete
+
+    def on_message_begin(self) -> None:
+        super().on_message_begin()
+        self._section_bytes = self._fields = self._head_bytes = 0
+
+    def on_url(self, url: bytes) -> None:
+        if self._has_room_for(len(url)):
+            super().on_url(url)
+
+    def on_header(self, name: bytes, value: bytes) -> None:
+        self._fields += 1
+        if self._has_room_for(len(name) + len(value) + 4) and not self._in_body:
+            # Trailer fields are dropped: no request needs them.
+            super().on_header(name, value)
+
+    def _has_room_for(self, length: int) -> bool:
+        self._section_bytes += length
+        if self._section_bytes > MAX_HEAD_BYTES or self._fields > MAX_FIELDS:
+            self._refuse()
+        return not self._is_over
+
+    def on_headers_complete(self) -> None:
+        if self._is_over:
+            return
+        super().on_headers_complete()
+        self._no_head_since_s = None
+        self._in_body = True
+        self._section_bytes = self._fields = self._body_bytes = self._framing_bytes = 0
+        self._admission.set_busy(self)
+        if len(self.pipeline) > MAX_PIPELINED:
+            self._refuse()
+
+    def on_body(self, body: bytes) -> None:
+        if self._is_over:
+            return
+        self._body_bytes += len(body)
+        self._framing_bytes -= len(body)
+        super().on_body(body)
+
+    def on_message_complete(self) -> None:
+        self._in_body = False
+        if not self._is_over:
+            super().on_message_complete()
+
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        # Of a pipelined request the head is there already.
+        if self.cycle.response_complete:
+            self._no_head_since_s = self.loop.time()
+            self._admission.set_idle(self)
+
+    def _start_asgi_task(self, cycle: RequestResponseCycle, app: ASGI3Application) -> None:
+        self._answering = cycle
+        super()._start_asgi_task(cycle, app)
+
+    def _unsupported_upgrade_warning(self) -> None:
+        """A request to upgrade is answered as one without: no client shall fill the log."""
+
+    def send_400_response(self, msg: str) -> None:
+        if not self._is_over:
+            super().send_400_response(msg)
+
+    # ---- what is refused -----------------------------------------------------------------------
+
+    def _refuse(self) -> None:
+        """Answer 431 where an answer can still be given, and close."""
+        if self._is_over:
+            return
+        self._is_over = True
+        cycle: RequestResponseCycle | None = self.cycle
+        is_answering = cycle is not None and not cycle.response_complete
+        is_answered = self._in_body and not is_answering
+        if not is_answered and (not is_answering or self._can_interrupt()):
+            self._disconnect()
+            self.transport.write(RAW_RESPONSES[HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE])
+        # Closed at once, with bytes unread, it would be reset, and the answer perhaps lost; and
+        # a client that connects again at once would cost as much as before.
+        self.flow.hold(True)
+        self._close_timer = self.loop.call_later(LINGER_S, self.abort)
+
+    def _can_interrupt(self) -> bool:
+        """Whether nothing was sent of the answer to the request whose body is being read."""
+        return self._in_body and not self.pipeline and not self.cycle.response_started
+
+    # ---- bodies that are answered already ------------------------------------------------------
+
+    def _hold(self, seconds: float) -> None:
+        """Read nothing until it is this connection's turn; its client is not silent meanwhile."""
+        now = self.loop.time()
+        turn_s = max(self._state.discarding_until_s, now) + seconds
+        self._state.discarding_until_s = turn_s
+        if self._discard_timer is None and turn_s - now > LEAST_PAUSE_S:
+            self._held_since_s = now
+            self.flow.hold(True)
+            self._discard_timer = self.loop.call_at(turn_s, self._read_on)
+
+    def _read_on(self) -> None:
+        self._discard_timer = None
+        if self._is_over:
+            return
+        if self._no_head_since_s is not None:
+            self._no_head_since_s += self.loop.time() - self._held_since_s
+        self.flow.hold(False)
+
+    # ---- deadlines -----------------------------------------------------------------------------
+
+    def _check_head_deadline(self) -> None:
+        # One timer a connection: a timer for every request would take measurable time.
+        longest_s = HEAD_S if self._has_sent else FIRST_BYTE_S
+        waited_s = 0.0
+        if self._no_head_since_s is not None:
+            waited_s = self.loop.time() - self._no_head_since_s
+        if waited_s >= longest_s:
+            self.abort()
+        else:
+            self._head_timer = self.loop.call_later(longest_s - waited_s, self._check_head_deadline)
+
+    def pause_writing(self) -> None:
+        """More is to be sent than the client has read."""
+        super().pause_writing()
+        self._start_unread_timer()
+
+    def resume_writing(self) -> None:
+        """The client has read most of it."""
+        self._stop_unread_timer()
+        super().resume_writing()
+
+    def _start_unread_timer(self) -> None:
+        left = self.transport.get_write_buffer_size()
+        self._unread_timer = self.loop.call_later(UNREAD_S, self._check_unread, left)
+
+    def _check_unread(self, left_before: int) -> None:
+        if self.transport.get_write_buffer_size() >= left_before:
+            self.abort()
+        else:
+            self._start_unread_timer()
+
+    def _stop_unread_timer(self) -> None:
+        if self._unread_timer is not None:
+            self._unread_timer.cancel()
+            self._unread_timer = None

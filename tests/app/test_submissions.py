@@ -1,0 +1,278 @@
+"""The app over a database: submissions, observers, readiness, zones."""
+
+import json
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from sqlalchemy import select
+
+from service.app.factory import open_app
+from service.errors import AcquisitionError, BadBatch, BadConfiguration, BadInput, Busy, Conflict
+from service.ingest import solver_pool, submit
+from service.observations.schema import OptionsIn, QuaternionIn, submission_from_json
+from service.settings import Settings
+from service.storage.sql.columns import metadata
+from service.times import parse_utc, utc_now
+from tests.storage.samples import KINDS, QUATERNION, without_accidents
+
+
+def told(outcome):
+    if isinstance(outcome, Exception):
+        return type(outcome), str(outcome)
+    return outcome.replayed, without_accidents(json.loads(outcome.body))
+
+
+def test_many_at_once_give_what_each_by_itself_gives(app, make):
+    """The bulk path is the single path repeated: answers, refusals and repeats alike."""
+    wrong = json.loads(make("b4").text)
+    wrong["observations"][0]["tracker"] = "NO_SUCH"
+    unknown = json.loads(make("b5").text) | {"spacecraft": "HST"}
+    one_run = [
+        make("b0"),
+        *(make(f"b{i}", kind=kind, after_s=60.0 * i) for i, kind in enumerate(KINDS, start=1)),
+        submission_from_json(json.dumps(wrong | {"batch": "w"})),
+        submission_from_json(json.dumps(unknown)),
+        make("b0"),
+        make("b0", stars=4),
+        make("b9", spacecraft="SWAS"),
+    ]
+    other_run = [submission_from_json(each.text, run="bulk") for each in one_run]
+    app.submissions.submit(one_run[-1])
+    app.submissions.submit(other_run[-1])
+
+    def single(submission):
+        try:
+            return app.submissions.submit(submission)
+        except Exception as error:
+            return error
+
+    singly = [told(single(each)) for each in one_run]
+    at_once = [told(each) for each in app.submissions.submit_many(other_run)]
+    assert [first for first, _ in singly] == [first for first, _ in at_once]
+    assert [first for first, _ in at_once] == [
+        *[False] * 5,
+        BadInput,
+        BadBatch,
+        True,
+        Conflict,
+        True,
+    ]
+    for (_, alone), (_, together) in zip(singly, at_once, strict=True):
+        if isinstance(alone, dict):
+            assert together == alone | {"run": "bulk"}
+        else:
+            assert together == alone.replace("run live", "run bulk")
+    live, bulk = (app.spacecraft.rates("XTE", run=run) for run in ("live", "bulk"))
+    assert live == bulk
+
+
+def everything(app):
+    """Every row of every table."""
+    with app.store.reading() as connection:
+        return {
+            table.name: sorted(map(str, connection.execute(select(table))))
+            for table in metadata.sorted_tables
+        }
+
+
+def test_batches_run_to_warm_up_are_not_kept(app, make, caplog):
+    app.submissions.submit(make("b1", kind="suspect"))
+    app.submissions.submit(make("s1", spacecraft="SWAS"))
+    before, observed = everything(app), []
+    app.submissions.observers.append(observed.append)
+    app.service.ready()
+    assert everything(app) == before
+    assert observed == []
+    assert "could not be run again" not in caplog.text
+    assert not app.submissions.submit(make("b2")).replayed
+
+
+def test_single_posts_go_before_bulk(app, make, monkeypatch):
+    """Between the batches of a bulk load whatever came one by one is computed and recorded."""
+    monkeypatch.setattr(submit, "YIELD_S", 10.0)
+    acquire, order, first_at_work = solver_pool.acquire, [], threading.Event()
+
+    def noting(batch, mission, sky):
+        order.append(batch.batch)
+        if batch.batch == "m0":
+            first_at_work.set()
+            time.sleep(0.5)
+        return acquire(batch, mission, sky)
+
+    monkeypatch.setattr(solver_pool, "acquire", noting)
+    bulk = [make(f"m{k}", run="bulk") for k in range(4)]
+    single = make("b1")
+    with ThreadPoolExecutor(1) as threads:
+        many = threads.submit(app.submissions.submit_many, bulk)
+        assert first_at_work.wait(30)
+        app.submissions.submit(single)
+        assert len(many.result(30)) == 4
+    assert order == ["m0", "b1", "m1", "m2", "m3"]
+
+
+def test_nothing_at_once_is_nothing(app):
+    assert app.submissions.submit_many([]) == []
+
+
+def test_observers_see_every_new_batch_once_and_neither_repeats_nor_what_ifs(app, make):
+    seen = []
+    app.submissions.observers.append(lambda recorded: seen.append(recorded.batch))
+    first = app.submissions.submit(make("b1"))
+    app.submissions.submit(make("b1"))
+    app.results.what_if(first.id, OptionsIn(), adopt=True)
+    app.submissions.submit_many([make("b1"), make("b2"), make("b2"), make("b3")])
+    assert seen == ["b1", "b2", "b3"]
+
+
+def test_an_observer_that_fails_takes_no_answer_away(app, make):
+    app.submissions.observers.append(lambda recorded: 1 / 0)
+    assert not app.submissions.submit(make()).replayed
+
+
+def test_a_warm_service_stays_warm(app, monkeypatch):
+    app.service.ready()
+    monkeypatch.setattr("service.app.service.prewarm_kernels", lambda *_: 1 / 0)
+    app.service.ready()
+
+
+def test_while_one_caller_warms_up_another_is_told_to_wait(app, monkeypatch):
+    begun, go_on = threading.Event(), threading.Event()
+    monkeypatch.setattr(
+        "service.app.service.prewarm_kernels", lambda *_: begun.set() or go_on.wait(30)
+    )
+    with ThreadPoolExecutor(1) as threads:
+        first = threads.submit(app.service.ready)
+        assert begun.wait(30)
+        with pytest.raises(Busy, match="warming up"):
+            app.service.ready()
+        go_on.set()
+        first.result(30)
+
+
+def test_what_is_asked_after_closing_is_busy(opened, make):
+    app = opened()
+    app.close()
+    with pytest.raises(Busy, match="stopping"):
+        app.submissions.submit(make())
+
+
+def test_what_was_recorded_is_there_when_opened_again(opened, make):
+    first = opened().submissions.submit(make())
+    again = opened().submissions.submit(make())
+    assert (again.replayed, again.body) == (True, first.body)
+
+
+def test_zones_show_what_is_cached_and_can_be_warmed_and_dropped(app, make):
+    time = parse_utc("1996-01-10T12:00:00.000Z")
+    app.zones.drop()
+    (warmed,) = app.zones.warm("XTE", [QuaternionIn(quaternion=QUATERNION)], time)
+    assert warmed["kind"] == "cap"
+    answer = json.loads(app.submissions.submit(make()).body)
+    assert answer["observations"][0]["zone"]["cached"]
+    shown = app.zones.state()
+    (zone,) = shown["items"]
+    assert (zone["spacecraft"], zone["stars"]) == ("XTE", warmed["stars"])
+    assert zone["bytes"] > 0
+    assert zone["hits"] == 1
+    assert zone["build_us"] > 0
+    assert shown["bytes"] <= shown["max_bytes"]
+    assert app.zones.drop("SWAS") == 0
+    assert app.zones.drop("XTE") == 1
+    assert app.zones.state()["items"] == []
+    for ask in (app.zones.drop, lambda name: app.zones.warm(name, [], time)):
+        with pytest.raises(BadBatch, match=r"spacecraft: there is no such .*'HST'"):
+            ask("HST")
+
+
+@pytest.mark.parametrize("name", ["none.csv", "none.npz"])
+def test_a_catalog_that_cannot_be_read_is_a_mistake_in_the_configuration(tmp_path, name):
+    database = f"sqlite:///{tmp_path / 'acquire.db'}"
+    with pytest.raises(BadConfiguration, match=name):
+        open_app(Settings(database=database, catalog=tmp_path / name))
+
+
+def test_no_moment_of_the_database_is_held_while_many_are_worked_on(app, make):
+    held = []
+    solver = app.submissions.ingest.solver
+    solver.acquire = lambda *asked, own=solver.acquire: (
+        held.append(app.store._readers.pool.checkedout()),
+        own(*asked),
+    )[1]
+    app.submissions.submit_many([make("b1"), make("b2")])
+    assert held == [0, 0]
+
+
+def test_many_at_once_share_the_time_of_their_recording(app, make):
+    """The sum over a chunk is what the chunk took, not that times its size."""
+    sent = [make(f"b{i}", after_s=60.0 * i) for i in range(40)]
+    start = time.perf_counter()
+    answers = app.submissions.submit_many(sent)
+    took_us = (time.perf_counter() - start) * 1e6
+    recording = [json.loads(each.body)["timings_us"]["record"] for each in answers]
+    assert all(each > 0 for each in recording)
+    assert sum(recording) < took_us
+
+
+def test_a_fault_of_ours_in_one_batch_keeps_no_other_from_being_recorded(
+    app, make, monkeypatch, caplog
+):
+    def acquire(batch, *rest):
+        if batch.batch == "b2":
+            raise ZeroDivisionError("inside")
+        return real(batch, *rest)
+
+    real = solver_pool.acquire
+    monkeypatch.setattr(solver_pool, "acquire", acquire)
+    first, second, third = app.submissions.submit_many([make("b1"), make("b2"), make("b3")])
+    assert not first.replayed
+    assert not third.replayed
+    assert isinstance(second, AcquisitionError)
+    assert "inside" not in str(second)
+    assert "batch b2 failed" in caplog.text
+
+
+def test_a_batch_was_received_before_it_was_worked_on_however_long_that_took(
+    app, make, monkeypatch
+):
+    solver = app.submissions.ingest.solver
+    acquire = solver.acquire
+    begun = []
+
+    def slow(batch, mission=None):
+        begun.append(utc_now().tai_ns)
+        time.sleep(0.02)
+        return acquire(batch, mission)
+
+    monkeypatch.setattr(solver, "acquire", slow)
+    made = [solver.solve(make("alone"))]
+    made += [solver.solve_one_of_many(make(name)) for name in ("one", "other")]
+    app.submissions.submit(make("in the queue"))
+    (told,) = (each for each in app.results.page().items if each.batch == "in the queue")
+    received = [each.received_ns for each in made] + [parse_utc(told.received).tai_ns]
+    assert all(came <= later for came, later in zip(received, begun, strict=True))
+
+
+def test_a_batch_that_no_processor_takes_for_long_may_come_again(app, make, monkeypatch):
+    monkeypatch.setattr(solver_pool, "WAIT_S", 0.01)
+    pool, go_on = app.submissions.ingest.pool, threading.Event()
+    give_up_s, begun = time.monotonic() + 30, threading.Barrier(len(pool._threads) + 1)
+
+    def hold():
+        begun.wait(30)
+        go_on.wait(30)
+
+    for _ in pool._threads:
+        pool.put(solver_pool.Task(hold, print, give_up_s), "a", is_long=False)
+    begun.wait(30)
+    with ThreadPoolExecutor(2) as threads:
+        batch = make().batch
+        single = threads.submit(app.submissions.ingest.run_again, batch)
+        many = threads.submit(app.submissions.submit_many, [make()])
+        time.sleep(0.1)
+        go_on.set()
+        for each in (single, many):
+            assert isinstance(each.exception(30), Busy)
+            assert "processor" in str(each.exception())
+    assert not app.submissions.submit(make()).replayed

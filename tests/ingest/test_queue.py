@@ -1,0 +1,262 @@
+"""The queue of submissions: repeats wait, slow batches delay no other, turns are fair."""
+
+import asyncio
+import json
+import threading
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import pytest
+
+from service.errors import Busy, Stopping
+from service.ingest import queue
+from service.ingest import solver_pool as pools
+from service.ingest.solver_pool import SolverPool, Task, TurnQueue, may_take_long
+from service.observations.schema import submission_from_json
+
+PATIENCE_S = 20.0
+
+
+class Held:
+    """Holds the computing of batches whose names are given until it is let go."""
+
+    def __init__(self, monkeypatch, *names):
+        self.begun, self.go_on = threading.Event(), threading.Event()
+        self.computed = []
+        acquire = pools.acquire
+
+        def holding(batch, mission, sky):
+            self.computed.append(batch.batch)
+            if batch.batch in names:
+                self.begun.set()
+                assert self.go_on.wait(PATIENCE_S)
+            return acquire(batch, mission, sky)
+
+        monkeypatch.setattr(pools, "acquire", holding)
+
+
+@pytest.fixture
+def send(app):
+    def sent(submission, caller=None):
+        return app.submissions.ingest.submit(submission, None, caller, Future())
+
+    return sent
+
+
+def test_a_batch_that_takes_long_delays_no_other(send, make, monkeypatch):
+    held = Held(monkeypatch, "slow")
+    slow = send(make("slow"))
+    assert held.begun.wait(PATIENCE_S)
+    for k in range(50):
+        assert not send(make(f"quick {k}")).result(PATIENCE_S).replayed
+    assert not slow.done()
+    held.go_on.set()
+    assert not slow.result(PATIENCE_S).replayed
+
+
+def test_a_repeat_of_what_is_computed_waits_for_it_and_gets_its_answer(send, make, monkeypatch):
+    held = Held(monkeypatch, "same")
+    first = send(make("same"))
+    assert held.begun.wait(PATIENCE_S)
+    again = [send(make("same")) for _ in range(5)]
+    send(make("other")).result(PATIENCE_S)
+    assert not any(each.done() for each in again)
+    held.go_on.set()
+    answer = first.result(PATIENCE_S)
+    for each in again:
+        assert each.result(PATIENCE_S).replayed
+        assert each.result().body == answer.body
+    assert held.computed.count("same") == 1
+
+
+def test_what_could_not_be_recorded_is_tried_again_by_its_repeat(send, make, monkeypatch):
+    failing = [ZeroDivisionError("inside")]
+    held = Held(monkeypatch, "same")
+    acquire = pools.acquire
+
+    def fail_once(*given):
+        acquisition = acquire(*given)
+        if failing:
+            raise failing.pop()
+        return acquisition
+
+    monkeypatch.setattr(pools, "acquire", fail_once)
+    first = send(make("same"))
+    assert held.begun.wait(PATIENCE_S)
+    again = send(make("same"))
+    held.go_on.set()
+    assert isinstance(first.exception(PATIENCE_S), ZeroDivisionError)
+    assert not again.result(PATIENCE_S).replayed
+
+
+def test_those_that_are_too_many_are_refused_at_once(send, make, monkeypatch):
+    monkeypatch.setattr(queue, "MAX_WAITING", 3)
+    held = Held(monkeypatch, "b0")
+    waiting = [send(make("b0"))]
+    assert held.begun.wait(PATIENCE_S)
+    waiting += [send(make("b0")) for _ in range(2)]
+    with pytest.raises(Busy, match="3 batches are waiting"):
+        send(make("b0"))
+    held.go_on.set()
+    assert [each.result(PATIENCE_S).replayed for each in waiting] == [False, True, True]
+
+
+def test_what_waited_too_long_may_come_again(app, send, make, monkeypatch):
+    begun = threading.Event()
+    look_up = app.submissions.ingest._queue._look_up
+
+    def slowly(group):
+        begun.set()
+        time.sleep(0.3)
+        return look_up(group)
+
+    monkeypatch.setattr(app.submissions.ingest._queue, "_look_up", slowly)
+    first = send(make("b1"))
+    assert begun.wait(PATIENCE_S)
+    late = app.submissions.ingest.submit_made(
+        ("XTE", "live", "b2"), "f", None, None, None, Future(), is_long=False, wait_s=0.1
+    )
+    assert isinstance(late.exception(PATIENCE_S), Busy)
+    assert not first.result(PATIENCE_S).replayed
+    assert not app.submissions.submit(make("b2")).replayed
+
+
+def test_the_answers_of_a_group_reach_an_event_loop_together(app, make):
+    sent = [make(f"b{k}") for k in range(8)]
+
+    async def post_all():
+        loop = asyncio.get_running_loop()
+        calls = []
+        told = loop.call_soon_threadsafe
+        loop.call_soon_threadsafe = lambda *given: (calls.append(given), told(*given))[1]
+        go_on = threading.Event()
+        app.store.writer.change(lambda connection: go_on.wait(PATIENCE_S))
+        futures = [
+            app.submissions.ingest.submit(each, None, None, loop.create_future()) for each in sent
+        ]
+        while app.store.writer.state()["queued"] < len(sent):
+            await asyncio.sleep(0.01)
+        calls.clear()
+        go_on.set()
+        answers = await asyncio.gather(*futures)
+        return answers, len(calls)
+
+    answers, calls = asyncio.run(post_all())
+    assert [json.loads(each.body)["batch"] for each in answers] == [f"b{k}" for k in range(8)]
+    assert calls == 1
+
+
+def test_a_client_that_has_gone_keeps_no_other_from_its_answer(app, make):
+    async def post():
+        loop = asyncio.get_running_loop()
+        gone, stays = (
+            app.submissions.ingest.submit(make(name), None, None, loop.create_future())
+            for name in ("gone", "stays")
+        )
+        gone.cancel()
+        return await stays
+
+    assert not asyncio.run(post()).replayed
+    assert app.submissions.submit(make("gone")).replayed
+
+
+def test_turns_go_around_between_clients_whatever_one_has_sent():
+    tasks = TurnQueue()
+    for k in range(3):
+        tasks.put("many", f"many {k}")
+    tasks.put("one", "one")
+    tasks.put("two", "two")
+    assert [tasks.get() for _ in range(5)] == ["many 0", "one", "two", "many 1", "many 2"]
+    assert not tasks
+
+
+def test_long_tasks_leave_a_thread_to_short_ones():
+    pool, go_on = SolverPool(2), threading.Event()
+    done = []
+    give_up_s = time.monotonic() + PATIENCE_S
+    for _ in range(5):
+        pool.put(Task(lambda: go_on.wait(PATIENCE_S), done.append, give_up_s), "a", is_long=True)
+    for k in range(5):
+        assert pool.call(lambda k=k: k, "a", is_long=False) == k
+    go_on.set()
+    pool.close()
+
+
+def test_a_task_that_was_not_begun_in_time_is_refused():
+    pool, go_on, refused = SolverPool(2), threading.Event(), Future()
+    now = time.monotonic()
+    hold = Task(lambda: go_on.wait(PATIENCE_S), print, now + PATIENCE_S)
+    for _ in range(2):
+        pool.put(hold, "a", is_long=False)
+    pool.put(Task(print, refused.set_result, now), "a", is_long=False)
+    go_on.set()
+    assert isinstance(refused.result(PATIENCE_S), Busy)
+    pool.close()
+
+
+def test_closing_finishes_what_has_begun_and_refuses_what_has_not():
+    pool, begun, go_on = SolverPool(2), threading.Event(), threading.Event()
+    with ThreadPoolExecutor(3) as threads:
+
+        def work():
+            begun.set()
+            return go_on.wait(PATIENCE_S)
+
+        first = threads.submit(pool.call, work, "a", is_long=True)
+        assert begun.wait(PATIENCE_S)
+        second = threads.submit(pool.call, work, "b", is_long=True)
+        while not pool._long:
+            time.sleep(0.001)
+        closing = threads.submit(pool.close)
+        assert isinstance(second.exception(PATIENCE_S), Stopping)
+        go_on.set()
+        assert first.result(PATIENCE_S) is True
+        closing.result(PATIENCE_S)
+    with pytest.raises(Stopping):
+        pool.call(print, "a", is_long=False)
+
+
+def test_an_ingest_thread_that_ended_or_stalls_is_noticed(app, make, monkeypatch):
+    service = app.submissions.ingest
+    service.require_alive()
+    monkeypatch.setattr(queue, "STALLED_S", 0.5)
+    go_on = threading.Event()
+    look_up = service._queue._look_up
+    monkeypatch.setattr(
+        service._queue, "_look_up", lambda group: (go_on.wait(PATIENCE_S), look_up(group))[1]
+    )
+    stalled = service.submit(make("b1"), None, None, Future())
+    time.sleep(0.8)
+    with pytest.raises(Stopping, match="restart"):
+        service.require_alive()
+    go_on.set()
+    stalled.exception(PATIENCE_S)
+    time.sleep(0.1)
+    service.require_alive()
+    service._queue._inbox.put(None)
+    service._queue._thread.join(PATIENCE_S)
+    with pytest.raises(Stopping, match="restart"):
+        service.require_alive()
+
+
+@pytest.mark.parametrize(
+    ("change", "is_long"),
+    [
+        ({}, False),
+        ({"options": {"tolerances": {"separation_deg": 0.3}}}, True),
+        ({"options": {"identifier": "lost_in_space"}}, True),
+        ({"a_priori": None}, True),
+    ],
+)
+def test_what_may_take_long_is_told_by_its_form(make, change, is_long):
+    sent = json.loads(make("b1").text) | change
+    assert may_take_long(submission_from_json(json.dumps(sent)).batch) is is_long
+
+
+def test_many_stars_and_inaccurate_ones_may_take_long(make):
+    sent = json.loads(make("b1").text)
+    stars = sent["observations"][0]["stars"]
+    sent["observations"][0]["stars"] = [stars[0] | {"sigma_arcsec": 600.0}, *stars[1:]]
+    assert may_take_long(submission_from_json(json.dumps(sent)).batch)
+    sent["observations"][0]["stars"] = stars * 50
+    assert may_take_long(submission_from_json(json.dumps(sent)).batch)

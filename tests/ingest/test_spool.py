@@ -1,0 +1,116 @@
+"""Uploads outlast the process that took them: a restart goes on where it was."""
+
+import os
+import signal
+import time
+
+import httpx
+import pytest
+from sqlalchemy import func, select
+
+from service.access.tokens import Caller
+from service.app import replays as app_replays
+from service.errors import Busy, Forbidden
+from service.storage.sql.tables import batches
+from tests.ingest.test_replays import finished
+from tests.web.serving import served
+
+LINES = 3000
+LONGEST = 1 << 20
+
+
+@pytest.fixture
+def lines(make):
+    text = make().text
+    return [text.replace('"b1"', f'"n{k}"', 1).encode() + b"\n" for k in range(LINES)]
+
+
+def upload(app, lines, caller=Caller("local", frozenset()), **options):  # noqa: B008
+    file = app.replays.new_upload(caller)
+    file.writelines(lines)
+    return app.replays.start_upload(file, "identity", "pass", LONGEST, caller, **options)
+
+
+def recorded(app):
+    with app.store.reading() as connection:
+        count = select(func.count(), func.count(batches.c.batch.distinct()))
+        return tuple(connection.execute(count.where(batches.c.run == "pass")).one())
+
+
+def stored(app):
+    folder = app.settings.spool_folder
+    return sorted(each.name for each in folder.iterdir()) if folder.is_dir() else []
+
+
+def test_an_upload_is_removed_when_its_replay_is_over(opened, lines):
+    app = opened(replay_processes=0)
+    id = upload(app, lines[:20])
+    assert stored(app)
+    assert finished(app, id)["state"] == "done"
+    give_up = time.monotonic() + 10
+    while stored(app) and time.monotonic() < give_up:
+        time.sleep(0.01)
+    assert stored(app) == []
+
+
+def test_a_replay_goes_on_after_a_restart_where_it_was(opened, lines):
+    app = opened(replay_processes=0)
+    id = upload(app, [b"{\n", *lines[:400]], total=401)
+    give_up = time.monotonic() + 60
+    while app.replays.get(id)["lines"]["done"] < 64 and time.monotonic() < give_up:
+        time.sleep(0.005)
+    app.close()
+    later = opened(replay_processes=0)
+    before = later.replays.get(id)
+    assert before["state"] == "interrupted"
+    assert 64 <= before["lines"]["done"] < 401
+    later.replays.resume()
+    after = finished(later, id)
+    assert (after["state"], after["lines"]) == ("done", {"total": 401, "done": 401, "refused": 1})
+    assert after["counts"]["new"] + after["counts"]["repeated"] == 400
+    assert recorded(later) == (400, 400)
+    assert [each["line"] for each in after["errors"]] == [1]
+
+
+def test_what_a_token_is_bound_to_holds_after_a_restart(opened, lines):
+    app = opened(replay_processes=0)
+    bound = Caller("pipeline", frozenset(["submit"]), frozenset(["SWAS"]), "T1")
+    id = upload(app, lines[:300], bound)
+    app.close()
+    later = opened(replay_processes=0)
+    later.replays.resume()
+    state = finished(later, id)
+    assert state["lines"]["refused"] == 300
+    assert str(Forbidden("pipeline is bound to SWAS, not to XTE")) in str(state["errors"][-1])
+
+
+def test_one_token_takes_no_more_than_its_slots(opened, lines, monkeypatch):
+    monkeypatch.setattr(app_replays, "MAX_OF_ONE_TOKEN", 1)
+    app = opened(replay_processes=0)
+    one, other = (Caller(name, frozenset(), None, name) for name in ("T1", "T2"))
+    first = upload(app, lines, one)
+    with pytest.raises(Busy, match="of this token"):
+        app.replays.new_upload(one)
+    upload(app, lines[:10], other)
+    app.replays.cancel(first)
+    finished(app, first)
+    app.replays.new_upload(one).close()
+
+
+def test_a_killed_service_goes_on_with_an_upload_when_it_is_started_again(tmp_path, lines):
+    database = f"sqlite:///{tmp_path / 'acquire.db'}"
+    head = {"Content-Type": "application/x-ndjson"}
+    with served(database) as (process, url):
+        path = f"{url}/api/v1/replays?run=pass"
+        answer = httpx.post(path, content=b"".join(lines), headers=head, timeout=60)
+        assert answer.status_code == 202
+        place = answer.headers["Location"]
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    with served(database) as (_, url):
+        give_up = time.monotonic() + 120
+        while (state := httpx.get(url + place).json())["state"] == "running":
+            assert time.monotonic() < give_up
+            time.sleep(0.1)
+    assert (state["state"], state["lines"]["done"]) == ("done", LINES)
+    assert state["counts"]["new"] + state["counts"]["repeated"] == LINES

@@ -1,0 +1,307 @@
+"""Replays computed by processes of their own: the same answers, whatever becomes of a process."""
+
+import json
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+
+import httpx
+import msgspec
+import pytest
+from sqlalchemy import select
+
+from service.app.factory import open_app
+from service.errors import AcquisitionError, BadBatch, BadConfiguration, BadInput
+from service.ingest.local_workers import ChunkEndsWorkers, LocalWorkers, WorkerConfig
+from service.ingest.telemetry_lines import named_in
+from service.observations.schema import submission_from_json
+from service.settings import Settings
+from service.storage.sql.tables import batches
+from tests.ingest.test_replays import finished
+from tests.storage import samples
+from tests.storage.samples import without_accidents
+
+GIVE_UP_S = 120.0
+
+
+def wait_until(is_so, what):
+    give_up = time.monotonic() + GIVE_UP_S
+    while not is_so():
+        assert time.monotonic() < give_up, what
+        time.sleep(0.01)
+
+
+def children_of(pid):
+    """Processes that a process has started, and those that these have."""
+    files = Path(f"/proc/{pid}/task").glob("*/children")
+    found = {int(child) for each in files for child in each.read_text().split()}
+    return found.union(*map(children_of, found))
+
+
+def workers_of(app):
+    return sorted(app.replays.bulk.workers.pids)
+
+
+def with_workers(app, count=1):
+    """The operations, once so many workers are ready."""
+    app.replays.bulk.workers.start()
+    wait_until(lambda: app.replays.processes() == count, "no worker is ready")
+    return app
+
+
+def names_in(app, run):
+    with app.store.reading() as connection:
+        return list(connection.scalars(select(batches.c.batch).where(batches.c.run == run)))
+
+
+def answers_in(app, run):
+    items = app.results.page(run=run, limit=500).items
+    return {each.batch: msgspec.to_builtins(app.results.get(each.id).answer) for each in items}
+
+
+@pytest.fixture
+def sent(make):
+    """Batches of every kind, more than one transaction of them."""
+    kinds = [samples.KINDS[k % len(samples.KINDS)] for k in range(80)]
+    return [make(f"b{k}", kind=kind, after_s=60.0 * k) for k, kind in enumerate(kinds)]
+
+
+@pytest.fixture
+def lines(sent):
+    return [each.text.encode() + b"\n" for each in sent]
+
+
+def endless(text):
+    """The lines of one batch after the other, and how many there were."""
+    number = 0
+    while True:
+        yield text.replace('"b1"', f'"n{number}"', 1).encode()
+        number += 1
+
+
+def test_workers_answer_what_single_posts_are_answered(opened, sent, lines, make):
+    """Bad lines, repeats and conflicts included; the serving process computes none of it."""
+    app = opened(replay_processes=1)
+    for each in sent:
+        app.submissions.submit(each)
+    with_workers(app)
+    conflict = make("b0", stars=4).text.encode()
+    unknown = lines[1].replace(b'"XTE"', b'"HST"')
+    tracker = make("b90").text.replace('"tracker":"', '"tracker":"no-').encode()
+    more = [b'{"cut', lines[3], unknown, tracker, b"\n", conflict]
+    app.zones.drop(None)
+    before = app.zones.state()["misses"]
+
+    replay = finished(app, app.replays.start(lines + more, "bulk"))
+    again = finished(app, app.replays.start(lines + more, "bulk"))
+
+    assert app.zones.state()["misses"] == before
+    single, bulk = answers_in(app, "live"), answers_in(app, "bulk")
+    assert single.keys() == bulk.keys()
+    for name, answer in bulk.items():
+        assert without_accidents(answer) | {"run": "live"} == without_accidents(single[name])
+    assert (replay["counts"]["new"], replay["counts"]["repeated"]) == (80, 1)
+    assert (again["counts"]["new"], again["counts"]["repeated"]) == (0, 81)
+    told = {each["line"]: each["problem"] for each in replay["errors"]}
+    assert told == {each["line"]: each["problem"] for each in again["errors"]}
+    assert told.keys() == {81, 83, 84, 86}
+    for number, text in ((81, more[0]), (83, unknown), (84, tracker)):
+        with pytest.raises(BadInput) as refusal:
+            app.submissions.submit(submission_from_json(text))
+        assert told[number]["detail"].startswith(str(refusal.value.faults[0]))
+    assert "another body" in told[86]["detail"]
+
+
+def test_observers_hear_of_what_workers_computed(opened, lines):
+    app = with_workers(opened(replay_processes=1))
+    seen = []
+    app.submissions.observers.append(seen.append)
+    replay = finished(app, app.replays.start(lines, "bulk"))
+    assert sorted(each.batch for each in seen) == sorted(f"b{k}" for k in range(80))
+    assert {(each.spacecraft, each.run) for each in seen} == {("XTE", "bulk")}
+    assert sum(each.has_attitude for each in seen) == replay["counts"]["attitudes"]
+    for outcome in ("observed", "unique", "ambiguous", "unmatched"):
+        assert sum(each.counts[outcome] for each in seen) == replay["counts"][outcome]
+
+
+def test_workers_that_are_killed_again_and_again_cost_and_double_nothing(opened, make):
+    app = with_workers(opened(replay_processes=2), 2)
+    killed, wanted = [], 2000
+    over = threading.Event()
+
+    def numbered():
+        for number, text in zip(range(wanted), endless(make().text), strict=False):
+            if number % 500 == 250:
+                killed.extend(workers_of(app))
+                for pid in workers_of(app):
+                    os.kill(pid, signal.SIGKILL)
+            yield text
+        over.set()
+
+    # Other processes are started and load the kernels, each time.
+    replay = finished(app, app.replays.start(numbered(), "bulk"), GIVE_UP_S * 2)
+    assert over.is_set()
+    assert len(set(killed)) >= 2
+    assert (replay["state"], replay["errors"]) == ("done", [])
+    assert replay["counts"]["new"] == wanted
+    assert Counter(names_in(app, "bulk")) == Counter(f"n{k}" for k in range(wanted))
+    with_workers(app, 2)
+    assert not set(workers_of(app)) & set(killed)
+
+
+def test_closing_ends_workers_and_replays_at_once(opened, make):
+    # Those of other services in this process stay.
+    others = set(threading.enumerate())
+    app = with_workers(opened(replay_processes=1))
+    id = app.replays.start(endless(make().text), "endless")
+    wait_until(lambda: app.replays.get(id)["lines"]["done"] > 100, "nothing is recorded")
+    (pid,) = workers_of(app)
+    app.close()
+    assert not Path(f"/proc/{pid}").exists()
+    left = set(threading.enumerate()) - others
+    assert not [each for each in left if each.name.startswith("worker-")]
+    later = opened()
+    replay = later.replays.get(id)
+    assert replay["state"] == "interrupted"
+    assert len(names_in(later, "endless")) == replay["lines"]["done"]
+
+
+def test_workers_that_are_still_starting_are_ended_as_well(opened):
+    app = opened(replay_processes=1)
+    before = children_of(os.getpid())
+    app.replays.bulk.workers.start()
+    wait_until(lambda: children_of(os.getpid()) - before, "no worker is started")
+    assert not workers_of(app)
+    started = children_of(os.getpid()) - before
+    app.close()
+    wait_until(lambda: not children_of(os.getpid()) & started, "a worker is left behind")
+
+
+def double(solver, number):
+    """What a worker makes of a number; of 13 it ends its process."""
+    if number == 13:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return [2 * number]
+
+
+def test_a_chunk_that_ends_its_processes_is_named_and_costs_no_other(missions, sky):
+    config = WorkerConfig(missions, None, sky.catalog.digest, 1 << 20)
+    workers = LocalWorkers(config, double, 2)
+    try:
+        futures = {number: workers.submit(number) for number in (1, 2, 13, 4, 5)}
+        for number, future in futures.items():
+            if number == 13:
+                assert isinstance(future.exception(GIVE_UP_S), ChunkEndsWorkers)
+            else:
+                assert future.result(GIVE_UP_S) == [2 * number]
+        assert workers.submit(6).result(GIVE_UP_S) == [12]
+    finally:
+        workers.close()
+
+
+class Served:
+    """`acquire serve` in a process group of its own, with one worker at work on a replay."""
+
+    def __init__(self, folder, lines):
+        self.database = f"sqlite:///{folder / 'acquire.db'}"
+        self._said = folder / "said"
+        command = [sys.executable, "-m", "service.cli", "serve", "--port", "0"]
+        environment = os.environ | {"ACQUIRE_REPLAY_PROCESSES": "1"}
+        with self._said.open("wb") as said:
+            self.process = subprocess.Popen(
+                [*command, "--database", self.database],
+                stdout=said,
+                stderr=said,
+                env=environment,
+                start_new_session=True,
+            )
+        wait_until(lambda: "running on http" in self.said, "the service did not start")
+        address = self.said.partition("running on ")[2].split()[0]
+        with httpx.Client(base_url=address, timeout=60) as client:
+            wait_until(lambda: client.get("/readyz").status_code == 200, "it is not ready")
+            head = {"Content-Type": "application/x-ndjson"}
+
+            def send(content, run):
+                path = f"/api/v1/replays?run={run}"
+                client.post(path, content=content, headers=head).raise_for_status()
+
+            def is_up():
+                return "\nstarid_replay_processes 1.0" in client.get("/metrics").text
+
+            send(lines[0], "first")
+            wait_until(is_up, "no worker is ready")
+            assert 'run="named",spacecraft="XTE"} 1.0' in client.get("/metrics").text
+            self.children = children_of(self.process.pid)
+            send(b"\n".join(lines), "bulk")
+            wait_until(
+                lambda: client.get("/api/v1/batches?run=bulk&limit=1").json()["items"],
+                "nothing is recorded",
+            )
+
+    @property
+    def said(self):
+        return self._said.read_text()
+
+    def left(self):
+        return {each for each in self.children if Path(f"/proc/{each}").exists()}
+
+
+@pytest.fixture
+def long_replay(make):
+    return [text for _, text in zip(range(20_000), endless(make().text), strict=False)]
+
+
+def test_no_worker_outlives_a_service_that_is_killed(tmp_path, long_replay):
+    served = Served(tmp_path, long_replay)
+    assert served.children
+    served.process.kill()
+    served.process.wait()
+    wait_until(lambda: not served.left(), "a worker is left behind")
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM], ids=lambda each: each.name)
+def test_whoever_stops_the_whole_group_stops_it_in_order(tmp_path, long_replay, stop):
+    """As Ctrl-C does, and systemd."""
+    served = Served(tmp_path, long_replay)
+    os.killpg(served.process.pid, stop)
+    assert served.process.wait(60) in (0, -stop)
+    wait_until(lambda: not served.left(), "a worker is left behind")
+    assert "Traceback" not in served.said
+    assert "a worker ended" not in served.said
+    app = open_app(Settings(database=served.database))
+    try:
+        newest, _ = app.replays.all()
+        assert newest["state"] == "interrupted"
+        names = names_in(app, "bulk")
+        assert len(names) == newest["lines"]["done"] < len(long_replay)
+        assert set(names) == {f"n{k}" for k in range(len(names))}
+    finally:
+        app.close()
+
+
+def test_a_catalog_that_was_changed_meanwhile_is_not_mixed_with_the_one_before(missions):
+    with pytest.raises(BadConfiguration, match="changed"):
+        WorkerConfig(missions, None, "sha256:another", 1 << 20).solver()
+
+
+def test_errors_cross_processes_whole(make):
+    text = make().text.replace('"vector":', '"vektor":')
+    with pytest.raises(AcquisitionError) as refusal:
+        submission_from_json(text)
+    copy = pickle.loads(pickle.dumps(refusal.value))
+    assert type(copy) is BadBatch
+    assert (str(copy), copy.faults) == (str(refusal.value), refusal.value.faults)
+
+
+def test_a_line_is_called_in_passing_what_it_is_called(make):
+    text = make("name").text.encode()
+    assert named_in(text, "r") == ("XTE", "r", "name")
+    assert named_in(json.dumps(json.loads(text) | {"batch": "\n"}).encode(), "r") is None
+    for bad in (b"", b"[]", b"\xff", b'{"batch": 1}', b'{"x":' + b"[" * 100_000):
+        assert named_in(bad, "r") is None

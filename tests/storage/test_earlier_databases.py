@@ -1,0 +1,372 @@
+"""Databases that earlier versions wrote are brought up to date, and all that they hold is read.
+
+Those of tests/databases, one of each schema on SQLite and on PostgreSQL; its
+README says how they were made.  Every route that reads and every page is found
+in the interface's description and in the app, so that new ones are read as well.
+"""
+
+import json
+import re
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from pathlib import Path
+
+import httpx
+import pytest
+from alembic.script import ScriptDirectory
+from sqlalchemy import MetaData, create_engine, inspect, select, text
+from sqlalchemy.pool import NullPool
+
+from service.access.tokens import add_token, new_secret
+from service.alarms.quantities import trend_names
+from service.app.factory import open_app
+from service.settings import Settings
+from service.storage.sql import migrations
+from service.storage.sql.engines import database_url
+from service.storage.upkeep.verify import verify
+from service.web.app import create_app
+from tests.databases.make import FOLDER, restore_postgresql, restore_sqlite
+from tests.web.conformance import check, reference
+from tests.web.serving import Server
+
+API = "/api/v1"
+REVISIONS = sorted(file.name.partition(".")[0] for file in FOLDER.glob("*.sqlite.gz"))
+KINDS = ("sqlite", "postgresql")
+LIVE_STREAM = f"{API}/events"
+"""It does not end: its beginning is read by a test of its own."""
+WITHOUT_A_RUN = ("/sign-in",)
+FOR_PROBES = ("/livez", "/readyz", "/metrics")
+COMPARED = (
+    "columns",
+    "primary key",
+    "foreign keys",
+    "unique constraints",
+    "indexes",
+    "check constraints",
+)
+
+
+@dataclass(frozen=True)
+class Earlier:
+    """An earlier database that was brought up to date and is served.
+
+    `before` and `after` are its rows by table around the upgrade, `problems`
+    what `verify` said then.
+    """
+
+    url: str
+    before: dict
+    after: dict
+    schema: dict
+    problems: list
+    client: httpx.Client
+    app: object
+
+    def get(self, address, **wanted):
+        answer = self.client.get(address, **wanted)
+        assert answer.status_code == 200, (address, answer.status_code, answer.text[:500])
+        return answer
+
+    def every_row(self, address):
+        """The items of all pages of a list."""
+        while address:
+            answer = self.get(address)
+            yield from answer.json()["items"]
+            address = answer.links.get("next", {}).get("url")
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def new_database(request, tmp_path_factory, postgresql_schema):
+    """Makes URLs of empty databases, as contexts."""
+    if request.param == "postgresql":
+        return postgresql_schema
+
+    def sqlite():
+        return nullcontext(f"sqlite:///{tmp_path_factory.mktemp('earlier') / 'acquire.db'}")
+
+    return sqlite
+
+
+@pytest.fixture(scope="session")
+def new_schemas():
+    """By kind of database, once one was made: a new one takes seconds."""
+    return {}
+
+
+@pytest.fixture(scope="module", params=REVISIONS)
+def earlier(request, new_database):
+    revision = request.param
+    with new_database() as url:
+        _restore(revision, url)
+        before = rows_of(url)
+        assert before["alembic_version"] == [{"version_num": revision}]
+        migrations.upgrade(url)
+        after, schema, problems = rows_of(url), schema_of(url), verify(url)
+        opened = open_app(Settings(database=url, replay_processes=0))
+        headers = {"Authorization": f"Bearer {_token(opened)}"}
+        app = create_app(opened)
+        hooks = {"response": [check]}
+        with (
+            Server(app) as address,
+            httpx.Client(
+                base_url=address, timeout=60, headers=headers, event_hooks=hooks
+            ) as client,
+        ):
+            yield Earlier(url, before, after, schema, problems, client, app)
+        assert verify(url) == []
+
+
+def _restore(revision, url):
+    if url.startswith("sqlite"):
+        restore_sqlite(revision, Path(database_url(url).database))
+        return
+    engine = create_engine(database_url(url), poolclass=NullPool)
+    with engine.begin() as connection:
+        schema = connection.scalar(text("SELECT current_schema()"))
+        restore_postgresql(revision, connection, schema)
+    engine.dispose()
+
+
+def _token(opened):
+    """Some of the databases hold tokens, so that access is closed: one more, for the tests."""
+    secret = new_secret()
+    token = {
+        "id": "01JD0000000000000000000001",
+        "name": "test",
+        "scopes": ("read", "submit", "operate"),
+        "spacecraft": None,
+        "rate_per_s": None,
+        "created": "1999-03-01T12:00:00.000Z",
+        "expires": "2099-03-01T12:00:00.000Z",
+    }
+    opened.context.change(partial(add_token, secret=secret, **token))
+    return secret
+
+
+def rows_of(url):
+    engine = create_engine(database_url(url), poolclass=NullPool)
+    tables = MetaData()
+    tables.reflect(engine)
+    with engine.connect() as connection:
+        found = {
+            table.name: [dict(row) for row in connection.execute(select(table)).mappings()]
+            for table in tables.tables.values()
+        }
+    engine.dispose()
+    return found
+
+
+def schema_of(url):
+    """Everything that the database says of its tables, by table and kind; order does not count."""
+    engine = create_engine(database_url(url), poolclass=NullPool)
+    seen = inspect(engine)
+    found = {}
+    for table in seen.get_table_names():
+        told = (
+            seen.get_columns(table),
+            [seen.get_pk_constraint(table)],
+            seen.get_foreign_keys(table),
+            seen.get_unique_constraints(table),
+            seen.get_indexes(table),
+            seen.get_check_constraints(table),
+        )
+        for kind, entries in zip(COMPARED, told, strict=True):
+            found[table, kind] = sorted(_as_text(entry) for entry in entries)
+    engine.dispose()
+    return found
+
+
+def _as_text(entry):
+    # The schema that this test has for itself stands in defaults that count up.
+    return re.sub(r"test_[0-9a-f]{32}\.", "", json.dumps(_plain(entry), sort_keys=True))
+
+
+def _plain(value):
+    if isinstance(value, dict):
+        return {name: _plain(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    return value if isinstance(value, bool | int | None) else str(value)
+
+
+# ---- the upgrade ---------------------------------------------------------------------------------
+
+
+def test_each_earlier_schema_has_its_databases():
+    """See tests/databases/README.md: it is made before the next migration is."""
+    script = ScriptDirectory.from_config(migrations._config())
+    schemas = {each.revision for each in script.walk_revisions()}
+    assert schemas - {migrations.HEAD} <= set(REVISIONS)
+    dumped = {file.name.partition(".")[0] for file in FOLDER.glob("*.postgresql.sql.gz")}
+    assert dumped == set(REVISIONS)
+
+
+def test_the_upgrade_loses_nothing(earlier):
+    for name, rows in earlier.before.items():
+        if name == "alembic_version" or not rows:
+            continue
+        shown = [{column: row[column] for column in rows[0]} for row in earlier.after[name]]
+        assert sorted(map(repr, shown)) == sorted(map(repr, rows)), name
+    assert earlier.before["batches"]
+    assert earlier.before["star_results"]
+    assert any(row["parent_id"] for row in earlier.before["results"])
+
+
+def test_its_schema_is_that_of_a_new_database(earlier, new_schemas, new_database):
+    kind = earlier.url.partition(":")[0]
+    if kind not in new_schemas:
+        with new_database() as url:
+            migrations.upgrade(url)
+            new_schemas[kind] = schema_of(url)
+    assert earlier.schema == new_schemas[kind]
+    assert migrations.check(earlier.url) == []
+
+
+def test_verify_finds_nothing_wrong(earlier):
+    assert earlier.problems == []
+
+
+# ---- reading -------------------------------------------------------------------------------------
+
+
+def names_of(earlier):
+    """What may stand in an address in place of {name}, {run}, and so on, by what comes before."""
+    spacecraft = [each["name"] for each in earlier.get(f"{API}/spacecraft").json()["items"]]
+    runs = [each["run"] for each in earlier.get(f"{API}/runs").json()["items"]]
+    alarms = [
+        each["id"]
+        for run in runs
+        for each in earlier.every_row(f"{API}/alarms?run={run}&state=all")
+    ]
+    return {
+        "batches/{id}": [each["id"] for each in earlier.every_row(f"{API}/batches?run=*")],
+        "replays/{id}": [each["id"] for each in earlier.get(f"{API}/replays").json()["items"]],
+        "alarms/{id}": alarms,
+        "spacecraft/{name}": spacecraft,
+        "advice/{name}": spacecraft,
+        "latest/{name}": spacecraft,
+        "runs/{run}": runs,
+        "limits/{quantity}": [
+            each["quantity"] for each in earlier.get(f"{API}/spacecraft/XTE/limits").json()["items"]
+        ],
+    }
+
+
+def filled(template, names):
+    """Every address of a path with parameters."""
+    found = re.search(r"([\w-]+)/\{(\w+)\}", template)
+    if not found:
+        return [template]
+    assert found[0] in names, f"{template}: tell the test what stands for {found[0]}"
+    return [
+        address
+        for name in names[found[0]]
+        for address in filled(template.replace(found[0], f"{found[1]}/{name}", 1), names)
+    ]
+
+
+def queries(address, runs):
+    """What is asked beside the address alone; `runs` are those that its spacecraft has."""
+    by_run = [f"?run={run}" for run in runs]
+    rest = address.rpartition("/")[2]
+    if rest == "history":
+        every = "&".join(f"quantity={name}" for name in trend_names())
+        return [
+            f"{each}&{more}"
+            for each in by_run
+            for more in (f"{every}&size=50", "strategy=latest&size=50", "format=csv")
+        ]
+    if rest == "rates":
+        return [f"{each}&bucket={bucket}" for each in by_run for bucket in ("hour", "day")]
+    if rest == "advice":
+        return ["?sample=4"]
+    if rest == "batches":
+        shown = ("outcome=ambiguous", "outcome=unmatched", "status=good", "status=suspect")
+        return by_run + [f"?run=*&{each}" for each in shown]
+    return by_run if rest in ("spacecraft", "overview", "attitudes", "worst") else [""]
+
+
+def runs_of(earlier, address):
+    """The runs that hold batches of the spacecraft that an address names, else all."""
+    named = re.search(r"/spacecraft/([^/]+)", address)
+    rows = earlier.before["batches"]
+    return {row["run"] for row in rows if not named or row["spacecraft"] == named[1]}
+
+
+def test_every_route_that_reads_answers(earlier):
+    """Each answer is held against openapi.yaml by the client: later fields have their defaults."""
+    names = names_of(earlier)
+    for path, methods in reference()["paths"].items():
+        if "get" not in methods or path == LIVE_STREAM or path.endswith("/overlay"):
+            continue
+        for address in filled(path, names):
+            for query in queries(address, runs_of(earlier, address)):
+                earlier.get(address + query)
+    assert all(names[each] for each in ("batches/{id}", "replays/{id}", "spacecraft/{name}"))
+
+
+def test_events_of_before_are_sent(earlier):
+    # Without the check of the other answers, which would read the stream to its end.
+    address = earlier.client.base_url.join(f"{LIVE_STREAM}?last_event_id=0")
+    with httpx.stream("GET", address, headers=earlier.client.headers, timeout=10) as answer:
+        assert answer.status_code == 200
+        names = (line for line in answer.iter_lines() if line.startswith("event: "))
+        expected = "batches" if earlier.before.get("events") else "hello"
+        assert any(line == f"event: {expected}" for line in islice(names, 3))
+
+
+def test_every_page_is_shown(earlier):
+    names = names_of(earlier)
+    # Of batches that are alike a few pages stand for all: each takes some 30 ms.
+    names["batches/{id}"] = names["batches/{id}"][::8] + framed(earlier)
+    names["advice/{name}"] = ["XTE?sample=4"]
+    pages = {
+        route.path
+        for route in earlier.app.state.routes
+        if "GET" in route.methods and not route.path.startswith("/api/")
+    } - {*FOR_PROBES}
+    assert len(pages) >= 16
+    for path in sorted(pages):
+        for address in filled(path, names):
+            answer = earlier.get(address, follow_redirects=True)
+            assert answer.headers["content-type"].startswith("text/html"), address
+        if "{" not in path and path not in WITHOUT_A_RUN:
+            earlier.get(f"{path}?run=replayed")
+    earlier.get("/compare?spacecraft=XTE&sample=3")
+
+
+def framed(earlier):
+    return [each["id"] for each in earlier.every_row(f"{API}/batches?run=*&spacecraft=IMAGER")]
+
+
+def test_frames_are_drawn(earlier):
+    made = framed(earlier)
+    assert len(made) == len(earlier.before.get("frames", []))
+    for id in made:
+        answer = earlier.get(f"{API}/batches/{id}/overlay")
+        assert answer.content.startswith(b"\x89PNG")
+
+
+def test_the_same_batch_again_is_answered_with_the_bytes_of_its_day(earlier):
+    """The fingerprint of a body must not depend on the version that computed it."""
+    first = {row["batch_id"]: row for row in earlier.before["results"] if not row["parent_id"]}
+    frames = {row["batch_id"] for row in earlier.before.get("frames", [])}
+    asked = [row for row in earlier.before["batches"] if row["id"] not in frames]
+    assert asked
+    for row in asked:
+        headers = {"Content-Type": "application/json"}
+        answer = earlier.client.post(f"{API}/batches", content=row["input"], headers=headers)
+        assert answer.status_code == 200, (row["batch"], answer.text[:300])
+        assert answer.headers["Replayed"] == "true"
+        assert answer.text == first[row["id"]]["answer"]
+
+
+def test_it_takes_new_batches_and_what_ifs(earlier):
+    row = next(row for row in earlier.before["batches"] if row["spacecraft"] == "XTE")
+    body = json.loads(row["input"]) | {"batch": "new", "run": "new"}
+    assert earlier.client.post(f"{API}/batches", json=body).status_code == 201
+    asked = {"options": {"solver": "triad"}, "record": True}
+    answer = earlier.client.post(f"{API}/batches/{row['id']}/what-if", json=asked)
+    assert answer.status_code == 201, answer.text[:300]

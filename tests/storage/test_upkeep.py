@@ -1,0 +1,393 @@
+"""Backup, verify and prune: copies of one moment, every fault named, nothing left hanging."""
+
+import io
+import sqlite3
+import subprocess
+import threading
+from pathlib import Path
+
+import pytest
+from sqlalchemy import create_engine, delete, func, make_url, select, text, update
+
+from service.app.factory import open_app
+from service.errors import BadConfiguration
+from service.imaging.submit import read_known
+from service.observations.schema import OptionsIn
+from service.settings import Settings
+from service.simulate.frame_files import frame_bytes
+from service.simulate.frames import FrameSettings, draw_frames
+from service.storage.recording import rollups
+from service.storage.sql.columns import metadata
+from service.storage.sql.database import Store
+from service.storage.sql.engines import database_url
+from service.storage.sql.rollup_tables import rollups_daily, rollups_hourly
+from service.storage.sql.tables import (
+    batches,
+    frames,
+    idempotency_keys,
+    results,
+    solutions,
+    star_results,
+)
+from service.storage.upkeep.backup import back_up
+from service.storage.upkeep.prune import OF_A_BATCH, OF_A_RESULT, prune
+from service.storage.upkeep.verify import verify
+from service.times import shifted
+from tests.storage.samples import START
+
+TIGHT = OptionsIn.model_validate({"tolerances": {"separation_deg": 1e-5}})
+KINDS = ("good", "suspect", "one_star", "spurious")
+
+
+@pytest.fixture
+def filled(app, make):
+    """Batches of every kind over two days and two runs, a what-if adopted, one with a key."""
+    ids = []
+    for k in range(12):
+        for run in ("live", "r"):
+            submission = make(f"b{k}", kind=KINDS[k % 4], run=run, after_s=k * 14_000.0)
+            ids.append(app.submissions.submit(submission, f"key-{run}-{k}").id)
+    app.results.what_if(ids[0], TIGHT, adopt=True)
+    app.results.what_if(ids[-1], TIGHT, record=True)
+    return app
+
+
+def counts(app):
+    tables = (batches, results, star_results, solutions, idempotency_keys)
+    with app.store.reading() as connection:
+        return {t.name: connection.scalar(select(func.count()).select_from(t)) for t in tables}
+
+
+def change(app, statement):
+    app.store.writer.change(lambda connection: connection.execute(statement)).result()
+
+
+# ---- verify ------------------------------------------------------------------------------------
+
+
+def test_of_a_sound_database_nothing_is_wrong(filled, database):
+    steps = []
+    assert verify(database, lambda *step: steps.append(step)) == []
+    assert steps[-1] == (24, 24)
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        (lambda id: delete(star_results).where(star_results.c.result_id == id), "its counts are"),
+        (lambda id: delete(solutions).where(solutions.c.result_id == id), "attitude is missing"),
+        (
+            lambda id: update(results).where(results.c.id == id).values(answer='{"id": "x"'),
+            "its answer cannot be read",
+        ),
+        (
+            lambda id: update(results).where(results.c.id == id).values(unique=0, observed=0),
+            "its counts are not those of its stars",
+        ),
+        (
+            lambda id: update(results).where(results.c.id == id).values(current=False),
+            "0 of its results are current",
+        ),
+        (
+            lambda id: (
+                update(batches)
+                .where(batches.c.id == id)
+                .values(input=func.replace(batches.c.input, "XTE", "XTF"))
+            ),
+            "its input is not the one that was fingerprinted",
+        ),
+        (
+            lambda id: update(batches).where(batches.c.id == id).values(input="{"),
+            "its input cannot be read",
+        ),
+        (lambda id: update(rollups_daily).values(unique=rollups_daily.c.unique + 1), "trends of"),
+        (
+            lambda id: update(rollups_hourly).values(
+                residual_rms_arcsec_max=rollups_hourly.c.residual_rms_arcsec_max + 1
+            ),
+            "not those of the results",
+        ),
+    ],
+)
+def test_every_kind_of_damage_is_named(app, make, database, fault, told):
+    id = app.submissions.submit(make()).id
+    assert verify(database) == []
+    change(app, fault(id))
+    assert any(told in problem for problem in verify(database))
+
+
+@pytest.fixture
+def framed(app, missions):
+    """The id of a batch that was made of a frame."""
+    (drawn,) = draw_frames(missions["IMAGER"], app.sky, FrameSettings(frames=1, seed=5))
+    known = read_known(drawn.known)
+    return app.frames.submit("IMAGER", known, io.BytesIO(frame_bytes(drawn))).id
+
+
+def test_a_sound_batch_made_of_a_frame_is_not_called_damaged(app, framed, database):
+    app.results.what_if(framed, OptionsIn(solver="triad"), record=True, adopt=False)
+    assert verify(database) == []
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        (
+            lambda id: (
+                update(batches)
+                .where(batches.c.id == id)
+                .values(input=func.replace(batches.c.input, '"magnitude":', '"magnitude":1'))
+            ),
+            "stars of its input are not those of its frame",
+        ),
+        (lambda id: update(frames).values(digest="sha256:0"), "is about another frame"),
+        (lambda id: update(frames).values(detections="{"), "cannot be read"),
+    ],
+)
+def test_damage_to_a_batch_made_of_a_frame_is_named(app, framed, database, fault, told):
+    change(app, fault(framed))
+    assert any(told in problem for problem in verify(database))
+
+
+def test_a_file_that_is_damaged_is_told_from_a_sound_one(filled, tmp_path):
+    if filled.store.url.drivername != "sqlite":
+        pytest.skip("PostgreSQL looks after its own files")
+    copy = tmp_path / "copy.db"
+    back_up(f"sqlite:///{filled.store.url.database}", copy)
+    data = bytearray(copy.read_bytes())
+    with sqlite3.connect(copy) as connection:
+        root = connection.execute(
+            "SELECT rootpage FROM sqlite_master WHERE name = 'ix_results_current_by_run'"
+        ).fetchone()[0]
+        page = connection.execute("PRAGMA page_size").fetchone()[0]
+    data[(root - 1) * page + page // 2 : root * page] = b"\xaa" * (page - page // 2)
+    copy.write_bytes(bytes(data))
+    problems = verify(f"sqlite:///{copy}")
+    assert any("the file is damaged" in problem for problem in problems)
+
+
+def test_a_database_that_is_behind_or_not_there_is_told_of(tmp_path):
+    with pytest.raises(BadConfiguration, match="there is no such file"):
+        verify(f"sqlite:///{tmp_path}/none.db")
+    (tmp_path / "empty.db").touch()
+    assert "acquire database upgrade" in verify(f"sqlite:///{tmp_path}/empty.db")[0]
+
+
+# ---- backup ------------------------------------------------------------------------------------
+
+
+def restored(database, dump, tmp_path):
+    """The URL of a database that is the backup alone."""
+    if database.startswith("sqlite"):
+        return f"sqlite:///{dump}"
+    url = make_url(database)
+    schema = url.query["options"].split("search_path=")[1].split(" ")[0]
+    engine = create_engine(database_url(database), isolation_level="AUTOCOMMIT")
+    with engine.connect() as connection:
+        connection.execute(text(f"DROP SCHEMA {schema} CASCADE"))
+    engine.dispose()
+    plain = url.set(drivername="postgresql", query={}).render_as_string(hide_password=False)
+    subprocess.run(["pg_restore", f"--dbname={plain}", "--no-owner", str(dump)], check=True)
+    return database
+
+
+def test_a_backup_is_whole_and_serves_in_the_place_of_the_database(
+    filled, database, tmp_path, make
+):
+    before, listed = counts(filled), filled.results.page(run="r", limit=500).items
+    back_up(database, tmp_path / "copy")
+    filled.submissions.submit(make("after", after_s=5.0))
+    filled.close()
+    copy = restored(database, tmp_path / "copy", tmp_path)
+    assert verify(copy) == []
+    app = open_app(Settings(database=copy))
+    try:
+        assert counts(app) == before
+        assert app.results.page(run="r", limit=500).items == listed
+        assert app.submissions.submit(make("after", after_s=5.0)).replayed is False
+    finally:
+        app.close()
+
+
+def test_a_backup_while_batches_are_recorded_is_of_one_moment(opened, make, database, tmp_path):
+    """Every batch in it is whole, those acknowledged before it are in, and it ends."""
+    app = opened()
+    submissions = [make(f"b{k}", after_s=float(k)) for k in range(60)]
+    acknowledged = [app.submissions.submit(each).id for each in submissions[:20]]
+    go_on = threading.Event()
+
+    def keep_recording():
+        for each in submissions[20:]:
+            app.submissions.submit(each)
+            go_on.wait(0.01)
+
+    thread = threading.Thread(target=keep_recording)
+    thread.start()
+    try:
+        back_up(database, tmp_path / "copy")
+    finally:
+        go_on.set()
+        thread.join()
+    app.close()
+    copy = restored(database, tmp_path / "copy", tmp_path)
+    assert verify(copy) == []
+    store = Store(copy)
+    try:
+        with store.reading() as connection:
+            assert set(acknowledged) <= set(connection.scalars(select(batches.c.id)))
+    finally:
+        store.close()
+
+
+def test_commits_between_two_pages_do_not_begin_a_copy_anew(tmp_path, opened, make, monkeypatch):
+    """A page at a time, with a commit after each: it still ends, and is of its first moment."""
+    app = opened()
+    if app.store.url.drivername != "sqlite":
+        pytest.skip("PostgreSQL has snapshots of its own")
+    app.submissions.submit(make("first"))
+    monkeypatch.setattr("service.storage.upkeep.backup.PAGES_AT_ONCE", 20)
+    steps = []
+
+    def commit(left, total):
+        steps.append((left, total))
+        app.submissions.submit(make(f"b{len(steps)}", after_s=float(len(steps))))
+
+    back_up(f"sqlite:///{app.store.url.database}", tmp_path / "copy.db", commit)
+    assert len(steps) >= 3
+    lefts = [left for left, _ in steps]
+    assert lefts == sorted(lefts, reverse=True)
+    with sqlite3.connect(tmp_path / "copy.db") as connection:
+        assert connection.execute("SELECT batch FROM batches").fetchall() == [("first",)]
+    assert verify(f"sqlite:///{tmp_path / 'copy.db'}") == []
+
+
+def test_a_backup_never_writes_over_anything_and_leaves_no_half_of_one(database, tmp_path):
+    there = tmp_path / "there"
+    there.write_text("mine")
+    with pytest.raises(BadConfiguration, match="exists already"):
+        back_up(database, there)
+    assert there.read_text() == "mine"
+    with pytest.raises(BadConfiguration, match="no such folder"):
+        back_up(database, tmp_path / "none" / "copy")
+    with pytest.raises(BadConfiguration, match="no such file"):
+        back_up(f"sqlite:///{tmp_path}/none.db", tmp_path / "copy")
+    broken = tmp_path / "broken.db"
+    broken.write_bytes(b"no database at all" * 100)
+    with pytest.raises(BadConfiguration, match="cannot be copied"):
+        back_up(f"sqlite:///{broken}", tmp_path / "copy")
+    left = {path.name for path in Path(tmp_path).iterdir() if not path.name.startswith("acquire")}
+    assert left == {"there", "broken.db"}
+
+
+# ---- prune -------------------------------------------------------------------------------------
+
+
+def test_what_is_before_is_gone_and_what_is_after_is_as_it_was(filled, database, make):
+    """Cut within an hour: the trends are those of what is left."""
+    cut = shifted(START, 5 * 14_000.0 + 1.0)
+    after = [i for i in filled.results.page(limit=500).items if i.time >= cut.text]
+    records = {item.id: filled.results.get(item.id) for item in after}
+    steps = []
+    pruned = prune(filled.store, cut, step=lambda p: steps.append((p.batches, p.total)))
+    assert (pruned.batches, pruned.total) == (12, 12)
+    assert steps[0] == (0, 12)
+    assert steps[-1] == (12, 12)
+    assert filled.results.page(limit=500).items == after
+    assert {id: filled.results.get(id) for id in records} == records
+    assert verify(database) == []
+    left = counts(filled)
+    assert (left["batches"], left["results"], left["idempotency_keys"]) == (12, 13, 12)
+    # What was deleted can come again, as if it had never been.
+    assert not filled.submissions.submit(make("b0", kind="good"), "key-live-0").replayed
+
+
+def test_of_one_run_alone(filled, database):
+    before = filled.results.page(limit=500).items
+    pruned = prune(filled.store, shifted(START, 1e6), "r")
+    assert (pruned.batches, filled.results.page(run="r").items) == (12, [])
+    assert filled.results.page(limit=500).items == before
+    assert [run.run for run in filled.runs.all()] == ["live"]
+    assert verify(database) == []
+
+
+def test_a_dry_run_counts_and_deletes_nothing(filled):
+    before = counts(filled)
+    assert prune(filled.store, shifted(START, 5 * 14_000.0), dry_run=True).total == 10
+    assert counts(filled) == before
+
+
+def test_an_hour_that_is_cut_keeps_its_later_part_in_the_trends(app, make, database):
+    for k in range(6):
+        app.submissions.submit(make(f"b{k}", after_s=k * 60.0, kind=KINDS[k % 4]))
+    prune(app.store, shifted(START, 180.0))
+    (hour,) = app.spacecraft.rates("XTE")
+    (day,) = app.spacecraft.rates("XTE", bucket="day")
+    assert (hour["batches"], day["batches"]) == (3, 3)
+    with app.store.reading() as connection:
+        for bucket in ("hour", "day"):
+            assert rollups.stored(connection, bucket) == rollups.recount(connection, bucket)
+    assert verify(database) == []
+
+
+def test_stopped_it_has_taken_out_whole_hours_and_goes_on(filled, database):
+    class Stopped(Exception):
+        pass
+
+    def stop(pruned):
+        if pruned.batches >= 3:
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        prune(filled.store, shifted(START, 1e6), step=stop)
+    assert verify(database) == []
+    pruned = prune(filled.store, shifted(START, 1e6))
+    assert pruned.batches == pruned.total == 24 - 3
+    assert counts(filled) == dict.fromkeys(counts(filled), 0)
+
+
+def test_while_it_prunes_batches_are_recorded(opened, make, database):
+    """Another connection prunes the first hour while the second is filled."""
+    app = opened()
+    for k in range(20):
+        app.submissions.submit(make(f"old{k}", after_s=float(k)))
+    store = Store(database)
+    try:
+        thread = threading.Thread(target=prune, args=(store, shifted(START, 3600.0)))
+        thread.start()
+        new = [app.submissions.submit(make(f"new{k}", after_s=7200.0 + k)).id for k in range(20)]
+        thread.join()
+    finally:
+        store.close()
+    left = app.results.page(limit=500).items
+    assert sorted(item.id for item in left) == sorted(new)
+    assert verify(database) == []
+
+
+def test_of_whatever_refers_to_a_batch_nothing_is_left_hanging():
+    """Every table of the code that refers to results or batches is one that is pruned."""
+    for target, pruned in ((results, OF_A_RESULT), (batches, OF_A_BATCH)):
+        refer = {
+            table
+            for table in metadata.sorted_tables
+            for key in table.foreign_keys
+            if key.column.table is target and table is not results
+        }
+        assert refer == set(pruned)
+
+
+def test_what_refers_to_a_result_is_found_without_reading_every_row(app):
+    """Deleting a result asks for its keys and its what-ifs."""
+    questions = {
+        "ix_idempotency_keys_result_id": "FROM idempotency_keys WHERE result_id = 'x'",
+        "ix_results_parent": "FROM results WHERE parent_id = 'x'",
+    }
+    with app.store.reading() as connection:
+        if connection.dialect.name == "sqlite":
+            explain = "EXPLAIN QUERY PLAN"
+        else:
+            # Of tables this small it would read every row, which is no answer.
+            connection.exec_driver_sql("SET LOCAL enable_seqscan = off")
+            explain = "EXPLAIN"
+        for index, question in questions.items():
+            plan = connection.exec_driver_sql(f"{explain} SELECT 1 {question}").all()
+            assert index in str(plan)

@@ -1,0 +1,242 @@
+"""The writer: shared commits, and failures that reach those they concern."""
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from sqlalchemy import func, insert, select, text
+from sqlalchemy.exc import IntegrityError, OperationalError
+
+from service.errors import Busy, Stopping
+from service.storage.sql.database import Store
+from service.storage.sql.tables import results, runs
+from service.storage.sql.writer import Writer
+from tests.storage.recount import assert_equal_to_a_recount
+
+
+@pytest.fixture
+def store(database):
+    opened = Store(database)
+    yield opened
+    opened.close()
+
+
+def held_up(writer):
+    """Keep the writer busy until the event that is given back is set."""
+    begun, go_on = threading.Event(), threading.Event()
+
+    def wait(_connection):
+        begun.set()
+        go_on.wait(30)
+
+    writer.change(wait)
+    begun.wait(30)
+    return go_on
+
+
+def before_commit(store, monkeypatch, act):
+    """Have `act` called with the writer's connection before each of its commits."""
+    kept = store.writer._connection
+    end = kept._end
+
+    def acting(connection, *, keep):
+        if keep:
+            act(connection)
+        end(connection, keep=keep)
+
+    monkeypatch.setattr(kept, "_end", acting)
+
+
+def new_run(name):
+    return lambda connection: connection.execute(insert(runs).values(name=name, created="now"))
+
+
+def names(store):
+    with store.reading() as connection:
+        return sorted(connection.scalars(select(runs.c.name)))
+
+
+def test_what_waits_together_is_committed_together(store, monkeypatch):
+    commits = []
+    before_commit(store, monkeypatch, commits.append)
+    go_on = held_up(store.writer)
+    waiting = [store.writer.change(new_run(f"run{i:02d}")) for i in range(20)]
+    go_on.set()
+    for each in waiting:
+        each.result(30)
+    assert len(names(store)) == 20
+    assert len(commits) == 2
+
+
+def test_what_has_time_lets_others_pass_for_one_transaction(store):
+    """Chunks of a bulk load neither hold up single posts nor wait for them for ever."""
+    done, writer = [], store.writer
+
+    def later(future, name):
+        future.add_done_callback(lambda _: done.append(name))
+        return future
+
+    def post_meanwhile(_connection):
+        later(writer.change(lambda _: None), "a post that came meanwhile")
+
+    go_on = held_up(writer)
+    chunks = [later(writer.record([], low_priority=True), f"chunk {k}") for k in (1, 2)]
+    later(writer.change(post_meanwhile), "a post")
+    go_on.set()
+    for each in chunks:
+        each.result(30)
+    assert done == ["a post", "chunk 1", "a post that came meanwhile", "chunk 2"]
+
+
+def test_an_answer_comes_after_its_commit(store):
+    for index in range(20):
+        store.writer.change(new_run(f"run{index:02d}")).result(30)
+        assert len(names(store)) == index + 1
+
+
+def test_one_change_that_fails_spoils_none_of_its_neighbours(store):
+    go_on = held_up(store.writer)
+    waiting = [store.writer.change(new_run(name)) for name in ("a", "b", "a", "c")]
+    go_on.set()
+    assert isinstance(waiting[2].exception(30), IntegrityError)
+    assert names(store) == ["a", "b", "c"]
+
+
+@pytest.mark.parametrize("empty_database", ["sqlite"], indirect=True)
+def test_a_change_that_fails_with_an_answer_half_read_keeps_no_lock(store):
+    """Closed like that, SQLite's connection would live on for as long as the answer does."""
+    half_read = []
+
+    def fail(connection):
+        half_read.append(connection.execute(text("SELECT name FROM sqlite_master")))
+        half_read[0].fetchone()
+        connection.execute(insert(runs).values(name="lost", created="now"))
+        raise OperationalError("SELECT", {}, Exception("disk I/O error"))
+
+    store.writer.change(new_run("before")).result(30)
+    assert isinstance(store.writer.change(fail).exception(30), Busy)
+    store.writer.change(new_run("after")).result(5)
+    assert names(store) == ["after", "before"]
+
+
+def test_one_draft_that_cannot_be_kept_spoils_none_of_its_neighbours(app, make):
+    go_on = held_up(app.store.writer)
+    drafts = [app.submissions.ingest.solver.solve(make(name)) for name in ("b1", "b2", "b3")]
+    drafts[1].result["mission_digest"] = "sha256:of nothing that is there"
+    waiting = app.store.writer.record(drafts)
+    go_on.set()
+    first, second, third = waiting.result(30)
+    assert isinstance(second, IntegrityError)
+    assert [app.results.get(each.id).answer.batch for each in (first, third)] == ["b1", "b3"]
+    assert [each["batches"] for each in app.spacecraft.rates("XTE")] == [2]
+
+
+def test_a_full_queue_is_busy_and_takes_work_again_once_it_is_written(store):
+    writer = Writer(store._writing, max_queued=3)
+    go_on = held_up(writer)
+    waiting = [writer.change(new_run(name)) for name in "abc"]
+    with pytest.raises(Busy, match="3 records are waiting"):
+        writer.change(new_run("d"))
+    go_on.set()
+    for each in waiting:
+        each.result(30)
+    writer.change(new_run("d")).result(30)
+    writer.close()
+    assert names(store) == ["a", "b", "c", "d"]
+
+
+def test_closing_writes_what_is_queued_and_refuses_the_rest(store):
+    go_on = held_up(store.writer)
+    waiting = [store.writer.change(new_run(name)) for name in "abc"]
+    with ThreadPoolExecutor(1) as thread:
+        closing = thread.submit(store.writer.close)
+        while not store.writer._closing:
+            pass
+        with pytest.raises(Busy, match="stopping"):
+            store.writer.change(new_run("d"))
+        go_on.set()
+        closing.result(30)
+    assert all(each.done() for each in waiting)
+    assert names(store) == ["a", "b", "c"]
+
+
+def test_a_commit_that_fails_reaches_everyone_who_waits_and_writing_goes_on(
+    app, make, caplog, monkeypatch
+):
+    """What is put in stands for a disk that fails at COMMIT: nothing of the transaction is kept."""
+    app.submissions.submit(make("b0"))
+
+    def fail(_connection):
+        raise OperationalError("COMMIT", {}, Exception("disk I/O error"))
+
+    before_commit(app.store, monkeypatch, fail)
+    with ThreadPoolExecutor(8) as threads:
+        waiting = [threads.submit(app.submissions.submit, make(f"b{i}")) for i in range(8)]
+        errors = [each.exception(30) for each in waiting]
+    assert errors[0] is None  # recorded before: a repeat only reads
+    assert all(isinstance(error, Busy) for error in errors[1:])
+    assert "disk" not in str(errors[1]), "what is inside is for the log alone"
+    assert "disk I/O error" in caplog.text
+    assert len(app.results.page().items) == 1
+    monkeypatch.undo()
+    assert not any(app.submissions.submit(make(f"b{i}")).replayed for i in range(1, 8))
+    assert len(app.results.page().items) == 8
+
+
+@pytest.mark.parametrize("empty_database", ["sqlite"], indirect=True)
+def test_a_full_disk_loses_nothing_acknowledged_and_writing_resumes_with_room(
+    app, make, caplog, monkeypatch
+):
+    """SQLite's own bound on the file gives the error of a full disk, wherever it strikes."""
+    kept, limit = app.store.writer._connection, {"pages": 0}
+    start = kept._start
+
+    def bound(connection):
+        start(connection)
+        connection.connection.execute(f"PRAGMA max_page_count = {limit['pages']}")
+
+    with app.store.reading() as connection:
+        used = connection.exec_driver_sql("PRAGMA page_count").scalar()
+    monkeypatch.setattr(kept, "_start", bound)
+    acknowledged, refused = [], []
+    for index in range(60):
+        limit["pages"] = used + index  # a little more room each time
+        try:
+            acknowledged.append(app.submissions.submit(make(f"b{index}")))
+        except Busy as error:
+            refused.append(str(error))
+    assert acknowledged
+    assert refused
+    assert all("cannot be written now" in each for each in refused)
+    assert "disk is full" in caplog.text
+    limit["pages"] = 1_000_000
+    assert not app.submissions.submit(make("at last")).replayed
+    for each in acknowledged:
+        assert app.results.get(each.id).current
+    with app.store.reading() as connection:
+        stored = connection.scalar(select(func.count()).select_from(results))
+        assert stored == len(acknowledged) + 1
+        assert_equal_to_a_recount(connection)
+        assert connection.exec_driver_sql("PRAGMA integrity_check").scalar() == "ok"
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_writer_that_ends_leaves_nobody_waiting_and_is_not_ready(app):
+    writer = app.store.writer
+
+    def end(_connection):
+        begun.set()
+        go_on.wait(30)
+        raise SystemExit
+
+    begun, go_on = threading.Event(), threading.Event()
+    ended = writer.change(end)
+    begun.wait(30)
+    later = writer.change(new_run("late"))
+    go_on.set()
+    for each in (ended, later):
+        assert isinstance(each.exception(30), Stopping)
+    with pytest.raises(Stopping):
+        writer.change(new_run("later still"))
+    with pytest.raises(Busy, match="started again"):
+        app.service.ready()

@@ -1,0 +1,31 @@
+"""Holds a database against what was acknowledged: nothing lost, nothing torn, nothing doubled."""
+
+import hashlib
+
+from sqlalchemy import func, select
+
+from service.storage.sql.tables import batches, results, solutions, star_results
+from tests.storage.recount import assert_equal_to_a_recount
+
+
+def assert_whole(app, acknowledged):
+    with app.store.reading() as connection:
+        stored = {
+            id: hashlib.sha256(answer.encode()).hexdigest()
+            for id, answer in connection.execute(select(results.c.id, results.c.answer))
+        }
+        assert acknowledged.items() <= stored.items()
+        assert connection.scalar(select(func.count()).select_from(batches)) == len(stored)
+        stars = dict(
+            connection.execute(
+                select(star_results.c.result_id, func.count()).group_by(star_results.c.result_id)
+            ).all()
+        )
+        solved = set(connection.scalars(select(solutions.c.result_id)))
+        for row in connection.execute(select(results)).mappings():
+            assert stars[row["id"]] == row["observed"]
+            assert (row["id"] in solved) == (row["status"] is not None)
+        assert_equal_to_a_recount(connection)
+        if connection.dialect.name == "sqlite":
+            assert connection.exec_driver_sql("PRAGMA integrity_check").scalar() == "ok"
+            assert connection.exec_driver_sql("PRAGMA foreign_key_check").all() == []

@@ -1,0 +1,57 @@
+"""Kernels that borrow what they are given: nothing is counted, nothing is made, nothing leaks."""
+
+import sys
+
+import numpy as np
+import pytest
+from numba import njit
+from numba.core.errors import NumbaError
+
+from service.attitude.covariance import information
+from service.attitude.quest import quest
+from service.compiled.jit import njit_no_refcount
+from service.compiled.views import borrowed_view
+from service.identify.voting.fov_rotation import rotation_rad
+from service.vectors import unit
+
+
+def test_what_borrows_leaves_the_counts_of_its_caller_alone(rng):
+    vectors, weights = unit(rng.normal(size=(5, 3))), np.ones(5)
+    quaternion, room, start = np.empty(4), np.empty((3, 3, 3)), np.array([0.0, 0.0, 0.0, 1.0])
+    held = (vectors, weights, quaternion, room, start)
+    before = [sys.getrefcount(array) for array in held]
+    for _ in range(1_000):
+        information(vectors, weights, room[0])
+        quest(vectors, vectors, weights, start, quaternion, room)
+        rotation_rad(vectors[0], vectors[1], vectors[2], vectors[3], vectors[4], start, False)
+    assert [sys.getrefcount(array) for array in held] == before
+
+
+def test_what_its_caller_made_is_there_as_long_as_it_runs():
+    @njit_no_refcount
+    def total(rows):
+        found = 0.0
+        for row in rows:
+            for value in row:
+                found += value
+        return found
+
+    @njit
+    def of_new_arrays(n):
+        found = 0.0
+        for k in range(n):
+            made = np.full((3, 4), float(k))
+            view = borrowed_view(made)
+            found += total(made) - total(view[1:])
+        return found
+
+    assert of_new_arrays(1_000) == sum(4.0 * k for k in range(1_000))
+
+
+def test_what_borrows_cannot_make_an_array():
+    @njit_no_refcount
+    def makes(n):
+        return np.empty(n)[0]
+
+    with pytest.raises(NumbaError):
+        makes(3)

@@ -1,0 +1,71 @@
+"""The code stays readable in pieces: short modules and functions, few arguments, small folders."""
+
+import ast
+from collections import Counter
+from functools import cache
+from pathlib import Path
+
+import service
+
+PACKAGE = Path(service.__file__).parent
+MAX_MODULE_LINES, MAX_FUNCTION_LINES, MAX_ARGUMENTS, MAX_MODULES = 400, 80, 12, 20
+
+# Still to be split.
+LONG_MODULES = {"ingest/replays.py", "ingest/submit.py", "storage/sql/engines.py"}
+LONG_FUNCTIONS: set[str] = set()
+FULL_FOLDERS = {"web/api"}
+
+
+def name_of(path):
+    return path.relative_to(PACKAGE).as_posix()
+
+
+@cache
+def modules():
+    return {path: path.read_text(encoding="utf-8") for path in sorted(PACKAGE.rglob("*.py"))}
+
+
+@cache
+def functions():
+    """Every function of the service, kernels and methods included, by module and name."""
+    return {
+        f"{name_of(path)}:{node.name}": node
+        for path, text in modules().items()
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    }
+
+
+def test_there_is_something_to_measure():
+    assert len(modules()) > 300
+    assert len(functions()) > 1500
+
+
+def test_no_module_is_too_long():
+    long = {name_of(path) for path, text in modules().items() if lines_of(text) > MAX_MODULE_LINES}
+    assert long <= LONG_MODULES
+
+
+def lines_of(text):
+    return text.count("\n")
+
+
+def test_no_function_is_too_long():
+    long = {
+        name
+        for name, node in functions().items()
+        if node.end_lineno - node.lineno + 1 > MAX_FUNCTION_LINES
+    }
+    assert long <= LONG_FUNCTIONS
+
+
+def test_no_function_takes_too_many_arguments():
+    def count(arguments):
+        return len(arguments.posonlyargs + arguments.args + arguments.kwonlyargs)
+
+    assert not {name for name, node in functions().items() if count(node.args) > MAX_ARGUMENTS}
+
+
+def test_no_folder_holds_too_many_modules():
+    counts = Counter(name_of(path.parent) for path in modules())
+    assert {folder for folder, count in counts.items() if count > MAX_MODULES} <= FULL_FOLDERS

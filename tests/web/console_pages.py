@@ -1,0 +1,16 @@
+"""The addresses of the console's pages, from the registry."""
+
+from service.web.console import pages as pages
+from service.web.console.registry import PAGES
+
+WITHOUT_CONTENT = ("latest_batch", "sign_in_page")
+"""A redirect, and the page before there is a reader."""
+
+
+def console_addresses() -> list[str]:
+    """Every page that needs no id; of spacecraft that of XTE."""
+    return [
+        page.path.format(name="XTE")
+        for name, page in PAGES.items()
+        if name not in WITHOUT_CONTENT and "{id}" not in page.path
+    ]
