@@ -77,7 +77,7 @@ def of_all(part: Identification, mask: Mask) -> Identification:
     likely: list[tuple[float, ...]] = [()] * n
     for place, names in zip(places, part.rivals, strict=True):
         rivals[place] = names
-    for place, chances in zip(places, part.rival_probability, strict=True):
+    for place, chances in zip(places, part.rival_probability or ((),) * len(places), strict=True):
         likely[place] = chances
     return structs.replace(
         part,
