@@ -10,7 +10,11 @@ from service.cli.configuration import settings_of
 from service.errors import BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
+    from service.acquire.camera_calibration import CameraCalibration
     from service.acquire.picture import PictureResult
+    from service.identify.blind.solver import BlindSolver
+    from service.settings import Settings
+    from service.sky.whole_sky.bright_stars import BrightStars
 
 
 def add(commands: Any) -> None:
@@ -47,20 +51,40 @@ def add(commands: Any) -> None:
 
 def run(parsed: Namespace) -> int:
     """Calibrate, write the files and print the result; 1 where a picture could not be used."""
-    from service.acquire.camera_calibration import calibrate_camera, mission_text
-    from service.acquire.picture import blind_sky, solve_picture
-    from service.cli.pictures import LEAST_MEGAPIXELS, focal_guess_px
-    from service.imaging.frames.files import read_frame
-    from service.imaging.frames.frame import FrameLimits
-    from service.imaging.residual_map import draw_residuals
-    from service.missions.mission import parse_mission
+    from service.acquire.camera_calibration import calibrate_camera
+    from service.acquire.picture import blind_sky
     from service.sky.catalog.star_catalog import open_catalog
 
     settings = settings_of(parsed)
     sky, solver = blind_sky(open_catalog(settings.catalog))
+    used = _solved(parsed, settings, sky, solver)
+    if not used:
+        message = "none of the pictures has an attitude: there is nothing to calibrate with"
+        raise BadInput(Fault("FILE", message, shown_value(len(parsed.files))))
+    stars = [
+        sky.direction[[star.row for star in each.attitude.stars]] for each in used if each.attitude
+    ]
+    found = calibrate_camera(used, stars)
+    name = _mission_name(parsed)
+    _write_mission(parsed.output, name, found)
+    maps = _write_maps(parsed.output, found)
+    _print_result(found)
+    print(f"{parsed.output}: mission {name}; residual maps: {maps[0]}, {maps[1]}")
+    return 0 if len(used) == len(parsed.files) else 1
+
+
+def _solved(
+    parsed: Namespace, settings: "Settings", sky: "BrightStars", solver: "BlindSolver"
+) -> list["PictureResult"]:
+    """The pictures with an attitude; why the others have none is printed."""
+    from service.acquire.picture import solve_picture
+    from service.cli.pictures import LEAST_MEGAPIXELS, focal_guess_px
+    from service.imaging.frames.files import read_frame
+    from service.imaging.frames.frame import FrameLimits
+
     max_pixels = 1_000_000 * max(settings.frame_megapixels, LEAST_MEGAPIXELS)
     used: list[PictureResult] = []
-    refused, shape = 0, None
+    shape = None
     for file in parsed.files:
         try:
             with file.open("rb") as opened:
@@ -70,45 +94,56 @@ def run(parsed: Namespace) -> int:
                 guess_px = used[0].attitude.lens.focal_px
             result = solve_picture(frame, sky, solver, guess_px)
         except BadInput as error:
-            refused += 1
             print(f"acquire: {file}: {error}", file=sys.stderr)
             continue
         if result.attitude is None:
-            refused += 1
             reason = "; ".join(result.remarks)
             print(f"acquire: {file}: no attitude: {reason}", file=sys.stderr)
             continue
         shape = (frame.height_px, frame.width_px)
         used.append(result)
         print(f"{file}: {len(result.attitude.stars)} stars, {result.attitude.rms_px:.2f} px rms")
-    if not used:
-        message = "none of the pictures has an attitude: there is nothing to calibrate with"
-        raise BadInput(Fault("FILE", message, shown_value(len(parsed.files))))
-    stars = [
-        sky.direction[[star.row for star in each.attitude.stars]] for each in used if each.attitude
-    ]
-    found = calibrate_camera(used, stars)
-    name = (
-        parsed.name
-        or "".join(
-            letter if letter.isalnum() or letter in "_-" else "_" for letter in parsed.output.stem
-        )
-        .lstrip("_-")
-        .upper()
-    )
-    text = mission_text(name or "CAMERA", found)
-    parse_mission(text, str(parsed.output))
-    parsed.output.write_text(text, encoding="utf-8")
-    size = found.lens.width_px, found.lens.height_px
-    before, after = found.rms_px
+    return used
+
+
+def _mission_name(parsed: Namespace) -> str:
+    """The name as given, or one made of letters of the output's name."""
+    stem: str = parsed.output.stem
+    letters = "".join(each if each.isalnum() or each in "_-" else "_" for each in stem)
+    return str(parsed.name or letters.lstrip("_-").upper() or "CAMERA")
+
+
+def _write_mission(output: Path, name: str, found: "CameraCalibration") -> None:
+    """Write the mission file, once it is known to be one that can be read."""
+    from service.acquire.camera_calibration import mission_text
+    from service.missions.mission import parse_mission
+
+    text = mission_text(name, found)
+    parse_mission(text, str(output))
+    output.write_text(text, encoding="utf-8")
+
+
+def _write_maps(output: Path, found: "CameraCalibration") -> list[Path]:
+    """Write the residuals before and after as pictures beside the mission file."""
+    from service.imaging.residual_map import draw_residuals
+
+    size, usual_px = (found.lens.width_px, found.lens.height_px), max(found.rms_px[1], 1e-3)
+    # Before, the places are of all stars; after, without those that were left out.
+    drawn = {
+        "before": (found.before_place_px, found.before_px),
+        "after": (found.place_px, found.after_px),
+    }
     maps = []
-    for word, residual in (("before", found.before_px), ("after", found.after_px)):
-        path = parsed.output.with_name(f"{parsed.output.stem}-residuals-{word}.png")
-        # Before, the places are of all stars; after, without those that were left out.
-        place = found.place_px if word == "after" else found.before_place_px
-        path.write_bytes(draw_residuals(place, residual, size, max(after, 1e-3), word))
+    for word, (place, residual) in drawn.items():
+        path = output.with_name(f"{output.stem}-residuals-{word}.png")
+        path.write_bytes(draw_residuals(place, residual, size, usual_px, word))
         maps.append(path)
+    return maps
+
+
+def _print_result(found: "CameraCalibration") -> None:
     lens = found.lens
+    before, after = found.rms_px
     center_u, center_v = lens.center_px
     print(
         f"focal length {lens.focal_px:.2f} +- {found.sigma(0) * lens.focal_px:.2f} px, centre "
@@ -126,5 +161,3 @@ def run(parsed: Namespace) -> int:
     )
     for remark in found.remarks:
         print(remark)
-    print(f"{parsed.output}: mission {name}; residual maps: {maps[0]}, {maps[1]}")
-    return 1 if refused else 0
