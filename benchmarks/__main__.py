@@ -12,7 +12,18 @@ import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
 
-from benchmarks import (
+from benchmarks.record import SERVICE, record_of
+from benchmarks.report import Report
+from benchmarks.speed import (
+    kernels,
+    performance,
+    posts,
+    soak,
+    staircase,
+    stored,
+    verified_cost,
+)
+from benchmarks.validation import (
     aberration,
     attitude_against_svd,
     calibration,
@@ -21,24 +32,15 @@ from benchmarks import (
     covariance,
     frames,
     imaging_claims,
-    kernels,
-    lost_in_space,
     paper_runs,
-    performance,
     plain_reference,
-    posts,
     ptp,
-    soak,
     spurious,
-    staircase,
-    stored,
     two_groups,
-    verified_cost,
     whole_sky,
     zone_counts,
 )
-from benchmarks.record import SERVICE, record_of
-from benchmarks.report import Report
+from benchmarks.validation.lost_in_space import measure as lost_in_space
 
 BENCHMARKS: dict[str, Callable[[bool, int], Report]] = {
     "zone_counts": zone_counts.run,

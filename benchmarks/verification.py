@@ -5,7 +5,8 @@
     python -m benchmarks.verification --only sky,covariance  these anew, the others as they are
     python -m benchmarks.verification --check                measure nothing: which are stale?
 
-A section is a module of `benchmarks` with its `SECTION`, listed in `SECTIONS`.
+A section is a module of `benchmarks.validation` with its `SECTION`, listed in `SECTIONS`; that
+of the cost of verifying is one of `benchmarks.speed`.
 The exit code is 1 where the page has a section out of its bounds.
 
 `--check` names the sections of docs/verification.md and of docs/performance.md
@@ -21,7 +22,10 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from benchmarks import (
+from benchmarks.record import ROOT, record_of
+from benchmarks.sections import Section, framed, has_record, kept, out_of_bounds, stale
+from benchmarks.speed import performance, verified_cost
+from benchmarks.validation import (
     aberration,
     attitude_against_svd,
     calibration,
@@ -29,18 +33,14 @@ from benchmarks import (
     consistency,
     covariance,
     imaging_claims,
-    lost_in_space,
     paper_runs,
-    performance,
     plain_reference,
     ptp,
     spurious,
-    verified_cost,
     whole_sky,
     zone_counts,
 )
-from benchmarks.record import record_of
-from benchmarks.sections import Section, framed, has_record, kept, out_of_bounds, stale
+from benchmarks.validation.lost_in_space import measure as lost_in_space
 from service import __version__
 
 SECTIONS: Mapping[str, Section] = {
@@ -62,7 +62,7 @@ SECTIONS: Mapping[str, Section] = {
 }
 """In the order of the page."""
 
-TARGET = Path(__file__).parent.parent / "docs" / "verification.md"
+TARGET = ROOT / "docs" / "verification.md"
 DEFAULT_SEED = 19941026
 
 

@@ -1,6 +1,7 @@
 """The code stays readable in pieces: short modules and functions, few arguments, small folders."""
 
 import ast
+import re
 from collections import Counter
 from functools import cache
 from pathlib import Path
@@ -69,3 +70,10 @@ def test_no_function_takes_too_many_arguments():
 def test_no_folder_holds_too_many_modules():
     counts = Counter(name_of(path.parent) for path in modules())
     assert {folder for folder, count in counts.items() if count > MAX_MODULES} <= FULL_FOLDERS
+
+
+def test_no_test_of_the_service_imports_a_benchmark():
+    """Both use what `tests/reference` and `service/simulate` hold; benchmarks have their own tests."""
+    importing = re.compile(r"^\s*(from|import) benchmarks\b", re.MULTILINE)
+    files = Path(__file__).parent.rglob("*.py")
+    assert [f.name for f in files if importing.search(f.read_text(encoding="utf-8"))] == []

@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.two_groups import acquired, is_at, is_good, simple, two_groups
 from service.acquire import acquire
 from service.observations.schema import submission_from_json
 from service.simulate.stretches import Pass
@@ -13,6 +12,7 @@ from service.simulate.telemetry import draw_pass
 from service.simulate.two_groups import Views
 from service.vectors import rotate_about
 from tests.advice.passes import mission_like
+from tests.reference.two_groups import acquired, is_at, is_good, simple, two_groups
 
 BATCHES = 25
 

@@ -5,7 +5,6 @@ import json
 
 import pytest
 
-from benchmarks import centroids
 from service.errors import BadInput
 from service.studies.star_image_report.claims import Claim, Row, Study
 from service.studies.star_image_report.command import ROWS, run_imaging, table
@@ -86,10 +85,3 @@ def test_a_row_that_is_not_there_is_refused_by_name():
         run_imaging(["IM-12"])
     with pytest.raises(BadInput, match="seed"):
         run_imaging(["IM-5"], seed=-1)
-
-
-def test_centroids_are_held_beside_photutils_and_sep(monkeypatch, seed):
-    monkeypatch.setattr(centroids, "RATIOS", (100.0,))
-    report = centroids.run(quick=True, seed=seed)
-    assert report.passed, report.text()
-    assert "sep winpos" in report.text()

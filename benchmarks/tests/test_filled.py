@@ -5,7 +5,7 @@ import re
 import pytest
 from sqlalchemy import event
 
-from benchmarks.fill_database import fill
+from benchmarks.speed.fill_database import fill
 from service.app.factory import open_app
 from service.settings import Settings
 from service.times import parse_utc, shifted

@@ -64,8 +64,8 @@ def service(database: Path) -> Iterator[Served]:
 
 @contextmanager
 def no_op() -> Iterator[Served]:
-    """The no-op (`benchmarks.no_op`) under the same server."""
-    arguments = ["-m", "uvicorn", "benchmarks.no_op:app", "--http", "httptools"]
+    """The no-op (`benchmarks.speed.no_op`) under the same server."""
+    arguments = ["-m", "uvicorn", "benchmarks.speed.no_op:app", "--http", "httptools"]
     arguments += ["--loop", "uvloop", "--no-access-log", "--log-level", "warning"]
     with _served(arguments, "/") as served:
         yield served

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from benchmarks.lost_in_space_peers import LIMIT_MAG, Solver
+from benchmarks.validation.lost_in_space.peers import LIMIT_MAG, Solver
 from service.simulate.scenes import Scene
 from service.vectors import Matrix
 

@@ -18,9 +18,9 @@ import numpy.typing as npt
 from numba import njit
 from scipy.spatial import cKDTree
 
-from benchmarks.bare import bare_many, bare_one, room_for
 from benchmarks.bounds import Bound, at_least, at_most, equal
 from benchmarks.report import Report
+from benchmarks.speed.bare import bare_many, bare_one, room_for
 from service.attitude.kernels import QUEST, solve
 from service.attitude.solve import WORST_AXIS_DEG
 from service.identify.attitude_from_matches import attitude_of, match

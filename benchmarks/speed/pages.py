@@ -1,6 +1,6 @@
-"""What the pages' data costs on a database of millions: `python -m benchmarks.pages OUT.db`.
+"""What the pages' data costs on a database of millions: `python -m benchmarks.speed.pages OUT.db`.
 
-The database is made by `python -m benchmarks.fill_database`.  Each page's data
+The database is made by `python -m benchmarks.speed.fill_database`.  Each page's data
 is asked of the operations and put into JSON, as a handler does; its answer is
 held against a count by other means.  Shown are milliseconds of several calls:
 the median and the fastest by the clock, and the least of the processor's own
@@ -21,7 +21,7 @@ from typing import Any
 import msgspec
 from tqdm import tqdm
 
-from benchmarks.fill_database import CADENCE_S
+from benchmarks.speed.fill_database import CADENCE_S
 from service.app.factory import App, open_app
 from service.observations.schema import OptionsIn
 from service.settings import Settings
@@ -179,12 +179,14 @@ def measure(asked: Asked) -> Measured:
 
 def main() -> int:
     parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.pages", description=(__doc__ or "").splitlines()[0]
+        prog="python -m benchmarks.speed.pages", description=(__doc__ or "").splitlines()[0]
     )
     parser.add_argument("database", type=Path, metavar="OUT.db")
     file = parser.parse_args().database
     if not file.is_file():
-        sys.exit(f"{file} is not there: make it with `python -m benchmarks.fill_database {file}`")
+        sys.exit(
+            f"{file} is not there: make it with `python -m benchmarks.speed.fill_database {file}`"
+        )
     app = open_app(Settings(database=f"sqlite:///{file}"))
     try:
         app.service.ready()

@@ -25,10 +25,10 @@ from statistics import median
 from typing import Any
 
 from benchmarks.bounds import Bound, at_least, at_most, equal
-from benchmarks.load import drive, request
-from benchmarks.posts import API, CONNECTIONS, FIRST, RIGHT, Telemetry, telemetry
 from benchmarks.report import Report
-from benchmarks.serving import Served, service
+from benchmarks.speed.load import drive, request
+from benchmarks.speed.posts import API, CONNECTIONS, FIRST, RIGHT, Telemetry, telemetry
+from benchmarks.speed.serving import Served, service
 
 SHARE = 0.7
 SLICES, SLICE_S = 60, 60.0

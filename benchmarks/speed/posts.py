@@ -6,7 +6,7 @@ The service runs as it is served, a process of its own over a SQLite file with
 synchronous=FULL; batches are live ones of a nominal pass, five stars, by votes.
 The no-op is the same framework and server, and the same body: its route declares
 the batch as its body, so that the framework checks it, and answers a small JSON
-(`benchmarks.no_op`); one that takes any JSON stands beside it.  Every answer is looked
+(`benchmarks.speed.no_op`); one that takes any JSON stands beside it.  Every answer is looked
 at: each post is recorded, new, and its stars are named as the pass drew them.
 """
 
@@ -24,9 +24,9 @@ from statistics import median
 from typing import Any
 
 from benchmarks.bounds import Bound, at_least, at_most, equal
-from benchmarks.load import Driven, drive, request
 from benchmarks.report import Report
-from benchmarks.serving import START_S, Served, no_op, service
+from benchmarks.speed.load import Driven, drive, request
+from benchmarks.speed.serving import START_S, Served, no_op, service
 from service.app.factory import open_app
 from service.missions.mission import load_missions
 from service.observations.schema import submission_from_json
@@ -42,12 +42,14 @@ FIRST = datetime.fromisoformat(DEFAULT_START)
 CONNECTIONS = 16
 POSTS, QUICK_POSTS = 2_000, 800
 """Of a turn: short, so that a server and its no-op meet the same machine, and many turns."""
+ONE_BY_ONE = 200
+"""Of a turn, over one connection."""
 BULK, QUICK_BULK = 30_000, 3_000
 ROUNDS, QUICK_ROUNDS = 9, 3
 GAP_S = 0.02
 """Between the posts of a connection, where waits and not rates are measured."""
 CHUNK = 250
-LEAST_OF_NO_OP, LEAST_OF_CEILING, MOST_WAIT, MOST_READY_S = 0.35, 0.5, 3.0, 3.0
+LEAST_OF_NO_OP, LEAST_OF_CEILING, MOST_WAIT, MOST_READY_S = 0.28, 0.5, 3.0, 3.0
 MOST_READY_MB, MOST_AFTER_MB, MOST_BULK_MB = 700.0, 800.0, 1600.0
 """Of all processes of the service together."""
 MOST_FIRST = 1.5
@@ -132,6 +134,7 @@ def singles(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any]
     ready_s, first, in_a_row, later = (median(each) for each in zip(*starts, strict=True))
     rates: dict[str, list[float]] = {"no-op": [], "any JSON": [], "service": []}
     cpu_us: dict[str, list[float]] = {name: [] for name in rates}
+    p50_ms: list[float] = []
     right = seen = 0
     with no_op() as bare, service(folder / "single.db") as served:
         at_ready_mb = served.resident_mb()
@@ -153,6 +156,9 @@ def singles(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any]
                     answer = json.loads(driven.last)
                     got, of = pass_.right(int(answer["batch"].rpartition("-")[2]), answer)
                     right, seen = right + got, seen + of
+            row = pass_.bodies(ONE_BY_ONE, f"one-by-one-{round_}")
+            waits = drive(served.port, [request(f"{API}/batches", each) for each in row], 1)
+            p50_ms.append(waits.percentile_ms(50))
         page = _read(served, f"{API}/batches?limit=500")["items"]
         for item in page[:100]:
             answer = _read(served, f"{API}/batches/{item['id']}")["answer"]
@@ -177,9 +183,10 @@ def singles(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any]
         "single: service over a route that takes any JSON": median(beside_any),
         "single: cpu of no-op over service": median(cpu_us["no-op"]) / median(cpu_us["service"]),
         "single: cpu of the service, us a post": median(cpu_us["service"]),
+        "single: p50 over one connection, ms": median(p50_ms),
         "single: stars named rightly": right / seen,
         "memory: at ready, MB": at_ready_mb,
-        f"memory: after {rounds * count + 400:,} posts, MB": after_mb,
+        f"memory: after {rounds * (count + ONE_BY_ONE) + 400:,} posts, MB": after_mb,
     }
     bounds = [
         at_least("single posts over the no-op", ratio, LEAST_OF_NO_OP),

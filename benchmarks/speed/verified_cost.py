@@ -19,6 +19,7 @@ from numba import njit
 from tqdm import tqdm
 
 from benchmarks.bounds import Bound, at_least, at_most
+from benchmarks.record import CORE, SIMULATOR
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
 from service.acquire import acquire
@@ -315,4 +316,4 @@ by votes and with the early stop.
     return Written(text, bounds_of(costs))
 
 
-SECTION = Section("What verifying costs", write)
+SECTION = Section("What verifying costs", write, (*CORE, *SIMULATOR, "service/studies/paper_1994"))

@@ -7,7 +7,13 @@ from functools import cache
 
 import numpy as np
 
-from benchmarks.lost_in_space_peers import LIMIT_MAG, Solver, ours, peers, tetra3rs_solver
+from benchmarks.validation.lost_in_space.peers import (
+    LIMIT_MAG,
+    Solver,
+    ours,
+    peers,
+    tetra3rs_solver,
+)
 from service.acquire import acquire
 from service.identify.lost_in_space.solver import FieldOfView
 from service.missions.mission import Mission

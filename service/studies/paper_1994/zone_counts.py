@@ -1,24 +1,18 @@
-"""Stars and pairs of the paper's own zones, from the shipped catalog, beside the paper's."""
+"""Stars and pairs of the paper's own zones, from a catalog of today, beside the paper's."""
 
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.bounds import Bound, at_most
-from benchmarks.record import CORE
-from benchmarks.report import Report
-from benchmarks.sections import Section, Written, table
 from service.missions.mission import Band, Cap, Mission, load_missions
-from service.sky.cache import LruCache
-from service.sky.catalog.star_catalog import load_embedded
 from service.sky.ephemeris import sun_direction
 from service.sky.model import SkyModel
 from service.sky.zones import SearchRegion
 from service.times import Utc, parse_utc
 from service.vectors import Vector, from_ra_dec
 
-PAPER = Path(__file__).parent.parent / "tests" / "studies" / "against_paper" / "zone_counts.json"
+_FILE = Path(__file__).with_name("zone_counts.json")
 
 
 @dataclass(frozen=True)
@@ -33,15 +27,17 @@ class Count:
 
     @property
     def off(self) -> float:
+        """Our count beyond the paper's, as a share of the paper's."""
         return self.here / self.paper - 1.0
 
     @property
     def passed(self) -> bool:
+        """Whether the difference is within its bound."""
         return abs(self.off) <= self.within
 
 
 def counted(sky: SkyModel, mission: Mission, axis: Vector, time: Utc) -> tuple[int, int]:
-    """Stars and pairs of the exact zone about an axis."""
+    """Stars and pairs of a mission's exact zone about an axis."""
     zone = mission.zone
     if isinstance(zone, Cap):
         region = SearchRegion("cap", axis, 0.0, zone.radius_deg)
@@ -56,7 +52,7 @@ def counted(sky: SkyModel, mission: Mission, axis: Vector, time: Utc) -> tuple[i
 
 def counts(sky: SkyModel) -> Iterator[Count]:
     """Every count that the paper prints, beside what is found here."""
-    paper = json.loads(PAPER.read_text(encoding="utf-8"))
+    paper = json.loads(_FILE.read_text(encoding="utf-8"))
     missions = load_missions()
     time = parse_utc(paper["time"])
     for zone in paper["zones"]:
@@ -79,42 +75,3 @@ def counts(sky: SkyModel) -> Iterator[Count]:
                 pick(month[k] for month in months),
                 paper["within"][quantity],
             )
-
-
-def run(quick: bool, seed: int) -> Report:
-    """The benchmark's form of it; neither the size nor the seed matters."""
-    found = list(counts(SkyModel(load_embedded(), LruCache(256 << 20))))
-    figures = {
-        f"{c.zone}, {c.quantity}": f"{c.here:,} (paper {c.paper:,}, {c.off:+.1%})" for c in found
-    }
-    return Report("zone_counts", figures, bounds_of(found))
-
-
-def bounds_of(found: list[Count]) -> list[Bound]:
-    """The largest difference of each quantity, stars and pairs."""
-    return [
-        at_most(
-            f"largest difference of {quantity}, as a share",
-            max(abs(c.off) for c in found if c.quantity == quantity),
-            next(c.within for c in found if c.quantity == quantity),
-        )
-        for quantity in dict.fromkeys(c.quantity for c in found)
-    ]
-
-
-def write(quick: bool, seed: int) -> Written:
-    """The section of the verification; neither the size nor the seed matters."""
-    found = list(counts(SkyModel(load_embedded(), LruCache(256 << 20))))
-    rows = [(c.zone, c.quantity, c.paper, c.here, f"{c.off:+.1%}") for c in found]
-    text = f"""
-Stars and pairs of the zones whose counts Fink & Shoup print, from the catalog that is shipped.
-Their run catalogs of 1994 are not to be had, so agreement within 8 % of the stars and 15 % of the
-pairs is asked for, not equality. The bands about the Sun are those of the first of each month from
-July 1995 to January 1996; of these the paper gives the fewest and the most.
-
-{table(("zone", "of", "paper", "here", "difference"), rows, numbers=3)}
-"""
-    return Written(text, bounds_of(found))
-
-
-SECTION = Section("The sky", write, (*CORE, "tests/studies/against_paper/zone_counts.json"))

@@ -1,4 +1,6 @@
-"""A database of millions of batches to measure with: `python -m benchmarks.fill_database OUT.db`.
+"""A database of millions of batches to measure with.
+
+    python -m benchmarks.speed.fill_database OUT.db
 
 Every table that lists, trends and alarms are read from is filled as the writer
 would have: batches, results, solutions, hourly and daily trends.  Answers and
@@ -68,7 +70,7 @@ def parts_of(total: int) -> list[Part]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.fill_database", description=__doc__.splitlines()[0]
+        prog="python -m benchmarks.speed.fill_database", description=__doc__.splitlines()[0]
     )
     parser.add_argument("output", type=Path, metavar="OUT.db", help="a new SQLite file")
     parser.add_argument("--batches", type=int, default=DEFAULT_BATCHES, metavar="N")

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.bounds import Bound, at_most, between
-from benchmarks.covariance import Passes, error_of
 from benchmarks.record import CORE, SIMULATOR
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
+from benchmarks.validation.covariance import Passes, error_of
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
@@ -93,4 +93,4 @@ def count_of(quick: bool) -> int:
     return QUICK_BATCHES if quick else BATCHES
 
 
-SECTION = Section("Aberration", write, (*CORE, *SIMULATOR, "benchmarks/covariance.py"))
+SECTION = Section("Aberration", write, (*CORE, *SIMULATOR, "benchmarks/validation/covariance.py"))

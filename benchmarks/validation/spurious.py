@@ -13,7 +13,7 @@ from benchmarks.bounds import Bound, at_least, at_most
 from benchmarks.record import CORE, SIMULATOR
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, pictures_of, table
-from benchmarks.verified_views import Condition, judged_views
+from benchmarks.validation.verified_views import Condition, judged_views
 from service.missions.mission import Identifier
 from service.simulate.drawing import Folder
 
@@ -234,4 +234,6 @@ def _draw(found: list[tuple[Case, Shares, Shares]], pictures: Folder) -> None:
     pictures.save(figure, "spurious")
 
 
-SECTION = Section("Spurious stars", write, (*CORE, *SIMULATOR, "benchmarks/verified_views.py"))
+SECTION = Section(
+    "Spurious stars", write, (*CORE, *SIMULATOR, "benchmarks/validation/verified_views.py")
+)

@@ -14,7 +14,7 @@ from benchmarks.bounds import Bound, at_least, at_most
 from benchmarks.record import CORE, SIMULATOR
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, pictures_of, table
-from benchmarks.verified_views import Condition, interval, judged_views
+from benchmarks.validation.verified_views import Condition, interval, judged_views
 from service.simulate.drawing import Folder
 from service.vectors import Vector
 
@@ -226,5 +226,7 @@ def _draw(found: list[Reliability], pictures: Folder) -> None:
 
 
 SECTION = Section(
-    "What a probability is worth", write, (*CORE, *SIMULATOR, "benchmarks/verified_views.py")
+    "What a probability is worth",
+    write,
+    (*CORE, *SIMULATOR, "benchmarks/validation/verified_views.py"),
 )

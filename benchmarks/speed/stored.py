@@ -3,7 +3,7 @@
     python -m benchmarks stored           five million batches: minutes, and 5 GB meanwhile
     python -m benchmarks stored --quick   twenty thousand
 
-The database is filled by `benchmarks.fill_database`; then batches are recorded
+The database is filled by `benchmarks.speed.fill_database`; then batches are recorded
 in earnest and trends are read.  What a trend is held against is a count of the
 same results one by one; the answers must be equal.
 """
@@ -19,9 +19,9 @@ from typing import Any
 from sqlalchemy import text
 
 from benchmarks.bounds import Bound, at_most
-from benchmarks.fill_database import START, fill
-from benchmarks.posts import telemetry
 from benchmarks.report import Report
+from benchmarks.speed.fill_database import START, fill
+from benchmarks.speed.posts import telemetry
 from service.app.factory import App, open_app
 from service.observations.schema import submission_from_json
 from service.settings import Settings

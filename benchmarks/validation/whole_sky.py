@@ -12,6 +12,7 @@ from msgspec import structs
 from tqdm import tqdm
 
 from benchmarks.bounds import Bound, at_least, at_most
+from benchmarks.record import CORE, SIMULATOR
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
 from service.acquire import acquire
@@ -114,4 +115,6 @@ stars, 3 arcsec, 0.1 mag. The heavy-tailed prior has a uniform share, which then
     return Written(text, bounds)
 
 
-SECTION = Section("Nothing known beforehand", write)
+SECTION = Section(
+    "Nothing known beforehand", write, (*CORE, *SIMULATOR, "service/studies/paper_1994")
+)

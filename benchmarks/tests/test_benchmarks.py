@@ -5,13 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import aberration, consistency, covariance, lost_in_space, performance
 from benchmarks.__main__ import main
 from benchmarks.bounds import equal, share_as_expected
-from benchmarks.lost_in_space_conditions import CONDITIONS
-from benchmarks.lost_in_space_document import LEAST_RIGHT
 from benchmarks.record import read_record
 from benchmarks.sections import Section, Written, bounds_shown, kept, stale, state_of
+from benchmarks.speed import performance
+from benchmarks.validation import aberration, centroids, consistency, covariance
+from benchmarks.validation.lost_in_space.__main__ import main as lost_in_space
+from benchmarks.validation.lost_in_space.conditions import CONDITIONS
+from benchmarks.validation.lost_in_space.document import LEAST_RIGHT
 from benchmarks.verification import SECTIONS, TARGET, remake
 from benchmarks.verification import main as verification
 
@@ -22,6 +24,13 @@ def test_a_benchmark_s_small_sample_is_within_its_bounds(benchmark, seed):
     assert report.passed, report.text()
 
 
+def test_centroids_are_held_beside_photutils_and_sep(monkeypatch, seed):
+    monkeypatch.setattr(centroids, "RATIOS", (100.0,))
+    report = centroids.run(quick=True, seed=seed)
+    assert report.passed, report.text()
+    assert "sep winpos" in report.text()
+
+
 def test_a_benchmark_prints_its_figures(capsys):
     assert main(["zone_counts", "--quick"]) == 0
     assert "zone_counts: within bounds" in capsys.readouterr().out
@@ -30,7 +39,7 @@ def test_a_benchmark_prints_its_figures(capsys):
 def test_the_solvers_benchmark_explains_itself(capsys):
     """Its conditions have percent signs in their names."""
     with pytest.raises(SystemExit) as stopped:
-        lost_in_space.main(["--help"])
+        lost_in_space(["--help"])
     assert stopped.value.code == 0
     assert "focal length off 0.2 %" in capsys.readouterr().out
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.bounds import Bound, at_least, at_most
+from benchmarks.record import CORE, SIMULATOR
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, pictures_of, table
 from service.simulate.drawing import Folder
@@ -259,4 +260,4 @@ def _draw(votes: Sequence[Tally], verified: Sequence[Tally], pictures: Folder) -
     pictures.save(figure, "paper-verified")
 
 
-SECTION = Section("The runs of the paper", write)
+SECTION = Section("The runs of the paper", write, (*CORE, *SIMULATOR, "service/studies/paper_1994"))

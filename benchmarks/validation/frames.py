@@ -1,7 +1,7 @@
 """Frames through the whole service's core: found, placed, identified, solved, held against truth.
 
-    python -m benchmarks.frames --frames 1000 --seed 3            about ten minutes on two cores
-    python -m benchmarks.frames --frames 1000 --seed 3 --write    docs/frames.md and its picture
+    python -m benchmarks.validation.frames --frames 1000 --seed 3    ten minutes on two cores
+    python -m benchmarks.validation.frames --write                   docs/frames.md, its picture
 
 Every frame is drawn from the real sky with all its noise (`service.simulate.frames`), written
 as FITS and read again.  The batch made of it goes down the staircase twice: with an a priori
@@ -21,14 +21,13 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
 from benchmarks.bounds import Bound, at_least, at_most, between
-from benchmarks.record import CORE, IMAGING, record_of
+from benchmarks.record import CORE, IMAGING, ROOT, record_of
 from benchmarks.report import Report
 from benchmarks.sections import bounds_table, table
 from service.acquire import Acquisition, acquire
@@ -69,8 +68,8 @@ RIGHT_LEAST = 0.995
 SPREAD = (0.85, 1.15)
 DETECTION_MOST = 1.5
 
-DOCUMENT = Path(__file__).parent.parent / "docs" / "frames.md"
-PICTURE = Path(__file__).parent.parent / "docs" / "images" / "overlay.png"
+DOCUMENT = ROOT / "docs" / "frames.md"
+PICTURE = ROOT / "docs" / "images" / "overlay.png"
 
 
 SOURCES = (*CORE, *IMAGING, "service/simulate/frames.py", "service/simulate/frame_files.py")
@@ -375,7 +374,8 @@ def document(report: Report, seed: int) -> str:
     record = record_of(SOURCES)
     return f"""# Frames
 
-Written by `python -m benchmarks.frames --frames {report.figures["frames"]} --seed {seed} --write`;
+Written by
+`python -m benchmarks.validation.frames --frames {report.figures["frames"]} --seed {seed} --write`;
 its figures are not edited by hand. {verdict}
 
 {record.sentence} Seed {seed}.
@@ -427,7 +427,7 @@ def picture(seed: int, frames: int) -> bytes:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.frames",
+        prog="python -m benchmarks.validation.frames",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

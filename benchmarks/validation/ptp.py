@@ -7,6 +7,7 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.bounds import Bound, at_least, at_most, between, equal
+from benchmarks.record import CORE, SIMULATOR
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
 from service.identify.triangles.ptp import identify_triangles, propose
@@ -153,4 +154,6 @@ neither may pass. Its tables and its rivals are in [ptp.md](ptp.md).
     return Written(text, report.bounds)
 
 
-SECTION = Section("Identification without a prior: PTP", write)
+SECTION = Section(
+    "Identification without a prior: PTP", write, (*CORE, *SIMULATOR, "service/studies/ptp_2015")
+)

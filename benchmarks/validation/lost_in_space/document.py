@@ -7,15 +7,15 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from benchmarks.bounds import Bound, at_least, at_most, faults_of
-from benchmarks.lost_in_space_conditions import UNCALIBRATED_MAG, WITHOUT_MAGNITUDES
-from benchmarks.lost_in_space_rows import Row, interval, more_often
 from benchmarks.record import CORE, SIMULATOR, record_of
+from benchmarks.validation.lost_in_space.conditions import UNCALIBRATED_MAG, WITHOUT_MAGNITUDES
+from benchmarks.validation.lost_in_space.rows import Row, interval, more_often
 
 OURS = ("lost_in_space", "staircase, a priori")
 SOURCES = (
     *CORE,
     *SIMULATOR,
-    *(f"benchmarks/lost_in_space{part}.py" for part in ("_conditions", "_peers", "_rows")),
+    "benchmarks/validation/lost_in_space",
 )
 LEAST_RIGHT = {
     "0 px": 0.995,
@@ -148,7 +148,8 @@ def document(rows: Sequence[Row], scenes: int, seed: int, turn: int) -> tuple[st
     )
     text = f"""# Lost in space, beside other solvers
 
-Written by `python -m benchmarks.lost_in_space --scenes {scenes} --seed {seed} --write` in an
+Written by
+`python -m benchmarks.validation.lost_in_space --scenes {scenes} --seed {seed} --write` in an
 environment with the extra `peers`; its figures are not edited by hand. Python
 {platform.python_version()}. {verdict}
 
@@ -177,12 +178,12 @@ fields with at least six detected stars of the database.
 All solvers look for the same stars, those of our run catalog to V 6.5. Ours also knows those to
 V 7.5 when it holds an attitude against the sky, for noise shows such stars, though it makes no
 pairs of them; the peers take one limit for both. Each is driven as its documents say
-(`benchmarks/lost_in_space_peers.py`). tetra3rs and cedar-solve take edge ratios off by 0.005, which
-a pixel of noise needs. cedar-solve and ruststartracker, which take milliseconds, get the first
-scenes only. Solvers take turns in blocks of {turn} scenes, another going first in every block, each
-as it would be run on a stream of pictures: what it is told is made ready before the block, one
-scene that is not timed comes first, answers are judged after the block. Times are of the process's
-own clock around one call from Python.
+(`benchmarks/validation/lost_in_space/peers.py`). tetra3rs and cedar-solve take edge ratios off
+by 0.005, which a pixel of noise needs. cedar-solve and ruststartracker, which take milliseconds,
+get the first scenes only. Solvers take turns in blocks of {turn} scenes, another going first in
+every block, each as it would be run on a stream of pictures: what it is told is made ready before
+the block, one scene that is not timed comes first, answers are judged after the block. Times are of
+the process's own clock around one call from Python.
 
 ## What came of it
 

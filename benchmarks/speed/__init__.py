@@ -1,0 +1,1 @@
+"""What the service and its kernels cost: docs/performance.md."""

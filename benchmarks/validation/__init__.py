@@ -1,0 +1,1 @@
+"""Whether answers are right: docs/verification.md and the pages beside it."""
