@@ -73,7 +73,7 @@ def test_no_folder_holds_too_many_modules():
 
 
 def test_no_test_of_the_service_imports_a_benchmark():
-    """Both use what `tests/reference` and `service/simulate` hold; benchmarks have their own tests."""
+    """What both use stands in `tests/reference` and `service/simulate`."""
     importing = re.compile(r"^\s*(from|import) benchmarks\b", re.MULTILINE)
     files = Path(__file__).parent.rglob("*.py")
     assert [f.name for f in files if importing.search(f.read_text(encoding="utf-8"))] == []
