@@ -27,14 +27,14 @@ from service.web.api import (
     zones,
 )
 from service.web.api import tokens as access
-from service.web.api.access import authorize
-from service.web.api.metrics import Metrics
-from service.web.api.problems import add_error_handlers
-from service.web.api.request_body import DEFAULT_LIMITS, BodyBudget, BodyLimits
 from service.web.console import console_router
 from service.web.event_stream import Live
 from service.web.middleware import AroundRequests
 from service.web.openapi.document import add_reference
+from service.web.requests.access import authorize
+from service.web.requests.metrics import Metrics
+from service.web.requests.problems import add_error_handlers
+from service.web.requests.request_body import DEFAULT_LIMITS, BodyBudget, BodyLimits
 from service.web.warm_request import warm_request
 
 log = logging.getLogger(__name__)

@@ -18,10 +18,15 @@ from service import logs
 from service.access.sessions import Access
 from service.errors import Busy
 from service.settings import is_loopback
-from service.web.api.access import authorize, entry_of, is_open
-from service.web.api.metrics import Metrics
-from service.web.api.problems import ProblemType, error_response, internal_error, problem_response
-from service.web.api.request_body import BodyBudget
+from service.web.requests.access import authorize, entry_of, is_open
+from service.web.requests.metrics import Metrics
+from service.web.requests.problems import (
+    ProblemType,
+    error_response,
+    internal_error,
+    problem_response,
+)
+from service.web.requests.request_body import BodyBudget
 from service.web.warm_request import WARM_REQUEST
 
 WRONG_HOST = ProblemType(421, "Misdirected request", "not-this-host")
@@ -45,7 +50,7 @@ class AroundRequests:
     page of another site could otherwise resolve its own name to this machine.
 
     Changes that were refused, or that changed memory only, get their audit entry
-    before the answer is sent (`service.web.api.access`).
+    before the answer is sent (`service.web.requests.access`).
 
     A request for one of the `direct` routes goes straight to its handler: the
     framework's routing and dependencies take twice as long as the rest of a

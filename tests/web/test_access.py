@@ -18,8 +18,8 @@ from service.settings import Settings
 from service.storage.recording.ids import Ulids
 from service.times import shifted, utc_now
 from service.web import event_stream as live
-from service.web.api.access import COOKIE, POLICIES, authorize
 from service.web.app import bare_app, create_app
+from service.web.requests.access import COOKIE, POLICIES, authorize
 from tests.web.serving import Server
 from tests.web.test_bodies import raw
 

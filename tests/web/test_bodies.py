@@ -9,8 +9,8 @@ import pytest
 
 from service.app.factory import open_app
 from service.settings import Settings
-from service.web.api.request_body import MAX_JSON_BYTES, BodyLimits
 from service.web.app import create_app
+from service.web.requests.request_body import MAX_JSON_BYTES, BodyLimits
 from tests.web.serving import Server
 
 URL = "/api/v1/batches"

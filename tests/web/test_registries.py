@@ -11,12 +11,12 @@ from service.app.factory import open_app
 from service.app.output_formats import OUTPUT_FORMATS, OutputFormat
 from service.cli.parser import build_parser
 from service.settings import Settings
-from service.web.api.access import POLICIES, Policy
-from service.web.api.problems import ProblemType
 from service.web.app import bare_app, create_app
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import PAGES, console_page
 from service.web.console.rendering import rendered
+from service.web.requests.access import POLICIES, Policy
+from service.web.requests.problems import ProblemType
 from tests.web.console_pages import console_addresses
 from tests.web.serving import Server
 

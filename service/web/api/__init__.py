@@ -1,1 +1,1 @@
-"""The HTTP API: routes, schemas, parameters."""
+"""The HTTP API: one module for the routes of each subject."""

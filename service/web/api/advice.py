@@ -10,9 +10,9 @@ from starlette.responses import Response
 from service.app.advice import ADVICE_SAMPLE
 from service.observations.schema import tolerances_from_text
 from service.storage.models.advice import Advice
-from service.web.api.dependencies import AppDep, json_response
-from service.web.api.query_parameters import PeriodQuery
 from service.web.openapi.route import ResponseDoc, route_docs
+from service.web.requests.dependencies import AppDep, json_response
+from service.web.requests.query_parameters import PeriodQuery
 
 router = APIRouter(prefix="/api/v1/spacecraft", tags=["spacecraft"])
 

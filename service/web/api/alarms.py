@@ -20,11 +20,11 @@ from service.storage.models.alarms import (
     LimitHistory,
     LimitList,
 )
-from service.web.api.access import AuditDep, CallerDep
-from service.web.api.dependencies import AppDep, json_response, page_response
-from service.web.api.query_parameters import NO_QUERY, AlarmQuery, Comment, StatementQuery, Who
-from service.web.api.request_body import JsonBody, read_model
 from service.web.openapi.route import LINK, ResponseDoc, route_docs
+from service.web.requests.access import AuditDep, CallerDep
+from service.web.requests.dependencies import AppDep, json_response, page_response
+from service.web.requests.query_parameters import NO_QUERY, AlarmQuery, Comment, StatementQuery, Who
+from service.web.requests.request_body import JsonBody, read_model
 
 router = APIRouter(prefix="/api/v1", tags=["alarms"])
 

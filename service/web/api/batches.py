@@ -11,11 +11,6 @@ from starlette.responses import Response
 from service.errors import BadInput
 from service.observations.schema import BatchIn, OptionsIn, Wire
 from service.storage.models.answers import Answer, BatchPage, Result
-from service.web.api.access import AuditDep, CallerDep, require_scope
-from service.web.api.dependencies import AppDep, answer_response, json_response, page_response
-from service.web.api.headers import NO_IDEMPOTENCY_KEY, idempotency_key
-from service.web.api.query_parameters import NO_QUERY, BatchQuery, require_no_query
-from service.web.api.request_body import BINARY, JsonBody, json_body, read_model, refused
 from service.web.openapi.route import (
     IDEMPOTENCY_KEY,
     LINK,
@@ -24,6 +19,11 @@ from service.web.openapi.route import (
     ResponseDoc,
     route_docs,
 )
+from service.web.requests.access import AuditDep, CallerDep, require_scope
+from service.web.requests.dependencies import AppDep, answer_response, json_response, page_response
+from service.web.requests.headers import NO_IDEMPOTENCY_KEY, idempotency_key
+from service.web.requests.query_parameters import NO_QUERY, BatchQuery, require_no_query
+from service.web.requests.request_body import BINARY, JsonBody, json_body, read_model, refused
 
 router = APIRouter(prefix="/api/v1/batches", tags=["batches"])
 

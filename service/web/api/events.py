@@ -14,10 +14,10 @@ from starlette.types import Receive, Scope, Send
 
 from service.errors import BadBatch, Fault, shown_value
 from service.observations.schema import RunName
-from service.web.api.access import CallerDep, credentials
-from service.web.api.query_parameters import Query, Spacecraft
 from service.web.event_stream import Listener, Live
 from service.web.openapi.route import LAST_EVENT_ID, ResponseDoc, route_docs
+from service.web.requests.access import CallerDep, credentials
+from service.web.requests.query_parameters import Query, Spacecraft
 
 router = APIRouter(prefix="/api/v1", tags=["events"])
 

@@ -9,10 +9,10 @@ from starlette.responses import Response
 
 from service.storage.models.overview import About, Overview
 from service.storage.queries.alarms import summary
-from service.web.api.access import CallerDep
-from service.web.api.dependencies import AppDep, json_response
-from service.web.api.query_parameters import NO_QUERY, RunQuery
 from service.web.openapi.route import ResponseDoc, route_docs
+from service.web.requests.access import CallerDep
+from service.web.requests.dependencies import AppDep, json_response
+from service.web.requests.query_parameters import NO_QUERY, RunQuery
 
 router = APIRouter(prefix="/api/v1", tags=["spacecraft"])
 

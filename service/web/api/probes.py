@@ -10,9 +10,9 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 
 from service.errors import Busy
-from service.web.api.dependencies import AppDep, MetricsDep
-from service.web.api.query_parameters import NO_QUERY
 from service.web.openapi.route import ResponseDoc, route_docs
+from service.web.requests.dependencies import AppDep, MetricsDep
+from service.web.requests.query_parameters import NO_QUERY
 
 router = APIRouter(tags=["probes"], dependencies=[NO_QUERY])
 

@@ -13,11 +13,17 @@ from starlette.responses import Response
 from service.app.replays import discard_upload
 from service.observations.schema import BatchIn, RunName, Wire
 from service.storage.models.runs import Replay, ReplayList, RunList, RunState
-from service.web.api.access import AuditDep, CallerDep, require_all_spacecraft
-from service.web.api.dependencies import AppDep, json_response
-from service.web.api.query_parameters import NO_QUERY, Query
-from service.web.api.request_body import MAX_JSON_BYTES, JsonBody, Spooled, ndjson_body, read_model
 from service.web.openapi.route import LOCATION, ResponseDoc, route_docs
+from service.web.requests.access import AuditDep, CallerDep, require_all_spacecraft
+from service.web.requests.dependencies import AppDep, json_response
+from service.web.requests.query_parameters import NO_QUERY, Query
+from service.web.requests.request_body import (
+    MAX_JSON_BYTES,
+    JsonBody,
+    Spooled,
+    ndjson_body,
+    read_model,
+)
 
 router = APIRouter(prefix="/api/v1", tags=["runs and replays"])
 

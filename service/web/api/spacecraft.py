@@ -15,10 +15,11 @@ from service.storage.models.spacecraft import (
     SpacecraftState,
 )
 from service.storage.models.trends import History, Ranking
-from service.web.api.access import CallerDep
-from service.web.api.dependencies import AppDep, json_response, page_response
-from service.web.api.history_files import THINNED, history_file, streamed_file, thinned_header
-from service.web.api.query_parameters import (
+from service.web.openapi.route import LINK, ResponseDoc, route_docs
+from service.web.requests.access import CallerDep
+from service.web.requests.dependencies import AppDep, json_response, page_response
+from service.web.requests.history_files import THINNED, history_file, streamed_file, thinned_header
+from service.web.requests.query_parameters import (
     JSON_FORMAT,
     HistoryQuery,
     PeriodPageQuery,
@@ -26,7 +27,6 @@ from service.web.api.query_parameters import (
     RunQuery,
     WorstQuery,
 )
-from service.web.openapi.route import LINK, ResponseDoc, route_docs
 
 router = APIRouter(prefix="/api/v1/spacecraft", tags=["spacecraft"])
 

@@ -12,11 +12,11 @@ from service.access.tokens import SESSION_H
 from service.errors import Unauthenticated
 from service.observations.schema import Wire
 from service.storage.models.access import AuditPage, Session
-from service.web.api.access import COOKIE, CallerDep
-from service.web.api.dependencies import AppDep, json_response, page_response
-from service.web.api.query_parameters import NO_QUERY, AuditQuery
-from service.web.api.request_body import SessionBody, read_model
 from service.web.openapi.route import LINK, ResponseDoc, route_docs
+from service.web.requests.access import COOKIE, CallerDep
+from service.web.requests.dependencies import AppDep, json_response, page_response
+from service.web.requests.query_parameters import NO_QUERY, AuditQuery
+from service.web.requests.request_body import SessionBody, read_model
 
 router = APIRouter(prefix="/api/v1", tags=["access"])
 

@@ -9,11 +9,11 @@ from starlette.responses import Response
 
 from service.observations.schema import APrioriIn, Key, Wire
 from service.storage.models.zones import Dropped, ZoneCache, ZoneList
-from service.web.api.access import CallerDep
-from service.web.api.dependencies import AppDep, json_response
-from service.web.api.query_parameters import NO_QUERY, Query, Spacecraft, Time
-from service.web.api.request_body import JsonBody, read_model
 from service.web.openapi.route import ResponseDoc, route_docs
+from service.web.requests.access import CallerDep
+from service.web.requests.dependencies import AppDep, json_response
+from service.web.requests.query_parameters import NO_QUERY, Query, Spacecraft, Time
+from service.web.requests.request_body import JsonBody, read_model
 
 router = APIRouter(prefix="/api/v1/zones", tags=["zones"])
 

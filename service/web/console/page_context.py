@@ -12,11 +12,11 @@ from service.app.factory import App
 from service.observations.schema import RunName
 from service.storage.queries.future_dated import LIVE
 from service.times import Utc
-from service.web.api.access import CallerDep
-from service.web.api.dependencies import AppDep
-from service.web.api.query_parameters import Query
 from service.web.console.formatting import present
 from service.web.console.registry import PAGES, ConsolePage, navigation
+from service.web.requests.access import CallerDep
+from service.web.requests.dependencies import AppDep
+from service.web.requests.query_parameters import Query
 
 __all__ = ["EMPTY_LAYOUT", "LIVE", "ContextDep", "Layout", "PageContext", "PageQuery"]
 

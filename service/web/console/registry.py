@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from service.web.api.access import POLICIES, Policy
+from service.web.requests.access import POLICIES, Policy
 
 Handler = Callable[..., Any]
 

@@ -16,15 +16,15 @@ from starlette.responses import HTMLResponse, Response
 
 from service import __version__
 from service.errors import AcquisitionError, BadInput, Busy, problem_of, problem_of_faults
-from service.web.api.problems import (
+from service.web.console.formatting import FILTERS, present
+from service.web.console.page_context import EMPTY_LAYOUT, LIVE, Layout
+from service.web.requests.problems import (
     INTERNAL_ERROR,
     PROBLEM_TYPES,
     ProblemType,
     faults_in_query,
     problem_type_of,
 )
-from service.web.console.formatting import FILTERS, present
-from service.web.console.page_context import EMPTY_LAYOUT, LIVE, Layout
 
 HEADERS: Mapping[str, str] = {
     "Content-Security-Policy": (

@@ -14,7 +14,6 @@ from pydantic.json_schema import GenerateJsonSchema, models_json_schema
 from service import __version__
 from service.observations.schema import BatchIn
 from service.storage.models.base import Record, component_name, described
-from service.web.api.access import POLICIES
 from service.web.api.alarms import CommentIn, LimitIn, ShelveIn, StatementIn
 from service.web.api.batches import WhatIfIn
 from service.web.api.compare import CompareIn
@@ -22,6 +21,7 @@ from service.web.api.runs import RunIn
 from service.web.api.tokens import SignIn
 from service.web.api.zones import WarmIn
 from service.web.openapi.route import SCHEMAS, add_table_formats, auth_responses
+from service.web.requests.access import POLICIES
 
 DESCRIPTION = """\
 Send the stars that a star tracker observed; the service identifies them, solves for

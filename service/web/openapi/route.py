@@ -12,8 +12,8 @@ from starlette.responses import Response
 
 from service.app.output_formats import OUTPUT_FORMATS
 from service.storage.models.base import Record, component_name
-from service.web.api.problems import MEDIA_TYPE as PROBLEM_JSON
-from service.web.api.request_body import BINARY, FRAMES, JSON, NDJSON
+from service.web.requests.problems import MEDIA_TYPE as PROBLEM_JSON
+from service.web.requests.request_body import BINARY, FRAMES, JSON, NDJSON
 
 SCHEMAS = "#/components/schemas/"
 TABLES = "x-tables"

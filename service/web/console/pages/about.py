@@ -5,10 +5,10 @@ from typing import Annotated
 from fastapi import Query as InQuery
 from starlette.responses import Response
 
-from service.web.api.access import Policy
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
+from service.web.requests.access import Policy
 
 
 @console_page("/about", "About", Policy("read", "nothing"), position=80)

@@ -10,11 +10,11 @@ from starlette.responses import Response
 
 from service.advice.report import no_changes_text
 from service.missions.mission import Tolerances
-from service.web.api.access import Policy
 from service.web.api.advice import ADVICE_LIMIT_S, MAX_SAMPLE, AdviceQuery
 from service.web.console.page_context import ContextDep
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
+from service.web.requests.access import Policy
 
 
 class AdviceForm(AdviceQuery):

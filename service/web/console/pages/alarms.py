@@ -9,11 +9,11 @@ from starlette.responses import Response
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key
 from service.times import recorded_utc, shifted
-from service.web.api.access import Policy
-from service.web.api.query_parameters import Cursor
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
+from service.web.requests.access import Policy
+from service.web.requests.query_parameters import Cursor
 
 ROWS = 50
 STATES = ("active", "open", "acknowledged", "shelved", "cleared", "all")

@@ -16,7 +16,6 @@ from service.storage.models.answers import Answer
 from service.storage.models.answers import Star as FoundStar
 from service.storage.queries.results import answer_from_json
 from service.vectors import matrix_from_quaternion, to_ra_dec
-from service.web.api.access import Policy
 from service.web.console.charts.sky_chart import sky_chart
 from service.web.console.options import (
     asked_options,
@@ -28,6 +27,7 @@ from service.web.console.options import (
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
+from service.web.requests.access import Policy
 
 VIEWS = ("all", "field")
 """What the chart shows: all candidates of the answer, or the field of view alone."""

@@ -9,11 +9,11 @@ from starlette.responses import Response
 from service.observations.schema import Key
 from service.storage.queries.results import OutcomeName, Status
 from service.times import parse_utc
-from service.web.api.access import Policy
-from service.web.api.query_parameters import Cursor
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
+from service.web.requests.access import Policy
+from service.web.requests.query_parameters import Cursor
 
 ROWS = 50
 Any_ = Literal[""]

@@ -11,12 +11,12 @@ from starlette.responses import Response
 from service.errors import BadBatch, Fault, shown_value
 from service.observations.schema import Key, OptionsIn
 from service.times import parse_utc
-from service.web.api.access import Policy
 from service.web.api.compare import WORK_S
 from service.web.console.options import asked_options, fields_of, settings_of_mission
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
+from service.web.requests.access import Policy
 
 SAMPLE = 100
 SIDES = ("a", "b")

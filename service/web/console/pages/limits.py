@@ -6,10 +6,10 @@ from fastapi import Path
 from fastapi import Query as InQuery
 from starlette.responses import Response
 
-from service.web.api.access import Policy
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
+from service.web.requests.access import Policy
 
 SEVERITIES = ("watch", "warning", "critical")
 

@@ -8,11 +8,11 @@ from fastapi import Query as InQuery
 from starlette.responses import Response
 
 from service.storage.models.spacecraft import MissionThen
-from service.web.api.access import Policy
 from service.web.console.options import SYMBOLS
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
+from service.web.requests.access import Policy
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,11 @@ from starlette.responses import Response
 from service.storage.models.overview import OverviewRow
 from service.storage.models.overview import Window as Sums
 from service.times import DAY_S, parse_utc, shifted
-from service.web.api.access import Policy
 from service.web.console.charts.sparkline import Sparkline, sparkline
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
+from service.web.requests.access import Policy
 
 STALE_AFTER_S = 3600.0
 """A spacecraft this far behind the latest batch of its run is marked as stale."""

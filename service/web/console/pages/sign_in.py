@@ -6,11 +6,11 @@ from fastapi import Query as InQuery
 from pydantic import Field
 from starlette.responses import Response
 
-from service.web.api.access import OPEN
-from service.web.api.query_parameters import Query
 from service.web.console.page_context import EMPTY_LAYOUT
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
+from service.web.requests.access import OPEN
+from service.web.requests.query_parameters import Query
 
 OWN_PATH = r"^/([^/\\\x00-\x20][^\\\x00-\x20]*)?$"
 """A second slash, or a backslash that browsers take for one, would name another host."""

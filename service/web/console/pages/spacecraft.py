@@ -14,11 +14,11 @@ from service.app.output_formats import OUTPUT_FORMATS
 from service.storage.models.answers import Summary
 from service.storage.models.trends import RankedBatch
 from service.times import DAY_S, HOUR_S, Utc, parse_utc, shifted
-from service.web.api.access import Policy
-from service.web.api.query_parameters import End, Start
 from service.web.console.page_context import LIVE, ContextDep, PageContext, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
+from service.web.requests.access import Policy
+from service.web.requests.query_parameters import End, Start
 
 Range = Literal["hour", "day", "month", "year"]
 RANGES_S: dict[Range, int] = {

@@ -14,8 +14,8 @@ from starlette.responses import Response
 from service.app.factory import App
 from service.storage.models.base import Page
 from service.storage.recording.unsaved_result import Answered
-from service.web.api.metrics import Metrics
-from service.web.api.request_body import JSON
+from service.web.requests.metrics import Metrics
+from service.web.requests.request_body import JSON
 
 _JSON = msgspec.json.Encoder()
 
