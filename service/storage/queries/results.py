@@ -9,8 +9,9 @@ from sqlalchemy import Connection, Select, select
 
 from service.alarms.quantities import QUANTITIES, value_names
 from service.errors import NotFound, shown_value
-from service.storage.models.answers import Answer, FrameWithStars, Result, StarCounts, Summary
+from service.storage.models.answers import Answer, Result, StarCounts, Summary
 from service.storage.models.base import Page
+from service.storage.models.frames import FrameWithStars
 from service.storage.queries.pages import ResultFilter, newest_first, page_of
 from service.storage.recording.unsaved_result import STARS, Row
 from service.storage.sql.tables import batches, frames, missions, results

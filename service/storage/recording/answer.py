@@ -15,7 +15,6 @@ from service.sky.zones import SearchRegion
 from service.storage.models.answers import (
     Answer,
     Attitude,
-    Frame,
     Provenance,
     Rival,
     SearchedZone,
@@ -26,6 +25,7 @@ from service.storage.models.answers import (
     TrackerFit,
     TrackerStars,
 )
+from service.storage.models.frames import Frame
 from service.vectors import ra_dec_of
 
 FRAME = "EME2000"

@@ -19,7 +19,8 @@ from service.acquire import Acquisition
 from service.missions.mission import Identifier, Mission, Solver
 from service.observations.frame_record import FrameRecord
 from service.observations.schema import Submission
-from service.storage.models.answers import Answer, Frame, FrameTimings
+from service.storage.models.answers import Answer
+from service.storage.models.frames import Frame, FrameTimings
 from service.storage.queries.future_dated import AHEAD_NS, LIVE
 from service.storage.recording.answer import answer_of, rows_of_stars
 from service.storage.recording.result_metrics import metrics_of
