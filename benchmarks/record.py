@@ -29,9 +29,20 @@ CORE = (
     "service/times.py",
     "service/compiled",
     "service/vectors.py",
+    # Pictures of cameras without a mission: no batch passes through these.
+    ":!service/acquire/camera_calibration.py",
+    ":!service/acquire/frame_submission.py",
+    ":!service/acquire/picture.py",
+    ":!service/acquire/picture_diagnosis.py",
+    ":!service/identify/blind",
 )
-"""What the answer to a batch depends on."""
-SIMULATOR = ("service/simulate", "tests/reference")
+"""What the answer to a batch depends on.  `:!` leaves out a file or a folder, as in git."""
+SIMULATOR = (
+    "service/simulate",
+    "tests/reference",
+    ":!service/simulate/frames.py",
+    ":!service/simulate/frame_files.py",
+)
 IMAGING = ("service/imaging", "service/studies/star_image_report", "service/simulate/drawing.py")
 SERVICE = ("service", "catalogs/stars.npz")
 
@@ -85,8 +96,12 @@ def commit_of(sources: Sequence[str]) -> str:
 
 def digest_of(sources: Iterable[str]) -> str:
     """A digest of files and of all files in folders, by their paths and their bytes."""
-    digest = hashlib.sha256()
-    for path in sorted({path for source in sources for path in _files(ROOT / source)}):
+    digest, used = hashlib.sha256(), list(sources)
+    left_out = [ROOT / each.removeprefix(":!") for each in used if each.startswith(":!")]
+    found = {path for each in used if not each.startswith(":!") for path in _files(ROOT / each)}
+    for path in sorted(found):
+        if any(path.is_relative_to(each) for each in left_out):
+            continue
         digest.update(f"{os.path.relpath(path, ROOT)}\0".encode())
         digest.update(hashlib.sha256(path.read_bytes()).digest())
     return digest.hexdigest()[:16]

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.__main__ import main
 from benchmarks.bounds import equal, share_as_expected
-from benchmarks.record import read_record
+from benchmarks.record import digest_of, read_record
 from benchmarks.sections import Section, Written, bounds_shown, kept, stale, state_of
 from benchmarks.speed import performance
 from benchmarks.validation import aberration, centroids, consistency, covariance
@@ -121,6 +121,18 @@ def test_a_section_is_stale_once_its_sources_have_changed(tmp_path, monkeypatch,
     assert "its sources have changed" in why
     remake(["one"], False, seed, page)
     assert found() == []
+
+
+def test_a_source_that_is_left_out_makes_nothing_stale(tmp_path):
+    kept, apart = tmp_path / "kept.py", tmp_path / "apart.py"
+    for file in (kept, apart):
+        file.write_text("FACTOR = 1\n", "utf-8")
+    sources = (str(tmp_path), f":!{apart}")
+    first = digest_of(sources)
+    apart.write_text("FACTOR = 2\n", "utf-8")
+    assert digest_of(sources) == first
+    kept.write_text("FACTOR = 2\n", "utf-8")
+    assert digest_of(sources) != first
 
 
 def test_a_section_without_its_record_is_stale():
