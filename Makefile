@@ -9,6 +9,8 @@ BATCHES ?=
 # Further arguments, e.g. make test PYTEST_ARGS="-k quest -x"
 DEMO_ARGS ?=
 PYTEST_ARGS ?=
+# Of `make torture`: an expression as pytest -k has it, e.g. "kills and sqlite"; empty: all
+PARTS ?=
 # Processes that share the tests between them, a file to each at a time; 0 for one after another
 WORKERS ?= 2
 BENCH_ARGS ?=
@@ -35,7 +37,8 @@ DEV = $(VENV)/.installed-dev
 help:
 	@echo "make run      set up, serve on http://$(HOST):$(PORT), replay sample telemetry, print a table"
 	@echo "make test     set up and run the tests"
-	@echo "make torture  kills, failing disks, odd input at full size (tests do a fiftieth)"
+	@echo "make torture  kills, failing disks, odd input at full size (tests do a fiftieth); goes on"
+	@echo "              where it stopped; PARTS=\"kills and sqlite\" for some, as pytest -k has it"
 	@echo "make check    tests, format, lint, types, import floors, migrations, openapi.yaml"
 	@echo "make format   format the code and mend what the linter can"
 	@echo "make bench    measure speed, write docs/performance.md; BENCH_ARGS=--all for all benchmarks"
@@ -46,7 +49,7 @@ help:
 	@echo "make clean    remove .venv and everything that was built or cached"
 	@echo
 	@echo "Variables: PORT, HOST, BATCHES, PYTHON, WORKERS, TEST_POSTGRESQL_URL,"
-	@echo "           DEMO_ARGS, PYTEST_ARGS, BENCH_ARGS, BASE, COMPARE_ARGS"
+	@echo "           DEMO_ARGS, PYTEST_ARGS, PARTS, BENCH_ARGS, BASE, COMPARE_ARGS"
 
 run: $(RUNTIME)
 	@exec $(BIN)/acquire demo --host $(HOST) --port $(PORT) $(if $(BATCHES),--batches $(BATCHES)) $(DEMO_ARGS)
@@ -65,7 +68,8 @@ endif
 
 torture: $(DEV)
 	@echo "== torture: kills, failing disks and odd input at full size; hours"
-	@$(BIN)/python -m pytest --torture -m torture $(PYTEST_ARGS)
+	@echo "== results are in .torture; what passed with the same code is left out"
+	@$(BIN)/python -m pytest -p tests.torture --torture -m torture $(if $(PARTS),-k "$(PARTS)") $(PYTEST_ARGS)
 
 check: test format-check lint types floors migrations-check openapi-check
 	@echo "== all checks passed"

@@ -11,6 +11,7 @@ a schema of its own there.
 """
 
 import faulthandler
+import json
 import logging
 import os
 import tomllib
@@ -31,11 +32,11 @@ from service.sky.model import SkyModel
 from service.storage.sql.engines import database_url
 from service.storage.sql.migrations import upgrade
 from tests import scale
+from tests.torture import FIGURES
 
 DEFAULT_SEED = 19941026
 DEFAULT_BATCHES = 240
 TORTURE_TIMEOUT_S = 6 * 3600
-FIGURES = "figures"
 
 hypothesis.settings.register_profile(
     # Two shared cores: a deadline would fail on the machine, not on the code.
@@ -103,7 +104,7 @@ def pytest_runtest_setup(item):
 def pytest_terminal_summary(terminalreporter):
     """What tests of endurance did, a line each."""
     told = [
-        f"{report.nodeid}: {value}"
+        f"{report.nodeid}: {', '.join(f'{each} {figure}' for each, figure in value.items())}"
         for reports in terminalreporter.stats.values()
         for report in reports
         if getattr(report, "when", None) == "call"
@@ -139,8 +140,8 @@ def figures(seed, record_property):
     """Takes down how much was tried and what came of it: figures(kills=500); told at the end."""
 
     def note(**counted):
-        told = ", ".join(f"{name} {value}" for name, value in counted.items())
-        record_property(FIGURES, f"{told}; seed {seed}")
+        # As JSON has it: a property may come from another process.
+        record_property(FIGURES, json.loads(json.dumps(counted | {"seed": seed}, default=str)))
 
     return note
 
