@@ -16,6 +16,7 @@ from service.identify.blind.solver import (
     FocalRange,
     rotation_between,
 )
+from service.identify.blind.systematics import shared_variance_px2, simpler_fit
 from service.identify.blind.verify import LEAST_SIGMA_PX, Points, Verified
 from service.imaging.detection.points import (
     FIRST_THRESHOLD,
@@ -68,13 +69,16 @@ class PictureAttitude:
 
     `attitude` (3, 3) turns ICRS into the camera's axes: x to the right of the picture, y
     down, z to the sky through the middle of the picture.  `covariance_rad2` (3, 3) is of the
-    small rotation about these axes.  Sigmas are scaled by `sigma_scale`, which the residuals gave.
+    small rotation about these axes.  Sigmas are scaled by `sigma_scale`, which the residuals
+    gave.  The covariance also holds what the stars' errors may have in common, `shared_px`,
+    and how far the lens's last terms turn the attitude: these do not average down.
     """
 
     attitude: Matrix
     covariance_rad2: Matrix
     fit: LensFit
     sigma_scale: float
+    shared_px: float
     log_odds: float
     rms_px: float
     stars: tuple[PictureStar, ...]
@@ -219,6 +223,9 @@ def _attitude(
         moved = apparent(sky.direction[row], velocity_c, time)
         about = fit.attitude @ rotation_between(sky.direction[row], moved)
     jacobian = _turns_of_the_middle(fit)
+    # Of the residuals a few stars leave little: what they had in common is not seen at all.
+    u_px, v_px, variance_px2 = places.u_px[seen], places.v_px[seen], found.rms_px**2
+    shared_px2 = shared_variance_px2(u_px, v_px, found.residual_px, variance_px2)
     flux = points.flux_counts[seen] / (frame.exposure_s or 1.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         zero = sky.magnitude_mag[row] + 2.5 * np.log10(flux)
@@ -227,9 +234,11 @@ def _attitude(
     spread = 1.48 * float(np.median(np.abs(zero - middle))) if len(zero) > 1 else math.nan
     return PictureAttitude(
         attitude=_of_the_middle(fit.lens, about),
-        covariance_rad2=scale**2 * jacobian @ fit.covariance @ jacobian.T,
+        covariance_rad2=scale**2 * jacobian @ fit.covariance @ jacobian.T
+        + _systematic(found, u_px, v_px, sky.direction[row], shared_px2),
         fit=fit,
         sigma_scale=scale,
+        shared_px=math.sqrt(shared_px2),
         log_odds=found.log_odds,
         rms_px=found.rms_px,
         stars=tuple(_stars(found, seen, points, sky)),
@@ -237,6 +246,22 @@ def _attitude(
         zero_point_sigma_mag=spread,
         aberration_corrected=frame.time is not None,
     )
+
+
+def _systematic(
+    found: Verified, u_px: Vector, v_px: Vector, star: Vector, shared_px2: float
+) -> Matrix:
+    """The covariance (3, 3) of what does not average down, in square radians."""
+    lens = found.fit.lens
+    middle_u, middle_v = _middle(lens)
+    arm_px2 = float(np.mean((u_px - middle_u) ** 2 + (v_px - middle_v) ** 2))
+    covariance = shared_px2 * np.diag([lens.focal_px**-2.0, lens.focal_px**-2.0, 1.0 / arm_px2])
+    simple = simpler_fit(found.fit, u_px, v_px, star, found.residual_px)
+    if simple is None:
+        return covariance
+    whole = _of_the_middle(lens, found.fit.attitude)
+    turn = attitude_error_arcsec(_of_the_middle(simple.lens, simple.attitude), whole)
+    return np.asarray(covariance + np.outer(turn, turn) / ARCSEC_PER_RADIAN**2)
 
 
 def _stars(found: Verified, seen: Any, points: PointSources, sky: BrightStars) -> Any:

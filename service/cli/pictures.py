@@ -77,6 +77,8 @@ def result_json(result: "PictureResult") -> dict[str, Any]:
         return told
     lens, ra_dec = found.lens, found.boresight_deg
     told["attitude"] = {
+        # The lens was fitted on the picture itself: it is not calibrated.
+        "status": "suspect",
         "quaternion": [round(each, 9) for each in found.quaternion.tolist()],
         "sigma_arcsec": [round(each, 2) for each in found.sigma_arcsec.tolist()],
         "ra_deg": round(ra_dec[0], 5),
@@ -96,6 +98,7 @@ def result_json(result: "PictureResult") -> dict[str, Any]:
     }
     told["residual_rms_px"] = round(found.rms_px, 3)
     told["sigma_scale"] = round(found.sigma_scale, 3)
+    told["shared_error_px"] = round(found.shared_px, 3)
     told["zero_point_mag"] = _known(found.zero_point_mag, 2)
     told["zero_point_sigma_mag"] = _known(found.zero_point_sigma_mag, 2)
     told["exposure_s"] = result.frame.exposure_s
@@ -134,8 +137,10 @@ def _summary(file: Path, told: dict[str, Any]) -> str:
             f"  quaternion {q}  (ICRS to camera, scalar last: x right, y down, z to the sky)"
         )
         lines.append(
-            f"  sigma {sigma} arcsec about x, y, z; scaled by the residuals, "
-            f"{told['residual_rms_px']:.2f} px rms; aberration {found['aberration']}"
+            f"  {found['status']} (the lens is not calibrated)  sigma {sigma} arcsec about x, y, "
+            f"z; scaled by the residuals, {told['residual_rms_px']:.2f} px rms, with "
+            f"{told['shared_error_px']:.2f} px that more stars would not take away; aberration "
+            f"{found['aberration']}"
         )
         lines.append(
             f"  field {width:.3f} x {height:.3f} deg, focal length {lens['focal_px']:.1f} "

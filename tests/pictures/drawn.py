@@ -2,6 +2,7 @@
 
 import io
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -9,6 +10,9 @@ from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
 from service.identify.blind.lens import Lens
+from service.identify.blind.solver import rotation_between
+from service.sky.whole_sky.bright_stars import BrightStars
+from service.vectors import Matrix
 
 SIZES = ((1024, 768), (640, 480), (1280, 960), (1024, 1024))
 FAINTEST_RATIO = 5.0
@@ -19,15 +23,22 @@ FAINTEST_RATIO = 5.0
 class DrawnPicture:
     """`counts` (rows, columns) of 8 bits; `attitude` (3, 3) is of the lens's own axis."""
 
-    counts: np.ndarray
+    counts: Any
     lens: Lens
-    attitude: np.ndarray
+    attitude: Matrix
     psf_sigma_px: float
 
 
 def draw_picture(
-    rng, sky, field_deg=None, bend=None, stars=None, quality=70, lens=None, off_center=0.01
-):
+    rng: np.random.Generator,
+    sky: BrightStars,
+    field_deg: float | None = None,
+    bend: float | None = None,
+    stars: int | None = None,
+    quality: int | None = 70,
+    lens: Lens | None = None,
+    off_center: float = 0.01,
+) -> DrawnPicture:
     """A picture of 5 to 50 degrees, distortion to 3 %, any gain, some clipped to black, JPEG."""
     if lens is None:
         width, height = SIZES[rng.integers(len(SIZES))]
@@ -60,18 +71,30 @@ def draw_picture(
     return DrawnPicture(counts, lens, attitude, psf)
 
 
-def jpeg_of(counts, quality=90):
+def middle_attitude(picture: DrawnPicture) -> Matrix:
+    """The truth of a drawn picture about its middle: the shortest turn of its lens's axis."""
+    lens = picture.lens
+    middle = lens.directions(
+        np.array([(lens.width_px - 1) / 2]), np.array([(lens.height_px - 1) / 2])
+    )[0]
+    axis = np.cross(middle, [0.0, 0.0, 1.0])
+    three = np.stack([middle, axis, np.cross(middle, axis)])
+    turned = np.stack([[0.0, 0.0, 1.0], axis, np.cross([0.0, 0.0, 1.0], axis)])
+    return rotation_between(turned, three) @ picture.attitude
+
+
+def jpeg_of(counts: Any, quality: int = 90) -> bytes:
     file = io.BytesIO()
     Image.fromarray(counts).save(file, "JPEG", quality=quality)
     return file.getvalue()
 
 
-def _add_star(counts, u, v, psf, light):
+def _add_star(counts: Any, u: float, v: float, psf: float, light: float) -> None:
     half = int(np.ceil(4.0 * psf + 2.0))
     columns = np.arange(max(0, round(u) - half), min(counts.shape[1], round(u) + half + 1))
     rows = np.arange(max(0, round(v) - half), min(counts.shape[0], round(v) + half + 1))
 
-    def share(at, center):
+    def share(at: Any, center: float) -> Any:
         edges = (np.stack([at - 0.5, at + 0.5]) - center) / (psf * np.sqrt(2.0))
         return 0.5 * np.diff(erf(edges), axis=0)[0]
 

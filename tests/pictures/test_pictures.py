@@ -13,14 +13,14 @@ from service.acquire.picture import blind_sky, overlay_of, solve_picture
 from service.cli import main
 from service.errors import BadFile
 from service.identify.blind.lens import Lens
-from service.identify.blind.solver import FocalRange, focal_px_of, rotation_between
+from service.identify.blind.solver import FocalRange, focal_px_of
 from service.identify.blind.verify import Points
 from service.imaging.detection.points import find_points
 from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import Frame, FrameLimits
 from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import ARCSEC_PER_RADIAN, attitude_error_arcsec
-from tests.pictures.drawn import draw_picture, jpeg_of
+from tests.pictures.drawn import draw_picture, jpeg_of, middle_attitude
 
 FOLDER = Path(__file__).parent
 TRUTH = json.loads((FOLDER / "truth.json").read_text())["pictures"]
@@ -36,18 +36,6 @@ def frame_of(counts):
     return Frame(counts.astype(np.float32), "NPY", "sha256:0", 255.0)
 
 
-def middle_attitude(picture):
-    """The truth of a drawn picture about its middle: the shortest turn of its lens's axis."""
-    lens = picture.lens
-    middle = lens.directions(
-        np.array([(lens.width_px - 1) / 2]), np.array([(lens.height_px - 1) / 2])
-    )[0]
-    axis = np.cross(middle, [0.0, 0.0, 1.0])
-    three = np.stack([middle, axis, np.cross(middle, axis)])
-    turned = np.stack([[0.0, 0.0, 1.0], axis, np.cross([0.0, 0.0, 1.0], axis)])
-    return rotation_between(turned, three) @ picture.attitude
-
-
 @pytest.mark.parametrize("guess", [None, 0.9, 1.1])
 @pytest.mark.parametrize("truth", TRUTH, ids=[each["file"] for each in TRUTH])
 def test_a_real_picture_told_nothing_or_its_field_within_a_tenth(blind, truth, guess):
@@ -59,7 +47,10 @@ def test_a_real_picture_told_nothing_or_its_field_within_a_tenth(blind, truth, g
     assert np.hypot(*error[:2]) < 0.2 * 3600
     assert abs(error[2]) < 0.2 * 3600
     assert result.attitude.lens.focal_px == pytest.approx(truth["focal_length_px"], rel=0.005)
-    # What the residuals speak against is not told as known to the last digit.
+    # The truth was fitted without distortion and with the axis in the middle.
+    turn = error / ARCSEC_PER_RADIAN
+    square = turn @ np.linalg.solve(result.attitude.covariance_rad2, turn)
+    assert square < chi2(3).ppf(0.99)
     assert result.attitude.sigma_arcsec.max() < 200
     if guess is not None:
         assert any("residuals are radial" in each for each in result.remarks)
