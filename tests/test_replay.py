@@ -13,7 +13,6 @@ import pytest
 
 from service.app.factory import open_app
 from service.errors import BadFile, BadInput, Busy, Forbidden, NotFound, Unauthenticated
-from service.ingest.replays import mark_interrupted
 from service.observations.readers.csv_rows import write_csv
 from service.observations.schema import BatchIn
 from service.replay.bulk_upload import replay_in_bulk
@@ -25,6 +24,7 @@ from service.settings import Settings
 from service.simulate.files import read_objects
 from service.simulate.stretches import Pass, Trouble, Troubles
 from service.simulate.telemetry import draw_pass
+from service.storage.queries.replays import mark_interrupted
 from service.web.app import create_app
 from tests.web.serving import Server
 

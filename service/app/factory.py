@@ -17,12 +17,12 @@ from service.app.service import Service
 from service.app.spacecraft import Spacecraft
 from service.app.submissions import Submissions
 from service.app.zones import Zones
-from service.ingest.replays import mark_interrupted
 from service.missions.mission import Mission, load_missions
 from service.settings import Settings, is_loopback
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import open_catalog
 from service.sky.model import SkyModel
+from service.storage.queries.replays import mark_interrupted
 from service.storage.recording.results import register
 from service.storage.sql.database import Store
 from service.times import utc_now

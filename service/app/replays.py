@@ -16,19 +16,19 @@ from service.app.submissions import Submissions
 from service.errors import AcquisitionError, Busy, NotFound, Stopping
 from service.ingest.bulk import Bulk, Check
 from service.ingest.local_workers import WorkerConfig
-from service.ingest.replays import (
-    Replay,
+from service.ingest.replays import RunningReplay
+from service.ingest.spool import Spool, SpooledReplay
+from service.observations.readers.decompress import Coding, unpacked_lines
+from service.storage.models.runs import Replay, ReplayCounts, ReplayLines
+from service.storage.queries.replays import (
+    find_replay,
     list_replays,
     mark_cancelled,
     read_replay,
-    read_replay_row,
     require_cancellable,
 )
-from service.ingest.spool import Spool, SpooledReplay
-from service.observations.readers.decompress import Coding, unpacked_lines
 from service.storage.recording.ids import unguessable_ulid
 from service.storage.recording.results import set_run_alarms
-from service.storage.recording.unsaved_result import Row
 from service.times import utc_now
 
 log = logging.getLogger(__name__)
@@ -72,11 +72,11 @@ class Replays:
         )
         self._spool = Spool(context.settings.spool_folder)
         self._lock = threading.Lock()
-        self._replays: list[Replay] = []
+        self._replays: list[RunningReplay] = []
         self._closing = False
 
     @property
-    def at_work(self) -> list[Replay]:
+    def at_work(self) -> list[RunningReplay]:
         """The replays that are not over."""
         return [each for each in self._replays if not each.is_over]
 
@@ -86,7 +86,7 @@ class Replays:
         Every batch goes to `run`.  Lines that can be closed are closed at the end.
         """
         replay = self._new(run, options)
-        replay.start(lines, _noted_with(run, options))
+        replay.start(lines, _stored_with(run, options))
         return replay.id
 
     def new_upload(self, caller: Caller) -> IO[bytes]:
@@ -112,14 +112,14 @@ class Replays:
         with ExitStack() as on_failure:
             on_failure.callback(discard_upload, file)
             replay = self._new(run, options, drop=self._spool.drop)
-            on_failure.callback(replay.give_up)
+            on_failure.callback(replay.release_slot)
             about = SpooledReplay(
                 replay.id, coding, longest_bytes, caller.token_id, caller.name, bound
             )
             on_failure.callback(self._spool.drop, replay.id)
             self._spool.keep(file, about)
             file.seek(0)
-            replay.start(_lines_of(file, about, replay), _noted_with(run, options))
+            replay.start(_lines_of(file, about, replay), _stored_with(run, options))
             on_failure.pop_all()
         return replay.id
 
@@ -134,44 +134,38 @@ class Replays:
 
     def _resume(self, about: SpooledReplay) -> None:
         with self._context.reading() as connection:
-            row = read_replay_row(connection, about.id)
-        if row is None or row["state"] not in ("running", "interrupted"):
+            stored = find_replay(connection, about.id)
+        if stored is None or stored.state not in ("running", "interrupted"):
             self._spool.drop(about.id)
             return
         bound = None if about.spacecraft is None else frozenset(about.spacecraft)
         caller = Caller(about.caller, frozenset(), bound, about.owner)
         options: ReplayOptions = {"check": caller.require, "owner": about.owner}
         file = self._spool.open(about.id)
-        replay = self._new(row["run"], options, row, self._spool.drop)
-        log.info("replay %s goes on after line %d", about.id, row["lines_done"])
+        replay = self._new(stored.run, options, stored, self._spool.drop)
+        log.info("replay %s goes on after line %d", about.id, stored.lines.done)
         replay.resume(_lines_of(file, about, replay))
 
     def _new(
         self,
         run: str,
         options: ReplayOptions,
-        row: Row | None = None,
+        stored: Replay | None = None,
         drop: Callable[[str], object] = lambda id: None,
-    ) -> Replay:
+    ) -> RunningReplay:
         """A replay that takes a slot; `drop` is called when it is over and will not be resumed."""
-        # Knowing the id is enough to read the progress.
-        row = row or {
-            "id": unguessable_ulid(),
-            "run": checked_run_name(run),
-            "name": options.get("name", "replay"),
-            "lines_total": options.get("total"),
-        }
+        state = stored or _new_state(checked_run_name(run), options)
 
-        def ended(state: str) -> None:
-            self._spool.release(str(row["id"]))
-            if state != "interrupted":
-                drop(str(row["id"]))
+        def ended(end: str) -> None:
+            self._spool.release(state.id)
+            if end != "interrupted":
+                drop(state.id)
 
-        replay = Replay(
+        replay = RunningReplay(
             self._context.store,
             self.bulk,
             lambda: utc_now().text,
-            row,
+            state,
             options.get("check", lambda spacecraft: None),
             options.get("owner"),
             self._context.settings.replay_seconds,
@@ -192,7 +186,7 @@ class Replays:
         if owner is not None and own >= MAX_OF_ONE_TOKEN:
             raise Busy(f"{own} replays of this token are running", REPLAY_RETRY_S)
 
-    def cancel(self, id: str, caller: Caller | None = None) -> Row:
+    def cancel(self, id: str, caller: Caller | None = None) -> Replay:
         """End a replay; what it recorded stays.  Returns how far it came.
 
         Waits a few seconds for its end, until when its state is `running`.  A
@@ -212,16 +206,16 @@ class Replays:
         elif not replay.is_over:
             replay.cancel()
             replay.wait(CANCEL_WAIT_S)
-        state = self.get(known)
-        require_cancellable(state["state"])
-        return state
+        cancelled = self.get(known)
+        require_cancellable(cancelled.state)
+        return cancelled
 
-    def all(self) -> list[Row]:
+    def all(self) -> list[Replay]:
         """The latest replays and their progress, newest first."""
         with self._context.reading() as connection:
             return list_replays(connection)
 
-    def get(self, id: str) -> Row:
+    def get(self, id: str) -> Replay:
         """A replay and how far it is, with the lines that were refused."""
         with self._context.reading() as connection:
             return read_replay(connection, known_id(id, "replay"))
@@ -241,17 +235,32 @@ class Replays:
             replay.wait()
 
 
+def _new_state(run: str, options: ReplayOptions) -> Replay:
+    return Replay(
+        # Knowing the id is enough to read the progress.
+        id=unguessable_ulid(),
+        run=run,
+        name=options.get("name", "replay"),
+        state="running",
+        lines=ReplayLines(total=options.get("total"), done=0, refused=0),
+        counts=ReplayCounts(**dict.fromkeys(ReplayCounts.__struct_fields__, 0)),
+        errors=[],
+        started=utc_now().text,
+        finished=None,
+    )
+
+
 def discard_upload(file: IO[bytes]) -> None:
     """Remove an upload of which no replay is started."""
     file.close()
     Path(file.name).unlink(missing_ok=True)
 
 
-def _lines_of(file: IO[bytes], about: SpooledReplay, replay: Replay) -> Iterable[bytes]:
+def _lines_of(file: IO[bytes], about: SpooledReplay, replay: RunningReplay) -> Iterable[bytes]:
     return unpacked_lines(file, about.coding, about.longest_bytes, replay.require_going_on)
 
 
-def _noted_with(run: str, options: ReplayOptions) -> Callable[[Connection], None]:
+def _stored_with(run: str, options: ReplayOptions) -> Callable[[Connection], None]:
     """What is stored in the transaction that notes a replay."""
 
     def store(connection: Connection) -> None:

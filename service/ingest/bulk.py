@@ -12,13 +12,20 @@ from service.errors import AcquisitionError, Busy
 from service.ingest.local_workers import ChunkEndsWorkers, LocalWorkers, WorkerConfig, WorkerLost
 from service.ingest.solver_pool import Solver
 from service.ingest.submit import Answers, SubmissionService
-from service.ingest.telemetry_lines import Found, Lines, Refused, Seen, found_in, named_in
+from service.ingest.telemetry_lines import (
+    InvalidLine,
+    LineResult,
+    RecordedLine,
+    TelemetryLines,
+    identity_in,
+    line_results,
+)
 from service.observations.schema import Submission, submission_from_json
 from service.storage.recording.identity import Registry, look_up, stored_answers
 from service.storage.recording.unsaved_result import Answered, Draft
 from service.storage.sql.database import Store
 
-AHEAD = 2
+PENDING_A_WORKER = 2
 """Chunks a worker that it has, or that wait for it."""
 
 Check = Callable[[str], None]
@@ -28,9 +35,9 @@ Require = Callable[[], object]
 """Raises an `AcquisitionError` where no more is to be computed."""
 
 
-def work(solver: Solver, lines: Lines) -> list[Found]:
+def solve_lines(solver: Solver, lines: TelemetryLines) -> list[LineResult]:
     """What a worker makes of some lines."""
-    return found_in(lines, lambda fresh: [solver.solve_one_of_many(each) for each in fresh])
+    return line_results(lines, lambda fresh: [solver.solve_one_of_many(each) for each in fresh])
 
 
 INTERACTIVE_WINDOW_S = 0.5
@@ -47,21 +54,23 @@ class Bulk:
     ) -> None:
         self._submissions = submissions
         self._store = store
-        self.workers: LocalWorkers[Lines, Found] = LocalWorkers(config, work, workers)
+        self.workers: LocalWorkers[TelemetryLines, LineResult] = LocalWorkers(
+            config, solve_lines, workers
+        )
 
     def close(self) -> None:
         """End the workers; what they were at comes to nothing."""
         self.workers.close()
 
     @property
-    def ahead(self) -> int:
+    def max_pending(self) -> int:
         """How many chunks should be begun before the first of them is recorded.
 
         While batches come one by one as well, a worker less is given to do, so that
         theirs find a processor free.
         """
         up = self.workers.up
-        return up - 2 if up > 1 and self._gives_way else AHEAD * up
+        return up - 2 if up > 1 and self._gives_way else PENDING_A_WORKER * up
 
     @property
     def lines(self) -> int:
@@ -75,7 +84,7 @@ class Bulk:
 
     def begin(
         self, texts: Sequence[bytes], run: str, check: Check, require: Require = lambda: None
-    ) -> "Chunk":
+    ) -> "BulkChunk":
         """Let a chunk be computed; raises `Busy` where the time has not come.
 
         `require` is called before each batch that this process computes itself, and
@@ -83,23 +92,23 @@ class Bulk:
         """
         self.workers.start()
         self._submissions.yield_to_interactive()
-        named = [named_in(text, run) for text in texts]
+        named = [identity_in(text, run) for text in texts]
         with self._store.reading() as connection:
             registry = look_up(connection, {each for each in named if each is not None})
             ids = {each.result_id for each in registry.identities.values()}
             stored = stored_answers(connection, ids)
         known = frozenset(k for k, each in enumerate(named) if each in registry.identities)
-        return Chunk(self, Lines(run, texts, known), check, require, registry, stored)
+        return BulkChunk(self, TelemetryLines(run, texts, known), check, require, registry, stored)
 
-    def compute(self, lines: Lines, require: Require) -> "Future[list[Found]]":
+    def compute(self, lines: TelemetryLines, require: Require) -> "Future[list[LineResult]]":
         """What the lines come to, as soon as a worker has found it out, or at once."""
         if self.workers.up:
             return self.workers.submit(lines)
-        done: Future[list[Found]] = Future()
+        done: Future[list[LineResult]] = Future()
         done.set_result(self.compute_here(lines, require))
         return done
 
-    def compute_here(self, lines: Lines, require: Require) -> list[Found]:
+    def compute_here(self, lines: TelemetryLines, require: Require) -> list[LineResult]:
         """The same in this process, which nobody who posts one by one shall feel."""
 
         def drafts(fresh: Sequence[Submission]) -> list[Draft | AcquisitionError]:
@@ -109,7 +118,7 @@ class Bulk:
                 made.append(self.draft_here(each))
             return made
 
-        return found_in(lines, drafts)
+        return line_results(lines, drafts)
 
     def draft_here(self, submission: Submission) -> Draft | AcquisitionError:
         """One of them, when nobody waits."""
@@ -120,13 +129,13 @@ class Bulk:
         return self._submissions.begin_writing(drafts)
 
 
-class Chunk:
+class BulkChunk:
     """A chunk on its way: computed first, then recorded."""
 
     def __init__(
         self,
         bulk: Bulk,
-        lines: Lines,
+        lines: TelemetryLines,
         check: Check,
         require: Require,
         registry: Registry,
@@ -141,12 +150,12 @@ class Chunk:
         """Whether it is computed, or comes to be within so many seconds."""
         return bool(wait([self._computed], within_s).done)
 
-    def hand_on(self) -> None:
+    def queue_write(self) -> None:
         """Queue what was computed for the writer; raises `Busy` where it must be called again."""
         drafts = [each for each in self._decided if isinstance(each, Draft)]
         self._finish = self._bulk.begin_writing(drafts)
 
-    def give_up(self) -> None:
+    def cancel(self) -> None:
         """Let it not be computed, where that has not begun."""
         self._computed.cancel()
 
@@ -161,7 +170,7 @@ class Chunk:
             found = self._computed.result()
         except ChunkEndsWorkers as error:
             # Computed here it might end this process as well.
-            names = named_in(self._lines.texts[0], self._lines.run)
+            names = identity_in(self._lines.texts[0], self._lines.run)
             refusal = AcquisitionError(f"computing the lines from {names} on failed: {error}")
             return [refusal] * len(self._lines.texts)
         except WorkerLost:
@@ -170,9 +179,9 @@ class Chunk:
             self._decision(text, each) for text, each in zip(self._lines.texts, found, strict=True)
         ]
 
-    def _decision(self, text: bytes, found: Found) -> Draft | Answered | AcquisitionError:
+    def _decision(self, text: bytes, found: LineResult) -> Draft | Answered | AcquisitionError:
         try:
-            if isinstance(found, Refused):
+            if isinstance(found, InvalidLine):
                 if found.spacecraft is not None:
                     self._check(found.spacecraft)
                 return found.error
@@ -187,7 +196,7 @@ class Chunk:
         except AcquisitionError as error:
             return error
 
-    def _repeat(self, text: bytes, seen: Seen) -> Draft | Answered | AcquisitionError:
+    def _repeat(self, text: bytes, seen: RecordedLine) -> Draft | Answered | AcquisitionError:
         first = self._registry.first(seen.identity, None, seen.fingerprint)
         if first is None:
             # It is not called what it seemed to be called.

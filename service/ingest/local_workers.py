@@ -50,8 +50,8 @@ PACKED_TOGETHER, MOST_BYTES = 8, 65_536
 log = logging.getLogger(__name__)
 
 Task = TypeVar("Task")
-Found = TypeVar("Found")
-Work = Callable[[Solver, Task], Sequence[Found]]
+Output = TypeVar("Output")
+Work = Callable[[Solver, Task], Sequence[Output]]
 
 
 class WorkerLost(Exception):
@@ -80,23 +80,23 @@ class WorkerConfig:
 
 
 @dataclass(eq=False)
-class _Chunk(Generic[Task, Found]):
+class _QueuedTask(Generic[Task, Output]):
     task: Task
-    done: "Future[list[Found]]" = field(default_factory=Future)
+    done: "Future[list[Output]]" = field(default_factory=Future)
     deaths: int = 0
     """Processes that died while it was the only chunk at work."""
 
 
-class LocalWorkers(Generic[Task, Found]):
+class LocalWorkers(Generic[Task, Output]):
     """Workers that do one kind of work, from the first `start` to `close`."""
 
-    def __init__(self, config: WorkerConfig, work: "Work[Task, Found]", count: int) -> None:
+    def __init__(self, config: WorkerConfig, work: "Work[Task, Output]", count: int) -> None:
         """`work` is a function of a module, so that a worker finds it by its name."""
         self._config, self._work, self.count = config, work, count
         self._lock = threading.RLock()
         self._executor: ProcessPoolExecutor | None = None
         self._stop: Connection | None = None
-        self._one_by_one: deque[_Chunk[Task, Found]] = deque()
+        self._one_by_one: deque[_QueuedTask[Task, Output]] = deque()
         """Chunks that were unfinished when an executor broke, and those that came since."""
         self._pids: set[int] = set()
         self._pause_s = PAUSE_S
@@ -123,9 +123,9 @@ class LocalWorkers(Generic[Task, Found]):
             if self._executor is None and self.count and not (self._closing or too_soon):
                 self._open()
 
-    def submit(self, task: Task) -> "Future[list[Found]]":
+    def submit(self, task: Task) -> "Future[list[Output]]":
         """Queue a task; the future gives what was found, or raises `WorkerLost` or `Stopping`."""
-        chunk: _Chunk[Task, Found] = _Chunk(task)
+        chunk: _QueuedTask[Task, Output] = _QueuedTask(task)
         with self._lock:
             if self._closing:
                 raise Stopping("the service is stopping")
@@ -180,7 +180,7 @@ class LocalWorkers(Generic[Task, Found]):
             self._stop.close()
         return executor
 
-    def _hand_in(self, chunk: _Chunk[Task, Found]) -> None:
+    def _hand_in(self, chunk: _QueuedTask[Task, Output]) -> None:
         executor = self._executor or self._open()
         try:
             future = executor.submit(_compute, self._work, chunk.task)
@@ -213,7 +213,7 @@ class LocalWorkers(Generic[Task, Found]):
 
     def _take_result(
         self,
-        chunk: _Chunk[Task, Found],
+        chunk: _QueuedTask[Task, Output],
         executor: ProcessPoolExecutor,
         future: "Future[tuple[int, list[bytes]]]",
     ) -> None:
@@ -234,7 +234,7 @@ class LocalWorkers(Generic[Task, Found]):
             _fail(chunk, WorkerLost(f"a worker failed ({error!r})"))
         self._go_on(chunk)
 
-    def _try_again(self, chunk: _Chunk[Task, Found], broken: ProcessPoolExecutor) -> None:
+    def _try_again(self, chunk: _QueuedTask[Task, Output], broken: ProcessPoolExecutor) -> None:
         with self._lock:
             self._replace(broken)
             if not (self._one_by_one and self._one_by_one[0] is chunk):
@@ -249,7 +249,7 @@ class LocalWorkers(Generic[Task, Found]):
         _fail(chunk, ChunkEndsWorkers(f"{MOST_DEATHS} processes died over it"))
         self._go_on(chunk)
 
-    def _go_on(self, finished: _Chunk[Task, Found]) -> None:
+    def _go_on(self, finished: _QueuedTask[Task, Output]) -> None:
         """Hand in the next of the chunks that are computed one by one."""
         with self._lock:
             if self._one_by_one and self._one_by_one[0] is finished:
@@ -274,7 +274,7 @@ class LocalWorkers(Generic[Task, Found]):
                 self._check_idle_after(IDLE_S - idle_s)
 
 
-def _fail(chunk: _Chunk[Any, Any], error: Exception) -> None:
+def _fail(chunk: _QueuedTask[Any, Any], error: Exception) -> None:
     if not chunk.done.done():
         chunk.done.set_exception(error)
 

@@ -1,4 +1,4 @@
-"""Lines of telemetry, a batch each: read and computed, many at once, in whichever process."""
+"""Lines of telemetry, a batch each: read and solved many at once, in this process or a worker."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ from service.storage.recording.unsaved_result import Draft
 
 
 @dataclass(frozen=True)
-class Lines:
-    """Some lines for one run; those `known` by their place among them seem to be recorded."""
+class TelemetryLines:
+    """Lines for one run; `known` holds the positions of those that seem to be recorded."""
 
     run: str
     texts: Sequence[bytes]
@@ -22,7 +22,7 @@ class Lines:
 
 
 @dataclass(frozen=True)
-class Seen:
+class RecordedLine:
     """A line that was read, but not computed."""
 
     identity: Identity
@@ -30,18 +30,18 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Refused:
+class InvalidLine:
     """What is wrong with a line, and whose batch it is where it can be read."""
 
     spacecraft: str | None
     error: AcquisitionError
 
 
-Found = Draft | Seen | Refused
+LineResult = Draft | RecordedLine | InvalidLine
 Drafting = Callable[[Sequence[Submission]], Sequence[Draft | AcquisitionError]]
 
 
-def found_in(lines: Lines, draft: Drafting) -> list[Found]:
+def line_results(lines: TelemetryLines, draft: Drafting) -> list[LineResult]:
     """What each line comes to, in order; `draft` is given all that are to be computed."""
     read = [_read(text, lines.run) for text in lines.texts]
     fresh = [
@@ -50,42 +50,42 @@ def found_in(lines: Lines, draft: Drafting) -> list[Found]:
         if isinstance(each, Submission) and place not in lines.known
     ]
     drafted = iter(draft(fresh))
-    found: list[Found] = []
+    found: list[LineResult] = []
     for place, each in enumerate(read):
-        if isinstance(each, Refused):
+        if isinstance(each, InvalidLine):
             found.append(each)
         elif place in lines.known:
-            found.append(Seen(identity_of(each.batch), each.fingerprint))
+            found.append(RecordedLine(identity_of(each.batch), each.fingerprint))
         else:
             match next(drafted):
                 case AcquisitionError() as error:
-                    found.append(Refused(each.batch.spacecraft, error))
+                    found.append(InvalidLine(each.batch.spacecraft, error))
                 case made:
                     found.append(made)
     return found
 
 
-def _read(text: bytes, run: str) -> Submission | Refused:
+def _read(text: bytes, run: str) -> Submission | InvalidLine:
     try:
         return submission_from_json(text, run=run)
     except AcquisitionError as error:
-        return Refused(None, error)
+        return InvalidLine(None, error)
 
 
 _Name = Annotated[str, msgspec.Meta(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\x7f]+\Z")]
 
 
-class _Named(msgspec.Struct):
+class _NamedBatch(msgspec.Struct):
     """As much of a batch as names it."""
 
     spacecraft: _Name
     batch: _Name
 
 
-_NAMED = msgspec.json.Decoder(_Named)
+_NAMED = msgspec.json.Decoder(_NamedBatch)
 
 
-def named_in(text: bytes, run: str) -> Identity | None:
+def identity_in(text: bytes, run: str) -> Identity | None:
     """What a line seems to be called, read in passing; None where that cannot be told."""
     try:
         named = _NAMED.decode(text)

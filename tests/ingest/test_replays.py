@@ -6,7 +6,9 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import msgspec
 import pytest
+from msgspec.structs import asdict
 from sqlalchemy import update
 
 from service.errors import BadBatch, Busy, Stopping
@@ -16,7 +18,7 @@ from service.storage.sql.writer import Writer
 
 def finished(app, id, seconds=60):
     give_up = time.monotonic() + seconds
-    while (replay := app.replays.get(id))["finished"] is None and time.monotonic() < give_up:
+    while (replay := app.replays.get(id)).finished is None and time.monotonic() < give_up:
         time.sleep(0.01)
     return replay
 
@@ -28,11 +30,11 @@ def lines(make):
 
 def test_every_line_is_recorded_in_the_run_and_none_in_live(app, lines):
     replay = finished(app, app.replays.start(lines, "pass-1", name="pass-1.ndjson"))
-    assert replay["state"] == "done"
-    assert replay["lines"] == {"total": None, "done": 10, "refused": 0}
-    assert (replay["run"], replay["name"], replay["errors"]) == ("pass-1", "pass-1.ndjson", [])
-    assert replay["started"] <= replay["finished"]
-    assert [each["batches"] for each in app.spacecraft.rates("XTE", run="pass-1")] == [10]
+    assert replay.state == "done"
+    assert asdict(replay.lines) == {"total": None, "done": 10, "refused": 0}
+    assert (replay.run, replay.name, replay.errors) == ("pass-1", "pass-1.ndjson", [])
+    assert replay.started <= replay.finished
+    assert [each.batches for each in app.spacecraft.rates("XTE", run="pass-1")] == [10]
     assert app.spacecraft.rates("XTE") == []
     assert app.results.page().items == []
 
@@ -42,20 +44,20 @@ def test_a_bad_line_is_reported_with_its_number_and_the_rest_goes_on(app, lines,
     lines[5] = b"\n"
     lines[7] = make("b0", stars=4).text.encode() + b"\n"
     replay = finished(app, app.replays.start(lines, "pass-1"))
-    assert replay["state"] == "done"
-    assert replay["lines"] == {"total": None, "done": 10, "refused": 2}
-    truncated, conflict = replay["errors"]
-    assert truncated["line"] == 4
-    assert truncated["problem"]["errors"]
-    assert (conflict["line"], "another body" in conflict["problem"]["detail"]) == (8, True)
+    assert replay.state == "done"
+    assert asdict(replay.lines) == {"total": None, "done": 10, "refused": 2}
+    truncated, conflict = replay.errors
+    assert truncated.line == 4
+    assert truncated.problem.errors
+    assert (conflict.line, "another body" in conflict.problem.detail) == (8, True)
     assert len(app.results.page(run="pass-1").items) == 7
 
 
 def test_a_replay_is_safe_to_run_twice(app, lines):
     for _ in range(2):
         replay = finished(app, app.replays.start(lines, "pass-1"))
-        assert replay["lines"]["refused"] == 0
-    assert [each["batches"] for each in app.spacecraft.rates("XTE", run="pass-1")] == [10]
+        assert replay.lines.refused == 0
+    assert [each.batches for each in app.spacecraft.rates("XTE", run="pass-1")] == [10]
 
 
 def test_lines_that_can_be_closed_are_closed_at_the_end(app, lines):
@@ -67,7 +69,7 @@ def test_lines_that_can_be_closed_are_closed_at_the_end(app, lines):
 def test_that_a_replay_is_over_is_noted_once_the_database_can_be_written_again(
     app, lines, monkeypatch
 ):
-    monkeypatch.setattr("service.ingest.replays.BUSY_PAUSE_S", 0.01)
+    monkeypatch.setattr("service.ingest.replay_progress.SAVE_PAUSE_S", 0.01)
     change, refused = app.store.writer.change, []
 
     def refuse(change):
@@ -89,13 +91,13 @@ def test_that_a_replay_is_over_is_noted_once_the_database_can_be_written_again(
 
     replay = finished(app, app.replays.start(Closed(), "pass-1"))
     assert len(refused) == 3
-    assert (replay["state"], replay["lines"]["done"]) == ("done", 10)
+    assert (replay.state, replay.lines.done) == ("done", 10)
 
 
 def test_the_first_thousand_errors_are_kept_and_all_are_counted(app):
     replay = finished(app, app.replays.start([b"{\n"] * 1200, "pass-1"))
-    assert replay["lines"]["refused"] == 1200
-    assert [each["line"] for each in replay["errors"]] == list(range(1, 1001))
+    assert replay.lines.refused == 1200
+    assert [each.line for each in replay.errors] == list(range(1, 1001))
 
 
 def test_lines_that_break_off_fail_the_replay_and_keep_what_was_read(app, lines):
@@ -104,8 +106,8 @@ def test_lines_that_break_off_fail_the_replay_and_keep_what_was_read(app, lines)
         raise OSError("the file is gone")
 
     replay = finished(app, app.replays.start(broken(), "pass-1"))
-    assert replay["state"] == "failed"
-    assert "the file is gone" in replay["errors"][0]["problem"]["detail"]
+    assert replay.state == "failed"
+    assert "the file is gone" in replay.errors[0].problem.detail
 
 
 @pytest.mark.parametrize("run", ["no spaces", "-", "x" * 65])
@@ -124,14 +126,14 @@ def test_closing_interrupts_a_replay_and_keeps_what_it_recorded(opened, make):
     app = opened()
     id = app.replays.start(endless(), "endless")
     give_up = time.monotonic() + 60
-    while app.replays.get(id)["lines"]["done"] == 0 and time.monotonic() < give_up:
+    while app.replays.get(id).lines.done == 0 and time.monotonic() < give_up:
         time.sleep(0.01)
     app.close()
     later = opened()
     replay = later.replays.get(id)
-    assert replay["state"] == "interrupted"
+    assert replay.state == "interrupted"
     (run,) = later.runs.all()
-    assert run.batches == replay["lines"]["done"]
+    assert run.batches == replay.lines.done
 
 
 def test_what_a_killed_process_left_running_is_marked_interrupted_on_opening(opened, lines):
@@ -141,11 +143,12 @@ def test_what_a_killed_process_left_running_is_marked_interrupted_on_opening(ope
     left = update(replays).values(state="running", finished=None)
     app.store.writer.change(lambda connection: connection.execute(left)).result()
     app.close()
-    assert opened().replays.get(id)["state"] == "interrupted"
+    assert opened().replays.get(id).state == "interrupted"
 
 
 def test_progress_is_json_ready(app, lines):
-    json.dumps(finished(app, app.replays.start(lines, "pass-1")))
+    replay = finished(app, app.replays.start(lines, "pass-1"))
+    assert json.loads(msgspec.json.encode(replay))["lines"]["done"] == 10
 
 
 def test_replays_that_begin_together_are_all_stopped_by_closing(opened, make):
@@ -164,7 +167,7 @@ def test_replays_that_begin_together_are_all_stopped_by_closing(opened, make):
     app.close()
     assert not [each for each in threading.enumerate() if each.name.startswith("replay-")]
     later = opened()
-    assert {later.replays.get(id)["state"] for id in ids} == {"interrupted"}
+    assert {later.replays.get(id).state for id in ids} == {"interrupted"}
 
 
 def test_a_replay_does_not_outlive_a_service_that_stops_under_it(app, lines, monkeypatch):
@@ -172,7 +175,7 @@ def test_a_replay_does_not_outlive_a_service_that_stops_under_it(app, lines, mon
         Writer, "record", lambda *_, **named: (_ for _ in ()).throw(Stopping("stopping"))
     )
     replay = finished(app, app.replays.start(lines, "pass-1"))
-    assert (replay["state"], replay["lines"]["refused"]) == ("interrupted", 0)
+    assert (replay.state, replay.lines.refused) == ("interrupted", 0)
 
 
 def test_none_begins_once_the_service_is_stopping(opened, lines):
@@ -200,5 +203,5 @@ def test_replays_have_a_bound_in_number(app, lines, monkeypatch):
 def test_what_is_kept_of_bad_lines_is_bounded(app):
     wrong = json.dumps({"k" * 30_000 + str(k): 1 for k in range(20)}).encode()
     replay = finished(app, app.replays.start([wrong] * 100, "pass-1"))
-    assert replay["lines"]["refused"] == 100
-    assert len(json.dumps(replay["errors"])) < 200_000
+    assert replay.lines.refused == 100
+    assert len(msgspec.json.encode(replay.errors)) < 200_000

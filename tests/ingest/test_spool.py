@@ -6,6 +6,7 @@ import time
 
 import httpx
 import pytest
+from msgspec.structs import asdict
 from sqlalchemy import func, select
 
 from service.access.tokens import Caller
@@ -46,7 +47,7 @@ def test_an_upload_is_removed_when_its_replay_is_over(opened, lines):
     app = opened(replay_processes=0)
     id = upload(app, lines[:20])
     assert stored(app)
-    assert finished(app, id)["state"] == "done"
+    assert finished(app, id).state == "done"
     give_up = time.monotonic() + 10
     while stored(app) and time.monotonic() < give_up:
         time.sleep(0.01)
@@ -57,19 +58,19 @@ def test_a_replay_goes_on_after_a_restart_where_it_was(opened, lines):
     app = opened(replay_processes=0)
     id = upload(app, [b"{\n", *lines[:400]], total=401)
     give_up = time.monotonic() + 60
-    while app.replays.get(id)["lines"]["done"] < 64 and time.monotonic() < give_up:
+    while app.replays.get(id).lines.done < 64 and time.monotonic() < give_up:
         time.sleep(0.005)
     app.close()
     later = opened(replay_processes=0)
     before = later.replays.get(id)
-    assert before["state"] == "interrupted"
-    assert 64 <= before["lines"]["done"] < 401
+    assert before.state == "interrupted"
+    assert 64 <= before.lines.done < 401
     later.replays.resume()
     after = finished(later, id)
-    assert (after["state"], after["lines"]) == ("done", {"total": 401, "done": 401, "refused": 1})
-    assert after["counts"]["new"] + after["counts"]["repeated"] == 400
+    assert (after.state, asdict(after.lines)) == ("done", {"total": 401, "done": 401, "refused": 1})
+    assert after.counts.new + after.counts.repeated == 400
     assert recorded(later) == (400, 400)
-    assert [each["line"] for each in after["errors"]] == [1]
+    assert [each.line for each in after.errors] == [1]
 
 
 def test_what_a_token_is_bound_to_holds_after_a_restart(opened, lines):
@@ -80,8 +81,8 @@ def test_what_a_token_is_bound_to_holds_after_a_restart(opened, lines):
     later = opened(replay_processes=0)
     later.replays.resume()
     state = finished(later, id)
-    assert state["lines"]["refused"] == 300
-    assert str(Forbidden("pipeline is bound to SWAS, not to XTE")) in str(state["errors"][-1])
+    assert state.lines.refused == 300
+    assert str(Forbidden("pipeline is bound to SWAS, not to XTE")) in str(state.errors[-1])
 
 
 def test_one_token_takes_no_more_than_its_slots(opened, lines, monkeypatch):

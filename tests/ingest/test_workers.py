@@ -19,7 +19,7 @@ from sqlalchemy import select
 from service.app.factory import open_app
 from service.errors import AcquisitionError, BadBatch, BadConfiguration, BadInput
 from service.ingest.local_workers import ChunkEndsWorkers, LocalWorkers, WorkerConfig
-from service.ingest.telemetry_lines import named_in
+from service.ingest.telemetry_lines import identity_in
 from service.observations.schema import submission_from_json
 from service.settings import Settings
 from service.storage.sql.tables import batches
@@ -96,26 +96,26 @@ def test_workers_answer_what_single_posts_are_answered(opened, sent, lines, make
     tracker = make("b90").text.replace('"tracker":"', '"tracker":"no-').encode()
     more = [b'{"cut', lines[3], unknown, tracker, b"\n", conflict]
     app.zones.drop(None)
-    before = app.zones.state()["misses"]
+    before = app.zones.state().misses
 
     replay = finished(app, app.replays.start(lines + more, "bulk"))
     again = finished(app, app.replays.start(lines + more, "bulk"))
 
-    assert app.zones.state()["misses"] == before
+    assert app.zones.state().misses == before
     single, bulk = answers_in(app, "live"), answers_in(app, "bulk")
     assert single.keys() == bulk.keys()
     for name, answer in bulk.items():
         assert without_accidents(answer) | {"run": "live"} == without_accidents(single[name])
-    assert (replay["counts"]["new"], replay["counts"]["repeated"]) == (80, 1)
-    assert (again["counts"]["new"], again["counts"]["repeated"]) == (0, 81)
-    told = {each["line"]: each["problem"] for each in replay["errors"]}
-    assert told == {each["line"]: each["problem"] for each in again["errors"]}
+    assert (replay.counts.new, replay.counts.repeated) == (80, 1)
+    assert (again.counts.new, again.counts.repeated) == (0, 81)
+    told = {each.line: each.problem for each in replay.errors}
+    assert told == {each.line: each.problem for each in again.errors}
     assert told.keys() == {81, 83, 84, 86}
     for number, text in ((81, more[0]), (83, unknown), (84, tracker)):
         with pytest.raises(BadInput) as refusal:
             app.submissions.submit(submission_from_json(text))
-        assert told[number]["detail"].startswith(str(refusal.value.faults[0]))
-    assert "another body" in told[86]["detail"]
+        assert told[number].detail.startswith(str(refusal.value.faults[0]))
+    assert "another body" in told[86].detail
 
 
 def test_observers_hear_of_what_workers_computed(opened, lines):
@@ -125,9 +125,9 @@ def test_observers_hear_of_what_workers_computed(opened, lines):
     replay = finished(app, app.replays.start(lines, "bulk"))
     assert sorted(each.batch for each in seen) == sorted(f"b{k}" for k in range(80))
     assert {(each.spacecraft, each.run) for each in seen} == {("XTE", "bulk")}
-    assert sum(each.has_attitude for each in seen) == replay["counts"]["attitudes"]
+    assert sum(each.has_attitude for each in seen) == replay.counts.attitudes
     for outcome in ("observed", "unique", "ambiguous", "unmatched"):
-        assert sum(each.counts[outcome] for each in seen) == replay["counts"][outcome]
+        assert sum(each.counts[outcome] for each in seen) == getattr(replay.counts, outcome)
 
 
 def test_workers_that_are_killed_again_and_again_cost_and_double_nothing(opened, make):
@@ -148,8 +148,8 @@ def test_workers_that_are_killed_again_and_again_cost_and_double_nothing(opened,
     replay = finished(app, app.replays.start(numbered(), "bulk"), GIVE_UP_S * 2)
     assert over.is_set()
     assert len(set(killed)) >= 2
-    assert (replay["state"], replay["errors"]) == ("done", [])
-    assert replay["counts"]["new"] == wanted
+    assert (replay.state, replay.errors) == ("done", [])
+    assert replay.counts.new == wanted
     assert Counter(names_in(app, "bulk")) == Counter(f"n{k}" for k in range(wanted))
     with_workers(app, 2)
     assert not set(workers_of(app)) & set(killed)
@@ -160,7 +160,7 @@ def test_closing_ends_workers_and_replays_at_once(opened, make):
     others = set(threading.enumerate())
     app = with_workers(opened(replay_processes=1))
     id = app.replays.start(endless(make().text), "endless")
-    wait_until(lambda: app.replays.get(id)["lines"]["done"] > 100, "nothing is recorded")
+    wait_until(lambda: app.replays.get(id).lines.done > 100, "nothing is recorded")
     (pid,) = workers_of(app)
     app.close()
     assert not Path(f"/proc/{pid}").exists()
@@ -168,8 +168,8 @@ def test_closing_ends_workers_and_replays_at_once(opened, make):
     assert not [each for each in left if each.name.startswith("worker-")]
     later = opened()
     replay = later.replays.get(id)
-    assert replay["state"] == "interrupted"
-    assert len(names_in(later, "endless")) == replay["lines"]["done"]
+    assert replay.state == "interrupted"
+    assert len(names_in(later, "endless")) == replay.lines.done
 
 
 def test_workers_that_are_still_starting_are_ended_as_well(opened):
@@ -277,9 +277,9 @@ def test_whoever_stops_the_whole_group_stops_it_in_order(tmp_path, long_replay, 
     app = open_app(Settings(database=served.database))
     try:
         newest, _ = app.replays.all()
-        assert newest["state"] == "interrupted"
+        assert newest.state == "interrupted"
         names = names_in(app, "bulk")
-        assert len(names) == newest["lines"]["done"] < len(long_replay)
+        assert len(names) == newest.lines.done < len(long_replay)
         assert set(names) == {f"n{k}" for k in range(len(names))}
     finally:
         app.close()
@@ -301,7 +301,7 @@ def test_errors_cross_processes_whole(make):
 
 def test_a_line_is_called_in_passing_what_it_is_called(make):
     text = make("name").text.encode()
-    assert named_in(text, "r") == ("XTE", "r", "name")
-    assert named_in(json.dumps(json.loads(text) | {"batch": "\n"}).encode(), "r") is None
+    assert identity_in(text, "r") == ("XTE", "r", "name")
+    assert identity_in(json.dumps(json.loads(text) | {"batch": "\n"}).encode(), "r") is None
     for bad in (b"", b"[]", b"\xff", b'{"batch": 1}', b'{"x":' + b"[" * 100_000):
-        assert named_in(bad, "r") is None
+        assert identity_in(bad, "r") is None

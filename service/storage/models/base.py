@@ -86,7 +86,7 @@ Reason = Annotated[
 
 
 class Record(Struct, frozen=True, kw_only=True):
-    """A record; `component` is its name in the OpenAPI document, where that differs."""
+    """A record; `component` is its name in the OpenAPI document, empty where no answer has it."""
 
     component: ClassVar[str] = ""
 

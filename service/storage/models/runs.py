@@ -8,6 +8,8 @@ from pydantic import Field
 from service.storage.models.base import Count, Id, Moment, Record, doc
 from service.storage.models.problems import FieldFault
 
+ReplayStateName = Literal["running", "done", "interrupted", "failed", "cancelled"]
+
 
 class Run(Record, frozen=True, kw_only=True):
     """A run."""
@@ -69,22 +71,32 @@ class RefusedLine(Record, frozen=True, kw_only=True):
     problem: LineProblem
 
 
-class Replay(Record, frozen=True, kw_only=True):
-    """A replay and its progress."""
+class ReplayProgress(Record, frozen=True, kw_only=True):
+    """A replay and its progress, without the refused lines: the data of an event."""
 
-    component: ClassVar[str] = "ReplayState"
     id: Id
     run: str
     name: str
-    state: Literal["running", "done", "interrupted", "failed", "cancelled"]
+    state: ReplayStateName
     lines: ReplayLines
     counts: ReplayCounts
+    started: Moment
+    finished: Moment | None
+
+
+class Replay(ReplayProgress, frozen=True, kw_only=True):
+    """A replay and its progress."""
+
+    component: ClassVar[str] = "ReplayState"
     errors: Annotated[
         list[RefusedLine],
         doc("The first thousand refused lines; then, for a failed replay, the reason."),
     ]
-    started: Moment
-    finished: Moment | None
+
+    def progress(self) -> ReplayProgress:
+        """The replay without the refused lines."""
+        names = ReplayProgress.__struct_fields__
+        return ReplayProgress(**{name: getattr(self, name) for name in names})
 
 
 class ReplayList(Record, frozen=True, kw_only=True):

@@ -99,7 +99,7 @@ def watch_run(run: Run, body: JsonBody, app: AppDep, audited: AuditDep) -> Respo
 )
 def list_replays(app: AppDep) -> Response:
     """The latest replays and their progress, newest first."""
-    return json_response({"items": app.replays.all()})
+    return json_response(ReplayList(items=app.replays.all()))
 
 
 @router.post(
@@ -155,5 +155,5 @@ def get_replay(id: ReplayId, app: AppDep) -> Response:
 )
 def cancel_replay(id: ReplayId, app: AppDep, caller: CallerDep) -> Response:
     """Cancel a replay; the batches that it recorded stay."""
-    state = app.replays.cancel(id, caller)
-    return json_response(state, 202 if state["state"] == "running" else 200)
+    replay = app.replays.cancel(id, caller)
+    return json_response(replay, 202 if replay.state == "running" else 200)

@@ -124,7 +124,8 @@ def _schemas() -> dict[str, Any]:
 
 def _records(kind: type[Record]) -> Iterator[type[Record]]:
     for each in kind.__subclasses__():
-        yield each
+        if vars(each).get("component"):
+            yield each
         yield from _records(each)
 
 

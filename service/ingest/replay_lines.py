@@ -1,0 +1,60 @@
+"""The lines of a telemetry file, in groups that are computed together."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+
+from service.errors import BadBatch, BadInput, Fault
+
+MAX_BLANK_LINES = 1_000_000
+"""Of a file.  They hold nothing, and five gigabytes of them pack to five megabytes."""
+
+
+@dataclass
+class LineGroup:
+    """Lines of a file that are not blank, with their numbers from 1.
+
+    `last` is the number of the last line that was read, blank or not.
+    """
+
+    last: int = 0
+    numbers: list[int] = field(default_factory=list)
+    texts: list[bytes] = field(default_factory=list)
+
+
+def line_groups(
+    lines: Iterable[bytes],
+    skipped: int,
+    size: Callable[[], int],
+    require: Callable[[], object],
+) -> Iterator[LineGroup]:
+    """The lines after the first `skipped` ones, `size` of them at a time.
+
+    `require` is called before each line, and ends the reading where it raises.  Raises
+    `BadBatch` where there are too many blank lines.
+    """
+    group, read, handed, blank = LineGroup(), 0, 0, 0
+    try:
+        for line in lines:
+            require()
+            read += 1
+            if read <= skipped:
+                handed = read
+                continue
+            if line.strip():
+                group.numbers.append(read)
+                group.texts.append(line.rstrip(b"\r\n"))
+            else:
+                blank += 1
+                if blank > MAX_BLANK_LINES:
+                    raise BadBatch(Fault("body", f"has more than {MAX_BLANK_LINES} blank lines"))
+            group.last = read
+            if len(group.texts) >= size():
+                yield group
+                group, handed = LineGroup(), read
+    except BadInput:
+        # A damaged or too long file ends here; the lines before the fault are valid.
+        if group.last > handed:
+            yield group
+        raise
+    if group.last > handed:
+        yield group

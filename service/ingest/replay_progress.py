@@ -1,0 +1,203 @@
+"""The progress of a running replay: counted here, stored in its row, reported by events."""
+
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import Future
+
+import msgspec
+from msgspec import UNSET, structs
+from sqlalchemy import Connection
+
+from service.errors import AcquisitionError, Stopping, problem_of
+from service.storage.models.problems import FieldFault
+from service.storage.models.runs import (
+    LineProblem,
+    RefusedLine,
+    Replay,
+    ReplayCounts,
+    ReplayLines,
+    ReplayProgress,
+    ReplayStateName,
+)
+from service.storage.queries.replays import (
+    CANCELLED,
+    insert_replay,
+    is_cancelled,
+    update_replay,
+)
+from service.storage.recording import events
+from service.storage.recording.unsaved_result import Answered
+from service.storage.sql.database import Store
+
+MAX_ERRORS_KEPT = 1_000
+MAX_FAULTS_KEPT = 3
+"""Of one line: all are stored again with every chunk that adds some, and read as a whole."""
+MAX_TEXT_KEPT = 300
+SAVE_EVERY_S = 0.2
+"""Between two stored states: each is a transaction, and an event for all who listen."""
+SAVE_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
+
+log = logging.getLogger(__name__)
+
+
+class _CountedAnswer(msgspec.Struct):
+    """The part of an answer that is counted."""
+
+    counts: dict[str, int]
+    attitude: msgspec.Raw
+
+
+_COUNTED = msgspec.json.Decoder(_CountedAnswer)
+
+
+class ProgressRecorder:
+    """Counts what came of the lines of one replay, and stores it."""
+
+    def __init__(
+        self,
+        store: Store,
+        now: Callable[[], str],
+        replay: Replay,
+        on_cancelled: Callable[[], object],
+    ) -> None:
+        """`on_cancelled` is called in the writer's thread where the row says `cancelled`."""
+        self._store = store
+        self._now = now
+        self._on_cancelled = on_cancelled
+        self._started_as = replay.progress()
+        self._counts: Counter[str] = Counter(structs.asdict(replay.counts))
+        self.lines_done = replay.lines.done
+        """The number of the last line whose batch is recorded."""
+        self._refused = replay.lines.refused
+        self._errors = list(replay.errors)
+        self._errors_changed = False
+        self._saving: Future[None] | None = None
+        self._is_saved = True
+        self._saved_s = 0.0
+
+    @property
+    def id(self) -> str:
+        """The id of the replay."""
+        return self._started_as.id
+
+    @property
+    def run(self) -> str:
+        """The run that the batches go to."""
+        return self._started_as.run
+
+    def insert(self, also: Callable[[Connection], object]) -> None:
+        """Store the replay as new; `also` is called in the same transaction."""
+        progress = self._progress("running", None)
+        replay = Replay(**structs.asdict(progress), errors=[])
+
+        def store(connection: Connection) -> None:
+            insert_replay(connection, replay)
+            also(connection)
+            events.note(connection, "replay", progress, run=self.run)
+
+        self._store.writer.change(store).result()
+
+    def count(self, answered: Answered) -> None:
+        """Count the answer to one line."""
+        answer = _COUNTED.decode(answered.body)
+        self._counts["repeated" if answered.replayed else "new"] += 1
+        self._counts["attitudes"] += bytes(answer.attitude) != b"null"
+        self._counts.update(answer.counts)
+
+    def refuse(self, number: int, error: Exception, *, ends: bool = False) -> None:
+        """Count a refused line; an error that `ends` the replay is kept in any case."""
+        self._refused += 1
+        if len(self._errors) < MAX_ERRORS_KEPT or ends:
+            self._errors.append(RefusedLine(line=number, problem=_shortened_problem(error)))
+            self._errors_changed = True
+
+    def save_sometimes(self) -> None:
+        """Store how far the replay is, unless that was done a moment ago."""
+        if time.monotonic() - self._saved_s > SAVE_EVERY_S:
+            self.save("running")
+            self._saved_s = time.monotonic()
+
+    def save(self, state: ReplayStateName, finished: str | None = None) -> None:
+        """Queue the present progress for the writer; it is stored while the next chunk is solved.
+
+        A replay that another process has cancelled stays cancelled.
+        """
+        progress = self._progress(state, finished)
+        errors = list(self._errors) if self._errors_changed else None
+
+        def store(connection: Connection) -> None:
+            stored = progress
+            if is_cancelled(connection, self.id):
+                self._on_cancelled()
+                ended = finished or self._now()
+                stored = structs.replace(progress, state=CANCELLED, finished=ended)
+            update_replay(connection, stored, errors)
+            events.note(connection, "replay", stored, run=self.run)
+
+        self.require_saved()
+        self._errors_changed, self._is_saved = False, True
+        try:
+            self._saving = self._store.writer.change(store)
+        except AcquisitionError as error:
+            self._not_saved(error)
+
+    def require_saved(self) -> None:
+        """Wait until the progress that was last queued is stored, or has failed to be."""
+        saving, self._saving = self._saving, None
+        if saving is None:
+            return
+        try:
+            saving.result()
+        except Exception as error:
+            self._not_saved(error)
+
+    def conclude(self, state: ReplayStateName, closing: threading.Event) -> None:
+        """Store the state at the end; try again until that succeeds or the service closes.
+
+        Nothing else would say that the replay is over.
+        """
+        pause_s = SAVE_PAUSE_S
+        while True:
+            self.save(state, self._now())
+            self.require_saved()
+            if self._is_saved or closing.wait(pause_s):
+                return
+            pause_s = min(2.0 * pause_s, LONGEST_PAUSE_S)
+
+    def _progress(self, state: ReplayStateName, finished: str | None) -> ReplayProgress:
+        total = self._started_as.lines.total
+        return structs.replace(
+            self._started_as,
+            state=state,
+            lines=ReplayLines(total=total, done=self.lines_done, refused=self._refused),
+            counts=ReplayCounts(
+                **{name: self._counts[name] for name in ReplayCounts.__struct_fields__}
+            ),
+            finished=finished,
+        )
+
+    def _not_saved(self, error: Exception) -> None:
+        # The next save has the same and more; the batches themselves are recorded.
+        self._errors_changed = True
+        # While the service stops nothing is stored; the next start marks it as interrupted.
+        self._is_saved = isinstance(error, Stopping)
+        log.warning("progress of replay %s not stored: %s", self.id, error)
+
+
+def _shortened_problem(error: Exception) -> LineProblem:
+    """What is wrong with a line: its first faults, and no text longer than a reader needs."""
+    problem = problem_of(error)
+    if "errors" not in problem:
+        return LineProblem(detail=_shortened(problem["detail"]), errors=UNSET)
+    faults = [
+        FieldFault(**{name: text and _shortened(text) for name, text in fault.items()})
+        for fault in problem["errors"][:MAX_FAULTS_KEPT]
+    ]
+    return LineProblem(detail=_shortened(problem["detail"]), errors=faults)
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= MAX_TEXT_KEPT else text[: MAX_TEXT_KEPT - 1] + "…"

@@ -1,0 +1,132 @@
+"""The table of replays: how far each is, and the end of those that this process does not run."""
+
+from typing import Any
+
+import msgspec
+from msgspec import structs
+from sqlalchemy import Connection, insert, select, update
+
+from service.errors import NotFound, WrongState, shown_value
+from service.storage.models.runs import (
+    RefusedLine,
+    Replay,
+    ReplayCounts,
+    ReplayLines,
+    ReplayProgress,
+    ReplayStateName,
+)
+from service.storage.recording import events
+from service.storage.sql.tables import replays
+
+MAX_LISTED = 100
+CANCELLED: ReplayStateName = "cancelled"
+_NO_COUNTS = dict.fromkeys(ReplayCounts.__struct_fields__, 0)
+
+
+def find_replay(connection: Connection, id: str) -> Replay | None:
+    """A replay and its progress; None where there is none."""
+    row = connection.execute(select(replays).where(replays.c.id == id)).mappings().first()
+    return None if row is None else _replay(row)
+
+
+def read_replay(connection: Connection, id: str) -> Replay:
+    """A replay and its progress; raises `NotFound`."""
+    replay = find_replay(connection, id)
+    if replay is None:
+        raise NotFound(f"there is no replay with the id {shown_value(id)}")
+    return replay
+
+
+def list_replays(connection: Connection) -> list[Replay]:
+    """The latest replays and their progress, newest first."""
+    query = select(replays).order_by(replays.c.id.desc()).limit(MAX_LISTED)
+    return [_replay(row) for row in connection.execute(query).mappings()]
+
+
+def _replay(row: Any) -> Replay:
+    # A row of an earlier version may have no counts.
+    counts = _NO_COUNTS | msgspec.json.decode(row["counts"] or "{}")
+    return Replay(
+        id=row["id"],
+        run=row["run"],
+        name=row["name"],
+        state=row["state"],
+        lines=ReplayLines(
+            total=row["lines_total"], done=row["lines_done"], refused=row["lines_refused"]
+        ),
+        counts=msgspec.convert(counts, ReplayCounts),
+        errors=msgspec.json.decode(row["errors"], type=list[RefusedLine]),
+        started=row["started"],
+        finished=row["finished"],
+    )
+
+
+def insert_replay(connection: Connection, replay: Replay) -> None:
+    """Add a replay."""
+    row = {
+        "id": replay.id,
+        "run": replay.run,
+        "name": replay.name,
+        "lines_total": replay.lines.total,
+        "started": replay.started,
+    }
+    connection.execute(insert(replays), row | _progress(replay) | _errors(replay.errors))
+
+
+def update_replay(
+    connection: Connection, progress: ReplayProgress, errors: list[RefusedLine] | None
+) -> None:
+    """Store the progress of a replay, and the refused lines unless they are None."""
+    values = _progress(progress) | ({} if errors is None else _errors(errors))
+    connection.execute(update(replays).where(replays.c.id == progress.id).values(values))
+
+
+def _progress(progress: ReplayProgress) -> dict[str, Any]:
+    return {
+        "state": progress.state,
+        "lines_done": progress.lines.done,
+        "lines_refused": progress.lines.refused,
+        "counts": msgspec.json.encode(progress.counts).decode(),
+        "finished": progress.finished,
+    }
+
+
+def _errors(errors: list[RefusedLine]) -> dict[str, str]:
+    return {"errors": msgspec.json.encode(errors).decode()}
+
+
+def is_cancelled(connection: Connection, id: str) -> bool:
+    """Whether the table says that a replay is cancelled, perhaps by another process."""
+    return connection.scalar(select(replays.c.state).where(replays.c.id == id)) == CANCELLED
+
+
+def mark_interrupted(connection: Connection, now: str) -> None:
+    """Close the replays that a stopped process left unfinished.
+
+    If another process still runs one, that process sets its state to `running` again
+    when it next stores its progress.
+    """
+    connection.execute(
+        update(replays)
+        .where(replays.c.state == "running")
+        .values(state="interrupted", finished=now)
+    )
+
+
+def mark_cancelled(connection: Connection, id: str, now: str) -> None:
+    """Close a running replay of another process, which ends it when it next stores its progress.
+
+    Raises `NotFound`, and `WrongState` for one that has ended.
+    """
+    replay = read_replay(connection, id)
+    require_cancellable(replay.state)
+    if replay.state == "running":
+        ended = structs.replace(replay.progress(), state=CANCELLED, finished=now)
+        update_replay(connection, ended, None)
+        events.note(connection, "replay", ended, run=ended.run)
+
+
+def require_cancellable(state: str) -> None:
+    """Raise `WrongState` for the state of a replay that has ended otherwise."""
+    if state not in ("running", CANCELLED):
+        raise WrongState(f"the replay has ended already, its state is {state}")
