@@ -59,7 +59,7 @@ def asked_of(app: App) -> list[Asked]:
 
     def whole(span_s: float) -> Callable[[Any], bool]:
         # A batch every cadence, the first of the stretch included and its end excluded.
-        return lambda found: abs(sum(found["batches"]) - span_s // CADENCE_S) <= 1
+        return lambda found: abs(sum(found.batches) - span_s // CADENCE_S) <= 1
 
     trends = [
         Asked(
@@ -78,9 +78,9 @@ def asked_of(app: App) -> list[Asked]:
             PAGE_MS,
             app.spacecraft.overview,
             lambda found: all(
-                each["last_hour"]["batches"] == HOUR_S // CADENCE_S
-                for each in found["items"]
-                if each["latest_batch"] and each["latest_batch"]["time"] == found["as_of"]
+                each.last_hour.batches == HOUR_S // CADENCE_S
+                for each in found.items
+                if each.latest_batch and each.latest_batch.time == found.as_of
             ),
         ),
         *trends,
@@ -91,14 +91,14 @@ def asked_of(app: App) -> list[Asked]:
             lambda: app.spacecraft.worst_batches(
                 SPACECRAFT, by="ambiguous_share", start=first, end=latest
             ),
-            lambda found: found[0]["value"] == _worst(app, first, latest) and len(found) == 20,
+            lambda found: found[0].value == _worst(app, first, latest) and len(found) == 20,
         ),
         Asked(
             "Spacecraft",
             "state, settings and their history",
             PAGE_MS,
             lambda: app.spacecraft.state(SPACECRAFT),
-            lambda found: found["state"] != "no_batches",
+            lambda found: found.state != "no_batches",
         ),
         Asked(
             "Batches",
@@ -107,8 +107,8 @@ def asked_of(app: App) -> list[Asked]:
             lambda: app.results.page(run="*").items,
             lambda found: (
                 len(found) == 100
-                and [each["time"] for each in found]
-                == sorted((each["time"] for each in found), reverse=True)
+                and [each.time for each in found]
+                == sorted((each.time for each in found), reverse=True)
             ),
         ),
         Asked(
@@ -116,7 +116,7 @@ def asked_of(app: App) -> list[Asked]:
             "one with its stars",
             PAGE_MS,
             lambda: app.results.get(newest),
-            lambda found: found["answer"]["counts"]["observed"] > 0,
+            lambda found: found.answer.counts.observed > 0,
         ),
         Asked(
             "Batch",
@@ -132,9 +132,9 @@ def asked_of(app: App) -> list[Asked]:
             "every run",
             PAGE_MS,
             app.runs.all,
-            lambda found: sum(each["batches"] for each in found) == _count(app),
+            lambda found: sum(each.batches for each in found) == _count(app),
         ),
-        Asked("Zones", "the cache", PAGE_MS, app.zones.state, lambda found: "items" in found),
+        Asked("Zones", "the cache", PAGE_MS, app.zones.state, lambda found: found.max_bytes > 0),
         Asked("About", "what answers", PAGE_MS, app.service.about, bool),
     ]
 

@@ -108,7 +108,7 @@ def measured(total: int, seed: int) -> tuple[dict[str, Any], list[Bound]]:
                 figures[f"{name}, ms"] = took
                 figures[f"{name}: counted one by one, ms"] = scan_ms
                 figures[f"{name}: over counting"] = took / scan_ms
-                found = sum(r["observed"] for r in rows), sum(r["ambiguous"] for r in rows)
+                found = sum(r.observed for r in rows), sum(r.ambiguous for r in rows)
                 bounds.append(
                     Bound(f"{name}: stars", f"{found}", f"{counted}, counted", found == counted)
                 )

@@ -18,7 +18,14 @@ from service.advice.trackers import (
     magnitude_findings,
     noise_findings,
 )
-from service.advice.trials import Counts, Trial, Variant, counts_of, trial_of, variants
+from service.advice.trials import (
+    TrialCounts,
+    Variant,
+    VariantOutcome,
+    counts_of,
+    trial_of,
+    variants,
+)
 from service.errors import BadInput
 from service.identify.identification import Identification
 from service.missions.mission import Mission
@@ -43,7 +50,7 @@ class WorkLimit:
 
 
 @dataclass(frozen=True)
-class Advice:
+class Findings:
     """The findings of a sample of batches on a mission's settings.
 
     `refused` counts batches that no longer fit the mission, the first reason
@@ -62,7 +69,7 @@ class Advice:
     noise: tuple[NoiseFinding, ...]
     magnitudes: tuple[MagnitudeFinding, ...]
     alignment: tuple[AlignmentFinding, ...]
-    trials: tuple[Trial, ...]
+    trials: tuple[VariantOutcome, ...]
     uses_voting: bool
     with_rival: int
     mirrored: int
@@ -74,7 +81,7 @@ def advise(
     run: Run,
     own: Mapping[str, float] | None = None,
     pace: WorkLimit | None = None,
-) -> Advice:
+) -> Findings:
     """The advice that batches of a mission give; `run` acquires one batch.
 
     Batches should come in random order: when time runs out, the rest are
@@ -100,7 +107,7 @@ def advise(
         pace.step()
     evidence = merged(parts)
     tolerances = tuple(tolerance_findings(mission, evidence))
-    return Advice(
+    return Findings(
         mission=mission,
         sampled=len(sample.cases),
         identified=evidence.batches,
@@ -124,7 +131,7 @@ def advise(
 class _SampledBatches:
     """The batches that could run, each with its verified identification."""
 
-    cases: list[tuple[ObservationBatch, tuple[Identification, ...], Counts]] = field(
+    cases: list[tuple[ObservationBatch, tuple[Identification, ...], TrialCounts]] = field(
         default_factory=list
     )
     refused: int = 0
@@ -145,9 +152,9 @@ def _trials(
     run: Run,
     own: Mapping[str, float],
     pace: WorkLimit,
-) -> list[Trial]:
+) -> list[VariantOutcome]:
     present, by_probability, *others = variants(mission, findings, own)
-    counts: dict[Variant, list[Counts]] = {each: [] for each in (present, *others)}
+    counts: dict[Variant, list[TrialCounts]] = {each: [] for each in (present, *others)}
     for batch, sure, _ in sample.cases:
         if not pace.in_time(1.0):
             break

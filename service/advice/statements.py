@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from service.advice.advice import Advice
+from service.advice.advice import Findings
 from service.advice.intervals import Interval
 from service.advice.tolerances import KEPT, LEAST_BATCHES, LEAST_DIFFERENCES, ToleranceFinding
 from service.advice.trackers import AlignmentFinding, MagnitudeFinding, NoiseFinding
-from service.advice.trials import ALL_RECOMMENDED, PRESENT, Trial
+from service.advice.trials import ALL_RECOMMENDED, PRESENT, VariantOutcome
 from service.missions.mission import Mission
 
 Action = Literal["widen", "tighten", "keep", "correct", "wait"]
@@ -18,10 +18,10 @@ _APRIORI = ("cross_product_deg", "pole_difference_deg", "pole_angle_deg")
 
 
 @dataclass(frozen=True)
-class Change:
+class FileChange:
     """A line for the mission file: its table, of a tracker where `tracker` names one, and why."""
 
-    table: str
+    table: Literal["tolerances", "catalog", "trackers"]
     tracker: str | None
     line: str
 
@@ -36,10 +36,10 @@ class Statement:
 
     action: Action
     text: str
-    changes: tuple[Change, ...] = ()
+    changes: tuple[FileChange, ...] = ()
 
 
-def group_statements(advice: Advice) -> list[Statement]:
+def group_statements(advice: Findings) -> list[Statement]:
     """Statements on batches with two groups of stars, and on mirrored batches."""
     statements = []
     if advice.with_rival:
@@ -63,7 +63,7 @@ def group_statements(advice: Advice) -> list[Statement]:
     return statements
 
 
-def tolerance_statement(finding: ToleranceFinding, advice: Advice) -> Statement:
+def tolerance_statement(finding: ToleranceFinding, advice: Findings) -> Statement:
     """The statement on one tolerance."""
     name, unit = finding.tolerance.name, finding.tolerance.unit
     now = _quantity(finding.now, unit)
@@ -114,7 +114,7 @@ def tolerance_statement(finding: ToleranceFinding, advice: Advice) -> Statement:
 
 
 def _change_statement(
-    action: Action, text: str, finding: ToleranceFinding, advice: Advice
+    action: Action, text: str, finding: ToleranceFinding, advice: Findings
 ) -> Statement:
     if not advice.uses_voting:
         return Statement(
@@ -123,13 +123,13 @@ def _change_statement(
             f"not use it: keep it. By votes it should be {finding.recommended:g}.",
         )
     line = f"{finding.tolerance.name} = {finding.recommended:g}"
-    change = Change("tolerances", None, f"{line:<32} # {finding.symbol}, was {finding.now:g}")
+    change = FileChange("tolerances", None, f"{line:<32} # {finding.symbol}, was {finding.now:g}")
     return Statement(action, text, (change,))
 
 
 def _present_and_recommended(
-    finding: ToleranceFinding, trials: Sequence[Trial]
-) -> tuple[Trial | None, Trial | None]:
+    finding: ToleranceFinding, trials: Sequence[VariantOutcome]
+) -> tuple[VariantOutcome | None, VariantOutcome | None]:
     """The votes with the present settings, and with this tolerance as recommended."""
     present = next((t for t in trials if t.variant.name == PRESENT), None)
     alone = {finding.tolerance.name: finding.recommended}
@@ -141,7 +141,7 @@ def _present_and_recommended(
     return present, next(found, None)
 
 
-def _effect(present: Trial | None, with_it: Trial | None) -> str:
+def _effect(present: VariantOutcome | None, with_it: VariantOutcome | None) -> str:
     if present is None or with_it is None or with_it.change is None or not with_it.observed:
         return "There was no time to try another value."
     change = with_it.change
@@ -154,7 +154,7 @@ def _effect(present: Trial | None, with_it: Trial | None) -> str:
     )
 
 
-def _gains(present: Trial | None, with_it: Trial | None) -> bool:
+def _gains(present: VariantOutcome | None, with_it: VariantOutcome | None) -> bool:
     if present is None or with_it is None or with_it.change is None:
         return False
     return with_it.change.high < 0.0 and with_it.other_star <= present.other_star
@@ -192,11 +192,11 @@ def noise_statement(finding: NoiseFinding) -> Statement:
     return Statement(
         "correct",
         text,
-        (Change("trackers", finding.tracker, f"{line:<32} # was {finding.now_arcsec:g}"),),
+        (FileChange("trackers", finding.tracker, f"{line:<32} # was {finding.now_arcsec:g}"),),
     )
 
 
-def magnitude_statement(finding: MagnitudeFinding, advice: Advice) -> Statement:
+def magnitude_statement(finding: MagnitudeFinding, advice: Findings) -> Statement:
     """The statement on one tracker's magnitudes."""
     start = f"Magnitudes of {finding.tracker}"
     if finding.offset_mag is None or finding.scale is None or finding.scatter_mag is None:
@@ -210,7 +210,7 @@ def magnitude_statement(finding: MagnitudeFinding, advice: Advice) -> Statement:
         f"scatter by {finding.scatter_mag.value:.3f} mag "
         f"({_bounds(finding.scatter_mag, 3)})."
     )
-    changes: list[Change] = []
+    changes: list[FileChange] = []
     if finding.verdict == "off" and abs(offset.value) > finding.now_sigma_mag / 4:
         line = _color_line(advice.mission, finding, advice.magnitudes)
         if line is None:
@@ -228,7 +228,7 @@ def magnitude_statement(finding: MagnitudeFinding, advice: Advice) -> Statement:
         text += f" The mission's sigma of {finding.now_sigma_mag:g} mag is {told}."
         line_text = f"magnitude_sigma_mag = {finding.scatter_mag.value:.2g}"
         changes.append(
-            Change(
+            FileChange(
                 "trackers",
                 finding.tracker,
                 f"{line_text:<32} # SIGMAG, was {finding.now_sigma_mag:g}",
@@ -243,7 +243,7 @@ def magnitude_statement(finding: MagnitudeFinding, advice: Advice) -> Statement:
 
 def _color_line(
     mission: Mission, finding: MagnitudeFinding, all_of_them: Sequence[MagnitudeFinding]
-) -> Change | None:
+) -> FileChange | None:
     """The colour polynomial with the offset in its constant; None where trackers disagree."""
     for other in all_of_them:
         if other is finding or other.offset_mag is None or finding.offset_mag is None:
@@ -254,7 +254,7 @@ def _color_line(
     constant, *rest = mission.catalog.color_polynomial_mag or (0.0,)
     terms = [round(constant + finding.offset_mag.value, 3), *rest]
     was = list(mission.catalog.color_polynomial_mag) or "V itself"
-    return Change("catalog", None, f"{f'color_polynomial_mag = {terms}':<32} # was {was}")
+    return FileChange("catalog", None, f"{f'color_polynomial_mag = {terms}':<32} # was {was}")
 
 
 def alignment_statement(finding: AlignmentFinding) -> Statement:
@@ -269,7 +269,7 @@ def alignment_statement(finding: AlignmentFinding) -> Statement:
     if finding.verdict == "fits":
         return Statement("keep", f"{start} fits: turned about the body axes by {parts}.")
     changes = tuple(
-        Change(
+        FileChange(
             "trackers",
             finding.tracker,
             f"{name}_axis_body = [{', '.join(f'{part:.9f}' for part in axis)}]",

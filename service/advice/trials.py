@@ -43,7 +43,7 @@ class Variant:
 
 
 @dataclass(frozen=True)
-class Counts:
+class TrialCounts:
     """Outcomes of the stars of one batch under a variant.
 
     `other_star` counts the stars that are unique here and under verified
@@ -58,7 +58,7 @@ class Counts:
 
 
 @dataclass(frozen=True)
-class Trial:
+class VariantOutcome:
     """A variant with the sums over the sample, and the change from the present settings.
 
     `change` is that of the share of stars not unique, in percentage points;
@@ -111,7 +111,7 @@ def variants(
         yield Variant(f"{shown}, asked for", "starid", own)
 
 
-def counts_of(acquisition: Acquisition, verified: Sequence[Identification]) -> Counts:
+def counts_of(acquisition: Acquisition, verified: Sequence[Identification]) -> TrialCounts:
     """The outcomes of one batch, held against those of verified identification by tracker."""
     other_star = 0
     for each, sure in zip(acquisition.trackers, verified, strict=True):
@@ -119,17 +119,19 @@ def counts_of(acquisition: Acquisition, verified: Sequence[Identification]) -> C
         both = mine.unique & sure.unique
         other_star += int(np.count_nonzero(both & (mine.star != sure.star)))
     counts = acquisition.counts
-    return Counts(**{name: counts[name] for name in OUTCOMES}, other_star=other_star)
+    return TrialCounts(**{name: counts[name] for name in OUTCOMES}, other_star=other_star)
 
 
-def trial_of(variant: Variant, counts: Sequence[Counts], present: Sequence[Counts] | None) -> Trial:
+def trial_of(
+    variant: Variant, counts: Sequence[TrialCounts], present: Sequence[TrialCounts] | None
+) -> VariantOutcome:
     """The sums over a sample, and the change from the same batches under the present settings."""
     sums = {name: sum(getattr(each, name) for each in counts) for name in (*OUTCOMES, "other_star")}
     change = None if present is None else _change(counts, present)
-    return Trial(variant, len(counts), **sums, change=change)
+    return VariantOutcome(variant, len(counts), **sums, change=change)
 
 
-def _change(counts: Sequence[Counts], present: Sequence[Counts]) -> Interval | None:
+def _change(counts: Sequence[TrialCounts], present: Sequence[TrialCounts]) -> Interval | None:
     """The ratio of sums over batches, with the linearised variance of a ratio."""
     stars = np.array([each.observed for each in counts], float)
     lost = np.array(

@@ -7,16 +7,16 @@ from collections.abc import Callable
 from functools import partial
 
 from service.advice.advice import WorkLimit, advise
-from service.advice.report import advice_record
+from service.app.advice_record import advice_record
 from service.app.context import Context
 from service.app.submissions import Submissions
 from service.errors import Busy
 from service.missions.mission import mission_named
 from service.observations.schema import TolerancesIn
+from service.storage.models.advice import Advice
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.recorded_batch import sample_batches
-from service.storage.recording.unsaved_result import Row
 from service.times import Utc
 
 ADVICE_SAMPLE = 200
@@ -44,7 +44,7 @@ class AdviceService:
         tolerances: TolerancesIn = NO_TOLERANCES,
         limit_s: float = math.inf,
         step: Callable[[], object] = lambda: None,
-    ) -> Row:
+    ) -> Advice:
         """What the batches of a run say of a mission's settings; see `service.advice`.
 
         Of the batches at most `sample` are run again, fewer where `limit_s`
@@ -64,14 +64,7 @@ class AdviceService:
             pace = WorkLimit(lambda share: time.monotonic() - began < share * limit_s, step)
             # Were the worst looked up in the whole sky, the others would look too good.
             run_again = partial(self._submissions.ingest.run_again, mission=mission.within_zones)
-            advice = advise(mission, drawn.batches, run_again, own, pace)
+            findings = advise(mission, drawn.batches, run_again, own, pace)
         finally:
             self._lock.release()
-        return {
-            "spacecraft": name,
-            "run": run or LIVE,
-            "first": drawn.first,
-            "last": drawn.last,
-            "batches_in_range": drawn.total,
-            **advice_record(advice),
-        }
+        return advice_record(name, run or LIVE, drawn, findings)

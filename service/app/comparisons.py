@@ -6,13 +6,13 @@ import threading
 from service.app.context import Context
 from service.app.submissions import Submissions
 from service.errors import Busy
-from service.ingest.compare_options import Pair, compare
+from service.ingest.compare_options import ComparedSample, Pair, compare
 from service.missions.mission import mission_named
 from service.observations.schema import OptionsIn
+from service.storage.models.compare import Comparison
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.recorded_batch import batch_with_options, sample_batches
-from service.storage.recording.unsaved_result import Row
 from service.times import Utc
 
 COMPARE_SAMPLE, COMPARE_RETRY_S = 100, 10
@@ -37,7 +37,7 @@ class Comparisons:
         end: Utc | None = None,
         sample: int = COMPARE_SAMPLE,
         limit_s: float = math.inf,
-    ) -> Row:
+    ) -> Comparison:
         """Run recorded batches again with two sets of options and show where they differ.
 
         Of a stretch at most `sample` batches, fewer where `limit_s` seconds run
@@ -62,14 +62,7 @@ class Comparisons:
             found, cut_short = compare(pairs, self._submissions.ingest.run_again, limit_s)
         finally:
             self._lock.release()
-        options = (each.model_dump(mode="json", exclude_none=True) for each in (a, b))
-        return {
-            "spacecraft": name,
-            "run": run or LIVE,
-            "start": drawn.first,
-            "end": drawn.last,
-            "batches_in_stretch": drawn.total,
-            "sampled": len(pairs),
-            "cut_short": cut_short,
-            **found.row(*options),
-        }
+        run_name = run or LIVE
+        sample_of = ComparedSample(name, run_name, drawn.first, drawn.last, drawn.total, len(pairs))
+        options = tuple(each.model_dump(mode="json", exclude_none=True) for each in (a, b))
+        return found.record(sample_of, (options[0], options[1]), cut_short=cut_short)

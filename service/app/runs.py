@@ -6,15 +6,15 @@ from collections.abc import Callable, Mapping
 from service.access.audit import Entry
 from service.app.context import Context, checked_run_name
 from service.errors import BadBatch, Fault
-from service.ingest.reprocess import Plan, Progress, reprocess
+from service.ingest.reprocess import ReprocessPlan, ReprocessProgress, reprocess
 from service.missions.mission import Mission, mission_named
+from service.storage.models.compare import RunComparison
 from service.storage.models.runs import Run, RunState
 from service.storage.queries import histories, overview
 from service.storage.queries.compare_runs import compare_runs
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
 from service.storage.recording.results import set_run_alarms
-from service.storage.recording.unsaved_result import Row
 from service.times import Utc, utc_now
 
 
@@ -51,7 +51,7 @@ class Runs:
         spacecraft: str | None = None,
         start: Utc | None = None,
         end: Utc | None = None,
-    ) -> Row:
+    ) -> RunComparison:
         """The outcomes of the same stars in two runs, and the angles between their attitudes."""
         with self._context.reading() as connection:
             return compare_runs(connection, ResultFilter(run, spacecraft, start, end), other)
@@ -65,8 +65,8 @@ class Runs:
         start: Utc | None = None,
         end: Utc | None = None,
         processes: int = 0,
-        step: Callable[[Progress], object] = lambda progress: None,
-    ) -> tuple[Progress, Row]:
+        step: Callable[[ReprocessProgress], object] = lambda progress: None,
+    ) -> tuple[ReprocessProgress, RunComparison]:
         """Run the batches of a run again into another, and compare both.
 
         The settings are those of this app.  `run` None takes a name
@@ -81,7 +81,7 @@ class Runs:
             if spacecraft in (None, name)
         }
         stretch = ResultFilter(source, spacecraft, start, end)
-        plan = Plan(
+        plan = ReprocessPlan(
             stretch=stretch,
             run=checked_run_name(run or self._run_of_settings(source, chosen)),
             missions=chosen,

@@ -14,9 +14,9 @@ from service.app.replays import Replays
 from service.app.submissions import Submissions
 from service.errors import Busy
 from service.observations.schema import submission_from_json
+from service.storage.models.overview import About, CatalogAbout, MissionAbout
 from service.storage.recording.alarm_evaluation import latest_inputs
 from service.storage.recording.ids import Ulids
-from service.storage.recording.unsaved_result import Row
 from service.times import utc_now
 
 log = logging.getLogger(__name__)
@@ -100,21 +100,19 @@ class Service:
                 # A batch that no longer runs must not prevent the start.
                 log.warning("the latest batch of a spacecraft could not be run again: %s", error)
 
-    def about(self) -> Row:
+    def about(self) -> About:
         """What answers: version, catalog, missions, kind of database."""
         catalog = self._context.sky.catalog
-        return {
-            "version": __version__,
-            "started": self.started.text,
-            "database": self._context.store.url.get_backend_name(),
-            "catalog": {
-                "digest": catalog.digest,
-                "name": catalog.name,
-                "stars": len(catalog.magnitude_v_mag),
-            },
-            "missions": [
-                {"name": each.name, "description": each.description, "digest": each.digest}
+        return About(
+            version=__version__,
+            started=self.started.text,
+            database=self._context.store.url.get_backend_name(),
+            catalog=CatalogAbout(
+                digest=catalog.digest, name=catalog.name, stars=len(catalog.magnitude_v_mag)
+            ),
+            missions=[
+                MissionAbout(name=each.name, description=each.description, digest=each.digest)
                 for each in self._context.missions.values()
             ],
-            "credits": list(CREDITS),
-        }
+            credits=list(CREDITS),
+        )

@@ -12,16 +12,16 @@ from service.storage.models.overview import Overview
 from service.storage.models.spacecraft import (
     AttitudeRow,
     MissionNow,
+    Rates,
     SpacecraftRow,
     SpacecraftState,
 )
-from service.storage.models.trends import RankedBatch
+from service.storage.models.trends import History, RankedBatch
 from service.storage.queries import histories, overview, trends
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.ranking import worst_batches
 from service.storage.recording import rollups
-from service.storage.recording.unsaved_result import Row
 from service.times import Utc, utc_now
 
 
@@ -82,16 +82,17 @@ class Spacecraft:
         start: Utc | None = None,
         end: Utc | None = None,
         bucket: rollups.Bucket = "hour",
-    ) -> list[Row]:
+    ) -> list[Rates]:
         """Stars by outcome over all observed ones, in UTC hours or days by batch time.
 
         Raises `BadInput` for a stretch with too many of them.
         """
         mission_named(self._context.missions, name)
         with self._context.reading() as connection:
-            return rollups.rates(
+            found = rollups.rates(
                 connection, name, run=run or LIVE, start=start, end=end, bucket=bucket
             )
+        return [Rates(**each) for each in found]
 
     def history(
         self,
@@ -103,7 +104,7 @@ class Spacecraft:
         strategy: trends.Strategy = "minmax",
         size: int = 500,
         quantities: Sequence[QuantityName] = (),
-    ) -> Row:
+    ) -> History:
         """Histories of quantities, all of them unless named, in at most `size` points each.
 
         `minmax` gives buckets with mean, least and greatest, `latest` the newest
@@ -124,7 +125,7 @@ class Spacecraft:
         start: Utc | None = None,
         end: Utc | None = None,
         quantities: Sequence[QuantityName] = (),
-    ) -> Iterator[Row]:
+    ) -> Iterator[History]:
         """The history of every batch of a stretch, in pages; see `trends.every_batch`."""
         mission_named(self._context.missions, name)
         names = tuple(quantities) or trend_names()

@@ -6,9 +6,11 @@ from service.acquire.prewarm import prewarm_zones
 from service.app.context import Context
 from service.ingest.solver_pool import mission_in_input
 from service.observations.schema import APrioriIn, prior_of
+from service.sky.cache import Entry, Sized
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.zones import Zone
-from service.storage.recording.unsaved_result import Row
+from service.storage.models.answers import ZoneSummary
+from service.storage.models.zones import CachedRunCatalog, CachedZone, ZoneCache
 from service.times import Utc
 
 
@@ -18,36 +20,31 @@ class Zones:
     def __init__(self, context: Context) -> None:
         self._context = context
 
-    def state(self) -> Row:
+    def state(self) -> ZoneCache:
         """What the cache holds, the least recently used first, and its counters."""
         state = self._context.sky.cache.state()
-        zones, run_catalogs = [], []
-        for entry in state.entries:
-            use = {"bytes": entry.thing.nbytes, "hits": entry.hits, "build_us": entry.build_us}
-            if isinstance(entry.thing, Zone):
-                zone = entry.thing
-                about = {"spacecraft": zone.mission, **zone.summary(), "grid_deg": zone.grid_deg}
-                zones.append(about | {"run_catalog": zone.run_catalog} | use)
-            elif isinstance(entry.thing, RunCatalog):
-                catalog = entry.thing
-                about = {"digest": catalog.digest, "epoch_year": catalog.epoch_year}
-                run_catalogs.append(about | {"stars": len(catalog)} | use)
-        return {
-            "items": zones,
-            "run_catalogs": run_catalogs,
-            "bytes": state.nbytes,
-            "max_bytes": state.max_bytes,
-            "hits": state.hits,
-            "misses": state.misses,
-            "evictions": state.evictions,
-            "build_us": state.build_us,
-        }
+        return ZoneCache(
+            items=[
+                _zone(each, each.thing) for each in state.entries if isinstance(each.thing, Zone)
+            ],
+            run_catalogs=[
+                _run_catalog(each, each.thing)
+                for each in state.entries
+                if isinstance(each.thing, RunCatalog)
+            ],
+            bytes=state.nbytes,
+            max_bytes=state.max_bytes,
+            hits=state.hits,
+            misses=state.misses,
+            evictions=state.evictions,
+            build_us=state.build_us,
+        )
 
-    def warm(self, spacecraft: str, a_priori: Sequence[APrioriIn], time: Utc) -> list[Row]:
+    def warm(self, spacecraft: str, a_priori: Sequence[APrioriIn], time: Utc) -> list[ZoneSummary]:
         """Build the zones that batches of these a priori attitudes will ask for."""
         mission = mission_in_input(self._context.missions, spacecraft)
         return [
-            zone.summary()
+            ZoneSummary(**zone.summary())
             for each in a_priori
             for zone in prewarm_zones(self._context.sky, mission, prior_of(each), time)
         ]
@@ -57,3 +54,26 @@ class Zones:
         if spacecraft is not None:
             mission_in_input(self._context.missions, spacecraft)
         return self._context.sky.drop_zones(spacecraft)
+
+
+def _zone(entry: Entry[Sized], zone: Zone) -> CachedZone:
+    return CachedZone(
+        **zone.summary(),
+        spacecraft=zone.mission,
+        grid_deg=zone.grid_deg,
+        run_catalog=zone.run_catalog,
+        bytes=zone.nbytes,
+        hits=entry.hits,
+        build_us=entry.build_us,
+    )
+
+
+def _run_catalog(entry: Entry[Sized], catalog: RunCatalog) -> CachedRunCatalog:
+    return CachedRunCatalog(
+        digest=catalog.digest,
+        epoch_year=catalog.epoch_year,
+        stars=len(catalog),
+        bytes=catalog.nbytes,
+        hits=entry.hits,
+        build_us=entry.build_us,
+    )

@@ -11,13 +11,23 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from statistics import fmean, median
+from typing import Any
 
 from service.acquire import Acquisition
 from service.alarms.quantities import QUANTITIES
 from service.observations.batch import ObservationBatch
+from service.storage.models.answers import StarCounts
+from service.storage.models.compare import (
+    BatchChange,
+    ComparedAttitudes,
+    ComparedSide,
+    Comparison,
+    StarChange,
+    StarSide,
+    Transition,
+)
 from service.storage.recording.answer import StarRow, star_rows
 from service.storage.recording.result_metrics import metrics_of
-from service.storage.recording.unsaved_result import Row
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion
 
 MAX_SHOWN = 100
@@ -53,18 +63,30 @@ class _Side:
             self.ratios.append(ratio)
         self.work_us.append(sum(acquisition.timings_us.values()))
 
-    def row(self, options: Row) -> Row:
+    def record(self, options: dict[str, Any]) -> ComparedSide:
         names = ("observed", "unique", "ambiguous", "unmatched", "solved", "suspect")
-        return {
-            "options": options,
+        return ComparedSide(
+            options=options,
             **{name: int(self.counts[name]) for name in names},
-            "residual_ratio_mean": fmean(self.ratios) if self.ratios else None,
-            "us_per_batch": median(self.work_us) if self.work_us else None,
-        }
+            residual_ratio_mean=fmean(self.ratios) if self.ratios else None,
+            us_per_batch=median(self.work_us) if self.work_us else None,
+        )
 
 
 @dataclass
-class Comparison:
+class ComparedSample:
+    """The choice of batches of a comparison: where from, how many there are and were drawn."""
+
+    spacecraft: str
+    run: str
+    first: str | None
+    last: str | None
+    total: int
+    drawn: int
+
+
+@dataclass
+class ComparisonTally:
     """Both sides so far, star by star."""
 
     a: _Side = field(default_factory=_Side)
@@ -74,7 +96,7 @@ class Comparison:
     renamed: int = 0
     attitudes: "Counter[str]" = field(default_factory=Counter)
     angles_arcsec: list[float] = field(default_factory=list)
-    changed: list[Row] = field(default_factory=list)
+    changed: list[BatchChange] = field(default_factory=list)
     changed_batches: int = 0
 
     def add(self, pair: Pair, a: Acquisition, b: Acquisition) -> None:
@@ -96,26 +118,39 @@ class Comparison:
             if len(self.changed) < MAX_SHOWN:
                 self.changed.append(_changed(pair, a, b, differing, angle_arcsec))
 
-    def row(self, a: Row, b: Row) -> Row:
-        """The whole comparison as the interface shows it."""
+    def record(
+        self,
+        sample: ComparedSample,
+        options: tuple[dict[str, Any], dict[str, Any]],
+        *,
+        cut_short: bool,
+    ) -> Comparison:
+        """The whole comparison; `options` are those of both sides."""
         angles = self.angles_arcsec
-        return {
-            "compared": self.compared,
-            "a": self.a.row(a),
-            "b": self.b.row(b),
-            "transitions": [
-                {"from": one, "to": other, "stars": stars}
+        return Comparison(
+            spacecraft=sample.spacecraft,
+            run=sample.run,
+            start=sample.first,
+            end=sample.last,
+            batches_in_stretch=sample.total,
+            sampled=sample.drawn,
+            cut_short=cut_short,
+            compared=self.compared,
+            a=self.a.record(options[0]),
+            b=self.b.record(options[1]),
+            transitions=[
+                Transition(from_=one, to=other, stars=stars)
                 for (one, other), stars in sorted(self.transitions.items())
             ],
-            "renamed": self.renamed,
-            "attitudes": {
+            renamed=self.renamed,
+            attitudes=ComparedAttitudes(
                 **{name: self.attitudes[name] for name in _WHICH.values()},
-                "angle_arcsec_median": median(angles) if angles else None,
-                "angle_arcsec_max": max(angles) if angles else None,
-            },
-            "changed_batches": self.changed_batches,
-            "changed": sorted(self.changed, key=lambda each: str(each["time"])),
-        }
+                angle_arcsec_median=median(angles) if angles else None,
+                angle_arcsec_max=max(angles) if angles else None,
+            ),
+            changed_batches=self.changed_batches,
+            changed=sorted(self.changed, key=lambda each: each.time),
+        )
 
 
 _WHICH = {
@@ -126,9 +161,11 @@ _WHICH = {
 }
 
 
-def compare(pairs: Sequence[Pair], run_again: RunAgain, limit_s: float) -> tuple[Comparison, bool]:
+def compare(
+    pairs: Sequence[Pair], run_again: RunAgain, limit_s: float
+) -> tuple[ComparisonTally, bool]:
     """Run both sides of each batch; whether `limit_s` seconds cut it short."""
-    found, end_s = Comparison(), time.monotonic() + limit_s
+    found, end_s = ComparisonTally(), time.monotonic() + limit_s
     for pair in pairs:
         if time.monotonic() > end_s:
             return found, True
@@ -142,23 +179,23 @@ def _changed(
     b: Acquisition,
     differing: Sequence[tuple[StarRow, StarRow]],
     angle_arcsec: float | None,
-) -> Row:
-    return {
-        "id": pair.id,
-        "batch": pair.a.batch,
-        "time": pair.a.time.text,
-        "a": a.counts,
-        "b": b.counts,
-        "attitude_angle_arcsec": angle_arcsec,
-        "stars": [
-            {"tracker": one.tracker, "position": one.position, "a": _star(one), "b": _star(other)}
+) -> BatchChange:
+    return BatchChange(
+        id=pair.id,
+        batch=pair.a.batch,
+        time=pair.a.time.text,
+        a=StarCounts(**a.counts),
+        b=StarCounts(**b.counts),
+        attitude_angle_arcsec=angle_arcsec,
+        stars=[
+            StarChange(tracker=one.tracker, position=one.position, a=_star(one), b=_star(other))
             for one, other in differing
         ],
-    }
+    )
 
 
-def _star(star: StarRow) -> Row:
-    return {"outcome": star.outcome, "star": star.star_id}
+def _star(star: StarRow) -> StarSide:
+    return StarSide(outcome=star.outcome, star=star.star_id)
 
 
 def _named(star: StarRow) -> tuple[str, str | None]:

@@ -28,16 +28,16 @@ from service.storage.sql.tables import batches, results
 
 CHUNK = 100
 """Batches that a worker takes, and that a transaction records."""
-AHEAD = 2
+PENDING_A_WORKER = 2
 """Chunks a worker that wait for it, or for being written."""
 REFUSALS_KEPT = 20
 
-Stored = tuple[str, str]
+StoredBatch = tuple[str, str]
 """A batch's input and the options of its result, as the JSON texts that are kept."""
 
 
 @dataclass
-class Progress:
+class ReprocessProgress:
     """How far a reprocessing is: `total` are the batches of the stretch, `before` those done."""
 
     run: str
@@ -50,7 +50,7 @@ class Progress:
 
 
 @dataclass(frozen=True)
-class Plan:
+class ReprocessPlan:
     """What is to run again: the stretch, the run that takes it, and with which settings."""
 
     stretch: ResultFilter
@@ -63,7 +63,7 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Refused:
+class RefusedBatch:
     """A batch that the settings cannot take, and why."""
 
     batch: str
@@ -71,8 +71,11 @@ class Refused:
 
 
 def reprocess(
-    store: Store, plan: Plan, catalog_digest: str, step: Callable[[Progress], object]
-) -> Progress:
+    store: Store,
+    plan: ReprocessPlan,
+    catalog_digest: str,
+    step: Callable[[ReprocessProgress], object],
+) -> ReprocessProgress:
     """Run every batch of the plan's stretch that its run does not hold yet.
 
     `step` is called at the start and after each transaction.  Raises `BadBatch`
@@ -82,8 +85,8 @@ def reprocess(
     progress = _counted(store, plan)
     step(progress)
     with closing(_ChunkSolver(plan, catalog_digest)) as solver:
-        waiting: deque[Callable[[], list[Draft | Refused]]] = deque()
-        most = AHEAD * solver.count
+        waiting: deque[Callable[[], list[Draft | RefusedBatch]]] = deque()
+        most = PENDING_A_WORKER * solver.count
         for chunk in _chunks(store, plan):
             waiting.append(solver.take(chunk))
             if len(waiting) >= most:
@@ -102,7 +105,7 @@ def require_other_run(run: str, source: str | None) -> None:
         raise BadBatch(Fault("run", message, shown_value(run)))
 
 
-def _require_same_settings(store: Store, plan: Plan, catalog_digest: str) -> None:
+def _require_same_settings(store: Store, plan: ReprocessPlan, catalog_digest: str) -> None:
     require_other_run(plan.run, plan.stretch.run)
     made_with = select(
         results.c.spacecraft, results.c.mission_digest, results.c.catalog_digest
@@ -117,11 +120,11 @@ def _require_same_settings(store: Store, plan: Plan, catalog_digest: str) -> Non
                 raise BadBatch(Fault("run", message, shown_value(plan.run)))
 
 
-def _conditions(plan: Plan) -> list[ColumnElement[bool]]:
+def _conditions(plan: ReprocessPlan) -> list[ColumnElement[bool]]:
     return [*plan.stretch.conditions(), results.c.spacecraft.in_(sorted(plan.missions))]
 
 
-def _not_yet(plan: Plan) -> ColumnElement[bool]:
+def _not_yet(plan: ReprocessPlan) -> ColumnElement[bool]:
     """Whether a batch is not in the plan's run, as SQL beside `batches`."""
     done = batches.alias("done")
     return ~exists().where(
@@ -133,17 +136,17 @@ def _not_yet(plan: Plan) -> ColumnElement[bool]:
     )
 
 
-def _counted(store: Store, plan: Plan) -> Progress:
+def _counted(store: Store, plan: ReprocessPlan) -> ReprocessProgress:
     joined = (
         select(func.count()).select_from(results).join(batches, results.c.batch_id == batches.c.id)
     )
     with store.reading() as connection:
         total = connection.scalar(joined.where(*_conditions(plan))) or 0
         left = connection.scalar(joined.where(*_conditions(plan), _not_yet(plan))) or 0
-    return Progress(plan.run, int(total), int(total) - int(left))
+    return ReprocessProgress(plan.run, int(total), int(total) - int(left))
 
 
-def _chunks(store: Store, plan: Plan) -> Iterator[list[Stored]]:
+def _chunks(store: Store, plan: ReprocessPlan) -> Iterator[list[StoredBatch]]:
     """What is still to be done, in order of time; no moment of the database is held on to."""
     place: tuple[int, str] | None = None
     query = (
@@ -168,15 +171,17 @@ def _after(place: tuple[int, str]) -> ColumnElement[bool]:
     return (time_ns > place[0]) | and_(time_ns == place[0], batch_id > place[1])
 
 
-def _record(store: Store, found: Sequence[Draft | Refused], progress: Progress) -> None:
+def _record(
+    store: Store, found: Sequence[Draft | RefusedBatch], progress: ReprocessProgress
+) -> None:
     drafts = [each for each in found if isinstance(each, Draft)]
-    refused = [each for each in found if isinstance(each, Refused)]
+    refused = [each for each in found if isinstance(each, RefusedBatch)]
     outcomes = store.writer.record(drafts).result() if drafts else []
     for draft, outcome in zip(drafts, outcomes, strict=True):
         if isinstance(outcome, Answered):
             progress.recorded += 1
         elif isinstance(outcome, AcquisitionError) and not isinstance(outcome, Busy):
-            refused.append(Refused(draft.identity[2], str(outcome)))
+            refused.append(RefusedBatch(draft.identity[2], str(outcome)))
         else:
             # Trouble of the database: nothing was decided about any of them.
             raise outcome
@@ -189,36 +194,38 @@ def _record(store: Store, found: Sequence[Draft | Refused], progress: Progress) 
 
 
 @dataclass(frozen=True)
-class _Part:
+class _WorkerTask:
     """What a worker takes: stored batches, and the run that they go to."""
 
     run: str
-    stored: Sequence[Stored]
+    stored: Sequence[StoredBatch]
 
 
-def work(solver: Solver, part: _Part) -> list[Draft | Refused]:
+def process_again(solver: Solver, part: _WorkerTask) -> list[Draft | RefusedBatch]:
     """The drafts of stored batches in a run, with what cannot be taken."""
     return [_again(solver, part.run, *each) for each in part.stored]
 
 
-def _again(solver: Solver, run: str, input: str, options: str) -> Draft | Refused:
+def _again(solver: Solver, run: str, input: str, options: str) -> Draft | RefusedBatch:
     model = BatchIn.model_validate_json(input).model_copy(
         update={"run": run, "options": OptionsIn.model_validate(json.loads(options))}
     )
     try:
         return solver.solve(submission_from_model(model))
     except AcquisitionError as error:
-        return Refused(model.batch, str(error))
+        return RefusedBatch(model.batch, str(error))
 
 
 class _ChunkSolver:
     """Computes in workers, or where only one is wanted or they are lost, in this process."""
 
-    def __init__(self, plan: Plan, catalog_digest: str) -> None:
+    def __init__(self, plan: ReprocessPlan, catalog_digest: str) -> None:
         self._run = plan.run
         self._config = WorkerConfig(plan.missions, plan.catalog, catalog_digest, plan.shelf_bytes)
         self.count = plan.processes or os.cpu_count() or 1
-        self._workers = LocalWorkers[_Part, Draft | Refused](self._config, work, self.count)
+        self._workers = LocalWorkers[_WorkerTask, Draft | RefusedBatch](
+            self._config, process_again, self.count
+        )
         if self.count > 1:
             self._workers.start()
 
@@ -226,21 +233,21 @@ class _ChunkSolver:
     def _solver(self) -> Solver:
         return self._config.solver()
 
-    def take(self, stored: Sequence[Stored]) -> Callable[[], list[Draft | Refused]]:
+    def take(self, stored: Sequence[StoredBatch]) -> Callable[[], list[Draft | RefusedBatch]]:
         """Begin with some batches; to call what it gives waits for what comes of them."""
-        part = _Part(self._run, stored)
+        part = _WorkerTask(self._run, stored)
         if self.count == 1:
-            return lambda: work(self._solver, part)
+            return lambda: process_again(self._solver, part)
         future = self._workers.submit(part)
 
-        def found() -> list[Draft | Refused]:
+        def found() -> list[Draft | RefusedBatch]:
             try:
                 return future.result()
             except ChunkEndsWorkers as error:
                 batches = [json.loads(input)["batch"] for input, _ in stored]
-                return [Refused(batch, str(error)) for batch in batches]
+                return [RefusedBatch(batch, str(error)) for batch in batches]
             except WorkerLost:
-                return work(self._solver, part)
+                return process_again(self._solver, part)
 
         return found
 

@@ -8,12 +8,14 @@ from scipy import stats
 
 from service.acquire import acquire
 from service.advice.advice import WorkLimit
-from service.advice.report import advice_record, advice_text
 from service.advice.statements import alignment_statement, noise_statement
 from service.advice.tolerances import rounded_up, tolerance_findings
 from service.advice.trackers import alignment_findings, magnitude_findings, noise_findings
+from service.app.advice_record import advice_record
+from service.cli.advice_text import advice_text
 from service.missions.mission import Mission
 from service.simulate.stretches import NO_TROUBLES, Trouble, Troubles
+from service.storage.queries.recorded_batch import BatchSample
 from service.vectors import (
     ARCSEC_PER_RADIAN,
     angle_between_deg,
@@ -32,6 +34,10 @@ from tests.advice.passes import (
 )
 
 BATCHES = 150
+
+
+def record_of(findings, batches_in_range=200):
+    return advice_record("XTE", "r", BatchSample(batches_in_range, (), "a", "b"), findings)
 
 
 def finding(mission, evidence, name):
@@ -80,16 +86,15 @@ def test_a_tracker_whose_noise_grows_does_not_fit_and_no_sigma_is_advised(
     pass_ = flown(
         mission, sky, batches, seed, change=worn(mission, begin, batches, 5.0), angles_share=0.0
     )
-    row = advice_record(advice_from(mission, sky, pass_.batches[::-1]))
-    (noise,) = row["noise"]
-    assert noise["verdict"] == "too_small"
-    assert noise["action"] == "correct"
-    assert noise["sigma_arcsec"]["value"] > 3 * mission.trackers[0].sigma_arcsec
-    assert noise["batches"] < batches / 2
-    assert "Look at the tracker first" in noise["text"]
-    assert row["changes"] == []
-    about = {"spacecraft": "XTE", "run": "r", "first": "a", "last": "b", "batches_in_range": 200}
-    text = advice_text(about | row)
+    row = record_of(advice_from(mission, sky, pass_.batches[::-1]))
+    (noise,) = row.noise
+    assert noise.verdict == "too_small"
+    assert noise.action == "correct"
+    assert noise.sigma_arcsec.value > 3 * mission.trackers[0].sigma_arcsec
+    assert noise.batches < batches / 2
+    assert "Look at the tracker first" in noise.text
+    assert row.changes == []
+    text = advice_text(row)
     assert "Nothing in the mission file needs to change" not in text
     assert "sigma_arcsec =" not in text
 
@@ -138,8 +143,8 @@ def test_the_line_for_the_magnitudes_undoes_their_offset(sky, missions, seed):
 
     mission = missions["XTE"]
     pass_ = flown(mission, sky, BATCHES, seed, change=fainter)
-    row = advice_record(advice_from(mission, sky, pass_.batches[:60]))
-    (line,) = [c["line"] for c in row["changes"] if c["table"] == "catalog"]
+    row = record_of(advice_from(mission, sky, pass_.batches[:60]))
+    (line,) = [c.line for c in row.changes if c.table == "catalog"]
     key, value = line.partition("#")[0].split(" = ")
     polynomial = tuple(float(part) for part in value.strip(" []").split(","))
     better = mission.model_dump()
@@ -214,25 +219,25 @@ def test_a_tolerance_is_changed_only_where_the_identifier_asks_for_it(sky, seed,
     mission = mission_like(tolerances={"separation_deg": 0.001})
     mission = mission.model_copy(update={"identifier": identifier})
     pass_ = flown(mission, sky, 60, seed)
-    row = advice_record(advice_from(mission, sky, pass_.batches))
-    found = next(each for each in row["tolerances"] if each["tolerance"] == "separation_deg")
-    keys = [each["line"].partition(" = ")[0] for each in row["changes"]]
-    assert found["verdict"] == "too_tight"
-    assert found["recommended"] > 0.001
+    row = record_of(advice_from(mission, sky, pass_.batches))
+    found = next(each for each in row.tolerances if each.tolerance == "separation_deg")
+    keys = [each.line.partition(" = ")[0] for each in row.changes]
+    assert found.verdict == "too_tight"
+    assert found.recommended > 0.001
     if identifier == "starid":
-        assert (found["action"], "separation_deg" in keys) == ("widen", True)
+        assert (found.action, "separation_deg" in keys) == ("widen", True)
     else:
-        assert (found["action"], "separation_deg" in keys) == ("keep", False)
-        assert "does not use it: keep it" in found["text"]
+        assert (found.action, "separation_deg" in keys) == ("keep", False)
+        assert "does not use it: keep it" in found.text
 
 
 def test_a_tolerance_that_growing_noise_makes_too_tight_waits(sky, seed):
     mission = mission_like().model_copy(update={"identifier": "starid"})
     pass_ = flown(mission, sky, 150, seed, change=worn(mission, 0.6, 150, 8.0), angles_share=0.0)
-    row = advice_record(advice_from(mission, sky, pass_.batches))
-    found = next(each for each in row["tolerances"] if each["tolerance"] == "separation_deg")
-    assert (found["verdict"], found["action"]) == ("too_tight", "wait")
-    keys = {each["line"].partition(" = ")[0] for each in row["changes"]}
+    row = record_of(advice_from(mission, sky, pass_.batches))
+    found = next(each for each in row.tolerances if each.tolerance == "separation_deg")
+    assert (found.verdict, found.action) == ("too_tight", "wait")
+    keys = {each.line.partition(" = ")[0] for each in row.changes}
     assert not keys & {"separation_deg", "sigma_arcsec"}
 
 
@@ -244,10 +249,10 @@ def test_two_trackers_with_the_same_offset_give_one_line(sky, seed):
             star["magnitude"] += 0.35
 
     mission = mission_like(second_tracker={})
-    row = advice_record(
+    row = record_of(
         advice_from(mission, sky, flown(mission, sky, 40, seed, change=fainter).batches)
     )
-    lines = [each["line"] for each in row["changes"] if each["table"] == "catalog"]
+    lines = [each.line for each in row.changes if each.table == "catalog"]
     assert [line.partition(" = ")[0] for line in lines] == ["color_polynomial_mag"]
 
 
@@ -295,17 +300,17 @@ def test_a_tolerance_whose_test_is_off_is_not_judged(sky, seed):
 
 def test_of_a_few_batches_nothing_is_said(sky, missions, seed):
     mission = missions["XTE"]
-    row = advice_record(advice_from(mission, sky, flown(mission, sky, 6, seed).batches))
-    assert row["changes"] == []
-    findings = row["tolerances"] + row["noise"] + row["magnitudes"]
-    assert {each["action"] for each in findings} == {"wait"}
-    assert all("too little data" in each["text"] for each in findings)
+    row = record_of(advice_from(mission, sky, flown(mission, sky, 6, seed).batches))
+    assert row.changes == []
+    findings = row.tolerances + row.noise + row.magnitudes
+    assert {each.action for each in findings} == {"wait"}
+    assert all("too little data" in each.text for each in findings)
 
 
 def test_of_no_batches_nothing_is_said(sky, missions):
-    row = advice_record(advice_from(missions["SOHO"], sky, []))
-    assert row["changes"] == []
-    assert row["batches_sampled"] == 0
+    row = record_of(advice_from(missions["SOHO"], sky, []))
+    assert row.changes == []
+    assert row.batches_sampled == 0
 
 
 def test_a_pass_as_the_mission_expects_it_needs_no_tighter_or_wider_separation(sky, missions, seed):
@@ -375,8 +380,7 @@ def test_the_text_can_be_acted_upon(sky, seed):
     mission = mission.model_copy(update={"identifier": "starid"})
     pass_ = flown(mission, sky, 60, seed, troubles=NO_TROUBLES)
     advice = advice_from(mission, sky, pass_.batches)
-    about = {"spacecraft": "XTE", "run": "r", "first": "a", "last": "b", "batches_in_range": 99}
-    text = advice_text(about | advice_record(advice))
+    text = advice_text(record_of(advice, 99))
     assert "60 of 99 batches were examined." in text
     assert "SEPTOL (separation_deg) is too tight" in text
     changes = text.partition("To change in the mission file of XTE:")[2].splitlines()

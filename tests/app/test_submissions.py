@@ -168,19 +168,19 @@ def test_zones_show_what_is_cached_and_can_be_warmed_and_dropped(app, make):
     time = parse_utc("1996-01-10T12:00:00.000Z")
     app.zones.drop()
     (warmed,) = app.zones.warm("XTE", [QuaternionIn(quaternion=QUATERNION)], time)
-    assert warmed["kind"] == "cap"
+    assert warmed.kind == "cap"
     answer = json.loads(app.submissions.submit(make()).body)
     assert answer["observations"][0]["zone"]["cached"]
     shown = app.zones.state()
-    (zone,) = shown["items"]
-    assert (zone["spacecraft"], zone["stars"]) == ("XTE", warmed["stars"])
-    assert zone["bytes"] > 0
-    assert zone["hits"] == 1
-    assert zone["build_us"] > 0
-    assert shown["bytes"] <= shown["max_bytes"]
+    (zone,) = shown.items
+    assert (zone.spacecraft, zone.stars) == ("XTE", warmed.stars)
+    assert zone.bytes > 0
+    assert zone.hits == 1
+    assert zone.build_us > 0
+    assert shown.bytes <= shown.max_bytes
     assert app.zones.drop("SWAS") == 0
     assert app.zones.drop("XTE") == 1
-    assert app.zones.state()["items"] == []
+    assert app.zones.state().items == []
     for ask in (app.zones.drop, lambda name: app.zones.warm(name, [], time)):
         with pytest.raises(BadBatch, match=r"spacecraft: there is no such .*'HST'"):
             ask("HST")

@@ -20,20 +20,20 @@ def filled(app, make):
 
 
 def transitions(found):
-    return {(each["from"], each["to"]): each["stars"] for each in found["transitions"]}
+    return {(each.from_, each.to): each.stars for each in found.transitions}
 
 
 def test_equal_options_change_nothing(filled):
     found = filled.comparisons.of_options("XTE", NONE, NONE)
-    assert found["compared"] == found["sampled"] == found["batches_in_stretch"] == 6
-    assert found["changed"] == []
-    assert found["renamed"] == 0
-    assert all(each["from"] == each["to"] for each in found["transitions"])
-    assert found["attitudes"]["angle_arcsec_max"] == 0.0
-    assert found["attitudes"]["neither"] == 1
+    assert found.compared == found.sampled == found.batches_in_stretch == 6
+    assert found.changed == []
+    assert found.renamed == 0
+    assert all(each.from_ == each.to for each in found.transitions)
+    assert found.attitudes.angle_arcsec_max == 0.0
+    assert found.attitudes.neither == 1
     recorded = filled.spacecraft.rates("XTE")[0]
     for name in ("observed", "unique", "ambiguous", "unmatched", "solved", "suspect"):
-        assert found["a"][name] == recorded[name]
+        assert getattr(found.a, name) == getattr(recorded, name)
 
 
 def test_what_changes_is_what_a_what_if_of_each_batch_says(filled):
@@ -43,16 +43,16 @@ def test_what_changes_is_what_a_what_if_of_each_batch_says(filled):
         told = filled.results.what_if(each.id, TIGHT).body.decode()
         for name in counted:
             counted[name] += told.count(f'"outcome":"{name}"')
-    assert {name: found["b"][name] for name in counted} == counted
-    assert sum(transitions(found).values()) == found["a"]["observed"] == found["b"]["observed"]
+    assert {name: getattr(found.b, name) for name in counted} == counted
+    assert sum(transitions(found).values()) == found.a.observed == found.b.observed
     moved = sum(stars for (one, other), stars in transitions(found).items() if one != other)
-    shown = [star for each in found["changed"] for star in each["stars"]]
+    shown = [star for each in found.changed for star in each.stars]
     assert moved > 0
-    assert len(shown) == moved + found["renamed"]
-    assert found["changed_batches"] == len(found["changed"])
-    for each in found["changed"]:
-        answer = filled.results.get(each["id"]).answer
-        assert (answer.batch, answer.time) == (each["batch"], each["time"])
+    assert len(shown) == moved + found.renamed
+    assert found.changed_batches == len(found.changed)
+    for each in found.changed:
+        answer = filled.results.get(each.id).answer
+        assert (answer.batch, answer.time) == (each.batch, each.time)
 
 
 def test_nothing_is_kept(filled):
@@ -64,12 +64,12 @@ def test_nothing_is_kept(filled):
 
 def test_a_stretch_a_sample_and_a_bound_on_the_work(filled, make):
     start, end = (make(after_s=seconds).batch.time for seconds in (30, 120))
-    assert filled.comparisons.of_options("XTE", NONE, NONE, start=start, end=end)["compared"] == 3
+    assert filled.comparisons.of_options("XTE", NONE, NONE, start=start, end=end).compared == 3
     few = filled.comparisons.of_options("XTE", NONE, NONE, sample=2)
-    assert (few["batches_in_stretch"], few["sampled"], few["compared"]) == (6, 2, 2)
+    assert (few.batches_in_stretch, few.sampled, few.compared) == (6, 2, 2)
     cut = filled.comparisons.of_options("XTE", NONE, NONE, limit_s=-1.0)
-    assert (cut["cut_short"], cut["compared"], cut["sampled"]) == (True, 0, 6)
+    assert (cut.cut_short, cut.compared, cut.sampled) == (True, 0, 6)
     empty = filled.comparisons.of_options("XTE", NONE, NONE, run="nothing")
-    assert (empty["compared"], empty["start"], empty["a"]["residual_ratio_mean"]) == (0, None, None)
+    assert (empty.compared, empty.start, empty.a.residual_ratio_mean) == (0, None, None)
     with pytest.raises(NotFound):
         filled.comparisons.of_options("NOPE", NONE, NONE)

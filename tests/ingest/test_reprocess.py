@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from msgspec.structs import asdict
 from sqlalchemy import func, select
 
 from service.errors import BadBatch, NotFound
@@ -87,9 +88,9 @@ def test_with_the_same_settings_everything_comes_out_alike(app, recorded):
         one, other = without_accidents(before[name]), without_accidents(after[name])
         assert (one.pop("run"), other.pop("run")) == ("live", "again")
         assert one == other
-    assert compared["batches"] == BATCHES
-    assert all(each["before"] == each["after"] for each in compared["stars"]["transitions"])
-    assert compared["attitudes"]["angle_arcsec"]["max"] == 0.0
+    assert compared.batches == BATCHES
+    assert all(each.before == each.after for each in compared.stars.transitions)
+    assert compared.attitudes.angle_arcsec.max == 0.0
 
 
 def test_live_results_and_rates_stay_as_they_are(app, recorded):
@@ -124,21 +125,21 @@ def test_another_mission_file_decides_and_the_comparison_counts_star_by_star(
                 matrix_from_quaternion(each["attitude"]["quaternion"]) for each in (old, new)
             ]
             angles.append(np.linalg.norm(attitude_error_arcsec(*matrices)))
-    transitions = compared["stars"]["transitions"]
+    transitions = compared.stars.transitions
 
     def counted(*what):
         keys = ("before", "after", "same_star")
         return sum(
-            each["stars"] for each in transitions if tuple(each[key] for key in keys) == what
+            each.stars for each in transitions if tuple(getattr(each, key) for key in keys) == what
         )
 
-    assert compared["stars"]["after"] == stars
+    assert asdict(compared.stars.after) == stars
     assert counted("unique", "unique", False) == otherwise
     assert counted("ambiguous", "unique", False) == lost > 0
-    assert compared["attitudes"]["in_both"] == len(angles)
-    found = compared["attitudes"]["angle_arcsec"]
-    assert found["max"] == pytest.approx(max(angles), abs=1e-6)
-    assert found["p95"] == pytest.approx(np.quantile(angles, 0.95), abs=1e-6)
+    assert compared.attitudes.in_both == len(angles)
+    found = compared.attitudes.angle_arcsec
+    assert found.max == pytest.approx(max(angles), abs=1e-6)
+    assert found.p95 == pytest.approx(np.quantile(angles, 0.95), abs=1e-6)
 
 
 class _Stopped(Exception):
@@ -160,7 +161,7 @@ def test_what_was_stopped_goes_on_where_it_was(app, recorded):
     progress, compared = app.runs.reprocess("again", processes=1)
     assert seen == [0, CHUNK, CHUNK, 2 * CHUNK]
     assert (progress.before, progress.recorded) == (2 * CHUNK, BATCHES - 2 * CHUNK)
-    assert compared["batches"] == len(answers_of(app, "again")) == BATCHES
+    assert compared.batches == len(answers_of(app, "again")) == BATCHES
     progress, _ = app.runs.reprocess("again", processes=1)
     assert (progress.before, progress.recorded) == (BATCHES, 0)
 
@@ -247,6 +248,6 @@ def test_a_batch_that_no_longer_fits_is_refused_by_name_and_the_rest_goes_on(
     progress, compared = renamed.runs.reprocess("again", processes=1)
     assert (progress.recorded, progress.refused) == (0, 2)
     assert progress.refusals[0].startswith("b1: observations.0.tracker: XTE has OTHER")
-    assert compared["batches"] == 0
+    assert compared.batches == 0
     with first.store.reading() as connection:
         assert connection.scalar(select(func.count()).select_from(batches)) == 2

@@ -82,19 +82,19 @@ def test_thinning_out_keeps_the_least_and_greatest_of_every_bucket(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trends, "MAX_BATCHES_SUMMED", at_most)
         shown = app.spacecraft.history("XTE", run=run, start=start, end=end, size=size)
-    assert len(shown["unix_s"]) <= size or shown["bucket_s"] == 3600
+    assert len(shown.unix_s) <= size or shown.bucket_s == 3600
     for name in trend_names():
         if isinstance(QUANTITIES[name].source, Rate):
             continue
-        series = shown["series"][name]
+        series = shown.series[name]
         found = list(
             zip(
-                *(shown["unix_s"], shown["batches"]),
-                *(series["mean"], series["min"], series["max"]),
+                *(shown.unix_s, shown.batches),
+                *(series.mean, series.min, series.max),
                 strict=True,
             )
         )
-        wanted = list(expected(rows, start, end, shown["bucket_s"], name))
+        wanted = list(expected(rows, start, end, shown.bucket_s, name))
         assert [(f[0], f[1], f[3], f[4]) for f in found] == [(w[0], w[1], *w[3:]) for w in wanted]
         for (*_, mean, _, _), (*_, correct, _, _) in zip(found, wanted, strict=True):
             assert mean == (None if correct is None else pytest.approx(correct))
@@ -148,7 +148,7 @@ def test_a_dense_stretch_is_read_in_as_many_rows_as_it_shows(app):
         assert len(time_buckets.read_steps(connection, span, 60)["batches"]) == 5
         assert len(time_buckets.read_buckets(connection, span, "day")["batches"]) == 1
     shown = app.spacecraft.history("XTE", start=START, end=shifted(START, 300), size=5)
-    assert shown["batches"] == [600] * 5
+    assert shown.batches == [600] * 5
     item = next(each for each in app.spacecraft.overview().items if each.name == "XTE")
     assert sum(item.sparkline_hour.batches) == 3000
     assert len(item.sparkline_hour.batches) == 3
@@ -158,41 +158,41 @@ def test_a_year_is_read_from_days_and_a_month_from_hours(app):
     put(app, [result_row(app, shifted(START, 43200.0 * k)) for k in range(720)])
     end = shifted(START, 365 * 86400)
     year = app.spacecraft.history("XTE", start=START, end=end, size=400)
-    assert (year["source"], year["bucket_s"]) == ("day", 86400)
-    assert sum(year["batches"]) == 720
+    assert (year.source, year.bucket_s) == ("day", 86400)
+    assert sum(year.batches) == 720
     month = app.spacecraft.history("XTE", start=START, end=shifted(START, 30 * 86400), size=1000)
-    assert month["bucket_s"] == 3600 or month["source"] == "batch"
-    assert sum(month["batches"]) == 60
+    assert month.bucket_s == 3600 or month.source == "batch"
+    assert sum(month.batches) == 60
 
 
 def test_without_a_range_it_is_the_day_up_to_the_latest_batch(app):
     put(app, [result_row(app, shifted(START, 3600.0 * k)) for k in range(60)])
     shown = app.spacecraft.history("XTE")
-    assert sum(shown["batches"]) == 24
-    assert shown["end"].startswith(shifted(START, 59 * 3600).text[:19])
+    assert sum(shown.batches) == 24
+    assert shown.end.startswith(shifted(START, 59 * 3600).text[:19])
 
 
 def test_of_a_spacecraft_without_a_batch_it_is_empty(app):
     for strategy in ("minmax", "latest"):
         shown = app.spacecraft.history("SWAS", strategy=strategy)
-        assert shown["unix_s"] == []
-        assert shown["start"] is None
+        assert shown.unix_s == []
+        assert shown.start is None
 
 
 def test_the_latest_are_single_batches_with_their_times(app):
     rows = [result_row(app, shifted(START, 60.0 * k), ambiguous=k % 5) for k in range(10)]
     put(app, rows)
     shown = app.spacecraft.history("XTE", strategy="latest", size=4, quantities=["ambiguous_share"])
-    assert shown["time"] == [batch["time"] for batch, _ in rows[-4:]]
-    assert shown["id"] == [batch["id"] for batch, _ in rows[-4:]]
-    assert list(shown["series"]) == ["ambiguous_share"]
-    assert len(shown["series"]["ambiguous_share"]["value"]) == 4
+    assert shown.time == [batch["time"] for batch, _ in rows[-4:]]
+    assert shown.id == [batch["id"] for batch, _ in rows[-4:]]
+    assert list(shown.series) == ["ambiguous_share"]
+    assert len(shown.series["ambiguous_share"].value) == 4
 
 
 def test_the_rate_of_batches_counts_the_hours_that_are_shown_of_a_bucket(app):
     put(app, [result_row(app, shifted(START, 30.0 * k)) for k in range(240)])
     shown = app.spacecraft.history("XTE", start=START, end=shifted(START, 7200), size=3)
-    rate = shown["series"]["batches_per_hour"]["mean"]
+    rate = shown.series["batches_per_hour"].mean
     assert rate == [pytest.approx(120.0)] * len(rate)
 
 

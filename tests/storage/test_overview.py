@@ -65,7 +65,7 @@ def test_a_live_batch_dated_far_ahead_is_never_the_latest(app, make):
     found = item(app)
     assert found.latest_batch.batch == "right"
     assert app.spacecraft.overview().as_of == make("right").batch.time.text
-    assert app.spacecraft.history("XTE")["end"].startswith("1996")
+    assert app.spacecraft.history("XTE").end.startswith("1996")
     # It is there all the same, and of a spacecraft with nothing else it is what there is.
     assert app.results.page().items[0].batch == "wrong"
     lone = ahead.replace('"XTE"', '"SWAS"').encode()

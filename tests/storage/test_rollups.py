@@ -57,13 +57,13 @@ def test_they_equal_a_recount_after_any_sequence_of_batches_and_adoptions(app, m
 def test_an_adopted_result_takes_the_place_of_the_old_one(app, make):
     first = app.submissions.submit(make(kind="suspect"))
     (before,) = app.spacecraft.rates("XTE")
-    assert (before["unique"], before["solved"], before["suspect"]) == (5, 1, 1)
+    assert (before.unique, before.solved, before.suspect) == (5, 1, 1)
     app.results.what_if(first.id, TIGHT, record=True)
     assert app.spacecraft.rates("XTE") == [before]
     app.results.what_if(first.id, TIGHT, adopt=True)
     (after,) = app.spacecraft.rates("XTE")
-    assert (after["unique"], after["unmatched"]) == (4, 1)
-    assert (after["batches"], after["solved"], after["suspect"]) == (1, 1, 0)
+    assert (after.unique, after.unmatched) == (4, 1)
+    assert (after.batches, after.solved, after.suspect) == (1, 1, 0)
     assert_trends_whole(app)
 
 
@@ -71,22 +71,22 @@ def test_live_rates_never_include_a_named_run(app, make):
     app.submissions.submit(make("b1"))
     app.submissions.submit(make("b1", run="again"))
     app.submissions.submit(make("b2", run="again"))
-    assert [each["batches"] for each in app.spacecraft.rates("XTE")] == [1]
-    assert [each["batches"] for each in app.spacecraft.rates("XTE", run="again")] == [2]
+    assert [each.batches for each in app.spacecraft.rates("XTE")] == [1]
+    assert [each.batches for each in app.spacecraft.rates("XTE", run="again")] == [2]
 
 
 def test_buckets_are_utc_hours_and_days_of_the_batch_time(app, make):
     for index, hours in enumerate((0, 0.5, 1, 11.75, 12.25)):
         app.submissions.submit(make(f"b{index}", after_s=3600 * hours))
     hourly = app.spacecraft.rates("XTE", bucket="hour")
-    assert [(each["start"][11:16], each["batches"]) for each in hourly] == [
+    assert [(each.start[11:16], each.batches) for each in hourly] == [
         ("12:00", 2),
         ("13:00", 1),
         ("23:00", 1),
         ("00:00", 1),
     ]
     daily = app.spacecraft.rates("XTE", bucket="day")
-    assert [(each["start"], each["batches"]) for each in daily] == [
+    assert [(each.start, each.batches) for each in daily] == [
         ("1996-01-10T00:00:00.000Z", 4),
         ("1996-01-11T00:00:00.000Z", 1),
     ]
@@ -107,7 +107,7 @@ def test_a_range_takes_the_buckets_it_touches(app, make, start, end, hours):
     app.submissions.submit(make("b2", after_s=3600))
     given_range = {"start": start and parse_utc(start), "end": end and parse_utc(end)}
     shown = app.spacecraft.rates("XTE", **given_range)
-    assert [int(each["start"][11:13]) for each in shown] == hours
+    assert [int(each.start[11:13]) for each in shown] == hours
 
 
 def test_a_stretch_with_more_buckets_than_an_answer_holds_is_refused(app, make, monkeypatch):

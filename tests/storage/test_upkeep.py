@@ -322,7 +322,7 @@ def test_an_hour_that_is_cut_keeps_its_later_part_in_the_trends(app, make, datab
     prune(app.store, shifted(START, 180.0))
     (hour,) = app.spacecraft.rates("XTE")
     (day,) = app.spacecraft.rates("XTE", bucket="day")
-    assert (hour["batches"], day["batches"]) == (3, 3)
+    assert (hour.batches, day.batches) == (3, 3)
     with app.store.reading() as connection:
         for bucket in ("hour", "day"):
             assert rollups.stored(connection, bucket) == rollups.recount(connection, bucket)

@@ -128,7 +128,7 @@ def test_one_draft_that_cannot_be_kept_spoils_none_of_its_neighbours(app, make):
     first, second, third = waiting.result(30)
     assert isinstance(second, IntegrityError)
     assert [app.results.get(each.id).answer.batch for each in (first, third)] == ["b1", "b3"]
-    assert [each["batches"] for each in app.spacecraft.rates("XTE")] == [2]
+    assert [each.batches for each in app.spacecraft.rates("XTE")] == [2]
 
 
 def test_a_full_queue_is_busy_and_takes_work_again_once_it_is_written(store):

@@ -48,10 +48,11 @@ def run(parsed: Namespace) -> int:
     """Print what recorded batches say of a mission's settings."""
     import json
 
+    import msgspec
     from tqdm import tqdm
 
-    from service.advice.report import advice_text
     from service.app.factory import open_app
+    from service.cli.advice_text import advice_text
     from service.missions.mission import load_missions, mission_named
     from service.observations.schema import tolerances_from_text
 
@@ -63,7 +64,7 @@ def run(parsed: Namespace) -> int:
         with tqdm(
             total=None, unit=" batches", desc="running again", disable=parsed.quiet or None
         ) as bar:
-            row = app.advice.of_spacecraft(
+            advice = app.advice.of_spacecraft(
                 parsed.spacecraft,
                 run=parsed.run,
                 start=start,
@@ -74,5 +75,8 @@ def run(parsed: Namespace) -> int:
             )
     finally:
         app.close()
-    print(json.dumps(row, ensure_ascii=False, indent=1) if parsed.json else advice_text(row))
+    if parsed.json:
+        print(json.dumps(msgspec.to_builtins(advice), ensure_ascii=False, indent=1))
+    else:
+        print(advice_text(advice))
     return 0

@@ -51,12 +51,13 @@ def run(parsed: Namespace) -> int:
     """Run recorded batches again into another run, and print how both compare."""
     import json
 
+    import msgspec
     from tqdm import tqdm
 
     from service.app.context import checked_run_name
     from service.app.factory import open_app
     from service.cli.run_comparison import comparison_text
-    from service.ingest.reprocess import Progress, require_other_run
+    from service.ingest.reprocess import ReprocessProgress, require_other_run
     from service.missions.mission import load_missions, mission_named, read_mission
     from service.storage.sql.served import unserved
 
@@ -81,7 +82,7 @@ def run(parsed: Namespace) -> int:
             total=None, unit=" batches", desc="running again", disable=parsed.quiet or None
         ) as bar:
 
-            def step(progress: Progress) -> None:
+            def step(progress: ReprocessProgress) -> None:
                 bar.total = progress.total
                 bar.update(progress.before + progress.recorded + progress.refused - bar.n)
 
@@ -100,7 +101,7 @@ def run(parsed: Namespace) -> int:
         counts = {
             name: getattr(progress, name) for name in ("total", "before", "recorded", "refused")
         }
-        print(json.dumps(counts | compared, indent=1))
+        print(json.dumps(counts | msgspec.to_builtins(compared), indent=1))
     else:
         print(comparison_text(progress, compared))
     return 1 if progress.refused else 0

@@ -1,4 +1,4 @@
-"""Two sets of options side by side."""
+"""Two sets of options side by side, and two runs."""
 
 from typing import Annotated, ClassVar
 
@@ -94,3 +94,69 @@ class Comparison(Record, frozen=True, kw_only=True):
     attitudes: ComparedAttitudes
     changed_batches: Count
     changed: Annotated[list[BatchChange], doc("The first hundred, oldest first.")]
+
+
+class OutcomeCounts(Record, frozen=True, kw_only=True):
+    """Stars by outcome, without their sum."""
+
+    unique: int
+    ambiguous: int
+    unmatched: int
+
+
+class StatusCounts(Record, frozen=True, kw_only=True):
+    """Batches by the status of their attitude."""
+
+    good: int = 0
+    suspect: int = 0
+    none: int = 0
+
+
+class RunTransition(Record, frozen=True, kw_only=True):
+    """Number of stars with an outcome in one run and an outcome in the other."""
+
+    before: str
+    after: str
+    same_star: bool
+    stars: int
+
+    @property
+    def is_change(self) -> bool:
+        """Whether the outcome differs, or the named star."""
+        return self.before != self.after or (self.before == "unique" and not self.same_star)
+
+
+class RunStars(Record, frozen=True, kw_only=True):
+    """Outcomes of the stars of the batches that both runs have."""
+
+    observed: int
+    before: OutcomeCounts
+    after: OutcomeCounts
+    transitions: list[RunTransition]
+
+
+class AngleStatistics(Record, frozen=True, kw_only=True):
+    """Angles between the attitudes of two runs, in arcseconds."""
+
+    median: float
+    p95: float
+    max: float
+
+
+class RunAttitudes(Record, frozen=True, kw_only=True):
+    """Attitudes of the batches that both runs have, and the angles between them."""
+
+    before: StatusCounts
+    after: StatusCounts
+    in_both: int
+    angle_arcsec: AngleStatistics | None
+
+
+class RunComparison(Record, frozen=True, kw_only=True):
+    """The batches that two runs have in common: `before` in `run`, `after` in `other`."""
+
+    run: str | None
+    other: str
+    batches: int
+    stars: RunStars
+    attitudes: RunAttitudes

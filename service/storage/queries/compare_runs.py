@@ -1,21 +1,30 @@
 """Two runs side by side: what became of the same stars, and how far the attitudes differ."""
 
+from collections import Counter
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from sqlalchemy import Connection, Subquery, and_, case, func, select
 
+from service.storage.models.compare import (
+    AngleStatistics,
+    OutcomeCounts,
+    RunAttitudes,
+    RunComparison,
+    RunStars,
+    RunTransition,
+    StatusCounts,
+)
 from service.storage.queries.pages import ResultFilter
-from service.storage.recording.unsaved_result import Row
 from service.storage.sql.tables import batches, results, solutions, star_results
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
-OUTCOMES = ("unique", "ambiguous", "unmatched")
 _READ_AT_ONCE = 10_000
 _QUATERNION = ("q1", "q2", "q3", "qc")
 
 
-def compare_runs(connection: Connection, selected: ResultFilter, other: str) -> Row:
+def compare_runs(connection: Connection, selected: ResultFilter, other: str) -> RunComparison:
     """The current results of a period beside those of the same batches in another run.
 
     `stars` counts what became of each, from the one run (`before`) to the other
@@ -24,18 +33,18 @@ def compare_runs(connection: Connection, selected: ResultFilter, other: str) -> 
     """
     pairs = _pairs(selected, other)
     transitions = _transitions(connection, pairs)
-    return {
-        "run": selected.run,
-        "other": other,
-        "batches": int(connection.scalar(select(func.count()).select_from(pairs)) or 0),
-        "stars": {
-            "observed": sum(each["stars"] for each in transitions),
-            "before": _sums(transitions, "before"),
-            "after": _sums(transitions, "after"),
-            "transitions": transitions,
-        },
-        "attitudes": _attitudes(connection, pairs),
-    }
+    return RunComparison(
+        run=selected.run,
+        other=other,
+        batches=int(connection.scalar(select(func.count()).select_from(pairs)) or 0),
+        stars=RunStars(
+            observed=sum(each.stars for each in transitions),
+            before=_sums((each.before, each.stars) for each in transitions),
+            after=_sums((each.after, each.stars) for each in transitions),
+            transitions=transitions,
+        ),
+        attitudes=_attitudes(connection, pairs),
+    )
 
 
 def _pairs(selected: ResultFilter, other: str) -> Subquery:
@@ -63,7 +72,7 @@ def _pairs(selected: ResultFilter, other: str) -> Subquery:
     )
 
 
-def _transitions(connection: Connection, pairs: Subquery) -> list[Row]:
+def _transitions(connection: Connection, pairs: Subquery) -> list[RunTransition]:
     """How many stars went from which outcome to which, the most first."""
     old, new = star_results.alias("old_star"), star_results.alias("new_star")
     same = case((old.c.star_id == new.c.star_id, 1), else_=0)
@@ -82,35 +91,40 @@ def _transitions(connection: Connection, pairs: Subquery) -> list[Row]:
         .group_by(old.c.outcome, new.c.outcome, same)
     )
     found = [
-        {"before": before, "after": after, "same_star": bool(alike), "stars": int(stars)}
+        RunTransition(before=before, after=after, same_star=bool(alike), stars=int(stars))
         for before, after, alike, stars in connection.execute(query)
     ]
-    return sorted(found, key=lambda each: (-each["stars"], each["before"], each["after"]))
+    return sorted(found, key=lambda each: (-each.stars, each.before, each.after))
 
 
-def _sums(transitions: list[Row], side: str) -> dict[str, int]:
-    return {
-        outcome: sum(each["stars"] for each in transitions if each[side] == outcome)
-        for outcome in OUTCOMES
-    }
+def _sums(stars: Iterable[tuple[str, int]]) -> OutcomeCounts:
+    counts: Counter[str] = Counter()
+    for outcome, number in stars:
+        counts[outcome] += number
+    return OutcomeCounts(**{name: counts[name] for name in OutcomeCounts.__struct_fields__})
 
 
-def _attitudes(connection: Connection, pairs: Subquery) -> Row:
+def _attitudes(connection: Connection, pairs: Subquery) -> RunAttitudes:
     """How many attitudes each has, and the angle between those that both have."""
     states = select(pairs.c.status_before, pairs.c.status_after, func.count()).group_by(
         pairs.c.status_before, pairs.c.status_after
     )
-    before: dict[str, int] = {"good": 0, "suspect": 0, "none": 0}
-    after = dict(before)
+    before: Counter[str] = Counter()
+    after: Counter[str] = Counter()
     for old, new, count in connection.execute(states):
         before[old or "none"] += int(count)
         after[new or "none"] += int(count)
     angles = _angles_arcsec(connection, pairs)
-    found: Row = {"before": before, "after": after, "in_both": len(angles), "angle_arcsec": None}
+    statistics = None
     if len(angles):
         median, p95 = np.quantile(angles, (0.5, 0.95)).tolist()
-        found["angle_arcsec"] = {"median": median, "p95": p95, "max": float(angles.max())}
-    return found
+        statistics = AngleStatistics(median=median, p95=p95, max=float(angles.max()))
+    return RunAttitudes(
+        before=StatusCounts(**before),
+        after=StatusCounts(**after),
+        in_both=len(angles),
+        angle_arcsec=statistics,
+    )
 
 
 def _angles_arcsec(connection: Connection, pairs: Subquery) -> Vector:

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from sqlalchemy import Connection, select
 
 from service.alarms.quantities import QUANTITIES, BatchShare, QuantityName, Rate, StarShare
+from service.storage.models.trends import History, Numbers, Series
 from service.storage.queries.pages import (
     PLACE,
     ResultFilter,
@@ -26,7 +27,6 @@ from service.storage.queries.time_buckets import (
     read_buckets,
     read_steps,
 )
-from service.storage.recording.unsaved_result import Row
 from service.storage.sql.tables import MEASURED, batches, results
 from service.times import DAY_S, HOUR_S, Utc, parse_utc, shifted, unix_seconds, utc_now
 from service.vectors import Vector
@@ -65,33 +65,23 @@ def history(
     start: Utc | None,
     end: Utc | None,
     request: HistoryRequest,
-) -> Row:
+) -> History:
     """A history, its buckets or batches in columns, oldest first.
 
     Without an end it ends just after the latest batch, without a start it
     begins a day before its end.
     """
     span = _span(connection, spacecraft, run, start, end)
-    about = {"spacecraft": spacecraft, "run": run, "strategy": request.strategy}
     if span is None:
-        return about | {
-            "start": None if start is None else start.text,
-            "end": None if end is None else end.text,
-            **_empty(request),
-        }
-    about |= {"start": span.start.text, "end": span.end.text}
+        return _empty(spacecraft, run, start, end, request)
     if request.strategy == "latest":
-        return about | _latest(connection, span, request)
+        return _latest(connection, span, request)
     width_s, source = _resolution(connection, span, request.size)
     if source == "batch":
         cells = read_steps(connection, span, width_s)
     else:
         cells = read_buckets(connection, span, source)
-    return about | {
-        "bucket_s": width_s,
-        "source": source,
-        **_thinned(cells, span, width_s, request),
-    }
+    return _thinned(cells, span, width_s, source, request)
 
 
 def latest_time(
@@ -135,18 +125,27 @@ def _buckets(first_s: float, end_s: float, width_s: int) -> int:
     return int(np.ceil(end_s / width_s) - first_s // width_s)
 
 
-def _thinned(cells: Columns, span: BucketFilter, width_s: int, request: HistoryRequest) -> Row:
+def _thinned(
+    cells: Columns, span: BucketFilter, width_s: int, source: Source, request: HistoryRequest
+) -> History:
     number = np.floor(cells["unix_s"] / width_s)
     _, first = np.unique(number, return_index=True)
     unix_s = number[first] * width_s
     reduced = _Reduced(cells, first, _covered_h(unix_s, width_s, span))
     counts = reduced.sum("batches").astype(int).tolist()
-    return {
-        "thinned": sum(counts) > len(counts),
-        "unix_s": unix_s.tolist(),
-        "batches": counts,
-        "series": {name: reduced.series(name) for name in request.quantities},
-    }
+    return History(
+        spacecraft=span.spacecraft,
+        run=span.run,
+        start=span.start.text,
+        end=span.end.text,
+        strategy=request.strategy,
+        bucket_s=width_s,
+        source=source,
+        thinned=sum(counts) > len(counts),
+        unix_s=unix_s.tolist(),
+        batches=counts,
+        series={name: reduced.series(name) for name in request.quantities},
+    )
 
 
 def _covered_h(unix_s: Vector, width_s: int, span: BucketFilter) -> Vector:
@@ -164,7 +163,7 @@ class _Reduced:
     def sum(self, name: str) -> Vector:
         return self._reduce(np.add, self._cells[name])
 
-    def series(self, name: QuantityName) -> Row:
+    def series(self, name: QuantityName) -> Series:
         """One quantity: unit, how many batches have it, mean, least and greatest of a batch.
 
         What the rollups have no columns of is not known.
@@ -204,17 +203,17 @@ def _over(part: Vector, whole: Vector) -> Vector:
         return np.asarray(np.where(whole > 0, part / whole, np.nan))
 
 
-def _series(name: QuantityName, count: Vector, mean: Vector, low: Vector, high: Vector) -> Row:
-    return {
-        "unit": QUANTITIES[name].unit,
-        "count": count.astype(int).tolist(),
-        "mean": _listed(mean),
-        "min": _listed(low),
-        "max": _listed(high),
-    }
+def _series(name: QuantityName, count: Vector, mean: Vector, low: Vector, high: Vector) -> Series:
+    return Series(
+        unit=QUANTITIES[name].unit,
+        count=count.astype(int).tolist(),
+        mean=_listed(mean),
+        min=_listed(low),
+        max=_listed(high),
+    )
 
 
-def _listed(values: Vector) -> list[float | None]:
+def _listed(values: Vector) -> Numbers:
     unknown = np.isnan(values)
     if unknown.any():
         values = values.astype(object)
@@ -236,7 +235,7 @@ def every_batch(
     start: Utc | None,
     end: Utc | None,
     quantities: Sequence[QuantityName],
-) -> Iterator[Row]:
+) -> Iterator[History]:
     """The batches of a period as `history` gives the latest, oldest first, in pages.
 
     At least one page is given, which may hold none.  Between two pages no
@@ -246,56 +245,73 @@ def every_batch(
     with reading() as connection:
         span = _span(connection, spacecraft, run, start, end)
     if span is None:
-        yield _of_batches([], request)
+        yield _empty(spacecraft, run, start, end, request)
         return
     chosen = ResultFilter(run, spacecraft, span.start, span.end).conditions()
     cursor: str | None = None
     while True:
         with reading() as connection:
             page = page_of(connection, oldest_first(_OF_BATCHES.where(*chosen), cursor), PAGE, dict)
-        yield _of_batches(page.items, request)
+        yield _of_batches(page.items, span, request)
         cursor = page.next_cursor
         if cursor is None:
             return
 
 
-def _latest(connection: Connection, span: BucketFilter, request: HistoryRequest) -> Row:
+def _latest(connection: Connection, span: BucketFilter, request: HistoryRequest) -> History:
     chosen = ResultFilter(span.run, span.spacecraft, span.start, span.end).conditions()
     # One more than requested tells whether there are more.
     query = newest_first(_OF_BATCHES.where(*chosen)).limit(request.size + 1)
     rows = list(connection.execute(query).mappings())
-    return _of_batches(rows[: request.size][::-1], request) | {"thinned": len(rows) > request.size}
+    thinned = len(rows) > request.size
+    return _of_batches(rows[: request.size][::-1], span, request, thinned=thinned)
 
 
-def _of_batches(rows: Sequence[Any], request: HistoryRequest) -> Row:
-    return {
-        "bucket_s": None,
-        "source": "batch",
-        "thinned": False,
-        "unix_s": unix_seconds([row["time_ns"] for row in rows]).tolist(),
-        **{name: [row[name] for row in rows] for name in ("time", "id", "batch")},
-        "series": {
-            name: {
-                "unit": QUANTITIES[name].unit,
-                "value": list(map(QUANTITIES[name].value_of, rows)),
-            }
+def _of_batches(
+    rows: Sequence[Any], span: BucketFilter, request: HistoryRequest, *, thinned: bool = False
+) -> History:
+    return History(
+        spacecraft=span.spacecraft,
+        run=span.run,
+        start=span.start.text,
+        end=span.end.text,
+        strategy=request.strategy,
+        bucket_s=None,
+        source="batch",
+        thinned=thinned,
+        unix_s=unix_seconds([row["time_ns"] for row in rows]).tolist(),
+        time=[row["time"] for row in rows],
+        id=[row["id"] for row in rows],
+        batch=[row["batch"] for row in rows],
+        series={
+            name: Series(
+                unit=QUANTITIES[name].unit, value=list(map(QUANTITIES[name].value_of, rows))
+            )
             for name in request.quantities
         },
-    }
+    )
 
 
-def _empty(request: HistoryRequest) -> Row:
-    if request.strategy == "latest":
-        return _of_batches([], request)
-    columns = ("count", "mean", "min", "max")
-    return {
-        "bucket_s": None,
-        "source": "batch",
-        "thinned": False,
-        "unix_s": [],
-        "batches": [],
-        "series": {
-            name: {"unit": QUANTITIES[name].unit} | {column: [] for column in columns}
+def _empty(
+    spacecraft: str, run: str, start: Utc | None, end: Utc | None, request: HistoryRequest
+) -> History:
+    """The history of a run without batches of the spacecraft."""
+    is_latest = request.strategy == "latest"
+    columns: tuple[str, ...] = ("value",) if is_latest else ("count", "mean", "min", "max")
+    lists: tuple[str, ...] = ("time", "id", "batch") if is_latest else ("batches",)
+    return History(
+        spacecraft=spacecraft,
+        run=run,
+        start=None if start is None else start.text,
+        end=None if end is None else end.text,
+        strategy=request.strategy,
+        bucket_s=None,
+        source="batch",
+        thinned=False,
+        unix_s=[],
+        **{name: [] for name in lists},
+        series={
+            name: Series(unit=QUANTITIES[name].unit, **{column: [] for column in columns})
             for name in request.quantities
         },
-    }
+    )

@@ -70,7 +70,7 @@ def list_attitudes(
 )
 def list_rates(name: Name, query: Annotated[RatesQuery, InQuery()], app: AppDep) -> Response:
     """Stars by outcome, in at most 20,000 buckets of batch time."""
-    return json_response({"items": app.spacecraft.rates(name, **query.asked())})
+    return json_response(RateList(items=app.spacecraft.rates(name, **query.asked())))
 
 
 @router.get(
@@ -97,10 +97,9 @@ def get_history(name: Name, query: Annotated[HistoryQuery, InQuery()], app: AppD
         size=query.size or DEFAULT_SIZE,
         **where,
     )
-    thinned = history["thinned"]
     if query.format != JSON_FORMAT:
-        return history_file(history_table(history), query.format, file, is_thinned=thinned)
-    return json_response(history, headers=thinned_header(thinned))
+        return history_file(history_table(history), query.format, file, is_thinned=history.thinned)
+    return json_response(history, headers=thinned_header(history.thinned))
 
 
 @router.get(
@@ -109,6 +108,5 @@ def get_history(name: Name, query: Annotated[HistoryQuery, InQuery()], app: AppD
 )
 def list_worst(name: Name, query: Annotated[WorstQuery, InQuery()], app: AppDep) -> Response:
     """The batches with the worst values of a quantity in a period, worst first."""
-    return json_response(
-        {"by": query.by, "items": app.spacecraft.worst_batches(name, **query.asked())}
-    )
+    worst = app.spacecraft.worst_batches(name, **query.asked())
+    return json_response(Ranking(by=query.by, items=worst))

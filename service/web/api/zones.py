@@ -55,10 +55,10 @@ def warm_zones(body: JsonBody, app: AppDep, caller: CallerDep) -> Response:
     asked = read_model(WarmIn, body)
     caller.require(asked.spacecraft)
     warmed = app.zones.warm(asked.spacecraft, asked.a_priori, asked.time)
-    return json_response({"items": warmed})
+    return json_response(ZoneList(items=warmed))
 
 
 @router.delete("", **route_docs({200: ResponseDoc("The number of dropped zones.", Dropped)}))
 def drop_zones(query: Annotated[DropQuery, InQuery()], app: AppDep) -> Response:
     """Drop cached zones; the next batch builds its zones again."""
-    return json_response({"dropped": app.zones.drop(query.spacecraft)})
+    return json_response(Dropped(dropped=app.zones.drop(query.spacecraft)))

@@ -17,6 +17,7 @@ from service.alarms.limits import Severity
 from service.app.factory import App
 from service.ingest.submit import Recorded
 from service.storage.models.alarms import Alarm
+from service.storage.models.zones import ZoneCache
 from service.storage.queries.future_dated import LIVE
 from service.storage.recording.unsaved_result import Row
 
@@ -92,27 +93,27 @@ class _GaugeCollector(Collector):
             yield from _of_backlog(found["backlog"])
 
 
-def _of_zones(cache: Row) -> Iterator[Metric]:
+def _of_zones(cache: ZoneCache) -> Iterator[Metric]:
     """The cache of zones and run catalogs."""
     yield CounterMetricFamily(
         "starid_zone_cache_hits",
         "Zones and run catalogs found in the cache; replays have others.",
-        value=cache["hits"],
+        value=cache.hits,
     )
     yield CounterMetricFamily(
         "starid_zone_cache_misses",
         "Zones and run catalogs built.",
-        value=cache["misses"],
+        value=cache.misses,
     )
     yield CounterMetricFamily(
         "starid_zone_build_seconds",
         "Time spent building them.",
-        value=cache["build_us"] / 1e6,
+        value=cache.build_us / 1e6,
     )
     yield GaugeMetricFamily(
         "starid_zone_cache_bytes",
         "Memory that the cache holds.",
-        value=cache["bytes"],
+        value=cache.bytes,
     )
 
 

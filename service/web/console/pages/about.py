@@ -3,6 +3,7 @@
 from typing import Annotated
 
 from fastapi import Query as InQuery
+from msgspec import structs
 from starlette.responses import Response
 
 from service.web.console.page_context import ContextDep, PageQuery
@@ -15,5 +16,6 @@ from service.web.requests.access import Policy
 def about_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
     """Version, catalog, missions, database and credits."""
     about = context.app.service.about()
-    about["missions"] = [each for each in about["missions"] if context.caller.may_see(each["name"])]
+    missions = [each for each in about.missions if context.caller.may_see(each.name)]
+    about = structs.replace(about, missions=missions)
     return rendered("about.html.jinja", context.layout(query.run), about=about)

@@ -1,7 +1,6 @@
 """The page that compares two sets of options over the same recorded batches."""
 
-from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import Depends
 from pydantic import Field, ValidationError
@@ -10,6 +9,7 @@ from starlette.responses import Response
 
 from service.errors import BadBatch, Fault, shown_value
 from service.observations.schema import Key, OptionsIn
+from service.storage.models.compare import Comparison
 from service.times import parse_utc
 from service.web.api.compare import WORK_S
 from service.web.console.options import asked_options, fields_of, settings_of_mission
@@ -76,8 +76,8 @@ def compare_page(
     )
 
 
-def _matrix(result: Mapping[str, Any] | None) -> dict[tuple[str, str], int]:
+def _matrix(result: Comparison | None) -> dict[tuple[str, str], int]:
     """How many stars went from which outcome to which."""
     if result is None:
         return {}
-    return {(each["from"], each["to"]): each["stars"] for each in result["transitions"]}
+    return {(each.from_, each.to): each.stars for each in result.transitions}

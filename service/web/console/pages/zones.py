@@ -17,12 +17,12 @@ MOST_SHOWN = 60
 def zones_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
     """Cached zones and run catalogs, the most recently used first."""
     cache = context.app.zones.state()
-    epochs = {each["digest"]: each["epoch_year"] for each in cache["run_catalogs"]}
+    epochs = {each.digest: each.epoch_year for each in cache.run_catalogs}
     return rendered(
         "zones.html.jinja",
         context.layout(query.run),
         cache=cache,
-        zones=list(reversed(cache["items"]))[:MOST_SHOWN],
+        zones=cache.items[::-1][:MOST_SHOWN],
         epochs=epochs,
         spacecraft=context.spacecraft,
     )
