@@ -70,7 +70,11 @@ class Star(Record, frozen=True, kw_only=True):
         ),
     ]
     residual_arcsec: Annotated[float | None, doc("null if the attitude does not use the star.")]
-    flags: list[Annotated[str, DescribedAs(Literal["outside_field_of_view", "no_magnitude"])]]
+    flags: list[
+        Annotated[
+            str, DescribedAs(Literal["outside_field_of_view", "no_magnitude", "same_star_twice"])
+        ]
+    ]
 
 
 ZoneKind = Annotated[str, DescribedAs(Literal["cap", "band"])]
