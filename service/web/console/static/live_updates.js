@@ -1,13 +1,14 @@
-// The live connection: hears what was recorded and has the page drawn anew, without losing anything.
+// The event stream: it reports what was recorded, and the page is then fetched and redrawn.
 //
-// Every message has a number.  After a break the last one heard is named, and what came since
-// follows.  A hidden page lets go of its connection, since a browser keeps only six to a server,
-// and catches up when it is looked at again.
+// Every event has a number.  After an interruption the request names the last number received, and
+// the events since then follow.  A hidden page closes its stream, because a browser keeps only six
+// connections to a server, and catches up when it is visible again.
 import { fetchLatest, swapRegions } from "./regions.js";
 
 const EVENT_KINDS = ["batches", "alarm", "limit", "replay", "adopted"];
 const DRAW_EVERY_MS = 1000;
-const RECONNECT_MS = 1000;
+const FIRST_RETRY_MS = 1000;
+const LONGEST_RETRY_MS = 30000;
 const SHOW_LOST_AFTER_MS = 3000;
 const POLL_MS = 10000;
 
@@ -17,23 +18,26 @@ let source = null;
 let last = document.body.dataset.lastEvent || null;
 let drawing = null;
 let lostAt = null;
+let retryMs = FIRST_RETRY_MS;
+let retry = null;
+let refused = false;
 let stale = false;
 
 function clock(moment) {
   return moment.toISOString().slice(0, 19).replace("T", " ");
 }
 
-function say(state, text) {
+function showState(state, text) {
   shown.className = "";
   shown.dataset.state = state;
   shown.textContent = text;
 }
 
-function isOurs(data) {
+function concernsRun(data) {
   return data.run === undefined || data.run === run;
 }
 
-// Draws soon, and not more often than once a second however much is recorded.
+// Redraws the page soon, at most once a second however much is recorded.
 export function refreshSoon() {
   drawing ??= setTimeout(async () => {
     drawing = null;
@@ -42,21 +46,21 @@ export function refreshSoon() {
       if (fresh === null) return;
       swapRegions(fresh);
       document.dispatchEvent(new CustomEvent("drawn"));
-      if (stale && lostAt === null) say("live", "● Connected");
+      if (stale && lostAt === null && !refused) showState("live", "● Connected");
       stale = false;
     } catch (error) {
       stale = true;
-      say("lost", `▲ Not up to date: ${error.message}; trying again every ${POLL_MS / 1000} s; the page shows the previous state`);
+      showState("lost", `▲ Not up to date: ${error.message}; trying again every ${POLL_MS / 1000} s; the page shows the previous state`);
       setTimeout(refreshSoon, POLL_MS);
     }
   }, DRAW_EVERY_MS);
 }
 
-// How long ago something was, counted on from what the page was drawn with.
+// Ages on the page, counted on from the time at which it was drawn.
 let drawnAt = performance.now();
 document.addEventListener("drawn", () => (drawnAt = performance.now()));
 
-function inWords(seconds) {
+function ageText(seconds) {
   const whole = Math.max(0, Math.round(seconds));
   const units = [[86400, "d", 3600, "h"], [3600, "h", 60, "min"], [60, "min", 1, "s"]];
   for (const [size, unit, below, smaller] of units) {
@@ -69,68 +73,111 @@ function inWords(seconds) {
 
 setInterval(() => {
   for (const each of document.querySelectorAll("[data-age]")) {
-    each.textContent = inWords(Number(each.dataset.age) + (performance.now() - drawnAt) / 1000);
+    each.textContent = ageText(Number(each.dataset.age) + (performance.now() - drawnAt) / 1000);
   }
 }, 1000);
 
-function connect() {
+function streamAddress() {
   const query = new URLSearchParams({ run });
   if (document.body.dataset.stream) query.set("spacecraft", document.body.dataset.stream);
   if (last !== null) query.set("last_event_id", last);
-  source = new EventSource(`/api/v1/events?${query}`);
-  source.addEventListener("hello", (event) => heardFirst(event));
+  return `/api/v1/events?${query}`;
+}
+
+function connect() {
+  source = new EventSource(streamAddress());
+  source.addEventListener("hello", connected);
   source.addEventListener("reset", (event) => {
     last = event.lastEventId;
     refreshSoon();
   });
-  for (const kind of EVENT_KINDS) source.addEventListener(kind, (event) => heard(kind, event));
-  source.addEventListener("error", lost);
+  for (const kind of EVENT_KINDS) source.addEventListener(kind, received);
+  source.addEventListener("error", interrupted);
 }
 
-function heardFirst(event) {
-  // What came since the number that was asked for follows by itself.
+function connected(event) {
+  // The events since the requested number follow.
   last = event.lastEventId;
   lostAt = null;
-  say("live", "● Connected");
+  retryMs = FIRST_RETRY_MS;
+  showState("live", "● Connected");
 }
 
-function heard(kind, event) {
+function received(event) {
   last = event.lastEventId || last;
-  const data = JSON.parse(event.data);
-  if (!isOurs(data)) return;
-  document.dispatchEvent(new CustomEvent("heard", { detail: { kind, data } }));
-  refreshSoon();
+  if (concernsRun(JSON.parse(event.data))) refreshSoon();
 }
 
-function lost() {
-  // Streams end now and then by design, and the next attempt succeeds: no reason for alarm yet.
+async function interrupted() {
+  // Streams end now and then by design, and the next attempt succeeds: that is not shown.
   if (lostAt === null) {
     lostAt = new Date();
-    setTimeout(tellLost, SHOW_LOST_AFTER_MS);
+    setTimeout(showLost, SHOW_LOST_AFTER_MS);
   }
-  // Tried again here and not by the browser, so that the number asked for is the last one heard.
+  // A browser gives up a stream that was answered with a status other than 200.
+  const wasRefused = source.readyState === EventSource.CLOSED;
+  // Opened again here and not by the browser, so that the request names the last number received.
   source.close();
   source = null;
-  setTimeout(() => source ?? (document.hidden || connect()), RECONNECT_MS);
+  let waitMs = retryMs;
+  retryMs = Math.min(2 * retryMs, LONGEST_RETRY_MS);
+  if (wasRefused) {
+    const { status, retryAfterMs } = await refusal();
+    if (status === 401 || status === 403) {
+      stop(status);
+      return;
+    }
+    waitMs = Math.max(waitMs, retryAfterMs);
+  }
+  scheduleRetry(waitMs);
 }
 
-function tellLost() {
+// The status of the stream's address, which an EventSource does not report; 0 without an answer.
+async function refusal() {
+  const ended = new AbortController();
+  try {
+    const { status, headers } = await fetch(streamAddress(), { signal: ended.signal });
+    return { status, retryAfterMs: 1000 * (Number(headers.get("Retry-After")) || 0) };
+  } catch {
+    return { status: 0, retryAfterMs: 0 };
+  } finally {
+    ended.abort();
+  }
+}
+
+function scheduleRetry(waitMs) {
+  clearTimeout(retry);
+  retry = setTimeout(() => {
+    retry = null;
+    if (source === null && !document.hidden) connect();
+  }, waitMs);
+  if (lostAt !== null && new Date() - lostAt > SHOW_LOST_AFTER_MS) showLost();
+}
+
+function stop(status) {
+  refused = true;
+  lostAt = null;
+  const reason = status === 401 ? "The session has ended: sign in again" : "This token may not read the events";
+  showState("lost", `▲ Not connected. ${reason}; the page shows the state of ${clock(new Date())} UTC`);
+}
+
+function showLost() {
   if (lostAt === null) return;
-  say("lost", `▲ Connection lost since ${clock(lostAt)} UTC; trying again every second. The page shows the previous state`);
+  showState("lost", `▲ Connection lost since ${clock(lostAt)} UTC; trying again. The page shows the previous state`);
 }
 
 export function keepFresh() {
   // There is no stream for a token that is bound to several spacecraft.
   if (document.body.dataset.stream === "none") {
     setInterval(() => document.hidden || refreshSoon(), POLL_MS);
-    say("live", "● Updated every 10 s");
+    showState("live", "● Updated every 10 s");
     return;
   }
   document.addEventListener("visibilitychange", () => {
     if (document.hidden) {
       source?.close();
       source = null;
-    } else if (source === null) connect();
+    } else if (source === null && retry === null && !refused) connect();
   });
   if (!document.hidden) connect();
 }
