@@ -18,7 +18,7 @@ ARROW_PX = 28.0
 MOST_ENLARGED = 5000.0
 RADIUS_PX, SMALL_RADIUS_PX = 9, 5
 LINE_PX = 18
-FOOT_PX = 2 * LINE_PX + 8
+FOOT_PX = 3 * LINE_PX + 8
 
 Color = tuple[int, int, int]
 COLORS: Mapping[str, Color] = {
@@ -74,7 +74,8 @@ def _draw_mark(
     else:
         draw.ellipse(box, outline=color, width=1 if mark.kind == "left_out" else 2)
     if mark.predicted_px is not None:
-        du, dv = mark.predicted_px[0] - mark.u_px, mark.predicted_px[1] - mark.v_px
+        # Observed minus predicted, as the star field of the console shows it.
+        du, dv = mark.u_px - mark.predicted_px[0], mark.v_px - mark.predicted_px[1]
         _draw_arrow(draw, x, y, du * factor, dv * factor)
     if mark.label or mark.kind == "unmatched":
         text = mark.label or "?"
@@ -116,5 +117,5 @@ def _draw_foot(
         draw.text((x, top + 4 + LINE_PX), text, color, font=font)  # type: ignore[arg-type]
         x += draw.textlength(text, font=font) + 16  # type: ignore[arg-type]
     if factor:
-        text = f"arrows: to the predicted place, {factor:,.0f} times enlarged"
-        draw.text((x, top + 4 + LINE_PX), text, _ARROW, font=font)  # type: ignore[arg-type]
+        text = f"arrows: from the expected to the measured place, {factor:,.0f} times enlarged"
+        draw.text((6, top + 4 + 2 * LINE_PX), text, _ARROW, font=font)  # type: ignore[arg-type]

@@ -21,10 +21,10 @@ def overlay(marks):
 
 
 @pytest.mark.parametrize("along", [(0.05, 0.0), (-0.05, 0.0), (0.0, 0.05), (0.0, -0.05)])
-def test_an_arrow_leads_from_the_star_to_its_predicted_place(along):
+def test_an_arrow_points_from_the_expected_to_the_measured_place(along):
     """Columns to the right and rows downwards, as on the frame; longer, but no other way."""
     u, v = 100.0, 140.0
-    picture = overlay([Mark(u, v, "unique", predicted_px=(u + along[0], v + along[1]))])
+    picture = overlay([Mark(u, v, "unique", predicted_px=(u - along[0], v - along[1]))])
     rows, columns = np.nonzero((picture[: 3 * SIDE_PX] == ARROW).all(axis=2))
     star = 3.0 * (np.array([u, v]) + 0.5)
     away = np.array([columns, rows]).T - star
