@@ -41,6 +41,7 @@ from benchmarks.validation import (
     zone_counts,
 )
 from benchmarks.validation.lost_in_space import measure as lost_in_space
+from benchmarks.validation.pictures import blind, calibrations
 
 BENCHMARKS: dict[str, Callable[[bool, int], Report]] = {
     "zone_counts": zone_counts.run,
@@ -65,6 +66,8 @@ BENCHMARKS: dict[str, Callable[[bool, int], Report]] = {
     "stored": stored.run,
     "soak": soak.run,
     "lost_in_space": lost_in_space.run,
+    "pictures": blind.run,
+    "camera_calibrations": calibrations.run,
 }
 OF_SPEED = tuple(performance.TITLES)
 BY_NAME_ALONE = ("soak",)

@@ -32,8 +32,8 @@ class CameraCalibration:
     `covariance` (4, 4) is of the logarithm of the focal length, the bend and the centre in
     units of the half diagonal, scaled by the residuals.  Places and residuals are (n, 2):
     before, with a focal length alone, of all stars, and after, without those left out.
-    `centroid_sigma_px` is the median predicted error of a place; `sigma_floor_px` what is left
-    beside it.
+    `centroid_sigma_px` is the predicted error of a place, as an rms over the stars of `after_px`;
+    `sigma_floor_px` what is left beside it.
     """
 
     lens: Lens
@@ -73,8 +73,13 @@ class _View:
     attitude: Matrix
     u_px: Vector
     v_px: Vector
-    sigma_px: Vector
+    told_px: Vector
     star: Vector
+
+    @property
+    def sigma_px(self) -> Vector:
+        """The predicted errors of places, none better than what a lens's model may be."""
+        return np.maximum(self.told_px, LEAST_SIGMA_PX)
 
 
 def calibrate_camera(
@@ -102,11 +107,12 @@ def calibrate_camera(
     lens, covariance = _fit(lens, views, len(PARAMETERS))
     after = np.concatenate([_residuals(lens, view) for view in views])
     sigma = np.concatenate([view.sigma_px for view in views])
+    told = np.concatenate([view.told_px for view in views])
     freedom = max(after.size - 3 * len(views) - len(PARAMETERS), 1)
     scale2 = float(((after / sigma[:, None]) ** 2).sum()) / freedom
     covariance = covariance * scale2
-    told = np.concatenate([_told_sigma(result) for result in results])
-    variance = float((after**2).sum()) / freedom - float(np.median(told)) ** 2
+    told_px2 = float(np.mean(told**2))
+    variance = float((after**2).sum()) / freedom - told_px2
     found = [each.attitude for each in results if each.attitude is not None]
     exposures = [each.frame.exposure_s for each in results if each.frame.exposure_s is not None]
     zero = np.array([each.zero_point_mag for each in found])
@@ -118,7 +124,7 @@ def calibrate_camera(
         place_px=np.concatenate([np.column_stack([v.u_px, v.v_px]) for v in views]),
         before_px=before,
         after_px=after,
-        centroid_sigma_px=float(np.median(told)),
+        centroid_sigma_px=math.sqrt(told_px2),
         sigma_floor_px=max(math.sqrt(max(variance, 0.0)), LEAST_FLOOR_PX),
         psf_sigma_px=float(np.median([each.points.psf_sigma_px for each in results])),
         noise_counts=float(np.median([each.points.noise_counts for each in results])),
@@ -135,7 +141,7 @@ def _view(result: PictureResult, star: Vector) -> _View:
     found = result.attitude
     assert found is not None
     u, v = (np.array([getattr(each, name) for each in found.stars]) for name in ("u_px", "v_px"))
-    return _View(found.fit.attitude, u, v, np.maximum(_told_sigma(result), LEAST_SIGMA_PX), star)
+    return _View(found.fit.attitude, u, v, _told_sigma(result), star)
 
 
 def _told_sigma(result: PictureResult) -> Vector:
@@ -149,7 +155,7 @@ def _told_sigma(result: PictureResult) -> Vector:
 
 def _keep(view: _View, good: Vector) -> None:
     view.u_px, view.v_px = view.u_px[good], view.v_px[good]
-    view.sigma_px, view.star = view.sigma_px[good], view.star[good]
+    view.told_px, view.star = view.told_px[good], view.star[good]
 
 
 def _residuals(lens: Lens, view: _View) -> Vector:

@@ -30,6 +30,12 @@ MAX_POINTS = 300
 FIRST_THRESHOLD, SECOND_THRESHOLD = 5.0, 3.5
 FULL_SHARE = 0.9
 """Of the largest count: images with a higher peak may be cut off, and tell no width."""
+PLACE_NOISE = 1.34
+"""The error of a place times the signal to noise, in widths of a star's image.
+
+The least that there can be is the root of 2 behind a filter with the image of a star alone; the
+surround takes 5 % off the ratio.
+"""
 _LEAST_SIGMA_PX = 0.05
 _CENTROID_ROUNDS = 6
 
@@ -82,7 +88,7 @@ def find_points(counts: Counts, threshold: float = FIRST_THRESHOLD) -> PointSour
     u, v, ratio = u[order], v[order], ratio[order]
     weight = max(psf, 1.0)
     shapes = _moments(light, u, v, weight)
-    sigma = np.maximum(1.2 * psf / np.maximum(ratio, 1.0), _LEAST_SIGMA_PX)
+    sigma = np.maximum(PLACE_NOISE * psf / np.maximum(ratio, 1.0), _LEAST_SIGMA_PX)
     offset = 0.5 * (binning - 1)
     return PointSources(
         u_px=read_only(shapes.u_px * binning + offset),

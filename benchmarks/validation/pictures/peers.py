@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from benchmarks.lost_in_space_peers import CACHE
+from benchmarks.validation.lost_in_space.peers import CACHE
 from service.acquire.picture import blind_sky, solve_picture
 from service.imaging.frames.frame import Frame
 from service.sky.catalog.star_catalog import load_embedded
@@ -166,7 +166,7 @@ def _tetra3rs() -> PictureSolver:
 
 def _made(name: str, make: Callable[[Path], None]) -> Path:
     CACHE.mkdir(exist_ok=True)
-    path = CACHE / name
+    path: Path = CACHE / name
     if not path.exists():
         part = path.with_name(f"part-{name}")
         make(part)

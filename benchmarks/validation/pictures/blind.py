@@ -1,9 +1,9 @@
 """Pictures of cameras of which nothing is known: right, wrong or none, how honest, how fast.
 
-    python -m benchmarks.pictures --pictures 500 --seed 3
-    python -m benchmarks.pictures --folder real-data/pictures     real ones with truth.json too
-    python -m benchmarks.pictures ... --write                     into docs/cameras.md
-    PYTHONPATH=peers python -m benchmarks.pictures ...            beside cedar-solve and tetra3rs
+    python -m benchmarks.validation.pictures.blind --pictures 500 --seed 3
+    ... --folder real-data/pictures    real ones too, whose truth is in truth.json
+    ... --write                        into docs/cameras.md
+    PYTHONPATH=peers ...               beside cedar-solve and tetra3rs
 
 Pictures are drawn with random lenses: 5 to 50 degrees, distortion to 3 %, any gain, backgrounds
 of which some are clipped to black, JPEG of quality 70.  Every solver is told the field to 10 %, or
@@ -26,10 +26,10 @@ from scipy.stats import chi2
 from tqdm import tqdm
 
 from benchmarks.bounds import at_least, at_most
-from benchmarks.pictures_peers import YEAR, PictureSolver, solvers
-from benchmarks.record import CORE, IMAGING, record_of
+from benchmarks.record import record_of
 from benchmarks.report import Report
-from benchmarks.sections import table
+from benchmarks.validation.pictures.document import SOURCES, write_part
+from benchmarks.validation.pictures.peers import YEAR, PictureSolver, solvers
 from service.acquire.picture import blind_sky
 from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import ARCSEC_PER_RADIAN, Matrix, attitude_error_arcsec
@@ -41,9 +41,6 @@ RIGHT_SHARE, RIGHT_ROLL_DEG = 0.01, 1.0
 """Right is a boresight within a share of the field, and a roll within so many degrees."""
 QUANTILES = (0.25, 0.5, 0.75, 0.9, 0.99)
 RIGHT_LEAST = 0.9
-SOURCES = (*CORE, *IMAGING, "tests/pictures/drawn.py", "benchmarks/pictures_peers.py")
-DOCUMENT = Path(__file__).parent.parent / "docs" / "cameras.md"
-START, END = "<!-- measured by benchmarks.pictures -->", "<!-- end of measured -->"
 
 
 def run(quick: bool, seed: int) -> Report:
@@ -160,13 +157,6 @@ def _kinds(rows: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
     return kinds
 
 
-def section(report: Report, arguments: str) -> str:
-    """What the page says of a run."""
-    record = record_of((*SOURCES, "benchmarks/pictures.py"))
-    figures = table(("", "figure"), list(report.figures.items()))
-    return f"{START}\n\n{figures}\n\n{record.sentence} `{arguments}`\n{END}"
-
-
 def main() -> int:
     """Measure, print, and write the page if asked to; 1 where a figure is out of bounds."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -176,16 +166,12 @@ def main() -> int:
     parser.add_argument("--log", type=Path, help="what is done; default: by the code's digest")
     parser.add_argument("--write", action="store_true", help="the section of docs/cameras.md")
     parsed = parser.parse_args()
-    digest = record_of((*SOURCES, "benchmarks/pictures.py")).sources
+    digest = record_of(SOURCES).sources
     log = parsed.log or Path(tempfile.gettempdir()) / f"pictures-{parsed.seed}-{digest}.jsonl"
     report = _report(measured(parsed.pictures, parsed.seed, parsed.folder, solvers(), log))
     print(report.text())
     if parsed.write:
-        text = DOCUMENT.read_text(encoding="utf-8")
-        before, _, rest = text.partition(START)
-        again = f"python -m benchmarks.pictures --pictures {parsed.pictures} --seed {parsed.seed}"
-        made = section(report, again) + rest.partition(END)[2]
-        DOCUMENT.write_text(before + made, encoding="utf-8")
+        write_part("blind", report, f"--pictures {parsed.pictures} --seed {parsed.seed}")
     return 0 if report.passed else 1
 
 

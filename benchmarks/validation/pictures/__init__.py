@@ -1,0 +1,1 @@
+"""Pictures of cameras without a mission: attitudes, sigmas, time, peers, and calibrations."""

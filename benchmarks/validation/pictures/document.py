@@ -1,0 +1,31 @@
+"""The measured parts of docs/cameras.md, each between two comments."""
+
+from benchmarks.record import ROOT, record_of
+from benchmarks.report import Report
+from benchmarks.sections import table
+
+DOCUMENT = ROOT / "docs" / "cameras.md"
+SOURCES = (
+    "catalogs/stars.npz",
+    "service/acquire/camera_calibration.py",
+    "service/acquire/picture.py",
+    "service/identify/blind",
+    "service/imaging/detection/points.py",
+    "service/imaging/frames",
+    "service/sky/whole_sky",
+    "service/vectors.py",
+    "tests/pictures/drawn.py",
+    "benchmarks/validation/pictures",
+)
+"""What the answer to a picture depends on."""
+
+
+def write_part(name: str, report: Report, options: str) -> None:
+    """Put the figures of a run of a module of this folder between its comments."""
+    module = f"benchmarks.validation.pictures.{name}"
+    start, end = f"<!-- measured by {module} -->", f"<!-- end of {name} -->"
+    figures = table(("", "figure"), list(report.figures.items()))
+    record = record_of(SOURCES)
+    part = f"{start}\n{figures}\n\n{record.sentence} Again:\n`python -m {module} {options}`.\n{end}"
+    before, _, rest = DOCUMENT.read_text(encoding="utf-8").partition(start)
+    DOCUMENT.write_text(before + part + rest.partition(end)[2], encoding="utf-8")
