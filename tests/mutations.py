@@ -8,6 +8,7 @@ one JSON line: how many were read, how many refused, and the most memory held.
 """
 
 import gzip
+import importlib.util
 import io
 import json
 import random
@@ -37,6 +38,7 @@ from service.simulate.telemetry import draw_pass
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import import_csv, import_sky2000, load, load_embedded, save
 from service.sky.model import SkyModel
+from tests.imaging.colour_files import colours, dng, png_of_16_bits, tiff_of_16_bits
 from tests.sky.sky2000_records import SIRIUS, written
 
 MORE_MEMORY = 1 << 30
@@ -128,6 +130,19 @@ def picture(file_format, dtype=np.uint16, **options):
     return file.getvalue()
 
 
+def color_picture(file_format, **options):
+    file = io.BytesIO()
+    values = np.random.default_rng(6).integers(0, 256, (12, 20, 3)).astype(np.uint8)
+    Image.fromarray(values).save(file, file_format, **options)
+    return file.getvalue()
+
+
+def exif():
+    told = Image.Exif()
+    told.get_ifd(0x8769).update({33434: 0.5, 36867: "2026:03:01 00:00:00", 36881: "+01:00"})
+    return told
+
+
 def read_frame_of(data):
     read_frame(io.BytesIO(data), FRAME_LIMITS)
 
@@ -196,6 +211,33 @@ class Readers:
     def png_with_right_sums(self):
         return picture("PNG", np.uint8), lambda data: read_frame_of(with_right_sums(data))
 
+    def png_in_colour(self):
+        return color_picture("PNG"), lambda data: read_frame_of(with_right_sums(data))
+
+    def jpeg(self):
+        return picture("JPEG", np.uint8, quality=90), read_frame_of
+
+    def jpeg_in_colour(self):
+        return color_picture("JPEG", progressive=True, exif=exif()), read_frame_of
+
+    def bmp(self):
+        return picture("BMP", np.uint8), read_frame_of
+
+    def bmp_in_colour(self):
+        return color_picture("BMP"), read_frame_of
+
+    def png_of_16_bits_in_colour(self):
+        good = png_of_16_bits(colours(np.random.default_rng(7), 12, 20))
+        return good, lambda data: read_frame_of(with_right_sums(data))
+
+    def tiff_of_16_bits_in_colour(self):
+        good = tiff_of_16_bits(colours(np.random.default_rng(7), 12, 20))
+        return good, read_frame_of
+
+    def raw(self):
+        good = dng(np.random.default_rng(8).integers(0, 4000, (64, 96)).astype(np.uint16))
+        return good, read_frame_of
+
     def npy(self):
         file = io.BytesIO()
         np.save(file, frame_counts())
@@ -211,7 +253,13 @@ class Readers:
         return write_and_read
 
 
-NAMES = tuple(name for name in vars(Readers) if not name.startswith("_"))
+NEEDS = {"raw": "rawpy"}
+"""Packages without which a reader refuses every file."""
+NAMES = tuple(
+    name
+    for name in vars(Readers)
+    if not name.startswith("_") and (name not in NEEDS or importlib.util.find_spec(NEEDS[name]))
+)
 
 
 def main(name, count, seed):

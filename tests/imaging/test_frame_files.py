@@ -1,5 +1,6 @@
 """Frames are read as other readers read them, whatever the file's kind; truth is kept exactly."""
 
+import importlib.util
 import io
 import math
 
@@ -8,9 +9,11 @@ import pytest
 from astropy.io import fits
 from PIL import Image
 
+from service.errors import BadFile
 from service.imaging.frames.files import read_frame
 from service.imaging.frames.fits import write_fits
 from service.imaging.frames.frame import FrameLimits
+from tests.imaging.colour_files import colours, dng, png_of_16_bits, tiff_of_16_bits
 
 LIMITS = FrameLimits(max_pixels=1_000_000)
 
@@ -151,3 +154,47 @@ def test_a_jpeg_tells_its_exposure_and_its_time_where_the_clock_s_offset_is_know
     frame = read(file.getvalue())
     assert frame.exposure_s == 2.0
     assert frame.time == time
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        png_of_16_bits,
+        tiff_of_16_bits,
+        lambda values: tiff_of_16_bits(values, ">"),
+        lambda values: tiff_of_16_bits(values, packed=True),
+        lambda values: tiff_of_16_bits(values, ">", packed=True),
+    ],
+    ids=["png", "tiff", "tiff of great ends", "tiff deflated", "tiff deflated of great ends"],
+)
+def test_colours_of_16_bits_keep_all_of_them(rng, write):
+    values = colours(rng)
+    frame = read(write(values))
+    assert np.array_equal(frame.counts, values.sum(axis=2, dtype=np.int64))
+    assert frame.full_scale == 3 * 65535
+
+
+def test_how_opaque_a_pixel_of_16_bits_is_is_not_looked_at(rng):
+    values = colours(rng)
+    opaque = np.concatenate([values, values[:, :, :1]], axis=2)
+    frame = read(png_of_16_bits(opaque))
+    assert np.array_equal(frame.counts, values.sum(axis=2, dtype=np.int64))
+
+
+def test_a_raw_file_without_the_package_is_refused_with_what_to_install(counts, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    for data in (dng(counts), b"II*\0\x10\0\0\0CR\2\0", b"FUJIFILMCCD-RAW 0201"):
+        with pytest.raises(BadFile, match=r"rawpy: install the extra `raw`"):
+            read(data)
+
+
+def test_of_a_raw_file_the_pattern_is_summed(rng):
+    pytest.importorskip("rawpy")
+    values = rng.integers(100, 4000, (96, 128)).astype(np.uint16)
+    frame = read(dng(values))
+    assert frame.file_format == "RAW"
+    assert np.array_equal(frame.counts, values.reshape(48, 2, 64, 2).sum(axis=(1, 3)))
+    with pytest.raises(BadFile, match="at most 3,000 pixels"):
+        read(dng(values), FrameLimits(max_pixels=3000))
+    with pytest.raises(BadFile):
+        read(dng(values)[:5000])

@@ -30,7 +30,7 @@ def add(commands: Any) -> None:
     parser = add_command(
         commands,
         "frame",
-        "Detect the stars in frames and pictures (FITS, TIFF, PNG, JPEG, BMP, .npy), identify "
+        "Detect the stars in frames and pictures (FITS, TIFF, PNG, JPEG, BMP, raw, .npy), identify "
         "them and solve for the attitude.  Frames of a spacecraft are recorded; one that is sent "
         "again returns the first answer.  Without a spacecraft a picture may be from any camera: "
         "its lens is fitted with the attitude, and nothing is recorded.",

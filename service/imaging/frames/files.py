@@ -1,4 +1,4 @@
-"""Frames from files: FITS, TIFF, PNG, JPEG, BMP and numpy arrays, told apart by how they begin.
+"""Frames from files: FITS, pictures, raw files and numpy arrays, told apart by how they begin.
 
 A file is not to be believed.  Its size in pixels is read from its header and held
 against the limits before anything is decoded; what is read is bounded by that size
@@ -10,10 +10,11 @@ from collections.abc import Callable, Mapping
 from typing import IO
 
 from service.imaging.frames.frame import Frame, FrameLimits, refused
+from service.imaging.frames.raw import is_raw, read_raw
 
 Reader = Callable[[IO[bytes], FrameLimits, str], Frame]
 
-FORMATS = "FITS, TIFF, PNG, JPEG, BMP or a numpy array (.npy)"
+FORMATS = "FITS, TIFF, PNG, JPEG, BMP, a camera's raw file or a numpy array (.npy)"
 _LONGEST_MAGIC = 16
 
 
@@ -27,6 +28,9 @@ def read_frame(file: IO[bytes], limits: FrameLimits, digest: str | None = None) 
     start = file.read(_LONGEST_MAGIC)
     if not start:
         raise refused("is empty; it must hold a file: " + FORMATS)
+    if is_raw(file, start):
+        file.seek(0)
+        return read_raw(file, limits, digest)
     for magics, reader in _READERS.items():
         if start.startswith(magics):
             file.seek(0)

@@ -1,4 +1,4 @@
-"""Frames from TIFF, PNG, JPEG and BMP files: grey of up to 32 bits, or colours of 8."""
+"""Frames from TIFF, PNG, JPEG and BMP files: grey of up to 32 bits, or colours of up to 16."""
 
 import math
 import os
@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from service.errors import BadFile
 from service.imaging.frames.arrays import counts_of, full_scale_of
+from service.imaging.frames.deep_color import deep_light, is_deep
 from service.imaging.frames.frame import Frame, FrameLimits, refused
 
 GREY = ("L", "I;16", "I;16B", "I;16L", "I", "F")
@@ -45,8 +46,13 @@ def read_picture(file: IO[bytes], file_format: str, limits: FrameLimits, digest:
             limits.require(*image.size)
             if file_format != "JPEG" and getattr(image, "n_frames", 1) > 1:
                 raise refused(SEVERAL)
+            # To look for EXIF may decode the picture, and takes the word of its depth away.
+            deep = is_deep(image)
             told = _told(image)
-            values, full_scale = _light(image)
+            if deep:
+                values, full_scale = deep_light(image, file, file_format), 3.0 * 65535.0
+            else:
+                values, full_scale = _light(image)
     except BadFile:
         raise
     except Exception as error:
