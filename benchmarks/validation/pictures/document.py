@@ -26,6 +26,7 @@ def write_part(name: str, report: Report, options: str) -> None:
     start, end = f"<!-- measured by {module} -->", f"<!-- end of {name} -->"
     figures = table(("", "figure"), list(report.figures.items()))
     record = record_of(SOURCES)
-    part = f"{start}\n{figures}\n\n{record.sentence} Again:\n`python -m {module} {options}`.\n{end}"
+    again = f"{record.sentence} Again:\n`python -m {module} {options}`."
+    part = f"{start}\n\n{figures}\n\n{again}\n{end}"
     before, _, rest = DOCUMENT.read_text(encoding="utf-8").partition(start)
     DOCUMENT.write_text(before + part + rest.partition(end)[2], encoding="utf-8")
