@@ -9,7 +9,7 @@ from service.acquire import acquire
 from service.observations.schema import submission_from_json
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
-from service.simulate.two_groups import Views
+from service.simulate.two_groups import GHOST_SHIFT_DEG, Views
 from service.vectors import rotate_about
 from tests.advice.passes import mission_like
 from tests.reference.two_groups import acquired, is_at, is_good, simple, two_groups
@@ -122,3 +122,15 @@ def test_points_that_are_no_stars_give_no_good_attitude(views, points):
     drawn = views("XTE", points)
     group = (drawn.random_points(points) for _ in range(16 * BATCHES))
     assert simple(drawn, group, False).wrong <= 1
+
+
+def test_equal_reflections_are_weighed_with_all_their_stars(views):
+    """Among both groups the whole sky names some stars of one; that is no reason for the other."""
+    drawn = views("SOHO", 10)
+    for _ in range(12 * BATCHES):
+        real = drawn.field(10)
+        ghost = drawn.group(drawn.shifted(real.attitude, *GHOST_SHIFT_DEG), real.star)
+        batch, order = drawn.batch(real, ghost, prior=drawn.prior(real.attitude))
+        identification = acquired(drawn, batch).trackers[0].identification
+        is_ghost = np.repeat([False, True], 10)[order]
+        assert not (identification.unique & is_ghost).any()

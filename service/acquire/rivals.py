@@ -61,6 +61,11 @@ def find_groups(
         # Another tracker decided for this group: then the hypothesis is what is left over.
         left = [mask & ~each for mask, each in zip(found.explained, found.unique, strict=True)]
         other = _group(search, corrected, left)
+    else:
+        # Among stars of both groups the search of the whole sky leaves some of the first unnamed.
+        alone = _group(search, corrected, [~mask for mask in other.unique])
+        if alone is not None and _differ(alone.solution, other.solution):
+            first = alone
     if other is None or not _differ(first.solution, other.solution):
         # The same attitude twice: every star was sent twice, say.
         return found, None
