@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from service.identify.blind.lens import Lens
 from service.identify.blind.verify import Points, Stars, Verified, matched, refine, verify
@@ -103,7 +102,7 @@ class BlindSolver:
     _levels: dict[float, QuadLevel] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.stars = Stars(self.direction, cKDTree(self.direction))
+        self.stars = Stars(self.direction)
 
     @property
     def nbytes(self) -> int:

@@ -1,7 +1,7 @@
 """Whether the stars of the catalog stand where an attitude and a lens have them: the evidence."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +30,8 @@ LEAST_STARS, MOST_STARS = 12, 400
 MODELS = (FREE_SCALE, SCALE_BEND, SCALE_CENTER)
 LEAST_MATCHES = {FREE_SCALE: 4, SCALE_BEND: 7, SCALE_CENTER: 12}
 """Matches from which a model is fitted; of those that are, the evidence chooses."""
+HOPELESS_LOG_ODDS = 0.0
+"""Below this after two rounds: what is true stands above 20 by then, and chance below -5."""
 LEAST_REFINED = {FREE_SCALE: 4, SCALE_BEND: 6, SCALE_CENTER: 8}
 """The same once the attitude is known: priors hold what the stars do not."""
 
@@ -57,21 +59,34 @@ class Points:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Stars:
-    """The catalog (n, 3), brightest first, with the tree of its directions."""
+    """The catalog (n, 3), brightest first, with trees of its directions."""
 
     direction: Vector
-    tree: cKDTree
+    _trees: dict[int, cKDTree] = field(default_factory=dict)
+
+    def _brightest(self, toward: Vector, reach: float, most: int) -> Rows:
+        """The brightest so many within an angle of a direction, or all that there are.
+
+        Looked for among as many stars of the sky as have so many there, and among more if
+        that corner of the sky is empty.
+        """
+        count = 2.0 * most / (0.5 * (1.0 - math.cos(reach)))
+        while True:
+            power = min(math.ceil(math.log2(count)), math.ceil(math.log2(len(self.direction))))
+            if power not in self._trees:
+                self._trees[power] = cKDTree(self.direction[: 2**power])
+            found = self._trees[power].query_ball_point(toward, 2.0 * math.sin(0.5 * reach))
+            if len(found) >= most or 2**power >= len(self.direction):
+                return np.sort(np.asarray(found, int))[:most]
+            count = 2.0 ** (power + 1)
 
     def near(self, attitude: Matrix, lens: Lens, most: int) -> tuple[Rows, Vector, Vector]:
         """The brightest so many on a picture: rows, and where they stand (n)."""
         reach = math.atan(lens.radius_px / lens.focal_px * (1.0 + abs(lens.bend))) + 0.002
-        rows = np.sort(
-            np.asarray(self.tree.query_ball_point(attitude[2], 2.0 * math.sin(0.5 * reach)), int)
-        )
         # Before their places are known: a picture holds most of the cap about it.
-        rows = rows[: 3 * most]
+        rows = self._brightest(attitude[2], reach, 3 * most)
         u, v = lens.places(self.direction[rows] @ attitude.T)
         with np.errstate(invalid="ignore"):
             inside = (u > -0.5) & (v > -0.5) & (u < lens.width_px) & (v < lens.height_px)
@@ -111,7 +126,9 @@ def verify(
     """The attitude and lens refined from what they match; None where they match too little."""
     sigma = np.maximum(points.sigma_px, LEAST_SIGMA_PX)
     best = None
-    for parameters in (0, 0, 0, *MODELS):
+    for number, parameters in enumerate((0, 0, 0, *MODELS)):
+        if number == 2 and (best is None or best.log_odds < HOPELESS_LOG_ODDS):
+            return best
         rows, at, seen = _matches(points, stars, attitude, lens, gate_px)
         if len(seen) < LEAST_MATCHES[parameters or FREE_SCALE]:
             return best
