@@ -2,18 +2,24 @@
 
 import json
 import math
+from dataclasses import replace
 from time import perf_counter_ns
 from typing import IO, Any
 
 import numpy as np
 
 from service.acquire.picture import PictureAttitude, PictureResult, blind_sky, solve_picture
-from service.errors import BadBatch, Fault
 from service.identify.blind.lens import Lens
 from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import Frame, FrameLimits, refused, require_light
 from service.imaging.frames.preview import preview_png
-from service.imaging.submit import FrameIn, batch_of_stars, submission_of_frame, with_exposure
+from service.imaging.submit import (
+    FrameIn,
+    batch_of_stars,
+    submission_of_frame,
+    time_of,
+    with_exposure,
+)
 from service.missions.camera import Camera
 from service.missions.mission import Mission
 from service.observations.frame_record import FrameRecord
@@ -58,9 +64,7 @@ def _of_unknown_lens(
     tracker, camera = mission.camera_tracker(known.tracker, "tracker")
     frame = read_frame(file, FrameLimits(max_pixels, camera.shape, tracker.name), digest)
     require_light(frame, camera.saturation_counts)
-    time = known.time or frame.time
-    if time is None:
-        raise BadBatch(Fault("time", "must be given: the file has no time of exposure"))
+    time, remarks = time_of(known, frame)
     frame = with_exposure(frame, known.exposure_s or frame.exposure_s or camera.exposure_s)
     read = perf_counter_ns()
     sky, solver = blind_sky(catalog, round(parse_utc(time).julian_year))
@@ -79,6 +83,7 @@ def _of_unknown_lens(
     done = perf_counter_ns()
     timings = {"read": (read - start) // 1000, "detect": (done - read) // 1000, "centroid": 0}
     record = _record(result, chosen, stars, camera, tracker.name, timings)
+    record = replace(record, remarks=[*record.remarks, *remarks])
     submission = submission_from_model(model)
     return Submission(
         submission.batch, submission.text, known.fingerprint(mission.name, digest), record

@@ -4,6 +4,7 @@ import json
 import math
 import sys
 from argparse import Namespace
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ from service.settings import Settings
 
 if TYPE_CHECKING:
     from service.acquire.picture import PictureResult
+    from service.imaging.frames.frame import Frame
 
 FEW_NAMES = 12
 LEAST_MEGAPIXELS = 64
@@ -21,17 +23,14 @@ LEAST_MEGAPIXELS = 64
 def solve_pictures(parsed: Namespace, settings: Settings) -> int:
     """Solve every file and print its result; 1 where one was refused or has no attitude."""
     from service.acquire.picture import blind_sky, solve_picture
-    from service.imaging.frames.files import read_frame
-    from service.imaging.frames.frame import FrameLimits
     from service.sky.catalog.star_catalog import open_catalog
 
     sky, solver = blind_sky(open_catalog(settings.catalog))
-    max_pixels = 1_000_000 * max(settings.frame_megapixels, LEAST_MEGAPIXELS)
+    read = picture_reader(parsed.dark, settings)
     failed = 0
     for file in parsed.files:
         try:
-            with file.open("rb") as opened:
-                frame = read_frame(opened, FrameLimits(max_pixels))
+            frame = read(file, None)
             guess_px = focal_guess_px(parsed, frame.width_px, frame.height_px)
             result = solve_picture(frame, sky, solver, guess_px)
         except BadInput as error:
@@ -43,6 +42,27 @@ def solve_pictures(parsed: Namespace, settings: Settings) -> int:
         told = {"file": str(file), **result_json(result), "overlay": str(overlay)}
         print(json.dumps(told) if parsed.json else _summary(file, told))
     return 1 if failed else 0
+
+
+def picture_reader(
+    dark_file: Path | None, settings: Settings
+) -> "Callable[[Path, tuple[int, int] | None], Frame]":
+    """What reads a picture, of a shape if one is given, less the dark frame."""
+    from service.imaging.frames.dark import without_dark
+    from service.imaging.frames.files import read_frame
+    from service.imaging.frames.frame import FrameLimits
+
+    max_pixels = 1_000_000 * max(settings.frame_megapixels, LEAST_MEGAPIXELS)
+
+    def read(file: Path, shape: tuple[int, int] | None) -> "Frame":
+        with file.open("rb") as opened:
+            frame = read_frame(opened, FrameLimits(max_pixels, shape, "the first picture"))
+        return frame if dark is None else without_dark(frame, dark)
+
+    dark: Frame | None = None
+    if dark_file is not None:
+        dark = read(dark_file, None)
+    return read
 
 
 def focal_guess_px(parsed: Namespace, width_px: int, height_px: int) -> float | None:

@@ -6,6 +6,7 @@ The batch holds all that the answer follows from, so that a what-if needs no fra
 import hashlib
 import json
 import math
+from dataclasses import replace
 from itertools import pairwise
 from time import perf_counter_ns as clock_ns
 from typing import IO, TYPE_CHECKING, Annotated, Any
@@ -39,6 +40,7 @@ from service.observations.schema import (
     is_time,
     submission_from_model,
 )
+from service.times import utc_now
 from service.vectors import Vector
 
 if TYPE_CHECKING:
@@ -102,9 +104,7 @@ def submission_of_frame(
     tracker, camera = mission.camera_tracker(known.tracker, "tracker")
     frame = read_frame(file, FrameLimits(max_pixels, camera.shape, tracker.name), digest)
     require_light(frame, camera.saturation_counts)
-    time = known.time or frame.time
-    if time is None:
-        raise BadBatch(Fault("time", "must be given: the file has no time of exposure"))
+    time, remarks = time_of(known, frame)
     if known.exposure_s is not None:
         frame = with_exposure(frame, known.exposure_s)
     clock.append(clock_ns())
@@ -136,10 +136,32 @@ def submission_of_frame(
             strict=True,
         )
     )
-    record = _record(frame, found, stars, tracker, camera, known, steps)
+    record = replace(_record(frame, found, stars, tracker, camera, known, steps), remarks=remarks)
     submission = submission_from_model(model)
     fingerprint = known.fingerprint(mission.name, digest)
     return Submission(submission.batch, submission.text, fingerprint, record)
+
+
+def time_of(known: FrameIn, frame: Frame) -> tuple[str, list[str]]:
+    """The time of a frame, and what is to be said of it.
+
+    Without a time, aberration cannot be corrected: where it is ignored anyway, the time of
+    arrival stands in the records.  Raises `BadBatch` where it is not.
+    """
+    time = known.time or frame.time
+    if time is not None:
+        return time, []
+    if known.aberration != "ignore":
+        message = (
+            "must be given: the file has no time of exposure; it may be absent where aberration "
+            "is ignored"
+        )
+        raise BadBatch(Fault("time", message))
+    remark = (
+        "time_unknown: the time of arrival stands for that of the exposure; aberration, up to 20 "
+        "arcsec, is not corrected"
+    )
+    return utc_now().text, [remark]
 
 
 def with_exposure(frame: Frame, exposure_s: float) -> Frame:

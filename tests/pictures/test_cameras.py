@@ -12,7 +12,7 @@ from service.acquire.camera_calibration import calibrate_camera
 from service.acquire.frame_submission import submit_frame
 from service.acquire.picture import blind_sky, solve_picture
 from service.cli import main
-from service.errors import BadConfiguration
+from service.errors import BadBatch, BadConfiguration
 from service.identify.blind.lens import Lens
 from service.identify.blind.solver import rotation_between
 from service.imaging.frames.frame import Frame
@@ -103,6 +103,22 @@ def test_the_frame_of_a_rough_camera_becomes_a_batch_with_its_lens_fitted(field)
     assert len(made.frame.stars) == len(observations.magnitude_mag)
 
 
+def test_a_time_may_be_absent_where_aberration_is_ignored():
+    mission = parse_mission(ROUGH.format(field=11.0), "flir.toml")
+    catalog, size = load_embedded(), 10_000_000
+
+    def submitted(**known):
+        with (FOLDER / "cedarsolve-2019-07-29T204726_Alt40_Azi-135_Try1.jpg").open("rb") as file:
+            return submit_frame(file, "sha256:0", FrameIn(**known), mission, catalog, size)
+
+    with pytest.raises(BadBatch, match="may be absent where aberration is ignored"):
+        submitted()
+    made = submitted(aberration="ignore")
+    assert made.frame.remarks[-1].startswith("time_unknown")
+    assert made.batch.aberration == "ignore"
+    assert made.batch.a_priori is not None
+
+
 def test_a_frame_without_an_attitude_still_becomes_a_batch(rng):
     mission = parse_mission(ROUGH.format(field=11.0), "flir.toml")
     counts = rng.normal(50.0, 3.0, (768, 1024))
@@ -136,6 +152,16 @@ def test_a_camera_is_calibrated_from_its_pictures_alone(pictures, tmp_path, caps
     for word in ("before", "after"):
         with Image.open(tmp_path / f"mycam-residuals-{word}.png") as picture:
             assert picture.width == 900
+
+
+def test_a_dark_frame_goes_with_the_pictures_of_a_calibration(pictures, tmp_path, capsys):
+    dark, target = tmp_path / "dark.jpg", tmp_path / "mycam.toml"
+    dark.write_bytes(jpeg_of(np.full((768, 1024), 1, np.uint8)))
+    files = [str(each) for each in pictures[:2]]
+    assert main(["camera", "calibrate", *files, "--dark", str(dark), "-o", str(target)]) == 0
+    dark.write_bytes(jpeg_of(np.full((100, 100), 1, np.uint8)))
+    assert main(["frame", files[0], "--dark", str(dark), "--overlay", str(tmp_path)]) == 1
+    assert "size of its dark frame" in capsys.readouterr().err
 
 
 def test_claimed_sigmas_of_a_calibration_hold(blind):

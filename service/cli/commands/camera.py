@@ -47,6 +47,9 @@ def add(commands: Any) -> None:
     parser.add_argument("--focal-px", type=positive, metavar="PX", help="rough focal length")
     parser.add_argument("--focal-mm", type=positive, metavar="MM", help="with --pixel-um")
     parser.add_argument("--pixel-um", type=positive, metavar="UM", help="pixel pitch")
+    parser.add_argument(
+        "--dark", type=Path, metavar="FILE", help="a frame of the same exposure without light"
+    )
 
 
 def run(parsed: Namespace) -> int:
@@ -78,17 +81,14 @@ def _solved(
 ) -> list["PictureResult"]:
     """The pictures with an attitude; why the others have none is printed."""
     from service.acquire.picture import solve_picture
-    from service.cli.pictures import LEAST_MEGAPIXELS, focal_guess_px
-    from service.imaging.frames.files import read_frame
-    from service.imaging.frames.frame import FrameLimits
+    from service.cli.pictures import focal_guess_px, picture_reader
 
-    max_pixels = 1_000_000 * max(settings.frame_megapixels, LEAST_MEGAPIXELS)
+    read = picture_reader(parsed.dark, settings)
     used: list[PictureResult] = []
     shape = None
     for file in parsed.files:
         try:
-            with file.open("rb") as opened:
-                frame = read_frame(opened, FrameLimits(max_pixels, shape, "the first picture"))
+            frame = read(file, shape)
             guess_px = focal_guess_px(parsed, frame.width_px, frame.height_px)
             if used and used[0].attitude is not None:
                 guess_px = used[0].attitude.lens.focal_px

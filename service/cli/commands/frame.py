@@ -90,12 +90,15 @@ def add(commands: Any) -> None:
 def _add_lens(parser: ArgumentParser) -> None:
     """What may be known of the lens of a picture without a spacecraft."""
     lens = parser.add_argument_group(
-        "without a spacecraft", "what is known of the lens, if anything, within a quarter"
+        "without a spacecraft", "what is known of the camera; of its lens within a quarter"
     )
     lens.add_argument("--fov", type=degrees, metavar="DEG", help="field of view, the longer side")
     lens.add_argument("--focal-px", type=positive, metavar="PX", help="focal length in pixels")
     lens.add_argument("--focal-mm", type=positive, metavar="MM", help="with --pixel-um")
     lens.add_argument("--pixel-um", type=positive, metavar="UM", help="the pitch of the pixels")
+    lens.add_argument(
+        "--dark", type=Path, metavar="FILE", help="a frame of the same exposure without light"
+    )
 
 
 def run(parsed: Namespace) -> int:
