@@ -16,7 +16,6 @@ FREE_SCALE, SCALE_BEND, SCALE_CENTER = 4, 5, 7
 PARAMETERS = ("focal_px", "bend", "off_u", "off_v")
 """Of a lens, in the order in which they are fitted."""
 _ROUNDS = 12
-_STEPS = np.array([1e-7, 1e-7, 1e-7, 1e-7, 1e-6, 1e-6, 1e-6])
 _CONVERGED = 1e-9
 
 
@@ -173,20 +172,22 @@ def linearised(
     Parameters are the small rotation about the camera's axes, then those of `lens_of`.
     """
     here = lens_of(lens, names, free)
-    residual = _residual(here, attitude, u_px, v_px, star)
-    columns = []
-    for k in range(3 + len(free)):
-        step = _STEPS[k]
-        if k < 3:
-            turned = rotate_about(np.eye(3)[k] * step, attitude.T).T
-            moved = _residual(here, turned, u_px, v_px, star)
-        else:
-            other = free.copy()
-            other[k - 3] += step
-            # In pixels of one focal length: else a longer one would make all residuals longer.
-            lens_k = lens_of(lens, names, other)
-            moved = _residual(lens_k, attitude, u_px, v_px, star) * (
-                here.focal_px / lens_k.focal_px
-            )
-        columns.append((residual - moved) / step)
-    return residual, np.column_stack(columns)
+    body = star @ attitude.T
+    x, y = (body[:, :2] / body[:, 2:]).T
+    plane = here.plane(u_px, v_px)
+    residual = (plane - np.column_stack([x, y])) * here.focal_px
+    turns = [[-x * y, -1.0 - y * y], [1.0 + x * x, x * y], [-y, x]]
+    columns = [here.focal_px * np.array(each) for each in turns]
+    # In pixels of one focal length: else a longer one would make all residuals longer.
+    columns.append(here.focal_px * plane.T)
+    if len(names) > 1:
+        center_u, center_v = here.center_px
+        across, down = (u_px - center_u) / here.radius_px, (v_px - center_v) / here.radius_px
+        square = across**2 + down**2
+        columns.append(-here.radius_px * square * np.array([across, down]))
+    if len(names) > 2:
+        both = 2.0 * here.bend * across * down
+        along = 1.0 + here.bend * square + 2.0 * here.bend * np.array([across**2, down**2])
+        columns.append(here.radius_px * np.array([along[0], both]))
+        columns.append(here.radius_px * np.array([both, along[1]]))
+    return residual.ravel(), np.stack([column.T.ravel() for column in columns], axis=1)
