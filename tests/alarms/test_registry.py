@@ -7,6 +7,7 @@ import pytest
 
 from service.alarms.limits import LimitSettings, above
 from service.alarms.quantities import QUANTITIES, BatchShare, Quantity, StarShare
+from service.cli import main
 from service.web.app import bare_app
 from tests.web.conftest import (
     address,
@@ -110,6 +111,14 @@ def test_its_column_is_in_the_csv(full_run, added, bare_client):
     rows = list(csv.DictReader(io.StringIO(answer.text)))
     assert len(rows) == 20
     assert all(row[added.name] for row in rows)
+
+
+def test_the_command_writes_its_column(app, full_run, added, capsys):
+    where = ["--run", full_run, "--database", app.settings.database]
+    assert main(["history", "--spacecraft", "XTE", *where]) == 0
+    rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
+    assert len(rows) == 20
+    assert all(0.0 <= float(row[added.name]) <= 1.0 for row in rows)
 
 
 def test_it_has_limits(added, bare_client):

@@ -23,16 +23,25 @@ def identify_nothing(sighting):
 
 register(IdentifierEntry("nothing", identify_nothing, "leaves every star unmatched"))
 
+import contextlib
+import io
+import sys
+import httpx
 from service.acquire import acquire
+from service.app.factory import open_app
+from service.cli import main
 from service.cli.parser import build_parser
 from service.missions.mission import SHIPPED_FOLDER, parse_mission
 from service.observations.schema import submission_from_json
+from service.settings import Settings
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
+from service.web.app import create_app
 from service.web.console.options import fields_of
 from service.web.openapi.text import openapi_yaml
 from tests.observations.example import BATCH
+from tests.web.serving import Server
 
 text = (SHIPPED_FOLDER / "xte.toml").read_text(encoding="utf-8")
 mission = parse_mission(text.replace('identifier = "verified"', 'identifier = "nothing"'), "xte")
@@ -41,6 +50,17 @@ batch = submission_from_json(body).batch
 acquisition = acquire(batch, mission, SkyModel(load_embedded(), LruCache(1 << 26)))
 shapes = yaml.safe_load(openapi_yaml())["components"]["schemas"]
 arguments = ["simulate", "paper", "--identifier", "nothing", "verified"]
+
+database = f"sqlite:///{sys.argv[1]}/acquire.db"
+app = open_app(Settings(database=database, replay_processes=0))
+with Server(create_app(app)) as url, httpx.Client(base_url=url, timeout=60) as client:
+    sent = client.post("/api/v1/batches", content=body).raise_for_status().json()
+    other = {"options": {"identifier": "starid"}}
+    tried = client.post(f"/api/v1/batches/{sent['id']}/what-if", json=other).raise_for_status()
+    page = client.get(f"/batches/{sent['id']}").raise_for_status().text
+described = io.StringIO()
+with contextlib.redirect_stdout(described):
+    main(["openapi"])
 print(json.dumps({
     "mission": mission.identifier,
     "batch": batch.options.identifier,
@@ -48,14 +68,20 @@ print(json.dumps({
     "form": [each.choices for each in fields_of({}, None) if each.name == "identifier"],
     "options": shapes["OptionsIn"]["properties"]["identifier"],
     "answer": shapes["Answer"]["properties"]["identifier"],
+    "recorded": sent["identifier"],
+    "unmatched": sent["counts"]["unmatched"],
+    "tried": tried.json()["identifier"],
+    "page": page,
+    "printed": described.getvalue(),
     "command": build_parser().parse_args(arguments).identifier,
 }))
 """
 
 
-def test_an_identifier_added_through_the_registry_alone_is_known_everywhere():
+def test_an_identifier_added_through_the_registry_alone_is_known_everywhere(tmp_path):
+    """In missions, batches, the API, its description, the pages and the commands."""
     told = subprocess.run(
-        [sys.executable, "-c", FROM_OUTSIDE],
+        [sys.executable, "-c", FROM_OUTSIDE, str(tmp_path)],
         cwd=ROOT,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
@@ -70,6 +96,9 @@ def test_an_identifier_added_through_the_registry_alone_is_known_everywhere():
     assert seen["form"] == [names]
     assert seen["answer"]["enum"] == names
     assert {"enum": names, "type": "string"} in seen["options"]["anyOf"]
+    assert (seen["recorded"], seen["unmatched"], seen["tried"]) == ("nothing", 2, "starid")
+    assert ">nothing</option>" in seen["page"]
+    assert "- nothing\n" in seen["printed"]
     assert seen["command"] == ["nothing", "verified"]
 
 

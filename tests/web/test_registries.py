@@ -9,7 +9,7 @@ from fastapi import Query as InQuery
 
 from service.app.factory import open_app
 from service.app.output_formats import OUTPUT_FORMATS, OutputFormat
-from service.cli.parser import build_parser
+from service.cli import main
 from service.settings import Settings
 from service.web.app import bare_app, create_app
 from service.web.console.page_context import ContextDep, PageQuery
@@ -74,12 +74,18 @@ def test_a_new_format_is_described(ndjson):
     assert set(operation["responses"]["200"]["content"]) == {"application/json", "text/csv", NDJSON}
 
 
-def test_a_new_format_is_offered_by_page_and_command(ndjson, client, full_run):
+def test_a_new_format_is_written_by_the_command(ndjson, app, full_run, capsys):
+    where = ["--run", full_run, "--database", app.settings.database]
+    assert main(["history", "--spacecraft", "XTE", *where, "--format", "ndjson"]) == 0
+    rows = [json.loads(each) for each in capsys.readouterr().out.splitlines()]
+    assert len(rows) == 20
+    assert all("ambiguous_share" in each for each in rows)
+
+
+def test_a_new_format_is_offered_by_the_page(ndjson, client, full_run):
     page = client.get("/spacecraft/XTE", params={"run": full_run}).text
     assert "NDJSON:" in page
     assert "format=ndjson" in page
-    parsed = build_parser().parse_args(["history", "--spacecraft", "XTE", "--format", "ndjson"])
-    assert parsed.format == "ndjson"
 
 
 def test_an_unknown_format_is_refused_with_the_known_ones_named(client):
@@ -107,6 +113,12 @@ def test_a_new_page_is_served_and_is_in_the_navigation_in_its_place(passes_page,
         titles = [each.split(">")[1] for each in names]
         assert titles[titles.index("Batches") + 1] == "Passes"
         assert client.get("/passes?runn=x").status_code == 422
+
+
+def test_a_new_page_is_no_operation_of_the_api(passes_page):
+    """Pages are for people: the description lists what programs call."""
+    assert "/passes" not in bare_app().openapi()["paths"]
+    assert "/passes" in [route.path for route in bare_app().state.routes]
 
 
 def test_a_new_page_is_in_the_lists_that_tests_and_access_use(passes_page):
