@@ -16,7 +16,7 @@ from typing import Any
 from catalogs import derive, packages
 from catalogs.readme import readme
 from service.errors import AcquisitionError
-from service.sky.catalog.coding import COLUMNS, digest_of, pack
+from service.sky.catalog.coding import COLUMNS, file_digest, pack
 from service.sky.catalog.star_catalog import load
 
 HERE = Path(__file__).parent
@@ -69,7 +69,7 @@ def build(
     }
     page = readme(load(output), len(data), filling, disagreeing, notices)
     output.with_name("README.md").write_text(page, encoding="utf-8")
-    return BuildReport(output, digest_of(data), len(data), len(columns["hip"]))
+    return BuildReport(output, file_digest(data), len(data), len(columns["hip"]))
 
 
 def _hd_numbers(names: dict[str, dict[str, Any]]) -> Iterator[tuple[int, float]]:

@@ -28,7 +28,7 @@ from service.imaging.frames.files import read_frame
 from service.imaging.frames.fits import write_fits
 from service.imaging.frames.frame import FrameLimits
 from service.missions.mission import SHIPPED_FOLDER, load_missions, read_mission
-from service.observations.readers.csv_rows import write_csv
+from service.observations.readers.csv_rows import write_batches_csv
 from service.observations.readers.decompress import unpacked_lines
 from service.observations.readers.lines import MAX_LINE_BYTES
 from service.observations.readers.telemetry import read_lines
@@ -160,7 +160,7 @@ class Readers:
     def csv(self):
         file = self._folder / "pass.csv"
         with file.open("w", newline="") as text:
-            write_csv([BatchIn.model_validate(each) for each in pass_lines()], text)
+            write_batches_csv([BatchIn.model_validate(each) for each in pass_lines()], text)
         return file.read_bytes(), lambda data: read_telemetry(data, "csv")
 
     def catalog_csv(self):

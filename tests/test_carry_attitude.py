@@ -10,7 +10,7 @@ from service.app.factory import open_app
 from service.observations.schema import submission_from_json
 from service.replay.carry_attitude import AttitudeCarrier, turned
 from service.replay.in_process import replay_in_process
-from service.replay.items import Outcome, items_of
+from service.replay.items import LineOutcome, items_of
 from service.replay.over_http import replay_over_http
 from service.replay.summary import ReplaySummary
 from service.settings import Settings
@@ -92,7 +92,7 @@ def test_a_second_replay_sends_the_same_and_adds_nothing(passing, tmp_path):
 
 def answered(item, quaternion, status="good"):
     attitude = None if status is None else {"quaternion": quaternion, "status": status}
-    return Outcome(item, json.dumps({"attitude": attitude}).encode())
+    return LineOutcome(item, json.dumps({"attitude": attitude}).encode())
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ import pytest
 
 from service.app.factory import open_app
 from service.errors import BadFile, BadInput, Busy, Forbidden, NotFound, Unauthenticated
-from service.observations.readers.csv_rows import write_csv
+from service.observations.readers.csv_rows import write_batches_csv
 from service.observations.schema import BatchIn
 from service.replay.bulk_upload import replay_in_bulk
 from service.replay.in_process import replay_in_process
@@ -132,7 +132,7 @@ def test_files_sent_as_a_whole_come_to_the_same_and_bad_lines_keep_their_place(
     first = written(tmp_path / "one.ndjson", [*batches[:5], *bad_lines(batches[0]), batches[5]])
     second = tmp_path / "two.csv"
     with second.open("w", newline="") as stream:
-        write_csv([BatchIn.model_validate(each) for each in batches[6:9]], stream)
+        write_batches_csv([BatchIn.model_validate(each) for each in batches[6:9]], stream)
     rows = second.read_text().splitlines()
     rows.insert(2, rows[1].replace("STARTRACKER_1", "STARTRACKER_1,5"))
     second.write_text("\n".join(rows))
@@ -266,7 +266,7 @@ def test_rows_and_json_are_one_run(app, batches, run, tmp_path):
     json_file = written(tmp_path / "pass.ndjson", batches)
     csv_file = tmp_path / "pass.csv"
     with csv_file.open("w", newline="", encoding="utf-8") as file:
-        write_csv((BatchIn.model_validate_json(json.dumps(each)) for each in batches), file)
+        write_batches_csv((BatchIn.model_validate_json(json.dumps(each)) for each in batches), file)
     replayed(json_file, run, tmp_path / "a", app=app)
     summary, _ = replayed(csv_file, run, tmp_path / "b", app=app)
     assert (summary.new, summary.replayed) == (0, len(batches))
@@ -276,7 +276,7 @@ def test_rows_and_json_are_one_run(app, batches, run, tmp_path):
 def test_a_bad_row_of_a_csv_file_is_told_by_line_and_column(app, batches, run, tmp_path):
     path = tmp_path / "pass.csv"
     text = io.StringIO(newline="")
-    write_csv((BatchIn.model_validate_json(json.dumps(each)) for each in batches[:3]), text)
+    write_batches_csv((BatchIn.model_validate_json(json.dumps(each)) for each in batches[:3]), text)
     rows = text.getvalue().splitlines()
     at = next(
         k for k, row in enumerate(rows) if batches[1]["batch"] in row and ",SOHO" in f",{row}"

@@ -18,7 +18,7 @@ import numpy as np
 from service.missions.mission import SHIPPED_FOLDER, Mission, load_missions
 from service.simulate.frame_files import FrameFormat, frame_bytes
 from service.simulate.frames import FrameSettings, draw_frames
-from service.simulate.stretches import Pass, Prior, Trouble, Troubles
+from service.simulate.stretches import Pass, PriorKind, Trouble, Troubles
 from service.simulate.telemetry import draw_pass
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
@@ -26,7 +26,7 @@ from service.sky.model import SkyModel
 
 API = "/api/v1"
 IDENTIFIERS = ("verified", "starid", "ptp", "lost_in_space")
-PRIORS: tuple[Prior, Prior, Literal["none"]] = ("quaternion", "direction", "none")
+PRIORS: tuple[PriorKind, PriorKind, Literal["none"]] = ("quaternion", "direction", "none")
 TWIN = "TWIN"
 """A mission with two trackers, made for this: the shipped ones have one each."""
 MISSIONS = ("XTE", "SWAS", "SOHO", "IMAGER", TWIN)
@@ -147,7 +147,7 @@ class _Draw:
             identifier = IDENTIFIERS[k // len(MISSIONS) % len(IDENTIFIERS)]
             prior = PRIORS[k // (len(MISSIONS) * len(IDENTIFIERS)) % len(PRIORS)]
             # A direction does not tell where a tracker looks that is not along the zone's axis.
-            drawn_as: Prior = (
+            drawn_as: PriorKind = (
                 "direction" if prior == "direction" and mission != TWIN else "quaternion"
             )
             body = next(passes[mission, drawn_as])
@@ -162,7 +162,7 @@ class _Draw:
             found.append(_submit(f"batch: {identifier}, prior {known}{trackers}", name, body))
         return found
 
-    def _fields(self, mission: str, most: int, prior: Prior) -> Iterator[Json]:
+    def _fields(self, mission: str, most: int, prior: PriorKind) -> Iterator[Json]:
         """Fields of few stars and of many, in turn."""
         few = self._pass(mission, most, prior=prior)
         many = self._pass(mission, most, prior=prior, stars=25)

@@ -32,7 +32,7 @@ from service.missions.mission import load_missions
 from service.observations.schema import submission_from_json
 from service.settings import Settings
 from service.simulate.stretches import DEFAULT_START, NO_TROUBLES, Pass
-from service.simulate.telemetry import Drawn, draw_pass
+from service.simulate.telemetry import DrawnBatch, draw_pass
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
@@ -65,7 +65,7 @@ RIGHT = 0.98
 class Telemetry:
     """Batches of a pass, and the star ids that are true of each."""
 
-    drawn: Sequence[Drawn]
+    drawn: Sequence[DrawnBatch]
     _seconds: Iterator[int] = field(default_factory=itertools.count)
 
     def bodies(self, count: int, tag: str) -> list[bytes]:
@@ -82,7 +82,7 @@ class Telemetry:
         own = {"options": {"identifier": "starid"}, "batch": name, "time": time}
         return json.dumps(self._of(k).batch | own).encode()
 
-    def _of(self, k: int) -> Drawn:
+    def _of(self, k: int) -> DrawnBatch:
         return self.drawn[k % len(self.drawn)]
 
     def right(self, k: int, answer: dict[str, Any]) -> tuple[int, int]:

@@ -26,7 +26,7 @@ from service.imaging.centroids.centroid import METHODS, centroid
 from service.imaging.centroids.psf import GaussianPsf, Psf
 from service.imaging.centroids.sampled_psf import airy_psf
 from service.imaging.centroids.window import Detector, cutout
-from service.studies.star_image_report.windows import DrawnStar, draw_stars, flux_of_peak
+from service.studies.star_image_report.windows import WindowStar, draw_stars, flux_of_peak
 
 RATIOS = (10.0, 30.0, 100.0, 300.0, 1000.0)
 DETECTOR = Detector(gain_e_per_count=2.0, read_noise_e=10.0, saturation_counts=1e9)
@@ -51,10 +51,10 @@ MOST_DRAWN = 40
 """At most so many times the stars for a method that refuses most of them."""
 WELL_KNOWN = 2.5
 """So many times the stars are taken then: the ratio is known to 1.3 %, the refusals' pull shows."""
-Peer = Callable[[DrawnStar], tuple[float, float]]
+Peer = Callable[[WindowStar], tuple[float, float]]
 
 
-def _square(star: DrawnStar) -> tuple[Any, int, int]:
+def _square(star: WindowStar) -> tuple[Any, int, int]:
     """The 9 x 9 pixels about the true place, as every method of ours sums, background off."""
     u, v = round(star.u_px), round(star.v_px)
     window = cutout(star.window.counts, u, v, HALF_WIDTH_PX, DETECTOR, BACKGROUND)
@@ -62,7 +62,7 @@ def _square(star: DrawnStar) -> tuple[Any, int, int]:
 
 
 def _photutils(way: Callable[[Any], Any]) -> Peer:
-    def found(star: DrawnStar) -> tuple[float, float]:
+    def found(star: WindowStar) -> tuple[float, float]:
         square, corner_u, corner_v = _square(star)
         with warnings.catch_warnings():
             # A fit that does not converge says so; what it gives is scored all the same.
@@ -73,7 +73,7 @@ def _photutils(way: Callable[[Any], Any]) -> Peer:
     return found
 
 
-def _sep(star: DrawnStar) -> tuple[float, float]:
+def _sep(star: WindowStar) -> tuple[float, float]:
     """SExtractor's windowed place, from the true pixel, with the FWHM that it asks for."""
     light = np.ascontiguousarray(star.window.light_counts)
     sigma = 2.355 / 2.355 * 1.1
@@ -135,15 +135,15 @@ def rows(quick: bool, seed: int) -> tuple[list[list[object]], list[Bound], dict[
     return found_rows, flat + every("time a star, own methods", cost), spent
 
 
-def _kept(drawn: Iterator[DrawnStar], kept: list[DrawnStar]) -> Iterator[DrawnStar]:
+def _kept(drawn: Iterator[WindowStar], kept: list[WindowStar]) -> Iterator[WindowStar]:
     for star in drawn:
         kept.append(star)
         yield star
 
 
 def _row(
-    stars: list[DrawnStar],
-    further: Iterator[DrawnStar],
+    stars: list[WindowStar],
+    further: Iterator[WindowStar],
     psf: Psf,
     bound: float,
     spent: dict[str, float],
@@ -156,7 +156,7 @@ def _row(
     cells: list[object] = []
     bounds: list[tuple[str, Bound]] = []
     scatters: dict[str, float] = {}
-    more: list[DrawnStar] = []
+    more: list[WindowStar] = []
     for method in METHODS:
         began = time.process_time()
         records = [centroid(s.window, method, psf, half_width_px=HALF_WIDTH_PX) for s in stars]

@@ -33,7 +33,7 @@ from benchmarks.sections import bounds_table, table
 from service.acquire import Acquisition, acquire
 from service.errors import NotAvailable
 from service.imaging.detection.detect import detect, detection_kernel
-from service.imaging.frames.files import digest_of, read_frame
+from service.imaging.frames.files import frame_digest, read_frame
 from service.imaging.frames.frame import Frame, FrameLimits
 from service.imaging.overlay import draw_overlay
 from service.imaging.overlay_marks import marks_of
@@ -160,7 +160,7 @@ def _measured(drawn: DrawnFrame, mission: Mission, sky: SkyModel, timed: bool) -
 
     known = read_known(drawn.known)
     pixels = camera.width_px * camera.height_px
-    submission = submission_of_frame(file, digest_of(file), known, mission, pixels)
+    submission = submission_of_frame(file, frame_digest(file), known, mission, pixels)
     assert submission.frame is not None
     used = [star for star in submission.frame.stars if star["used"]]
     placed, false = _against_truth(used, u, v, magnitude)
@@ -414,7 +414,7 @@ def picture(seed: int, frames: int) -> bytes:
     file = io.BytesIO(frame_bytes(drawn))
     known = read_known(drawn.known)
     pixels = camera.width_px * camera.height_px
-    submission = submission_of_frame(file, digest_of(file), known, mission, pixels)
+    submission = submission_of_frame(file, frame_digest(file), known, mission, pixels)
     record = submission.frame
     assert record is not None
     answer = answer_of(acquire(submission.batch, mission, sky), id=None)

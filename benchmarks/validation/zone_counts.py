@@ -7,7 +7,7 @@ from benchmarks.sections import Section, Written, table
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
-from service.studies.paper_1994.zone_counts import Count, counts
+from service.studies.paper_1994.zone_counts import ZoneQuantity, counts
 
 
 def run(quick: bool, seed: int) -> Report:
@@ -19,7 +19,7 @@ def run(quick: bool, seed: int) -> Report:
     return Report("zone_counts", figures, bounds_of(found))
 
 
-def bounds_of(found: list[Count]) -> list[Bound]:
+def bounds_of(found: list[ZoneQuantity]) -> list[Bound]:
     """The largest difference of each quantity, stars and pairs."""
     return [
         at_most(

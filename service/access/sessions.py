@@ -29,11 +29,11 @@ LEAST_BURST = 5.0
 
 Now = Callable[[], Utc]
 Reading = Callable[[], AbstractContextManager[Connection]]
-Change = Callable[[Callable[[Connection], Any]], Any]
+RunInTransaction = Callable[[Callable[[Connection], Any]], Any]
 
 
 @dataclass
-class _Bucket:
+class _TokenBucket:
     """The token bucket of a rate limit: it fills with time, up to a burst."""
 
     left: float
@@ -43,7 +43,9 @@ class _Bucket:
 class Access:
     """Identifies callers; the one place that does."""
 
-    def __init__(self, reading: Reading, change: Change, loopback: bool, now: Now) -> None:
+    def __init__(
+        self, reading: Reading, change: RunInTransaction, loopback: bool, now: Now
+    ) -> None:
         """`reading` gives a connection; `change` runs a change and waits for its commit.
 
         `loopback`: whether the service listens on a loopback address only.
@@ -57,7 +59,7 @@ class Access:
         self._open_until_s = 0.0
         self._out_of_reach_until_s = 0.0
         self._closed = False
-        self._buckets: dict[str, _Bucket] = {}
+        self._buckets: dict[str, _TokenBucket] = {}
 
     @property
     def is_open(self) -> bool:
@@ -98,7 +100,7 @@ class Access:
         if not self._closed and self._loopback:
             return OPEN_CALLER if clock_s < self._open_until_s else None
         kind, secret = ("session", session) if token is None else ("token", token)
-        known = None if secret is None else self._known.get((kind, tokens.digest_of(secret)))
+        known = None if secret is None else self._known.get((kind, tokens.secret_digest(secret)))
         return known[0] if known is not None and clock_s < known[1] else None
 
     def caller(self, token: str | None, session: str | None) -> Caller:
@@ -107,7 +109,7 @@ class Access:
             return OPEN_CALLER
         for kind, secret in (("token", token), ("session", session)):
             if secret is not None:
-                return self._holder(kind, tokens.digest_of(secret))
+                return self._holder(kind, tokens.secret_digest(secret))
         raise Unauthenticated("a token is needed: Authorization: Bearer acq_...")
 
     def look_up_again(self, token: str | None, session: str | None) -> Caller:
@@ -116,7 +118,7 @@ class Access:
             self._open_until_s = 0.0
             for kind, secret in (("token", token), ("session", session)):
                 if secret is not None:
-                    self._known.pop((kind, tokens.digest_of(secret)), None)
+                    self._known.pop((kind, tokens.secret_digest(secret)), None)
         return self.caller(token, session)
 
     def _holder(self, kind: str, digest: str) -> Caller:
@@ -143,7 +145,7 @@ class Access:
             return
         clock_s, burst = time.monotonic(), max(rate, LEAST_BURST)
         with self._lock:
-            bucket = self._buckets.setdefault(caller.token_id, _Bucket(burst, clock_s))
+            bucket = self._buckets.setdefault(caller.token_id, _TokenBucket(burst, clock_s))
             bucket.left = min(burst, bucket.left + rate * (clock_s - bucket.filled_s))
             bucket.filled_s = clock_s
             if bucket.left < 1:
@@ -153,7 +155,7 @@ class Access:
 
     def sign_in(self, token: str) -> tuple[str, Caller]:
         """Begin a browser's session; returns the secret for its cookie, and the caller."""
-        caller = self._holder("token", tokens.digest_of(token))
+        caller = self._holder("token", tokens.secret_digest(token))
         if caller.token_id is None:
             raise Unauthenticated("access is open: signing in is not needed")
         token_id, secret, begun = caller.token_id, tokens.new_secret(), self._now()
@@ -171,7 +173,7 @@ class Access:
 
     def sign_out(self, session: str) -> None:
         """End a browser's session."""
-        digest = tokens.digest_of(session)
+        digest = tokens.secret_digest(session)
         self._change(partial(tokens.end_session, digest=digest))
         with self._lock:
             self._known.pop(("session", digest), None)

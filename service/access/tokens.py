@@ -65,7 +65,7 @@ def new_secret() -> str:
     return PREFIX + secrets.token_urlsafe(32)
 
 
-def digest_of(secret: str) -> str:
+def secret_digest(secret: str) -> str:
     """The digest that is stored of a token or a session."""
     return hashlib.sha256(secret.encode("utf-8", "surrogatepass")).hexdigest()
 
@@ -105,7 +105,7 @@ def add_token(
         insert(access_tokens).values(
             id=id,
             name=name,
-            digest=digest_of(secret),
+            digest=secret_digest(secret),
             scopes=json.dumps([each for each in SCOPES if each in scopes]),
             spacecraft=None if spacecraft is None else json.dumps(sorted(set(spacecraft))),
             rate_per_s=rate_per_s,
@@ -174,7 +174,7 @@ def add_session(
     connection.execute(delete(access_sessions).where(access_sessions.c.expires <= created))
     connection.execute(
         insert(access_sessions).values(
-            digest=digest_of(secret), token_id=token_id, created=created, expires=expires
+            digest=secret_digest(secret), token_id=token_id, created=created, expires=expires
         )
     )
 

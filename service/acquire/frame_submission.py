@@ -11,7 +11,7 @@ import numpy as np
 from service.acquire.picture import PictureAttitude, PictureResult, blind_sky, solve_picture
 from service.identify.blind.lens import Lens
 from service.imaging.frames.files import read_frame
-from service.imaging.frames.frame import Frame, FrameLimits, refused, require_light
+from service.imaging.frames.frame import Frame, FrameLimits, bad_frame, require_light
 from service.imaging.frames.preview import preview_png
 from service.imaging.submit import (
     FrameIn,
@@ -70,7 +70,7 @@ def _of_unknown_lens(
     sky, solver = blind_sky(catalog, round(parse_utc(time).julian_year))
     result = solve_picture(_without_time(frame), sky, solver, camera.focal_length_px)
     if result.points.count == 0:
-        raise refused("shows no star that could be used", "; ".join(result.remarks)[:200])
+        raise bad_frame("shows no star that could be used", "; ".join(result.remarks)[:200])
     chosen = _chosen(result, camera.most_stars, mission.catalog.magnitude_limit_mag)
     found = result.attitude
     if found is not None and known.a_priori is None:

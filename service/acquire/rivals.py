@@ -15,11 +15,11 @@ from service.acquire.search import Search, SearchResult
 from service.attitude.solution import AttitudeSolution
 from service.identify.hypotheses.groups import (
     Mask,
+    first_share,
     log_weight_of_group,
     may_be_a_group,
     of_all,
     part_of,
-    share_of,
     shared,
 )
 from service.missions.identifiers import IDENTIFIERS
@@ -103,7 +103,7 @@ def _weigh(
     assert first is not None
     assert second is not None
     stars = tuple(each.star for each in second.identifications)
-    share = share_of(*weights, sum(int((rows >= 0).sum()) for rows in stars))
+    share = first_share(*weights, sum(int((rows >= 0).sum()) for rows in stars))
     apart_arcsec = attitude_error_arcsec(other.solution.matrix, one.solution.matrix)
     identifications = [
         shared(mine, its, share)

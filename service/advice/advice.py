@@ -22,8 +22,8 @@ from service.advice.trials import (
     TrialCounts,
     Variant,
     VariantOutcome,
-    counts_of,
-    trial_of,
+    trial_counts,
+    variant_outcome,
     variants,
 )
 from service.errors import BadInput
@@ -34,7 +34,7 @@ from service.observations.batch import ObservationBatch
 EVIDENCE_SHARE = 0.4
 """Of the time there is, the share in which evidence is collected; the rest is for trials."""
 
-Run = Callable[[ObservationBatch], Acquisition]
+RunAgain = Callable[[ObservationBatch], Acquisition]
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Findings:
 def advise(
     mission: Mission,
     batches: Sequence[ObservationBatch],
-    run: Run,
+    run: RunAgain,
     own: Mapping[str, float] | None = None,
     pace: WorkLimit | None = None,
 ) -> Findings:
@@ -101,7 +101,7 @@ def advise(
         else:
             parts.append(evidence_of(number, acquisition))
             sure = tuple(each.identification for each in acquisition.trackers)
-            sample.cases.append((batch, sure, counts_of(acquisition, sure)))
+            sample.cases.append((batch, sure, trial_counts(acquisition, sure)))
             sample.with_rival += acquisition.rival is not None
             sample.mirrored += any(each.mirrored for each in sure)
         pace.step()
@@ -149,7 +149,7 @@ def _trials(
     mission: Mission,
     findings: Sequence[ToleranceFinding],
     sample: _SampledBatches,
-    run: Run,
+    run: RunAgain,
     own: Mapping[str, float],
     pace: WorkLimit,
 ) -> list[VariantOutcome]:
@@ -159,7 +159,7 @@ def _trials(
         if not pace.in_time(1.0):
             break
         try:
-            of_batch = {each: counts_of(run(each.of(batch)), sure) for each in counts}
+            of_batch = {each: trial_counts(run(each.of(batch)), sure) for each in counts}
         except BadInput as error:
             sample.refuse(error)
         else:
@@ -167,7 +167,7 @@ def _trials(
                 counts[each].append(found)
         pace.step()
     return [
-        trial_of(present, counts[present], None),
-        trial_of(by_probability, [found for *_, found in sample.cases], None),
-        *(trial_of(each, counts[each], counts[present]) for each in others),
+        variant_outcome(present, counts[present], None),
+        variant_outcome(by_probability, [found for *_, found in sample.cases], None),
+        *(variant_outcome(each, counts[each], counts[present]) for each in others),
     ]

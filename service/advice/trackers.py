@@ -27,7 +27,7 @@ CLOSE = 0.2
 CERTAIN = 0.999
 """Of the intervals that tell whether noise changed: several stretches are looked at."""
 
-Verdict = Literal["too_small", "fits", "too_large", "no_verdict"]
+SizeVerdict = Literal["too_small", "fits", "too_large", "no_verdict"]
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class NoiseFinding:
     now_arcsec: float
     sigma_arcsec: Interval | None
     batches: int
-    verdict: Verdict
+    verdict: SizeVerdict
     before_arcsec: Interval | None = None
     since: Utc | None = None
 
@@ -63,7 +63,7 @@ class MagnitudeFinding:
     scatter_mag: Interval | None
     stars: int
     verdict: Literal["off", "fits", "no_verdict"]
-    scatter_verdict: Verdict
+    scatter_verdict: SizeVerdict
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def _squared_noise(fits: list[TrackerAttitude]) -> Vector:
     return np.asarray(np.array([fit.taste for fit in fits]) / chi2.median(freedom))
 
 
-def _size_verdict(now: float, found: Interval) -> Verdict:
+def _size_verdict(now: float, found: Interval) -> SizeVerdict:
     """Whether a sigma is certainly, and by more than CLOSE, below or above what was found."""
     if found.low > now and found.value > (1.0 + CLOSE) * now:
         return "too_small"

@@ -111,7 +111,7 @@ def variants(
         yield Variant(f"{shown}, asked for", "starid", own)
 
 
-def counts_of(acquisition: Acquisition, verified: Sequence[Identification]) -> TrialCounts:
+def trial_counts(acquisition: Acquisition, verified: Sequence[Identification]) -> TrialCounts:
     """The outcomes of one batch, held against those of verified identification by tracker."""
     other_star = 0
     for each, sure in zip(acquisition.trackers, verified, strict=True):
@@ -122,7 +122,7 @@ def counts_of(acquisition: Acquisition, verified: Sequence[Identification]) -> T
     return TrialCounts(**{name: counts[name] for name in OUTCOMES}, other_star=other_star)
 
 
-def trial_of(
+def variant_outcome(
     variant: Variant, counts: Sequence[TrialCounts], present: Sequence[TrialCounts] | None
 ) -> VariantOutcome:
     """The sums over a sample, and the change from the same batches under the present settings."""

@@ -7,7 +7,7 @@ from typing import IO
 from service.access.tokens import Caller, own_key
 from service.app.context import Context, known_id
 from service.app.submissions import Submissions
-from service.imaging.frames.files import digest_of
+from service.imaging.frames.files import frame_digest
 from service.imaging.overlay import draw_overlay
 from service.imaging.overlay_marks import marks_of
 from service.imaging.submit import FrameIn
@@ -45,7 +45,7 @@ class Frames:
         self._submissions.require_kernels()
         with file:
             mission = mission_named(self._context.missions, spacecraft)
-            digest = digest_of(file)
+            digest = frame_digest(file)
             max_pixels = self._context.settings.frame_megapixels * 1_000_000
 
             def make() -> Submission:

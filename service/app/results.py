@@ -14,7 +14,7 @@ from service.storage.queries.future_dated import LIVE
 from service.storage.queries.neighbours import neighbours
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.recorded_batch import recorded_batch, recorded_mission
-from service.storage.queries.results import OutcomeName, Status
+from service.storage.queries.results import OutcomeName, StatusName
 from service.storage.queries.star_field import star_field_of
 from service.storage.recording.ids import is_ulid
 from service.storage.recording.unsaved_result import Answered, Row
@@ -41,7 +41,7 @@ class Results:
         start: Utc | None = None,
         end: Utc | None = None,
         outcome: OutcomeName | None = None,
-        status: Status | None = None,
+        status: StatusName | None = None,
         limit: int = 100,
         cursor: str | None = None,
     ) -> Page[Summary]:

@@ -6,7 +6,7 @@ from service.acquire.prewarm import prewarm_zones
 from service.app.context import Context
 from service.ingest.solver_pool import mission_in_input
 from service.observations.schema import APrioriIn, prior_of
-from service.sky.cache import Entry, Sized
+from service.sky.cache import CacheEntry, Sized
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.zones import Zone
 from service.storage.models.answers import ZoneSummary
@@ -56,7 +56,7 @@ class Zones:
         return self._context.sky.drop_zones(spacecraft)
 
 
-def _zone(entry: Entry[Sized], zone: Zone) -> CachedZone:
+def _zone(entry: CacheEntry[Sized], zone: Zone) -> CachedZone:
     return CachedZone(
         **zone.summary(),
         spacecraft=zone.mission,
@@ -68,7 +68,7 @@ def _zone(entry: Entry[Sized], zone: Zone) -> CachedZone:
     )
 
 
-def _run_catalog(entry: Entry[Sized], catalog: RunCatalog) -> CachedRunCatalog:
+def _run_catalog(entry: CacheEntry[Sized], catalog: RunCatalog) -> CachedRunCatalog:
     return CachedRunCatalog(
         digest=catalog.digest,
         epoch_year=catalog.epoch_year,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from service.imaging.frames.frame import Counts
+from service.imaging.frames.frame import CountArray
 from service.vectors import Matrix, Vector, from_ra_dec
 
 MOST_SIDE_PX, LEAST_SIDE_PX = 1600, 800
@@ -44,7 +44,7 @@ class SkyView:
 
 
 def draw_sky(
-    light: Counts,
+    light: CountArray,
     noise_counts: float,
     binning: int,
     candidates: Sequence[tuple[float, float]],

@@ -17,7 +17,7 @@ from pydantic import AfterValidator, Field, ValidationError
 from service.errors import BadBatch, Fault
 from service.imaging.centroids.record import Flag
 from service.imaging.frames.files import read_frame
-from service.imaging.frames.frame import Frame, FrameLimits, refused, require_light
+from service.imaging.frames.frame import Frame, FrameLimits, bad_frame, require_light
 from service.imaging.frames.preview import preview_of
 from service.missions.camera import Camera, CentroidMethod
 from service.missions.mission import Mission, Tracker
@@ -26,11 +26,11 @@ from service.observations.frame_record import FrameRecord
 from service.observations.schema import (
     APrioriIn,
     BatchIn,
+    BodyRate,
     Key,
     Number,
     OptionsIn,
     Position,
-    Rate,
     RunName,
     Speed,
     Submission,
@@ -64,7 +64,7 @@ class FrameIn(Wire):
     run: RunName = "live"
     tracker: Key | None = None
     a_priori: APrioriIn | None = None
-    body_rates_deg_per_s: tuple[Rate, Rate, Rate] = (0.0, 0.0, 0.0)
+    body_rates_deg_per_s: tuple[BodyRate, BodyRate, BodyRate] = (0.0, 0.0, 0.0)
     velocity_km_per_s: tuple[Speed, Speed, Speed] | None = None
     sun_vector: UnitVector | None = None
     position_km: Position | None = None
@@ -127,7 +127,7 @@ def submission_of_frame(
     clock.append(clock_ns())
     used = [star for star in stars if star.left_out is None]
     if not used:
-        raise refused("shows no star that could be used", f"{found.count} candidates")
+        raise bad_frame("shows no star that could be used", f"{found.count} candidates")
     model = batch_of_stars(mission.name, known, digest, time, tracker, _observed(used, camera))
     steps = dict(
         zip(

@@ -98,7 +98,7 @@ class Tests(Strict):
     match_groups: bool = False
 
 
-class Limits(NamedTuple):
+class ToleranceLimits(NamedTuple):
     """The tolerances of the pair tests as kernels take them, angles in radians."""
 
     separation: float  # SEPTOL
@@ -125,7 +125,7 @@ class Rules:
 
     tolerances: Tolerances
     tests: Tests
-    limits: Limits
+    limits: ToleranceLimits
     switches: Switches
 
 
@@ -134,7 +134,7 @@ def rules_of(tolerances: Tolerances, tests: Tests) -> Rules:
     return Rules(
         tolerances,
         tests,
-        Limits(
+        ToleranceLimits(
             separation=math.radians(tolerances.separation_deg),
             magnitude=float(tolerances.magnitude_mag),
             magnitude_order=float(tolerances.magnitude_order_mag),

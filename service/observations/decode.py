@@ -31,11 +31,11 @@ _ABSENT: Final = math.nan
 _NO_VECTOR: Final = (_ABSENT, _ABSENT, _ABSENT)
 
 
-class _Told(msgspec.Struct, forbid_unknown_fields=True, gc=False):
+class _SentPart(msgspec.Struct, forbid_unknown_fields=True, gc=False):
     """An object of the text; what a model of `wire` leaves out has the same default here."""
 
 
-class Star(_Told):
+class SentStar(_SentPart):
     """One observed star; NaN for a number that is absent."""
 
     vector: Triple = _NO_VECTOR
@@ -46,32 +46,32 @@ class Star(_Told):
     sigma_arcsec: float = _ABSENT
 
 
-class Tracker(_Told):
+class SentTracker(_SentPart):
     """The stars that one tracker observed."""
 
     tracker: str
-    stars: list[Star]
+    stars: list[SentStar]
 
 
-class Direction(_Told):
+class SentDirection(_SentPart):
     """A direction in right ascension and declination."""
 
     ra_deg: float
     dec_deg: float
 
 
-class Prior(_Told):
+class SentPrior(_SentPart):
     """A priori knowledge of one kind, the others left out."""
 
     quaternion: tuple[float, float, float, float] | None = None
-    boresight: Direction | None = None
+    boresight: SentDirection | None = None
     sun_pointed: bool = False
     sun_vector: Triple | None = None
     position_km: Triple | None = None
     frame: str = "EME2000"
 
 
-class Chosen(_Told):
+class SentOptions(_SentPart):
     """Options that replace the mission's settings."""
 
     identifier: Identifier | None = None
@@ -81,25 +81,25 @@ class Chosen(_Told):
     zone_grid_deg: float | None = None
 
 
-class Batch(_Told):
+class SentBatch(_SentPart):
     """A batch of observed stars."""
 
     spacecraft: str
     batch: str
     time: str
-    observations: list[Tracker]
-    a_priori: Prior | None
+    observations: list[SentTracker]
+    a_priori: SentPrior | None
     run: str = "live"
     body_rates_deg_per_s: Triple = (0.0, 0.0, 0.0)
     velocity_km_per_s: Triple | None = None
     sun_vector: Triple | None = None
     position_km: Triple | None = None
     aberration: Aberration = "to_correct"
-    options: Chosen = msgspec.field(default_factory=Chosen)
+    options: SentOptions = msgspec.field(default_factory=SentOptions)
 
 
-_BATCH = msgspec.json.Decoder(Batch)
-_PRIOR = msgspec.json.Decoder(Prior)
+_BATCH = msgspec.json.Decoder(SentBatch)
+_PRIOR = msgspec.json.Decoder(SentPrior)
 
 
 def batch_from_canonical(text: str) -> ObservationBatch:
@@ -132,7 +132,7 @@ def prior_from_canonical(text: str) -> APriori:
     return _prior_of(_PRIOR.decode(text), None, None)
 
 
-def _prior_of(prior: Prior, sun_vector: Triple | None, position_km: Triple | None) -> APriori:
+def _prior_of(prior: SentPrior, sun_vector: Triple | None, position_km: Triple | None) -> APriori:
     """The a priori knowledge as the core takes it; the Sun's direction may stand beside it too."""
     if prior.quaternion is not None:
         # By plain numbers: numpy takes as long for four as for a thousand.
@@ -148,7 +148,7 @@ def _prior_of(prior: Prior, sun_vector: Triple | None, position_km: Triple | Non
     )
 
 
-def _tracker_stars(tracker: Tracker) -> TrackerStars:
+def _tracker_stars(tracker: SentTracker) -> TrackerStars:
     stars = tracker.stars
     vectors: list[float] = []
     for star in stars:

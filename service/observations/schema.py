@@ -39,7 +39,7 @@ NORM_TOLERANCE = 1e-3
 MAX_FAULTS_SHOWN = 20
 MAX_NAME_SHOWN = 80
 
-Frame = Literal["EME2000", "ICRF", "GCRF"]
+ReferenceFrame = Literal["EME2000", "ICRF", "GCRF"]
 
 
 def _near_unit(components: tuple[float, ...]) -> tuple[float, ...]:
@@ -67,11 +67,11 @@ Key = Annotated[str, Field(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\
 RunName = Annotated[
     str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.:-]*$")
 ]
-Rate = Annotated[Number, Field(ge=-360, le=360)]
+BodyRate = Annotated[Number, Field(ge=-360, le=360)]
 Speed = Annotated[Number, Field(ge=-100, le=100)]
 Distance = Annotated[Number, Field(ge=-1e9, le=1e9)]
 Position = tuple[Distance, Distance, Distance]
-Tolerance = Annotated[Number, Field(ge=0, le=180)]
+ToleranceValue = Annotated[Number, Field(ge=0, le=180)]
 
 
 class Wire(BaseModel):
@@ -111,7 +111,7 @@ class QuaternionIn(Wire):
     """An a priori attitude: inertial to body, scalar last."""
 
     quaternion: Quaternion
-    frame: Frame = "EME2000"
+    frame: ReferenceFrame = "EME2000"
 
 
 class DirectionIn(Wire):
@@ -125,7 +125,7 @@ class BoresightIn(Wire):
     """An a priori boresight with unknown roll (cap missions)."""
 
     boresight: DirectionIn
-    frame: Frame = "EME2000"
+    frame: ReferenceFrame = "EME2000"
 
 
 class SunPointedIn(Wire):
@@ -134,7 +134,7 @@ class SunPointedIn(Wire):
     sun_pointed: Literal[True]
     sun_vector: UnitVector | None = None
     position_km: Position | None = None
-    frame: Frame = "EME2000"
+    frame: ReferenceFrame = "EME2000"
 
 
 class TestsIn(Wire):
@@ -154,10 +154,10 @@ class TolerancesIn(Wire):
     separation_deg: Annotated[Number, Field(ge=0, le=5)] | None = None
     magnitude_mag: Annotated[Number, Field(ge=0, le=30)] | None = None
     magnitude_order_mag: Annotated[Number, Field(ge=0, le=30)] | None = None
-    cross_product_deg: Tolerance | None = None
-    pole_difference_deg: Tolerance | None = None
-    pole_angle_deg: Tolerance | None = None
-    fov_rotation_deg: Tolerance | None = None
+    cross_product_deg: ToleranceValue | None = None
+    pole_difference_deg: ToleranceValue | None = None
+    pole_angle_deg: ToleranceValue | None = None
+    fov_rotation_deg: ToleranceValue | None = None
 
 
 class OptionsIn(Wire):
@@ -220,7 +220,7 @@ class BatchIn(Wire):
     time: Annotated[str, AfterValidator(is_time)]
     run: RunName = "live"
     a_priori: APrioriIn | None
-    body_rates_deg_per_s: tuple[Rate, Rate, Rate] = (0.0, 0.0, 0.0)
+    body_rates_deg_per_s: tuple[BodyRate, BodyRate, BodyRate] = (0.0, 0.0, 0.0)
     velocity_km_per_s: tuple[Speed, Speed, Speed] | None = None
     sun_vector: UnitVector | None = None
     position_km: Position | None = None

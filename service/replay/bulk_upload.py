@@ -23,7 +23,7 @@ from service.errors import (
     problem_of_faults,
 )
 from service.observations.readers.telemetry import read_lines
-from service.replay.items import Item, Outcome, Problem, Report
+from service.replay.items import Item, LineOutcome, Problem, Report
 from service.replay.over_http import GIVE_UP_AFTER_S, checked_url, shown_error
 
 ROUTE = "/api/v1/replays"
@@ -54,7 +54,7 @@ class _SentLines:
                 if line.body is None:
                     assert line.fault is not None
                     problem = problem_of_faults([line.fault])
-                    self._report(Outcome(Item(file, line.number, None), None, problem=problem))
+                    self._report(LineOutcome(Item(file, line.number, None), None, problem=problem))
                     continue
                 self._places.append(line.number)
                 yield line.body + b"\n"
@@ -99,7 +99,7 @@ def replay_in_bulk(
                 client.delete(begun, timeout=CANCEL_S)
             raise
     for each in state["errors"]:
-        report(Outcome(lines.item(each["line"]), None, problem=each["problem"]))
+        report(LineOutcome(lines.item(each["line"]), None, problem=each["problem"]))
     if state["state"] != "done":
         raise Busy(
             f"{url} ended the replay before its end ({state['state']}, "

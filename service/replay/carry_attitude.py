@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from service.observations.schema import submission_from_json
-from service.replay.items import Item, Outcome, Report
+from service.replay.items import Item, LineOutcome, Report
 from service.times import Utc
 from service.vectors import (
     Matrix,
@@ -63,7 +63,7 @@ class AttitudeCarrier:
         body["a_priori"] = {"quaternion": quaternion.tolist(), "frame": "EME2000"}
         return replace(item, submission=submission_from_json(json.dumps(body)))
 
-    def note(self, outcome: Outcome) -> None:
+    def note(self, outcome: LineOutcome) -> None:
         """Remember the attitude of an answer, if it is a good one."""
         if outcome.answer is None or outcome.item.submission is None:
             return
@@ -79,7 +79,7 @@ class AttitudeCarrier:
 def reporting_to_carrier(report: Report, carrier: AttitudeCarrier) -> Report:
     """A report that passes every outcome to the carrier too."""
 
-    def both(outcome: Outcome) -> None:
+    def both(outcome: LineOutcome) -> None:
         carrier.note(outcome)
         report(outcome)
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from service.app.factory import App
 from service.errors import AcquisitionError, Busy, problem_of
 from service.replay.carry_attitude import AttitudeCarrier, reporting_to_carrier
-from service.replay.items import Item, Outcome, Pace, Report
+from service.replay.items import Item, LineOutcome, Pace, Report
 
 CHUNK = 500
 """Batches of one transaction: enough to share its cost, few enough to see progress."""
@@ -50,12 +50,12 @@ def _submit(app: App, chunk: list[Item], report: Report) -> None:
     )
     for item in chunk:
         if item.submission is None:
-            report(Outcome(item, None, problem=item.problem))
+            report(LineOutcome(item, None, problem=item.problem))
             continue
         answer = next(answers)
         if isinstance(answer, Busy):
             raise answer
         if isinstance(answer, AcquisitionError):
-            report(Outcome(item, None, problem=problem_of(answer)))
+            report(LineOutcome(item, None, problem=problem_of(answer)))
         else:
-            report(Outcome(item, answer.body, answer.replayed))
+            report(LineOutcome(item, answer.body, answer.replayed))

@@ -26,7 +26,7 @@ class Item:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class LineOutcome:
     """The outcome of a line: the answer's own bytes, or a problem.
 
     `replayed` tells that the batch was already recorded.
@@ -38,7 +38,7 @@ class Outcome:
     problem: Problem | None = None
 
 
-Report = Callable[[Outcome], None]
+Report = Callable[[LineOutcome], None]
 
 
 def items_of(files: Sequence[Path], run: str) -> Iterator[Item]:

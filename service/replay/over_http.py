@@ -13,7 +13,7 @@ import httpx
 
 from service.errors import BadInput, Busy, Fault, Unauthenticated, shown_value
 from service.replay.carry_attitude import AttitudeCarrier, reporting_to_carrier
-from service.replay.items import Item, Outcome, Pace, Problem, Report
+from service.replay.items import Item, LineOutcome, Pace, Problem, Report
 
 ROUTE = "/api/v1/batches"
 JSON = {"Content-Type": "application/json"}
@@ -93,7 +93,7 @@ async def _replay(
         if watched_run is not None:
             await _watch(client, watched_run)
         clock = asyncio.get_running_loop().time
-        window: deque[asyncio.Task[Outcome]] = deque()
+        window: deque[asyncio.Task[LineOutcome]] = deque()
         try:
             for item in items:
                 while (wait_s := pace.wait_s(item, clock())) > 0:
@@ -137,13 +137,13 @@ async def _watch(client: httpx.AsyncClient, run: str) -> None:
 
 async def _outcome(
     client: httpx.AsyncClient, url: str, item: Item, give_up_after_s: float
-) -> Outcome:
+) -> LineOutcome:
     if item.submission is None:
-        return Outcome(item, None, problem=item.problem)
+        return LineOutcome(item, None, problem=item.problem)
     response = await _post(client, url, item.submission.text, give_up_after_s)
     if response.status_code in (200, 201):
-        return Outcome(item, response.content, response.headers.get("Replayed") == "true")
-    return Outcome(item, None, problem=_problem(response))
+        return LineOutcome(item, response.content, response.headers.get("Replayed") == "true")
+    return LineOutcome(item, None, problem=_problem(response))
 
 
 async def _post(

@@ -14,8 +14,8 @@ import msgspec
 from tqdm import tqdm
 
 from service.errors import BadFile, Fault
-from service.observations.readers.telemetry import form_of
-from service.replay.items import Outcome
+from service.observations.readers.telemetry import telemetry_format
+from service.replay.items import LineOutcome
 
 MAX_PROBLEMS_SHOWN = 20
 STARS = ("observed", "unique", "ambiguous", "unmatched")
@@ -58,7 +58,7 @@ class ReplaySummary:
         """Lines that were processed."""
         return self.new + self.replayed + self.refused
 
-    def add(self, outcome: Outcome) -> None:
+    def add(self, outcome: LineOutcome) -> None:
         """Count one outcome and write its line of the results."""
         if outcome.answer is None:
             self.refused += 1
@@ -95,10 +95,10 @@ class ReplaySummary:
         self.stars.update(answer["counts"])
         self.attitudes += answer["attitude"] is not None
 
-    def _refusal(self, outcome: Outcome) -> dict[str, Any]:
+    def _refusal(self, outcome: LineOutcome) -> dict[str, Any]:
         return {"line": outcome.item.number, "problem": outcome.problem}
 
-    def _print_problem(self, outcome: Outcome) -> None:
+    def _print_problem(self, outcome: LineOutcome) -> None:
         if self.refused > MAX_PROBLEMS_SHOWN:
             return
         where = f"{outcome.item.file}:{outcome.item.number}"
@@ -162,7 +162,7 @@ def _lines_in(files: Sequence[Path]) -> int | None:
     """Lines to come, for the bar; None where a line is not a batch."""
     count = 0
     for file in files:
-        if form_of(file) == "csv":
+        if telemetry_format(file) == "csv":
             return None
         try:
             with file.open("rb") as stream:

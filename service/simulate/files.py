@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from service.errors import BadFile, Fault
-from service.observations.readers.csv_rows import write_csv
-from service.observations.readers.telemetry import form_of
+from service.observations.readers.csv_rows import write_batches_csv
+from service.observations.readers.telemetry import telemetry_format
 from service.observations.schema import BatchIn
-from service.simulate.telemetry import Drawn
+from service.simulate.telemetry import DrawnBatch
 
 
 def truth_path(telemetry: Path) -> Path:
@@ -18,7 +18,7 @@ def truth_path(telemetry: Path) -> Path:
     return telemetry.with_name(f"{telemetry.stem}.truth.ndjson")
 
 
-def write_pass(drawn: Iterable[Drawn], telemetry: Path) -> int:
+def write_pass(drawn: Iterable[DrawnBatch], telemetry: Path) -> int:
     """Write batches (NDJSON, or CSV by the name) and their truth; how many there were.
 
     Both files appear when they are whole: a pass cut short leaves the old ones.
@@ -35,8 +35,10 @@ def write_pass(drawn: Iterable[Drawn], telemetry: Path) -> int:
     with ExitStack() as stack:
         truth = stack.enter_context(_appearing(truth_path(telemetry)))
         out = stack.enter_context(_appearing(telemetry))
-        if form_of(telemetry) == "csv":
-            write_csv((BatchIn.model_validate_json(json.dumps(each)) for each in batches()), out)
+        if telemetry_format(telemetry) == "csv":
+            write_batches_csv(
+                (BatchIn.model_validate_json(json.dumps(each)) for each in batches()), out
+            )
         else:
             out.writelines(_line(each) for each in batches())
     return count

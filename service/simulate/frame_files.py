@@ -13,7 +13,7 @@ from service.imaging.frames.fits import write_fits
 from service.simulate.frames import DrawnFrame
 from service.times import shifted
 
-Writer = Callable[[DrawnFrame, BinaryIO], None]
+FrameWriter = Callable[[DrawnFrame, BinaryIO], None]
 FrameFormat = Literal["fits", "tiff", "png", "npy"]
 TRUTH = "truth.ndjson"
 
@@ -57,7 +57,7 @@ def _fits(drawn: DrawnFrame, file: BinaryIO) -> None:
     write_fits(file, drawn.counts, cards)
 
 
-def _picture(file_format: str) -> Writer:
+def _picture(file_format: str) -> FrameWriter:
     def write(drawn: DrawnFrame, file: BinaryIO) -> None:
         from PIL import Image
 
@@ -70,6 +70,6 @@ def _npy(drawn: DrawnFrame, file: BinaryIO) -> None:
     np.save(file, drawn.counts)
 
 
-_WRITERS: Mapping[FrameFormat, Writer] = {
+_WRITERS: Mapping[FrameFormat, FrameWriter] = {
     "fits": _fits, "tiff": _picture("TIFF"), "png": _picture("PNG"), "npy": _npy,
 }  # fmt: skip

@@ -18,10 +18,10 @@ from service.errors import BadInput, Fault, shown_value
 from service.imaging.centroids.psf import GaussianPsf, Psf
 from service.imaging.centroids.sampled_psf import airy_psf, cross_psf
 from service.imaging.detection.trail import TrailPsf, trails_px
-from service.imaging.frames.frame import Counts
+from service.imaging.frames.frame import CountArray
 from service.missions.camera import Camera
 from service.missions.mission import Mission, RunCatalogSettings, Tracker
-from service.simulate.motion import pointed, random_axis, turned
+from service.simulate.motion import pointed, random_axis, turned_by
 from service.simulate.orbits import orbit_of
 from service.simulate.real_sky import RealSky, real_sky
 from service.sky.catalog.run_catalog import build_run_catalog
@@ -89,7 +89,7 @@ class DrawnFrame:
     `known` is what goes with the frame to the service; `truth` never does.
     """
 
-    counts: Counts
+    counts: CountArray
     exposure_s: float
     time: Utc
     known: dict[str, Any]
@@ -100,13 +100,13 @@ class DrawnFrame:
 class _Chip:
     """What stays the same from frame to frame: the pixels' response, and which are hot."""
 
-    response: Counts
-    hot: Counts
+    response: CountArray
+    hot: CountArray
     hot_e_per_s: Vector
 
 
 @dataclass(frozen=True)
-class _Stars:
+class _FrameStars:
     """The stars on one frame, brightest first, at mid exposure."""
 
     row: Any
@@ -195,7 +195,7 @@ def _stars(
     time: Utc,
     position_km: Vector,
     velocity_km_per_s: Vector,
-) -> _Stars:
+) -> _FrameStars:
     run = everything.run
     boresight = attitude.T @ tracker.body_from_tracker[:, 2]
     near = math.cos(math.radians(min(camera.corner_radius_deg + 0.5, 89.0)))
@@ -210,17 +210,17 @@ def _stars(
     inside = (u > -margin) & (u < columns + margin) & (v > -margin) & (v < rows + margin)
     row, u, v = row[inside], u[inside], v[inside]
     trails = trails_px(camera, tracker.body_from_tracker, rates_deg_per_s, u, v, camera.exposure_s)
-    return _Stars(row, u, v, everything.magnitude_mag[row], *trails)
+    return _FrameStars(row, u, v, everything.magnitude_mag[row], *trails)
 
 
 def _exposed(
     camera: Camera,
     psf: Psf,
-    stars: _Stars,
+    stars: _FrameStars,
     chip: _Chip,
     wanted: FrameSettings,
     rng: np.random.Generator,
-) -> tuple[Counts, int]:
+) -> tuple[CountArray, int]:
     """The counts of one exposure, and how many cosmic rays hit."""
     light_e = np.full(camera.shape, wanted.sky_e_per_s * camera.exposure_s)
     flux_e = camera.flux_counts(stars.magnitude_mag, camera.exposure_s) * camera.gain_e_per_count
@@ -242,7 +242,7 @@ def _exposed(
 
 
 def add_star(
-    light: Counts, psf: TrailPsf, u_px: float, v_px: float, flux: float, half_px: int
+    light: CountArray, psf: TrailPsf, u_px: float, v_px: float, flux: float, half_px: int
 ) -> None:
     """Add a star's image to an array of light, where it falls on it."""
     rows, columns = light.shape
@@ -256,7 +256,7 @@ def add_star(
         light[top:bottom, left:right] += flux * psf.pixel(du, dv)
 
 
-def _add_cosmic_ray(electrons: Counts, rng: np.random.Generator) -> None:
+def _add_cosmic_ray(electrons: CountArray, rng: np.random.Generator) -> None:
     """A straight track of uneven charge: most are a few pixels long."""
     rows, columns = electrons.shape
     length, angle = rng.exponential(4.0), rng.uniform(0.0, math.tau)
@@ -281,7 +281,7 @@ def _a_priori(
     if error_deg is None:
         return None
     error = random_axis(rng) * math.radians(rng.uniform(0.0, error_deg))
-    quaternion = np.round(quaternion_from_matrix(turned(attitude, error)), 10)
+    quaternion = np.round(quaternion_from_matrix(turned_by(attitude, error)), 10)
     return {"quaternion": quaternion.tolist(), "frame": "EME2000"}
 
 

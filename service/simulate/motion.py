@@ -46,13 +46,13 @@ def slewing_attitudes(rates_deg_per_s: Vector, cadence_s: float, first: Matrix) 
     attitude = first
     for rates in rates_deg_per_s:
         yield attitude
-        attitude = turned(attitude, np.radians(rates) * cadence_s)
+        attitude = turned_by(attitude, np.radians(rates) * cadence_s)
         # A product of many rotations drifts from being one.
         u, _, vt = np.linalg.svd(attitude)
         attitude = u @ vt
 
 
-def turned(attitude: Matrix, rotation_vector_rad: Vector) -> Matrix:
+def turned_by(attitude: Matrix, rotation_vector_rad: Vector) -> Matrix:
     """The attitude after the body has turned by a rotation vector in body axes."""
     return rotate_about(-rotation_vector_rad, attitude.T).T
 
@@ -60,7 +60,7 @@ def turned(attitude: Matrix, rotation_vector_rad: Vector) -> Matrix:
 def pointed(axis_body: Vector, direction: Vector, roll_rad: float) -> Matrix:
     """The attitude that has a body axis along an inertial direction, turned about it by a roll."""
     body, inertial = (np.stack([each, *across(each)]) for each in (axis_body, direction))
-    return turned(body.T @ inertial, axis_body * roll_rad)
+    return turned_by(body.T @ inertial, axis_body * roll_rad)
 
 
 def across(direction: Vector) -> tuple[Vector, Vector]:

@@ -16,7 +16,7 @@ import numpy as np
 from erfa import ufunc
 
 from service.missions.mission import RunCatalogSettings
-from service.sky.catalog.blending import Rows, merge
+from service.sky.catalog.blending import Rows, merged_into
 from service.sky.catalog.proper_motion import moved
 from service.sky.catalog.run_catalog import J2000_YEAR, RunCatalog, instrument_magnitude
 from service.sky.catalog.star_catalog import Catalog
@@ -77,7 +77,7 @@ def real_sky(catalog: Catalog, settings: RunCatalogSettings, run: RunCatalog) ->
         catalog.pm_dec_mas_per_year,
         run.epoch_year - J2000_YEAR,
     )
-    leader = merge(then, alone, catalog.light_elsewhere, settings.merge_within_arcsec)
+    leader = merged_into(then, alone, catalog.light_elsewhere, settings.merge_within_arcsec)
     star_of = np.full(len(catalog), -1)
     star_of[run.catalog_row] = np.arange(len(run))
     star = star_of[leader]

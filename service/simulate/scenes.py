@@ -29,7 +29,7 @@ MAX_TRIES = 10_000
 
 
 @dataclass(frozen=True)
-class Camera:
+class PinholeCamera:
     """A square detector behind a pinhole: +Z is the boresight, x and y count from the centre."""
 
     side_px: int = 1024
@@ -70,7 +70,7 @@ class Conditions:
     """Attitudes are drawn until so many stars are detected."""
     spurious: int = 0
     """Points that are no stars, anywhere in the field, as bright as detected stars are."""
-    camera: Camera = Camera()
+    camera: PinholeCamera = PinholeCamera()
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +238,7 @@ def _as_bright(
 
 
 def _scene(
-    camera: Camera,
+    camera: PinholeCamera,
     pixels: Vector,
     magnitude: Vector,
     row: npt.NDArray[np.int64],

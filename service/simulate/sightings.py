@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from service.missions.mission import Band, Calibration, Mission, Tracker
 from service.observations.batch import Aberration
-from service.simulate.motion import across, random_axis, turned
+from service.simulate.motion import across, random_axis, turned_by
 from service.simulate.real_sky import RealSky
 from service.simulate.stretches import Stretch
 from service.sky.ephemeris import apparent
@@ -39,7 +39,7 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Scene:
+class BatchScene:
     """The sky about one batch, and what befalls its stars."""
 
     mission: Mission
@@ -63,7 +63,7 @@ class Scene:
             if any(len(each.star) for each in seen):
                 return attitude, seen
             axis = self.mission.axis_body if keeps_pole else random_axis(self.rng)
-            attitude = turned(attitude, axis * math.radians(3.0))
+            attitude = turned_by(attitude, axis * math.radians(3.0))
 
     def _visible(self, tracker: Tracker, attitude: Matrix, most: int) -> Seen:
         alignment = tracker.body_from_tracker

@@ -8,7 +8,7 @@ from service.errors import BadInput, Fault, shown_value
 from service.missions.mission import Band, Mission
 from service.observations.batch import MAX_STARS_PER_TRACKER, Aberration
 
-Prior = Literal["quaternion", "direction", "mixed"]
+PriorKind = Literal["quaternion", "direction", "mixed"]
 Kind = Literal["nominal", "attitude_error", "spurious", "magnitude_error", "position_error"]
 
 DEFAULT_START = "1999-03-01T00:00:00.000Z"
@@ -73,7 +73,7 @@ class Pass:
     start: str | None = None
     cadence_s: float | None = None
     stars: int = 5
-    prior: Prior = "quaternion"
+    prior: PriorKind = "quaternion"
     angles_share: float = 0.25
     """The share of batches whose stars come as `h_deg`, `v_deg`; the others come as vectors."""
     aberration: Mapping[Aberration, float] = field(default_factory=lambda: {"to_correct": 1.0})
@@ -87,7 +87,9 @@ class Pass:
         cadence_s = 1.0 if self.cadence_s is None else self.cadence_s
         _require(0 < cadence_s <= 1e6, "cadence", "must be above 0 and at most 1e6 s", cadence_s)
         _require(0 <= self.angles_share <= 1, "angles", "must be from 0 to 1", self.angles_share)
-        _require(self.prior in get_args(Prior), "prior", f"must be {_any_of(Prior)}", self.prior)
+        _require(
+            self.prior in get_args(PriorKind), "prior", f"must be {_any_of(PriorKind)}", self.prior
+        )
         for word, share in self.aberration.items():
             known = word in get_args(Aberration)
             _require(known, "aberration", f"must be of {_any_of(Aberration)}", word)

@@ -24,7 +24,7 @@ from service.simulate.motion import (
 )
 from service.simulate.orbits import orbit_of
 from service.simulate.real_sky import real_sky
-from service.simulate.sightings import Scene, Seen
+from service.simulate.sightings import BatchScene, Seen
 from service.simulate.stretches import Pass
 from service.sky.ephemeris import observer_velocity, sun_direction
 from service.sky.model import SkyModel
@@ -46,14 +46,14 @@ BAND_A_PRIORI_DEG = 0.1
 
 
 @dataclass(frozen=True)
-class Drawn:
+class DrawnBatch:
     """One batch as it is sent, and what is true of it; both ready for JSON."""
 
     batch: dict[str, Any]
     truth: dict[str, Any]
 
 
-def draw_pass(mission: Mission, sky: SkyModel, wanted: Pass) -> Iterator[Drawn]:
+def draw_pass(mission: Mission, sky: SkyModel, wanted: Pass) -> Iterator[DrawnBatch]:
     """The batches of a pass, in order of time.
 
     Every batch has a random generator of its own, so that a change of one
@@ -74,7 +74,7 @@ def draw_pass(mission: Mission, sky: SkyModel, wanted: Pass) -> Iterator[Drawn]:
         time = _rounded(shifted(start, k * cadence_s))
         rng = np.random.default_rng([*root, 1, k])
         position_km, velocity_km_per_s = (np.round(each, 4) for each in orbit.state(time))
-        scene = Scene(
+        scene = BatchScene(
             mission=mission,
             sky=real_sky(sky.catalog, mission.catalog, sky.run_catalog(mission, time)),
             time=time,
@@ -108,7 +108,7 @@ def draw_pass(mission: Mission, sky: SkyModel, wanted: Pass) -> Iterator[Drawn]:
                 for each in seen
             ],
         }
-        yield Drawn(batch, _truth(batch, scene, attitude, presumed, seen))
+        yield DrawnBatch(batch, _truth(batch, scene, attitude, presumed, seen))
 
 
 def _motion(
@@ -126,7 +126,7 @@ def _motion(
 
 
 def _on_the_sun(
-    scene: Scene, sun: Vector, roll_rad: float, most: int
+    scene: BatchScene, sun: Vector, roll_rad: float, most: int
 ) -> tuple[Matrix, Matrix, list[Seen]]:
     """A pole close to the Sun; the a priori attitude has it on the Sun, with any roll."""
     rng, stretch, axis = scene.rng, scene.stretch, scene.mission.axis_body
@@ -139,7 +139,7 @@ def _on_the_sun(
 
 
 def _on_the_sky(
-    scene: Scene, attitude: Matrix, drift: Vector, most: int
+    scene: BatchScene, attitude: Matrix, drift: Vector, most: int
 ) -> tuple[Matrix, Matrix, list[Seen]]:
     """Anywhere; the a priori attitude is off: attitude = R1(psi) R2(theta) R3(phi) a priori."""
     rng, stretch, limit = scene.rng, scene.stretch, CAP_A_PRIORI_DEG
@@ -176,7 +176,7 @@ def _prior(mission: Mission, presumed: Matrix, by_direction: bool) -> dict[str, 
 
 
 def _truth(
-    batch: dict[str, Any], scene: Scene, attitude: Matrix, presumed: Matrix, seen: list[Seen]
+    batch: dict[str, Any], scene: BatchScene, attitude: Matrix, presumed: Matrix, seen: list[Seen]
 ) -> dict[str, Any]:
     axis = scene.mission.axis_body
     error_deg = attitude_error_arcsec(presumed, attitude) / 3600.0

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from service.missions.mission import Band, Mission
 from service.observations.batch import ObservationBatch, Options, QuaternionPrior, TrackerStars
-from service.simulate.motion import pointed, random_axis, tilted, turned
+from service.simulate.motion import pointed, random_axis, tilted, turned_by
 from service.simulate.sightings import anywhere, shaken
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.ephemeris import sun_direction
@@ -115,7 +115,7 @@ class Views:
         boresight = self.mission.trackers[0].body_from_tracker[:, 2]
         axis = np.cross(boresight, random_axis(self.rng))
         axis /= np.linalg.norm(axis)
-        return turned(attitude, axis * math.radians(self.rng.uniform(least_deg, most_deg)))
+        return turned_by(attitude, axis * math.radians(self.rng.uniform(least_deg, most_deg)))
 
     def ghosts(self, stars: int) -> tuple[Group, Group]:
         """So many stars and as many reflections of them."""

@@ -29,7 +29,7 @@ T = TypeVar("T", bound=Sized)
 
 
 @dataclass
-class Entry(Generic[T]):
+class CacheEntry(Generic[T]):
     """One cached thing, and its use so far."""
 
     key: Hashable
@@ -42,7 +42,7 @@ class Entry(Generic[T]):
 class CacheState:
     """The state of a cache: its entries, least recently used first, and its counters."""
 
-    entries: tuple[Entry[Sized], ...]
+    entries: tuple[CacheEntry[Sized], ...]
     nbytes: int
     max_bytes: int
     hits: int
@@ -56,7 +56,7 @@ class LruCache:
     """A cache bounded in bytes; safe to use from many threads."""
 
     max_bytes: int
-    _entries: "OrderedDict[Hashable, Entry[Sized]]" = field(default_factory=OrderedDict)
+    _entries: "OrderedDict[Hashable, CacheEntry[Sized]]" = field(default_factory=OrderedDict)
     _building: "dict[Hashable, Future[Sized]]" = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _building_slots: threading.Semaphore = field(
@@ -101,11 +101,11 @@ class LruCache:
         build_us = (time.perf_counter_ns() - started) // 1000
         with self._lock:
             del self._building[key]
-            self._put(Entry(key, thing, build_us))
+            self._put(CacheEntry(key, thing, build_us))
         promise.set_result(thing)
         return thing, False
 
-    def _put(self, entry: Entry[Sized]) -> None:
+    def _put(self, entry: CacheEntry[Sized]) -> None:
         self._entries[entry.key] = entry
         self._nbytes += entry.thing.nbytes
         self._build_us += entry.build_us

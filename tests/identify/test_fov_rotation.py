@@ -9,7 +9,7 @@ from service.acquire.choices import choices_of
 from service.identify.voting.fov_rotation import rotation_rad
 from service.observations.batch import BoresightPrior
 from service.observations.schema import OptionsIn
-from service.simulate.motion import random_axis, turned
+from service.simulate.motion import random_axis, turned_by
 from service.studies.paper_1994.printed import the_paper
 from service.studies.paper_1994.views import EPOCH, batch_of, draw_zone
 from service.vectors import rotate_about, unit
@@ -104,7 +104,7 @@ def test_a_tracker_rolled_beyond_the_tolerance_is_not_identified(sky, missions, 
 
 def test_the_turn_of_an_attitude_is_that_of_its_pairs(rng):
     attitude = np.eye(3)
-    off = turned(attitude, np.radians(7.0) * BORESIGHT)
+    off = turned_by(attitude, np.radians(7.0) * BORESIGHT)
     assert rotation_deg(lambda pair: pair @ off, rng) == pytest.approx(7.0, abs=1e-6)
 
 

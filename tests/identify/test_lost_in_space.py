@@ -15,8 +15,8 @@ from service.identify.lost_in_space.matching import nearest_stars
 from service.identify.lost_in_space.solver import FieldOfView, LostInSpace
 from service.missions.mission import RunCatalogSettings
 from service.simulate.scenes import (
-    Camera,
     Conditions,
+    PinholeCamera,
     Scene,
     SceneSky,
     draw_random_points,
@@ -296,7 +296,7 @@ def scene_of(case):
     """A real image: centroids with their brightness, which is no magnitude, as points."""
     y, x = np.array(case["centroids_yx"]).T
     pixels = np.column_stack([x - case["width"] / 2, (y - case["height"] / 2) * case["y_scale"]])
-    camera = Camera(side_px=case["width"], focal_px=case["focal_px"])
+    camera = PinholeCamera(side_px=case["width"], focal_px=case["focal_px"])
     n = len(pixels)
     return Scene(
         direction=camera.directions(pixels),

@@ -8,7 +8,7 @@ import pytest
 
 from service.attitude.covariance import within
 from service.identify.lost_in_space.decision import LARGEST_SIGMA_RAD
-from service.identify.lost_in_space.pair_order import rows_within
+from service.identify.lost_in_space.pair_order import rows_of_magnitude
 from service.identify.lost_in_space.prefilter import candidates_of
 from service.identify.lost_in_space.solver import FieldOfView, LostInSpace
 from service.identify.lost_in_space.workspace import CHUNK, Chunk
@@ -40,13 +40,13 @@ def test_the_rows_of_a_magnitude_are_all_within_its_gate_and_few_more(index, rng
     magnitude = index.arrays.stars[:, 3]
     for seen in (*rng.uniform(-3.0, 9.0, 60), -10.0, 20.0):
         for gate in (0.0, 0.3, 1.7):
-            first, last = rows_within(index.arrays.brighter, seen, gate)
+            first, last = rows_of_magnitude(index.arrays.brighter, seen, gate)
             wanted = np.flatnonzero(np.abs(magnitude - seen) <= gate)
             assert len(wanted) == 0 or (first <= wanted[0] and wanted[-1] < last)
             got = magnitude[first:last]
             assert (got >= seen - gate - 0.051).all()
             assert (got <= seen + gate + 0.051).all()
-    first, last = rows_within(index.arrays.brighter, math.nan, 1.0)
+    first, last = rows_of_magnitude(index.arrays.brighter, math.nan, 1.0)
     assert first == 0
     assert last >= index.stars
 

@@ -14,11 +14,11 @@ from service.observations.decode import batch_from_canonical
 from tests.observations.example import BATCH
 
 ALIKE = [
-    (wire.StarIn, canonical.Star),
-    (wire.TrackerIn, canonical.Tracker),
-    (wire.DirectionIn, canonical.Direction),
-    (wire.OptionsIn, canonical.Chosen),
-    (wire.BatchIn, canonical.Batch),
+    (wire.StarIn, canonical.SentStar),
+    (wire.TrackerIn, canonical.SentTracker),
+    (wire.DirectionIn, canonical.SentDirection),
+    (wire.OptionsIn, canonical.SentOptions),
+    (wire.BatchIn, canonical.SentBatch),
 ]
 PRIORS = (wire.QuaternionIn, wire.BoresightIn, wire.SunPointedIn)
 
@@ -49,9 +49,9 @@ def test_what_the_text_leaves_out_has_the_default_of_the_model(model, struct):
 
 def test_every_kind_of_prior_has_its_fields():
     fields = {name for model in PRIORS for name in model.model_fields}
-    assert fields == set(canonical.Prior.__struct_fields__)
+    assert fields == set(canonical.SentPrior.__struct_fields__)
     assert {model.model_fields["frame"].default for model in PRIORS} == {
-        _defaults(canonical.Prior)["frame"]
+        _defaults(canonical.SentPrior)["frame"]
     }
 
 

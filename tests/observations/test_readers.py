@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from service.errors import BadBatch, BadFile
 from service.observations.readers.csv_columns import COLUMNS
-from service.observations.readers.csv_rows import write_csv
+from service.observations.readers.csv_rows import write_batches_csv
 from service.observations.readers.lines import MAX_LINE_BYTES, Line
 from service.observations.readers.telemetry import read_lines
 from service.observations.schema import BatchIn, submission_from_json
@@ -310,7 +310,7 @@ def test_rows_and_json_of_one_batch_are_one_submission(some: list[dict[str, obje
     """Written as CSV and read back, a batch has the text and the fingerprint that it had."""
     models = [BatchIn.model_validate_json(json.dumps(body)) for body in some]
     text = io.StringIO(newline="")
-    write_csv(models, text)
+    write_batches_csv(models, text)
     assert text.getvalue().splitlines()[0] == ",".join(COLUMNS)
     lines = list(read_lines(io.BytesIO(text.getvalue().encode()), "csv"))
     assert refused(lines) == []

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from service.simulate.scenes import (
-    Camera,
     Conditions,
+    PinholeCamera,
     SceneSky,
     draw_random_points,
     draw_scene,
@@ -20,7 +20,7 @@ def sky():
 
 
 def test_the_camera_sees_ten_degrees_and_its_pixels_read_back():
-    camera = Camera()
+    camera = PinholeCamera()
     assert camera.field_deg == pytest.approx(10.0, abs=1e-3)
     pixels = np.array([[0.0, 0.0], [512.0, -512.0], [-13.5, 200.25]])
     assert camera.pixels(camera.directions(pixels)) == pytest.approx(pixels, abs=1e-9)
@@ -33,7 +33,7 @@ def test_without_noise_every_star_stands_where_the_attitude_puts_it(sky):
         there = catalog.direction[scene.star] @ scene.attitude.T
         assert angle_between_deg(scene.direction, there) == pytest.approx(0.0, abs=1e-9)
         assert scene.magnitude_mag == pytest.approx(catalog.magnitude_mag[scene.star])
-        pixels = Camera().pixels(catalog.direction @ scene.attitude.T)
+        pixels = PinholeCamera().pixels(catalog.direction @ scene.attitude.T)
         inside = (np.abs(pixels) <= 512).all(axis=1) & (catalog.direction @ scene.attitude[2] > 0)
         expected = np.flatnonzero(inside & (catalog.magnitude_mag <= 6.0))
         assert sorted(scene.star) == expected.tolist()
@@ -102,7 +102,7 @@ def test_how_far_an_attitude_is_off_is_told_for_boresight_and_in_total(sky):
 
 def test_random_points_lie_in_the_field_and_name_no_star(sky):
     scene = draw_random_points(sky, Conditions(), 12, np.random.default_rng(7))
-    assert (np.abs(Camera().pixels(scene.direction)) <= 512).all()
+    assert (np.abs(PinholeCamera().pixels(scene.direction)) <= 512).all()
     assert (scene.star == -1).all()
 
 

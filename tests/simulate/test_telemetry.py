@@ -16,7 +16,7 @@ from service.observations.schema import submission_from_json
 from service.simulate.files import read_objects, truth_path, write_pass
 from service.simulate.orbits import HaloOrbit, orbit_of
 from service.simulate.real_sky import real_sky
-from service.simulate.sightings import Scene, Seen, anywhere, measured_angles_deg, shaken
+from service.simulate.sightings import BatchScene, Seen, anywhere, measured_angles_deg, shaken
 from service.simulate.stretches import NO_TROUBLES, Pass, Stretch, Trouble, Troubles
 from service.simulate.telemetry import draw_pass
 from service.sky.ephemeris import apparent, observer_velocity, sun_direction
@@ -210,7 +210,7 @@ def test_magnitude_errors_end_at_six_sigmas(missions, sky, kind):
     (tracker,), rng = mission.trackers, TailFirst()
     real = real_sky(sky.catalog, mission.catalog, sky.run_catalog(mission, time))
     still, stretch = np.zeros(3), Stretch(kind, 0.5)
-    scene = Scene(mission, real, time, still, still, "ignore", still, stretch, rng)
+    scene = BatchScene(mission, real, time, still, still, "ignore", still, stretch, rng)
     direction = np.tile([0.0, 0.0, 1.0], (4, 1))
     seen = Seen(tracker, direction, np.zeros(4), np.full(4, 5.0), np.arange(4))
     sigma_mag = 0.5 if kind == "magnitude_error" else tracker.magnitude_sigma_mag

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from service.missions.mission import RunCatalogSettings
-from service.sky.catalog.blending import merge
+from service.sky.catalog.blending import merged_into
 from service.sky.catalog.run_catalog import (
     build_run_catalog,
     export_csv,
@@ -160,7 +160,7 @@ def test_merging_agrees_with_a_walk_over_all_stars(catalog, within_arcsec):
     """On a crowded patch every star finds the leader that a plain walk gives it."""
     patch = angle_between_deg(catalog.direction, from_ra_dec(56.75, 24.1)) < 4.0
     direction, magnitude = catalog.direction[patch], catalog.magnitude_v_mag[patch]
-    found = merge(direction, magnitude, np.zeros(len(magnitude), dtype=bool), within_arcsec)
+    found = merged_into(direction, magnitude, np.zeros(len(magnitude), dtype=bool), within_arcsec)
     assert found.tolist() == brute_force_leaders(direction, magnitude, within_arcsec)
     assert np.sum(found != np.arange(len(found))) >= 3
 

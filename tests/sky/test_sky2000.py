@@ -16,7 +16,7 @@ from service.observations.schema import submission_from_json
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
 from service.sky.cache import LruCache
-from service.sky.catalog.sky2000 import FIELDS, is_sky2000, read
+from service.sky.catalog.sky2000 import FIELDS, is_sky2000, read_sky2000
 from service.sky.catalog.star_catalog import import_catalog, load, save
 from service.sky.model import SkyModel
 from tests.sky.sky2000_records import LAYOUT, SIRIUS, written
@@ -110,9 +110,9 @@ def test_what_is_written_by_the_description_is_what_is_read(folder, stars):
     known = [v for v in values if v["Vmag"] is not None or v["Vder"] is not None]
     if not known:
         with pytest.raises(BadFile, match="no star"):
-            read(path)
+            read_sky2000(path)
         return
-    assert len(read(path).without_magnitude) == len(values) - len(known)
+    assert len(read_sky2000(path).without_magnitude) == len(values) - len(known)
     save(import_catalog(path), folder / "stars.npz")
     catalog = load(folder / "stars.npz")
     assert len(catalog) == len(known)
@@ -239,7 +239,7 @@ def test_whatever_a_file_holds_it_is_read_or_refused(folder, data, at):
         path.write_bytes(content)
         faults = ()
         try:
-            assert len(read(path).columns["label"]) >= 1
+            assert len(read_sky2000(path).columns["label"]) >= 1
         except BadFile as refusal:
             faults = refusal.faults
         assert len(faults) <= 20

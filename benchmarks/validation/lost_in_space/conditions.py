@@ -22,8 +22,8 @@ from service.simulate.motion import random_axis
 from service.simulate.scenes import (
     EPOCH_YEAR,
     MERGE_WITHIN_ARCSEC,
-    Camera,
     Conditions,
+    PinholeCamera,
     Scene,
     SceneSky,
     draw_random_points,
@@ -166,7 +166,7 @@ def _with_prior(condition: Condition, deg: float, with_peers: bool) -> list[Solv
     if with_peers and importlib.util.find_spec("tetra3rs"):
         solvers.append(
             tetra3rs_solver(
-                _database().run_catalog, Camera(), lambda scene: _off_by(scene, deg), deg
+                _database().run_catalog, PinholeCamera(), lambda scene: _off_by(scene, deg), deg
             )
         )
     return solvers

@@ -20,7 +20,7 @@ import numpy as np
 
 from service.identify.lost_in_space.finder import search_sky
 from service.identify.lost_in_space.solver import FieldOfView, LostInSpace
-from service.simulate.scenes import Camera, Scene
+from service.simulate.scenes import PinholeCamera, Scene
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.whole_sky.index import build_sky_index
 from service.vectors import Matrix, from_ra_dec
@@ -63,7 +63,7 @@ def ours(
     )
 
 
-def peers(run_catalog: RunCatalog, camera: Camera, position_px: float) -> list[Solver]:
+def peers(run_catalog: RunCatalog, camera: PinholeCamera, position_px: float) -> list[Solver]:
     """Those that are installed."""
     made = []
     if importlib.util.find_spec("tetra3rs"):
@@ -82,7 +82,7 @@ def _cached(name: str, run_catalog: RunCatalog, suffix: str) -> Path:
 
 def tetra3rs_solver(
     run_catalog: RunCatalog,
-    camera: Camera,
+    camera: PinholeCamera,
     hint: Callable[[Scene], Matrix] | None = None,
     hint_deg: float = 1.0,
 ) -> Solver:
@@ -126,7 +126,7 @@ def tetra3rs_solver(
     )
 
 
-def _cedar_solve(run_catalog: RunCatalog, camera: Camera) -> Solver:
+def _cedar_solve(run_catalog: RunCatalog, camera: PinholeCamera) -> Solver:
     from tetra3 import Tetra3
 
     logging.getLogger("tetra3.Tetra3").setLevel(logging.ERROR)
@@ -178,7 +178,7 @@ def _cedar_solve(run_catalog: RunCatalog, camera: Camera) -> Solver:
     return Solver("cedar-solve", path.stat().st_size / 1e6, ready, solve, attitude, slow=True)
 
 
-def _ruststartracker(run_catalog: RunCatalog, camera: Camera, position_px: float) -> Solver:
+def _ruststartracker(run_catalog: RunCatalog, camera: PinholeCamera, position_px: float) -> Solver:
     import ruststartracker
     from ruststartracker.star import StarTrackerError
 

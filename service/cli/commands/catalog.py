@@ -116,13 +116,13 @@ def import_catalog(parsed: Namespace) -> int:
     """Check a site's catalog and store it."""
     from tqdm import tqdm
 
-    from service.sky.catalog.star_catalog import form_of, import_csv, import_sky2000, save
+    from service.sky.catalog.star_catalog import catalog_format, import_csv, import_sky2000, save
 
     # Of night.dat.gz the name is night.
     name = parsed.file.name.removesuffix(".gz").rpartition(".")[0] or parsed.file.name
     output = parsed.output or parsed.file.with_name(f"{name}.npz")
     left_out: tuple[str, ...] = ()
-    if (parsed.format or form_of(parsed.file)) == "sky2000":
+    if (parsed.format or catalog_format(parsed.file)) == "sky2000":
         with tqdm(unit=" stars", desc="reading", disable=None, leave=False) as bar:
             catalog, left_out = import_sky2000(parsed.file, bar.update)
     else:

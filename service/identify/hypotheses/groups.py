@@ -137,7 +137,7 @@ def shared(found: Identification, rival: Identification, share: float) -> Identi
     )
 
 
-def share_of(log_weight: float, other_log_weight: float, stars: int) -> float:
+def first_share(log_weight: float, other_log_weight: float, stars: int) -> float:
     """The share of the first of two groups by their log weights, the smaller one of so many stars.
 
     Either group has noise of its own, which says nothing of which of them is real:

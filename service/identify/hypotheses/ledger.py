@@ -61,7 +61,7 @@ def _enter(ledger, h):  # type: ignore[no-untyped-def]
 
 
 @njit_no_refcount
-def part_of(match, whole):  # type: ignore[no-untyped-def]
+def is_part(match, whole):  # type: ignore[no-untyped-def]
     """Whether every star of a match is the same in another."""
     apart = 0
     for k in range(len(match)):

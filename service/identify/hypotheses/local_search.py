@@ -13,8 +13,8 @@ from service.identify.hypotheses.fitting import (
     weigh_without,
     work_of_fit,
 )
-from service.identify.hypotheses.ledger import keep, known, part_of, spent
-from service.identify.hypotheses.scene import Progress, within
+from service.identify.hypotheses.ledger import is_part, keep, known, spent
+from service.identify.hypotheses.scene import Progress, within_bounds
 from service.sky.geometry.star_buckets import nearest
 
 MATCH_GATE = 34.0
@@ -47,7 +47,7 @@ def consider(observed, stars, match, scratch, ledger, progress):  # type: ignore
     progress = spent(progress, n)
     if known(fresh, ledger, progress.count):
         return progress, not misfit
-    if not (part_of(fresh, match) and part_of(match, fresh)):
+    if not (is_part(fresh, match) and is_part(match, fresh)):
         matched, square, log_det = fit_match(observed, stars, fresh, scratch, 1)
         progress = spent(progress, work_of_fit(n, matched))
         if matched < 2:
@@ -148,7 +148,7 @@ def _match_at(observed, stars, t, first, second):  # type: ignore[no-untyped-def
             first,
             k,
         )
-        if one >= 0 and within(one, stars):
+        if one >= 0 and within_bounds(one, stars):
             first[k] = one
-        if other >= 0 and within(other, stars):
+        if other >= 0 and within_bounds(other, stars):
             second[k] = other

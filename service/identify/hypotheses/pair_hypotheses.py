@@ -10,7 +10,7 @@ from service.identify.hypotheses import evidence
 from service.identify.hypotheses.fitting import log_weight_bound, weigh
 from service.identify.hypotheses.ledger import at_bound, keep, known, left_unexplored, spent
 from service.identify.hypotheses.local_search import NEGLIGIBLE
-from service.identify.hypotheses.scene import polar_difference, within
+from service.identify.hypotheses.scene import polar_difference, within_bounds
 from service.identify.sighting import PRIOR_ROTATION
 from service.sky.geometry.pairs import separation_rad
 
@@ -83,7 +83,7 @@ def _weigh_pair(observed, stars, pairs, pair, scratch, ledger, progress, top):  
             if swap == 1:
                 a, b = b, a
             shift = _shift(observed, stars, pair, polar_i, polar_j, a, b)
-            if shift > farthest or not (within(a, stars) and within(b, stars)):
+            if shift > farthest or not (within_bounds(a, stars) and within_bounds(b, stars)):
                 continue
             match[:] = -1
             match[i], match[j] = a, b

@@ -11,10 +11,10 @@ from service.identify.hypotheses.evidence import LOG_PRIOR_AT_BEST, log_prior
 from service.identify.hypotheses.fitting import log_weight_bound
 from service.identify.hypotheses.ledger import (
     at_bound,
+    is_part,
     known,
     leaves_a_group,
     left_unexplored,
-    part_of,
     spent,
 )
 from service.identify.hypotheses.local_search import LARGEST_GATE_RAD, NEGLIGIBLE, consider
@@ -22,7 +22,7 @@ from service.identify.hypotheses.scene import (
     PREDICTION_GATE,
     polar_difference,
     with_magnitude,
-    within,
+    within_bounds,
 )
 from service.identify.sighting import PRIOR_DIRECTION
 from service.sky.geometry.star_buckets import nearest
@@ -192,10 +192,10 @@ def _evaluate(observed, stars, scan, a, b, fewest, scratch, ledger, progress):  
         if match[k] >= 0:
             used[matched] = match[k]
             matched += 1
-    if matched < fewest or not (within(a, stars) and within(b, stars)):
+    if matched < fewest or not (within_bounds(a, stars) and within_bounds(b, stars)):
         return matched, progress
     match[scan.i], match[scan.j] = a, b
-    if known(match, ledger, progress.count) or part_of(match, ledger.heaviest_match):
+    if known(match, ledger, progress.count) or is_part(match, ledger.heaviest_match):
         return matched, progress
     progress, fits = consider(observed, stars, match, scratch, ledger, progress)
     if fits:
@@ -215,7 +215,7 @@ def _evaluate(observed, stars, scan, a, b, fewest, scratch, ledger, progress):  
             continue
         match[:] = -1
         match[scan.i], match[scan.j], match[k] = a, b, one
-        if known(match, ledger, progress.count) or part_of(match, ledger.heaviest_match):
+        if known(match, ledger, progress.count) or is_part(match, ledger.heaviest_match):
             continue
         progress, _ = consider(observed, stars, match, scratch, ledger, progress)
     return matched, progress
@@ -236,7 +236,7 @@ def _nearest_to_predicted(stars, scratch, a, b, k, taken):  # type: ignore[no-un
         scratch.used,
         taken,
     )
-    return one if one >= 0 and within(one, stars) else -1
+    return one if one >= 0 and within_bounds(one, stars) else -1
 
 
 @njit_no_refcount

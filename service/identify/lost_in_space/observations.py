@@ -17,7 +17,7 @@ class Points(NamedTuple):
     velocity: Any
 
 
-class Field(NamedTuple):
+class FieldBounds(NamedTuple):
     """The field of view: within a cosine of the boresight, and within two tangents.
 
     `area` is its solid angle, `limit_mag` the faintest star that the tracker

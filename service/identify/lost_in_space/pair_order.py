@@ -43,7 +43,7 @@ def magnitude_gate(sigma_mag):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def rows_within(brighter, magnitude, gate):  # type: ignore[no-untyped-def]
+def rows_of_magnitude(brighter, magnitude, gate):  # type: ignore[no-untyped-def]
     """First row and the one past the last of the stars that a point of this magnitude may be.
 
     To the steps of the table `brighter`: a few more than within the gate.

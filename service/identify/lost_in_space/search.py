@@ -21,7 +21,7 @@ from service.identify.lost_in_space.pair_order import (
     describe_points,
     magnitude_gate,
     pair_costs,
-    rows_within,
+    rows_of_magnitude,
 )
 from service.identify.lost_in_space.predictors import GATE, predict
 from service.identify.lost_in_space.prefilter import candidates_of, possible_of, ranked, stars_near
@@ -198,8 +198,8 @@ def try_pair(points, index, field, gate_mag, plan, workspace):  # type: ignore[n
     ranked(prefilter, point_pairs_in(workspace).beyond, plan.prefiltered)
     low, high = buckets_of(points, index, i, j, plan.gate)
     first, last = classes_of(points.magnitude[j], index.class_edge, plan.gate_mag)
-    rows_i = rows_within(index.brighter, points.magnitude[i], plan.gate_mag)
-    rows_j = rows_within(index.brighter, points.magnitude[j], plan.gate_mag)
+    rows_i = rows_of_magnitude(index.brighter, points.magnitude[i], plan.gate_mag)
+    rows_j = rows_of_magnitude(index.brighter, points.magnitude[j], plan.gate_mag)
     # So many of the points asked first that one of them must have a star.
     asked = plan.firsts - plan.needed + 1
     for c in range(first, last + 1):

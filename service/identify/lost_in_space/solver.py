@@ -16,7 +16,7 @@ from service.attitude.solution import NoAttitude
 from service.compiled.views import borrowed_view
 from service.identify.lost_in_space import decision, posterior
 from service.identify.lost_in_space.matching import match_at, refine
-from service.identify.lost_in_space.observations import Field, Points
+from service.identify.lost_in_space.observations import FieldBounds, Points
 from service.identify.lost_in_space.pair_order import magnitude_gate
 from service.identify.lost_in_space.search import MAX_WORK, enter, search
 from service.identify.lost_in_space.workspace import (
@@ -73,18 +73,18 @@ class FieldOfView:
         corner_deg = math.degrees(math.atan(tangent * math.sqrt(2.0)))
         return cls(corner_deg, 0.5 * side_deg, limit_mag, magnitude_sigma_mag)
 
-    def as_field(self) -> Field:
+    def as_field(self) -> FieldBounds:
         """The same as the kernels take it."""
         cosine = math.cos(math.radians(self.radius_deg))
         if self.half_width_deg is None:
-            return Field(
+            return FieldBounds(
                 *(cosine, math.inf, math.inf, 2.0 * math.pi * (1.0 - cosine)),
                 *(self.limit_mag, self.magnitude_sigma_mag),
             )
         tangent = math.tan(math.radians(self.half_width_deg))
         # The solid angle of a pyramid over a square.
         area = 4.0 * math.asin(tangent * tangent / (1.0 + tangent * tangent))
-        return Field(cosine, tangent, tangent, area, self.limit_mag, self.magnitude_sigma_mag)
+        return FieldBounds(cosine, tangent, tangent, area, self.limit_mag, self.magnitude_sigma_mag)
 
 
 class LostInSpaceResult(NamedTuple):
@@ -245,7 +245,7 @@ def _decided(n, count, work, bounded, workspace, matrices, star):  # type: ignor
 
 @njit(cache=True, nogil=True)
 def _field_in(values):  # type: ignore[no-untyped-def]
-    return Field(values[0], values[1], values[2], values[3], values[4], values[5])
+    return FieldBounds(values[0], values[1], values[2], values[3], values[4], values[5])
 
 
 @njit(cache=True, nogil=True)

@@ -15,7 +15,7 @@ from service.compiled.jit import njit_no_refcount
 from service.vectors import Vector
 
 Triple = tuple[float, float, float]
-Frame = tuple[Triple, Triple, Triple]
+Axes = tuple[Triple, Triple, Triple]
 
 
 @njit_no_refcount
@@ -53,7 +53,7 @@ def rotation_rad(
 
 
 @njit_no_refcount
-def _frame(first: Vector, second: Vector) -> Frame:
+def _frame(first: Vector, second: Vector) -> Axes:
     """The middle of two unit vectors, the direction from one to the other, and their normal."""
     middle = first[0] + second[0], first[1] + second[1], first[2] + second[2]
     along = second[0] - first[0], second[1] - first[1], second[2] - first[2]
@@ -62,7 +62,7 @@ def _frame(first: Vector, second: Vector) -> Frame:
 
 
 @njit_no_refcount
-def _carried(v: Triple, observed: Frame, candidate: Frame) -> Triple:
+def _carried(v: Triple, observed: Axes, candidate: Axes) -> Triple:
     """The vector, turned as the observed frame is turned to the candidate's."""
     x, y, z = _dot(observed[0], v), _dot(observed[1], v), _dot(observed[2], v)
     one, two, three = candidate

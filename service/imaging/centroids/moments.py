@@ -32,7 +32,7 @@ SLOPE_LEAST = 0.2
 
 
 @dataclass(frozen=True)
-class Moment:
+class ProfileMoment:
     """The first moment of one profile over its sum, in steps from its middle sample.
 
     `variance` is the full law sum (n - d)² sigma_n² / (sum)², of which the report's 7.36
@@ -50,7 +50,7 @@ class Moment:
         return self.total / math.sqrt(self.total_variance) if self.total_variance > 0 else math.inf
 
 
-def moment(samples: Array, sample_variance: Array, level_sigma: float = 0.0) -> Moment:
+def moment(samples: Array, sample_variance: Array, level_sigma: float = 0.0) -> ProfileMoment:
     """The moment of samples n = -N ... N; `level_sigma` is an error common to all of them."""
     steps = np.arange(len(samples), dtype=np.float64) - (len(samples) - 1) / 2.0
     total = float(samples.sum())
@@ -59,7 +59,7 @@ def moment(samples: Array, sample_variance: Array, level_sigma: float = 0.0) -> 
     square = float(arm**2 @ sample_variance) + (level_sigma * float(arm.sum())) ** 2
     total_variance = float(sample_variance.sum()) + (level_sigma * len(samples)) ** 2
     variance = square / total**2 if total else math.inf
-    return Moment(displacement, variance, total, total_variance)
+    return ProfileMoment(displacement, variance, total, total_variance)
 
 
 def profiles(square: Array, method: str) -> tuple[Array, Array]:
@@ -107,7 +107,7 @@ def by_moments(
     return refusal(method, "the window follows no star", (Flag.NOT_CONVERGED,))
 
 
-def _moments(region: Region, method: str) -> tuple[Moment, Moment]:
+def _moments(region: Region, method: str) -> tuple[ProfileMoment, ProfileMoment]:
     gain = region.window.detector.gain_e_per_count
     # Photon noise by the counts themselves: summed linearly, that is unbiased.
     variance = region.floor_variance + region.light / gain
@@ -132,7 +132,7 @@ def _record(
     region: Region,
     method: str,
     psf: Psf | None,
-    along: tuple[Moment, Moment],
+    along: tuple[ProfileMoment, ProfileMoment],
     flags: tuple[Flag, ...],
     iterations: int,
 ) -> CentroidRecord:

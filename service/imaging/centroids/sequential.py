@@ -15,7 +15,7 @@ from service.imaging.centroids.window import Array
 
 
 @dataclass(frozen=True)
-class Estimate:
+class StateEstimate:
     """A state (m,) with its covariance (m, m) after a number of measurements."""
 
     state: Array
@@ -27,7 +27,7 @@ class Estimate:
         """One standard deviation of every part of the state."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
-    def updated(self, row: Array, value: float, variance: float) -> "Estimate":
+    def updated(self, row: Array, value: float, variance: float) -> "StateEstimate":
         """The estimate after one more measurement (6.20, 6.26).
 
         Only a number is inverted.  The report concludes that the covariance goes to zero
@@ -40,9 +40,9 @@ class Estimate:
         gain_over = gain / spread
         state = self.state + gain_over * (value - float(row @ self.state))
         covariance = self.covariance - np.outer(gain_over, gain)
-        return Estimate(state, 0.5 * (covariance + covariance.T), self.measurements + 1)
+        return StateEstimate(state, 0.5 * (covariance + covariance.T), self.measurements + 1)
 
-    def replayed(self, rows: Array, values: Array, variances: npt.ArrayLike) -> "Estimate":
+    def replayed(self, rows: Array, values: Array, variances: npt.ArrayLike) -> "StateEstimate":
         """The estimate after many measurements, one after another; rows (n, m)."""
         estimate = self
         for row, value, variance in zip(
@@ -52,13 +52,13 @@ class Estimate:
         return estimate
 
 
-def diffuse(sigmas: Iterable[float]) -> Estimate:
+def diffuse(sigmas: Iterable[float]) -> StateEstimate:
     """The start that knows nothing: zero, give or take `sigmas`."""
     spread = np.asarray(tuple(sigmas), dtype=np.float64)
-    return Estimate(np.zeros(len(spread)), np.diag(spread**2))
+    return StateEstimate(np.zeros(len(spread)), np.diag(spread**2))
 
 
-def batch(rows: Array, values: Array, variances: npt.ArrayLike) -> Estimate:
+def batch(rows: Array, values: Array, variances: npt.ArrayLike) -> StateEstimate:
     """Weighted least squares of all at once: (C^T Q C)^-1 C^T Q R with Q of 1/variance (6.13).
 
     Raises `numpy.linalg.LinAlgError` where the rows leave a direction unknown.
@@ -71,7 +71,7 @@ def batch(rows: Array, values: Array, variances: npt.ArrayLike) -> Estimate:
             f"{np.linalg.matrix_rank(weighted)} of them apart"
         )
     covariance = np.linalg.inv(weighted.T @ weighted)
-    return Estimate(covariance @ weighted.T @ (values * root), covariance, len(values))
+    return StateEstimate(covariance @ weighted.T @ (values * root), covariance, len(values))
 
 
 def least_norm(rows: Array, values: Array, norm: Array) -> Array:

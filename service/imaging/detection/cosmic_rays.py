@@ -13,7 +13,7 @@ from service.imaging.centroids.psf import GaussianPsf, Psf
 from service.imaging.centroids.record import CentroidRecord
 from service.imaging.centroids.window import Mask, Window
 from service.imaging.detection.shapes import is_sharp, patches_of
-from service.imaging.frames.frame import Counts
+from service.imaging.frames.frame import CountArray
 from service.vectors import Vector
 
 HALF_PX = 5
@@ -43,7 +43,7 @@ class Behind:
 
 
 def stars_behind(
-    light: Counts, u_px: Vector, v_px: Vector, psf_sigma_px: float, noise_counts: float
+    light: CountArray, u_px: Vector, v_px: Vector, psf_sigma_px: float, noise_counts: float
 ) -> Behind:
     """What lies behind candidates (k,) that are sharper than a star.
 

@@ -14,7 +14,7 @@ import sep
 from service.imaging.centroids.psf import GaussianPsf
 from service.imaging.detection.cosmic_rays import stars_behind
 from service.imaging.detection.shapes import is_sharp
-from service.imaging.frames.frame import Counts, Frame, refused
+from service.imaging.frames.frame import CountArray, Frame, bad_frame
 from service.missions.camera import Camera
 from service.vectors import Vector, read_only
 
@@ -36,8 +36,8 @@ class Detections:
     False where a pixel holds no number or something sharper than a star.
     """
 
-    light: Counts
-    background_counts: Counts
+    light: CountArray
+    background_counts: CountArray
     noise_counts: float
     good: npt.NDArray[np.bool_]
     u_px: Vector
@@ -110,7 +110,7 @@ def detection_kernel(camera: Camera) -> npt.NDArray[np.float32]:
 
 
 def _extracted(
-    light: Counts, noise: float, mask: npt.NDArray[np.bool_] | None, camera: Camera
+    light: CountArray, noise: float, mask: npt.NDArray[np.bool_] | None, camera: Camera
 ) -> npt.NDArray[np.void]:
     try:
         found: npt.NDArray[np.void] = sep.extract(
@@ -125,12 +125,12 @@ def _extracted(
         )
     except Exception as error:
         # SEP has one exception for all: its buffers are full of bright pixels.
-        raise refused(f"is bright nearly everywhere: {str(error)[:100]}") from None
+        raise bad_frame(f"is bright nearly everywhere: {str(error)[:100]}") from None
     return found
 
 
 def _good(
-    light: Counts,
+    light: CountArray,
     known: npt.NDArray[np.bool_],
     noise: float,
     stars: npt.NDArray[np.void],

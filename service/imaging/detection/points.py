@@ -13,7 +13,7 @@ import numpy.typing as npt
 import sep
 from scipy import fft
 
-from service.imaging.frames.frame import Counts
+from service.imaging.frames.frame import CountArray
 from service.vectors import Vector, read_only
 
 MESH_PX = 32
@@ -61,7 +61,7 @@ class PointSources:
     background_counts: float
     clipped_share: float
     """Of the pixels, those at the lowest count: where it is large, the background was cut off."""
-    light: Counts
+    light: CountArray
     binning: int
     width_px: int
     height_px: int
@@ -72,7 +72,7 @@ class PointSources:
         return len(self.u_px)
 
 
-def find_points(counts: Counts, threshold: float = FIRST_THRESHOLD) -> PointSources:
+def find_points(counts: CountArray, threshold: float = FIRST_THRESHOLD) -> PointSources:
     """The candidates on a picture (rows, columns); their images are measured on it first."""
     height, width = counts.shape
     binning = max(1, math.ceil(math.sqrt(counts.size / MAX_WORKING_PIXELS)))
@@ -121,7 +121,7 @@ class _Shapes:
     weighted: Vector
 
 
-def _binned(counts: Counts, binning: int) -> Counts:
+def _binned(counts: CountArray, binning: int) -> CountArray:
     """The means of blocks; an incomplete one at the edge is left out."""
     if binning == 1:
         return np.array(counts, dtype=np.float32)
@@ -131,7 +131,7 @@ def _binned(counts: Counts, binning: int) -> Counts:
     return np.asarray(blocks.reshape(shape).mean(axis=(1, 3)), dtype=np.float32)
 
 
-def _filled(counts: Counts) -> Counts:
+def _filled(counts: CountArray) -> CountArray:
     """Pixels without a number at the median of the others."""
     unknown = ~np.isfinite(counts)
     if unknown.any():
@@ -140,7 +140,7 @@ def _filled(counts: Counts) -> Counts:
 
 
 def _measured_psf(
-    light: Counts, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64], ratio: Vector
+    light: CountArray, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64], ratio: Vector
 ) -> float:
     """One standard deviation of a star's image: the median of clear, round, whole ones."""
     order = np.argsort(-ratio)[:60]
@@ -163,13 +163,13 @@ class _Filter:
     two passes of a Gaussian over the picture.
     """
 
-    def __init__(self, light: Counts) -> None:
+    def __init__(self, light: CountArray) -> None:
         self.light = light
         # What lies beyond one edge must not come in at the other.
         self._sides = [fft.next_fast_len(side + PADDING_PX, real=True) for side in light.shape]
         self._spectrum = fft.rfft2(light, self._sides)
 
-    def __call__(self, psf: float) -> Counts:
+    def __call__(self, psf: float) -> CountArray:
         """The light behind the image of a star less its surround."""
         rows, columns = self._sides
         down, across = fft.fftfreq(rows), fft.rfftfreq(columns)
@@ -179,10 +179,10 @@ class _Filter:
         return np.ascontiguousarray(light[:height, :width])
 
 
-def _star_less_surround(down: Vector, across: Vector, psf: float) -> Counts:
+def _star_less_surround(down: Vector, across: Vector, psf: float) -> CountArray:
     """The response to frequencies in cycles a pixel (rows, columns) of the filter."""
 
-    def gaussian(frequency: Vector, width: float) -> Counts:
+    def gaussian(frequency: Vector, width: float) -> CountArray:
         return np.exp(-2.0 * (math.pi * width * frequency) ** 2).astype(np.float32)
 
     narrow, wide = (
@@ -218,7 +218,7 @@ def _peaks(
 
 
 def _moments(
-    light: Counts, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64], weight_px: float
+    light: CountArray, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64], weight_px: float
 ) -> _Shapes:
     """Centroids and second moments under a Gaussian weight that follows each image."""
     half = max(3, math.ceil(3.0 * weight_px))

@@ -8,7 +8,7 @@ a cosmic ray's track across itself.
 import numpy as np
 import numpy.typing as npt
 
-from service.imaging.frames.frame import Counts
+from service.imaging.frames.frame import CountArray
 from service.vectors import Vector
 
 HALF_PX = 3
@@ -18,7 +18,7 @@ _ROUNDS = 2
 
 
 def is_sharp(
-    light: Counts, u_px: Vector, v_px: Vector, psf_sigma_px: float
+    light: CountArray, u_px: Vector, v_px: Vector, psf_sigma_px: float
 ) -> npt.NDArray[np.bool_]:
     """Whether (n,) candidates are narrower, along some direction, than a point's image can be.
 
@@ -54,7 +54,7 @@ def is_sharp(
     return np.asarray(~(smaller >= SHARP * expected))
 
 
-def patches_of(light: Counts, u_px: Vector, v_px: Vector, half: int) -> npt.NDArray[np.float64]:
+def patches_of(light: CountArray, u_px: Vector, v_px: Vector, half: int) -> npt.NDArray[np.float64]:
     """Squares (n, 2 half + 1, 2 half + 1) about the nearest pixels; dark beyond the frame."""
     padded = np.pad(light, half)
     windows = np.lib.stride_tricks.sliding_window_view(padded, (2 * half + 1, 2 * half + 1))

@@ -9,7 +9,7 @@ import hashlib
 from collections.abc import Callable, Mapping
 from typing import IO
 
-from service.imaging.frames.frame import Frame, FrameLimits, refused
+from service.imaging.frames.frame import Frame, FrameLimits, bad_frame
 from service.imaging.frames.raw import is_raw, read_raw
 
 Reader = Callable[[IO[bytes], FrameLimits, str], Frame]
@@ -23,11 +23,11 @@ def read_frame(file: IO[bytes], limits: FrameLimits, digest: str | None = None) 
 
     Raises `BadFile` for what is no frame, or none that the limits allow.
     """
-    digest = digest or digest_of(file)
+    digest = digest or frame_digest(file)
     file.seek(0)
     start = file.read(_LONGEST_MAGIC)
     if not start:
-        raise refused("is empty; it must hold a file: " + FORMATS)
+        raise bad_frame("is empty; it must hold a file: " + FORMATS)
     if is_raw(file, start):
         file.seek(0)
         return read_raw(file, limits, digest)
@@ -36,11 +36,11 @@ def read_frame(file: IO[bytes], limits: FrameLimits, digest: str | None = None) 
             file.seek(0)
             return reader(file, limits, digest)
     if start.startswith((b"II+\0", b"MM\0+")):
-        raise refused("is a BigTIFF file; a frame fits an ordinary one")
-    raise refused(f"is not {FORMATS}", f"its first bytes are {start[:8].hex(' ')}")
+        raise bad_frame("is a BigTIFF file; a frame fits an ordinary one")
+    raise bad_frame(f"is not {FORMATS}", f"its first bytes are {start[:8].hex(' ')}")
 
 
-def digest_of(file: IO[bytes]) -> str:
+def frame_digest(file: IO[bytes]) -> str:
     """`sha256:` of all that is in a file."""
     file.seek(0)
     return "sha256:" + hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]

@@ -10,8 +10,8 @@ from typing import IO
 import numpy as np
 
 from service.errors import BadInput
-from service.imaging.frames.arrays import counts_of, exactly
-from service.imaging.frames.frame import Counts, Frame, FrameLimits, refused
+from service.imaging.frames.arrays import as_counts, exactly
+from service.imaging.frames.frame import CountArray, Frame, FrameLimits, bad_frame
 from service.times import parse_utc, shifted
 
 BLOCK, CARD = 2880, 80
@@ -32,14 +32,16 @@ def read_fits(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
             break
         unit = _Unit(_read_header(file))
         if unit.is_compressed:
-            raise refused("is compressed by tiles; send the plain image", "ZIMAGE = T")
+            raise bad_frame("is compressed by tiles; send the plain image", "ZIMAGE = T")
         if unit.is_image:
             return _image(file, unit, limits, digest)
         file.seek(file.tell() + -(-unit.data_bytes // BLOCK) * BLOCK)
-    raise refused("holds no image of two dimensions")
+    raise bad_frame("holds no image of two dimensions")
 
 
-def write_fits(file: IO[bytes], counts: Counts, cards: dict[str, bool | int | float | str]) -> None:
+def write_fits(
+    file: IO[bytes], counts: CountArray, cards: dict[str, bool | int | float | str]
+) -> None:
     """Write counts, unsigned 16-bit integers, with further cards, as a FITS file."""
     height_px, width_px = counts.shape
     # FITS has signed integers only: the zero lies in the middle (4.4.2.5).
@@ -63,16 +65,16 @@ class _Unit:
         """A whole number of the header; raises `BadFile` for anything else."""
         value = self.cards.get(key, default)
         if not isinstance(value, int) or isinstance(value, bool) or not least <= value < 1 << 40:
-            raise refused(f"has a FITS header with an impossible {key}", str(value)[:40])
+            raise bad_frame(f"has a FITS header with an impossible {key}", str(value)[:40])
         return value
 
     def number(self, key: str, default: float) -> float:
         """A finite number of the header."""
         value = self.cards.get(key, default)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise refused(f"has a FITS header with an impossible {key}", str(value)[:40])
+            raise bad_frame(f"has a FITS header with an impossible {key}", str(value)[:40])
         if not abs(value) < 1e30:
-            raise refused(f"has a FITS header with an impossible {key}", str(value)[:40])
+            raise bad_frame(f"has a FITS header with an impossible {key}", str(value)[:40])
         return float(value)
 
     @property
@@ -80,7 +82,7 @@ class _Unit:
         """The lengths of its axes, the fastest first."""
         count = self.whole("NAXIS")
         if count > 999:
-            raise refused("has a FITS header with an impossible NAXIS", str(count))
+            raise bad_frame("has a FITS header with an impossible NAXIS", str(count))
         return [self.whole(f"NAXIS{k + 1}") for k in range(count)]
 
     @property
@@ -89,7 +91,7 @@ class _Unit:
         value = self.whole("BITPIX", least=-64)
         if value not in TYPES:
             known = ", ".join(str(each) for each in TYPES)
-            raise refused(f"has a FITS header whose BITPIX is none of {known}", str(value))
+            raise bad_frame(f"has a FITS header whose BITPIX is none of {known}", str(value))
         return value
 
     @property
@@ -124,10 +126,10 @@ def _image(file: IO[bytes], unit: _Unit, limits: FrameLimits, digest: str) -> Fr
     kind = np.dtype(TYPES[unit.bitpix])
     zero, scale = unit.number("BZERO", 0.0), unit.number("BSCALE", 1.0)
     if scale == 0.0:
-        raise refused("has a FITS header with an impossible BSCALE", "0")
+        raise bad_frame("has a FITS header with an impossible BSCALE", "0")
     data = exactly(file, width_px * height_px * kind.itemsize)
     stored = np.frombuffer(data, kind).reshape(height_px, width_px)
-    counts = counts_of(stored)
+    counts = as_counts(stored)
     if (scale, zero) != (1.0, 0.0):
         counts = (counts * scale + zero).astype(counts.dtype, copy=False)
     full_scale = np.inf
@@ -170,7 +172,7 @@ def _read_header(file: IO[bytes]) -> dict[str, Value]:
     for _ in range(MAX_HEADER_BLOCKS):
         block = file.read(BLOCK)
         if len(block) < BLOCK:
-            raise refused("is cut off in its FITS header")
+            raise bad_frame("is cut off in its FITS header")
         for at in range(0, BLOCK, CARD):
             card = block[at : at + CARD].decode("latin-1")
             key = card[:8].rstrip()
@@ -178,7 +180,7 @@ def _read_header(file: IO[bytes]) -> dict[str, Value]:
                 return cards
             if card[8:10] == "= ":
                 cards.setdefault(key, _value(card[10:]))
-    raise refused(f"has a FITS header without END in its first {MAX_HEADER_BLOCKS} blocks")
+    raise bad_frame(f"has a FITS header without END in its first {MAX_HEADER_BLOCKS} blocks")
 
 
 def _value(text: str) -> Value:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from service.errors import BadFile, Fault
 
-Counts = npt.NDArray[Any]
+CountArray = npt.NDArray[Any]
 """(rows, columns), float32 or float64; NaN where a pixel holds no number."""
 
 LEAST_KNOWN, MOST_FULL = 0.5, 0.5
@@ -27,7 +27,7 @@ class Frame:
     exposure, each None where the file does not tell.
     """
 
-    counts: Counts
+    counts: CountArray
     file_format: str
     digest: str
     full_scale: float = math.inf
@@ -57,15 +57,15 @@ class FrameLimits:
         """Raise `BadFile` for a size that is not to be decoded; asked before anything is."""
         size = f"{width_px} x {height_px} px"
         if width_px < 1 or height_px < 1:
-            raise refused("has no pixels", size)
+            raise bad_frame("has no pixels", size)
         if self.shape is not None and (height_px, width_px) != self.shape:
             rows, columns = self.shape
-            raise refused(f"must have the {columns} x {rows} px of {self.whose}", size)
+            raise bad_frame(f"must have the {columns} x {rows} px of {self.whose}", size)
         if width_px * height_px > self.max_pixels:
-            raise refused(f"may have at most {self.max_pixels:,} pixels", size)
+            raise bad_frame(f"may have at most {self.max_pixels:,} pixels", size)
 
 
-def refused(message: str, value: str | None = None) -> BadFile:
+def bad_frame(message: str, value: str | None = None) -> BadFile:
     """The refusal of a frame as a whole."""
     return BadFile(Fault("frame", message, value))
 
@@ -78,15 +78,15 @@ def require_light(frame: Frame, saturation_counts: float) -> None:
     known = np.isfinite(frame.counts)
     share = float(known.mean())
     if share < LEAST_KNOWN:
-        raise refused("has no number in most of its pixels", f"NaN in {1.0 - share:.0%}")
+        raise bad_frame("has no number in most of its pixels", f"NaN in {1.0 - share:.0%}")
     least = float(np.min(frame.counts, where=known, initial=np.inf))
     most = float(np.max(frame.counts, where=known, initial=-np.inf))
     largest = max(least, most, key=abs)
     if abs(largest) > LARGEST_COUNT:
         message = f"holds a count beyond {LARGEST_COUNT:.4g}, the largest of single precision"
-        raise refused(message, f"{largest:.4g}")
+        raise bad_frame(message, f"{largest:.4g}")
     if least == most:
-        raise refused("has no contrast: every pixel holds the same count", f"{least:g}")
+        raise bad_frame("has no contrast: every pixel holds the same count", f"{least:g}")
     full = float((frame.counts >= min(saturation_counts, frame.full_scale)).mean())
     if full > MOST_FULL:
-        raise refused("is saturated", f"{full:.0%} of its pixels are full")
+        raise bad_frame("is saturated", f"{full:.0%} of its pixels are full")

@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from service.errors import BadFile
-from service.imaging.frames.arrays import counts_of, full_scale_of
+from service.imaging.frames.arrays import as_counts, full_scale_of
 from service.imaging.frames.deep_color import deep_light, is_deep
-from service.imaging.frames.frame import Frame, FrameLimits, refused
+from service.imaging.frames.frame import Frame, FrameLimits, bad_frame
 
 GREY = ("L", "I;16", "I;16B", "I;16L", "I", "F")
 """Pillow's words for one channel of light."""
@@ -45,7 +45,7 @@ def read_picture(file: IO[bytes], file_format: str, limits: FrameLimits, digest:
         with Image.open(file, formats=(file_format,)) as image:
             limits.require(*image.size)
             if file_format != "JPEG" and getattr(image, "n_frames", 1) > 1:
-                raise refused(SEVERAL)
+                raise bad_frame(SEVERAL)
             # To look for EXIF may decode the picture, and takes the word of its depth away.
             deep = is_deep(image)
             told = _told(image)
@@ -58,8 +58,8 @@ def read_picture(file: IO[bytes], file_format: str, limits: FrameLimits, digest:
     except Exception as error:
         # A decoder that stumbles over what it reads does so in many ways.
         reason = str(error)[:200] or type(error).__name__
-        raise refused(f"cannot be read as {file_format}: {reason}") from None
-    return Frame(counts_of(values), file_format, digest, full_scale, *told)
+        raise bad_frame(f"cannot be read as {file_format}: {reason}") from None
+    return Frame(as_counts(values), file_format, digest, full_scale, *told)
 
 
 def _light(image: Any) -> tuple[npt.NDArray[Any], float]:
@@ -69,7 +69,7 @@ def _light(image: Any) -> tuple[npt.NDArray[Any], float]:
         # Pillow has one kind of integer beyond 16 bits; how full it can be is not known.
         return values, math.inf if image.mode == "I" else full_scale_of(values.dtype)
     if image.mode not in COLORS:
-        raise refused("must be grey or in colour, not of a bit a pixel", image.mode)
+        raise bad_frame("must be grey or in colour, not of a bit a pixel", image.mode)
     channels = np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
     # Three bytes a pixel, summed into two.
     return channels.sum(axis=2, dtype=np.uint16), 3.0 * 255.0
@@ -123,20 +123,20 @@ def _require_small_tags(file: IO[bytes]) -> None:
         file.seek(at)
         (tags,) = struct.unpack(order + "H", file.read(2))
         if tags > MAX_TAGS:
-            raise refused(f"has more than {MAX_TAGS} tags", str(tags))
+            raise bad_frame(f"has more than {MAX_TAGS} tags", str(tags))
         entries = [struct.unpack(order + "HHL4s", file.read(12)) for _ in range(tags)]
         (following,) = struct.unpack(order + "L", file.read(4))
     except struct.error:
-        raise refused(f"is cut off: its TIFF directory lies beyond its {end} bytes") from None
+        raise bad_frame(f"is cut off: its TIFF directory lies beyond its {end} bytes") from None
     if following:
-        raise refused(SEVERAL)
+        raise bad_frame(SEVERAL)
     tile = 1
     for tag, kind, count, value in entries:
         size = _TAG_TYPE_BYTES[kind] if kind < len(_TAG_TYPE_BYTES) else 8
         if size * count > MAX_TAG_BYTES:
-            raise refused(f"has a TIFF tag of more than {MAX_TAG_BYTES} bytes", f"tag {tag}")
+            raise bad_frame(f"has a TIFF tag of more than {MAX_TAG_BYTES} bytes", f"tag {tag}")
         if tag in (_TILE_WIDTH, _TILE_LENGTH):
             tile *= struct.unpack(order + ("H2x" if kind == 3 else "L"), value)[0]
     if tile > MAX_TILE_PIXELS:
-        raise refused(f"has tiles of more than {MAX_TILE_PIXELS} pixels", str(tile))
+        raise bad_frame(f"has tiles of more than {MAX_TILE_PIXELS} pixels", str(tile))
     file.seek(0)

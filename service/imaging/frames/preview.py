@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from service.imaging.detection.detect import Detections
-from service.imaging.frames.frame import Counts
+from service.imaging.frames.frame import CountArray
 
 MAX_SIDE_PX = 1024
 BLACK_SIGMAS = 2.0
@@ -20,7 +20,7 @@ def preview_of(found: Detections) -> tuple[bytes, int]:
     return preview_png(np.where(found.good, found.light, 0.0), found.noise_counts)
 
 
-def preview_png(light: Counts, noise_counts: float) -> tuple[bytes, int]:
+def preview_png(light: CountArray, noise_counts: float) -> tuple[bytes, int]:
     """A PNG of light (rows, columns) above its background, and how many pixels a side make one.
 
     The brightest of the pixels that become one counts, so that no star is lost.

@@ -10,8 +10,8 @@ from typing import IO
 import numpy as np
 
 from service.errors import BadFile
-from service.imaging.frames.arrays import counts_of
-from service.imaging.frames.frame import Frame, FrameLimits, refused
+from service.imaging.frames.arrays import as_counts
+from service.imaging.frames.frame import Frame, FrameLimits, bad_frame
 
 ABSENT = (
     "is a camera's raw file, which needs the package rawpy: install the extra `raw` "
@@ -51,7 +51,7 @@ def _has_tags_of_raw(file: IO[bytes], order: str) -> bool:
 def read_raw(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
     """The frame in a camera's raw file; raises `BadFile` with what is wrong with it."""
     if not importlib.util.find_spec("rawpy"):
-        raise refused(ABSENT)
+        raise bad_frame(ABSENT)
     import rawpy
 
     try:
@@ -64,7 +64,9 @@ def read_raw(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
             limits.require(sizes.width // step, sizes.height // step)
             values = raw.raw_image_visible
             if values is None or values.ndim != 2:
-                raise refused("holds colours that are already mixed; convert it to TIFF of 16 bits")
+                raise bad_frame(
+                    "holds colours that are already mixed; convert it to TIFF of 16 bits"
+                )
             rows, columns = (side // step for side in values.shape)
             blocks = values[: rows * step, : columns * step].reshape(rows, step, columns, step)
             counts = blocks.sum(axis=(1, 3), dtype=np.uint32)
@@ -74,6 +76,6 @@ def read_raw(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
         raise
     except Exception as error:
         # LibRaw knows some hundred ways in which a file is wrong.
-        raise refused(f"cannot be read as a raw file: {str(error)[:200]}") from None
+        raise bad_frame(f"cannot be read as a raw file: {str(error)[:200]}") from None
     exposure_s = shutter_s if 0.0 < shutter_s <= 3600.0 else None
-    return Frame(counts_of(counts), "RAW", digest, full_scale, None, exposure_s)
+    return Frame(as_counts(counts), "RAW", digest, full_scale, None, exposure_s)

@@ -14,14 +14,14 @@ import numpy.typing as npt
 from service.errors import BadInput, Fault
 from service.imaging.centroids.window import Array
 
-Field = npt.NDArray[np.complex128] | npt.NDArray[np.float64]
+PupilField = npt.NDArray[np.complex128] | npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Pupil:
     """Transmission (n, n), rows along y, columns along x; `cell_m` is a cell's side."""
 
-    transmission: Field
+    transmission: PupilField
     cell_m: float
 
     @property
@@ -34,7 +34,7 @@ class Pupil:
         """Middles of the cells along either axis, symmetric about zero."""
         return centres(self.transmission.shape[0], self.cell_m)
 
-    def behind(self, transmission: Field) -> "Pupil":
+    def behind(self, transmission: PupilField) -> "Pupil":
         """With a further transparency before or after it."""
         return Pupil(self.transmission * transmission, self.cell_m)
 

@@ -35,7 +35,7 @@ VERBATIM = (*TEXTS, "tracker")
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
-Row = dict[str, str]
+CsvRow = dict[str, str]
 
 
 class BadCell(Exception):
@@ -81,7 +81,7 @@ def _near(name: str) -> str:
     return f"{close[0]} is meant?" if close else f"there are {', '.join(COLUMNS)}"
 
 
-def _number(row: Row, column: str) -> float:
+def _number(row: CsvRow, column: str) -> float:
     cell = row[column]
     if not cell:
         raise BadCell(column, "is empty, while the columns that belong to it are not")
@@ -93,14 +93,14 @@ def _number(row: Row, column: str) -> float:
     return number
 
 
-def _group(row: Row, columns: tuple[str, ...]) -> list[float] | None:
+def _group(row: CsvRow, columns: tuple[str, ...]) -> list[float] | None:
     """The numbers of columns that are given together, or None where all are empty."""
     if not any(row.get(column) for column in columns):
         return None
     return [_number(row, column) for column in columns]
 
 
-def batch_fields(row: Row) -> dict[str, Any]:
+def batch_fields(row: CsvRow) -> dict[str, Any]:
     """The fields of the batch itself, without its stars; raises `BadCell`."""
     fields: dict[str, Any] = {name: row[name] for name in TEXTS if row.get(name)}
     frame = fields.pop("frame", None)
@@ -132,23 +132,23 @@ def batch_fields(row: Row) -> dict[str, Any]:
     return fields
 
 
-def star_of(row: Row) -> dict[str, Any]:
+def star_of(row: CsvRow) -> dict[str, Any]:
     """The star of a row; raises `BadCell`."""
     star: dict[str, Any] = {name: _number(row, name) for name in STAR_NUMBERS if row.get(name)}
     vector = _group(row, DIRECTION)
     return star if vector is None else {"vector": vector, **star}
 
 
-def number_cells(cells: Iterable[tuple[str, float]]) -> Row:
+def number_cells(cells: Iterable[tuple[str, float]]) -> CsvRow:
     """Numbers as cells, by column."""
     # repr gives the shortest text that reads back as the same number.
     return {column: repr(value) for column, value in cells}
 
 
-def batch_cells(batch: BatchIn) -> Row:
+def batch_cells(batch: BatchIn) -> CsvRow:
     """The cells of a checked batch that are the same in each of its rows."""
     prior = batch.a_priori
-    cells: Row = {"spacecraft": batch.spacecraft, "batch": batch.batch, "run": batch.run}
+    cells: CsvRow = {"spacecraft": batch.spacecraft, "batch": batch.batch, "run": batch.run}
     cells |= {"time": batch.time, "aberration": batch.aberration}
     vectors: dict[str, tuple[float, ...] | None] = {
         name: getattr(batch, name, None) for name in VECTORS

@@ -20,7 +20,7 @@ from service.observations.readers.csv_columns import (
     STAR_COLUMNS,
     VERBATIM,
     BadCell,
-    Row,
+    CsvRow,
     batch_cells,
     batch_fields,
     checked_header,
@@ -33,18 +33,18 @@ from service.observations.schema import BatchIn
 MAX_ROWS = MAX_STARS_PER_TRACKER * MAX_TRACKERS
 
 
-class _Batch:
+class _BatchRows:
     """The rows of one batch as they come in: its own fields once, then a star a row."""
 
     def __init__(self, number: int, key: tuple[str, ...], fault: Fault | None = None) -> None:
         self.number, self.key, self.fault = number, key, fault
         self.fault_at = number
-        self.first: Row = {}
+        self.first: CsvRow = {}
         self.fields: dict[str, Any] = {}
         self.trackers: dict[str, list[dict[str, Any]]] = {}
         self.rows = 0
 
-    def add(self, number: int, row: Row) -> None:
+    def add(self, number: int, row: CsvRow) -> None:
         if self.fault is not None:
             return
         try:
@@ -84,7 +84,7 @@ def batches_of_rows(lines: Iterator[Line]) -> Iterator[Line]:
     header.
     """
     header = _header(next(lines, None))
-    batch: _Batch | None = None
+    batch: _BatchRows | None = None
     stray: int | None = None
     for line in lines:
         cells, fault = _cells(line, header)
@@ -100,7 +100,7 @@ def batches_of_rows(lines: Iterator[Line]) -> Iterator[Line]:
             if batch is not None:
                 yield batch.line()
             beside = None if stray is None else _beside(line.number, stray)
-            batch, stray = _Batch(line.number, key, beside), None
+            batch, stray = _BatchRows(line.number, key, beside), None
         if fault is not None:
             batch.refuse(line.number, fault)
         batch.add(line.number, cells)
@@ -129,7 +129,7 @@ def _split(body: bytes) -> list[str] | None:
         return None
 
 
-def _cells(line: Line, header: list[str]) -> tuple[Row | None, Fault | None]:
+def _cells(line: Line, header: list[str]) -> tuple[CsvRow | None, Fault | None]:
     """The cells of a row by column, None where it cannot be told whose they are."""
     if line.body is None:
         return None, line.fault
@@ -155,7 +155,7 @@ def _beside(batch: int, damaged: int) -> Fault:
     return Fault(f"line {batch}", message)
 
 
-def write_csv(batches: Iterable[BatchIn], stream: TextIO) -> None:
+def write_batches_csv(batches: Iterable[BatchIn], stream: TextIO) -> None:
     """Write checked batches as rows; `stream` is opened with `newline=""`.
 
     A Sun vector or position inside an a priori attitude is written as the

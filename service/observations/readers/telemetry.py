@@ -17,19 +17,19 @@ from service.observations.readers.csv_columns import COLUMNS
 from service.observations.readers.csv_rows import batches_of_rows
 from service.observations.readers.lines import Line, physical_lines
 
-Form = Literal["ndjson", "csv"]
+TelemetryFormat = Literal["ndjson", "csv"]
 
 _LOOKED_AT_BYTES, _LOOKED_AT_LINES = 1 << 16, 20
 _PACKED = {b"\x1f\x8b": ("gzip", "gunzip"), b"\x28\xb5\x2f\xfd": ("zstd", "unzstd")}
 _SHOWN_BYTES = 40
 
 
-def form_of(path: Path) -> Form:
+def telemetry_format(path: Path) -> TelemetryFormat:
     """The form of a file by its name: `.csv` is CSV, all else NDJSON."""
     return "csv" if path.suffix.lower() == ".csv" else "ndjson"
 
 
-def read_lines(source: Path | BinaryIO, form: Form | None = None) -> Iterator[Line]:
+def read_lines(source: Path | BinaryIO, form: TelemetryFormat | None = None) -> Iterator[Line]:
     """The batches of a file or of a binary stream, in order.
 
     The form is told by the file's name where it is not given; a stream without
@@ -37,7 +37,7 @@ def read_lines(source: Path | BinaryIO, form: Form | None = None) -> Iterator[Li
     CSV header with unknown or missing columns.
     """
     with _opened(source) as stream:
-        if (form or (form_of(source) if isinstance(source, Path) else "ndjson")) == "csv":
+        if (form or (telemetry_format(source) if isinstance(source, Path) else "ndjson")) == "csv":
             yield from batches_of_rows(physical_lines(stream))
         else:
             yield from physical_lines(stream)
@@ -50,7 +50,7 @@ def require_telemetry(path: Path) -> None:
     """
     with _opened(path) as stream:
         start = stream.read(_LOOKED_AT_BYTES).removeprefix(codecs.BOM_UTF8)
-    form = form_of(path)
+    form = telemetry_format(path)
     message = _not_telemetry(start, form)
     if message is not None:
         shown = shown_value(start[:_SHOWN_BYTES]) if start.strip() else None
@@ -64,7 +64,7 @@ def require_telemetry(path: Path) -> None:
             ) from None
 
 
-def _not_telemetry(start: bytes, form: Form) -> str | None:
+def _not_telemetry(start: bytes, form: TelemetryFormat) -> str | None:
     """What a file is instead of telemetry, by its beginning; None for telemetry."""
     lines = [line.strip() for line in start.split(b"\n") if line.strip()][:_LOOKED_AT_LINES]
     if not lines:

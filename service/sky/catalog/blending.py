@@ -9,7 +9,7 @@ from service.vectors import Vector
 Rows = npt.NDArray[np.intp]
 
 
-def merge(
+def merged_into(
     direction: Vector,
     magnitude: Vector,
     light_elsewhere: npt.NDArray[np.bool_],

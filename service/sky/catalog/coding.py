@@ -27,7 +27,7 @@ _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 
 
 @dataclass(frozen=True)
-class Coding:
+class ColumnCoding:
     """How one column is coded: value = integer times step; step None is a plain column."""
 
     meaning: str
@@ -64,44 +64,44 @@ class Coding:
 
 _MAS_DEG = 1.0 / 3_600_000.0
 
-COLUMNS: Mapping[str, Coding] = {
-    "ra_deg": Coding("right ascension", "deg", "int32", _MAS_DEG),
-    "dec_deg": Coding("declination", "deg", "int32", _MAS_DEG),
-    "pm_ra_mas_per_year": Coding(
+COLUMNS: Mapping[str, ColumnCoding] = {
+    "ra_deg": ColumnCoding("right ascension", "deg", "int32", _MAS_DEG),
+    "dec_deg": ColumnCoding("declination", "deg", "int32", _MAS_DEG),
+    "pm_ra_mas_per_year": ColumnCoding(
         "proper motion in right ascension, times cos(declination)", "mas/year", "int32", 0.01
     ),
-    "pm_dec_mas_per_year": Coding("proper motion in declination", "mas/year", "int32", 0.01),
-    "parallax_mas": Coding("parallax", "mas", "int32", 0.01, -(2**31)),
-    "magnitude_v_mag": Coding("V", "mag", "int16", 0.01),
-    "color_bv_mag": Coding("B-V", "mag", "int16", 0.001, -(2**15)),
-    "neighbour_arcsec": Coding(
+    "pm_dec_mas_per_year": ColumnCoding("proper motion in declination", "mas/year", "int32", 0.01),
+    "parallax_mas": ColumnCoding("parallax", "mas", "int32", 0.01, -(2**31)),
+    "magnitude_v_mag": ColumnCoding("V", "mag", "int16", 0.01),
+    "color_bv_mag": ColumnCoding("B-V", "mag", "int16", 0.001, -(2**15)),
+    "neighbour_arcsec": ColumnCoding(
         "distance of the nearest neighbour", "arcsec", "uint16", 0.1, 2**16 - 1
     ),
-    "neighbour_fainter_by_mag": Coding(
+    "neighbour_fainter_by_mag": ColumnCoding(
         "that neighbour's V minus the star's", "mag", "int16", 0.01, -(2**15)
     ),
-    "rival_arcsec": Coding(
+    "rival_arcsec": ColumnCoding(
         "distance of the nearest neighbour not more than 2 mag fainter",
         "arcsec",
         "uint16",
         0.1,
         2**16 - 1,
     ),
-    "rival_fainter_by_mag": Coding(
+    "rival_fainter_by_mag": ColumnCoding(
         "that neighbour's V minus the star's", "mag", "int16", 0.01, -(2**15)
     ),
-    "variability_mag": Coding("amplitude of variability", "mag", "uint16", 0.01, 2**16 - 1),
-    "position_sigma_arcsec": Coding(
+    "variability_mag": ColumnCoding("amplitude of variability", "mag", "uint16", 0.01, 2**16 - 1),
+    "position_sigma_arcsec": ColumnCoding(
         "standard deviation of the position per axis", "arcsec", "uint16", 0.01, 2**16 - 1
     ),
-    "components": Coding("components that Tycho-2 resolves within the star", "", "uint8"),
-    "light_elsewhere": Coding(
+    "components": ColumnCoding("components that Tycho-2 resolves within the star", "", "uint8"),
+    "light_elsewhere": ColumnCoding(
         "true: the star's light is counted in a neighbour's magnitude already", "", "bool"
     ),
-    "hip": Coding("Hipparcos number, 0 where there is none", "", "int32"),
-    "tyc": Coding("Tycho identifier as three numbers, 0 where there is none", "", "uint16"),
-    "hd": Coding("Henry Draper number, 0 where there is none", "", "int32"),
-    "sao": Coding("SAO number, 0 where there is none", "", "int32"),
+    "hip": ColumnCoding("Hipparcos number, 0 where there is none", "", "int32"),
+    "tyc": ColumnCoding("Tycho identifier as three numbers, 0 where there is none", "", "uint16"),
+    "hd": ColumnCoding("Henry Draper number, 0 where there is none", "", "int32"),
+    "sao": ColumnCoding("SAO number, 0 where there is none", "", "int32"),
 }
 
 ALWAYS_KNOWN = (
@@ -116,7 +116,7 @@ LABEL = "label"
 """An optional further column: the identifiers of a site's own catalog, as text."""
 
 
-def digest_of(data: bytes) -> str:
+def file_digest(data: bytes) -> str:
     """The digest of a file's bytes as text, "sha256:…"."""
     return "sha256:" + hashlib.sha256(data).hexdigest()
 

@@ -17,7 +17,7 @@ MAX_ID_LENGTH = 64
 
 
 @dataclass(frozen=True)
-class _Number:
+class _NumberColumn:
     """What a column of numbers may hold; `whole` numbers are those of other catalogs."""
 
     column: str
@@ -27,27 +27,27 @@ class _Number:
     whole: bool = False
 
 
-REQUIRED: Mapping[str, _Number] = {
-    "ra_deg": _Number("ra_deg", 0.0, 360.0, math.nan),
-    "dec_deg": _Number("dec_deg", -90.0, 90.0, math.nan),
-    "magnitude": _Number("magnitude_v_mag", -5.0, 20.0, math.nan),
+REQUIRED: Mapping[str, _NumberColumn] = {
+    "ra_deg": _NumberColumn("ra_deg", 0.0, 360.0, math.nan),
+    "dec_deg": _NumberColumn("dec_deg", -90.0, 90.0, math.nan),
+    "magnitude": _NumberColumn("magnitude_v_mag", -5.0, 20.0, math.nan),
 }
-OPTIONAL: Mapping[str, _Number] = {
-    "pm_ra_mas_per_year": _Number("pm_ra_mas_per_year", -20_000.0, 20_000.0, 0.0),
-    "pm_dec_mas_per_year": _Number("pm_dec_mas_per_year", -20_000.0, 20_000.0, 0.0),
-    "parallax_mas": _Number("parallax_mas", -1000.0, 1000.0, math.nan),
-    "color_bv_mag": _Number("color_bv_mag", -5.0, 10.0, math.nan),
-    "variability_mag": _Number("variability_mag", 0.0, 30.0, math.nan),
-    "position_sigma_arcsec": _Number("position_sigma_arcsec", 0.0, 3600.0, math.nan),
-    "hip": _Number("hip", 1, 2**31 - 1, 0, whole=True),
-    "hd": _Number("hd", 1, 2**31 - 1, 0, whole=True),
-    "sao": _Number("sao", 1, 2**31 - 1, 0, whole=True),
+OPTIONAL: Mapping[str, _NumberColumn] = {
+    "pm_ra_mas_per_year": _NumberColumn("pm_ra_mas_per_year", -20_000.0, 20_000.0, 0.0),
+    "pm_dec_mas_per_year": _NumberColumn("pm_dec_mas_per_year", -20_000.0, 20_000.0, 0.0),
+    "parallax_mas": _NumberColumn("parallax_mas", -1000.0, 1000.0, math.nan),
+    "color_bv_mag": _NumberColumn("color_bv_mag", -5.0, 10.0, math.nan),
+    "variability_mag": _NumberColumn("variability_mag", 0.0, 30.0, math.nan),
+    "position_sigma_arcsec": _NumberColumn("position_sigma_arcsec", 0.0, 3600.0, math.nan),
+    "hip": _NumberColumn("hip", 1, 2**31 - 1, 0, whole=True),
+    "hd": _NumberColumn("hd", 1, 2**31 - 1, 0, whole=True),
+    "sao": _NumberColumn("sao", 1, 2**31 - 1, 0, whole=True),
 }
 """Columns that may be left out, whole or star by star (an empty cell)."""
 _ALL = {**REQUIRED, **OPTIONAL}
 
 
-def read(path: Path) -> dict[str, npt.NDArray[Any]]:
+def read_csv_catalog(path: Path) -> dict[str, npt.NDArray[Any]]:
     """The columns of a CSV catalog, by their names in a catalog, in the order of the file.
 
     `ra_deg` is in [0, 360), 360 itself being read as 0.  Raises BadFile with
@@ -149,7 +149,7 @@ def _label_fault(label: str, seen: Mapping[str, int]) -> str | None:
     return None
 
 
-def _number(text: str, rule: _Number, *, required: bool) -> float | str:
+def _number(text: str, rule: _NumberColumn, *, required: bool) -> float | str:
     """The cell's number, or what is wrong with it."""
     if not text and not required:
         return rule.absent

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from service.missions.mission import RunCatalogSettings
-from service.sky.catalog.blending import Rows, combined, merge
+from service.sky.catalog.blending import Rows, combined, merged_into
 from service.sky.catalog.proper_motion import moved
 from service.sky.catalog.rejection import rejections
 from service.sky.catalog.star_catalog import Catalog
@@ -90,7 +90,7 @@ def build_run_catalog(
         catalog.pm_dec_mas_per_year,
         epoch_year - J2000_YEAR,
     )
-    leader = merge(start, alone, catalog.light_elsewhere, settings.merge_within_arcsec)
+    leader = merged_into(start, alone, catalog.light_elsewhere, settings.merge_within_arcsec)
     if settings.merge_limit_mag is not None:
         apart = alone > settings.merge_limit_mag
         leader[apart] = np.flatnonzero(apart)

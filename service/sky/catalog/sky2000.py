@@ -34,7 +34,7 @@ _DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)")
 
 
 @dataclass(frozen=True)
-class Field:
+class RecordField:
     """Bytes `first` to `last`, from 1, of a record: a number within bounds, or blank.
 
     `label` is the description's own.  `must` be there, or may be blank.
@@ -66,37 +66,37 @@ class Field:
 
 
 MAX_NUMBER = 99_999_999
-FIELDS: Mapping[str, Field] = {
+FIELDS: Mapping[str, RecordField] = {
     field.label: field
     for field in (
-        Field("ID", 28, 35, 1, MAX_NUMBER, whole=True, must=True),
-        Field("HD", 36, 41, 1, 999_999, whole=True),
-        Field("SAO", 44, 49, 1, 999_999, whole=True),
-        Field("RAh", 119, 120, 0, 23, whole=True, must=True),
-        Field("RAm", 121, 122, 0, 59, whole=True, must=True),
+        RecordField("ID", 28, 35, 1, MAX_NUMBER, whole=True, must=True),
+        RecordField("HD", 36, 41, 1, 999_999, whole=True),
+        RecordField("SAO", 44, 49, 1, 999_999, whole=True),
+        RecordField("RAh", 119, 120, 0, 23, whole=True, must=True),
+        RecordField("RAm", 121, 122, 0, 59, whole=True, must=True),
         # Sixty seconds, from rounding, are in the catalog.
-        Field("RAs", 123, 129, 0.0, 60.0, must=True),
-        Field("DEd", 131, 132, 0, 90, whole=True, must=True),
-        Field("DEm", 133, 134, 0, 59, whole=True, must=True),
-        Field("DEs", 135, 140, 0.0, 60.0, must=True),
-        Field("e_pos", 141, 146, 0.0, 3600.0),
-        Field("pmRA", 150, 157, -10.0, 10.0),
-        Field("pmDE", 158, 165, -100.0, 100.0),
-        Field("Plx", 176, 183, -10.0, 10.0),
-        Field("Vmag", 233, 238, -5.0, 30.0),
-        Field("Vder", 239, 243, -5.0, 30.0),
-        Field("Bmag", 253, 258, -5.0, 30.0),
-        Field("B-V", 259, 264, -5.0, 10.0),
-        Field("ID_A", 388, 395, 0, MAX_NUMBER, whole=True),
-        Field("ID_B", 396, 403, 0, MAX_NUMBER, whole=True),
-        Field("ID_C", 404, 411, 0, MAX_NUMBER, whole=True),
-        Field("varAmp", 422, 426, 0.0, 30.0),
+        RecordField("RAs", 123, 129, 0.0, 60.0, must=True),
+        RecordField("DEd", 131, 132, 0, 90, whole=True, must=True),
+        RecordField("DEm", 133, 134, 0, 59, whole=True, must=True),
+        RecordField("DEs", 135, 140, 0.0, 60.0, must=True),
+        RecordField("e_pos", 141, 146, 0.0, 3600.0),
+        RecordField("pmRA", 150, 157, -10.0, 10.0),
+        RecordField("pmDE", 158, 165, -100.0, 100.0),
+        RecordField("Plx", 176, 183, -10.0, 10.0),
+        RecordField("Vmag", 233, 238, -5.0, 30.0),
+        RecordField("Vder", 239, 243, -5.0, 30.0),
+        RecordField("Bmag", 253, 258, -5.0, 30.0),
+        RecordField("B-V", 259, 264, -5.0, 10.0),
+        RecordField("ID_A", 388, 395, 0, MAX_NUMBER, whole=True),
+        RecordField("ID_B", 396, 403, 0, MAX_NUMBER, whole=True),
+        RecordField("ID_C", 404, 411, 0, MAX_NUMBER, whole=True),
+        RecordField("varAmp", 422, 426, 0.0, 30.0),
     )
 }
 DECLINATION_SIGN, BLENDED_V = 130, 249
 """Bytes of the two marks that are read: the sign of the declination, and `b` for blended light."""
 
-Record = dict[str, float | None]
+CatalogRecord = dict[str, float | None]
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def is_sky2000(path: Path) -> bool:
         return False
 
 
-def read(path: Path, step: Callable[[], object] = lambda: None) -> Read:
+def read_sky2000(path: Path, step: Callable[[], object] = lambda: None) -> Read:
     """The stars of a file, in its order; `step` is called after each record.
 
     The observed V, or where there is none the derived one, is the magnitude; a
@@ -125,7 +125,7 @@ def read(path: Path, step: Callable[[], object] = lambda: None) -> Read:
     Raises BadFile with up to FAULTS_SHOWN faults, each with line, bytes and value.
     """
     faults: list[Fault] = []
-    stars: list[Record] = []
+    stars: list[CatalogRecord] = []
     blended: list[bool] = []
     without: list[str] = []
     seen: dict[int, int] = {}
@@ -200,15 +200,15 @@ def _line_fault(raw: bytes, text: bytes) -> str | None:
     return None
 
 
-def _fault(line: int, field: Field, message: str, record: str) -> Fault:
+def _fault(line: int, field: RecordField, message: str, record: str) -> Fault:
     where = f"line {line}, bytes {field.first}-{field.last} ({field.label})"
     return Fault(where, message, shown_value(record[field.first - 1 : field.last]))
 
 
-def _values(line: int, record: str, faults: list[Fault]) -> Record | None:
+def _values(line: int, record: str, faults: list[Fault]) -> CatalogRecord | None:
     """The numbers of a record with its position in degrees; None where anything is wrong."""
     before = len(faults)
-    found: Record = {}
+    found: CatalogRecord = {}
     for label, field in FIELDS.items():
         try:
             found[label] = field.read(record)
@@ -238,7 +238,7 @@ def _values(line: int, record: str, faults: list[Fault]) -> Record | None:
 # ---- columns -----------------------------------------------------------------------------------
 
 
-def _columns(stars: list[Record], blended: list[bool]) -> dict[str, npt.NDArray[Any]]:
+def _columns(stars: list[CatalogRecord], blended: list[bool]) -> dict[str, npt.NDArray[Any]]:
     count = len(stars)
 
     def column(label: str, absent: float = math.nan) -> npt.NDArray[np.float64]:
@@ -270,7 +270,7 @@ def _columns(stars: list[Record], blended: list[bool]) -> dict[str, npt.NDArray[
 
 
 def _elsewhere(
-    stars: list[Record], number: npt.NDArray[np.int64], blended: list[bool]
+    stars: list[CatalogRecord], number: npt.NDArray[np.int64], blended: list[bool]
 ) -> npt.NDArray[np.bool_]:
     """Which stars' light is in the blended magnitude of another: its fainter components."""
     row_of = {int(each): row for row, each in enumerate(number)}

@@ -19,11 +19,11 @@ from service.errors import BadConfiguration, BadFile, Fault, NotFound
 from service.resources import shipped
 from service.sky.catalog import csv_file as catalog_csv
 from service.sky.catalog import sky2000
-from service.sky.catalog.coding import COLUMNS, LABEL, digest_of, pack, unpack
+from service.sky.catalog.coding import COLUMNS, LABEL, file_digest, pack, unpack
 from service.sky.catalog.neighbours import nearest_neighbours
 from service.vectors import Vector, from_ra_dec, read_only
 
-Form = Literal["csv", "sky2000"]
+CatalogFormat = Literal["csv", "sky2000"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +125,7 @@ def load(path: Path) -> Catalog:
         data = path.read_bytes()
     except OSError as error:
         raise BadFile(Fault(str(path), f"cannot be read: {error.strerror}")) from error
-    return _catalog(path.stem, digest_of(data), unpack(data, path))
+    return _catalog(path.stem, file_digest(data), unpack(data, path))
 
 
 @cache
@@ -153,7 +153,7 @@ def import_csv(path: Path) -> Catalog:
     within the catalog itself.  Raises BadFile naming line, column and value of
     up to twenty faults.
     """
-    return _of_a_site(path, catalog_csv.read(path))
+    return _of_a_site(path, catalog_csv.read_csv_catalog(path))
 
 
 def import_sky2000(
@@ -165,18 +165,18 @@ def import_sky2000(
     after each record.  Raises BadFile naming line, bytes and value of up to
     twenty faults.
     """
-    found = sky2000.read(path, step)
+    found = sky2000.read_sky2000(path, step)
     return _of_a_site(path, found.columns), found.without_magnitude
 
 
-def import_catalog(path: Path, form: Form | None = None) -> Catalog:
+def import_catalog(path: Path, form: CatalogFormat | None = None) -> Catalog:
     """A site's own catalog in either form; without one named, the file's beginning tells."""
-    if (form or form_of(path)) == "sky2000":
+    if (form or catalog_format(path)) == "sky2000":
         return import_sky2000(path)[0]
     return import_csv(path)
 
 
-def form_of(path: Path) -> Form:
+def catalog_format(path: Path) -> CatalogFormat:
     """The form of a site's file: SKY2000 where it begins as those records do, else CSV."""
     return "sky2000" if sky2000.is_sky2000(path) else "csv"
 
@@ -188,7 +188,7 @@ def _of_a_site(path: Path, columns: Mapping[str, npt.NDArray[Any]]) -> Catalog:
     direction = from_ra_dec(columns["ra_deg"], columns["dec_deg"])
     magnitude = columns["magnitude_v_mag"]
     columns |= nearest_neighbours(direction, magnitude, direction, magnitude)
-    return _catalog(path.stem, digest_of(_packed(columns)), columns)
+    return _catalog(path.stem, file_digest(_packed(columns)), columns)
 
 
 def save(catalog: Catalog, path: Path) -> None:

@@ -21,7 +21,7 @@ from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.geometry.pairs import build_pairs
 from service.sky.geometry.star_grid import build_star_grid
 from service.sky.whole_sky.bitmap import build_sky_bitmap
-from service.sky.whole_sky.store import FIRST, LAST, ROWS, Store, stored
+from service.sky.whole_sky.store import FIRST, LAST, ROWS, StoreBytes, stored
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
 BUCKET_RAD = 4.0 / ARCSEC_PER_RADIAN
@@ -95,7 +95,7 @@ class SkyIndex:
     run_catalog: str
     limit_mag: float
     radius_deg: float
-    store: Store
+    store: StoreBytes
     arrays: Index
 
     @property

@@ -21,10 +21,10 @@ HEAD_WORDS = 64
 FIRST, LAST, ROWS = 0, 1, 2
 """Of each array in the head: its first byte, the one past its last, and its rows."""
 
-Store = npt.NDArray[np.uint8]
+StoreBytes = npt.NDArray[np.uint8]
 
 
-def stored(arrays: Sequence[npt.NDArray[Any]]) -> tuple[Store, list[npt.NDArray[Any]]]:
+def stored(arrays: Sequence[npt.NDArray[Any]]) -> tuple[StoreBytes, list[npt.NDArray[Any]]]:
     """The arrays one after the other in a block, and the same arrays as views of it; locked."""
     head = np.zeros(HEAD_WORDS, np.int64)
     at = head.nbytes

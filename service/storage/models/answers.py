@@ -16,12 +16,12 @@ from service.storage.models.base import (
     DescribedAs,
     Digest,
     Id,
+    MissionSettings,
     Moment,
     Outcome,
     Quaternion,
     Reason,
     Record,
-    Settings,
     Shape,
     Status,
     doc,
@@ -79,8 +79,8 @@ class Star(Record, frozen=True, kw_only=True):
 
 ZoneKind = Annotated[str, DescribedAs(Literal["cap", "band"])]
 ZoneRightAscension = Annotated[float, doc("Centre of the cap, or pole of the band.")]
-ZoneStars = Annotated[Count, doc("Number of stars (NCAP).")]
-ZonePairs = Annotated[Count, doc("Number of pairs (NTOT).")]
+ZoneStarCount = Annotated[Count, doc("Number of stars (NCAP).")]
+ZonePairCount = Annotated[Count, doc("Number of pairs (NTOT).")]
 
 
 class ZoneSummary(Record, frozen=True, kw_only=True):
@@ -90,8 +90,8 @@ class ZoneSummary(Record, frozen=True, kw_only=True):
     kind: ZoneKind
     ra_deg: ZoneRightAscension
     dec_deg: float
-    stars: ZoneStars
-    pairs: ZonePairs
+    stars: ZoneStarCount
+    pairs: ZonePairCount
 
 
 class SearchedZone(ZoneSummary, frozen=True, kw_only=True):
@@ -274,7 +274,7 @@ class Summary(Record, frozen=True, kw_only=True):
     received: Annotated[Moment, doc("Time at which the service first received the batch.")]
     created: Annotated[Moment, doc("Time at which this result was recorded.")]
     identifier: str
-    options: Annotated[Settings, doc("Options that replaced the mission's settings.")]
+    options: Annotated[MissionSettings, doc("Options that replaced the mission's settings.")]
     counts: StarCounts
     status: Annotated[Status | None, doc("Status of the attitude; null without an attitude.")]
     reason: Reason | None
@@ -302,7 +302,7 @@ class Result(Record, frozen=True, kw_only=True):
         doc("The batch as it was sent, without default values."),
     ]
     options: Annotated[
-        Settings,
+        MissionSettings,
         doc(
             "Options of this result that replaced the mission's settings; `provenance.mission` "
             "identifies those settings."

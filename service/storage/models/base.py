@@ -39,7 +39,9 @@ Id = Annotated[
 ]
 Digest = Annotated[str, Field(pattern=r"^sha256:[0-9a-f]{64}$")]
 Count = Annotated[int, Field(ge=0)]
-Settings = Annotated[dict[str, Any], Field(description="With the names of the mission file.")]
+MissionSettings = Annotated[
+    dict[str, Any], Field(description="With the names of the mission file.")
+]
 Covariance = Annotated[
     list[Components],
     Field(

@@ -5,14 +5,14 @@ from typing import Annotated, ClassVar
 from msgspec import field
 
 from service.storage.models.answers import StarCounts
-from service.storage.models.base import Count, Id, Moment, Outcome, Record, Settings, doc
+from service.storage.models.base import Count, Id, MissionSettings, Moment, Outcome, Record, doc
 
 
 class ComparedSide(StarCounts, frozen=True, kw_only=True):
     """Results of all batches with one set of options."""
 
     component: ClassVar[str] = "SideOut"
-    options: Settings
+    options: MissionSettings
     solved: Count
     suspect: Count
     residual_ratio_mean: float | None

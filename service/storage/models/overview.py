@@ -11,7 +11,7 @@ from service.storage.models.spacecraft import SpacecraftRow
 Shares = list[float]
 
 
-class Window(Record, frozen=True, kw_only=True):
+class WindowCounts(Record, frozen=True, kw_only=True):
     """Counts in a period that ends with the run's latest batch."""
 
     component: ClassVar[str] = "WindowOut"
@@ -50,8 +50,8 @@ class OverviewRow(SpacecraftRow, frozen=True, kw_only=True):
     received_age_s: Annotated[
         float | None, doc("Time since the service received its latest batch.")
     ]
-    last_hour: Window | None
-    last_day: Window | None
+    last_hour: WindowCounts | None
+    last_day: WindowCounts | None
     sparkline_hour: Sparkline | None
     sparkline_day: Sparkline | None
     alarms: Annotated[list[Alarm], doc("Alarms that are not cleared, worst first.")]

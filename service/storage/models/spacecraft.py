@@ -9,10 +9,10 @@ from service.storage.models.base import (
     DescribedAs,
     Digest,
     Id,
+    MissionSettings,
     Moment,
     Quaternion,
     Record,
-    Settings,
     Status,
     doc,
 )
@@ -76,7 +76,7 @@ class MissionNow(Record, frozen=True, kw_only=True):
 
     component: ClassVar[str] = "MissionNow"
     digest: Digest
-    settings: Settings
+    settings: MissionSettings
 
 
 class MissionThen(MissionNow, frozen=True, kw_only=True):

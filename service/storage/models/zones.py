@@ -4,9 +4,9 @@ from typing import ClassVar
 
 from service.storage.models.answers import (
     ZoneKind,
-    ZonePairs,
+    ZonePairCount,
     ZoneRightAscension,
-    ZoneStars,
+    ZoneStarCount,
     ZoneSummary,
 )
 from service.storage.models.base import Count, Digest, Record
@@ -28,8 +28,8 @@ class CachedZone(CacheUse, frozen=True, kw_only=True):
     kind: ZoneKind
     ra_deg: ZoneRightAscension
     dec_deg: float
-    stars: ZoneStars
-    pairs: ZonePairs
+    stars: ZoneStarCount
+    pairs: ZonePairCount
     spacecraft: str
     grid_deg: float
     run_catalog: Digest

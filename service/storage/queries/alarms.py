@@ -121,11 +121,11 @@ def change(
     if changes:
         connection.execute(update(alarms).where(alarms.c.id == alarm["id"]).values(changes))
     whole = {**alarm, **changes}
-    note(connection, whole, actions, now, who=who, comment=comment)
+    record_action(connection, whole, actions, now, who=who, comment=comment)
     return whole
 
 
-def note(
+def record_action(
     connection: Connection,
     alarm: Row,
     actions: Sequence[Action],

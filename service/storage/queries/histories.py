@@ -23,7 +23,9 @@ def list_attitudes(
 ) -> Page[AttitudeRow]:
     """The attitudes of current results, oldest batch time first."""
     chosen = [*selected.conditions(), results.c.status.is_not(None)]
-    return page_of(connection, oldest_first(attitudes().where(*chosen), cursor), limit, attitude_of)
+    return page_of(
+        connection, oldest_first(attitudes().where(*chosen), cursor), limit, attitude_row
+    )
 
 
 def live_state(connection: Connection, mission: Mission, run: str, now: Utc) -> SpacecraftRow:
@@ -37,7 +39,7 @@ def live_state(connection: Connection, mission: Mission, run: str, now: Utc) -> 
     batch = newest(connection, summary_query(), selected, now)
     solved = attitudes().where(results.c.status.is_not(None))
     row = newest(connection, solved, selected, now)
-    last = None if row is None else attitude_of(row)
+    last = None if row is None else attitude_row(row)
     is_latest = batch is not None and last is not None and last.id == batch["id"]
     return SpacecraftRow(
         name=mission.name,
@@ -101,7 +103,7 @@ def _day(number: int) -> str:
 
 
 def attitudes() -> Select[Any]:
-    """The query for what `attitude_of` shows."""
+    """The query for what `attitude_row` shows."""
     place = [results.c.id, *PLACE, batches.c.batch, batches.c.time]
     return (
         select(*place, *(column for column in solutions.c if column.name != "result_id"))
@@ -110,7 +112,7 @@ def attitudes() -> Select[Any]:
     )
 
 
-def attitude_of(row: Any) -> AttitudeRow:
+def attitude_row(row: Any) -> AttitudeRow:
     """An attitude in a history: of which batch, at what time, how good."""
     p = {name: row[name] for name in ("p11", "p12", "p13", "p22", "p23", "p33")}
     return AttitudeRow(

@@ -16,9 +16,9 @@ from service.storage.recording.unsaved_result import Row
 from service.storage.sql.prepared import prepared
 from service.storage.sql.tables import limits
 
-Limits = Mapping[QuantityName, LimitSettings]
+LimitsInForce = Mapping[QuantityName, LimitSettings]
 
-_SHIPPED: dict[tuple[str, tuple[str, ...]], Limits] = {}
+_SHIPPED: dict[tuple[str, tuple[str, ...]], LimitsInForce] = {}
 # Run with every batch of a live spacecraft.
 _IN_FORCE = prepared(
     select(limits).where(
@@ -27,7 +27,7 @@ _IN_FORCE = prepared(
 )
 
 
-def limits_of(connection: Connection, mission: Mission) -> Limits:
+def limits_of(connection: Connection, mission: Mission) -> LimitsInForce:
     """The limits in force for a spacecraft: its own in place of the shipped ones."""
     # Read with every batch; a process meets few missions.
     key = mission.digest, limited_names()

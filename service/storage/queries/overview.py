@@ -9,7 +9,7 @@ from sqlalchemy import Connection, select
 
 from service.missions.mission import Mission
 from service.storage.models.alarms import Alarm
-from service.storage.models.overview import Overview, OverviewRow, Sparkline, Window
+from service.storage.models.overview import Overview, OverviewRow, Sparkline, WindowCounts
 from service.storage.queries.alarms import active_alarms, summary
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.histories import live_state
@@ -81,7 +81,7 @@ def _item(
         end = shifted(as_of, _TICK_S)
         span = BucketFilter(mission.name, run, shifted(end, -width_s), end)
         step_s, buckets = _read(connection, span, width_s)
-        window = Window(start=span.start.text, end=as_of.text, **totals(buckets))
+        window = WindowCounts(start=span.start.text, end=as_of.text, **totals(buckets))
         item[f"last_{name}"] = window
         item[f"sparkline_{name}"] = _sparkline(buckets, step_s)
     return OverviewRow(**item)

@@ -18,7 +18,7 @@ from service.storage.sql.rollup_tables import rollups_hourly
 from service.storage.sql.tables import results
 from service.times import HOUR_S, Utc, bucket_start
 
-Found = tuple[float, int, str, str]
+RankedRow = tuple[float, int, str, str]
 """(how bad, time_ns, batch_id, result id): in this order one batch is worse than another."""
 
 
@@ -30,7 +30,7 @@ def worst_batches(
     Of an offset its size counts, whichever its sign.
     """
     badness = _badness(by)
-    found: list[Found] = []
+    found: list[RankedRow] = []
     for begin, end, most in _hours(connection, selected, by, limit):
         if len(found) == limit and (most, end) < (found[-1][0], found[-1][1]):
             break

@@ -17,7 +17,7 @@ from service.storage.recording.unsaved_result import STARS, Row
 from service.storage.sql.tables import batches, frames, missions, results
 
 OutcomeName = Literal["unique", "ambiguous", "unmatched"]
-Status = Literal["good", "suspect", "none"]
+StatusName = Literal["good", "suspect", "none"]
 
 
 def list_batches(
@@ -25,7 +25,7 @@ def list_batches(
     selected: ResultFilter,
     *,
     outcome: OutcomeName | None,
-    status: Status | None,
+    status: StatusName | None,
     limit: int,
     cursor: str | None,
 ) -> Page[Summary]:

@@ -5,7 +5,7 @@ from sqlalchemy import Connection, bindparam, insert, select, update
 from service.alarms import state_machine
 from service.alarms.limits import LimitSettings, Severity
 from service.alarms.window import Point
-from service.storage.queries.alarms import change, note
+from service.storage.queries.alarms import change, record_action
 from service.storage.recording.ids import Ulids
 from service.storage.recording.unsaved_result import Row
 from service.storage.sql.prepared import prepared
@@ -71,7 +71,7 @@ class ActiveAlarms:
                 columns, actions = state_machine.raised(severity, limits, point, now, worst)
                 alarm = {"id": _IDS.new(), "quantity": quantity, **self._place, **columns}
                 self._connection.execute(insert(alarms), alarm)
-                note(self._connection, alarm, actions, now)
+                record_action(self._connection, alarm, actions, now)
                 self._alarms[quantity] = alarm
             return
         changes, actions = state_machine.observed(alarm, severity, limits, point, now, worst)

@@ -40,7 +40,7 @@ class World:
 
 
 @dataclass(frozen=True)
-class Counts:
+class PrintedCounts:
     """A printed run: stars, of them ambiguous (or unmatched), correct and misidentified."""
 
     stars: int
@@ -81,7 +81,7 @@ class Run:
     sigma_mag: float  # SIGMAG
     bound_mag: float  # RCMAG
     geometry: bool
-    printed: Counts
+    printed: PrintedCounts
     reference: Reference
 
     @property
@@ -141,7 +141,7 @@ def the_paper() -> Paper:
             Run(
                 **{
                     **_tuples(run),
-                    "printed": Counts(**run["printed"]),
+                    "printed": PrintedCounts(**run["printed"]),
                     "reference": Reference(**run["reference"]),
                 }
             )

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.studies.paper_1994.printed import REFERENCE_EXPERIMENTS, Counts
+from service.studies.paper_1994.printed import REFERENCE_EXPERIMENTS, PrintedCounts
 from service.studies.paper_1994.tally import AMBIGUOUS, MISIDENTIFIED, UNMATCHED, Integers, Tally
 from service.vectors import Matrix, Vector
 
@@ -73,7 +73,7 @@ def spread(tally: Tally) -> Spread:
     )
 
 
-def distance_squared(printed: Counts, ours: Spread) -> float:
+def distance_squared(printed: PrintedCounts, ours: Spread) -> float:
     """How far printed counts lie from ours: at most 5.99 in 95 of 100 experiments.
 
     d^T C^-1 d with C = (1 + 1/n) the covariance of an experiment's counts, n

@@ -16,7 +16,7 @@ _FILE = Path(__file__).with_name("zone_counts.json")
 
 
 @dataclass(frozen=True)
-class Count:
+class ZoneQuantity:
     """One quantity of one zone, the paper's and ours; `within` is the bound on their ratio."""
 
     zone: str
@@ -50,7 +50,7 @@ def counted(sky: SkyModel, mission: Mission, axis: Vector, time: Utc) -> tuple[i
     return len(found.star), found.pairs.count
 
 
-def counts(sky: SkyModel) -> Iterator[Count]:
+def counts(sky: SkyModel) -> Iterator[ZoneQuantity]:
     """Every count that the paper prints, beside what is found here."""
     paper = json.loads(_FILE.read_text(encoding="utf-8"))
     missions = load_missions()
@@ -59,7 +59,9 @@ def counts(sky: SkyModel) -> Iterator[Count]:
         axis = from_ra_dec(zone["ra_deg"], zone["dec_deg"])
         found = counted(sky, missions[zone["mission"]], axis, time)
         for quantity, here in zip(("stars", "pairs"), found, strict=True):
-            yield Count(zone["name"], quantity, zone[quantity], here, paper["within"][quantity])
+            yield ZoneQuantity(
+                zone["name"], quantity, zone[quantity], here, paper["within"][quantity]
+            )
     bands = paper["sun_bands"]
     mission = missions[bands["mission"]]
     months = [
@@ -68,7 +70,7 @@ def counts(sky: SkyModel) -> Iterator[Count]:
     ]
     for extreme, pick in (("fewest", min), ("most", max)):
         for k, quantity in enumerate(("stars", "pairs")):
-            yield Count(
+            yield ZoneQuantity(
                 f"{bands['name']}, {extreme}",
                 quantity,
                 bands[extreme][quantity],

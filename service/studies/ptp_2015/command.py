@@ -16,7 +16,7 @@ from service.studies.ptp_2015.comparison import (
     stars_in_fields,
 )
 from service.studies.ptp_2015.document import document
-from service.studies.ptp_2015.found import Found
+from service.studies.ptp_2015.found import Measurements
 from service.studies.ptp_2015.plots import draw
 from service.studies.ptp_2015.tables import TITLES, section
 
@@ -46,7 +46,7 @@ def run_ptp(
     plots: Path | None = None,
     report_path: Path | None = None,
     out: TextIO | None = None,
-) -> Found:
+) -> Measurements:
     """Print one table or figure of the PTP paper, or all (`ptp`), its numbers beside ours.
 
     `scenes` fields are drawn for each condition.  `json_path` takes one row per
@@ -81,12 +81,14 @@ def _checked(table: str, scenes: int, seed: int) -> Sequence[str]:
     return list(TITLES) if table == ALL else [table]
 
 
-def measured(wanted: Sequence[str], scenes: int, seed: int, processes: int | None = None) -> Found:
+def measured(
+    wanted: Sequence[str], scenes: int, seed: int, processes: int | None = None
+) -> Measurements:
     """Everything that some tables and figures show."""
     cases = [case for name in wanted for case in CASES[name]]
     tallies = compare(cases, scenes, seed, processes) if cases else []
     names = dict.fromkeys(t.algorithm for t in tallies if t.case.name.startswith("ptp-"))
-    return Found(
+    return Measurements(
         scenes,
         seed,
         {name: [tally for tally in tallies if tally.case.name == name] for name in wanted},
@@ -95,7 +97,7 @@ def measured(wanted: Sequence[str], scenes: int, seed: int, processes: int | Non
     )
 
 
-def rows_of(found: Found) -> list[dict[str, Any]]:
+def rows_of(found: Measurements) -> list[dict[str, Any]]:
     """One row per condition and algorithm, and one of Figure 10."""
     rows = [tally.row() for tallies in found.tallies.values() for tally in tallies]
     if found.stars is not None:
@@ -112,7 +114,7 @@ def rows_of(found: Found) -> list[dict[str, Any]]:
     return rows
 
 
-def write_json(found: Found, path: Path) -> None:
+def write_json(found: Measurements, path: Path) -> None:
     """Write the rows as a JSON array, one a line."""
     lines = ",\n".join(json.dumps(row, ensure_ascii=False) for row in rows_of(found))
     path.write_text(f"[\n{lines}\n]\n" if lines else "[]\n", encoding="utf-8")

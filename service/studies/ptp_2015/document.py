@@ -11,7 +11,7 @@ from service.sky.catalog.star_catalog import load_embedded
 from service.sky.geometry.triangles import build_triangles
 from service.studies.paper_1994.tables import markdown
 from service.studies.ptp_2015 import tables
-from service.studies.ptp_2015.found import Found
+from service.studies.ptp_2015.found import Measurements
 from service.studies.ptp_2015.printed import the_ptp_paper
 
 _INTRODUCTION = """\
@@ -63,7 +63,7 @@ separations; it answers with four stars. Nothing was tuned beyond that.
 """
 
 
-def document(found: Found, plots: Path, file: Path) -> str:
+def document(found: Measurements, plots: Path, file: Path) -> str:
     """Markdown: how the paper was read, its axis and ours, databases, tables, figures.
 
     The pictures are those that `plots.draw` made in the folder `plots`, linked
@@ -91,7 +91,7 @@ def document(found: Found, plots: Path, file: Path) -> str:
     return "\n\n".join(part.strip() for part in parts) + "\n"
 
 
-def _in_short(found: Found) -> list[str]:
+def _in_short(found: Measurements) -> list[str]:
     """The algorithms side by side at one pixel and at two, the best answer of its own first."""
     # Of one pixel and half a magnitude: it is their order that is claimed.
     printed = {row.algorithm: row.rate_pct for row in the_ptp_paper().table_6}

@@ -7,12 +7,12 @@ import numpy as np
 import numpy.typing as npt
 
 from service.studies.ptp_2015.comparison import Database
-from service.studies.ptp_2015.plots import Drawn
+from service.studies.ptp_2015.plots import PlottedSeries
 from service.studies.ptp_2015.tally import Tally
 
 
 @dataclass(frozen=True)
-class Found:
+class Measurements:
     """What was measured: tallies by table, the counts of Figure 10, the databases."""
 
     scenes: int
@@ -22,7 +22,7 @@ class Found:
     databases: Sequence[Database] = field(default_factory=tuple)
 
     @property
-    def drawn(self) -> Drawn:
+    def drawn(self) -> PlottedSeries:
         """The figures, for the plots."""
-        figures: Drawn = {} if self.stars is None else {"figure-10": self.stars}
+        figures: PlottedSeries = {} if self.stars is None else {"figure-10": self.stars}
         return figures | {name: tallies for name, tallies in self.tallies.items() if tallies}

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from service.simulate.drawing import pictures_in
 from service.studies.ptp_2015.printed import Ends, the_ptp_paper
-from service.studies.ptp_2015.tally import Rate, Tally
+from service.studies.ptp_2015.tally import FieldShare, Tally
 
 COLORS = {
     "PTP": "#0b5394",
@@ -18,10 +18,10 @@ COLORS = {
     "Liebe's triangles": "#741b47",
     "pyramid": "#444444",
 }
-Drawn = dict[str, Sequence[Tally] | npt.NDArray[np.int64]]
+PlottedSeries = dict[str, Sequence[Tally] | npt.NDArray[np.int64]]
 
 
-def draw(found: Drawn, folder: Path) -> list[Path]:
+def draw(found: PlottedSeries, folder: Path) -> list[Path]:
     """Draw every figure that there are results for; the SVG files written.
 
     Raises `NotAvailable` where matplotlib is not installed.
@@ -69,7 +69,7 @@ def _by_algorithm(tallies: Sequence[Tally]) -> dict[str, list[Tally]]:
     return {name: [tally for tally in tallies if tally.algorithm == name] for name in names}
 
 
-def _band(axis: Any, x: Sequence[float], rates: Sequence[Rate], name: str) -> None:
+def _band(axis: Any, x: Sequence[float], rates: Sequence[FieldShare], name: str) -> None:
     low, high = zip(*(rate.interval for rate in rates), strict=True)
     color = COLORS[name]
     axis.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from service.studies.paper_1994.tables import markdown
 from service.studies.ptp_2015 import claims
 from service.studies.ptp_2015.comparison import Database
-from service.studies.ptp_2015.found import Found
+from service.studies.ptp_2015.found import Measurements
 from service.studies.ptp_2015.printed import Ends, the_ptp_paper
 from service.studies.ptp_2015.tally import Tally
 
@@ -34,7 +34,7 @@ RATES = (
 )
 
 
-def section(found: Found, name: str) -> str:
+def section(found: Measurements, name: str) -> str:
     """A table or figure with its heading, and what the paper claims of it that cannot be."""
     tallies, paper = found.tallies[name], the_ptp_paper()
     if name == "ptp-5":

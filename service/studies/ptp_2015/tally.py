@@ -19,7 +19,7 @@ Fields = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Rate:
+class FieldShare:
     """A share of fields in percent with its 95 % interval (Wilson)."""
 
     count: int
@@ -63,25 +63,25 @@ class Tally:
         return np.asarray(self.rows[:, COLUMNS.index(name)])
 
     @cached_property
-    def strict(self) -> Rate:
+    def strict(self) -> FieldShare:
         """All named stars rightly named, three at least."""
         named, right = self._column("named"), self._column("named_right")
         return self._rate((named >= 3) & (right == named))
 
     @cached_property
-    def loose(self) -> Rate:
+    def loose(self) -> FieldShare:
         """Most named stars rightly named, two at least."""
         named, right = self._column("named"), self._column("named_right")
         return self._rate((named >= 2) & (2 * right > named))
 
     @cached_property
-    def checked(self) -> Rate:
+    def checked(self) -> FieldShare:
         """The same as strict after the attitude check."""
         unique, right = self._column("unique"), self._column("unique_right")
         return self._rate((unique >= 3) & (right == unique))
 
     @cached_property
-    def wrong(self) -> Rate:
+    def wrong(self) -> FieldShare:
         """After the attitude check a star is misnamed."""
         return self._rate(self._column("unique_right") < self._column("unique"))
 
@@ -96,8 +96,8 @@ class Tally:
         stars = self._column("stars")
         return Tally(self.case, self.algorithm, self.rows[(stars >= least) & (stars <= most)])
 
-    def _rate(self, fields: Fields) -> Rate:
-        return Rate(int(fields.sum()), len(self.rows))
+    def _rate(self, fields: Fields) -> FieldShare:
+        return FieldShare(int(fields.sum()), len(self.rows))
 
     def row(self) -> dict[str, Any]:
         """The tally as a JSON object."""

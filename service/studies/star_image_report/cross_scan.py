@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from service.imaging.centroids.moments import Moment, moment
+from service.imaging.centroids.moments import ProfileMoment, moment
 from service.imaging.centroids.record import BREAKDOWN_RATIO
 from service.imaging.centroids.window import Array
 
@@ -90,7 +90,7 @@ def variance_of_long_scan(
     return spacing * 2.0 * noise_sigma**2 * half_length**3 / (3.0 * light_integral**2)
 
 
-def variance_in_full(samples: Array, spacing: float, noise_sigma: float) -> Moment:
+def variance_in_full(samples: Array, spacing: float, noise_sigma: float) -> ProfileMoment:
     """sigma² sum (v - d)² / (sum Phi)²: 7.36 and (2N + 1) d² sigma² / (sum Phi)² for a star off it.
 
     In steps of the scan; `variance` times spacing² is the law.

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from service.imaging.centroids.sequential import Estimate, batch, diffuse, least_norm
+from service.imaging.centroids.sequential import StateEstimate, batch, diffuse, least_norm
 from service.imaging.centroids.window import Array
 from service.studies.star_image_report.claims import Claim, Picture, Row, Study
 from service.studies.star_image_report.quadratic_peak import Hump, StopRule, hump_of, recentred
@@ -142,7 +142,7 @@ def _monte_carlo(rng: np.random.Generator, study: Study) -> Claim:
     )
 
 
-def _path(rows: Array, values: Array) -> list[Estimate]:
+def _path(rows: Array, values: Array) -> list[StateEstimate]:
     estimate, path = diffuse([1.0] * 3), []
     for row, value in zip(rows, values, strict=True):
         estimate = estimate.updated(row, float(value), SIGMA**2)
@@ -150,7 +150,7 @@ def _path(rows: Array, values: Array) -> list[Estimate]:
     return path
 
 
-def _convergence(path: list[Estimate]) -> Claim:
+def _convergence(path: list[StateEstimate]) -> Claim:
     early, late = path[19], path[-1]
     off = np.abs(late.state[:2] - TRUTH) / late.sigma[:2]
     return Claim(
@@ -200,7 +200,7 @@ def _differenced(rng: np.random.Generator) -> tuple[Claim, ...]:
     )
 
 
-def limits(reach: float) -> tuple[Estimate, Hump, tuple[Array, Array], Array]:
+def limits(reach: float) -> tuple[StateEstimate, Hump, tuple[Array, Array], Array]:
     """A Gaussian offset by .3 taken for its hump, by points evenly within a circle."""
     hump = hump_of(lambda x, y: float(gaussian(np.asarray(x), np.asarray(y))), 1e-3)
     side = np.linspace(-reach, reach, 61)
@@ -248,7 +248,7 @@ def _limits(rng: np.random.Generator) -> tuple[Claim, ...]:
     )
 
 
-def _draw_path(figure: Any, path: list[Estimate]) -> None:
+def _draw_path(figure: Any, path: list[StateEstimate]) -> None:
     axes = figure.subplots(1, 2, sharey=True)
     n = np.unique(np.geomspace(4, len(path), 300).astype(int))
     shown = [path[k - 1] for k in n]

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from service.imaging.centroids.sequential import Estimate
+from service.imaging.centroids.sequential import StateEstimate
 from service.imaging.centroids.window import Array
 
 
@@ -82,7 +82,7 @@ class Hump:
         left = self.remainder(u, v, measured)
         return rows[one] - rows[other], left[one] - left[other]
 
-    def inconsistency(self, estimate: Estimate) -> tuple[float, float]:
+    def inconsistency(self, estimate: StateEstimate) -> tuple[float, float]:
         """G as it is estimated minus g of the estimated (a, b), and the sigma of that (6.4).
 
         Not zero within its sigma: the offset is outside the hump, or a background is
@@ -105,7 +105,7 @@ class StopRule:
     required_sigma: float
     inconsistency_sigmas: float | None = 4.0
 
-    def says(self, hump: Hump, estimate: Estimate) -> "Verdict":
+    def says(self, hump: Hump, estimate: StateEstimate) -> "Verdict":
         """Whether to go on."""
         if not np.all(estimate.sigma[:2] < self.required_sigma):
             return Verdict(done=False, consistent=True)
@@ -147,10 +147,10 @@ def recentred(
     slopes: Callable[[Array, Array], tuple[Array, Array]],
     points: tuple[Array, Array],
     measured: Array,
-    start: Estimate,
+    start: StateEstimate,
     variance: float,
     passes: int = 10,
-) -> Estimate:
+) -> StateEstimate:
     """(a, b) and a background with the true image and its slopes, re-centred at each pass.
 
     The remedy for an offset that is not small against the hump: the expansion is then made
@@ -166,4 +166,4 @@ def recentred(
         a, b, level = a + found.state[0], b + found.state[1], level + found.state[2]
         if np.abs(found.state[:2]).max() < 1e-9:
             break
-    return Estimate(np.array([a, b, level]), found.covariance, found.measurements)
+    return StateEstimate(np.array([a, b, level]), found.covariance, found.measurements)

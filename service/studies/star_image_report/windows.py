@@ -11,7 +11,7 @@ from service.imaging.centroids.window import Detector, Window
 
 
 @dataclass(frozen=True)
-class DrawnStar:
+class WindowStar:
     """A noisy window and the truth beside it, in pixels of the window."""
 
     window: Window
@@ -57,10 +57,10 @@ def draw_stars(
     detector: Detector,
     background_counts: float,
     size_px: int = 21,
-) -> Iterator[DrawnStar]:
+) -> Iterator[WindowStar]:
     """Stars anywhere on the middle pixel of their windows."""
     flux = flux_of_peak(psf, peak_snr, detector, background_counts)
     for _ in range(number):
         u, v = (size_px // 2 + rng.uniform(-0.5, 0.5, 2)).tolist()
         window = draw_window(rng, psf, (u, v), flux, detector, background_counts, size_px)
-        yield DrawnStar(window, u, v, flux)
+        yield WindowStar(window, u, v, flux)

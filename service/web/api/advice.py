@@ -20,7 +20,7 @@ MAX_SAMPLE = 2_000
 ADVICE_LIMIT_S = 20.0
 """The longest wait for an answer; a sample that takes longer is cut short, and says so."""
 
-Name = Annotated[str, Path(description="The spacecraft's name, such as `XTE`.")]
+SpacecraftPath = Annotated[str, Path(description="The spacecraft's name, such as `XTE`.")]
 
 
 class AdviceQuery(PeriodQuery):
@@ -48,6 +48,8 @@ class AdviceQuery(PeriodQuery):
     "/{name}/advice",
     **route_docs({200: ResponseDoc("The advice.", Advice)}, problems=(404, 503)),
 )
-def get_advice(name: Name, query: Annotated[AdviceQuery, InQuery()], app: AppDep) -> Response:
+def get_advice(
+    name: SpacecraftPath, query: Annotated[AdviceQuery, InQuery()], app: AppDep
+) -> Response:
     """Recommended mission settings from recorded batches: tolerances, noise, alignment."""
     return json_response(app.advice.of_spacecraft(name, **query.asked(), limit_s=ADVICE_LIMIT_S))

@@ -28,8 +28,8 @@ from service.web.requests.request_body import JsonBody, read_model
 
 router = APIRouter(prefix="/api/v1", tags=["alarms"])
 
-Name = Annotated[str, Path(description="The spacecraft's name, such as `XTE`.")]
-Quantity = Annotated[str, Path(description="A quantity, such as `ambiguous_share`.")]
+SpacecraftPath = Annotated[str, Path(description="The spacecraft's name, such as `XTE`.")]
+QuantityPath = Annotated[str, Path(description="A quantity, such as `ambiguous_share`.")]
 AlarmId = Annotated[str, Path(description="The `id` of an alarm.")]
 LIMITS = "/spacecraft/{name}/limits"
 
@@ -76,7 +76,7 @@ class LimitIn(StatementIn):
     dependencies=[NO_QUERY],
     **route_docs({200: ResponseDoc("Every limit.", LimitList)}, problems=(404,)),
 )
-def list_limits(name: Name, app: AppDep) -> Response:
+def list_limits(name: SpacecraftPath, app: AppDep) -> Response:
     """The limits of every quantity of a spacecraft, set or shipped."""
     return json_response({"items": app.limits.all(name)})
 
@@ -86,7 +86,7 @@ def list_limits(name: Name, app: AppDep) -> Response:
     dependencies=[NO_QUERY],
     **route_docs({200: ResponseDoc("The limit and its history.", LimitHistory)}, problems=(404,)),
 )
-def get_limit(name: Name, quantity: Quantity, app: AppDep) -> Response:
+def get_limit(name: SpacecraftPath, quantity: QuantityPath, app: AppDep) -> Response:
     """The limit of one quantity, the shipped limit, and the history of changes."""
     return json_response(app.limits.get(name, _quantity_with_limits(quantity)))
 
@@ -101,8 +101,8 @@ def get_limit(name: Name, quantity: Quantity, app: AppDep) -> Response:
     ),
 )
 def set_limit(
-    name: Name,
-    quantity: Quantity,
+    name: SpacecraftPath,
+    quantity: QuantityPath,
     body: JsonBody,
     app: AppDep,
     caller: CallerDep,
@@ -125,8 +125,8 @@ def set_limit(
     ),
 )
 def reset_limit(
-    name: Name,
-    quantity: Quantity,
+    name: SpacecraftPath,
+    quantity: QuantityPath,
     query: Annotated[StatementQuery, InQuery()],
     app: AppDep,
     caller: CallerDep,

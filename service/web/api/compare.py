@@ -20,7 +20,7 @@ router = APIRouter(prefix="/api/v1", tags=["batches"])
 WORK_S = 10.0
 """Of one comparison; the rest is left out, and the answer says so."""
 
-Options = Annotated[OptionsIn, Field(description="Options that replace each batch's own.")]
+SideOptions = Annotated[OptionsIn, Field(description="Options that replace each batch's own.")]
 
 
 class CompareIn(Wire):
@@ -34,8 +34,8 @@ class CompareIn(Wire):
         int,
         Field(ge=1, le=500, description="Maximum number of batches, taken evenly from the period."),
     ] = 100
-    a: Options = OptionsIn()
-    b: Options = OptionsIn()
+    a: SideOptions = OptionsIn()
+    b: SideOptions = OptionsIn()
 
 
 @router.post(

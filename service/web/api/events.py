@@ -17,7 +17,7 @@ from service.observations.schema import RunName
 from service.web.event_stream import Listener, Live
 from service.web.openapi.route import LAST_EVENT_ID, ResponseDoc, route_docs
 from service.web.requests.access import CallerDep, credentials
-from service.web.requests.query_parameters import Query, Spacecraft
+from service.web.requests.query_parameters import Query, SpacecraftFilter
 
 router = APIRouter(prefix="/api/v1", tags=["events"])
 
@@ -31,7 +31,7 @@ class EventQuery(Query):
     """Which events."""
 
     run: Annotated[RunName | None, Field(description="Only events of this run.")] = None
-    spacecraft: Spacecraft = None
+    spacecraft: SpacecraftFilter = None
     last_event_id: Annotated[
         int | None,
         Field(

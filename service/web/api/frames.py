@@ -16,7 +16,7 @@ from service.errors import BadBatch, Fault, shown_value
 from service.imaging.submit import FrameIn, read_known
 from service.missions.mission import mission_named
 from service.storage.models.answers import Answer
-from service.web.api.spacecraft import Name
+from service.web.api.spacecraft import SpacecraftPath
 from service.web.openapi.route import IDEMPOTENCY_KEY, LOCATION, REPLAYED, ResponseDoc, route_docs
 from service.web.requests.access import CallerDep
 from service.web.requests.dependencies import AppDep, MetricsDep, answer_response
@@ -120,7 +120,7 @@ async def _frame(
     ),
 )
 def submit_frame(
-    name: Name,
+    name: SpacecraftPath,
     upload: Annotated[FrameUpload, Depends(_frame)],
     key: IdempotencyKey,
     app: AppDep,

@@ -27,7 +27,7 @@ from service.web.requests.request_body import (
 
 router = APIRouter(prefix="/api/v1", tags=["runs and replays"])
 
-Run = Annotated[str, Path(description="The run's name.")]
+RunPath = Annotated[str, Path(description="The run's name.")]
 ReplayId = Annotated[str, Path(description="The `id` of a replay.")]
 
 
@@ -86,7 +86,7 @@ def list_runs(app: AppDep) -> Response:
     dependencies=[NO_QUERY],
     **route_docs({200: ResponseDoc("The run.", RunState)}, body=RunIn),
 )
-def watch_run(run: Run, body: JsonBody, app: AppDep, audited: AuditDep) -> Response:
+def watch_run(run: RunPath, body: JsonBody, app: AppDep, audited: AuditDep) -> Response:
     """Switch the alarms of a run on or off; creates the run if it does not exist."""
     asked = read_model(RunIn, body)
     return json_response(app.runs.watch(run, asked.alarms, audited.entry()))

@@ -32,7 +32,7 @@ router = APIRouter(prefix="/api/v1/spacecraft", tags=["spacecraft"])
 
 DEFAULT_SIZE = 500
 
-Name = Annotated[str, Path(description="The spacecraft's name, such as `XTE`.")]
+SpacecraftPath = Annotated[str, Path(description="The spacecraft's name, such as `XTE`.")]
 
 
 @router.get("", **route_docs({200: ResponseDoc("Every spacecraft.", SpacecraftList)}))
@@ -48,7 +48,9 @@ def list_spacecraft(
     "/{name}",
     **route_docs({200: ResponseDoc("The spacecraft.", SpacecraftState)}, problems=(404,)),
 )
-def get_spacecraft(name: Name, query: Annotated[RunQuery, InQuery()], app: AppDep) -> Response:
+def get_spacecraft(
+    name: SpacecraftPath, query: Annotated[RunQuery, InQuery()], app: AppDep
+) -> Response:
     """One spacecraft: state in a run, mission settings and their history."""
     return json_response(app.spacecraft.state(name, query.run))
 
@@ -58,7 +60,10 @@ def get_spacecraft(name: Name, query: Annotated[RunQuery, InQuery()], app: AppDe
     **route_docs({200: ResponseDoc("A page of attitudes.", AttitudePage, LINK)}, problems=(404,)),
 )
 def list_attitudes(
-    request: Request, name: Name, query: Annotated[PeriodPageQuery, InQuery()], app: AppDep
+    request: Request,
+    name: SpacecraftPath,
+    query: Annotated[PeriodPageQuery, InQuery()],
+    app: AppDep,
 ) -> Response:
     """The attitudes of a run, oldest first by batch time."""
     return page_response(request, app.spacecraft.attitudes(name, **query.asked()))
@@ -68,7 +73,9 @@ def list_attitudes(
     "/{name}/rates",
     **route_docs({200: ResponseDoc("The buckets with batches.", RateList)}, problems=(404,)),
 )
-def list_rates(name: Name, query: Annotated[RatesQuery, InQuery()], app: AppDep) -> Response:
+def list_rates(
+    name: SpacecraftPath, query: Annotated[RatesQuery, InQuery()], app: AppDep
+) -> Response:
     """Stars by outcome, in at most 20,000 buckets of batch time."""
     return json_response(RateList(items=app.spacecraft.rates(name, **query.asked())))
 
@@ -80,7 +87,9 @@ def list_rates(name: Name, query: Annotated[RatesQuery, InQuery()], app: AppDep)
         problems=(404,),
     ),
 )
-def get_history(name: Name, query: Annotated[HistoryQuery, InQuery()], app: AppDep) -> Response:
+def get_history(
+    name: SpacecraftPath, query: Annotated[HistoryQuery, InQuery()], app: AppDep
+) -> Response:
     """Quantities over a period.
 
     Thinned out to as many points as can be drawn, or as a table of every batch.
@@ -106,7 +115,9 @@ def get_history(name: Name, query: Annotated[HistoryQuery, InQuery()], app: AppD
     "/{name}/worst",
     **route_docs({200: ResponseDoc("The worst batches.", Ranking)}, problems=(404,)),
 )
-def list_worst(name: Name, query: Annotated[WorstQuery, InQuery()], app: AppDep) -> Response:
+def list_worst(
+    name: SpacecraftPath, query: Annotated[WorstQuery, InQuery()], app: AppDep
+) -> Response:
     """The batches with the worst values of a quantity in a period, worst first."""
     worst = app.spacecraft.worst_batches(name, **query.asked())
     return json_response(Ranking(by=query.by, items=worst))

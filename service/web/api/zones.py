@@ -12,7 +12,7 @@ from service.storage.models.zones import Dropped, ZoneCache, ZoneList
 from service.web.openapi.route import ResponseDoc, route_docs
 from service.web.requests.access import CallerDep
 from service.web.requests.dependencies import AppDep, json_response
-from service.web.requests.query_parameters import NO_QUERY, Query, Spacecraft, Time
+from service.web.requests.query_parameters import NO_QUERY, Query, SpacecraftFilter, Time
 from service.web.requests.request_body import JsonBody, read_model
 
 router = APIRouter(prefix="/api/v1/zones", tags=["zones"])
@@ -33,7 +33,7 @@ class WarmIn(Wire):
 class DropQuery(Query):
     """Which zones to drop."""
 
-    spacecraft: Spacecraft = None
+    spacecraft: SpacecraftFilter = None
 
 
 @router.get("", dependencies=[NO_QUERY], **route_docs({200: ResponseDoc("The cache.", ZoneCache)}))

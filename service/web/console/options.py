@@ -94,7 +94,7 @@ def _checked(nested: Mapping[str, Any], prefix: str) -> OptionsIn:
 
 def changed_options(asked: Mapping[str, Any], choices: Choices) -> OptionsIn:
     """The requested options that differ from the settings in force."""
-    held = settings_of(choices)
+    held = batch_settings(choices)
     changed: dict[str, Any] = {}
     for name, value in asked.items():
         if isinstance(value, dict):
@@ -106,7 +106,7 @@ def changed_options(asked: Mapping[str, Any], choices: Choices) -> OptionsIn:
     return OptionsIn.model_validate(changed)
 
 
-def settings_of(choices: Choices) -> dict[str, Any]:
+def batch_settings(choices: Choices) -> dict[str, Any]:
     """The settings in force for a batch, nested like options."""
     return {
         "identifier": choices.identifier,

@@ -22,7 +22,7 @@ from service.app.output_formats import OUTPUT_FORMATS
 from service.errors import BadBatch, BadInput, Fault, shown_value
 from service.observations.schema import Key, RunName
 from service.storage.queries.alarms import StateFilter
-from service.storage.queries.results import OutcomeName, Status
+from service.storage.queries.results import OutcomeName, StatusName
 from service.storage.queries.trends import MAX_SIZE, Strategy
 from service.storage.recording.rollups import Bucket
 from service.times import Utc, parse_utc
@@ -44,7 +44,9 @@ Time = Annotated[Utc, PlainValidator(_time), WithJsonSchema(_TIME_SCHEMA)]
 
 Start = Annotated[Time | None, Field(description="Start of the period, included.")]
 End = Annotated[Time | None, Field(description="End of the period, excluded.")]
-Limit = Annotated[int, Field(ge=1, le=MAX_LIMIT, description="Maximum number of items on a page.")]
+PageLimit = Annotated[
+    int, Field(ge=1, le=MAX_LIMIT, description="Maximum number of items on a page.")
+]
 Cursor = Annotated[
     str | None,
     Field(
@@ -52,7 +54,7 @@ Cursor = Annotated[
         description="Start of the page, taken from a `Link` header.",
     ),
 ]
-Spacecraft = Annotated[Key | None, Field(description="Only items of this spacecraft.")]
+SpacecraftFilter = Annotated[Key | None, Field(description="Only items of this spacecraft.")]
 
 
 class Query(BaseModel):
@@ -97,14 +99,14 @@ class PeriodQuery(Query):
 class PeriodPageQuery(PeriodQuery):
     """A page of what lies in a period."""
 
-    limit: Limit = 100
+    limit: PageLimit = 100
     cursor: Cursor = None
 
 
 class AuditQuery(Query):
     """A page of changes."""
 
-    limit: Limit = 100
+    limit: PageLimit = 100
     cursor: Cursor = None
 
 
@@ -115,13 +117,13 @@ class BatchQuery(PeriodPageQuery):
         RunName | Literal["*"],
         Field(description="The run: `live` for the batches of pipelines, `*` for all runs."),
     ] = "live"
-    spacecraft: Spacecraft = None
+    spacecraft: SpacecraftFilter = None
     outcome: Annotated[
         OutcomeName | None,
         Field(description="Only batches with at least one star of this outcome."),
     ] = None
     status: Annotated[
-        Status | None,
+        StatusName | None,
         Field(description="Only batches with a good attitude, with a suspect one, or with none."),
     ] = None
 
@@ -231,11 +233,11 @@ class AlarmQuery(Query):
         RunName | Literal["*"],
         Field(description="The run: `live` for the batches of pipelines, `*` for all runs."),
     ] = "live"
-    spacecraft: Spacecraft = None
+    spacecraft: SpacecraftFilter = None
     state: Annotated[
         StateFilter, Field(description="`active`: all alarms that are not cleared.")
     ] = "active"
-    limit: Limit = 100
+    limit: PageLimit = 100
     cursor: Cursor = None
 
 

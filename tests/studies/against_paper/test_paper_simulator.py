@@ -14,7 +14,7 @@ from service.acquire import acquire
 from service.errors import BadInput
 from service.studies.paper_1994.command import run_paper
 from service.studies.paper_1994.experiments import run_experiments
-from service.studies.paper_1994.printed import Counts, the_paper
+from service.studies.paper_1994.printed import PrintedCounts, the_paper
 from service.studies.paper_1994.region import (
     CHI_SQUARE_95,
     Spread,
@@ -92,7 +92,7 @@ class TestRegion:
         assert ours.mean.tolist() == [80.0, 0.0]
         assert ours.covariance[0, 0] == pytest.approx(40 * 80 / 79)
         # d = -80, C = 1.5 * 40 * 80 / 79 + 0.5
-        printed = Counts(stars=2000, ambiguous=0, correct=2000, misidentified=0)
+        printed = PrintedCounts(stars=2000, ambiguous=0, correct=2000, misidentified=0)
         assert distance_squared(printed, ours) == pytest.approx(80**2 / (4800 / 79 + 0.5))
 
     def test_what_differs_from_date_to_date_of_the_sun_is_no_spread(self):

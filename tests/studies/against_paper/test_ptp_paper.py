@@ -19,7 +19,7 @@ from service.studies.ptp_2015.printed import the_ptp_paper
 from service.studies.ptp_2015.rivals.liebe import features
 from service.studies.ptp_2015.rivals.planar_triangle import area_and_moment, area_and_moment_sigma
 from service.studies.ptp_2015.tables import TITLES
-from service.studies.ptp_2015.tally import COLUMNS, Rate, Tally
+from service.studies.ptp_2015.tally import COLUMNS, FieldShare, Tally
 from service.vectors import angle_between_deg, unit
 
 PIXEL_RAD = Conditions().camera.pixel_rad
@@ -147,7 +147,7 @@ class TestComparison:
     def test_a_rate_s_interval_is_wilson_s(self):
         for count, of in ((0, 10), (10, 10), (9_930, 10_000), (1, 3)):
             expected = binomtest(count, of).proportion_ci(0.95, "wilson")
-            assert Rate(count, of).interval == pytest.approx(
+            assert FieldShare(count, of).interval == pytest.approx(
                 (100 * expected.low, 100 * expected.high), abs=1e-4
             )
 

@@ -26,7 +26,7 @@ SEPARATION_MAX_DEG = 14.2
 MAX_TRIANGLES, MAX_CANDIDATES = 500, 2_000
 
 
-class Field(NamedTuple):
+class ObservedField(NamedTuple):
     """The observed stars (n): unit vectors, and their noise in radians."""
 
     direction: Any
@@ -85,7 +85,7 @@ class Pyramid:
             *(self.direction, self.brighter, self.dimmer),
             *(index.value, index.below, index.slope, index.intercept),
         )
-        if not _search(Field(scene.direction, scene.sigma_rad), pairs, image, star):
+        if not _search(ObservedField(scene.direction, scene.sigma_rad), pairs, image, star):
             return Proposed(match, image[:0], star[:0])
         match[image] = star
         return Proposed(match, image, star)

@@ -10,7 +10,7 @@ PAD = 2.0
 
 
 @dataclass(frozen=True)
-class Sparkline:
+class SparklineDrawing:
     """Two lines and the share that the top stands for; lone points are dots."""
 
     ambiguous: str
@@ -21,7 +21,7 @@ class Sparkline:
     height: int = HEIGHT
 
 
-def sparkline(series: Shares, start_s: float, end_s: float) -> Sparkline:
+def sparkline(series: Shares, start_s: float, end_s: float) -> SparklineDrawing:
     """The picture of `sparkline_hour` or `sparkline_day` of an overview, from start to end."""
     moments: Sequence[float] = series.unix_s
     shares: dict[str, list[float]] = {
@@ -51,4 +51,4 @@ def sparkline(series: Shares, start_s: float, end_s: float) -> Sparkline:
             "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in part) for part in parts if len(part) > 1
         )
         dots += [(name, *part[0]) for part in parts if len(part) == 1]
-    return Sparkline(paths["ambiguous"], paths["unmatched"], tuple(dots), top)
+    return SparklineDrawing(paths["ambiguous"], paths["unmatched"], tuple(dots), top)

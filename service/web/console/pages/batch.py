@@ -19,9 +19,9 @@ from service.vectors import matrix_from_quaternion, to_ra_dec
 from service.web.console.charts.sky_chart import sky_chart
 from service.web.console.options import (
     asked_options,
+    batch_settings,
     changed_options,
     fields_of,
-    settings_of,
     toml_of,
 )
 from service.web.console.page_context import ContextDep, PageQuery
@@ -36,7 +36,7 @@ ResultId = Annotated[str, Path()]
 
 
 @dataclass(frozen=True)
-class StarRow:
+class VoteRow:
     """One row of the vote table: the observed star, its identification, and the one before."""
 
     tracker: str
@@ -72,7 +72,7 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
         tried = answer_from_json(context.app.results.what_if(id, options).body)
     shown = tried or answer
     field = context.app.results.star_field(id, tried)
-    fields = fields_of(asked, settings_of(held))
+    fields = fields_of(asked, batch_settings(held))
     layout = context.layout(answer.run)
     return rendered(
         "batch.html.jinja",
@@ -106,14 +106,14 @@ def latest_batch(
     return RedirectResponse(f"{address}?{urlencode({'run': query.run})}", 303)
 
 
-def _stars(shown: Answer, before: Answer | None, field: Mapping[str, Any]) -> list[StarRow]:
+def _stars(shown: Answer, before: Answer | None, field: Mapping[str, Any]) -> list[VoteRow]:
     stars = []
     for index, tracker in enumerate(shown.observations):
         drawn = field["trackers"][index]
         magnitudes = {each["id"]: each["magnitude"] for each in drawn["catalog"]}
         for k, found in enumerate(tracker.stars):
             stars.append(
-                StarRow(
+                VoteRow(
                     tracker.tracker,
                     k + 1,
                     drawn["observed"][k],

@@ -7,7 +7,7 @@ from pydantic import Field
 from starlette.responses import Response
 
 from service.observations.schema import Key
-from service.storage.queries.results import OutcomeName, Status
+from service.storage.queries.results import OutcomeName, StatusName
 from service.times import parse_utc
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page
@@ -25,7 +25,7 @@ class BatchesQuery(PageQuery):
 
     spacecraft: Key | Any_ = ""
     outcome: OutcomeName | Any_ = ""
-    status: Status | Any_ = ""
+    status: StatusName | Any_ = ""
     start: Annotated[str, Field(max_length=40)] = ""
     end: Annotated[str, Field(max_length=40)] = ""
     cursor: Cursor = None

@@ -8,9 +8,9 @@ from fastapi import Query as InQuery
 from starlette.responses import Response
 
 from service.storage.models.overview import OverviewRow
-from service.storage.models.overview import Window as Sums
+from service.storage.models.overview import WindowCounts as Sums
 from service.times import DAY_S, parse_utc, shifted
-from service.web.console.charts.sparkline import Sparkline, sparkline
+from service.web.console.charts.sparkline import SparklineDrawing, sparkline
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
@@ -25,7 +25,7 @@ class OverviewWindow:
     """The hour or day before the run's latest batch: sums and a sparkline."""
 
     sums: Sums | None
-    spark: Sparkline | None
+    spark: SparklineDrawing | None
 
 
 @dataclass(frozen=True)
