@@ -20,13 +20,13 @@ from service.storage.queries.recorded_batch import sample_batches
 from service.times import Utc
 
 ADVICE_SAMPLE = 200
-"""Enough batches to know a sigma to about five percent; they run again in seconds."""
+"""Gives a sigma to about five percent; these batches are processed again in seconds."""
 ADVICE_RETRY_S = 10
 NO_TOLERANCES = TolerancesIn()
 
 
 class AdviceService:
-    """Works out advice, for one caller at a time."""
+    """Computes advice, for one caller at a time."""
 
     def __init__(self, context: Context, submissions: Submissions) -> None:
         self._context = context
@@ -62,7 +62,7 @@ class AdviceService:
                 )
             began = time.monotonic()
             pace = WorkLimit(lambda share: time.monotonic() - began < share * limit_s, step)
-            # Were the worst looked up in the whole sky, the others would look too good.
+            # Without the search of the whole sky, which would hide faults of the settings.
             run_again = partial(self._submissions.ingest.run_again, mission=mission.within_zones)
             findings = advise(mission, drawn.batches, run_again, own, pace)
         finally:

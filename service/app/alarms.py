@@ -98,7 +98,7 @@ class Alarms:
         return self._act(id, lambda _: ({}, ["commented"]), who, comment, utc_now().text, entry)
 
     def evaluate_by_clock(self) -> bool:
-        """Raise alarms of silent spacecraft, end shelving that is over; whether any was due."""
+        """Raise alarms of silent spacecraft and end expired shelving; whether there was any."""
         moment = utc_now()
         with self._context.reading() as connection:
             due = is_due_by_clock(connection, self._context.missions, moment)

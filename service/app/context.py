@@ -1,4 +1,4 @@
-"""What every part of the app works with: settings, missions, sky and records."""
+"""What the parts of the app share: settings, missions, sky and database."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -18,7 +18,7 @@ from service.storage.recording.ids import is_ulid
 from service.storage.sql.database import Store
 
 ALL_RUNS = "*"
-"""In place of the name of a run: every run, the live one included."""
+"""Stands for every run, the live one included, where the name of a run is expected."""
 
 _RUN_NAME = TypeAdapter(RunName)
 
@@ -43,7 +43,7 @@ class Context:
         return self.store.writer.change(change).result()
 
     def change_audited(self, change: Callable[[Connection], T], entry: Entry | None) -> T:
-        """`change`, together with its entry in the audit list: both are stored, or neither."""
+        """`change` with its entry in the audit list, in one transaction."""
 
         def audited(connection: Connection) -> T:
             changed = change(connection)
@@ -56,7 +56,7 @@ class Context:
 
 def known_id(id: str, what: str) -> str:
     """An id as it was given; raises `NotFound` for a text that cannot be one, such as `x`."""
-    # The form tells without asking the database.
+    # A malformed id needs no query.
     if not is_ulid(id):
         raise NotFound(f"there is no {what} with the id {shown_value(id)}")
     return id

@@ -24,9 +24,9 @@ class Events:
             return events.events_after(connection, last, limit)
 
     def listen(self, listener: Callable[[], object]) -> None:
-        """Have a function called, from any thread, whenever something was written."""
+        """Call a function, from any thread, after each commit."""
         self._context.store.writer.after_commit.append(listener)
 
     def unlisten(self, listener: Callable[[], object]) -> None:
-        """Stop calling it."""
+        """Stop calling a function after each commit."""
         self._context.store.writer.after_commit.remove(listener)

@@ -94,7 +94,7 @@ def open_app(
 
 
 def _register(context: Context) -> None:
-    """Record the missions and the catalog in use; replays of an earlier process have ended."""
+    """Record the missions and the catalog in use, and close replays of an earlier process."""
     moment = utc_now().text
     mission_rows = [
         {

@@ -17,7 +17,7 @@ from service.storage.queries.results import answer_from_json, frame_of_result
 from service.storage.recording.unsaved_result import Answered
 
 FRAME_WAIT_S = 30.0
-"""The longest that a frame waits for a thread: others may take seconds."""
+"""The longest time that a frame waits for a thread: other frames may take seconds."""
 
 
 class Frames:
@@ -49,7 +49,7 @@ class Frames:
             max_pixels = self._context.settings.frame_megapixels * 1_000_000
 
             def make() -> Submission:
-                # What this imports takes a third of the service's start.
+                # Importing this takes a third of the time that the service needs to start.
                 from service.acquire.frame_submission import submit_frame
 
                 catalog = self._context.sky.catalog
@@ -70,7 +70,7 @@ class Frames:
         """A PNG of the frame that a result was made of, with its stars, names and residuals."""
         with self._context.reading() as connection:
             row = frame_of_result(connection, known_id(id, "batch"))
-        # As it was for that result, whatever its file says now.
+        # The mission of that result, which may differ from the present file.
         mission = Mission.model_validate_json(row["settings"])
         answer, batch = answer_from_json(row["answer"]), submission_from_json(row["input"]).batch
         tracker, camera = mission.camera_tracker(batch.observations[0].tracker, "tracker")

@@ -40,4 +40,4 @@ def _csv_lines(rows: Iterable[TableRow]) -> str:
 
 
 OUTPUT_FORMATS: dict[str, OutputFormat] = {"csv": OutputFormat("CSV", "text/csv", write_csv)}
-"""By name, which is the suffix of a file as well."""
+"""By name, which is also the suffix of a file."""

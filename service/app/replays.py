@@ -1,4 +1,4 @@
-"""Replays: telemetry files worked through in the background."""
+"""Replays: telemetry files processed in the background."""
 
 import logging
 import threading
@@ -34,18 +34,18 @@ from service.times import utc_now
 log = logging.getLogger(__name__)
 
 MAX_REPLAYS, MAX_OF_ONE_TOKEN = 8, 4
-"""Each keeps a thread and a file of its own."""
+"""Each has a thread and a file of its own."""
 REPLAY_RETRY_S = 30
 CANCEL_WAIT_S = 5.0
-"""The longest that cancelling waits for the end of a replay."""
+"""The longest time that cancelling waits for the end of a replay."""
 
 
 class ReplayOptions(TypedDict, total=False):
-    """What a replay may be started with."""
+    """Options of a new replay."""
 
     name: str
     total: int | None
-    """The number of lines, where it is known."""
+    """The number of lines, if it is known."""
     check: Check
     """Raises the `AcquisitionError` that refuses a line of that spacecraft."""
     alarms: bool
@@ -81,7 +81,7 @@ class Replays:
         return [each for each in self._replays if not each.is_over]
 
     def start(self, lines: Iterable[bytes], run: str, **options: Unpack[ReplayOptions]) -> str:
-        """Work through NDJSON lines in the background; returns the id of the replay.
+        """Process NDJSON lines in the background; returns the id of the replay.
 
         Every batch goes to `run`.  Lines that can be closed are closed at the end.
         """
@@ -90,7 +90,7 @@ class Replays:
         return replay.id
 
     def new_upload(self, caller: Caller) -> IO[bytes]:
-        """A file for an upload; raises `Busy` where the caller can start no replay now."""
+        """A file for an upload; raises `Busy` if the caller cannot start a replay now."""
         self._require_slot(caller.token_id)
         return self._spool.new_file()
 
@@ -105,7 +105,7 @@ class Replays:
     ) -> str:
         """`start` with the lines of an upload, which is stored until the replay is over.
 
-        Of a line with more than `longest_bytes` the rest is not read.
+        A line is cut at `longest_bytes`.
         """
         bound = None if caller.spacecraft is None else sorted(caller.spacecraft)
         options |= {"check": caller.require, "owner": caller.token_id}
@@ -124,12 +124,12 @@ class Replays:
         return replay.id
 
     def resume(self) -> None:
-        """Go on with the uploads that an earlier process has not finished."""
+        """Continue the uploads that an earlier process has not finished."""
         for about in self._spool.left():
             try:
                 self._resume(about)
             except (AcquisitionError, OSError) as error:
-                log.warning("replay %s does not go on: %s", about.id, error)
+                log.warning("replay %s is not continued: %s", about.id, error)
                 self._spool.release(about.id)
 
     def _resume(self, about: SpooledReplay) -> None:
@@ -143,7 +143,7 @@ class Replays:
         options: ReplayOptions = {"check": caller.require, "owner": about.owner}
         file = self._spool.open(about.id)
         replay = self._new(stored.run, options, stored, self._spool.drop)
-        log.info("replay %s goes on after line %d", about.id, stored.lines.done)
+        log.info("replay %s continues after line %d", about.id, stored.lines.done)
         replay.resume(_lines_of(file, about, replay))
 
     def _new(
@@ -153,7 +153,7 @@ class Replays:
         stored: Replay | None = None,
         drop: Callable[[str], object] = lambda id: None,
     ) -> RunningReplay:
-        """A replay that takes a slot; `drop` is called when it is over and will not be resumed."""
+        """A replay that takes a slot; `drop` is called at its end unless it can be resumed."""
         state = stored or _new_state(checked_run_name(run), options)
 
         def ended(end: str) -> None:
@@ -251,7 +251,7 @@ def _new_state(run: str, options: ReplayOptions) -> Replay:
 
 
 def discard_upload(file: IO[bytes]) -> None:
-    """Remove an upload of which no replay is started."""
+    """Remove an upload for which no replay was started."""
     file.close()
     Path(file.name).unlink(missing_ok=True)
 
@@ -261,7 +261,7 @@ def _lines_of(file: IO[bytes], about: SpooledReplay, replay: RunningReplay) -> I
 
 
 def _stored_with(run: str, options: ReplayOptions) -> Callable[[Connection], None]:
-    """What is stored in the transaction that notes a replay."""
+    """A function that stores what belongs to a new replay, in its transaction."""
 
     def store(connection: Connection) -> None:
         if options.get("alarms"):

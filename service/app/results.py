@@ -56,7 +56,7 @@ class Results:
                 connection, stretch, outcome=outcome, status=status, limit=limit, cursor=cursor
             )
         if spacecraft is not None and not page.items:
-            # A misspelt name must not pass for a spacecraft without data.
+            # A misspelt name must not look like a spacecraft without data.
             mission_in_input(self._context.missions, spacecraft)
         return page
 
@@ -66,7 +66,7 @@ class Results:
             return neighbours(connection, known_id(id, "batch"))
 
     def star_field(self, id: str, answer: Answer | None = None) -> Row:
-        """What a picture of a result's stars is drawn from; see `star_field.star_field_of`.
+        """The data of the chart of a result's stars; see `star_field.star_field_of`.
 
         An `answer` in place of the recorded one, such as that of a what-if, is
         drawn over the same batch.
@@ -78,7 +78,7 @@ class Results:
         return star_field_of(batch, mission, self._context.sky, answer)
 
     def settings_for(self, id: str) -> Choices:
-        """The settings that a what-if of a result begins from."""
+        """The settings that a what-if of a result changes."""
         with self._context.reading() as connection:
             batch, _ = recorded_batch(connection, known_id(id, "batch"))
         return choices_of(batch, mission_named(self._context.missions, batch.spacecraft))
@@ -98,7 +98,7 @@ class Results:
         adopt: bool = False,
         entry: Entry | None = None,
     ) -> Answered:
-        """Run a recorded batch again with other options, in place of what they name.
+        """Process a recorded batch again; `options` replace those of the result that they name.
 
         The answer names its parent.  It is kept only where `record` or `adopt`
         asks for that; adopted, it becomes what lists, histories and rates show.

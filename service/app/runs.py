@@ -67,11 +67,11 @@ class Runs:
         processes: int = 0,
         step: Callable[[ReprocessProgress], object] = lambda progress: None,
     ) -> tuple[ReprocessProgress, RunComparison]:
-        """Run the batches of a run again into another, and compare both.
+        """Process the batches of a run again into another run, and compare both.
 
-        The settings are those of this app.  `run` None takes a name
-        that tells the settings.  What the run holds already is not run again.
-        Raises `BadBatch` where the run holds results of other settings.
+        The settings are those of this app.  Without `run` the name is derived from the
+        settings.  Batches that the run already has are not processed again.
+        Raises `BadBatch` if the run has results of other settings.
         """
         if spacecraft is not None:
             mission_named(self._context.missions, spacecraft)
@@ -93,7 +93,7 @@ class Runs:
         return progress, self.compare(source, plan.run, spacecraft, start, end)
 
     def _run_of_settings(self, source: str, missions: Mapping[str, Mission]) -> str:
-        """A name that the same settings give again, so that an interrupted run can continue."""
+        """A name derived from the settings, so that an interrupted run can continue."""
         digests = [
             self._context.sky.catalog.digest,
             *sorted(each.digest for each in missions.values()),

@@ -1,4 +1,4 @@
-"""The service itself: readiness, and what runs here."""
+"""The service itself: readiness, and its description."""
 
 import gc
 import logging
@@ -22,7 +22,7 @@ from service.times import utc_now
 log = logging.getLogger(__name__)
 
 WARM_UP_RUNS = 8
-"""Runs of a recorded batch at the start, after which the interpreter has specialised its code."""
+"""Runs of a recorded batch at the start; the interpreter then has specialised its code."""
 CREDITS = (
     "Hipparcos and Tycho-2 catalogs: ESA 1997, ESA/ESTEC; Hog et al. 2000",
     "Method: D. Fink and D. Shoup, Goddard Space Flight Center, 1994",
@@ -52,8 +52,8 @@ class Service:
     def ready(self) -> None:
         """Return once batches run at full speed; the first call compiles and prewarms.
 
-        Raises `Busy` while another call is at that, where the database cannot be
-        read, and where the last write failed and another that is tried now does too.
+        Raises `Busy` while another call does so, if the database cannot be read, and if the
+        last write failed and another write, tried now, fails too.
         """
         if not self._is_warm:
             if not self._warming.acquire(blocking=False):
@@ -63,11 +63,11 @@ class Service:
                     self._kernels.run(self._context.missions)
                 prewarm_kernels(self._context.sky, self._context.missions)
                 self._prewarm_recent_pointings()
-                # Collecting what exists by now, again and again, would cost more than a batch.
+                # Collecting the present objects would take longer than a batch, each time.
                 gc.freeze()
                 self._is_warm = True
                 if self._kernels is not None:
-                    # A service, and no command beside one.
+                    # Only the service resumes replays, not a command beside it.
                     self._replays.resume()
             finally:
                 gc.enable()
@@ -83,10 +83,10 @@ class Service:
             self._kernels.cancel()
 
     def _prewarm_recent_pointings(self) -> None:
-        """Build what the next batch of each live spacecraft will most likely need.
+        """Build the zones that the next batch of each live spacecraft will most likely need.
 
-        The latest batch of each runs again, under a new id, and is rolled back; where
-        there are few, several times, because code runs slowly at first.
+        The latest batch of each is processed again under a new id and rolled back; if there
+        are few, several times, because code runs slowly at first.
         """
         with self._context.reading() as connection:
             inputs = latest_inputs(connection)
@@ -101,7 +101,7 @@ class Service:
                 log.warning("the latest batch of a spacecraft could not be run again: %s", error)
 
     def about(self) -> About:
-        """What answers: version, catalog, missions, kind of database."""
+        """Version, catalog, missions and kind of database."""
         catalog = self._context.sky.catalog
         return About(
             version=__version__,

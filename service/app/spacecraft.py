@@ -26,7 +26,7 @@ from service.times import Utc, utc_now
 
 
 class Spacecraft:
-    """Reads what is recorded of each spacecraft; without a run of live batches."""
+    """Reads the records of each spacecraft: of a run, by default of the live one."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
@@ -85,7 +85,7 @@ class Spacecraft:
     ) -> list[Rates]:
         """Stars by outcome over all observed ones, in UTC hours or days by batch time.
 
-        Raises `BadInput` for a stretch with too many of them.
+        Raises `BadInput` for a period with too many of them.
         """
         mission_named(self._context.missions, name)
         with self._context.reading() as connection:
@@ -126,7 +126,7 @@ class Spacecraft:
         end: Utc | None = None,
         quantities: Sequence[QuantityName] = (),
     ) -> Iterator[History]:
-        """The history of every batch of a stretch, in pages; see `trends.every_batch`."""
+        """The history of every batch of a period, in pages; see `trends.every_batch`."""
         mission_named(self._context.missions, name)
         names = tuple(quantities) or trend_names()
         return trends.every_batch(
@@ -143,7 +143,7 @@ class Spacecraft:
         end: Utc | None = None,
         limit: int = 20,
     ) -> list[RankedBatch]:
-        """The batches of a stretch that are worst by a quantity, with its `value`, worst first."""
+        """The batches of a period with the worst values of a quantity, worst first."""
         mission_named(self._context.missions, name)
         stretch = ResultFilter(run or LIVE, name, start, end)
         with self._context.reading() as connection:

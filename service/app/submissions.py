@@ -17,7 +17,7 @@ READ_HERE_BYTES, READ_HERE_OBJECTS = 4_096, 64
 
 
 class Submissions:
-    """Takes batches: each is identified, solved and recorded once, however often it is sent."""
+    """Accepts batches; each is identified, solved and recorded once, however often it is sent."""
 
     def __init__(self, context: Context, kernels: KernelBuild | None) -> None:
         self.ingest = SubmissionService(context.missions, context.sky, context.store)
@@ -30,7 +30,7 @@ class Submissions:
         return self.ingest.observers
 
     def require_kernels(self) -> None:
-        """Raise `Busy` while kernels are compiled: no answer depends on what is."""
+        """Raise `Busy` while kernels are compiled: no answer depends on which ones exist."""
         if self._kernels is not None:
             self._kernels.require_built()
 
@@ -66,18 +66,18 @@ class Submissions:
         return await self.ingest.submit(submission, idempotency_key, caller, future)
 
     def submit_many(self, submissions: Sequence[Submission]) -> list[Answered | AcquisitionError]:
-        """`submit` of each in one transaction; an error stands in the place of what is refused."""
+        """`submit` each in one transaction; a refused batch has its error in the list."""
         return self.ingest.submit_many(submissions)
 
     def backlog(self) -> Row:
-        """What waits to be answered and to be written, and whether the last write succeeded."""
+        """The queues of posts and of writes, and whether the last write succeeded."""
         return self.ingest.backlog()
 
     def require_alive(self) -> None:
-        """Raise `Stopping` where submissions are not worked on any more."""
+        """Raise `Stopping` if the thread that processes submissions has ended."""
         self.ingest.require_alive()
 
     def close(self) -> None:
-        """Answer what waits, and stop."""
+        """Answer the queued posts, and stop."""
         self._reader.shutdown(cancel_futures=True)
         self.ingest.close()

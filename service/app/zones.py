@@ -21,7 +21,7 @@ class Zones:
         self._context = context
 
     def state(self) -> ZoneCache:
-        """What the cache holds, the least recently used first, and its counters."""
+        """The content of the cache, least recently used first, and its counters."""
         state = self._context.sky.cache.state()
         return ZoneCache(
             items=[
@@ -41,7 +41,7 @@ class Zones:
         )
 
     def warm(self, spacecraft: str, a_priori: Sequence[APrioriIn], time: Utc) -> list[ZoneSummary]:
-        """Build the zones that batches of these a priori attitudes will ask for."""
+        """Build the zones that batches with these a priori attitudes will need."""
         mission = mission_in_input(self._context.missions, spacecraft)
         return [
             ZoneSummary(**zone.summary())
@@ -50,7 +50,7 @@ class Zones:
         ]
 
     def drop(self, spacecraft: str | None = None) -> int:
-        """Drop the cached zones of a spacecraft, or all; how many there were."""
+        """Drop the cached zones of a spacecraft, or all; returns their number."""
         if spacecraft is not None:
             mission_in_input(self._context.missions, spacecraft)
         return self._context.sky.drop_zones(spacecraft)

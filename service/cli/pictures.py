@@ -1,4 +1,4 @@
-"""`acquire frame` without a spacecraft: pictures from anybody's camera, solved in this process."""
+"""`acquire frame` without a spacecraft: pictures from any camera, solved in this process."""
 
 import json
 import math
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 FEW_NAMES = 12
 LEAST_MEGAPIXELS = 64
-"""A picture of one's own may be larger than what a service takes from anybody."""
+"""A picture on this computer may be larger than what a service accepts from a client."""
 
 
 def solve_pictures(parsed: Namespace, settings: Settings) -> int:

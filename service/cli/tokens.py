@@ -1,4 +1,4 @@
-"""`acquire token`: straight into the database, also while a service is at work on it."""
+"""`acquire token`: in the database itself, also while a service uses it."""
 
 import getpass
 from collections.abc import Iterator, Sequence

@@ -107,7 +107,7 @@ def _solved(
 
 
 def _mission_name(parsed: Namespace) -> str:
-    """The name as given, or one made of letters of the output's name."""
+    """The given name, or one derived from the name of the output file."""
     stem: str = parsed.output.stem
     letters = "".join(each if each.isalnum() or each in "_-" else "_" for each in stem)
     return str(parsed.name or letters.lstrip("_-").upper() or "CAMERA")

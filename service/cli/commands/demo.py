@@ -1,4 +1,4 @@
-"""`acquire demo`: the service at work on sample passes."""
+"""`acquire demo`: the service with sample passes."""
 
 from argparse import Namespace
 from pathlib import Path

@@ -125,7 +125,7 @@ def run(parsed: Namespace) -> int:
         with ReplaySummary(parsed.files, parsed.results, progress) as summary:
             watched = run if parsed.alarms else None
             if carrier or parsed.results or parsed.speed or parsed.concurrency:
-                # Single answers are asked for, one by one or at their time.
+                # Each batch needs an answer of its own, or is sent at its own time.
                 many = parsed.concurrency or DEFAULT_CONCURRENCY
                 replay_over_http(
                     parsed.url,

@@ -1,12 +1,12 @@
-// Sending what a form asks for, and telling in words how it went.
+// Sends requests for forms and buttons, and shows their outcome.
 import { requestJson } from "./requests.js";
 
-// The answer's JSON; throws with the service's own words where it refused.
+// The answer's JSON; throws an error with the service's message if the request was refused.
 export async function send(method, address, body, headers = { "Content-Type": "application/json" }) {
   return requestJson(address, { method, headers: body === undefined ? {} : headers, body });
 }
 
-// Runs what a form or a button asks for; meanwhile it cannot be asked again.
+// Runs the work of a form or a button, which is disabled meanwhile.
 export async function attempt(button, status, work) {
   if (button) button.disabled = true;
   status.className = "";
@@ -21,9 +21,9 @@ export async function attempt(button, status, work) {
   }
 }
 
-// Who acts: remembered in this browser, so that it is typed once.
+// The name of the author, stored in this browser so that it is typed once.
 export function rememberWho(field) {
-  // Signed in, everybody acts under the name of their token.
+  // After sign-in the author is the name of the token.
   field.value ||= document.body.dataset.reader || localStorage.getItem("who") || "";
   field.readOnly = Boolean(document.body.dataset.reader);
   field.addEventListener("change", () => localStorage.setItem("who", field.value.trim()));

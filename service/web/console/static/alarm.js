@@ -1,4 +1,4 @@
-// Acting on an alarm: every button sends who acts and the comment with it.
+// Actions on an alarm: every button sends the author and the comment.
 import { refreshSoon } from "./live_updates.js";
 import { attempt, rememberWho, send } from "./actions.js";
 
@@ -6,17 +6,17 @@ const form = document.getElementById("act-form");
 const message = document.getElementById("message");
 const DONE = { acknowledge: "Acknowledged.", comment: "Comment added.", shelve: "Shelved.", unshelve: "Unshelved." };
 
-// What can be done in which state; comments always.
+// The actions allowed in each state; a comment is always allowed.
 const ALLOWED = { open: ["acknowledge", "shelve"], acknowledged: ["shelve"], shelved: ["acknowledge", "unshelve"], cleared: [] };
 
-function fit() {
+function enableAllowed() {
   const allowed = [...ALLOWED[document.getElementById("alarm").dataset.state], "comment"];
   for (const button of form.querySelectorAll("[data-act]")) button.disabled = !allowed.includes(button.dataset.act);
 }
 
 rememberWho(form.elements.who);
-fit();
-document.addEventListener("drawn", fit);
+enableAllowed();
+document.addEventListener("drawn", enableAllowed);
 
 form.addEventListener("submit", (event) => {
   event.preventDefault();

@@ -1,4 +1,4 @@
-// What-if: every change of a setting has the outcome drawn anew; the address says what was changed.
+// What-if: every change of a setting redraws the outcome; the address contains the changes.
 import { fetchPage, swapRegions } from "./regions.js";
 import { send } from "./actions.js";
 
@@ -52,7 +52,7 @@ async function adopt(button) {
   }
 }
 
-// Shows what works with a script alone.
+// Shows the buttons that need scripts.
 function ready() {
   for (const button of document.querySelectorAll("[data-copy], [data-adopt]")) button.hidden = false;
 }

@@ -1,4 +1,4 @@
-// Comparing takes up to ten seconds: says so, and sends only the fields that ask for something.
+// Comparing takes up to ten seconds: shows that, and sends only the fields that are not empty.
 const form = document.getElementById("compare");
 
 form.addEventListener("submit", () => {
@@ -9,7 +9,7 @@ form.addEventListener("submit", () => {
   form.setAttribute("aria-busy", "true");
 });
 
-// Back again by the browser's own button: every field works as before.
+// After the browser's Back button the fields work again.
 addEventListener("pageshow", () => {
   for (const field of form.elements) field.disabled = false;
   document.getElementById("message").textContent = "";

@@ -1,4 +1,4 @@
-// What every page has: the theme, the choice of a run, copying, and the live connection.
+// Parts of every page: the theme, the choice of a run, copying, and the event stream.
 import { keepFresh } from "./live_updates.js";
 import { attempt, send } from "./actions.js";
 
@@ -30,7 +30,7 @@ nameTheme();
 
 const runs = document.querySelector("[data-run-form]");
 runs.querySelector("button:not([type])").hidden = true;
-// The menu itself is put anew where there are other runs.
+// The menu itself is replaced when the list of runs changes.
 runs.addEventListener("change", () => runs.requestSubmit());
 
 document.addEventListener("click", async (event) => {
@@ -41,7 +41,7 @@ document.addEventListener("click", async (event) => {
     await navigator.clipboard.writeText(source.textContent);
     button.textContent = "Copied";
   } catch {
-    // Without leave to write there: mark the text, so that the keyboard can copy it.
+    // Without permission for the clipboard: select the text, so that the keyboard can copy it.
     getSelection().selectAllChildren(source);
     button.textContent = "Marked: press Ctrl-C";
   }

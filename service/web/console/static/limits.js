@@ -1,4 +1,4 @@
-// Changing limits: one quantity at a time, with who did it and why.
+// Changes limits, one quantity at a time, with author and comment.
 import { refreshSoon } from "./live_updates.js";
 import { attempt, rememberWho, send } from "./actions.js";
 
@@ -8,7 +8,7 @@ const signed = document.getElementById("signed");
 rememberWho(signed.elements.who);
 signed.addEventListener("submit", (event) => event.preventDefault());
 
-// An empty field is no bound.
+// An empty field means no bound.
 function numberIn(field) {
   const text = field.value.trim();
   if (text === "") return null;

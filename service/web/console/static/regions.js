@@ -1,7 +1,7 @@
-// Replaces parts of a page by newer ones without disturbing the reader.
+// Replaces parts of a page by newer ones; focus, input and selected text stay.
 import { request, unexpected } from "./requests.js";
 
-// The page at an address, as the server draws it now; an error page is an error here too.
+// The present page at an address; throws for an error page.
 export async function fetchPage(address) {
   const { answer, text } = await request(address, { headers: { Accept: "text/html" } });
   // The session has ended: sign in again and return here.
@@ -16,7 +16,7 @@ export async function fetchPage(address) {
 
 let asked = 0;
 
-// The same, or null where another page was asked for since: what comes late is not shown.
+// The same, or null if another page was requested since: late answers are not shown.
 export async function fetchLatest(address) {
   const mine = ++asked;
   try {
@@ -28,7 +28,7 @@ export async function fetchLatest(address) {
   }
 }
 
-// Somebody types in here, or has text marked: it is not pulled away.
+// A region with typed input or selected text is not replaced.
 function isBusy(region) {
   const active = document.activeElement;
   const marked = document.getSelection();
@@ -52,7 +52,7 @@ export function swapRegions(fresh, selector = "[data-region]") {
   }
 }
 
-// How to find the like of an element in a fresh region: by its id, its address, or its label.
+// Finds the same element in a fresh region: by its id, its address, or its label.
 function placeOf(element, region) {
   if (element.id) return (next) => next.querySelector(`#${CSS.escape(element.id)}`);
   const kind = element.tagName.toLowerCase();

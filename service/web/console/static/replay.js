@@ -1,4 +1,4 @@
-// Cancelling a replay.
+// Cancels a replay.
 import { refreshSoon } from "./live_updates.js";
 import { attempt, send } from "./actions.js";
 

@@ -2,7 +2,7 @@
 
 const NO_ANSWER = "the service does not answer; check that it is running and reachable, then try again";
 
-// The answer and its text; throws where there is none, or where it ends in the middle.
+// The answer and its text; throws if there is none, or if it is truncated.
 export async function request(address, options) {
   try {
     const answer = await fetch(address, options);
@@ -12,7 +12,7 @@ export async function request(address, options) {
   }
 }
 
-// The answer's JSON; throws with the service's own words where it refused.
+// The answer's JSON; throws an error with the service's message if the request was refused.
 export async function requestJson(address, options) {
   const { answer, text } = await request(address, options);
   const content = parsed(text);
@@ -21,7 +21,7 @@ export async function requestJson(address, options) {
   return content;
 }
 
-// A proxy in between may answer in its own way.
+// A proxy may answer in another format.
 export function unexpected(answer) {
   return `unexpected answer ${answer.status} of the service; try again in a minute`;
 }

@@ -1,4 +1,4 @@
-// Starting a replay, and having a run watched for alarms.
+// Starts a replay, and switches the alarms of a run.
 import { refreshSoon } from "./live_updates.js";
 import { attempt, send } from "./actions.js";
 

@@ -1,4 +1,4 @@
-// Exchanges a token for a session's cookie, which scripts cannot read, and goes on.
+// Exchanges a token for a session's cookie, which scripts cannot read, and opens the requested page.
 import { send } from "./actions.js";
 
 const form = document.getElementById("sign-in");

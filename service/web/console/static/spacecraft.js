@@ -1,4 +1,4 @@
-// The trends of one spacecraft: charts of a stretch of time that the address names.
+// The trends of one spacecraft: charts of the period in the address.
 import { requestJson } from "./requests.js";
 import { fetchLatest, swapRegions } from "./regions.js";
 import { Trend } from "./trend.js";
@@ -95,6 +95,6 @@ if (stretch()) {
   document.addEventListener("drawn", draw);
   document.addEventListener("theme", () => shown && draw());
 } else {
-  // With the first batch there is a page of another kind to show.
+  // The first batch needs the full page, with charts.
   document.addEventListener("drawn", () => document.querySelector("#state .empty") ?? location.reload());
 }

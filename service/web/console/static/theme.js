@@ -1,4 +1,4 @@
-// Before the first paint: the theme that was chosen here before; otherwise the system's holds.
+// Runs before the first paint: sets the theme chosen earlier in this browser, if any.
 "use strict";
 {
   const chosen = localStorage.getItem("theme");

@@ -4,7 +4,7 @@ const DASHES = { watch: [2, 4], warning: [6, 4], critical: [] };
 const DAY_S = 86400;
 const LABEL_PX = 16;
 
-// At the top and the right half of a label at the end of an axis has room.
+// Room for half of a label at the top and at the right end of an axis.
 const PADDING = [12, 32, 0, 0];
 
 function colour(name) {
@@ -56,7 +56,7 @@ function limitLines(limits, quantities) {
   return lines;
 }
 
-// As wide as the longest label, so that none is cut off.
+// The width of the longest label, so that none is cut off.
 function labelWidth(chart, labels, index, cycle) {
   const axis = chart.axes[index];
   if (cycle > 1) return axis._size;
@@ -65,7 +65,7 @@ function labelWidth(chart, labels, index, cycle) {
   return Math.ceil(Math.max(40, ...widths) + axis.ticks.size + axis.gap + 4);
 }
 
-// Bounds that several quantities share are one line; it is named after the severity alone.
+// Bounds that several quantities share are one line, named after the severity alone.
 function merged(lines, names) {
   const places = new Map();
   for (const { severity, value, quantity } of lines) {
@@ -94,7 +94,7 @@ function drawLimits(chart, lines) {
     ctx.moveTo(bbox.left, y);
     ctx.lineTo(bbox.left + bbox.width, y);
     ctx.stroke();
-    // Above its line, or below where there is no room.
+    // Above its line, or below it if there is no room.
     const isHigh = y - bbox.top < LABEL_PX * devicePixelRatio;
     ctx.textBaseline = isHigh ? "top" : "bottom";
     ctx.fillText(text, bbox.left + 4 * devicePixelRatio, y + (isHigh ? 3 : -2) * devicePixelRatio);

@@ -1,4 +1,4 @@
-// Building zones ahead and dropping them.
+// Builds and drops zones.
 import { refreshSoon } from "./live_updates.js";
 import { attempt, send } from "./actions.js";
 
