@@ -1,10 +1,10 @@
-"""Scores as a table: what came of nominal stretches, and of those with errors."""
+"""Scores as a table: a row for nominal stretches and one for those with errors."""
 
 from service.simulate.score import Score, together
 
 
 def table(scores: dict[str, dict[str, Score]]) -> str:
-    """Per mission a line of the nominal stretches and one of the stretches with errors."""
+    """For each mission a line of the nominal stretches and one of those with errors."""
     head = (
         f"{'':<15}{'batches':>8}{'stars':>7}{'unique':>9}{'ambig.':>8}{'unmatch.':>9}{'wrong':>8}"
         f"{'attitudes':>11}{'error':>8}{'sigma':>7}{'within':>8}{'solve':>8}{'whole':>8}"
@@ -20,9 +20,9 @@ def table(scores: dict[str, dict[str, Score]]) -> str:
         lines.append(_row(f"{name} serious", together(serious)))
     notes = (
         "nominal: the a priori error that the mission allows for; serious: a growing attitude",
-        "error and spurious stars.  wrong: named with certainty, but another star than the true",
-        "one.  error, sigma: one sigma along the attitude's worst axis, as it was and as the",
-        "covariance predicts it.  within: attitudes inside their own 99.7 % region.  solve:",
+        "error and false stars.  wrong: reported as unique, but not the true star.  error, sigma:",
+        "one sigma along the attitude's worst axis, as measured and as predicted by the",
+        "covariance.  within: attitudes inside their own 99.7 % region.  solve:",
         "identification and solution; whole: zone and recording too; medians of a batch.",
     )
     return "\n".join([*lines, "", *notes])

@@ -17,11 +17,9 @@ OWN_PATH = r"^/([^/\\\x00-\x20][^\\\x00-\x20]*)?$"
 
 
 class SignInQuery(Query):
-    """Where to go once signed in: a path of this service, never another's address."""
+    """The page to open after sign-in: a path of this service, never another host's address."""
 
-    next: Annotated[
-        str, Field(max_length=2000, pattern=r"^/([^/\\\x00-\x20][^\\\x00-\x20]*)?$")
-    ] = "/"
+    next: Annotated[str, Field(max_length=2000, pattern=OWN_PATH)] = "/"
 
 
 @console_page("/sign-in", "Sign in", OPEN)
