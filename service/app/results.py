@@ -9,6 +9,7 @@ from service.missions.mission import mission_named
 from service.observations.schema import OptionsIn
 from service.storage.models.answers import Answer, Neighbours, Result, Summary
 from service.storage.models.base import Page
+from service.storage.models.star_field import StarField
 from service.storage.queries import results
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.neighbours import neighbours
@@ -17,7 +18,7 @@ from service.storage.queries.recorded_batch import recorded_batch, recorded_miss
 from service.storage.queries.results import OutcomeName, StatusName
 from service.storage.queries.star_field import star_field_of
 from service.storage.recording.ids import is_ulid
-from service.storage.recording.unsaved_result import Answered, Row
+from service.storage.recording.unsaved_result import Answered
 from service.times import Utc
 
 
@@ -65,7 +66,7 @@ class Results:
         with self._context.reading() as connection:
             return neighbours(connection, known_id(id, "batch"))
 
-    def star_field(self, id: str, answer: Answer | None = None) -> Row:
+    def star_field(self, id: str, answer: Answer | None = None) -> StarField:
         """The data of the chart of a result's stars; see `star_field.star_field_of`.
 
         An `answer` in place of the recorded one, such as that of a what-if, is

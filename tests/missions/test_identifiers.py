@@ -54,7 +54,7 @@ arguments = ["simulate", "paper", "--identifier", "nothing", "verified"]
 database = f"sqlite:///{sys.argv[1]}/acquire.db"
 app = open_app(Settings(database=database, replay_processes=0))
 with Server(create_app(app)) as url, httpx.Client(base_url=url, timeout=60) as client:
-    sent = client.post("/api/v1/batches", content=body).raise_for_status().json()
+    sent = client.post("/api/v1/batches", json=json.loads(body)).raise_for_status().json()
     other = {"options": {"identifier": "starid"}}
     tried = client.post(f"/api/v1/batches/{sent['id']}/what-if", json=other).raise_for_status()
     page = client.get(f"/batches/{sent['id']}").raise_for_status().text

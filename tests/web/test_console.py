@@ -206,12 +206,12 @@ def test_residual_arrows_are_as_long_as_the_residuals_that_were_recorded(app, cl
     for each in pass_of(client, app, run):
         answer = client.get(f"/api/v1/batches/{each}").json()["answer"]
         field = app.results.star_field(each)
-        for tracker, drawn in zip(answer["observations"], field["trackers"], strict=True):
-            for star, seen in zip(tracker["stars"], drawn["observed"], strict=True):
+        for tracker, drawn in zip(answer["observations"], field.trackers, strict=True):
+            for star, seen in zip(tracker["stars"], drawn.observed, strict=True):
                 if star["residual_arcsec"] is None:
-                    assert seen["residual_arcsec"] is None
+                    assert seen.residual_arcsec is None
                 else:
-                    length = math.hypot(*seen["residual_arcsec"])
+                    length = math.hypot(*seen.residual_arcsec)
                     assert length == pytest.approx(star["residual_arcsec"], abs=2e-3)
 
 
@@ -253,13 +253,13 @@ def test_residual_arrows_point_from_the_predicted_place_to_where_a_star_was_seen
 
 def test_stars_named_by_an_answer_stand_where_they_were_seen(app, client, run):
     for each in pass_of(client, app, run):
-        for tracker in app.results.star_field(each)["trackers"]:
-            places = {star["id"]: star for star in tracker["catalog"]}
-            for seen in tracker["observed"]:
-                if seen["residual_arcsec"] is not None:
-                    star = places[seen["star"]]
-                    off = math.hypot(star["h_deg"] - seen["h_deg"], star["v_deg"] - seen["v_deg"])
-                    assert off * 3600 < 2.0 * math.hypot(*seen["residual_arcsec"]) + 1.0
+        for tracker in app.results.star_field(each).trackers:
+            places = {star.id: star for star in tracker.catalog}
+            for seen in tracker.observed:
+                if seen.residual_arcsec is not None:
+                    star = places[seen.star]
+                    off = math.hypot(star.h_deg - seen.h_deg, star.v_deg - seen.v_deg)
+                    assert off * 3600 < 2.0 * math.hypot(*seen.residual_arcsec) + 1.0
 
 
 def test_the_edge_of_a_zone_lies_at_the_bounds_of_its_aim(app, client, run):
@@ -270,9 +270,9 @@ def test_the_edge_of_a_zone_lies_at_the_bounds_of_its_aim(app, client, run):
         matrix_from_quaternion(record[place][name]["quaternion"])
         for place, name in (("input", "a_priori"), ("answer", "attitude"))
     )
-    (tracker,) = app.results.star_field(id)["trackers"]
-    assert len(tracker["zone_edges"]) >= 2
-    hv = np.radians(np.concatenate([np.array(line) for line in tracker["zone_edges"]]))
+    (tracker,) = app.results.star_field(id).trackers
+    assert len(tracker.zone_edges) >= 2
+    hv = np.radians(np.concatenate([np.array(line) for line in tracker.zone_edges]))
     # Its tracker's axes are the body's; the pole is body X.
     edge = np.column_stack([np.tan(hv), np.ones(len(hv))])
     off = np.abs(angle_between_deg(edge, found @ presumed[0]) - 90.0)

@@ -5,7 +5,6 @@ that the chart of an old result shows that result.
 """
 
 import math
-from typing import Any
 
 import numpy as np
 from erfa import ufunc
@@ -20,7 +19,13 @@ from service.sky.ephemeris import observer_velocity, sun_distance_au
 from service.sky.model import SkyModel
 from service.sky.zones import SearchRegion
 from service.storage.models.answers import Answer, Star, TrackerStars
-from service.storage.recording.unsaved_result import Row
+from service.storage.models.star_field import (
+    Boresight,
+    CatalogStarPlace,
+    ObservedStarPlace,
+    StarField,
+    TrackerField,
+)
 from service.vectors import (
     ARCSEC_PER_RADIAN,
     Matrix,
@@ -38,15 +43,14 @@ WIDEST_DEG = 15.0
 EDGE_STEP_DEG = 0.5
 
 
-def star_field_of(batch: ObservationBatch, mission: Mission, sky: SkyModel, answer: Answer) -> Row:
+def star_field_of(
+    batch: ObservationBatch, mission: Mission, sky: SkyModel, answer: Answer
+) -> StarField:
     """The view of every tracker of a batch, as an answer to it has identified the stars.
 
-    Directions are given as `h_deg`, `v_deg`: that of (tan h, tan v, 1) in the
-    tracker's axes.  Catalog stars are carried there by the answer's attitude,
-    or, where it has none (`through` is "a_priori"), by the presumed one, and are
-    then displaced by its error.  `residual_arcsec` is observed less predicted,
-    along h and along v.  Raises `BadInput` for a batch that does not fit the
-    mission.
+    The answer's attitude carries catalog stars into the tracker's axes.  Without one the
+    a priori attitude does, and the stars are displaced by its error.  Raises `BadInput`
+    for a batch that does not fit the mission.
     """
     solved, prior = answer.attitude, batch.a_priori
     if solved is not None and answer.path != "zone":
@@ -60,14 +64,14 @@ def star_field_of(batch: ObservationBatch, mission: Mission, sky: SkyModel, answ
     run_catalog = sky.run_catalog(mission, batch.time)
     rows = {name: row for row, name in enumerate(run_catalog.star_id)}
     trackers = zip(correct(batch, mission), answer.observations, strict=True)
-    return {
-        "through": "a_priori" if solved is None else solved.method,
-        "same_catalog": run_catalog.digest == answer.provenance.run_catalog,
-        "trackers": [
+    return StarField(
+        through="a_priori" if solved is None else solved.method,
+        same_catalog=run_catalog.digest == answer.provenance.run_catalog,
+        trackers=[
             _tracker(each, index, found, attitude, presumed, batch, mission, run_catalog, rows)
             for index, (each, found) in enumerate(trackers)
         ],
-    }
+    )
 
 
 def _tracker(
@@ -80,7 +84,7 @@ def _tracker(
     mission: Mission,
     run_catalog: RunCatalog,
     rows: dict[str, int],
-) -> Row:
+) -> TrackerField:
     tracker = corrected.tracker
     region = search_region(tracker, presumed, mission, f"observations.{index}.tracker")
     to_tracker = tracker.body_from_tracker.T @ attitude
@@ -92,27 +96,34 @@ def _tracker(
     natural = run_catalog.direction[shown]
     apparent = dict(zip(shown.tolist(), _apparent(natural, batch) @ to_tracker.T, strict=True))
     ra_deg, dec_deg = to_ra_dec(to_tracker[2])
-    return {
-        "tracker": tracker.name,
-        "boresight": {"ra_deg": float(ra_deg), "dec_deg": float(dec_deg)},
-        "field_of_view_radius_deg": tracker.field_of_view_radius_deg,
-        "radius_deg": radius_deg,
-        "magnitude_limit_mag": mission.catalog.magnitude_limit_mag,
-        "zone_edges": _zone_edges(region, to_tracker, radius_deg),
-        "catalog": [
-            {"id": run_catalog.star_id[row], "magnitude": float(run_catalog.magnitude_mag[row])}
-            | _angles(direction)
+    return TrackerField(
+        tracker=tracker.name,
+        boresight=Boresight(ra_deg=float(ra_deg), dec_deg=float(dec_deg)),
+        field_of_view_radius_deg=tracker.field_of_view_radius_deg,
+        radius_deg=radius_deg,
+        magnitude_limit_mag=mission.catalog.magnitude_limit_mag,
+        zone_edges=_zone_edges(region, to_tracker, radius_deg),
+        catalog=[
+            CatalogStarPlace(
+                id=run_catalog.star_id[row],
+                magnitude=float(run_catalog.magnitude_mag[row]),
+                **_angles(direction),
+            )
             for row, direction in apparent.items()
             if direction[2] > 0
         ],
-        "observed": [
-            {"outcome": star.outcome, "star": star.star and star.star.id}
-            | {"rivals": (star.rivals or []), "magnitude": _number(corrected.magnitude_mag[k])}
-            | _angles(seen[k])
-            | _residual(seen[k], star, rows, apparent, solved=star.residual_arcsec is not None)
+        observed=[
+            ObservedStarPlace(
+                outcome=star.outcome,
+                star=None if star.star is None else star.star.id,
+                rivals=list(star.rivals or []),
+                magnitude=_number(corrected.magnitude_mag[k]),
+                residual_arcsec=_residual(seen[k], star, rows, apparent),
+                **_angles(seen[k]),
+            )
             for k, star in enumerate(found.stars)
         ],
-    }
+    )
 
 
 def _names(star: Star) -> list[str]:
@@ -171,15 +182,15 @@ def _zone_edges(
 
 
 def _residual(
-    seen: Vector, star: Star, rows: dict[str, int], apparent: dict[int, Vector], *, solved: bool
-) -> dict[str, Any]:
+    seen: Vector, star: Star, rows: dict[str, int], apparent: dict[int, Vector]
+) -> tuple[float, float] | None:
     row = rows.get(star.star.id) if star.star else None
-    if not solved or row is None:
-        return {"residual_arcsec": None}
+    if star.residual_arcsec is None or row is None:
+        return None
     along_h = unit(np.array([1.0, 0.0, 0.0]) - seen[0] * seen)
     along_v = np.cross(seen, along_h)
     off = (seen - apparent[row]) * ARCSEC_PER_RADIAN
-    return {"residual_arcsec": [float(off @ along_h), float(off @ along_v)]}
+    return float(off @ along_h), float(off @ along_v)
 
 
 def _angles(direction: Vector) -> dict[str, float]:

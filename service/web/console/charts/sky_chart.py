@@ -5,10 +5,10 @@ the tracker sees the sky.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
+from service.storage.models.star_field import Boresight, ObservedStarPlace, TrackerField
 from service.web.console.charts.sky_labels import Box, Label, Labels, Place, points_along, text_box
 
 SIZE = 640
@@ -83,7 +83,7 @@ class SkyChart:
     """One tracker's picture; `key_px` is the length of the arrow that stands for `key_arcsec`."""
 
     tracker: str
-    boresight: Mapping[str, float]
+    boresight: Boresight
     field_of_view: Ring
     rings: tuple[Ring, ...]
     edges: tuple[str, ...]
@@ -118,18 +118,18 @@ class _Projection:
         return Ring(self.scale * math.tan(math.radians(radius_deg)), f"{radius_deg:g}°")
 
 
-def sky_chart(tracker: Mapping[str, Any], through: str, view: str = "all") -> SkyChart:
+def sky_chart(tracker: TrackerField, through: str, view: str = "all") -> SkyChart:
     """The chart of one tracker of a star field (see `star_field.star_field_of`).
 
     `view` is "all", which shows everything that the answer names, or "field" of view.
     """
-    field_deg = tracker["field_of_view_radius_deg"]
-    limit_mag = tracker["magnitude_limit_mag"]
-    projection = _Projection(tracker["radius_deg"] if view == "all" else field_deg * FIELD_MARGIN)
+    field_deg = tracker.field_of_view_radius_deg
+    limit_mag = tracker.magnitude_limit_mag
+    projection = _Projection(tracker.radius_deg if view == "all" else field_deg * FIELD_MARGIN)
     catalog = _catalog_stars(tracker, projection)
     named = [star for star in catalog if star.role != "none"]
-    places = [projection.place(each["h_deg"], each["v_deg"]) for each in tracker["observed"]]
-    residuals = [each["residual_arcsec"] for each in tracker["observed"]]
+    places = [projection.place(each.h_deg, each.v_deg) for each in tracker.observed]
+    residuals = [each.residual_arcsec for each in tracker.observed]
     px_per_arcsec, key_arcsec = _arrow_scale([math.hypot(*each) for each in residuals if each])
     arrows = [
         _arrow(place, residual, px_per_arcsec)
@@ -149,18 +149,18 @@ def sky_chart(tracker: Mapping[str, Any], through: str, view: str = "all") -> Sk
         ],
     )
     # Numbers first: the table has a name by its number.
-    observed = _observed_stars(tracker["observed"], places, arrows, catalog, labels)
+    observed = _observed_stars(tracker.observed, places, arrows, catalog, labels)
     names = [labels.name(star.id, (star.x, star.y)) for star in named]
     brightest = min((star.magnitude for star in catalog), default=limit_mag)
     steps = range(math.ceil(brightest), math.floor(limit_mag) + 1)
     return SkyChart(
-        tracker=tracker["tracker"],
-        boresight=tracker["boresight"],
+        tracker=tracker.tracker,
+        boresight=tracker.boresight,
         field_of_view=projection.ring(field_deg),
         rings=rings,
         edges=tuple(
             " ".join("{:.1f},{:.1f}".format(*projection.place(h, v)) for h, v in line)
-            for line in tracker["zone_edges"]
+            for line in tracker.zone_edges
         ),
         catalog=catalog,
         observed=observed,
@@ -172,23 +172,23 @@ def sky_chart(tracker: Mapping[str, Any], through: str, view: str = "all") -> Sk
     )
 
 
-def _catalog_stars(tracker: Mapping[str, Any], projection: _Projection) -> tuple[CatalogStar, ...]:
-    roles = {name: "rival" for each in tracker["observed"] for name in each["rivals"]}
-    roles |= {each["star"]: "chosen" for each in tracker["observed"] if each["star"]}
+def _catalog_stars(tracker: TrackerField, projection: _Projection) -> tuple[CatalogStar, ...]:
+    roles = {name: "rival" for each in tracker.observed for name in each.rivals}
+    roles |= {each.star: "chosen" for each in tracker.observed if each.star}
     return tuple(
         CatalogStar(
-            star["id"],
-            star["magnitude"],
-            *projection.place(star["h_deg"], star["v_deg"]),
-            star_radius(star["magnitude"], tracker["magnitude_limit_mag"]),
-            roles.get(star["id"], "none"),
+            star.id,
+            star.magnitude,
+            *projection.place(star.h_deg, star.v_deg),
+            star_radius(star.magnitude, tracker.magnitude_limit_mag),
+            roles.get(star.id, "none"),
         )
-        for star in tracker["catalog"]
+        for star in tracker.catalog
     )
 
 
 def _observed_stars(
-    observed: Sequence[Mapping[str, Any]],
+    observed: Sequence[ObservedStarPlace],
     places: Sequence[Place],
     arrows: Sequence[ChartLine | None],
     catalog: Sequence[CatalogStar],
@@ -198,14 +198,14 @@ def _observed_stars(
     return tuple(
         ObservedStar(
             number,
-            each["outcome"],
-            each["star"],
-            each["magnitude"],
+            each.outcome,
+            each.star,
+            each.magnitude,
             x,
             y,
             arrow,
             "" if arrow is None else _head(arrow),
-            tuple(ChartLine(x, y, *at[name]) for name in each["rivals"] if name in at),
+            tuple(ChartLine(x, y, *at[name]) for name in each.rivals if name in at),
             labels.number(str(number), (x, y)),
         )
         for number, (each, (x, y), arrow) in enumerate(

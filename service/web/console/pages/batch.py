@@ -1,6 +1,5 @@
 """The page of one batch: its star field, the votes, and a what-if with other settings."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 from urllib.parse import quote, urlencode
@@ -14,6 +13,7 @@ from starlette.responses import RedirectResponse, Response
 from service.errors import BadBatch, Fault, shown_value
 from service.storage.models.answers import Answer
 from service.storage.models.answers import Star as FoundStar
+from service.storage.models.star_field import ObservedStarPlace, StarField
 from service.storage.queries.results import answer_from_json
 from service.vectors import matrix_from_quaternion, to_ra_dec
 from service.web.console.charts.sky_chart import sky_chart
@@ -41,7 +41,7 @@ class VoteRow:
 
     tracker: str
     number: int
-    seen: Mapping[str, Any]
+    seen: ObservedStarPlace
     found: FoundStar
     before: FoundStar | None
     catalog_magnitude: float | None
@@ -82,7 +82,7 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
         tried=tried,
         shown=shown,
         stars=_stars(shown, answer if tried else None, field),
-        charts=[sky_chart(each, field["through"], view) for each in field["trackers"]],
+        charts=[sky_chart(each, field.through, view) for each in field.trackers],
         view=view,
         here=lambda **more: f"/batches/{id}?{urlencode(query | more)}",
         field=field,
@@ -106,17 +106,17 @@ def latest_batch(
     return RedirectResponse(f"{address}?{urlencode({'run': query.run})}", 303)
 
 
-def _stars(shown: Answer, before: Answer | None, field: Mapping[str, Any]) -> list[VoteRow]:
+def _stars(shown: Answer, before: Answer | None, field: StarField) -> list[VoteRow]:
     stars = []
     for index, tracker in enumerate(shown.observations):
-        drawn = field["trackers"][index]
-        magnitudes = {each["id"]: each["magnitude"] for each in drawn["catalog"]}
+        drawn = field.trackers[index]
+        magnitudes = {each.id: each.magnitude for each in drawn.catalog}
         for k, found in enumerate(tracker.stars):
             stars.append(
                 VoteRow(
                     tracker.tracker,
                     k + 1,
-                    drawn["observed"][k],
+                    drawn.observed[k],
                     found,
                     None if before is None else before.observations[index].stars[k],
                     magnitudes.get(found.star.id) if found.star else None,
