@@ -9,7 +9,7 @@ from service.missions.mission import (
     Identifier,
     Mission,
     Rules,
-    Solver,
+    SolverName,
     Tests,
     Tolerances,
     rules_of,
@@ -23,7 +23,7 @@ class Choices(Struct, frozen=True, eq=False, gc=False):
     """The identifier, the solver, the rules and the zone grid of one batch."""
 
     identifier: Identifier
-    solver: Solver
+    solver: SolverName
     rules: Rules
     zone_grid_deg: float
 

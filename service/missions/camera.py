@@ -73,11 +73,6 @@ class Camera(Strict):
         return self
 
     @property
-    def pixel_arcsec(self) -> float:
-        """What a pixel spans at the centre."""
-        return ARCSEC_PER_RADIAN / self.focal_length_px
-
-    @property
     def shape(self) -> tuple[int, int]:
         """(rows, columns) of a frame."""
         return self.height_px, self.width_px

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     Identifier = str
 else:
     Identifier = Literal[tuple(IDENTIFIERS)]
-Solver = Literal["quest", "triad"]
+SolverName = Literal["quest", "triad"]
 
 
 class Cap(Strict):
@@ -238,7 +238,7 @@ class Mission(Strict):
     name: Name
     description: str = ""
     identifier: Identifier = "verified"
-    solver: Solver = "quest"
+    solver: SolverName = "quest"
     lost_in_space_fallback: bool = True
     """Look in the whole sky where `verified` finds no good attitude about the a priori one."""
     zone: Annotated[Cap | Band, Field(discriminator="kind")]

@@ -4,7 +4,7 @@ from typing import Literal
 
 from msgspec import Struct
 
-from service.missions.mission import Identifier, Solver
+from service.missions.mission import Identifier, SolverName
 from service.times import Utc
 from service.vectors import Vector
 
@@ -45,7 +45,7 @@ class Options(Struct, frozen=True):
     """What a batch or a what-if asks to be done otherwise than its mission says."""
 
     identifier: Identifier | None = None
-    solver: Solver | None = None
+    solver: SolverName | None = None
     tests: dict[str, bool] = {}
     tolerances: dict[str, float] = {}
     zone_grid_deg: float | None = None

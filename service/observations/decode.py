@@ -11,7 +11,7 @@ from typing import Any, Final
 import msgspec
 import numpy as np
 
-from service.missions.mission import Identifier, Solver
+from service.missions.mission import Identifier, SolverName
 from service.observations.batch import (
     Aberration,
     APriori,
@@ -75,7 +75,7 @@ class SentOptions(_SentPart):
     """Options that replace the mission's settings."""
 
     identifier: Identifier | None = None
-    solver: Solver | None = None
+    solver: SolverName | None = None
     tests: dict[str, bool] = {}
     tolerances: dict[str, float] = {}
     zone_grid_deg: float | None = None

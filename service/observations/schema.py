@@ -22,7 +22,7 @@ from pydantic import (
 )
 
 from service.errors import BadBatch, BadInput, Fault, shown_value
-from service.missions.mission import GridStep, Identifier, Solver
+from service.missions.mission import GridStep, Identifier, SolverName
 from service.observations.batch import (
     MAX_STARS_PER_TRACKER,
     MAX_TRACKERS,
@@ -164,7 +164,7 @@ class OptionsIn(Wire):
     """Options that replace the mission's settings."""
 
     identifier: Identifier | None = None
-    solver: Solver | None = None
+    solver: SolverName | None = None
     tests: TestsIn = TestsIn()
     tolerances: TolerancesIn = TolerancesIn()
     zone_grid_deg: Annotated[GridStep, Field(strict=True)] | None = None

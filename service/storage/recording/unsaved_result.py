@@ -16,7 +16,7 @@ import msgspec
 from msgspec import UNSET, Struct, structs
 
 from service.acquire import Acquisition
-from service.missions.mission import Identifier, Mission, Solver
+from service.missions.mission import Identifier, Mission, SolverName
 from service.observations.frame_record import FrameRecord
 from service.observations.schema import Submission
 from service.storage.models.answers import Answer
@@ -255,7 +255,7 @@ def options_text(acquisition: Acquisition) -> str:
 
 @lru_cache(maxsize=256, typed=True)
 def _few_options(
-    identifier: Identifier | None, solver: Solver | None, zone_grid_deg: float | None
+    identifier: Identifier | None, solver: SolverName | None, zone_grid_deg: float | None
 ) -> str:
     # The same text again and again: to put it together takes longer than to insert a star.
     return _options_text(

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Path
+from fastapi import APIRouter
 from fastapi import Query as InQuery
 from pydantic import Field
 from starlette.responses import Response
@@ -12,6 +12,7 @@ from service.observations.schema import tolerances_from_text
 from service.storage.models.advice import Advice
 from service.web.openapi.route import ResponseDoc, route_docs
 from service.web.requests.dependencies import AppDep, json_response
+from service.web.requests.path_parameters import SpacecraftPath
 from service.web.requests.query_parameters import PeriodQuery
 
 router = APIRouter(prefix="/api/v1/spacecraft", tags=["spacecraft"])
@@ -19,8 +20,6 @@ router = APIRouter(prefix="/api/v1/spacecraft", tags=["spacecraft"])
 MAX_SAMPLE = 2_000
 ADVICE_LIMIT_S = 20.0
 """The longest wait for an answer; a sample that takes longer is cut short, and says so."""
-
-SpacecraftPath = Annotated[str, Path(description="The spacecraft's name, such as `XTE`.")]
 
 
 class AdviceQuery(PeriodQuery):

@@ -23,12 +23,12 @@ from service.storage.models.alarms import (
 from service.web.openapi.route import LINK, ResponseDoc, route_docs
 from service.web.requests.access import AuditDep, CallerDep
 from service.web.requests.dependencies import AppDep, json_response, page_response
+from service.web.requests.path_parameters import SpacecraftPath
 from service.web.requests.query_parameters import NO_QUERY, AlarmQuery, Comment, StatementQuery, Who
 from service.web.requests.request_body import JsonBody, read_model
 
 router = APIRouter(prefix="/api/v1", tags=["alarms"])
 
-SpacecraftPath = Annotated[str, Path(description="The spacecraft's name, such as `XTE`.")]
 QuantityPath = Annotated[str, Path(description="A quantity, such as `ambiguous_share`.")]
 AlarmId = Annotated[str, Path(description="The `id` of an alarm.")]
 LIMITS = "/spacecraft/{name}/limits"

@@ -16,11 +16,11 @@ from service.errors import BadBatch, Fault, shown_value
 from service.imaging.submit import FrameIn, read_known
 from service.missions.mission import mission_named
 from service.storage.models.answers import Answer
-from service.web.api.spacecraft import SpacecraftPath
 from service.web.openapi.route import IDEMPOTENCY_KEY, LOCATION, REPLAYED, ResponseDoc, route_docs
 from service.web.requests.access import CallerDep
 from service.web.requests.dependencies import AppDep, MetricsDep, answer_response
 from service.web.requests.headers import IdempotencyKey
+from service.web.requests.path_parameters import SpacecraftPath
 from service.web.requests.query_parameters import Query
 from service.web.requests.request_body import frame_body
 

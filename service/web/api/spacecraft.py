@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Path
+from fastapi import APIRouter
 from fastapi import Query as InQuery
 from starlette.requests import Request
 from starlette.responses import Response
@@ -19,6 +19,7 @@ from service.web.openapi.route import LINK, ResponseDoc, route_docs
 from service.web.requests.access import CallerDep
 from service.web.requests.dependencies import AppDep, json_response, page_response
 from service.web.requests.history_files import THINNED, history_file, streamed_file, thinned_header
+from service.web.requests.path_parameters import SpacecraftPath
 from service.web.requests.query_parameters import (
     JSON_FORMAT,
     HistoryQuery,
@@ -31,8 +32,6 @@ from service.web.requests.query_parameters import (
 router = APIRouter(prefix="/api/v1/spacecraft", tags=["spacecraft"])
 
 DEFAULT_SIZE = 500
-
-SpacecraftPath = Annotated[str, Path(description="The spacecraft's name, such as `XTE`.")]
 
 
 @router.get("", **route_docs({200: ResponseDoc("Every spacecraft.", SpacecraftList)}))

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from service.acquire.choices import Choices
 from service.errors import BadBatch, Fault, shown_value
 from service.missions.identifiers import IDENTIFIERS
-from service.missions.mission import Mission, Solver, Tests, Tolerances
+from service.missions.mission import Mission, SolverName, Tests, Tolerances
 from service.observations.schema import OptionsIn
 
 SYMBOLS: Mapping[str, str] = {
@@ -149,7 +149,7 @@ def fields_of(
 
     return [
         field("identifier", choices=tuple(IDENTIFIERS)),
-        field("solver", choices=get_args(Solver)),
+        field("solver", choices=get_args(SolverName)),
         field("zone_grid_deg"),
         *(field(leaf, "tests", SWITCH) for leaf in Tests.model_fields),
         *(field(leaf, "tolerances") for leaf in Tolerances.model_fields),
