@@ -158,7 +158,7 @@ def draw_batch(
             offset = float(rng.uniform(-0.5, 0.5)) if rates.any() else 0.0
             body = truth @ catalog.directions[row]
             if rates.any():
-                body = rotation(rates, -np.linalg.norm(rates) * offset) @ body
+                body = rotation(rates, -float(np.linalg.norm(rates)) * offset) @ body
             stars.append(
                 _star(
                     rng,

@@ -158,7 +158,8 @@ def attitude_matrix(quaternion: Triple) -> Array:
     q1, q2, q3, q4 = q / math.sqrt(sum(q * q))
     skew = np.array([[0, -q3, q2], [q3, 0, -q1], [-q2, q1, 0]])
     vector = np.array([q1, q2, q3])
-    return (q4 * q4 - vector @ vector) * np.eye(3) + 2 * np.outer(vector, vector) - 2 * q4 * skew
+    matrix = (q4 * q4 - vector @ vector) * np.eye(3) + 2 * np.outer(vector, vector) - 2 * q4 * skew
+    return np.asarray(matrix)
 
 
 def prior_attitude(batch: Json, mission: Json) -> tuple[Array, float]:
@@ -227,7 +228,7 @@ def body_vector(star: Json, alignment: Array, batch: Json) -> Array:
         v = np.array(
             [math.tan(math.radians(star["h_deg"])), math.tan(math.radians(star["v_deg"])), 1.0]
         )
-    v = alignment @ (v / np.linalg.norm(v))
+    v = np.asarray(alignment @ (v / np.linalg.norm(v)))
     turn = np.radians(batch.get("body_rates_deg_per_s", [0.0, 0.0, 0.0]))
     turn = turn * star.get("time_offset_s", 0.0)
     angle = np.linalg.norm(turn)
@@ -235,7 +236,7 @@ def body_vector(star: Json, alignment: Array, batch: Json) -> Array:
         return v
     # Rodrigues: the components parallel to, along and across the axis.
     n = turn / angle
-    return (
+    return np.asarray(
         v * math.cos(angle) + np.cross(n, v) * math.sin(angle) + n * (n @ v) * (1 - math.cos(angle))
     )
 

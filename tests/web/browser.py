@@ -50,8 +50,9 @@ class Browser:
     def _start(self) -> None:
         assert CHROMIUM is not None
         command = [CHROMIUM, *_FLAGS, f"--user-data-dir={self._folder}", "about:blank"]
-        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        process = self._stack.enter_context(subprocess.Popen(command, **quiet))
+        process = self._stack.enter_context(
+            subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        )
         self._stack.callback(process.terminate)
         noted = self._folder / "DevToolsActivePort"
         self.wait(lambda: noted.exists() and noted.read_text().count("\n") >= 1)

@@ -1,5 +1,6 @@
 """The app behind a real server: in a thread of this process, or as `acquire serve` has it."""
 
+import asyncio
 import socket
 import subprocess
 import sys
@@ -8,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
-from typing import IO
+from typing import IO, cast
 
 import httpx
 import uvicorn
@@ -41,7 +42,8 @@ class Server:
 
     def __init__(self, app: FastAPI, port: int = 0, admission: Admission | None = None) -> None:
         compile_kernels()
-        config = uvicorn.Config(app, port=port, http=Connection, ws="none", log_level="warning")
+        protocol = cast(type[asyncio.Protocol], Connection)
+        config = uvicorn.Config(app, port=port, http=protocol, ws="none", log_level="warning")
         self._server = StreamingServer(config, _stop_streams_of(app), admission)
         # Signals belong to the main thread, which is the caller's.
         self._thread = threading.Thread(target=self._server.run, name="server")
