@@ -319,14 +319,14 @@ def _parse_and_insert(lines: Sequence[bytes], database: Path) -> float:
     app = open_app(Settings(database=f"sqlite:///{database}"))
     try:
         made = [submission_from_json(line, run="bulk") for line in lines]
-        drafts = [app.submissions.ingest.solver.solve(each) for each in made]
+        unsaved_results = [app.submissions.ingest.solver.solve(each) for each in made]
         app.store.writer.change(lambda connection: None).result()
         spent = 0.0
         for first in range(0, len(lines), CHUNK):
             started = time.perf_counter()
             for line in lines[first : first + CHUNK]:
                 submission_from_json(line, run="bulk")
-            part = drafts[first : first + CHUNK]
+            part = unsaved_results[first : first + CHUNK]
             app.store.writer.record(part).result()
             spent += time.perf_counter() - started
     finally:

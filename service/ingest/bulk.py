@@ -22,7 +22,7 @@ from service.ingest.telemetry_lines import (
 )
 from service.observations.schema import Submission, submission_from_json
 from service.storage.recording.identity import Registry, look_up, stored_answers
-from service.storage.recording.unsaved_result import Answered, Draft
+from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.sql.database import Store
 
 PENDING_A_WORKER = 2
@@ -111,22 +111,22 @@ class Bulk:
     def compute_here(self, lines: TelemetryLines, require: Require) -> list[LineResult]:
         """The same in this process, which nobody who posts one by one shall feel."""
 
-        def drafts(fresh: Sequence[Submission]) -> list[Draft | AcquisitionError]:
+        def unsaved_results(fresh: Sequence[Submission]) -> list[UnsavedResult | AcquisitionError]:
             made = []
             for each in fresh:
                 require()
                 made.append(self.draft_here(each))
             return made
 
-        return line_results(lines, drafts)
+        return line_results(lines, unsaved_results)
 
-    def draft_here(self, submission: Submission) -> Draft | AcquisitionError:
+    def draft_here(self, submission: Submission) -> UnsavedResult | AcquisitionError:
         """One of them, when nobody waits."""
         return self._submissions.solve_one_of_many(submission)
 
-    def begin_writing(self, drafts: Sequence[Draft]) -> Callable[[], Answers]:
-        """Queue drafts for a transaction of their own; to call what it gives waits for that."""
-        return self._submissions.begin_writing(drafts)
+    def begin_writing(self, unsaved_results: Sequence[UnsavedResult]) -> Callable[[], Answers]:
+        """Queue results for a transaction of their own; the function returned waits for it."""
+        return self._submissions.begin_writing(unsaved_results)
 
 
 class BulkChunk:
@@ -152,8 +152,8 @@ class BulkChunk:
 
     def queue_write(self) -> None:
         """Queue what was computed for the writer; raises `Busy` where it must be called again."""
-        drafts = [each for each in self._decided if isinstance(each, Draft)]
-        self._finish = self._bulk.begin_writing(drafts)
+        unsaved_results = [each for each in self._decided if isinstance(each, UnsavedResult)]
+        self._finish = self._bulk.begin_writing(unsaved_results)
 
     def cancel(self) -> None:
         """Let it not be computed, where that has not begun."""
@@ -162,10 +162,12 @@ class BulkChunk:
     def answers(self) -> Answers:
         """The answer to each line, or what is wrong with it, when all is recorded."""
         written = iter(self._finish())
-        return [next(written) if isinstance(each, Draft) else each for each in self._decided]
+        return [
+            next(written) if isinstance(each, UnsavedResult) else each for each in self._decided
+        ]
 
     @cached_property
-    def _decided(self) -> list[Draft | Answered | AcquisitionError]:
+    def _decided(self) -> list[UnsavedResult | Answered | AcquisitionError]:
         try:
             found = self._computed.result()
         except ChunkEndsWorkers as error:
@@ -179,13 +181,15 @@ class BulkChunk:
             self._decision(text, each) for text, each in zip(self._lines.texts, found, strict=True)
         ]
 
-    def _decision(self, text: bytes, found: LineResult) -> Draft | Answered | AcquisitionError:
+    def _decision(
+        self, text: bytes, found: LineResult
+    ) -> UnsavedResult | Answered | AcquisitionError:
         try:
             if isinstance(found, InvalidLine):
                 if found.spacecraft is not None:
                     self._check(found.spacecraft)
                 return found.error
-            if isinstance(found, Draft):
+            if isinstance(found, UnsavedResult):
                 self._check(found.identity[0])
                 return found
             self._check(found.identity[0])
@@ -196,7 +200,9 @@ class BulkChunk:
         except AcquisitionError as error:
             return error
 
-    def _repeat(self, text: bytes, seen: RecordedLine) -> Draft | Answered | AcquisitionError:
+    def _repeat(
+        self, text: bytes, seen: RecordedLine
+    ) -> UnsavedResult | Answered | AcquisitionError:
         first = self._registry.first(seen.identity, None, seen.fingerprint)
         if first is None:
             # It is not called what it seemed to be called.

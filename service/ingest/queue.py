@@ -24,7 +24,7 @@ from service.errors import Busy, Stopping
 from service.ingest.solver_pool import WAIT_S, SolverPool, Task
 from service.observations.schema import Submission
 from service.storage.recording.identity import Identity, OwnKey
-from service.storage.recording.unsaved_result import Answered, Draft
+from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.sql.transaction import Results
 from service.storage.sql.writer import RETRY_AFTER_S, Writer
 from service.times import Utc, utc_now
@@ -69,8 +69,8 @@ class IngestQueue:
     def __init__(
         self,
         look_up: Callable[[Sequence[PendingBatch]], Found],
-        solve: Callable[[PendingBatch], Draft],
-        recorded: Callable[[Draft, Outcome], object],
+        solve: Callable[[PendingBatch], UnsavedResult],
+        recorded: Callable[[UnsavedResult, Outcome], object],
         writer: Writer,
         pool: SolverPool,
     ) -> None:
@@ -207,7 +207,7 @@ class IngestQueue:
     # ---- the writer's thread -----------------------------------------------------------------
 
     def _note_written(
-        self, pending: PendingBatch, unsaved: Draft, outcome: Results | Exception
+        self, pending: PendingBatch, unsaved: UnsavedResult, outcome: Results | Exception
     ) -> None:
         one = outcome if isinstance(outcome, Exception) else outcome[0]
         self._told(unsaved, one)

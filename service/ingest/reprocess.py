@@ -22,7 +22,7 @@ from service.ingest.solver_pool import Solver
 from service.missions.mission import Mission
 from service.observations.schema import BatchIn, OptionsIn, submission_from_model
 from service.storage.queries.pages import PLACE, ResultFilter
-from service.storage.recording.unsaved_result import Answered, Draft
+from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.sql.database import Store
 from service.storage.sql.tables import batches, results
 
@@ -85,7 +85,7 @@ def reprocess(
     progress = _counted(store, plan)
     step(progress)
     with closing(_ChunkSolver(plan, catalog_digest)) as solver:
-        waiting: deque[Callable[[], list[Draft | RefusedBatch]]] = deque()
+        waiting: deque[Callable[[], list[UnsavedResult | RefusedBatch]]] = deque()
         most = PENDING_A_WORKER * solver.count
         for chunk in _chunks(store, plan):
             waiting.append(solver.take(chunk))
@@ -172,16 +172,16 @@ def _after(place: tuple[int, str]) -> ColumnElement[bool]:
 
 
 def _record(
-    store: Store, found: Sequence[Draft | RefusedBatch], progress: ReprocessProgress
+    store: Store, found: Sequence[UnsavedResult | RefusedBatch], progress: ReprocessProgress
 ) -> None:
-    drafts = [each for each in found if isinstance(each, Draft)]
+    unsaved_results = [each for each in found if isinstance(each, UnsavedResult)]
     refused = [each for each in found if isinstance(each, RefusedBatch)]
-    outcomes = store.writer.record(drafts).result() if drafts else []
-    for draft, outcome in zip(drafts, outcomes, strict=True):
+    outcomes = store.writer.record(unsaved_results).result() if unsaved_results else []
+    for unsaved, outcome in zip(unsaved_results, outcomes, strict=True):
         if isinstance(outcome, Answered):
             progress.recorded += 1
         elif isinstance(outcome, AcquisitionError) and not isinstance(outcome, Busy):
-            refused.append(RefusedBatch(draft.identity[2], str(outcome)))
+            refused.append(RefusedBatch(unsaved.identity[2], str(outcome)))
         else:
             # Trouble of the database: nothing was decided about any of them.
             raise outcome
@@ -201,12 +201,12 @@ class _WorkerTask:
     stored: Sequence[StoredBatch]
 
 
-def process_again(solver: Solver, part: _WorkerTask) -> list[Draft | RefusedBatch]:
-    """The drafts of stored batches in a run, with what cannot be taken."""
+def process_again(solver: Solver, part: _WorkerTask) -> list[UnsavedResult | RefusedBatch]:
+    """The unsaved results of stored batches in a run, with what cannot be taken."""
     return [_again(solver, part.run, *each) for each in part.stored]
 
 
-def _again(solver: Solver, run: str, input: str, options: str) -> Draft | RefusedBatch:
+def _again(solver: Solver, run: str, input: str, options: str) -> UnsavedResult | RefusedBatch:
     model = BatchIn.model_validate_json(input).model_copy(
         update={"run": run, "options": OptionsIn.model_validate(json.loads(options))}
     )
@@ -223,7 +223,7 @@ class _ChunkSolver:
         self._run = plan.run
         self._config = WorkerConfig(plan.missions, plan.catalog, catalog_digest, plan.shelf_bytes)
         self.count = plan.processes or os.cpu_count() or 1
-        self._workers = LocalWorkers[_WorkerTask, Draft | RefusedBatch](
+        self._workers = LocalWorkers[_WorkerTask, UnsavedResult | RefusedBatch](
             self._config, process_again, self.count
         )
         if self.count > 1:
@@ -233,14 +233,16 @@ class _ChunkSolver:
     def _solver(self) -> Solver:
         return self._config.solver()
 
-    def take(self, stored: Sequence[StoredBatch]) -> Callable[[], list[Draft | RefusedBatch]]:
+    def take(
+        self, stored: Sequence[StoredBatch]
+    ) -> Callable[[], list[UnsavedResult | RefusedBatch]]:
         """Begin with some batches; to call what it gives waits for what comes of them."""
         part = _WorkerTask(self._run, stored)
         if self.count == 1:
             return lambda: process_again(self._solver, part)
         future = self._workers.submit(part)
 
-        def found() -> list[Draft | RefusedBatch]:
+        def found() -> list[UnsavedResult | RefusedBatch]:
             try:
                 return future.result()
             except ChunkEndsWorkers as error:

@@ -25,7 +25,7 @@ from service.observations.schema import Submission
 from service.sky.model import SkyModel
 from service.storage.recording.identity import OwnKey, identity_of
 from service.storage.recording.ids import Ulids
-from service.storage.recording.unsaved_result import Draft, submission_draft
+from service.storage.recording.unsaved_result import UnsavedResult, unsaved_submission
 from service.storage.sql.writer import RETRY_AFTER_S
 from service.times import Utc, utc_now
 
@@ -54,15 +54,15 @@ class Solver:
 
     def solve(
         self, submission: Submission, received: Utc | None = None, key: OwnKey | None = None
-    ) -> Draft:
+    ) -> UnsavedResult:
         """The result of a submission; raises `BadBatch` for what does not fit its mission."""
         received = received or utc_now()
         acquisition = self.acquire(submission.batch)
-        return submission_draft(
+        return unsaved_submission(
             submission, acquisition, id=self.ids.new(), received=received, key=key
         )
 
-    def solve_one_of_many(self, submission: Submission) -> Draft | AcquisitionError:
+    def solve_one_of_many(self, submission: Submission) -> UnsavedResult | AcquisitionError:
         """The result of a submission, or what is wrong with that one alone."""
         try:
             return self.solve(submission)

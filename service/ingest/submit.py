@@ -36,7 +36,7 @@ from service.storage.recording.identity import (
     stored_answers,
 )
 from service.storage.recording.results import record
-from service.storage.recording.unsaved_result import Answered, Draft, Row, what_if_draft
+from service.storage.recording.unsaved_result import Answered, Row, UnsavedResult, unsaved_what_if
 from service.storage.sql.database import Store
 from service.storage.sql.transaction import Results
 from service.times import utc_now
@@ -143,14 +143,14 @@ class SubmissionService:
             stored = stored_answers(connection, repeats)
         # The connection is given back: a snapshot of the database that is held for as long as
         # five hundred batches take keeps SQLite from shortening its log.
-        found: list[Draft | ExistingResult | AcquisitionError] = []
+        found: list[UnsavedResult | ExistingResult | AcquisitionError] = []
         for holder, each in zip(holders, submissions, strict=True):
             found.append(holder or self.solve_one_of_many(each))
-        drafts = [each for each in found if isinstance(each, Draft)]
-        written = iter(self.begin_writing(drafts)())
+        unsaved_results = [each for each in found if isinstance(each, UnsavedResult)]
+        written = iter(self.begin_writing(unsaved_results)())
         answers: Answers = []
         for one in found:
-            if isinstance(one, Draft):
+            if isinstance(one, UnsavedResult):
                 answers.append(next(written))
             elif isinstance(one, ExistingResult):
                 answers.append(Answered(one.result_id, stored[one.result_id], replayed=True))
@@ -178,7 +178,7 @@ class SubmissionService:
         if not (record or adopt):
             answer = answer_of(acquisition, id=None, parent=id, recorded=False)
             return Answered(None, msgspec.json.encode(answer), replayed=False)
-        draft = what_if_draft(
+        unsaved = unsaved_what_if(
             acquisition,
             id=self.solver.ids.new(),
             batch_id=parent["batch_id"],
@@ -187,9 +187,9 @@ class SubmissionService:
             created=utc_now(),
         )
         if entry is not None:
-            draft.audit = entry.row()
-        _note_handed_over([draft])
-        (outcome,) = _decided(self._store.writer.record([draft]).result())
+            unsaved.audit = entry.row()
+        _note_handed_over([unsaved])
+        (outcome,) = _decided(self._store.writer.record([unsaved]).result())
         if isinstance(outcome, AcquisitionError):
             raise outcome
         return outcome
@@ -220,10 +220,10 @@ class SubmissionService:
             is_long=False,
         )
         self._recorded_before([pending])
-        draft = self.solver.solve(submission)
+        unsaved = self.solver.solve(submission)
 
         def record_and_roll_back(connection: Connection) -> None:
-            record(connection, [draft])
+            record(connection, [unsaved])
             raise _RolledBack
 
         with suppress(_RolledBack):
@@ -231,24 +231,24 @@ class SubmissionService:
 
     # ---- bulk --------------------------------------------------------------------------------
 
-    def solve_one_of_many(self, submission: Submission) -> Draft | AcquisitionError:
+    def solve_one_of_many(self, submission: Submission) -> UnsavedResult | AcquisitionError:
         """The result of one of many; single submissions go first."""
         self.yield_to_interactive()
         return self.pool.call(
             lambda: self.solver.solve_one_of_many(submission), "bulk", is_long=True
         )
 
-    def begin_writing(self, drafts: Sequence[Draft]) -> Callable[[], Answers]:
+    def begin_writing(self, unsaved_results: Sequence[UnsavedResult]) -> Callable[[], Answers]:
         """Queue many results for a transaction; to call what it gives waits for the answers."""
-        if not drafts:
+        if not unsaved_results:
             return list
-        _note_handed_over(drafts)
-        future = self._store.writer.record(drafts, low_priority=True)
+        _note_handed_over(unsaved_results)
+        future = self._store.writer.record(unsaved_results, low_priority=True)
 
         def finish() -> Answers:
             outcomes = future.result()
-            for draft, outcome in zip(drafts, outcomes, strict=True):
-                self._tell(draft, outcome)
+            for unsaved, outcome in zip(unsaved_results, outcomes, strict=True):
+                self._tell(unsaved, outcome)
             return _decided(outcomes)
 
         return finish
@@ -281,10 +281,10 @@ class SubmissionService:
 
     # ---- steps of the queue ------------------------------------------------------------------
 
-    def _solve(self, pending: PendingBatch) -> Draft:
-        draft = self.solver.solve(pending.make(), pending.received, pending.key)
-        _note_handed_over([draft])
-        return draft
+    def _solve(self, pending: PendingBatch) -> UnsavedResult:
+        unsaved = self.solver.solve(pending.make(), pending.received, pending.key)
+        _note_handed_over([unsaved])
+        return unsaved
 
     def _recorded_before(
         self, group: Sequence[PendingBatch]
@@ -292,7 +292,7 @@ class SubmissionService:
         """What is stored of each: the answer, the error where its place is taken, or nothing."""
         # Identities before keys, each as of its moment: what is recorded in between is found by its
         # key, or seems new, and then the transaction finds it.
-        with self._noted_failure(len(group)), self._store.glancing() as connection:
+        with self._noted_failure(len(group)), self._store.lookup() as connection:
             registry = look_up(
                 connection,
                 {each.identity for each in group},
@@ -341,13 +341,13 @@ class SubmissionService:
             self._store.writer.note_failure(count)
             raise
 
-    def _tell(self, draft: Draft, outcome: Answered | Exception) -> None:
+    def _tell(self, unsaved: UnsavedResult, outcome: Answered | Exception) -> None:
         """Tell the observers of a new batch; a what-if holds the stars of one that is known."""
         is_new = isinstance(outcome, Answered) and not outcome.replayed
-        if not is_new or draft.batch is None or not self.observers:
+        if not is_new or unsaved.batch is None or not self.observers:
             return
         recorded = Recorded(
-            *draft.identity, counts=draft.counts, has_attitude=draft.solution is not None
+            *unsaved.identity, counts=unsaved.counts, has_attitude=unsaved.solution is not None
         )
         for observer in self.observers:
             try:
@@ -357,10 +357,10 @@ class SubmissionService:
                 log.exception("an observer failed")
 
 
-def _note_handed_over(drafts: Sequence[Draft]) -> None:
+def _note_handed_over(unsaved_results: Sequence[UnsavedResult]) -> None:
     moment_ns = time.perf_counter_ns()
-    for draft in drafts:
-        draft.handed_over_ns = moment_ns
+    for unsaved in unsaved_results:
+        unsaved.handed_over_ns = moment_ns
 
 
 def _decided(outcomes: Results) -> Answers:

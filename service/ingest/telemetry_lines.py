@@ -9,7 +9,7 @@ import msgspec
 from service.errors import AcquisitionError
 from service.observations.schema import Submission, submission_from_json
 from service.storage.recording.identity import Identity, identity_of
-from service.storage.recording.unsaved_result import Draft
+from service.storage.recording.unsaved_result import UnsavedResult
 
 
 @dataclass(frozen=True)
@@ -37,19 +37,19 @@ class InvalidLine:
     error: AcquisitionError
 
 
-LineResult = Draft | RecordedLine | InvalidLine
-Drafting = Callable[[Sequence[Submission]], Sequence[Draft | AcquisitionError]]
+LineResult = UnsavedResult | RecordedLine | InvalidLine
+Drafting = Callable[[Sequence[Submission]], Sequence[UnsavedResult | AcquisitionError]]
 
 
-def line_results(lines: TelemetryLines, draft: Drafting) -> list[LineResult]:
-    """What each line comes to, in order; `draft` is given all that are to be computed."""
+def line_results(lines: TelemetryLines, unsaved: Drafting) -> list[LineResult]:
+    """What each line comes to, in order; `unsaved` is given all that are to be computed."""
     read = [_read(text, lines.run) for text in lines.texts]
     fresh = [
         each
         for place, each in enumerate(read)
         if isinstance(each, Submission) and place not in lines.known
     ]
-    drafted = iter(draft(fresh))
+    drafted = iter(unsaved(fresh))
     found: list[LineResult] = []
     for place, each in enumerate(read):
         if isinstance(each, InvalidLine):

@@ -187,11 +187,11 @@ def test_a_database_out_of_reach_is_busy_and_the_reason_is_for_the_log_alone(app
 def test_who_has_glanced_holds_no_moment_and_the_log_can_begin_anew(app, make):
     """By a prepared statement, and by one that SQLAlchemy opens a transaction for."""
     app.submissions.submit(make("b1"))
-    with app.store.glancing() as connection:
+    with app.store.lookup() as connection:
         assert execute(connection, "SELECT batch FROM batches") == [("b1",)]
         assert connection.scalars(select(batches.c.batch)).all() == ["b1"]
     app.submissions.submit(make("b2"))
-    with app.store.glancing() as connection:
+    with app.store.lookup() as connection:
         assert len(execute(connection, "SELECT batch FROM batches")) == 2
     other = sqlite3.connect(app.store.url.database)
     try:

@@ -199,16 +199,18 @@ def test_of_fifty_concurrent_batches_under_one_key_one_is_recorded(app, make):
 
 
 def test_what_was_recorded_between_look_and_transaction_is_found(app, make):
-    """A draft is new when it is looked up; what came since then is noticed all the same."""
+    """An unsaved result is new when looked up; one that was recorded since is still noticed."""
     solve = app.submissions.ingest.solver.solve
     key = "of another body"
     sent = [make(f"b{i}") for i in range(6)]
     changed = make("b2", after_s=3600.0)
-    drafts = [solve(each) for each in (sent[0], sent[1], changed, sent[3])]
-    drafts += [solve(sent[4], key=("", key)), solve(sent[5])]
+    unsaved_results = [solve(each) for each in (sent[0], sent[1], changed, sent[3])]
+    unsaved_results += [solve(sent[4], key=("", key)), solve(sent[5])]
     first = [app.submissions.submit(each) for each in (sent[1], sent[2])]
     app.submissions.submit(make("b6"), key)
-    new, repeat, conflict, neighbour, reused, last = app.store.writer.record(drafts).result()
+    new, repeat, conflict, neighbour, reused, last = app.store.writer.record(
+        unsaved_results
+    ).result()
     assert [each.replayed for each in (new, neighbour, last)] == [False, False, False]
     assert (repeat.id, repeat.body, repeat.replayed) == (first[0].id, first[0].body, True)
     assert isinstance(conflict, Conflict)

@@ -121,9 +121,11 @@ def test_a_change_that_fails_with_an_answer_half_read_keeps_no_lock(store):
 
 def test_one_draft_that_cannot_be_kept_spoils_none_of_its_neighbours(app, make):
     go_on = held_up(app.store.writer)
-    drafts = [app.submissions.ingest.solver.solve(make(name)) for name in ("b1", "b2", "b3")]
-    drafts[1].result["mission_digest"] = "sha256:of nothing that is there"
-    waiting = app.store.writer.record(drafts)
+    unsaved_results = [
+        app.submissions.ingest.solver.solve(make(name)) for name in ("b1", "b2", "b3")
+    ]
+    unsaved_results[1].result["mission_digest"] = "sha256:of nothing that is there"
+    waiting = app.store.writer.record(unsaved_results)
     go_on.set()
     first, second, third = waiting.result(30)
     assert isinstance(second, IntegrityError)

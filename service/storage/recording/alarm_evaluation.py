@@ -20,7 +20,7 @@ from service.storage.queries.future_dated import LIVE
 from service.storage.queries.limits import limits_of
 from service.storage.recording.active_alarms import ActiveAlarms
 from service.storage.recording.silence import silence_severity
-from service.storage.recording.unsaved_result import Draft, Row
+from service.storage.recording.unsaved_result import Row, UnsavedResult
 from service.storage.sql.prepared import prepared
 from service.storage.sql.statements import insert_missing
 from service.storage.sql.tables import batches, missions, results, runs, watches
@@ -38,18 +38,20 @@ _SAVE = prepared(
 )
 
 
-def evaluate_limits(connection: Connection, new: Sequence[Draft]) -> None:
+def evaluate_limits(connection: Connection, new: Sequence[UnsavedResult]) -> None:
     """Evaluate the limits against new batches of the live run and of runs with alarms."""
-    groups: dict[tuple[str, str], list[Draft]] = {}
-    for draft in new:
-        spacecraft, run, _ = draft.identity
-        if draft.batch is not None and not draft.is_ahead:
-            groups.setdefault((run, spacecraft), []).append(draft)
+    groups: dict[tuple[str, str], list[UnsavedResult]] = {}
+    for unsaved in new:
+        spacecraft, run, _ = unsaved.identity
+        if unsaved.batch is not None and not unsaved.is_ahead:
+            groups.setdefault((run, spacecraft), []).append(unsaved)
     evaluated = _runs_with_alarms(connection, {run for run, _ in groups})
     for run, spacecraft in sorted(groups):
         if run in evaluated:
-            drafts = sorted(groups[run, spacecraft], key=lambda each: each.result["time_ns"])
-            LimitEvaluator(connection, spacecraft, run, drafts).evaluate()
+            unsaved_results = sorted(
+                groups[run, spacecraft], key=lambda each: each.result["time_ns"]
+            )
+            LimitEvaluator(connection, spacecraft, run, unsaved_results).evaluate()
 
 
 def _runs_with_alarms(connection: Connection, names: set[str]) -> set[str]:
@@ -70,17 +72,21 @@ class LimitEvaluator:
     """Evaluates new batches of one spacecraft in one run; its row in `watches` is locked."""
 
     def __init__(
-        self, connection: Connection, spacecraft: str, run: str, drafts: Sequence[Draft]
+        self,
+        connection: Connection,
+        spacecraft: str,
+        run: str,
+        unsaved_results: Sequence[UnsavedResult],
     ) -> None:
         self._connection = connection
         self._spacecraft, self._run = spacecraft, run
-        self._drafts = drafts
-        self._limits = limits_of(connection, _mission(connection, drafts[0]))
+        self._drafts = unsaved_results
+        self._limits = limits_of(connection, _mission(connection, unsaved_results[0]))
         row = self._locked()
         if row is None:
-            assert drafts[0].batch is not None
+            assert unsaved_results[0].batch is not None
             first = {"spacecraft": spacecraft, "run": run, "state": "{}"}
-            insert_missing(connection, watches, [first | _columns_of(drafts[0].batch)])
+            insert_missing(connection, watches, [first | _columns_of(unsaved_results[0].batch)])
             row = self._locked()
         assert row is not None
         self._row = row
@@ -94,21 +100,21 @@ class LimitEvaluator:
         row, newest = self._row, None
         latest_ns, received = row["time_ns"], row["received"]
         received_ns = self._saved.ns_of(received)
-        for draft in self._drafts:
-            batch = draft.batch
+        for unsaved in self._drafts:
+            batch = unsaved.batch
             assert batch is not None
             gap_ns = batch["time_ns"] - latest_ns
             if gap_ns >= 0:
                 newest, latest_ns = batch, batch["time_ns"]
             # In another run an older batch that comes late ends no silence.
             if self._run == LIVE or gap_ns >= 0:
-                since_ns = draft.received_ns - received_ns if self._run == LIVE else gap_ns
+                since_ns = unsaved.received_ns - received_ns if self._run == LIVE else gap_ns
                 latest = _reference(newest) if newest else (row["time"], row["batch_id"])
                 self._check_silence(since_ns * 1e-9, latest, batch["received"])
             if due:
-                self._evaluate_batch(draft, due)
-            if draft.received_ns > received_ns:
-                received, received_ns = batch["received"], draft.received_ns
+                self._evaluate_batch(unsaved, due)
+            if unsaved.received_ns > received_ns:
+                received, received_ns = batch["received"], unsaved.received_ns
         self._save(newest, received, received_ns)
         self._active.save()
 
@@ -137,7 +143,7 @@ class LimitEvaluator:
         needs the latest value alone: of those before it nothing would be stored.
         """
         due = []
-        new = [draft.result for draft in self._drafts]
+        new = [unsaved.result for unsaved in self._drafts]
         for name, limits in self._limits.items():
             sample_of = QUANTITIES[name].sample_of
             samples = [sample for each in new if (sample := sample_of(each))]
@@ -156,9 +162,9 @@ class LimitEvaluator:
         """The latest new batch that has a value of a quantity."""
         sample_of = QUANTITIES[name].sample_of
         return next(
-            draft.batch
-            for draft in reversed(self._drafts)
-            if draft.batch and sample_of(draft.result)
+            unsaved.batch
+            for unsaved in reversed(self._drafts)
+            if unsaved.batch and sample_of(unsaved.result)
         )
 
     def _latest_in_window(self, batch: Row, latest_ns: int) -> BatchRef:
@@ -182,20 +188,20 @@ class LimitEvaluator:
         return (found[0], found[1]) if found else _reference(batch)
 
     def _evaluate_batch(
-        self, draft: Draft, due: Sequence[tuple[QuantityName, LimitSettings]]
+        self, unsaved: UnsavedResult, due: Sequence[tuple[QuantityName, LimitSettings]]
     ) -> None:
-        assert draft.batch is not None
+        assert unsaved.batch is not None
         for name, limits in due:
-            sample = QUANTITIES[name].sample_of(draft.result)
+            sample = QUANTITIES[name].sample_of(unsaved.result)
             if sample is None:
                 continue
             window = self._windows[name]
             latest_ns = window.samples[-1][0] if window.samples else 0
-            latest = self._latest_in_window(draft.batch, latest_ns)
+            latest = self._latest_in_window(unsaved.batch, latest_ns)
             found = window.add(sample, limits, latest)
             if found and (found.severity is not None or self._active.has(name)):
                 point = Point(found.value, *latest)
-                now = draft.batch["received"]
+                now = unsaved.batch["received"]
                 self._active.observe(name, found.severity, limits, point, now, found.worst)
 
     def _locked(self) -> Row | None:
@@ -243,11 +249,11 @@ _LAST_SAVED: dict[tuple[str, str], _SavedWindows] = {}
 _MAX_SAVED = 64
 
 
-def _mission(connection: Connection, draft: Draft) -> Mission:
-    """The mission that a draft was made with; one from another process has its digest alone."""
-    if draft.mission is not None:
-        return draft.mission
-    query = select(missions.c.settings).where(missions.c.digest == draft.result["mission_digest"])
+def _mission(connection: Connection, unsaved: UnsavedResult) -> Mission:
+    """The mission of an unsaved result; one from another process has its digest alone."""
+    if unsaved.mission is not None:
+        return unsaved.mission
+    query = select(missions.c.settings).where(missions.c.digest == unsaved.result["mission_digest"])
     return Mission.model_validate_json(connection.execute(query).scalar_one())
 
 

@@ -14,7 +14,7 @@ from service.storage.recording.identity import (
     look_up,
     stored_answers,
 )
-from service.storage.recording.unsaved_result import Answered, Draft, Row
+from service.storage.recording.unsaved_result import Answered, Row, UnsavedResult
 from service.storage.sql.access_tables import audit
 from service.storage.sql.statements import insert_all, insert_missing
 from service.storage.sql.tables import (
@@ -61,35 +61,35 @@ def set_run_alarms(connection: Connection, run: str, watched: bool, now: str) ->
 
 
 def record(
-    connection: Connection, drafts: Sequence[Draft], assume_new: bool = False
+    connection: Connection, unsaved_results: Sequence[UnsavedResult], assume_new: bool = False
 ) -> list[Outcome]:
-    """Record what is new among the drafts; one outcome each, in order.
+    """Record those results that are new; one outcome each, in order.
 
     Look, then insert: a submission that is already there, in the tables or
-    earlier among the drafts, gets the stored answer, and one whose identity or
+    earlier among the unsaved results, gets the stored answer, and one whose identity or
     key is taken by another body gets the error.  On PostgreSQL another process
     may still insert between the two: then an `IntegrityError` is raised, and
     to call again is to look again.
 
-    Who expects none of them to be there, having looked, calls them `assume_new`: the
-    tables are not asked.  Where one is there after all the same error is raised, for
+    With `assume_new` the tables are not searched first: the caller has done so and
+    found none of them.  If one is there after all, the same error is raised, since
     identities and keys are unique.
     """
     registry = Registry()
     if not assume_new:
         registry = look_up(
             connection,
-            {draft.identity for draft in drafts if draft.batch is not None},
-            {draft.key for draft in drafts if draft.key is not None},
+            {unsaved.identity for unsaved in unsaved_results if unsaved.batch is not None},
+            {unsaved.key for unsaved in unsaved_results if unsaved.key is not None},
         )
     keys_before = set(registry.keys)
     holders: list[ExistingResult | AcquisitionError] = [
-        _holder(draft, registry) for draft in drafts
+        _holder(unsaved, registry) for unsaved in unsaved_results
     ]
     fresh = [
-        (draft, draft.to_json(len(drafts)))
-        for draft, holder in zip(drafts, holders, strict=True)
-        if isinstance(holder, ExistingResult) and holder.result_id == draft.id
+        (unsaved, unsaved.to_json(len(unsaved_results)))
+        for unsaved, holder in zip(unsaved_results, holders, strict=True)
+        if isinstance(holder, ExistingResult) and holder.result_id == unsaved.id
     ]
     _insert(connection, fresh, assume_new)
     insert_all(
@@ -101,38 +101,42 @@ def record(
             if key not in keys_before
         ],
     )
-    answers = {draft.id: body for draft, body in fresh}
+    answers = {unsaved.id: body for unsaved, body in fresh}
     missing = {h.result_id for h in holders if isinstance(h, ExistingResult)} - answers.keys()
     if missing:
         answers |= stored_answers(connection, missing)
     return [
-        Answered(holder.result_id, answers[holder.result_id], holder.result_id != draft.id)
+        Answered(holder.result_id, answers[holder.result_id], holder.result_id != unsaved.id)
         if isinstance(holder, ExistingResult)
         else holder
-        for draft, holder in zip(drafts, holders, strict=True)
+        for unsaved, holder in zip(unsaved_results, holders, strict=True)
     ]
 
 
-def _holder(draft: Draft, registry: Registry) -> ExistingResult | AcquisitionError:
-    """Who holds what the draft asks for: an earlier result, or from now on the draft itself."""
-    if draft.batch is None:
-        return ExistingResult(draft.id, "")
+def _holder(unsaved: UnsavedResult, registry: Registry) -> ExistingResult | AcquisitionError:
+    """The holder of an identity and key: an earlier result, or from now on the unsaved one."""
+    if unsaved.batch is None:
+        return ExistingResult(unsaved.id, "")
     try:
-        first = registry.first(draft.identity, draft.key, draft.batch["fingerprint"])
+        first = registry.first(unsaved.identity, unsaved.key, unsaved.batch["fingerprint"])
     except AcquisitionError as error:
         return error
-    taken = first or ExistingResult(draft.id, draft.batch["fingerprint"])
-    registry.enter(draft.identity, draft.key, taken)
+    taken = first or ExistingResult(unsaved.id, unsaved.batch["fingerprint"])
+    registry.enter(unsaved.identity, unsaved.key, taken)
     return taken
 
 
-def _insert(connection: Connection, fresh: Sequence[tuple[Draft, bytes]], assume_new: bool) -> None:
+def _insert(
+    connection: Connection, fresh: Sequence[tuple[UnsavedResult, bytes]], assume_new: bool
+) -> None:
     # Sorted, so that two processes that insert the same batches do not wait in a circle.
     firsts = sorted(
-        ((draft, body) for draft, body in fresh if draft.batch is not None),
+        ((unsaved, body) for unsaved, body in fresh if unsaved.batch is not None),
         key=lambda each: each[0].identity,
     )
-    names = {draft.identity[1]: draft.batch["received"] for draft, _ in firsts if draft.batch}
+    names = {
+        unsaved.identity[1]: unsaved.batch["received"] for unsaved, _ in firsts if unsaved.batch
+    }
     # Also those of a transaction that was taken back.  The foreign key then refuses their batches,
     # and `transact`, to which nothing is `assume_new`, inserts the run.
     known: set[str] = connection.info.setdefault(_RUNS, set())
@@ -145,59 +149,63 @@ def _insert(connection: Connection, fresh: Sequence[tuple[Draft, bytes]], assume
         [{"name": name, "created": names[name], "alarms": False} for name in missing],
     )
     known.update(missing)
-    insert_all(connection, batches, [draft.batch for draft, _ in firsts if draft.batch])
-    insert_all(connection, frames, [draft.frame for draft, _ in firsts if draft.frame])
+    insert_all(connection, batches, [unsaved.batch for unsaved, _ in firsts if unsaved.batch])
+    insert_all(connection, frames, [unsaved.frame for unsaved, _ in firsts if unsaved.frame])
     _insert_results(connection, firsts)
-    rollups.add(connection, ((draft.buckets, draft.result) for draft, _ in firsts))
+    rollups.add(connection, ((unsaved.buckets, unsaved.result) for unsaved, _ in firsts))
     # What-ifs go one by one: of two that are adopted, the second supersedes the first.
     adopted = []
-    for draft, body in fresh:
-        if draft.batch is None:
-            if draft.result["current"]:
-                _supersede(connection, draft)
-                where = draft.buckets
+    for unsaved, body in fresh:
+        if unsaved.batch is None:
+            if unsaved.result["current"]:
+                _supersede(connection, unsaved)
+                where = unsaved.buckets
                 adopted.append((where.spacecraft, where.run, where.hour))
-            _insert_results(connection, [(draft, body)])
+            _insert_results(connection, [(unsaved, body)])
     rollups.renew(connection, adopted)
-    insert_all(connection, audit, [draft.audit for draft, _ in fresh if draft.audit is not None])
-    evaluate_limits(connection, [draft for draft, _ in firsts])
-    _note_events(connection, [draft for draft, _ in fresh])
+    insert_all(
+        connection, audit, [unsaved.audit for unsaved, _ in fresh if unsaved.audit is not None]
+    )
+    evaluate_limits(connection, [unsaved for unsaved, _ in firsts])
+    _note_events(connection, [unsaved for unsaved, _ in fresh])
 
 
-def _note_events(connection: Connection, fresh: Sequence[Draft]) -> None:
+def _note_events(connection: Connection, fresh: Sequence[UnsavedResult]) -> None:
     """Note what came: new batches once for each spacecraft and run, adopted results each."""
-    new: dict[tuple[str, str], list[Draft]] = {}
-    for draft in fresh:
-        spacecraft, run, _ = draft.identity
-        if draft.batch is not None:
-            new.setdefault((run, spacecraft), []).append(draft)
-        elif draft.result["current"]:
-            about = {"spacecraft": spacecraft, "run": run, "id": draft.id}
-            about["batch_id"] = draft.result["batch_id"]
+    new: dict[tuple[str, str], list[UnsavedResult]] = {}
+    for unsaved in fresh:
+        spacecraft, run, _ = unsaved.identity
+        if unsaved.batch is not None:
+            new.setdefault((run, spacecraft), []).append(unsaved)
+        elif unsaved.result["current"]:
+            about = {"spacecraft": spacecraft, "run": run, "id": unsaved.id}
+            about["batch_id"] = unsaved.result["batch_id"]
             events.note(connection, "adopted", about, run=run, spacecraft=spacecraft)
-    for (run, spacecraft), drafts in new.items():
-        latest = max(drafts, key=lambda draft: int(draft.result["time_ns"]))
+    for (run, spacecraft), unsaved_results in new.items():
+        latest = max(unsaved_results, key=lambda unsaved: int(unsaved.result["time_ns"]))
         assert latest.batch is not None
         newest: Row = {name: latest.batch[name] for name in ("id", "batch", "time")}
         newest |= {name: latest.result[name] for name in ("status", "reason")}
         newest["counts"] = latest.counts
-        note: Row = {"spacecraft": spacecraft, "run": run, "batches": len(drafts)}
+        note: Row = {"spacecraft": spacecraft, "run": run, "batches": len(unsaved_results)}
         note["latest"] = newest
         events.note(connection, "batches", note, run=run, spacecraft=spacecraft)
 
 
-def _insert_results(connection: Connection, drafts: Sequence[tuple[Draft, bytes]]) -> None:
+def _insert_results(
+    connection: Connection, unsaved_results: Sequence[tuple[UnsavedResult, bytes]]
+) -> None:
     # In order of their ids, which rise: each goes to the end of its table.
-    in_order = sorted(drafts, key=lambda each: each[0].id)
-    rows = [draft.result | {"answer": body.decode()} for draft, body in in_order]
+    in_order = sorted(unsaved_results, key=lambda each: each[0].id)
+    rows = [unsaved.result | {"answer": body.decode()} for unsaved, body in in_order]
     insert_all(connection, results, rows)
-    insert_all(connection, star_results, [row for draft, _ in in_order for row in draft.stars])
+    insert_all(connection, star_results, [row for unsaved, _ in in_order for row in unsaved.stars])
     insert_all(connection, solutions, [d.solution for d, _ in in_order if d.solution is not None])
 
 
-def _supersede(connection: Connection, draft: Draft) -> None:
-    """Let the current result of a batch stand no longer, so that the draft can take its place."""
-    batch_id = draft.result["batch_id"]
+def _supersede(connection: Connection, unsaved: UnsavedResult) -> None:
+    """Mark the current result of a batch as superseded by an unsaved one."""
+    batch_id = unsaved.result["batch_id"]
     # The lock on the batch orders the adoptions of several processes.
     connection.execute(select(batches.c.id).where(batches.c.id == batch_id).with_for_update())
     current = and_(results.c.batch_id == batch_id, results.c.current)

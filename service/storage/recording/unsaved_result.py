@@ -1,9 +1,9 @@
-"""A record in the making: everything of a result but the last number of its answer.
+"""A result that is computed but not recorded: all but the last number of its answer.
 
 The rows are taken from the answer itself, so that what a list or a trend says
-cannot differ from what the client was told.  Whoever drafts puts the answer into
-JSON as well: a worker's answer comes to whoever writes as one text and not as a
-hundred small objects.
+cannot differ from what the client was told.  The answer is put into JSON where it
+is computed: a worker sends it to the writer as one text instead of a hundred small
+objects.
 """
 
 import json
@@ -54,12 +54,12 @@ class Buckets(Struct, frozen=True):
     day: int
 
 
-class Draft(Struct, eq=False):
+class UnsavedResult(Struct, eq=False):
     """A result that is computed and not yet recorded.
 
     `batch` is the row of a first submission and None for a what-if.  `answer` is JSON
     and lacks the time that recording took.  `mission` is None where another process
-    made the draft.
+    made the unsaved result.
     """
 
     mission: Mission | None
@@ -82,9 +82,9 @@ class Draft(Struct, eq=False):
     audit: Row | None = None
     """The entry of the audit list that is stored with it, of a what-if that somebody recorded."""
 
-    def __reduce__(self) -> tuple[type["Draft"], tuple[Any, ...]]:
+    def __reduce__(self) -> tuple[type["UnsavedResult"], tuple[Any, ...]]:
         # To another process without what stands first, the settings of its mission: they are many.
-        return Draft, (None, *structs.astuple(self)[1:])
+        return UnsavedResult, (None, *structs.astuple(self)[1:])
 
     @property
     def id(self) -> str:
@@ -110,15 +110,15 @@ class Draft(Struct, eq=False):
         return b"%b%b%d%b" % (head, _RECORD, waited_ns // (1000 * together), tail)
 
 
-def submission_draft(
+def unsaved_submission(
     submission: Submission,
     acquisition: Acquisition,
     *,
     id: str,
     received: Utc,
     key: tuple[str, str] | None = None,
-) -> Draft:
-    """The draft of a batch's first result, which is current and gives the batch its id."""
+) -> UnsavedResult:
+    """The first result of a batch, which is current and gives the batch its id."""
     batch = acquisition.batch
     row = {
         "id": id,
@@ -145,14 +145,14 @@ def submission_draft(
     result = _result_row(
         acquisition, answer, batch_id=id, parent=None, current=True, created=received
     )
-    draft = _draft(acquisition, answer, row, result, key, received)
-    draft.is_ahead = is_ahead
+    unsaved = _unsaved_result(acquisition, answer, row, result, key, received)
+    unsaved.is_ahead = is_ahead
     if submission.frame is not None:
-        draft.frame = _frame_row(submission.frame, id)
-    return draft
+        unsaved.frame = _frame_row(submission.frame, id)
+    return unsaved
 
 
-def what_if_draft(
+def unsaved_what_if(
     acquisition: Acquisition,
     *,
     id: str,
@@ -160,30 +160,30 @@ def what_if_draft(
     parent: str,
     adopt: bool,
     created: Utc,
-) -> Draft:
-    """The draft of a further result of a batch, current if it is to be adopted."""
+) -> UnsavedResult:
+    """A further result of a batch, current if it is to be adopted."""
     answer = answer_of(acquisition, id=id, parent=parent, recorded=True)
     result = _result_row(
         acquisition, answer, batch_id=batch_id, parent=parent, current=adopt, created=created
     )
-    return _draft(acquisition, answer, None, result, None, created)
+    return _unsaved_result(acquisition, answer, None, result, None, created)
 
 
-def _draft(
+def _unsaved_result(
     acquisition: Acquisition,
     answer: Answer,
     batch_row: Row | None,
     result: Row,
     key: tuple[str, str] | None,
     received: Utc,
-) -> Draft:
+) -> UnsavedResult:
     batch = acquisition.batch
     stars = rows_of_stars(answer)
     buckets = Buckets(
         batch.spacecraft, batch.run, batch.time.bucket(HOUR_S), batch.time.bucket(DAY_S)
     )
     solution = _solution_row(acquisition, answer, result["id"])
-    return Draft(
+    return UnsavedResult(
         acquisition.mission,
         (batch.spacecraft, batch.run, batch.batch),
         msgspec.json.encode(answer),

@@ -1,4 +1,4 @@
-"""The database, open: who writes to it, and how to read from it."""
+"""An open database: one writer and many readers."""
 
 import logging
 import sqlite3
@@ -9,6 +9,7 @@ from sqlalchemy import Connection
 from sqlalchemy.exc import DBAPIError, TimeoutError
 
 from service.errors import Busy
+from service.storage.sql.connections import PersistentConnection
 from service.storage.sql.database_file import DatabaseFile
 from service.storage.sql.engines import (
     TO_COMMIT,
@@ -16,7 +17,6 @@ from service.storage.sql.engines import (
     TO_READ,
     TO_SHOW,
     TURN_S,
-    Kept,
     database_file,
     database_url,
     reading_engine,
@@ -33,7 +33,7 @@ _WAL_RESET_BUG = (3, 7, 0), (3, 51, 2)
 
 
 class Readers:
-    """Connections that see one moment of a database each, and cannot write."""
+    """Connections that see one snapshot of a database each, and cannot write."""
 
     def __init__(
         self,
@@ -52,41 +52,43 @@ class Readers:
         if self.file is not None:
             self.file.remember()
         self._readers = reading_engine(self.url, TO_SHOW if serving else None)
-        self._glancing = self._readers
+        self._lookup_engine = self._readers
         if serving and self.file is None:
-            self._glancing = reading_engine(self.url, TO_LOOK_UP, 1)
-        self._glances = Kept(self._glancing, TO_READ, self.file, TURN_S if serving else None)
+            self._lookup_engine = reading_engine(self.url, TO_LOOK_UP, 1)
+        self._lookup_connection = PersistentConnection(
+            self._lookup_engine, TO_READ, self.file, TURN_S if serving else None
+        )
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """A connection that sees one moment of the database and cannot write.
+        """A connection that sees one snapshot of the database and cannot write.
 
         Raises `Busy` where the database is out of reach or every reader taken.
         """
         if self.file is not None:
             self.file.require()
-        with _reported(), self._readers.connect() as connection, connection.begin():
+        with _unavailable_is_busy(), self._readers.connect() as connection, connection.begin():
             yield connection
 
     @contextmanager
-    def glancing(self) -> Iterator[Connection]:
-        """`reading` by prepared statements, each of which may see another moment.
+    def lookup(self) -> Iterator[Connection]:
+        """A connection for prepared look-ups, each of which may see another snapshot.
 
-        Others who glance wait for it.
+        Look-ups take turns.
         """
-        with _reported(), self._glances.looking() as connection:
+        with _unavailable_is_busy(), self._lookup_connection.lookup() as connection:
             yield connection
 
     def close(self) -> None:
         """Let go of the database."""
-        self._glances.close()
-        self._glancing.dispose()
+        self._lookup_connection.close()
+        self._lookup_engine.dispose()
         self._readers.dispose()
 
 
 @contextmanager
-def _reported() -> Iterator[None]:
-    """Say `Busy` of trouble with the database that may pass."""
+def _unavailable_is_busy() -> Iterator[None]:
+    """Raise `Busy` for a fault of the database that may pass."""
     try:
         yield
     except TimeoutError as error:

@@ -7,19 +7,19 @@ refused at once, whatever the busy timeout.
 """
 
 import sqlite3
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url
-from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError, SQLAlchemyError
+from sqlalchemy.exc import ArgumentError, NoSuchModuleError
 from sqlalchemy.pool import QueuePool
 
-from service.errors import BadConfiguration, Busy
-from service.storage.sql.database_file import DatabaseFile, FileIdentity
+from service.errors import BadConfiguration
+from service.storage.sql.connections import driver_of, run_by_driver
+from service.storage.sql.database_file import DatabaseFile
 
 BUSY_TIMEOUT_MS = 10_000
 WRITER_CACHE_KIB = 32_768
@@ -27,16 +27,16 @@ WRITER_CACHE_KIB = 32_768
 TO_WRITE, TO_READ = "BEGIN IMMEDIATE", "BEGIN"
 """How SQLite begins a transaction of the one connection that writes, and of a reader."""
 MAX_READERS = 16
-"""At once in a process; whoever finds none free waits for one.
+"""Readers at once in a process; others wait for a free one.
 
-PostgreSQL allows a hundred connections as it comes; of SQLite each keeps two megabytes
-of pages, and whoever computes beside it a page of answers.
+PostgreSQL allows a hundred connections by default; each of SQLite's keeps two megabytes
+of pages, and its reader a page of answers.
 """
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """How long a connection waits where somebody waits for the service to answer.
+    """How long a connection waits while a client waits for the answer.
 
     `lock_s` for a lock that another holds, `statement_s` for a statement; for the
     server's answer to it `MORE_S` longer.
@@ -116,10 +116,10 @@ def writing_engine(
     _check_place(Path(url.database or ""))
     engine = create_engine(url, poolclass=QueuePool, pool_size=1, max_overflow=0)
     _open_as_file(engine, file, create)
-    # What a savepoint may have to take back is kept in memory: a file would be made for each.
+    # Savepoints are journalled in memory: otherwise SQLite makes a file for each.
     kept = ("temp_store = MEMORY", f"cache_size = -{WRITER_CACHE_KIB}")
-    # The log goes into the file after a thousand pages, as SQLite has it: whoever writes waits for
-    # that, of four thousand 20 ms, and nothing is gained.
+    # SQLite's default checkpoint after a thousand pages stays: with four thousand the writer waits
+    # 20 ms for each, and nothing is gained.
     pragmas = ("journal_mode = WAL", "synchronous = FULL", *kept)
     _set_up_sqlite(engine, *pragmas, begin=TO_WRITE, bounds=bounds)
     return engine
@@ -220,44 +220,9 @@ def _set_up_sqlite(engine: Engine, *pragmas: str, begin: str, bounds: Bounds | N
 
     @event.listens_for(engine, "begin")
     def _begun(connection: Connection) -> None:
-        # Where `Kept` has begun, SQLAlchemy takes part in what is going on.
+        # If `PersistentConnection` has begun one, SQLAlchemy joins it.
         if not driver_of(connection).in_transaction:
-            _by_driver(connection, begin)
-
-
-def driver_of(connection: Connection) -> sqlite3.Connection:
-    """The driver's connection to SQLite."""
-    driver = connection.connection.driver_connection
-    assert isinstance(driver, sqlite3.Connection)
-    return driver
-
-
-class Reported:
-    """What SQLite's driver says against a statement is raised as SQLAlchemy would.
-
-    A class, since there is one about every statement, and `contextmanager` takes longer.
-    """
-
-    __slots__ = ("_connection", "_sql")
-
-    def __init__(self, connection: Connection, sql: str) -> None:
-        self._connection, self._sql = connection, sql
-
-    def __enter__(self) -> sqlite3.Connection:
-        return driver_of(self._connection)
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: object
-    ) -> None:
-        if isinstance(error, sqlite3.Error):
-            raise DBAPIError.instance(
-                self._sql, None, error, sqlite3.Error, dialect=self._connection.dialect
-            ) from error
-
-
-def _by_driver(connection: Connection, sql: str) -> None:
-    with Reported(connection, sql) as driver:
-        driver.execute(sql)
+            run_by_driver(connection, begin)
 
 
 @contextmanager
@@ -274,130 +239,3 @@ def patience(connection: Connection) -> Iterator[None]:
         yield
     finally:
         driver.answer_s = answer_s
-
-
-class TakenBack(Exception):
-    """Ends a transaction that is to leave nothing behind, and with which nothing is wrong."""
-
-
-class Kept:
-    """A connection to SQLite that stays open between its transactions, one at a time.
-
-    To take one out of a pool and put it back takes as long as to look a batch
-    up, and so do SQLAlchemy's own steps about a transaction: SQLite's driver is
-    told by itself when one begins and ends.  A connection to a server comes from
-    the pool each time, which sees whether it is still there.
-    """
-
-    def __init__(
-        self,
-        engine: Engine,
-        begin: str,
-        file: DatabaseFile | None = None,
-        turn_s: float | None = None,
-    ) -> None:
-        """`begin` is SQLite's statement for it, `file` must stay the same.
-
-        Who waits for `turn_s` while others use it gets `Busy`.
-        """
-        self._engine = engine
-        self._begin = begin
-        self._file = file
-        self._log: FileIdentity | None = None
-        self._turn_s = -1.0 if turn_s is None else turn_s
-        self._is_sqlite = engine.dialect.name == "sqlite"
-        self._lock = threading.Lock()
-        self._open: Connection | None = None
-
-    @contextmanager
-    def transaction(self) -> Iterator[Connection]:
-        """A transaction, committed at the end; after an error the connection is given up.
-
-        After `TakenBack` it is not: nothing is wrong with it.
-        """
-        with self._given() as connection:
-            self._start(connection)
-            log = self._log
-            try:
-                yield connection
-                self._end(connection, keep=True)
-            except TakenBack:
-                self._end(connection, keep=False)
-                raise
-            except BaseException:
-                # Closed while an answer is half read, a connection would keep its lock.
-                with suppress(SQLAlchemyError):
-                    self._end(connection, keep=False)
-                raise
-        # What went into a file that is not there any more shall not be acknowledged.
-        if self._file is not None:
-            self._file.require_log(log)
-
-    @contextmanager
-    def looking(self) -> Iterator[Connection]:
-        """A connection to read by; on SQLite each statement of `prepared` sees its own moment."""
-        with self._given() as connection:
-            if not self._is_sqlite:
-                connection.begin()
-            yield connection
-            # SQLAlchemy begins one for what it is asked itself.
-            if connection.in_transaction():
-                connection.rollback()
-
-    @contextmanager
-    def _given(self) -> Iterator[Connection]:
-        if not self._lock.acquire(timeout=self._turn_s):
-            raise Busy("too many requests wait for the database", 1)
-        try:
-            with self._used() as connection:
-                yield connection
-        finally:
-            self._lock.release()
-
-    @contextmanager
-    def _used(self) -> Iterator[Connection]:
-        if self._file is not None:
-            self._file.require()
-        connection = self._open or self._engine.connect()
-        self._open = None
-        try:
-            yield connection
-        except TakenBack:
-            self._keep(connection)
-            raise
-        except BaseException:
-            # The next transaction shall not inherit what this one broke.
-            connection.invalidate()
-            connection.close()
-            raise
-        self._keep(connection)
-
-    def _keep(self, connection: Connection) -> None:
-        if self._is_sqlite:
-            self._open = connection
-        else:
-            connection.close()
-
-    def _start(self, connection: Connection) -> None:
-        if self._is_sqlite:
-            _by_driver(connection, self._begin)
-            if self._file is not None:
-                self._log = self._file.log_identity()
-        else:
-            connection.begin()
-
-    def _end(self, connection: Connection, *, keep: bool) -> None:
-        # On SQLite SQLAlchemy takes part once it was asked for something.
-        if not connection.in_transaction():
-            _by_driver(connection, "COMMIT" if keep else "ROLLBACK")
-        elif keep:
-            connection.commit()
-        else:
-            connection.rollback()
-
-    def close(self) -> None:
-        """Give the connection back."""
-        with self._lock:
-            if self._open is not None:
-                self._open.close()
-                self._open = None

@@ -1,10 +1,9 @@
 """Statements that are put into SQL once and run many times.
 
-SQLAlchemy works out the SQL of a statement at every execution, and reads every
-answer through its own rows.  With a dozen statements for each group of results
-that takes longer than running them.  On SQLite what is ready goes to the driver
-itself, its values by place; on PostgreSQL through SQLAlchemy, its values by
-name.
+SQLAlchemy compiles a statement at every execution and wraps every row.  With a
+dozen statements for each group of results that takes longer than running them.
+On SQLite the compiled text goes to the driver directly, with values by position;
+on PostgreSQL through SQLAlchemy, with values by name.
 """
 
 import sqlite3
@@ -16,7 +15,7 @@ from typing import Any
 from sqlalchemy import Connection, Executable
 from sqlalchemy.dialects import postgresql, sqlite
 
-from service.storage.sql.engines import Reported
+from service.storage.sql.connections import TranslatedErrors
 
 Row = dict[str, Any]
 
@@ -44,7 +43,7 @@ class Prepared:
             connection.exec_driver_sql(sql, list(rows))
             return
         take = itemgetter(*names)
-        with Reported(connection, sql) as driver:
+        with TranslatedErrors(connection, sql) as driver:
             driver.executemany(sql, map(take, rows) if len(names) > 1 else zip(map(take, rows)))
 
     def insert(self, connection: Connection, rows: Sequence[Row]) -> None:
@@ -59,7 +58,7 @@ class Prepared:
         sql, names = self._sql("sqlite")
         values = list(map(itemgetter(*names), rows))
         done = 0
-        with Reported(connection, sql) as driver:
+        with TranslatedErrors(connection, sql) as driver:
             for count in ROWS_AT_ONCE:
                 while len(values) - done >= count:
                     part = values[done : done + count]
@@ -82,7 +81,7 @@ class Prepared:
         if connection.dialect.name != "sqlite":
             found = connection.exec_driver_sql(sql, values)
             return [dict(row) for row in found.mappings()]
-        with Reported(connection, sql) as driver:
+        with TranslatedErrors(connection, sql) as driver:
             cursor = driver.execute(sql, [values[name] for name in names])
             rows = cursor.fetchall()
             return [dict(zip(_names(cursor), row, strict=True)) for row in rows]
@@ -108,7 +107,7 @@ def execute(connection: Connection, sql: str, values: Row | None = None) -> list
     if connection.dialect.name != "sqlite":
         result = connection.exec_driver_sql(sql, values or {})
         return [tuple(row) for row in result] if result.returns_rows else []
-    with Reported(connection, sql) as driver:
+    with TranslatedErrors(connection, sql) as driver:
         return driver.execute(sql, values or {}).fetchall()
 
 

@@ -19,7 +19,7 @@ from sqlalchemy.exc import (
 
 from service.storage.recording import events
 from service.storage.recording.results import Outcome, record
-from service.storage.recording.unsaved_result import Draft
+from service.storage.recording.unsaved_result import UnsavedResult
 from service.storage.sql.prepared import execute
 
 Results = list[Outcome | Exception]
@@ -33,7 +33,7 @@ class QueuedJob:
 
     settle: Callable[[Any], object]
     """Called with the `Results`, with what the change returns, or with an error."""
-    drafts: Sequence[Draft] = ()
+    unsaved_results: Sequence[UnsavedResult] = ()
     change: Callable[[Connection], Any] | None = None
     low_priority: bool = False
     """As a bulk load has: it is written by itself, after what else waits."""
@@ -42,7 +42,7 @@ class QueuedJob:
     @property
     def weight(self) -> int:
         """How much there is to write."""
-        return len(self.drafts) or 1
+        return len(self.unsaved_results) or 1
 
 
 def transact(connection: Connection, jobs: Sequence[QueuedJob], careful: bool) -> list[Any]:
@@ -53,30 +53,30 @@ def transact(connection: Connection, jobs: Sequence[QueuedJob], careful: bool) -
     transaction.  A `careful` try finds what is recorded, and keeps each failure to itself.
     """
     with events.numbered(connection):
-        drafts = [draft for job in jobs for draft in job.drafts]
+        unsaved_results = [unsaved for job in jobs for unsaved in job.unsaved_results]
         recorded: Sequence[Outcome | Exception]
         if careful:
-            recorded = _record(connection, drafts)
+            recorded = _record(connection, unsaved_results)
         else:
-            recorded = record(connection, drafts, assume_new=True)
+            recorded = record(connection, unsaved_results, assume_new=True)
         outcomes = iter(recorded)
         return [
-            [next(outcomes) for _ in job.drafts]
+            [next(outcomes) for _ in job.unsaved_results]
             if job.change is None
             else _change(connection, job.change, careful)
             for job in jobs
         ]
 
 
-def _record(connection: Connection, drafts: Sequence[Draft]) -> Results:
-    """All drafts together; where that fails, each by itself, so that one spoils no other."""
-    if not drafts:
+def _record(connection: Connection, unsaved_results: Sequence[UnsavedResult]) -> Results:
+    """Record all together; if that fails, each by itself, so that one fails no other."""
+    if not unsaved_results:
         return []
     failure: Exception
     for _ in range(MAX_LOOKS):
         try:
             with _savepoint(connection):
-                return list(record(connection, drafts))
+                return list(record(connection, unsaved_results))
         except IntegrityError as error:
             failure = error  # perhaps another process was faster: look again
         except Exception as error:
@@ -84,9 +84,9 @@ def _record(connection: Connection, drafts: Sequence[Draft]) -> Results:
                 raise
             failure = error
             break
-    if len(drafts) == 1:
+    if len(unsaved_results) == 1:
         return [failure]
-    return [outcome for draft in drafts for outcome in _record(connection, [draft])]
+    return [outcome for unsaved in unsaved_results for outcome in _record(connection, [unsaved])]
 
 
 def _change(connection: Connection, change: Callable[[Connection], Any], careful: bool) -> Any:

@@ -19,9 +19,10 @@ from sqlalchemy import Connection, Engine, update
 from sqlalchemy.exc import DBAPIError
 
 from service.errors import Busy, Stopping
-from service.storage.recording.unsaved_result import Draft, Row
+from service.storage.recording.unsaved_result import Row, UnsavedResult
+from service.storage.sql.connections import PersistentConnection, RolledBack
 from service.storage.sql.database_file import DatabaseFile
-from service.storage.sql.engines import TO_WRITE, Kept, TakenBack, patience
+from service.storage.sql.engines import TO_WRITE, patience
 from service.storage.sql.tables import WRITTEN_BY_POSTS, event_counter
 from service.storage.sql.transaction import QueuedJob, Results, is_of_the_database, transact
 
@@ -53,7 +54,7 @@ class Writer:
 
         Those of a bulk load, and other changes, wait as long as it takes.
         """
-        self._connection = Kept(engine, TO_WRITE, file)
+        self._connection = PersistentConnection(engine, TO_WRITE, file)
         self._max_queued = max_queued
         self._wait_s = wait_s
         self._failures = 0
@@ -71,7 +72,7 @@ class Writer:
 
     def queue(
         self,
-        drafts: Sequence[Draft],
+        unsaved_results: Sequence[UnsavedResult],
         settle: Callable[[Results | Exception], object],
         low_priority: bool = False,
     ) -> None:
@@ -82,12 +83,14 @@ class Writer:
         order: an answer, stored, or the error that kept this result, and no other, from
         being recorded.  Where the database itself fails it is called with `Busy`.
         """
-        self._put(QueuedJob(settle, drafts, low_priority=low_priority))
+        self._put(QueuedJob(settle, unsaved_results, low_priority=low_priority))
 
-    def record(self, drafts: Sequence[Draft], low_priority: bool = False) -> "Future[Results]":
+    def record(
+        self, unsaved_results: Sequence[UnsavedResult], low_priority: bool = False
+    ) -> "Future[Results]":
         """`queue` with a future that gives the outcomes, or raises `Busy`."""
         done: Future[Results] = Future()
-        self.queue(drafts, _settling(done), low_priority)
+        self.queue(unsaved_results, _settling(done), low_priority)
         return done
 
     def change(self, change: Callable[[Connection], T]) -> "Future[T]":
@@ -210,7 +213,7 @@ class Writer:
         if self._wait_s is None:
             return jobs
         since_s = time.monotonic() - self._wait_s
-        late = [j for j in jobs if j.since_s < since_s and j.drafts and not j.low_priority]
+        late = [j for j in jobs if j.since_s < since_s and j.unsaved_results and not j.low_priority]
         if not late:
             return jobs
         self.note_failure(sum(job.weight for job in late))
@@ -225,7 +228,7 @@ class Writer:
             try:
                 with self._transaction(jobs) as connection:
                     return self._transact(connection, jobs, careful=attempt > 1)
-            except TakenBack:
+            except RolledBack:
                 pass
             except DBAPIError as error:
                 if getattr(error.orig, "sqlstate", None) not in _CROSSED or attempt == MAX_ATTEMPTS:
@@ -241,7 +244,7 @@ class Writer:
             if careful or is_of_the_database(error):
                 raise
             log.debug("a transaction is made again, with care: %s", type(error).__name__)
-            raise TakenBack from error
+            raise RolledBack from error
 
     @contextmanager
     def _transaction(self, jobs: Sequence[QueuedJob]) -> Iterator[Connection]:

@@ -1,4 +1,4 @@
-"""Drafts: all of a result but the time that recording took, in whichever process they were made."""
+"""Unsaved results: all but the time that recording took, in whichever process they were made."""
 
 import json
 import pickle
@@ -11,23 +11,23 @@ from tests.storage import samples
 
 
 @pytest.fixture
-def draft(app, make):
-    """Drafts what `make` makes."""
+def unsaved(app, make):
+    """The unsaved result of what `make` makes."""
     return lambda *named, **wanted: app.submissions.ingest.solver.solve(make(*named, **wanted))
 
 
 @pytest.mark.parametrize("kind", samples.KINDS)
-def test_a_draft_comes_from_another_process_whole_but_for_its_mission(draft, kind):
-    made = draft(kind=kind)
+def test_a_draft_comes_from_another_process_whole_but_for_its_mission(unsaved, kind):
+    made = unsaved(kind=kind)
     (come,) = pickle.loads(pickle.dumps([made], pickle.HIGHEST_PROTOCOL))
     assert come.mission is None
     come.mission = made.mission
     assert structs.asdict(come) == structs.asdict(made)
 
 
-def test_drafts_that_come_together_are_small(draft):
+def test_drafts_that_come_together_are_small(unsaved):
     """What they are made of has one name for all of them."""
-    together = [draft(f"b{k}", after_s=60.0 * k) for k in range(2 * PACKED_TOGETHER)]
+    together = [unsaved(f"b{k}", after_s=60.0 * k) for k in range(2 * PACKED_TOGETHER)]
     packs = _packed(together)
     assert [len(pickle.loads(pack)) for pack in packs] == [PACKED_TOGETHER] * 2
     alone = sum(len(pack) for each in together for pack in _packed([each]))
@@ -47,9 +47,9 @@ def test_what_is_large_comes_alone():
 
 @pytest.mark.parametrize("name", ['"record":null', '{"timings_us":{"record":null}}', "\\"])
 def test_the_time_of_recording_has_its_place_whatever_a_client_calls_its_batch(
-    app, make, draft, name
+    app, make, unsaved, name
 ):
-    made = draft(name)
+    made = unsaved(name)
     drafted = json.loads(made.answer)
     assert drafted["timings_us"].pop("record") is None
     (answered,) = app.submissions.submit_many([make(name, run="again")])
