@@ -21,6 +21,8 @@ from service.web.raw_responses import MAX_FIELDS, MAX_HEAD_BYTES, RAW_RESPONSES
 
 MAX_PIPELINED = 128
 """Requests that wait on one connection until the one before them is answered."""
+PIPELINED_PAUSE_S = 0.01
+"""Before each of them is begun: a connection that is full of requests leaves time for others."""
 READ_BYTES = 16 << 10
 """The most that is read at a time: a connection holds no more that the app has not asked for."""
 
@@ -147,6 +149,8 @@ class _Http(HttpToolsProtocol):
     _is_over = False
     """Nothing that still arrives is looked at."""
     _answering: RequestResponseCycle | None = None
+    _in_pipeline = False
+    """Whether the request that begins has waited behind another one."""
     _in_body = False
     _section_bytes = _fields = 0
     """Of the head or the trailers, as far as the parser has reported them."""
@@ -281,7 +285,9 @@ class _Http(HttpToolsProtocol):
             super().on_message_complete()
 
     def on_response_complete(self) -> None:
+        self._in_pipeline = True
         super().on_response_complete()
+        self._in_pipeline = False
         # Of a pipelined request the head is there already.
         if self.cycle.response_complete:
             self._no_head_since_s = self.loop.time()
@@ -289,7 +295,10 @@ class _Http(HttpToolsProtocol):
 
     def _start_asgi_task(self, cycle: RequestResponseCycle, app: ASGI3Application) -> None:
         self._answering = cycle
-        super()._start_asgi_task(cycle, app)
+        if self._in_pipeline:
+            self.loop.call_later(PIPELINED_PAUSE_S, super()._start_asgi_task, cycle, app)
+        else:
+            super()._start_asgi_task(cycle, app)
 
     def _unsupported_upgrade_warning(self) -> None:
         """A request to upgrade is answered as one without: no client shall fill the log."""
