@@ -2,7 +2,7 @@
 
     python -m benchmarks                       those of speed, ten minutes: `make bench`
     python -m benchmarks --all                 those of answers as well
-    python -m benchmarks staircase --quick     one, on a small sample
+    python -m benchmarks pipeline --quick      one, on a small sample
 
 The exit code is 1 where a result is out of its bounds.
 """
@@ -17,9 +17,9 @@ from benchmarks.report import Report
 from benchmarks.speed import (
     kernels,
     performance,
+    pipeline,
     posts,
     soak,
-    staircase,
     stored,
     verified_cost,
 )
@@ -45,7 +45,7 @@ from benchmarks.validation.pictures import blind, calibrations
 
 BENCHMARKS: dict[str, Callable[[bool, int], Report]] = {
     "zone_counts": zone_counts.run,
-    "staircase": staircase.run,
+    "pipeline": pipeline.run,
     "aberration": aberration.run,
     "covariance": covariance.run,
     "consistency": consistency.run,

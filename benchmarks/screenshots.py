@@ -29,7 +29,7 @@ from tests.web.serving import Server
 
 FOLDER = Path(__file__).parents[1] / "docs" / "images"
 DOCUMENT = FOLDER.parent / "operators.md"
-HEADING = "## Every page, wide and narrow, light and dark"
+HEADING = "## All pages: wide and narrow, light and dark"
 RUN = "sample-pass"
 BATCHES = 240
 START = "1999-03-01T00:00:00.000Z"

@@ -37,6 +37,7 @@ from benchmarks.validation import (
     plain_reference,
     ptp,
     spurious,
+    two_groups,
     whole_sky,
     zone_counts,
 )
@@ -48,6 +49,7 @@ SECTIONS: Mapping[str, Section] = {
     "identification": plain_reference.SECTION,
     "paper": paper_runs.SECTION,
     "spurious": spurious.SECTION,
+    "two_groups": two_groups.SECTION,
     "calibration": calibration.SECTION,
     "whole_sky": whole_sky.SECTION,
     "verified_cost": verified_cost.SECTION,

@@ -11,34 +11,44 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import httpx
+import msgspec
 
+from service.acquire.kernel_build import KernelBuild
 from service.errors import BadConfiguration, BadInput, Busy, Fault
+from service.ingest.kernel_progress import kernel_progress
 from service.missions.mission import load_missions
 from service.replay.items import items_of
 from service.replay.over_http import replay_over_http
 from service.replay.summary import ReplaySummary
 from service.settings import PREFIX, Settings
 from service.simulate.files import read_objects, truth_path, write_pass
-from service.simulate.score import score
+from service.simulate.score import Score, score, together
 from service.simulate.score_table import table
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
+from service.times import HOUR_S
 from service.web.ports import require_free, url_of
 
 MISSIONS = ("XTE", "SWAS", "SOHO")
+START = "1999-03-01T00:00:00.000Z"
+"""Of every pass: a day on which all three were at work."""
+WIDTH_S = 20 * HOUR_S
+"""How long a pass lasts: within the day that the console shows first."""
 START_S = 300.0
-"""The longest that the server may take to be ready: the first time it compiles."""
+"""The longest that the server may take to be ready once its kernels are compiled."""
+COMPILING_S = 1800.0
+"""The longest that the compiling may take: minutes, more where other work has the processors."""
 COMPILES_AFTER_S = 5.0
-"""A start that takes longer than this is a first one."""
+"""From then on it is said what a start waits for."""
 PROGRESS_EVERY_S = 10.0
 """How often progress is printed without a terminal."""
 STOP_S = 15.0
@@ -47,8 +57,17 @@ CONCURRENCY = 2
 """Posts at a time: more would only wait for each other and swell the times that are shown."""
 
 
-def run_demo(folder: Path, settings: Settings, batches: int, seed: int, once: bool) -> int:
+def run_demo(
+    folder: Path,
+    settings: Settings,
+    batches: int,
+    seed: int,
+    once: bool,
+    as_json: bool = False,
+) -> int:
     """Serve, replay and print; then keep serving until interrupted, unless `once`.
+
+    `as_json` prints the table's figures as JSON in its place and nothing else.
 
     Raises `BadInput` for a pass that cannot be, `BadConfiguration` where the
     port is taken or the server does not start.
@@ -57,7 +76,7 @@ def run_demo(folder: Path, settings: Settings, batches: int, seed: int, once: bo
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         # A script that starts this with & ignores the signal: only a kill would end it.
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    wanted = Pass(batches, seed)
+    wanted = Pass(batches, seed, START, WIDTH_S / batches)
     if settings.port == 0:
         raise BadInput(Fault("--port", "must be a port that can be named", "0"))
     folder.mkdir(parents=True, exist_ok=True)
@@ -84,23 +103,60 @@ def run_demo(folder: Path, settings: Settings, batches: int, seed: int, once: bo
                     watched_run=run,
                 )
             scores[name] = score(read_objects(results), read_objects(truth_path(file)))
-        print(table(scores))
-        print()
         whole_s = time.perf_counter() - started
-        print(f"That took {whole_s:.1f} s, {ready_s:.1f} s of them until the server was ready.")
-        print("Where to look next:")
-        for place, what in _where_next(url, run, folder, settings, once):
-            print(f"  {place}\n      {what}")
+        if as_json:
+            seconds = {"seconds": whole_s, "seconds_until_ready": ready_s}
+            _print_json({"run": run, "url": url, **seconds, "scores": rows_of(scores)})
+        else:
+            print(table(scores))
+            print()
+            print(f"That took {whole_s:.1f} s, {ready_s:.1f} s of them until the server was ready.")
+            print("Where to look next:")
+            for place, what in _where_next(url, run, folder, settings, once):
+                print(f"  {place}\n      {what}")
         sys.stdout.flush()
         if once:
             return 0
-        print(f"\nServing on {url} until Ctrl-C.", flush=True)
+        told = sys.stderr if as_json else sys.stdout
+        print(f"\nServing on {url} until Ctrl-C.", file=told, flush=True)
         with suppress(KeyboardInterrupt):
             # A terminal's Ctrl-C reaches the server too, which may stop first.
             if server.wait() not in STOPPED_EXIT_CODES:
                 raise Busy(f"the server stopped by itself; see {folder / 'server.log'}")
-        print("stopped")
+        print("stopped", file=told)
         return 0
+
+
+def rows_of(scores: Mapping[str, Mapping[str, Score]]) -> list[dict[str, Any]]:
+    """The table's rows as plain values; a figure without batches is NaN."""
+    rows = []
+    for name, stretches in scores.items():
+        serious = together(each for kind, each in stretches.items() if kind != "nominal")
+        for kind, of in (("nominal", stretches.get("nominal", Score())), ("serious", serious)):
+            rows.append(
+                {
+                    "spacecraft": name,
+                    "kind": kind,
+                    "batches": of.batches,
+                    "refused": of.refused,
+                    "stars": of.stars["observed"],
+                    **{
+                        f"{word}_percent": of.percent(word)
+                        for word in ("unique", "ambiguous", "unmatched", "wrong")
+                    },
+                    "attitudes": of.attitudes,
+                    "error_arcsec": of.seen_sigma_arcsec,
+                    "sigma_arcsec": of.predicted_sigma_arcsec,
+                    "within_percent": of.within_percent,
+                    "solve_us": of.median_solving_us,
+                    "whole_us": of.median_whole_us,
+                }
+            )
+    return rows
+
+
+def _print_json(value: Any) -> None:
+    print(msgspec.json.format(msgspec.json.encode(value), indent=1).decode())
 
 
 def _where_next(
@@ -183,9 +239,13 @@ def _interrupt(number: int, frame: object) -> None:
 
 
 def _wait_until_ready(server: subprocess.Popen[bytes], url: str, log: Path) -> None:
-    start = time.monotonic()
+    start = compiled = time.monotonic()
     with httpx.Client(base_url=url, timeout=START_S, trust_env=False) as client, _Waiting() as wait:
-        while (waited_s := time.monotonic() - start) < START_S:
+        while (waited_s := time.monotonic() - start) < COMPILING_S:
+            if KernelBuild().is_needed:
+                compiled = time.monotonic()
+            elif time.monotonic() - compiled > START_S:
+                break
             if server.poll() is not None:
                 output = log.read_text(encoding="utf-8", errors="replace").strip()
                 raise BadConfiguration(f"the server did not start:\n{output}")
@@ -196,7 +256,7 @@ def _wait_until_ready(server: subprocess.Popen[bytes], url: str, log: Path) -> N
                 pass
             wait.show(waited_s)
             time.sleep(0.1)
-    raise Busy(f"the server at {url} is not ready after {START_S:.0f} s; see {log}")
+    raise Busy(f"the server at {url} is not ready after {waited_s:.0f} s; see {log}")
 
 
 class _Waiting:
@@ -210,16 +270,19 @@ class _Waiting:
     def show(self, waited_s: float) -> None:
         """Show how long the start has taken."""
         line = f"the server is starting: {waited_s:.0f} s"
-        if waited_s >= COMPILES_AFTER_S:
-            line += (
-                "; a machine's first start compiles for two to three minutes, later ones are quick"
-            )
+        if waited_s >= COMPILES_AFTER_S and self._compiles():
+            line += f"; {kernel_progress().line(waited_s)} (only the first start compiles)"
         if self._moves:
             print(f"\r{line:<{self._shown}}", end="", file=sys.stderr, flush=True)
             self._shown = len(line)
         elif waited_s >= self._next_s:
             print(line, file=sys.stderr, flush=True)
             self._next_s += PROGRESS_EVERY_S
+
+    @staticmethod
+    def _compiles() -> bool:
+        """Whether the server, which has this process's cache, is still compiling its kernels."""
+        return KernelBuild().is_needed
 
     def __enter__(self) -> Self:
         return self

@@ -29,7 +29,7 @@ _NUMBER = re.compile(r"\d+")
 
 
 @dataclass
-class About:
+class RequestContext:
     """The request that is worked on: its id, who asks (a token's name), and the run it names."""
 
     id: str
@@ -37,7 +37,7 @@ class About:
     run: str | None = None
 
 
-request: ContextVar[About | None] = ContextVar("request", default=None)
+request: ContextVar[RequestContext | None] = ContextVar("request", default=None)
 """What the lines written meanwhile belong to, also in threads that handlers run in."""
 
 
@@ -196,7 +196,7 @@ class _Lines(logging.Formatter):
     def fields(self, record: logging.LogRecord) -> dict[str, object]:
         """The fields of a line, in order; those that have no value are left out."""
         seconds = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
-        about: About | None = getattr(record, "about", request.get())
+        about: RequestContext | None = getattr(record, "about", request.get())
         told: dict[str, object | None] = {
             "time": f"{seconds}.{int(record.msecs):03d}Z",
             "level": record.levelname.lower(),

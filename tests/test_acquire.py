@@ -1,4 +1,4 @@
-"""The staircase from a batch to an attitude, end to end, by hand and on the real sky."""
+"""The pipeline from a batch to an attitude, end to end, by hand and on the real sky."""
 
 import copy
 import json

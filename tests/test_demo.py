@@ -1,5 +1,6 @@
 """The demonstration: from nothing to a table against truth, the same the second time."""
 
+import json
 import random
 import re
 import signal
@@ -8,10 +9,13 @@ import subprocess
 import sys
 
 import httpx
+import numba
 import pytest
 
 from service import demo as demonstration
+from service.acquire.kernel_build import mark_built
 from service.demo import MISSIONS
+from service.ingest.kernel_progress import KERNEL_BYTES
 from service.simulate.files import read_objects, truth_path
 from service.simulate.score import Score, score
 from service.simulate.score_table import table
@@ -71,6 +75,24 @@ def test_nominal_stretches_are_identified_and_the_errors_are_as_predicted(tmp_pa
     assert "docs/quickstart.md" in done.stdout
 
 
+def test_all_missions_fly_on_one_day_and_the_figures_come_as_json_too(tmp_path):
+    done = demo(tmp_path, "--batches", 12, "--json")
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert [(row["spacecraft"], row["kind"]) for row in told["scores"]] == [
+        (name, kind) for name in MISSIONS for kind in ("nominal", "serious")
+    ]
+    assert all(row["batches"] in (2, 10) for row in told["scores"])
+    assert told["run"].startswith("demo-")
+    times = [
+        [each["time"] for each in read_objects(tmp_path / f"{name.lower()}.ndjson")]
+        for name in MISSIONS
+    ]
+    assert times[0] == times[1] == times[2]
+    # Within the day that the console shows first.
+    assert times[0][0][:10] == times[0][-1][:10]
+
+
 def test_a_second_time_nothing_is_new_and_the_table_is_the_same(tmp_path):
     first, second = (demo(tmp_path, "--batches", 12) for _ in range(2))
     assert first.returncode == second.returncode == 0
@@ -115,7 +137,12 @@ def test_it_keeps_serving_until_it_is_told_to_stop_and_takes_its_server_with_it(
         httpx.get(f"{url}/livez", trust_env=False)
 
 
-def test_a_long_start_is_told_on_a_moving_line_or_now_and_then(monkeypatch, capsys):
+def test_a_long_start_is_told_on_a_moving_line_or_now_and_then(monkeypatch, capsys, tmp_path):
+    # A cache in which compiling has begun.
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    (tmp_path / "hypotheses_1").mkdir()
+    (tmp_path / "hypotheses_1" / "search.1.nbc").write_bytes(bytes(KERNEL_BYTES // 4))
+
     def said(terminal):
         monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
         with demonstration._Waiting() as waiting:
@@ -128,6 +155,10 @@ def test_a_long_start_is_told_on_a_moving_line_or_now_and_then(monkeypatch, caps
     assert "\n" not in moving
     assert moving.count("the server is starting") == 5
     assert moving.count("first start compiles") == 3
+    # A quarter is done after 16 s: step, share and time left.
+    assert "compiling kernels, verified identification: 25 %, about 48 s left" in moving
+    mark_built()
+    assert "compil" not in said(True)
     assert moving.endswith(" \r")
 
 

@@ -100,7 +100,7 @@ def test_a_text_of_a_client_begins_no_line_and_moves_no_cursor(written):
 
 def test_json_is_an_object_a_line_with_the_request_it_belongs_to(written):
     logger, stream = written(logs.JsonLines)
-    held = logs.request.set(logs.About("r-1", "J. Operator", "pass-7"))
+    held = logs.request.set(logs.RequestContext("r-1", "J. Operator", "pass-7"))
     try:
         logger.warning("of a request")
     finally:

@@ -1,4 +1,4 @@
-"""The staircase without a prior, or with a wrong one: the whole sky, and the path that says so."""
+"""The pipeline without a prior, or with a wrong one: the whole sky, and the path that says so."""
 
 import json
 import math

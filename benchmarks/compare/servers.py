@@ -52,7 +52,9 @@ def checked_out(commit: str) -> Path:
 
 def compile_kernels(tree: Path) -> None:
     """Compile what the first requests would wait for: minutes, or seconds when it was done."""
-    subprocess.run([sys.executable, "-m", "service.warm"], cwd=tree, env=_environment(), check=True)
+    here = (tree / "service" / "acquire" / "prewarm.py").exists()
+    module = "service.acquire.prewarm" if here else "service.warm"  # as it was called before
+    subprocess.run([sys.executable, "-m", module], cwd=tree, env=_environment(), check=True)
 
 
 @contextmanager

@@ -88,8 +88,10 @@ def asked_of(app: App) -> list[Asked]:
             "Spacecraft",
             "worst batches of a month",
             PAGE_MS,
-            lambda: app.spacecraft.worst_batches(
-                SPACECRAFT, by="ambiguous_share", start=first, end=latest
+            lambda: (
+                app.spacecraft.ranking(
+                    SPACECRAFT, by="ambiguous_share", start=first, end=latest
+                ).items
             ),
             lambda found: found[0].value == _worst(app, first, latest) and len(found) == 20,
         ),

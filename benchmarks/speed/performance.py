@@ -36,7 +36,7 @@ INTRODUCTION = (
 )
 TITLES = {
     "kernels": "Kernels: votes, TRIAD and QUEST; pairs of stars",
-    "staircase": "The whole way of a batch, zones cold and cached",
+    "pipeline": "The whole way of a batch, zones cold and cached",
     "verified_cost": "Verified identification beside the votes",
     "posts": "Single posts, bulk, both at once, start, memory",
     "stored": "As the database fills",
@@ -51,7 +51,7 @@ ABOUT = {
         "be switched off; they name the same stars and find the same quaternions. The bare k-d "
         "tree query, whose pairs must be the same, neither works out separations nor sorts."
     ),
-    "staircase": "Single calls of the core without records; see `benchmarks/speed/staircase.py`.",
+    "pipeline": "Single calls of the core without records; see `benchmarks/speed/pipeline.py`.",
     "verified_cost": "Compiled loops over views of the paper's runs, in one thread.",
     "posts": (
         "The service as it is served, over SQLite with synchronous=FULL, beside a no-op of the "

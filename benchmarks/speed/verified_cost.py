@@ -107,7 +107,7 @@ def sightings(
 
 
 def _sighting(acquired: Any) -> Sighting:
-    """What the identifier was given, from what the staircase keeps of it."""
+    """The input of the identifier, from what the pipeline keeps of it."""
     batch, mission, tracker = acquired.batch, acquired.mission, acquired.trackers[0]
     presumed = prior_attitude(batch.a_priori, batch.time, mission)
     return Sighting(

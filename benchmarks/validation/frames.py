@@ -4,7 +4,7 @@
     python -m benchmarks.validation.frames --write                   docs/frames.md, its picture
 
 Every frame is drawn from the real sky with all its noise (`service.simulate.frames`), written
-as FITS and read again.  The batch made of it goes down the staircase twice: with an a priori
+as FITS and read again.  The batch made of it goes through the pipeline twice: with an a priori
 attitude good to 1 deg, and with none.
 """
 
@@ -387,7 +387,7 @@ proper motion, parallax and aberration, through a distorting lens, drawn out by 
 to 0.02 deg/s about each axis). To that come the uneven response of the pixels, photon noise of
 stars, sky and dark current, 200 hot pixels, cosmic rays, the noise of reading, full pixels, and
 whole counts. The frame is written as FITS and read again, its stars are found, placed (`matched`)
-and made a batch, and the batch goes down the staircase: with an a priori attitude that is up to
+and made a batch, and the batch goes through the pipeline: with an a priori attitude that is up to
 1 deg off{lost}.
 
 A star to V 6.5 counts as found where a candidate lies within {FOUND_PX:g} pixels of its true place,

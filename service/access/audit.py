@@ -6,8 +6,8 @@ from sqlalchemy import Connection, insert, select
 
 from service.storage.models.access import AuditEntry
 from service.storage.models.base import Page
-from service.storage.recording.unsaved_result import Row
 from service.storage.sql.access_tables import audit
+from service.storage.sql.columns import Row
 
 MAX_BODY_KEPT = 4_000
 
@@ -37,7 +37,7 @@ class Entry:
         connection.execute(insert(audit).values(self.row()))
 
 
-def note(
+def add_entry(
     connection: Connection,
     *,
     id: str,

@@ -138,20 +138,25 @@ class Access:
             self._known[key] = (caller, clock_s + KNOWN_FOR_S)
         return caller
 
-    def count_request(self, caller: Caller) -> None:
-        """Count a request against its token's rate; raises `RateLimited`."""
+    def count_request(self, caller: Caller, count: int = 1) -> None:
+        """Count a request against its token's rate; raises `RateLimited`.
+
+        A request that counts as more than a burst is let through when the burst is there;
+        requests after it wait until what it took beyond that is made up for.
+        """
         rate = caller.rate_per_s
-        if rate is None or caller.token_id is None:
+        if rate is None or caller.token_id is None or count < 1:
             return
         clock_s, burst = time.monotonic(), max(rate, LEAST_BURST)
         with self._lock:
             bucket = self._buckets.setdefault(caller.token_id, _TokenBucket(burst, clock_s))
             bucket.left = min(burst, bucket.left + rate * (clock_s - bucket.filled_s))
             bucket.filled_s = clock_s
-            if bucket.left < 1:
-                wait_s = max(1, round((1 - bucket.left) / rate + 0.5))
+            needed = max(1.0, min(count, burst - 1))
+            if bucket.left < needed:
+                wait_s = max(1, round((needed - bucket.left) / rate + 0.5))
                 raise RateLimited(f"{caller.name} may send {rate:g} requests per second", wait_s)
-            bucket.left -= 1
+            bucket.left -= count
 
     def sign_in(self, token: str) -> tuple[str, Caller]:
         """Begin a browser's session; returns the secret for its cookie, and the caller."""

@@ -17,7 +17,6 @@ from sqlalchemy import Connection, delete, insert, select, update
 from service.errors import BadInput, Conflict, Fault, Forbidden, NotFound, shown_value
 from service.storage.models.access import Scope
 from service.storage.recording.identity import OwnKey
-from service.storage.recording.unsaved_result import Row
 from service.storage.sql.access_tables import access_sessions, access_tokens
 
 SCOPES: tuple[Scope, ...] = get_args(Scope)
@@ -51,6 +50,20 @@ class Caller:
         if not self.may_see(spacecraft):
             theirs = ", ".join(sorted(self.spacecraft or ()))
             raise Forbidden(f"{self.name} is bound to {theirs}, not to {spacecraft[:128]}")
+
+
+@dataclass(frozen=True)
+class TokenEntry:
+    """A token in the list of all tokens; times are UTC texts."""
+
+    name: str
+    scopes: list[str]
+    spacecraft: list[str] | None
+    """None: all."""
+    rate_per_s: float | None
+    created: str
+    expires: str
+    revoked: str | None
 
 
 def own_key(caller: Caller | None, key: str | None) -> OwnKey | None:
@@ -116,19 +129,19 @@ def add_token(
     )
 
 
-def list_tokens(connection: Connection) -> list[Row]:
+def list_tokens(connection: Connection) -> list[TokenEntry]:
     """Every token without its digest, the oldest first."""
     query = select(access_tokens).order_by(access_tokens.c.id)
     return [
-        {
-            "name": row["name"],
-            "scopes": json.loads(row["scopes"]),
-            "spacecraft": row["spacecraft"] and json.loads(row["spacecraft"]),
-            "rate_per_s": row["rate_per_s"],
-            "created": row["created"],
-            "expires": row["expires"],
-            "revoked": row["revoked"],
-        }
+        TokenEntry(
+            name=row["name"],
+            scopes=json.loads(row["scopes"]),
+            spacecraft=row["spacecraft"] and json.loads(row["spacecraft"]),
+            rate_per_s=row["rate_per_s"],
+            created=row["created"],
+            expires=row["expires"],
+            revoked=row["revoked"],
+        )
         for row in connection.execute(query).mappings()
     ]
 

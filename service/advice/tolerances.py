@@ -27,7 +27,7 @@ WIDE = 4.0
 LEAST_BATCHES = 20
 LEAST_DIFFERENCES = 100
 
-Verdict = Literal["too_tight", "fits", "too_wide", "no_verdict", "not_used"]
+ToleranceVerdict = Literal["too_tight", "fits", "too_wide", "no_verdict", "not_used"]
 Confidence = Literal["high", "moderate", "low", "none"]
 Differences = Callable[[Evidence], tuple[Vector, npt.NDArray[np.int64]]]
 
@@ -120,7 +120,7 @@ class ToleranceFinding:
     tolerance: Tolerance
     symbol: str
     now: float
-    verdict: Verdict
+    verdict: ToleranceVerdict
     confidence: Confidence
     differences: int
     batches: int
@@ -150,7 +150,7 @@ def _finding(
     batches = len(np.unique(batch))
     used = tolerance.test is None or bool(getattr(mission.tests, tolerance.test))
     needed = beyond = recommended = None
-    verdict: Verdict = "no_verdict" if used else "not_used"
+    verdict: ToleranceVerdict = "no_verdict" if used else "not_used"
     if len(differences):
         needed = quantile(differences, batch, KEPT)
         beyond = share_of(differences > now, batch)
@@ -173,7 +173,7 @@ def _finding(
     )
 
 
-def _verdict(now: float, needed: Interval, beyond: Interval, differences: int) -> Verdict:
+def _verdict(now: float, needed: Interval, beyond: Interval, differences: int) -> ToleranceVerdict:
     if beyond.low > 1.0 - KEPT:
         return "too_tight"
     if differences < LEAST_DIFFERENCES or not math.isfinite(needed.high):
@@ -184,7 +184,7 @@ def _verdict(now: float, needed: Interval, beyond: Interval, differences: int) -
     return "fits" if beyond.high <= 1.0 - KEPT or needed.high <= 2.0 * needed.low else "no_verdict"
 
 
-def _confidence(verdict: Verdict, needed: Interval | None) -> Confidence:
+def _confidence(verdict: ToleranceVerdict, needed: Interval | None) -> Confidence:
     if needed is None or verdict in ("no_verdict", "not_used"):
         return "none"
     if not math.isfinite(needed.high) or needed.value == 0.0:

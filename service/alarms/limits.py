@@ -10,7 +10,9 @@ from enum import IntEnum
 from functools import cached_property
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, StrictBool, model_validator
+from pydantic import Field, StrictBool, model_validator
+
+from service.missions.strict import Strict
 
 MAX_COUNT = 200
 """Most batches that a value is taken over: the samples are written with every batch."""
@@ -30,11 +32,7 @@ class Severity(IntEnum):
         return self.name.lower()
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class Bounds(_Strict):
+class Bounds(Strict):
     """A value below `low` or above `high` is out of limits; null: no bound."""
 
     low: float | None = None
@@ -47,7 +45,7 @@ class Bounds(_Strict):
         return self
 
 
-class LimitSettings(_Strict):
+class LimitSettings(Strict):
     """The limits of one quantity."""
 
     enabled: StrictBool = True

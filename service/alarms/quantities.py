@@ -7,7 +7,8 @@ document, the labels of the console, and the columns of CSV files.
 A quantity that is derived from the counts of stars and batches is one entry
 here.  One that is measured anew (`Measured`) needs a migration as well: a column
 of its name in `results`; and for `rolled_up`, of a share or a value, the columns
-`_min` and `_max` in both rollups, of a value also `_n` and `_sum`.  Results that
+`_min` and `_max` in all four rollups, of a value also `_n` and `_sum`; and a column in
+`tracker_values`.  Results that
 were recorded before it have no value of it.
 """
 
@@ -89,6 +90,9 @@ class Quantity:
     rolled_up: bool = False
     """Whether the rollups have columns of it.  Without, buckets have no extremes of a share of
     stars, and no values of a ratio; and batches are not ranked by it."""
+    by_tracker: bool = False
+    """Whether each tracker of a spacecraft with several has a value of it.  A tracker is suspect
+    where it is the one that disagrees with the others."""
 
     @property
     def is_share(self) -> bool:
@@ -159,6 +163,7 @@ QUANTITIES: dict[str, Quantity] = {
             StarShare(itemgetter("ambiguous")),
             lambda mission: above(0.15, 0.25, 0.5, hysteresis=0.03),
             rolled_up=True,
+            by_tracker=True,
         ),
         Quantity(
             "unmatched_share",
@@ -167,6 +172,7 @@ QUANTITIES: dict[str, Quantity] = {
             StarShare(itemgetter("unmatched")),
             lambda mission: above(0.15, 0.25, 0.5, hysteresis=0.03),
             rolled_up=True,
+            by_tracker=True,
         ),
         Quantity(
             "no_attitude_share",
@@ -181,6 +187,7 @@ QUANTITIES: dict[str, Quantity] = {
             "batches with a suspect attitude",
             BatchShare(itemgetter("suspect")),
             lambda mission: above(0.1, 0.25, 0.5, hysteresis=0.03),
+            by_tracker=True,
         ),
         Quantity(
             "residual_rms_arcsec",
@@ -190,6 +197,7 @@ QUANTITIES: dict[str, Quantity] = {
             # The normal value depends on the tracker; the ratio below takes that into account.
             lambda mission: LimitSettings(),
             rolled_up=True,
+            by_tracker=True,
         ),
         Quantity(
             "predicted_rms_arcsec",
@@ -197,6 +205,7 @@ QUANTITIES: dict[str, Quantity] = {
             "predicted residual rms",
             Measured(measurements.predicted_rms_arcsec),
             rolled_up=True,
+            by_tracker=True,
         ),
         Quantity(
             "residual_ratio",
@@ -206,6 +215,7 @@ QUANTITIES: dict[str, Quantity] = {
             lambda mission: above(1.5, 2.0, 3.0, hysteresis=0.1),
             description="Residual rms divided by the predicted rms; about 1.",
             rolled_up=True,
+            by_tracker=True,
         ),
         Quantity(
             "magnitude_offset_mag",
@@ -216,6 +226,7 @@ QUANTITIES: dict[str, Quantity] = {
             worse="size",
             description="Observed minus catalog magnitude, mean over the unique stars.",
             rolled_up=True,
+            by_tracker=True,
         ),
         Quantity(
             "a_priori_angle_deg",
@@ -252,6 +263,11 @@ def names() -> tuple[str, ...]:
 def trend_names() -> tuple[str, ...]:
     """The quantities that have a history."""
     return _names(lambda each: not isinstance(each.source, Gap))
+
+
+def tracker_names() -> tuple[str, ...]:
+    """The quantities that each tracker has a value of."""
+    return _names(lambda each: each.by_tracker)
 
 
 def limited_names() -> tuple[str, ...]:

@@ -21,8 +21,8 @@ from service.alarms.limits import LimitSettings, Severity
 from service.alarms.window import Point
 from service.errors import WrongState
 
-State = Literal["open", "acknowledged", "shelved", "cleared"]
-Action = Literal[
+AlarmState = Literal["open", "acknowledged", "shelved", "cleared"]
+AlarmActionName = Literal[
     "raised",
     "escalated",
     "eased",
@@ -35,12 +35,12 @@ Action = Literal[
     "commented",
     "cleared",
 ]
-Alarm = Mapping[str, Any]
+AlarmColumns = Mapping[str, Any]
 Changes = dict[str, Any]
-Step = tuple[Changes, list[Action]]
+AlarmUpdate = tuple[Changes, list[AlarmActionName]]
 
 
-def state_of(alarm: Alarm, now: str) -> State:
+def state_of(alarm: AlarmColumns, now: str) -> AlarmState:
     """The state of an alarm at a time; times are UTC texts of one form."""
     if alarm["cleared_at"] is not None:
         return "cleared"
@@ -51,7 +51,7 @@ def state_of(alarm: Alarm, now: str) -> State:
 
 def raised(
     severity: Severity, limits: LimitSettings, point: Point, now: str, worst: Point | None = None
-) -> Step:
+) -> AlarmUpdate:
     """A new alarm; `worst` is the worst value since it went out of limits, if not this one."""
     columns = {
         "severity": severity.word,
@@ -73,13 +73,13 @@ def raised(
 
 
 def observed(
-    alarm: Alarm,
+    alarm: AlarmColumns,
     severity: Severity | None,
     limits: LimitSettings,
     point: Point,
     now: str,
     worst: Point | None = None,
-) -> Step:
+) -> AlarmUpdate:
     """A new value for an active alarm: out of limits by a severity, or within them (None).
 
     `worst` is the worst value since it went out of them, if not this one.
@@ -95,7 +95,7 @@ def observed(
     worst = worst or point
     if limits.beyond(severity, worst.value) > limits.beyond(severity, alarm["worst_value"]):
         changes |= _at("worst", worst)
-    actions: list[Action] = []
+    actions: list[AlarmActionName] = []
     if severity > Severity[alarm["severity"].upper()]:
         changes |= {"severity": severity.word, "bound": limits.bound(severity, point.value)}
         changes |= {"acknowledged_at": None, "acknowledged_by": None}
@@ -107,7 +107,7 @@ def observed(
     return changes, actions
 
 
-def acknowledged(alarm: Alarm, who: str, now: str) -> Step:
+def acknowledged(alarm: AlarmColumns, who: str, now: str) -> AlarmUpdate:
     """Acknowledged by `who`; raises `WrongState` if it was already, or is cleared."""
     _require_active(alarm)
     if alarm["acknowledged_at"] is not None:
@@ -116,13 +116,13 @@ def acknowledged(alarm: Alarm, who: str, now: str) -> Step:
     return _cleared({**alarm, **changes}, changes, ["acknowledged"], now)
 
 
-def shelved(alarm: Alarm, who: str, until: str, now: str) -> Step:
+def shelved(alarm: AlarmColumns, who: str, until: str, now: str) -> AlarmUpdate:
     """Shelved until a time; shelving it again replaces that time."""
     _require_active(alarm)
     return {"shelved_at": now, "shelved_by": who, "shelved_until": until}, ["shelved"]
 
 
-def unshelved(alarm: Alarm) -> Step:
+def unshelved(alarm: AlarmColumns) -> AlarmUpdate:
     """No longer shelved; raises `WrongState` if it was not."""
     _require_active(alarm)
     if alarm["shelved_until"] is None:
@@ -130,21 +130,23 @@ def unshelved(alarm: Alarm) -> Step:
     return {"shelved_at": None, "shelved_by": None, "shelved_until": None}, ["unshelved"]
 
 
-def expired(alarm: Alarm, now: str) -> Step:
+def expired(alarm: AlarmColumns, now: str) -> AlarmUpdate:
     """No longer shelved, if that time is over; otherwise nothing changes."""
     over = alarm["cleared_at"] is None and (alarm["shelved_until"] or "~") <= now
     changes: Changes = {"shelved_at": None, "shelved_by": None, "shelved_until": None}
     return (changes, ["shelf_expired"]) if over else ({}, [])
 
 
-def _cleared(alarm: Alarm, changes: Changes, actions: list[Action], now: str) -> Step:
+def _cleared(
+    alarm: AlarmColumns, changes: Changes, actions: list[AlarmActionName], now: str
+) -> AlarmUpdate:
     whole = {**alarm, **changes}
     if whole["acknowledged_at"] is not None and whole["current_severity"] is None:
         return changes | {"cleared_at": now}, [*actions, "cleared"]
     return changes, actions
 
 
-def _require_active(alarm: Alarm) -> None:
+def _require_active(alarm: AlarmColumns) -> None:
     if alarm["cleared_at"] is not None:
         raise WrongState(f"the alarm was cleared at {alarm['cleared_at']}")
 

@@ -44,7 +44,7 @@ class Evaluated:
 
 
 @dataclass
-class Window:
+class SampleWindow:
     """The latest values of a quantity, and since when they are out of which limit."""
 
     samples: list[Sample] = field(default_factory=list)
@@ -139,7 +139,7 @@ class Window:
         return kept
 
     @classmethod
-    def from_json(cls, kept: Any) -> "Window":
+    def from_json(cls, kept: Any) -> "SampleWindow":
         """A window as it was kept."""
         since_ns = {Severity[word.upper()]: time_ns for word, time_ns in kept["since_ns"].items()}
         # What was written before worst values were kept has none: the next value takes their place.

@@ -45,7 +45,7 @@ class AdviceService:
         limit_s: float = math.inf,
         step: Callable[[], object] = lambda: None,
     ) -> Advice:
-        """What the batches of a run say of a mission's settings; see `service.advice`.
+        """Advice on a mission's settings from the batches of a run; see `service.advice`.
 
         Of the batches at most `sample` are run again, fewer where `limit_s`
         seconds run out; `step` is called after each, twice a batch.  `tolerances`

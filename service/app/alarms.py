@@ -10,7 +10,7 @@ from service.storage.models.base import Page
 from service.storage.queries import alarms
 from service.storage.queries.future_dated import LIVE
 from service.storage.recording.silence import evaluate_by_clock, is_due_by_clock
-from service.storage.recording.unsaved_result import Row
+from service.storage.sql.columns import Row
 from service.times import shifted, utc_now
 
 
@@ -111,7 +111,7 @@ class Alarms:
     def _act(
         self,
         id: str,
-        step: Callable[[Row], state_machine.Step],
+        step: Callable[[Row], state_machine.AlarmUpdate],
         who: str,
         comment: str | None,
         moment: str,

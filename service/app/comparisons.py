@@ -41,7 +41,7 @@ class Comparisons:
         """Run recorded batches again with two sets of options and show where they differ.
 
         Of a stretch at most `sample` batches, fewer where `limit_s` seconds run
-        out.  What options do not name stays as it was for a batch.  Raises
+        out.  Settings that the options do not name stay as they were for a batch.  Raises
         `Busy` while the service is computing another comparison.
         """
         mission_named(self._context.missions, name)

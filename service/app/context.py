@@ -1,4 +1,4 @@
-"""What the parts of the app share: settings, missions, sky and database."""
+"""Shared by the parts of the app: settings, missions, sky and database."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager

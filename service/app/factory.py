@@ -10,6 +10,7 @@ from service.app.context import Context
 from service.app.events import Events
 from service.app.frames import Frames
 from service.app.limits import Limits
+from service.app.products import Products
 from service.app.replays import Replays
 from service.app.results import Results
 from service.app.runs import Runs
@@ -25,6 +26,7 @@ from service.sky.model import SkyModel
 from service.storage.queries.replays import mark_interrupted
 from service.storage.recording.results import register
 from service.storage.sql.database import Store
+from service.storage.upkeep.split_trackers import BackgroundSplit, TrackerSplitter
 from service.times import utc_now
 
 
@@ -48,6 +50,7 @@ class App:
         self.frames = Frames(context, self.submissions)
         self.results = Results(context, self.submissions)
         self.spacecraft = Spacecraft(context)
+        self.products = Products(context)
         self.limits = Limits(context)
         self.alarms = Alarms(context)
         self.runs = Runs(context)
@@ -57,11 +60,15 @@ class App:
         self.zones = Zones(context)
         self.events = Events(context)
         self.audit = Audit(context)
-        self.service = Service(context, self.submissions, self.replays, kernels)
+        self.tracker_split = BackgroundSplit(
+            TrackerSplitter(context.store, context.sky, context.missions)
+        )
+        self.service = Service(context, self.submissions, self.replays, kernels, self.tracker_split)
 
     def close(self) -> None:
         """Stop the replays, write what is queued, and close the database."""
         self.replays.stop()
+        self.tracker_split.stop()
         self.submissions.close()
         self.store.close()
 

@@ -1,38 +1,43 @@
 """Histories as tables: the names of the columns with their units, and a row a bucket or batch."""
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from itertools import chain
 from typing import Any
 
-from service.app.output_formats import TableRow
+from service.alarms.quantities import QUANTITIES, QuantityName
+from service.products.tables import Column, Page, Table
 from service.storage.models.trends import History
 from service.times import utc_of_unix
 
-BATCH_COLUMNS = ("time", "batch", "id")
-BUCKET_PARTS = ("count", "mean", "min", "max")
-
-
-@dataclass(frozen=True)
-class Table:
-    """The names of columns and the rows, page by page."""
-
-    columns: Sequence[str]
-    pages: Iterable[Iterable[TableRow]]
+BATCH_COLUMNS = (
+    Column("time", "text", "UTC", description="Time of the batch.", width=30),
+    Column("batch", "text", description="Name of the batch.", width=128),
+    Column("id", "text", description="Id of the result.", width=26),
+)
+BUCKET_COLUMNS = (
+    Column("start", "text", "UTC", description="Start of the bucket.", width=30),
+    Column("bucket_s", "integer", "s", description="Width of the bucket."),
+    Column("batches", "integer", description="Batches in the bucket."),
+)
+BUCKET_PARTS = {
+    "count": "batches with a value",
+    "mean": "mean",
+    "min": "least of a batch",
+    "max": "greatest of a batch",
+}
 
 
 def history_table(history: History) -> Table:
     """The table of a history; see `trends.history`."""
     if history.strategy == "latest":
         return batch_table(iter([history]))
-    series = history.series
-    columns = [f"{name}_{part}" for name in series for part in BUCKET_PARTS]
+    columns = [
+        _column(name, part, told) for name in history.series for part, told in BUCKET_PARTS.items()
+    ]
     starts = [utc_of_unix(each).text for each in history.unix_s]
-    widths = [history.bucket_s] * len(starts)
-    values: list[Any] = [history.batches]
-    values += [getattr(each, part) for each in series.values() for part in BUCKET_PARTS]
-    rows = zip(starts, widths, *values, strict=True)
-    return Table(["start", "bucket_s", "batches", *columns], [rows])
+    page: list[Any] = [starts, [history.bucket_s] * len(starts), history.batches]
+    page += [getattr(each, part) for each in history.series.values() for part in BUCKET_PARTS]
+    return Table([*BUCKET_COLUMNS, *columns], [page], _about(history))
 
 
 def batch_table(pages: Iterator[History]) -> Table:
@@ -41,10 +46,28 @@ def batch_table(pages: Iterator[History]) -> Table:
     The first page is read at once: its errors are raised here.
     """
     first = next(pages)
-    columns = [*BATCH_COLUMNS, *first.series]
-    return Table(columns, (_batch_rows(page) for page in chain([first], pages)))
+    columns = [*BATCH_COLUMNS, *(_column(name) for name in first.series)]
+    return Table(columns, (_batch_page(page) for page in chain([first], pages)), _about(first))
 
 
-def _batch_rows(page: History) -> Iterable[TableRow]:
+def _batch_page(page: History) -> Page:
     values: list[Any] = [each.value for each in page.series.values()]
-    return zip(*(getattr(page, name) for name in BATCH_COLUMNS), *values, strict=True)
+    return [*(getattr(page, each.name) for each in BATCH_COLUMNS), *values]
+
+
+def _column(name: QuantityName, part: str = "", told: str = "") -> Column:
+    quantity = QUANTITIES[name]
+    about = f"{quantity.label}: {told}" if told else quantity.label
+    if part == "count":
+        return Column(f"{name}_count", "integer", description=about)
+    return Column(f"{name}_{part}" if part else name, unit=quantity.unit, description=about)
+
+
+def _about(history: History) -> dict[str, str]:
+    return {
+        "product": "history",
+        "spacecraft": history.spacecraft,
+        "run": history.run,
+        "start": history.start or "",
+        "end": history.end or "",
+    }

@@ -4,6 +4,7 @@ from service.access.audit import Entry
 from service.acquire.choices import Choices, choices_of
 from service.app.context import ALL_RUNS, Context, known_id
 from service.app.submissions import Submissions
+from service.errors import NotFound
 from service.ingest.solver_pool import mission_in_input
 from service.missions.mission import mission_named
 from service.observations.schema import OptionsIn
@@ -17,9 +18,11 @@ from service.storage.queries.pages import ResultFilter
 from service.storage.queries.recorded_batch import recorded_batch, recorded_mission
 from service.storage.queries.results import OutcomeName, StatusName
 from service.storage.queries.star_field import star_field_of
+from service.storage.queries.tracker_comparison import tracker_comparison
 from service.storage.recording.ids import is_ulid
 from service.storage.recording.unsaved_result import Answered
-from service.times import Utc
+from service.storage.sql.columns import Row
+from service.times import Utc, utc_now
 
 
 class Results:
@@ -34,6 +37,20 @@ class Results:
         with self._context.reading() as connection:
             return results.read_record(connection, known_id(id, "batch"))
 
+    def latest(self, spacecraft: str, run: str | None = None) -> Result:
+        """The newest current result of a spacecraft in a run, by batch time; as `get`.
+
+        A live batch that is dated far in the future counts only where there is no other.
+        """
+        run = run or LIVE
+        mission_named(self._context.missions, spacecraft)
+        selected = ResultFilter(run, spacecraft)
+        with self._context.reading() as connection:
+            id = results.newest_id(connection, selected, utc_now())
+            if id is None:
+                raise NotFound(f"{spacecraft} has no batch in the run {run}")
+            return results.read_record(connection, id)
+
     def page(
         self,
         *,
@@ -43,18 +60,26 @@ class Results:
         end: Utc | None = None,
         outcome: OutcomeName | None = None,
         status: StatusName | None = None,
+        batch: str | None = None,
         limit: int = 100,
         cursor: str | None = None,
     ) -> Page[Summary]:
         """Current results, newest batch time first; see `results.list_batches`.
 
-        The run `*` stands for every run, live batches included.
+        The run `*` stands for every run, live batches included.  `batch` is a batch id, of
+        which there is one in each run of a spacecraft.
         Raises `BadBatch` for a spacecraft that has neither batches nor a mission.
         """
         stretch = ResultFilter(None if run == ALL_RUNS else run or LIVE, spacecraft, start, end)
         with self._context.reading() as connection:
             page = results.list_batches(
-                connection, stretch, outcome=outcome, status=status, limit=limit, cursor=cursor
+                connection,
+                stretch,
+                outcome=outcome,
+                status=status,
+                batch=batch,
+                limit=limit,
+                cursor=cursor,
             )
         if spacecraft is not None and not page.items:
             # A misspelt name must not look like a spacecraft without data.
@@ -77,6 +102,20 @@ class Results:
             answer = answer or recorded
             mission = recorded_mission(connection, answer.provenance.mission)
         return star_field_of(batch, mission, self._context.sky, answer)
+
+    def trackers(self, id: str, answer: Answer | None = None) -> list[Row]:
+        """The trackers of a result side by side; see `tracker_comparison`.
+
+        Empty for a result of one tracker.  An `answer` in place of the recorded one, such
+        as that of a what-if, is compared over the same batch.
+        """
+        with self._context.reading() as connection:
+            batch, recorded = recorded_batch(connection, known_id(id, "batch"))
+            answer = answer or recorded
+            if len(answer.observations) == 1:
+                return []
+            mission = recorded_mission(connection, answer.provenance.mission)
+        return tracker_comparison(batch, mission, self._context.sky, answer)
 
     def settings_for(self, id: str) -> Choices:
         """The settings that a what-if of a result changes."""

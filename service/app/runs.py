@@ -86,7 +86,7 @@ class Runs:
             run=checked_run_name(run or self._run_of_settings(source, chosen)),
             missions=chosen,
             catalog=self._context.settings.catalog,
-            shelf_bytes=self._context.settings.shelf_mb << 20,
+            cache_bytes=self._context.settings.shelf_mb << 20,
             processes=processes,
         )
         progress = reprocess(self._context.store, plan, self._context.sky.catalog.digest, step)

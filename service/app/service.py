@@ -13,10 +13,13 @@ from service.app.context import Context
 from service.app.replays import Replays
 from service.app.submissions import Submissions
 from service.errors import Busy
+from service.ingest.kernel_helper import compiling_beside
+from service.ingest.kernel_progress import progress_logged
 from service.observations.schema import submission_from_json
 from service.storage.models.overview import About, CatalogAbout, MissionAbout
 from service.storage.recording.alarm_evaluation import latest_inputs
 from service.storage.recording.ids import Ulids
+from service.storage.upkeep.split_trackers import BackgroundSplit
 from service.times import utc_now
 
 log = logging.getLogger(__name__)
@@ -39,11 +42,13 @@ class Service:
         submissions: Submissions,
         replays: Replays,
         kernels: KernelBuild | None,
+        tracker_split: BackgroundSplit,
     ) -> None:
         self._context = context
         self._submissions = submissions
         self._replays = replays
         self._kernels = kernels
+        self._tracker_split = tracker_split
         self._warming = threading.Lock()
         self._is_warm = False
         self._ids = Ulids()
@@ -59,16 +64,18 @@ class Service:
             if not self._warming.acquire(blocking=False):
                 raise Busy("the service is warming up")
             try:
-                if self._kernels is not None:
-                    self._kernels.run(self._context.missions)
+                if self._kernels is not None and self._kernels.is_needed:
+                    with progress_logged(log), compiling_beside(self._context.missions):
+                        self._kernels.run(self._context.missions)
                 prewarm_kernels(self._context.sky, self._context.missions)
                 self._prewarm_recent_pointings()
                 # Collecting the present objects would take longer than a batch, each time.
                 gc.freeze()
                 self._is_warm = True
                 if self._kernels is not None:
-                    # Only the service resumes replays, not a command beside it.
+                    # Only the service does this by itself, not a command beside it.
                     self._replays.resume()
+                    self._tracker_split.start()
             finally:
                 gc.enable()
                 self._warming.release()
@@ -95,7 +102,7 @@ class Service:
                 sent = submission_from_json(text)
                 for _ in range(1 + WARM_UP_RUNS // len(inputs)):
                     batch = structs.replace(sent.batch, batch=self._ids.new())
-                    self._submissions.ingest.rehearse(structs.replace(sent, batch=batch))
+                    self._submissions.ingest.warm_up(structs.replace(sent, batch=batch))
             except Exception as error:
                 # A batch that no longer runs must not prevent the start.
                 log.warning("the latest batch of a spacecraft could not be run again: %s", error)

@@ -1,13 +1,17 @@
 """Spacecraft: their state, attitudes, star rates, histories and worst batches."""
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
-from msgspec import structs
+from msgspec import UNSET, structs
+from sqlalchemy import Connection
 
-from service.alarms.quantities import QuantityName, trend_names
+from service.alarms.quantities import QuantityName, tracker_names, trend_names
 from service.app.context import Context
-from service.missions.mission import mission_named
+from service.errors import BadBatch, Fault, shown_value
+from service.missions.mission import Mission, mission_named
 from service.storage.models.base import Page
+from service.storage.models.fleet import Fleet
 from service.storage.models.overview import Overview
 from service.storage.models.spacecraft import (
     AttitudeRow,
@@ -16,11 +20,12 @@ from service.storage.models.spacecraft import (
     SpacecraftRow,
     SpacecraftState,
 )
-from service.storage.models.trends import History, RankedBatch
-from service.storage.queries import histories, overview, trends
+from service.storage.models.trends import History, Ranking
+from service.storage.queries import fleet, histories, overview, trends
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.ranking import worst_batches
+from service.storage.queries.tracker_splits import is_waiting
 from service.storage.recording import rollups
 from service.times import Utc, utc_now
 
@@ -36,6 +41,12 @@ class Spacecraft:
         with self._context.reading() as connection:
             missions = self._context.missions.values()
             return overview.overview(connection, missions, run or LIVE, utc_now())
+
+    def fleet(self, names: Sequence[str], run: str, period: fleet.Period) -> Fleet:
+        """Some of the spacecraft in a run, for one page of all of them; see `fleet.fleet`."""
+        missions = [self._context.missions[name] for name in names]
+        with self._context.reading() as connection:
+            return fleet.fleet(connection, missions, run, period, utc_now())
 
     def states(self, run: str | None = None) -> list[SpacecraftRow]:
         """Every spacecraft that has a mission file, with its state in a run."""
@@ -104,18 +115,21 @@ class Spacecraft:
         strategy: trends.Strategy = "minmax",
         size: int = 500,
         quantities: Sequence[QuantityName] = (),
+        tracker: str | None = None,
     ) -> History:
         """Histories of quantities, all of them unless named, in at most `size` points each.
 
         `minmax` gives buckets with mean, least and greatest, `latest` the newest
-        batches one by one; see `trends.history`.
+        batches one by one; see `trends.history`.  With a tracker they are the tracker's own.
         """
-        mission_named(self._context.missions, name)
-        asked = trends.HistoryRequest(tuple(quantities) or trend_names(), strategy, size)
+        mission = mission_named(self._context.missions, name)
+        names = _quantities(quantities, tracker)
+        asked = trends.HistoryRequest(names, strategy, size, _split_tracker(mission, tracker))
         with self._context.reading() as connection:
-            return trends.history(
+            found = trends.history(
                 connection, name, run=run or LIVE, start=start, end=end, request=asked
             )
+            return structs.replace(found, **_named(connection, mission, run or LIVE, tracker))
 
     def every_batch(
         self,
@@ -125,15 +139,21 @@ class Spacecraft:
         start: Utc | None = None,
         end: Utc | None = None,
         quantities: Sequence[QuantityName] = (),
+        tracker: str | None = None,
     ) -> Iterator[History]:
         """The history of every batch of a period, in pages; see `trends.every_batch`."""
-        mission_named(self._context.missions, name)
-        names = tuple(quantities) or trend_names()
+        mission = mission_named(self._context.missions, name)
         return trends.every_batch(
-            self._context.reading, name, run=run or LIVE, start=start, end=end, quantities=names
+            self._context.reading,
+            name,
+            run=run or LIVE,
+            start=start,
+            end=end,
+            quantities=_quantities(quantities, tracker),
+            tracker=_split_tracker(mission, tracker),
         )
 
-    def worst_batches(
+    def ranking(
         self,
         name: str,
         *,
@@ -142,9 +162,50 @@ class Spacecraft:
         start: Utc | None = None,
         end: Utc | None = None,
         limit: int = 20,
-    ) -> list[RankedBatch]:
-        """The batches of a period with the worst values of a quantity, worst first."""
-        mission_named(self._context.missions, name)
+        tracker: str | None = None,
+    ) -> Ranking:
+        """The batches of a period with the worst values of a quantity, worst first.
+
+        With a tracker they are ranked by its own values.
+        """
+        mission = mission_named(self._context.missions, name)
+        _quantities((by,), tracker, "by")
         stretch = ResultFilter(run or LIVE, name, start, end)
         with self._context.reading() as connection:
-            return worst_batches(connection, stretch, by, limit)
+            own = _split_tracker(mission, tracker)
+            items = worst_batches(connection, stretch, by, limit, own)
+            return Ranking(by=by, items=items, **_named(connection, mission, run or LIVE, tracker))
+
+
+def _quantities(
+    named: Sequence[QuantityName], tracker: str | None, field: str = "quantity"
+) -> tuple[QuantityName, ...]:
+    """The quantities that are named, or all; raises `BadBatch` for one that no tracker has."""
+    if tracker is None:
+        return tuple(named) or trend_names()
+    for name in named:
+        if name not in tracker_names():
+            known = ", ".join(tracker_names())
+            raise BadBatch(Fault(field, f"a tracker has {known} only", shown_value(name)))
+    return tuple(named) or tracker_names()
+
+
+def _split_tracker(mission: Mission, tracker: str | None) -> str | None:
+    """The tracker whose own values are read; None where the spacecraft's are.
+
+    Those of a single tracker are the spacecraft's.  Raises `BadInput` for one that the
+    mission has not.
+    """
+    if tracker is not None:
+        mission.tracker(tracker, "tracker")
+    return tracker if len(mission.trackers) > 1 else None
+
+
+def _named(
+    connection: Connection, mission: Mission, run: str, tracker: str | None
+) -> dict[str, Any]:
+    """What an answer about a tracker says of it."""
+    if tracker is None:
+        return {"tracker": UNSET, "not_split": UNSET}
+    waits = len(mission.trackers) > 1 and is_waiting(connection, mission.name, run)
+    return {"tracker": tracker, "not_split": waits}

@@ -3,17 +3,30 @@
 import asyncio
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Annotated, Any
+
+from pydantic import Field, TypeAdapter, ValidationError
+from pydantic_core import to_json
 
 from service.access.tokens import Caller
 from service.acquire.kernel_build import KernelBuild
 from service.app.context import Context
-from service.errors import AcquisitionError
-from service.ingest.submit import Observer, SubmissionService
-from service.observations.schema import Submission, submission_from_json
-from service.storage.recording.unsaved_result import Answered, Row
+from service.errors import AcquisitionError, BadBatch
+from service.ingest.submit import Backlog, Observer, SubmissionService
+from service.observations.schema import Submission, faults_of, submission_from_json
+from service.storage.recording.unsaved_result import Answered
 
+MAX_ARRAY = 100
+"""The most batches of an array."""
 READ_HERE_BYTES, READ_HERE_OBJECTS = 4_096, 64
 """Bounds of a batch that the event loop reads itself: more than thirty stars."""
+
+
+_ARRAY: TypeAdapter[list[Any]] = TypeAdapter(
+    Annotated[list[Any], Field(min_length=1, max_length=MAX_ARRAY)]
+)
+
+Outcome = Answered | BaseException
 
 
 class Submissions:
@@ -65,11 +78,37 @@ class Submissions:
         future: asyncio.Future[Answered] = loop.create_future()
         return await self.ingest.submit(submission, idempotency_key, caller, future)
 
+    async def read_array(self, sent: bytes) -> list[Submission | BadBatch]:
+        """The batches of a JSON array; in the place of one that is refused, its error.
+
+        Raises `BadBatch` where the body is no array of one to `MAX_ARRAY` elements.
+        """
+        self.require_kernels()
+        loop = asyncio.get_running_loop()
+        return await loop.run_in_executor(self._reader, _submissions_of_array, sent)
+
+    async def answered_each(
+        self, read: Sequence[Submission | BadBatch], caller: Caller | None = None
+    ) -> list[Outcome]:
+        """`submit` each of the batches of an array; the answers and errors in their order."""
+        loop = asyncio.get_running_loop()
+        futures: list[asyncio.Future[Answered]] = []
+        for each in read:
+            future: asyncio.Future[Answered] = loop.create_future()
+            futures.append(future)
+            try:
+                if isinstance(each, BadBatch):
+                    raise each
+                self.ingest.submit(each, None, caller, future)
+            except AcquisitionError as error:
+                future.set_exception(error)
+        return list(await asyncio.gather(*futures, return_exceptions=True))
+
     def submit_many(self, submissions: Sequence[Submission]) -> list[Answered | AcquisitionError]:
         """`submit` each in one transaction; a refused batch has its error in the list."""
         return self.ingest.submit_many(submissions)
 
-    def backlog(self) -> Row:
+    def backlog(self) -> Backlog:
         """The queues of posts and of writes, and whether the last write succeeded."""
         return self.ingest.backlog()
 
@@ -81,3 +120,19 @@ class Submissions:
         """Answer the queued posts, and stop."""
         self._reader.shutdown(cancel_futures=True)
         self.ingest.close()
+
+
+def _submissions_of_array(sent: bytes) -> list[Submission | BadBatch]:
+    try:
+        elements = _ARRAY.validate_json(sent)
+    except ValidationError as error:
+        raise BadBatch(faults_of(error)) from None
+    return [_submission_of(each) for each in elements]
+
+
+def _submission_of(element: Any) -> Submission | BadBatch:
+    try:
+        # As text again: a batch is read by the one reader of batches, NaN and all.
+        return submission_from_json(to_json(element, inf_nan_mode="constants"))
+    except BadBatch as error:
+        return error

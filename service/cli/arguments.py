@@ -4,8 +4,11 @@ Modules of commands import nothing heavy before they run: help answers at once.
 """
 
 import argparse
+import difflib
+import sys
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 LOCAL = "http://127.0.0.1:8000"
@@ -15,12 +18,67 @@ CAMERA_MISSION = "IMAGER, or one of your own whose tracker has a camera"
 Function = Callable[[argparse.Namespace], int]
 
 
+def print_json(value: Any) -> None:
+    """Print a value of plain types as JSON; numbers that are not finite become null."""
+    import msgspec
+
+    print(msgspec.json.format(msgspec.json.encode(value), indent=1).decode())
+
+
 class Parser(argparse.ArgumentParser):
-    """A parser whose error messages fit on one line and point to the help."""
+    """A parser whose error messages fit on one line, name what was meant and point to the help.
+
+    A command that has commands of its own prints its help where none is given.
+    """
 
     def error(self, message: str) -> NoReturn:
         """Print the message and exit with code 2."""
         self.exit(2, f"acquire: {message} (see `{self.prog} --help`)\n")
+
+    # The stubs of argparse declare two overloads, by whether a namespace is given; here one
+    # signature takes both.
+    def parse_known_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: Any = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """Parse; an option that does not exist is an error that names the nearest one."""
+        words = sys.argv[1:] if args is None else list(args)
+        has_commands = self._subparsers is not None
+        # Before a missing argument is reported: the misspelt option may be the missing one.
+        self._refuse_unknown_options(words[:1] if has_commands else words)
+        known: argparse.Namespace
+        known, extra = super().parse_known_args(words, namespace)
+        if has_commands and getattr(known, "function", None) is None and not extra:
+            self.print_help()
+            self.exit()
+        return known, extra
+
+    def _refuse_unknown_options(self, words: Sequence[str]) -> None:
+        for word in words:
+            if word == "--":
+                return
+            name = word.partition("=")[0]
+            if not name.startswith("--") or " " in name or name in self._option_string_actions:
+                continue
+            shown = [
+                option
+                for option, action in self._option_string_actions.items()
+                if action.help != argparse.SUPPRESS
+            ]
+            self.error(f"there is no option {name}{_meant(name, shown)}")
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        try:
+            super()._check_value(action, value)
+        except argparse.ArgumentError as error:
+            if meant := _meant(str(value), map(str, action.choices or ())):
+                error.message = f"invalid choice: {value!r}{meant}"
+            raise
+
+
+def _meant(given: str, known: Iterable[str]) -> str:
+    """The end of an error message: the nearest word that there is, or nothing."""
+    near = difflib.get_close_matches(given, tuple(known), n=1)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 def add_command(
@@ -56,10 +114,8 @@ def add_group(parent: Any, name: str, summary: str, examples: str) -> Any:
 
 
 def add_subcommands(parser: argparse.ArgumentParser) -> Any:
-    """Let a parser require one of several commands."""
-    return parser.add_subparsers(
-        title="commands", metavar="COMMAND", required=True, parser_class=Parser
-    )
+    """Let a parser take one of several commands; without one it prints its help."""
+    return parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=Parser)
 
 
 def add_database(parser: argparse.ArgumentParser) -> None:
@@ -71,15 +127,34 @@ def add_database(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_json(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add `--json`, which prints `what` as JSON in the place of text for people."""
+    parser.add_argument("--json", action="store_true", help=f"print {what} as JSON")
+
+
+STANDARD_OUTPUT = Path("-")
+
+
+def add_json_file(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add `--json [OUT]`: `what` as JSON to a file, or printed in the place of text."""
+    parser.add_argument(
+        "--json",
+        type=Path,
+        nargs="?",
+        const=STANDARD_OUTPUT,
+        metavar="OUT",
+        help=f"write {what} to OUT; without OUT, print them in the place of the tables",
+    )
+
+
 def add_period(parser: argparse.ArgumentParser, run_help: str) -> None:
-    """Add `--run`, `--from` and `--to`; see `configuration.period_of`."""
+    """Add `--run`, `--start` and `--end`; see `configuration.period_of`."""
     parser.add_argument("--run", metavar="NAME", help=run_help)
-    parser.add_argument(
-        "--from", dest="start", metavar="UTC", help="start of the period (batch time), included"
-    )
-    parser.add_argument(
-        "--to", dest="end", metavar="UTC", help="end of the period (batch time), excluded"
-    )
+    parser.add_argument("--start", metavar="UTC", help="start of the period (batch time), included")
+    parser.add_argument("--end", metavar="UTC", help="end of the period (batch time), excluded")
+    # The words of earlier versions, which scripts may hold.
+    parser.add_argument("--from", dest="start", help=argparse.SUPPRESS)
+    parser.add_argument("--to", dest="end", help=argparse.SUPPRESS)
 
 
 def count(text: str) -> int:

@@ -1,4 +1,4 @@
-"""What commands need beside their arguments: settings, missions, catalogs, periods."""
+"""Configuration of commands beside their arguments: settings, missions, catalogs, periods."""
 
 import dataclasses
 from argparse import Namespace
@@ -36,13 +36,13 @@ def settings_of_existing(parsed: Namespace) -> Settings:
 
 
 def period_of(parsed: Namespace) -> "tuple[Utc | None, Utc | None]":
-    """The times of `--from` and `--to`; raises `BadInput` where they are out of order."""
+    """The times of `--start` and `--end`; raises `BadInput` where they are out of order."""
     from service.times import parse_utc
 
-    start = None if parsed.start is None else parse_utc(parsed.start, "--from")
-    end = None if parsed.end is None else parse_utc(parsed.end, "--to")
+    start = None if parsed.start is None else parse_utc(parsed.start, "--start")
+    end = None if parsed.end is None else parse_utc(parsed.end, "--end")
     if start is not None and end is not None and start.tai_ns > end.tai_ns:
-        raise BadInput(Fault("--to", "must not be before --from", shown_value(parsed.end)))
+        raise BadInput(Fault("--end", "must not be before --start", shown_value(parsed.end)))
     return start, end
 
 

@@ -47,7 +47,7 @@ def solve_pictures(parsed: Namespace, settings: Settings) -> int:
 def picture_reader(
     dark_file: Path | None, settings: Settings
 ) -> "Callable[[Path, tuple[int, int] | None], Frame]":
-    """What reads a picture, of a shape if one is given, less the dark frame."""
+    """A function that reads a picture, of a shape if one is given, less the dark frame."""
     from service.imaging.frames.dark import without_dark
     from service.imaging.frames.files import read_frame
     from service.imaging.frames.frame import FrameLimits

@@ -3,10 +3,12 @@
 import getpass
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 
 from sqlalchemy import Connection
 
 from service.access import audit, tokens
+from service.cli.arguments import print_json
 from service.errors import BadInput, Fault, shown_value
 from service.missions.mission import load_missions, mission_named
 from service.settings import Settings
@@ -58,22 +60,27 @@ def create(
     return 0
 
 
-def show(settings: Settings) -> int:
+def show(settings: Settings, as_json: bool = False) -> int:
     """Print every token without its secret."""
     moment = utc_now().text
     with _opened(settings, create=False) as store, store.reading() as connection:
         rows = tokens.list_tokens(connection)
+    states = [
+        "revoked" if each.revoked else "expired" if each.expires <= moment else "good"
+        for each in rows
+    ]
+    if as_json:
+        print_json(
+            [asdict(row) | {"state": state} for row, state in zip(rows, states, strict=True)]
+        )
+        return 0
     if not rows:
         print("there are no tokens: access on this machine is open")
         return 0
     print(f"{'name':<24}{'scopes':<22}{'spacecraft':<18}{'until':<12}state")
-    for row in rows:
-        state = "revoked" if row["revoked"] else "expired" if row["expires"] <= moment else "good"
-        about = "all" if row["spacecraft"] is None else ",".join(row["spacecraft"])
-        print(
-            f"{row['name']:<24}{','.join(row['scopes']):<22}{about:<18}{row['expires'][:10]:<12}"
-            f"{state}"
-        )
+    for row, state in zip(rows, states, strict=True):
+        about = "all" if row.spacecraft is None else ",".join(row.spacecraft)
+        print(f"{row.name:<24}{','.join(row.scopes):<22}{about:<18}{row.expires[:10]:<12}{state}")
     return 0
 
 
@@ -97,7 +104,9 @@ def _about(spacecraft: Sequence[str] | None) -> str:
 
 def _note(connection: Connection, ids: Ulids, moment: str, action: str, name: str) -> None:
     who = f"command:{getpass.getuser()}"
-    audit.note(connection, id=ids.new(), moment=moment, who=who[:80], action=action, about=name)
+    audit.add_entry(
+        connection, id=ids.new(), moment=moment, who=who[:80], action=action, about=name
+    )
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """Many batches at once, from lines of telemetry to stored answers.
 
-Workers compute, where there are some; else this process does, a line whenever
-nobody waits who posts one by one.  The database is this process's own.
+Worker processes compute where there are any; otherwise this process does, a line at a
+time while no single post waits.  Only this process uses the database.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,12 +36,12 @@ Require = Callable[[], object]
 
 
 def solve_lines(solver: Solver, lines: TelemetryLines) -> list[LineResult]:
-    """What a worker makes of some lines."""
+    """The results of some lines, computed in a worker."""
     return line_results(lines, lambda fresh: [solver.solve_one_of_many(each) for each in fresh])
 
 
 INTERACTIVE_WINDOW_S = 0.5
-"""After a single batch bulk gives way for so long: another may follow."""
+"""Bulk pauses so long after a single batch, because another may follow."""
 LINES, FEW_LINES = 64, 8
 """Of a chunk: the more, the less each costs; but a single post waits for one chunk at most."""
 
@@ -101,7 +101,7 @@ class Bulk:
         return BulkChunk(self, TelemetryLines(run, texts, known), check, require, registry, stored)
 
     def compute(self, lines: TelemetryLines, require: Require) -> "Future[list[LineResult]]":
-        """What the lines come to, as soon as a worker has found it out, or at once."""
+        """The results of lines: from a worker, or computed here if there is none."""
         if self.workers.up:
             return self.workers.submit(lines)
         done: Future[list[LineResult]] = Future()
@@ -109,19 +109,19 @@ class Bulk:
         return done
 
     def compute_here(self, lines: TelemetryLines, require: Require) -> list[LineResult]:
-        """The same in this process, which nobody who posts one by one shall feel."""
+        """The same in this process; single posts go first."""
 
         def unsaved_results(fresh: Sequence[Submission]) -> list[UnsavedResult | AcquisitionError]:
             made = []
             for each in fresh:
                 require()
-                made.append(self.draft_here(each))
+                made.append(self.solve_here(each))
             return made
 
         return line_results(lines, unsaved_results)
 
-    def draft_here(self, submission: Submission) -> UnsavedResult | AcquisitionError:
-        """One of them, when nobody waits."""
+    def solve_here(self, submission: Submission) -> UnsavedResult | AcquisitionError:
+        """The result of one line, computed when no single post waits."""
         return self._submissions.solve_one_of_many(submission)
 
     def begin_writing(self, unsaved_results: Sequence[UnsavedResult]) -> Callable[[], Answers]:
@@ -206,5 +206,5 @@ class BulkChunk:
         first = self._registry.first(seen.identity, None, seen.fingerprint)
         if first is None:
             # It is not called what it seemed to be called.
-            return self._bulk.draft_here(submission_from_json(text, run=self._lines.run))
+            return self._bulk.solve_here(submission_from_json(text, run=self._lines.run))
         return Answered(first.result_id, self._stored[first.result_id], replayed=True)

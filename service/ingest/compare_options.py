@@ -8,12 +8,13 @@ star's on the other side.
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from statistics import fmean, median
 from typing import Any
 
 from service.acquire import Acquisition
+from service.advice.advice import RunAgain
 from service.alarms.quantities import QUANTITIES
 from service.observations.batch import ObservationBatch
 from service.storage.models.answers import StarCounts
@@ -32,8 +33,6 @@ from service.vectors import attitude_error_arcsec, matrix_from_quaternion
 
 MAX_SHOWN = 100
 """Batches that are shown star by star; the others are counted."""
-
-RunAgain = Callable[[ObservationBatch], Acquisition]
 
 
 @dataclass(frozen=True)

@@ -49,9 +49,9 @@ PACKED_TOGETHER, MOST_BYTES = 8, 65_536
 
 log = logging.getLogger(__name__)
 
-Task = TypeVar("Task")
+Input = TypeVar("Input")
 Output = TypeVar("Output")
-Work = Callable[[Solver, Task], Sequence[Output]]
+Work = Callable[[Solver, Input], Sequence[Output]]
 
 
 class WorkerLost(Exception):
@@ -64,39 +64,39 @@ class ChunkEndsWorkers(WorkerLost):
 
 @dataclass(frozen=True)
 class WorkerConfig:
-    """What a worker computes with: the same missions, catalog and cache as its parent."""
+    """The settings of a worker: the same missions, catalog and cache as its parent."""
 
     missions: Mapping[str, Mission]
     catalog: Path | None
     catalog_digest: str
-    shelf_bytes: int
+    cache_bytes: int
 
     def solver(self) -> Solver:
         """The worker's solver; raises `BadConfiguration` where the catalog's file has changed."""
         catalog = open_catalog(self.catalog)
         if catalog.digest != self.catalog_digest:
             raise BadConfiguration(f"catalog {self.catalog}: the file has changed since the start")
-        return Solver(self.missions, SkyModel(catalog, LruCache(self.shelf_bytes)))
+        return Solver(self.missions, SkyModel(catalog, LruCache(self.cache_bytes)))
 
 
 @dataclass(eq=False)
-class _QueuedTask(Generic[Task, Output]):
-    task: Task
+class _QueuedTask(Generic[Input, Output]):
+    task: Input
     done: "Future[list[Output]]" = field(default_factory=Future)
     deaths: int = 0
     """Processes that died while it was the only chunk at work."""
 
 
-class LocalWorkers(Generic[Task, Output]):
+class LocalWorkers(Generic[Input, Output]):
     """Workers that do one kind of work, from the first `start` to `close`."""
 
-    def __init__(self, config: WorkerConfig, work: "Work[Task, Output]", count: int) -> None:
+    def __init__(self, config: WorkerConfig, work: "Work[Input, Output]", count: int) -> None:
         """`work` is a function of a module, so that a worker finds it by its name."""
         self._config, self._work, self.count = config, work, count
         self._lock = threading.RLock()
         self._executor: ProcessPoolExecutor | None = None
         self._stop: Connection | None = None
-        self._one_by_one: deque[_QueuedTask[Task, Output]] = deque()
+        self._one_by_one: deque[_QueuedTask[Input, Output]] = deque()
         """Chunks that were unfinished when an executor broke, and those that came since."""
         self._pids: set[int] = set()
         self._pause_s = PAUSE_S
@@ -123,9 +123,9 @@ class LocalWorkers(Generic[Task, Output]):
             if self._executor is None and self.count and not (self._closing or too_soon):
                 self._open()
 
-    def submit(self, task: Task) -> "Future[list[Output]]":
+    def submit(self, task: Input) -> "Future[list[Output]]":
         """Queue a task; the future gives what was found, or raises `WorkerLost` or `Stopping`."""
-        chunk: _QueuedTask[Task, Output] = _QueuedTask(task)
+        chunk: _QueuedTask[Input, Output] = _QueuedTask(task)
         with self._lock:
             if self._closing:
                 raise Stopping("the service is stopping")
@@ -180,7 +180,7 @@ class LocalWorkers(Generic[Task, Output]):
             self._stop.close()
         return executor
 
-    def _hand_in(self, chunk: _QueuedTask[Task, Output]) -> None:
+    def _hand_in(self, chunk: _QueuedTask[Input, Output]) -> None:
         executor = self._executor or self._open()
         try:
             future = executor.submit(_compute, self._work, chunk.task)
@@ -213,7 +213,7 @@ class LocalWorkers(Generic[Task, Output]):
 
     def _take_result(
         self,
-        chunk: _QueuedTask[Task, Output],
+        chunk: _QueuedTask[Input, Output],
         executor: ProcessPoolExecutor,
         future: "Future[tuple[int, list[bytes]]]",
     ) -> None:
@@ -234,7 +234,7 @@ class LocalWorkers(Generic[Task, Output]):
             _fail(chunk, WorkerLost(f"a worker failed ({error!r})"))
         self._go_on(chunk)
 
-    def _try_again(self, chunk: _QueuedTask[Task, Output], broken: ProcessPoolExecutor) -> None:
+    def _try_again(self, chunk: _QueuedTask[Input, Output], broken: ProcessPoolExecutor) -> None:
         with self._lock:
             self._replace(broken)
             if not (self._one_by_one and self._one_by_one[0] is chunk):
@@ -249,7 +249,7 @@ class LocalWorkers(Generic[Task, Output]):
         _fail(chunk, ChunkEndsWorkers(f"{MOST_DEATHS} processes died over it"))
         self._go_on(chunk)
 
-    def _go_on(self, finished: _QueuedTask[Task, Output]) -> None:
+    def _go_on(self, finished: _QueuedTask[Input, Output]) -> None:
         """Hand in the next of the chunks that are computed one by one."""
         with self._lock:
             if self._one_by_one and self._one_by_one[0] is finished:

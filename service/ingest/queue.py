@@ -21,23 +21,22 @@ from functools import partial
 from queue import Empty, SimpleQueue
 
 from service.errors import Busy, Stopping
-from service.ingest.solver_pool import WAIT_S, SolverPool, Task
+from service.ingest.solver_pool import WAIT_S, SolverPool, SolverTask
 from service.observations.schema import Submission
 from service.storage.recording.identity import Identity, OwnKey
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
-from service.storage.sql.transaction import Results
+from service.storage.sql.transaction import WriteOutcome, WriteOutcomes
 from service.storage.sql.writer import RETRY_AFTER_S, Writer
 from service.times import Utc, utc_now
 
 MAX_WAITING = 2_000
 GROUP = 64
 HEARTBEAT_S, STALLED_S = 1.0, 20.0
-"""The ingest thread tells at least so often that it works, and is taken for dead after so long;
+"""The longest time between heartbeats of the ingest thread, and the silence that counts as failure;
 one look-up takes at most five seconds."""
 DRAIN_S = 8.0
 """The longest wait for submissions to be answered when the service stops."""
 
-Outcome = Answered | Exception
 Found = Sequence[Answered | Exception | None]
 
 log = logging.getLogger(__name__)
@@ -63,6 +62,14 @@ class PendingBatch:
     since_s: float = field(default_factory=time.monotonic)
 
 
+@dataclass(frozen=True)
+class QueueState:
+    """How many submissions wait for their answers, and the age of the oldest."""
+
+    queued: int
+    oldest_s: float
+
+
 class IngestQueue:
     """Takes submissions from any thread."""
 
@@ -70,7 +77,7 @@ class IngestQueue:
         self,
         look_up: Callable[[Sequence[PendingBatch]], Found],
         solve: Callable[[PendingBatch], UnsavedResult],
-        recorded: Callable[[UnsavedResult, Outcome], object],
+        recorded: Callable[[UnsavedResult, WriteOutcome], object],
         writer: Writer,
         pool: SolverPool,
     ) -> None:
@@ -82,7 +89,7 @@ class IngestQueue:
         self._in_flight: dict[Identity, list[PendingBatch]] = {}
         """Those that are being computed or recorded, each with its repeats."""
         self._unsettled: dict[PendingBatch, None] = {}
-        self._written: list[tuple[PendingBatch, Outcome]] = []
+        self._written: list[tuple[PendingBatch, WriteOutcome]] = []
         self._closing = False
         self._empty = threading.Event()
         self._empty.set()
@@ -103,15 +110,15 @@ class IngestQueue:
             self._empty.clear()
         self._inbox.put(pending)
 
-    def state(self) -> tuple[int, float]:
-        """How many submissions wait for their answers, and the age of the oldest in seconds."""
+    def state(self) -> QueueState:
+        """The submissions that wait for their answers."""
         with self._lock:
             oldest = next(iter(self._unsettled), None)
             age_s = 0.0 if oldest is None else time.monotonic() - oldest.since_s
-            return len(self._unsettled), age_s
+            return QueueState(len(self._unsettled), age_s)
 
     def wait_until_empty(self, seconds: float) -> None:
-        """Wait until no submission waits for its answer, but no longer than so."""
+        """Wait until every submission is answered, at most `seconds`."""
         self._empty.wait(seconds)
 
     def require_alive(self) -> None:
@@ -138,14 +145,14 @@ class IngestQueue:
                     log.exception("a group of submissions failed")
                     self._settle([(pending, error) for pending in group])
         finally:
-            # Nothing is left after closing in order; otherwise no client shall wait in vain.
+            # Empty after an orderly close; otherwise the waiting clients get an error.
             with self._lock:
                 self._closing = True
                 left = list(self._unsettled)
             self._settle([(each, Stopping("the service is stopping")) for each in left])
 
     def _next_group(self) -> list[PendingBatch] | None:
-        """What waits, one at least; None after `close`."""
+        """The submissions that wait, at least one; None after `close`."""
         group: list[PendingBatch] = []
         while not group:
             self._beat_s = time.monotonic()
@@ -160,7 +167,7 @@ class IngestQueue:
         return group
 
     def _begin(self, group: Sequence[PendingBatch]) -> None:
-        """Answer what is recorded or waited too long; have the rest computed, each once."""
+        """Answer recorded and expired submissions; start computing the others, each once."""
         now_s = time.monotonic()
         late = [each for each in group if now_s - each.since_s > each.wait_s]
         group = [each for each in group if now_s - each.since_s <= each.wait_s]
@@ -185,7 +192,7 @@ class IngestQueue:
                 repeats.append(pending)
                 return
             self._in_flight[pending.identity] = []
-        task = Task(
+        task = SolverTask(
             partial(self._solve_and_record, pending),
             lambda error: self._finish([(pending, error)]),
             pending.since_s + pending.wait_s,
@@ -207,7 +214,7 @@ class IngestQueue:
     # ---- the writer's thread -----------------------------------------------------------------
 
     def _note_written(
-        self, pending: PendingBatch, unsaved: UnsavedResult, outcome: Results | Exception
+        self, pending: PendingBatch, unsaved: UnsavedResult, outcome: WriteOutcomes | Exception
     ) -> None:
         one = outcome if isinstance(outcome, Exception) else outcome[0]
         self._told(unsaved, one)
@@ -220,7 +227,7 @@ class IngestQueue:
 
     # ---- answers -----------------------------------------------------------------------------
 
-    def _finish(self, outcomes: Sequence[tuple[PendingBatch, Outcome]]) -> None:
+    def _finish(self, outcomes: Sequence[tuple[PendingBatch, WriteOutcome]]) -> None:
         """Answer what was computed; its repeats are looked up, for it may have failed."""
         with self._lock:
             repeats = [each for p, _ in outcomes for each in self._in_flight.pop(p.identity, ())]
@@ -228,8 +235,8 @@ class IngestQueue:
             self._inbox.put(each)
         self._settle(outcomes)
 
-    def _settle(self, outcomes: Sequence[tuple[PendingBatch, Outcome]]) -> None:
-        by_loop: dict[asyncio.AbstractEventLoop, list[tuple[PendingBatch, Outcome]]] = {}
+    def _settle(self, outcomes: Sequence[tuple[PendingBatch, WriteOutcome]]) -> None:
+        by_loop: dict[asyncio.AbstractEventLoop, list[tuple[PendingBatch, WriteOutcome]]] = {}
         with self._lock:
             for pending, _ in outcomes:
                 self._unsettled.pop(pending, None)
@@ -241,12 +248,12 @@ class IngestQueue:
             else:
                 by_loop.setdefault(pending.future.get_loop(), []).append((pending, outcome))
         for loop, some in by_loop.items():
-            # The loop may be closed: nobody waits for its answers any more.
+            # The loop may be closed: then no client waits for these answers.
             with suppress(RuntimeError):
                 loop.call_soon_threadsafe(_answer, some)
 
 
-def _answer(outcomes: Sequence[tuple[PendingBatch, Outcome]]) -> None:
+def _answer(outcomes: Sequence[tuple[PendingBatch, WriteOutcome]]) -> None:
     for pending, outcome in outcomes:
         if pending.future.done():
             continue  # the client has gone

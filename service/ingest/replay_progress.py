@@ -96,7 +96,7 @@ class ProgressRecorder:
         def store(connection: Connection) -> None:
             insert_replay(connection, replay)
             also(connection)
-            events.note(connection, "replay", progress, run=self.run)
+            events.add_event(connection, "replay", progress, run=self.run)
 
         self._store.writer.change(store).result()
 
@@ -135,7 +135,7 @@ class ProgressRecorder:
                 ended = finished or self._now()
                 stored = structs.replace(progress, state=CANCELLED, finished=ended)
             update_replay(connection, stored, errors)
-            events.note(connection, "replay", stored, run=self.run)
+            events.add_event(connection, "replay", stored, run=self.run)
 
         self.require_saved()
         self._errors_changed, self._is_saved = False, True
@@ -188,7 +188,7 @@ class ProgressRecorder:
 
 
 def _shortened_problem(error: Exception) -> LineProblem:
-    """What is wrong with a line: its first faults, and no text longer than a reader needs."""
+    """The problem of a line: its first faults, long texts shortened."""
     problem = problem_of(error)
     if "errors" not in problem:
         return LineProblem(detail=_shortened(problem["detail"]), errors=UNSET)

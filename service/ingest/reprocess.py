@@ -1,8 +1,8 @@
 """Recorded batches run again into a named run: over all cores, and resumable.
 
 Workers compute; this process alone reads and writes, since SQLite has one
-writer.  What the run holds already is left out of the reading, so that a
-reprocessing that was stopped, however hard, goes on where it was.
+writer.  Batches that the run already holds are not read, so that a stopped or
+killed reprocessing continues where it was.
 """
 
 import json
@@ -51,13 +51,13 @@ class ReprocessProgress:
 
 @dataclass(frozen=True)
 class ReprocessPlan:
-    """What is to run again: the stretch, the run that takes it, and with which settings."""
+    """The batches to run again, the run that gets the results, and the settings."""
 
     stretch: ResultFilter
     run: str
     missions: Mapping[str, Mission]
     catalog: Path | None
-    shelf_bytes: int
+    cache_bytes: int
     processes: int = 0
     """How many workers; 0: one a core, 1: none but this process."""
 
@@ -147,7 +147,7 @@ def _counted(store: Store, plan: ReprocessPlan) -> ReprocessProgress:
 
 
 def _chunks(store: Store, plan: ReprocessPlan) -> Iterator[list[StoredBatch]]:
-    """What is still to be done, in order of time; no moment of the database is held on to."""
+    """The batches still to be run, in order of time; no read transaction stays open."""
     place: tuple[int, str] | None = None
     query = (
         select(*PLACE, batches.c.input, results.c.options)
@@ -195,7 +195,7 @@ def _record(
 
 @dataclass(frozen=True)
 class _WorkerTask:
-    """What a worker takes: stored batches, and the run that they go to."""
+    """The input of a worker: stored batches, and the run that they go to."""
 
     run: str
     stored: Sequence[StoredBatch]
@@ -221,7 +221,7 @@ class _ChunkSolver:
 
     def __init__(self, plan: ReprocessPlan, catalog_digest: str) -> None:
         self._run = plan.run
-        self._config = WorkerConfig(plan.missions, plan.catalog, catalog_digest, plan.shelf_bytes)
+        self._config = WorkerConfig(plan.missions, plan.catalog, catalog_digest, plan.cache_bytes)
         self.count = plan.processes or os.cpu_count() or 1
         self._workers = LocalWorkers[_WorkerTask, UnsavedResult | RefusedBatch](
             self._config, process_again, self.count

@@ -100,8 +100,8 @@ def may_take_long(batch: ObservationBatch) -> bool:
     )
 
 
-class Task(NamedTuple):
-    """Work for a thread, and what is called in its place where it is not begun in time."""
+class SolverTask(NamedTuple):
+    """Work for a thread, and the function that is called if it does not start in time."""
 
     work: Callable[[], object]
     refuse: Callable[[Exception], object]
@@ -113,16 +113,16 @@ class TurnQueue:
     """Tasks in turns: one of each client and spacecraft that has some, then the next."""
 
     def __init__(self) -> None:
-        self._tasks: OrderedDict[Hashable, deque[Task]] = OrderedDict()
+        self._tasks: OrderedDict[Hashable, deque[SolverTask]] = OrderedDict()
 
     def __bool__(self) -> bool:
         return bool(self._tasks)
 
-    def put(self, turn: Hashable, task: Task) -> None:
+    def put(self, turn: Hashable, task: SolverTask) -> None:
         """Add a task to those of a turn."""
         self._tasks.setdefault(turn, deque()).append(task)
 
-    def get(self) -> Task:
+    def get(self) -> SolverTask:
         """The next task; its turn comes again after all others."""
         turn, tasks = self._tasks.popitem(last=False)
         task = tasks.popleft()
@@ -148,7 +148,7 @@ class SolverPool:
         for thread in self._threads:
             thread.start()
 
-    def put(self, task: Task, turn: Hashable, *, is_long: bool) -> None:
+    def put(self, task: SolverTask, turn: Hashable, *, is_long: bool) -> None:
         """Queue a task; raises `Stopping` after `close`."""
         with self._changed:
             if self._closing:
@@ -169,7 +169,7 @@ class SolverPool:
                 done.set_exception(error)
 
         give_up_s = time.monotonic() + (WAIT_S if wait_s is None else wait_s)
-        self.put(Task(run, done.set_exception, give_up_s), turn, is_long=is_long)
+        self.put(SolverTask(run, done.set_exception, give_up_s), turn, is_long=is_long)
         return done.result()
 
     def close(self) -> None:
@@ -200,7 +200,7 @@ class SolverPool:
                     with self._changed:
                         self._long_slots += 1
 
-    def _next(self) -> tuple[Task, bool] | None:
+    def _next(self) -> tuple[SolverTask, bool] | None:
         """The next task and whether it is long; None when there will be none."""
         with self._changed:
             while True:

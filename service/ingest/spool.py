@@ -20,7 +20,7 @@ RETRY_S = 30
 
 @dataclass(frozen=True)
 class SpooledReplay:
-    """What a replay needs beside its row and its file to go on."""
+    """The settings that a replay needs beside its row and its file to go on."""
 
     id: str
     coding: Coding

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from typing import TypeVar
 
 import msgspec
@@ -16,7 +17,7 @@ from service.access.audit import Entry
 from service.access.tokens import Caller, own_key
 from service.acquire import Acquisition
 from service.errors import AcquisitionError, BadBatch, Busy, Fault, shown_value
-from service.ingest.queue import IngestQueue, PendingBatch
+from service.ingest.queue import IngestQueue, PendingBatch, QueueState
 from service.ingest.solver_pool import WAIT_S, Solver, SolverPool, may_take_long
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
@@ -36,15 +37,16 @@ from service.storage.recording.identity import (
     stored_answers,
 )
 from service.storage.recording.results import record
-from service.storage.recording.unsaved_result import Answered, Row, UnsavedResult, unsaved_what_if
+from service.storage.recording.unsaved_result import Answered, UnsavedResult, unsaved_what_if
 from service.storage.sql.database import Store
-from service.storage.sql.transaction import Results
+from service.storage.sql.transaction import WriteOutcomes
+from service.storage.sql.writer import WriterState
 from service.times import utc_now
 
 MAX_KEY_LENGTH = 255
 
 YIELD_S = 0.002
-"""Each of many batches waits at most so long for single ones that wait for their answers."""
+"""The longest wait of each bulk batch for single posts."""
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +55,7 @@ AnswerFuture = TypeVar("AnswerFuture", "asyncio.Future[Answered]", "Future[Answe
 
 
 class Recorded(Struct, frozen=True, eq=False):
-    """A batch that is newly recorded, as observers are told of it."""
+    """A newly recorded batch, as observers receive it."""
 
     spacecraft: str
     run: str
@@ -66,8 +68,16 @@ class Recorded(Struct, frozen=True, eq=False):
 Observer = Callable[[Recorded], None]
 
 
-class _RolledBack(Exception):
-    """Ends a transaction that is to leave nothing behind."""
+@dataclass(frozen=True)
+class Backlog:
+    """The queue of submitted batches, and that of the writer."""
+
+    posts: QueueState
+    writes: WriterState
+
+
+class _WarmedUp(Exception):
+    """Rolls the warm-up batch back."""
 
 
 class SubmissionService:
@@ -132,7 +142,7 @@ class SubmissionService:
         return future
 
     def submit_many(self, submissions: Sequence[Submission]) -> Answers:
-        """Record many in one transaction; an error stands in the place of what is refused."""
+        """Record many in one transaction; a refused one has its error in the list."""
         with self._store.reading() as connection:
             registry = look_up(connection, {identity_of(each.batch) for each in submissions})
             holders = [
@@ -205,7 +215,7 @@ class SubmissionService:
             is_long=may_take_long(batch),
         )
 
-    def rehearse(self, submission: Submission) -> None:
+    def warm_up(self, submission: Submission) -> None:
         """Look up, solve and record a batch, and take it back: nothing is kept or told.
 
         Connections are opened and statements prepared that the first batch
@@ -224,9 +234,9 @@ class SubmissionService:
 
         def record_and_roll_back(connection: Connection) -> None:
             record(connection, [unsaved])
-            raise _RolledBack
+            raise _WarmedUp
 
-        with suppress(_RolledBack):
+        with suppress(_WarmedUp):
             self._store.writer.change(record_and_roll_back).result()
 
     # ---- bulk --------------------------------------------------------------------------------
@@ -264,11 +274,9 @@ class SubmissionService:
 
     # ---- state -------------------------------------------------------------------------------
 
-    def backlog(self) -> Row:
-        """What waits: `posts` that are not answered yet, and the state of the `writes`."""
-        waiting, oldest_s = self._queue.state()
-        posts = {"queued": waiting, "oldest_s": oldest_s}
-        return {"posts": posts, "writes": self._store.writer.state()}
+    def backlog(self) -> Backlog:
+        """The submissions without an answer, and the state of the writes."""
+        return Backlog(self._queue.state(), self._store.writer.state())
 
     def require_alive(self) -> None:
         """Raise `Stopping` where submissions are not worked on any more."""
@@ -289,9 +297,9 @@ class SubmissionService:
     def _recorded_before(
         self, group: Sequence[PendingBatch]
     ) -> list[Answered | AcquisitionError | None]:
-        """What is stored of each: the answer, the error where its place is taken, or nothing."""
-        # Identities before keys, each as of its moment: what is recorded in between is found by its
-        # key, or seems new, and then the transaction finds it.
+        """For each: the stored answer, the error where another body has its identity, or None."""
+        # Identities before keys, each as of its moment: a batch recorded in between is found by
+        # its key, or seems new, and then the transaction finds it.
         with self._noted_failure(len(group)), self._store.lookup() as connection:
             registry = look_up(
                 connection,
@@ -363,7 +371,7 @@ def _note_handed_over(unsaved_results: Sequence[UnsavedResult]) -> None:
         unsaved.handed_over_ns = moment_ns
 
 
-def _decided(outcomes: Results) -> Answers:
+def _decided(outcomes: WriteOutcomes) -> Answers:
     answers: Answers = []
     for outcome in outcomes:
         # Neither is an answer to the batch: both say that nothing was decided about it.

@@ -31,25 +31,25 @@ class RecordedLine:
 
 @dataclass(frozen=True)
 class InvalidLine:
-    """What is wrong with a line, and whose batch it is where it can be read."""
+    """The error of a line, and the spacecraft of its batch where it can be read."""
 
     spacecraft: str | None
     error: AcquisitionError
 
 
 LineResult = UnsavedResult | RecordedLine | InvalidLine
-Drafting = Callable[[Sequence[Submission]], Sequence[UnsavedResult | AcquisitionError]]
+ComputeMany = Callable[[Sequence[Submission]], Sequence[UnsavedResult | AcquisitionError]]
 
 
-def line_results(lines: TelemetryLines, unsaved: Drafting) -> list[LineResult]:
-    """What each line comes to, in order; `unsaved` is given all that are to be computed."""
+def line_results(lines: TelemetryLines, compute: ComputeMany) -> list[LineResult]:
+    """The result of each line, in order; `compute` is given all new submissions."""
     read = [_read(text, lines.run) for text in lines.texts]
     fresh = [
         each
         for place, each in enumerate(read)
         if isinstance(each, Submission) and place not in lines.known
     ]
-    drafted = iter(unsaved(fresh))
+    computed = iter(compute(fresh))
     found: list[LineResult] = []
     for place, each in enumerate(read):
         if isinstance(each, InvalidLine):
@@ -57,7 +57,7 @@ def line_results(lines: TelemetryLines, unsaved: Drafting) -> list[LineResult]:
         elif place in lines.known:
             found.append(RecordedLine(identity_of(each.batch), each.fingerprint))
         else:
-            match next(drafted):
+            match next(computed):
                 case AcquisitionError() as error:
                     found.append(InvalidLine(each.batch.spacecraft, error))
                 case made:
@@ -86,7 +86,7 @@ _NAMED = msgspec.json.Decoder(_NamedBatch)
 
 
 def identity_in(text: bytes, run: str) -> Identity | None:
-    """What a line seems to be called, read in passing; None where that cannot be told."""
+    """The identity in a line, without checking the rest; None where it cannot be read."""
     try:
         named = _NAMED.decode(text)
     except (msgspec.MsgspecError, UnicodeError, RecursionError):

@@ -123,6 +123,18 @@ class ReplaySummary:
         if self._results is not None:
             self._results.close()
 
+    def counts(self) -> dict[str, Any]:
+        """The summary as plain values."""
+        return {
+            "batches": self.batches,
+            "new": self.new,
+            "already_recorded": self.replayed,
+            "refused": self.refused,
+            "stars": {word: self.stars[word] for word in STARS},
+            "attitudes": self.attitudes,
+            "batches_per_s": self.batches / max(self.seconds, 1e-9),
+        }
+
     def table(self) -> str:
         """The summary: what was sent, what was found, how fast."""
         observed = self.stars["observed"]

@@ -9,10 +9,12 @@ from contextlib import asynccontextmanager
 import anyio.to_thread
 from fastapi import APIRouter, Depends, FastAPI
 from fastapi.routing import APIRoute
+from starlette.middleware.gzip import DEFAULT_EXCLUDED_CONTENT_TYPES, GZipMiddleware
 from starlette.staticfiles import StaticFiles
 
 from service import __version__
 from service.app.factory import App
+from service.products.formats import OUTPUT_FORMATS
 from service.web.api import (
     advice,
     alarms,
@@ -22,16 +24,19 @@ from service.web.api import (
     frames,
     overview,
     probes,
+    products,
     runs,
     spacecraft,
     zones,
 )
 from service.web.api import tokens as access
+from service.web.conditional import ConditionalAnswers
 from service.web.console import console_router
 from service.web.event_stream import Live
 from service.web.middleware import AroundRequests
 from service.web.openapi.document import add_reference
 from service.web.requests.access import authorize
+from service.web.requests.exports import Exports
 from service.web.requests.metrics import Metrics
 from service.web.requests.problems import add_error_handlers
 from service.web.requests.request_body import DEFAULT_LIMITS, BodyBudget, BodyLimits
@@ -46,6 +51,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     batches.router,
     frames.router,
     spacecraft.router,
+    products.router,
     advice.router,
     compare.router,
     zones.router,
@@ -56,6 +62,12 @@ ROUTERS: tuple[APIRouter, ...] = (
     access.router,
     probes.router,
 )
+
+COMPRESS_LEVEL = 4
+"""Of gzip: a third of the time of its default, for 7 % more bytes of a list."""
+
+COMPRESSED = (*DEFAULT_EXCLUDED_CONTENT_TYPES, OUTPUT_FORMATS["parquet"].media_type)
+"""Media types that are compressed by themselves, or are streams of events."""
 
 DIRECT = (batches.submit_batch,)
 """Handlers that are asked by the thousand a second: see `AroundRequests`."""
@@ -88,6 +100,15 @@ def create_app(app: App, limits: BodyLimits = DEFAULT_LIMITS) -> FastAPI:
     web_app.state.body_budget = BodyBudget(limits)
     web_app.state.metrics = Metrics(app)
     web_app.state.live = Live(app)
+    # The last that is added is the first that is asked: it passes the direct routes by these two.
+    web_app.add_middleware(ConditionalAnswers)
+    web_app.add_middleware(
+        GZipMiddleware,
+        minimum_size=1_000,
+        compresslevel=COMPRESS_LEVEL,
+        exclude_content_types=COMPRESSED,
+    )
+    web_app.state.exports = Exports()
     web_app.add_middleware(
         AroundRequests,
         metrics=web_app.state.metrics,

@@ -20,7 +20,7 @@ IPV6_SITE_BITS = 64
 
 
 class Closable(Protocol):
-    """What is admitted: it can be closed at once."""
+    """A connection that can be closed at once."""
 
     def abort(self) -> None:
         """Close the connection, whatever is still to be sent."""
@@ -148,7 +148,7 @@ def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 @lru_cache(maxsize=4096)
 def _origin(host: str) -> str:
-    """What counts as one client: an IPv4 address, or a /64 network of IPv6."""
+    """The key of one client: an IPv4 address, or a /64 network of IPv6."""
     address = _address(host)
     if address is None:
         return host

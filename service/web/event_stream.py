@@ -1,6 +1,6 @@
-"""Live events: what the records note, passed on to whoever listens, and nothing lost between.
+"""Live events: recorded events, sent to every listener without a gap.
 
-The same task looks every second for what no batch tells of: silence.
+The same task checks every second for silent spacecraft.
 
 One task reads new events, at once when this process wrote them and every second
 for what others wrote.  The latest are held in memory; each listener takes them
@@ -45,7 +45,7 @@ T = TypeVar("T")
 
 @dataclass(eq=False)
 class Listener:
-    """Who follows a stream, and by what they were let in."""
+    """A client of a stream, and the token or session that it presented."""
 
     caller: Caller
     token: str | None = None
@@ -221,9 +221,10 @@ class Live:
 
 
 def _concerns(event: Event, run: str | None, spacecraft: str | None) -> bool:
-    """What names no run concerns every run; of a replay only who asks for all spacecraft is told.
+    """Whether an event passes the filters of a stream.
 
-    It names none, its lines may be about any, and its id lets one ask for their faults.
+    An event without a run concerns every run.  A replay names no spacecraft: its lines may be
+    about any, and its id gives access to their errors, so it passes only without a filter.
     """
     return (event.run is None or run is None or event.run == run) and (
         spacecraft is None or event.spacecraft == spacecraft

@@ -20,16 +20,11 @@ from service.errors import Busy
 from service.settings import is_loopback
 from service.web.requests.access import authorize, entry_of, is_open
 from service.web.requests.metrics import Metrics
-from service.web.requests.problems import (
-    ProblemType,
-    error_response,
-    internal_error,
-    problem_response,
-)
+from service.web.requests.problem_types import WRONG_HOST, ProblemType
+from service.web.requests.problems import error_response, internal_error, problem_response
 from service.web.requests.request_body import BodyBudget
 from service.web.warm_request import WARM_REQUEST
 
-WRONG_HOST = ProblemType(421, "Misdirected request", "not-this-host")
 NOT_FOUND = ProblemType(404, "Not Found")
 
 log = logging.getLogger(__name__)
@@ -97,7 +92,7 @@ class AroundRequests:
 
         # A scope of its own: the server still sees HEAD and frames the answer accordingly.
         inner = {**scope, "method": "GET"} if is_head else scope
-        about = logs.About(_request_id(scope), run=_run(scope))
+        about = logs.RequestContext(_request_id(scope), run=_run(scope))
         # Every request has a task, and so a context, of its own.
         logs.request.set(about)
         try:
@@ -183,7 +178,7 @@ class ProbesOnly:
 
 
 async def _answered(route: APIRoute, request: Request) -> Response:
-    """What a direct route answers, guarded as every route is."""
+    """The response of a direct route, with the access check of every route."""
     try:
         await authorize(request)
         response: Response = await route.endpoint(request)

@@ -22,7 +22,7 @@ from service.storage.sql.served import hold_served
 from service.web.app import create_app
 from service.web.connection_limits import Admission
 from service.web.middleware import ProbesOnly
-from service.web.slow_clients import Connection, State
+from service.web.slow_clients import Connection, SharedState
 
 MAX_FILES = 4096
 
@@ -108,7 +108,7 @@ class Server(uvicorn.Server):
         admission: Admission | None = None,
     ) -> None:
         super().__init__(config)
-        self.server_state = self._state = State(admission or Admission(_connections()))
+        self.server_state = self._state = SharedState(admission or Admission(_connections()))
         self._stop_streams = stop_streams
         self._probes: tuple[socket.socket, uvicorn.Config] | None = None
 

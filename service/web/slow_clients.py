@@ -46,8 +46,8 @@ DISCARDING_SHARE = 0.1
 LEAST_PAUSE_S = 0.005
 
 
-class State(ServerState):
-    """What the connections of a server share."""
+class SharedState(ServerState):
+    """State that the connections of a server share."""
 
     def __init__(self, admission: Admission) -> None:
         super().__init__()
@@ -66,7 +66,7 @@ class Connection(asyncio.BufferedProtocol):
     def __init__(
         self,
         config: uvicorn.Config,
-        server_state: State,
+        server_state: SharedState,
         app_state: dict[str, Any],
         _loop: asyncio.AbstractEventLoop | None = None,
         admission: Admission | None = None,
@@ -161,7 +161,7 @@ class _Http(HttpToolsProtocol):
     def __init__(
         self,
         config: uvicorn.Config,
-        server_state: State,
+        server_state: SharedState,
         app_state: dict[str, Any],
         _loop: asyncio.AbstractEventLoop | None,
         admission: Admission | None,
@@ -301,7 +301,7 @@ class _Http(HttpToolsProtocol):
             super()._start_asgi_task(cycle, app)
 
     def _unsupported_upgrade_warning(self) -> None:
-        """A request to upgrade is answered as one without: no client shall fill the log."""
+        """Answer a request to upgrade as any other; a warning each time would fill the log."""
 
     def send_400_response(self, msg: str) -> None:
         if not self._is_over:

@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from service.alarms.limits import LimitSettings, Severity
 from service.alarms.quantities import default_limits, limited_names
-from service.alarms.window import Window
+from service.alarms.window import SampleWindow
 
 S = 10**9
 
@@ -25,7 +25,7 @@ def limits(**changed):
 
 
 def judge(settings, values, step_s=10):
-    window = Window()
+    window = SampleWindow()
     found = [window.add((k * step_s * S, value, 1), settings) for k, value in enumerate(values)]
     return [each and each.severity and each.severity.word for each in found]
 
@@ -56,7 +56,7 @@ def test_nothing_is_judged_before_there_are_enough():
 
 
 def test_what_is_judged_is_the_mean_of_the_latest():
-    window = Window()
+    window = SampleWindow()
     settings = limits(minimum_count=4)
     for k, value in enumerate([100, 1, 2, 3, 4]):
         judged = window.add((k, value, 1), settings)
@@ -64,7 +64,7 @@ def test_what_is_judged_is_the_mean_of_the_latest():
 
 
 def test_shares_are_pooled_over_all_stars():
-    window, settings = Window(), limits(minimum_count=2)
+    window, settings = SampleWindow(), limits(minimum_count=2)
     window.add((0, 1, 1), settings)
     assert window.add((1, 0, 9), settings).value == pytest.approx(0.1)
 
@@ -93,7 +93,7 @@ def test_the_value_does_not_depend_on_the_order_in_which_batches_come(samples, c
     samples = [(time, part, 5) for time, part in dict(samples).items()]
 
     def last(order):
-        window = Window()
+        window = SampleWindow()
         judged = [window.add(each, settings) for each in order]
         return window.samples, judged[-1] and judged[-1].value
 
@@ -118,7 +118,7 @@ def test_what_is_passed_over_would_have_been_in_limits_one_by_one(groups, count,
         limits(watch={"low": -size, "high": size}, minimum_count=count, duration_s=duration_s)
         for size in (1.4, 1.0)
     )
-    one_by_one, together = Window(), Window()
+    one_by_one, together = SampleWindow(), SampleWindow()
     for values, is_wide in groups:
         settings = wide if is_wide else narrow
         samples = [(time * S, value, 1) for time, value in values]
@@ -136,7 +136,7 @@ def test_what_is_passed_over_would_have_been_in_limits_one_by_one(groups, count,
 
 
 def test_what_stays_well_in_limits_is_passed_over():
-    settings, window = limits(minimum_count=3), Window()
+    settings, window = limits(minimum_count=3), SampleWindow()
     assert window.add_if_within([(k, 0.5, 1) for k in range(10)], settings)
     assert not window.add_if_within([(k, 1.5, 1) for k in range(10, 13)], settings)
     # Of batches that come late no mean is worse than the worst of them.
@@ -147,10 +147,10 @@ def test_what_stays_well_in_limits_is_passed_over():
 @given(st.lists(st.floats(-5, 5), max_size=30), st.floats(0, 100), st.integers(1, 5))
 def test_kept_and_read_again_a_window_goes_on_as_it_was(values, duration_s, count):
     settings = limits(duration_s=duration_s, minimum_count=count)
-    whole, kept = Window(), Window()
+    whole, kept = SampleWindow(), SampleWindow()
     for k, value in enumerate(values):
         expected = whole.add((k * S, value, 1), settings)
-        kept = Window.from_json(kept.to_json())
+        kept = SampleWindow.from_json(kept.to_json())
         assert kept.add((k * S, value, 1), settings) == expected
 
 

@@ -264,7 +264,7 @@ def test_a_batch_that_no_processor_takes_for_long_may_come_again(app, make, monk
         go_on.wait(30)
 
     for _ in pool._threads:
-        pool.put(solver_pool.Task(hold, print, give_up_s), "a", is_long=False)
+        pool.put(solver_pool.SolverTask(hold, print, give_up_s), "a", is_long=False)
     begun.wait(30)
     with ThreadPoolExecutor(2) as threads:
         batch = make().batch

@@ -1,4 +1,4 @@
-"""The identifier `ptp` in the staircase: a batch of the paper's camera, the a priori ignored."""
+"""The identifier `ptp` in the pipeline: a batch of the paper's camera, the a priori ignored."""
 
 import json
 

@@ -60,6 +60,10 @@ def hostile_files(rng):
     yield "tiff bomb", _tiff_bomb(20_000, 20_000), "400000000 pixels"
     yield "tiff of more than it says", _tiff_bomb(SIDE, SIDE), "no contrast"
     yield "tiff with great tags", _tiff_tags(200), "TIFF tag"
+    yield "tiff with great tags of fractions", _tiff_tags(200, 5, 8), "TIFF tag"
+    yield "tiff with much exif", _tiff_of_exif(), "EXIF"
+    yield "jpeg with much exif", _jpeg_of_exif(_picture(grey, "JPEG")), "EXIF"
+    yield "png with much exif", _png(SIDE, SIDE, 0, chunk=_chunk(b"eXIf", _exif())), "no contrast"
     yield "tiff with many tags", _tiff_tags(60_000), "tags"
     yield "tiff cut off", _picture(sky, "TIFF")[:100_000], "TIFF"
     yield "tiff whose directory is elsewhere", b"II*\0" + struct.pack("<L", 1 << 31), "cut off"
@@ -176,12 +180,34 @@ def _tiff_bomb(width, height):
     )
 
 
-def _tiff_tags(count):
+def _tiff_tags(count, kind=1, size=1):
     """Tags that all point to the same ten megabytes."""
     behind = bytes(10 << 20)
     tags = [(256, 4, 1, SIDE), (257, 4, 1, SIDE)]
-    tags += [(1000 + k, 1, len(behind), 8) for k in range(count)]
+    tags += [(1000 + k, kind, len(behind) // size, 8) for k in range(count)]
     return _tiff(tags, behind)
+
+
+def _exif():
+    """EXIF of a million fractions, each of which becomes an object where all are read."""
+    fractions = struct.pack("<LL", 3, 7) * (1 << 20)
+    at = 8 + 2 * (2 + 12 + 4)
+    inside = struct.pack("<HHHLL4x", 1, 40_000, 5, 1 << 20, at)
+    return _tiff([(0x8769, 4, 1, 8 + 2 + 12 + 4)], inside + fractions)
+
+
+def _tiff_of_exif():
+    inside = struct.pack("<HHHLL4x", 1, 40_000, 5, 1 << 20, 8)
+    size = [(256, 4, 1, SIDE), (257, 4, 1, SIDE)]
+    return _tiff([*size, (0x8769, 4, 1, 8 + 2 + 12 * 3 + 4)], inside + bytes(8 << 20))
+
+
+def _jpeg_of_exif(whole):
+    """The same in pieces of 64 KiB, which Pillow joins."""
+    data, size = _exif(), 65_000
+    parts = [b"Exif\0\0" + data[at : at + size] for at in range(0, len(data), size)]
+    told = b"".join(b"\xff\xe1" + struct.pack(">H", len(part) + 2) + part for part in parts)
+    return whole[:2] + told + whole[2:]
 
 
 def _npy(shape, descr):

@@ -11,7 +11,7 @@ import pytest
 from service.errors import Busy, Stopping
 from service.ingest import queue
 from service.ingest import solver_pool as pools
-from service.ingest.solver_pool import SolverPool, Task, TurnQueue, may_take_long
+from service.ingest.solver_pool import SolverPool, SolverTask, TurnQueue, may_take_long
 from service.observations.schema import submission_from_json
 
 PATIENCE_S = 20.0
@@ -134,7 +134,7 @@ def test_the_answers_of_a_group_reach_an_event_loop_together(app, make):
         futures = [
             app.submissions.ingest.submit(each, None, None, loop.create_future()) for each in sent
         ]
-        while app.store.writer.state()["queued"] < len(sent):
+        while app.store.writer.state().queued < len(sent):
             await asyncio.sleep(0.01)
         calls.clear()
         go_on.set()
@@ -175,7 +175,9 @@ def test_long_tasks_leave_a_thread_to_short_ones():
     done = []
     give_up_s = time.monotonic() + PATIENCE_S
     for _ in range(5):
-        pool.put(Task(lambda: go_on.wait(PATIENCE_S), done.append, give_up_s), "a", is_long=True)
+        pool.put(
+            SolverTask(lambda: go_on.wait(PATIENCE_S), done.append, give_up_s), "a", is_long=True
+        )
     for k in range(5):
         assert pool.call(lambda k=k: k, "a", is_long=False) == k
     go_on.set()
@@ -185,10 +187,10 @@ def test_long_tasks_leave_a_thread_to_short_ones():
 def test_a_task_that_was_not_begun_in_time_is_refused():
     pool, go_on, refused = SolverPool(2), threading.Event(), Future()
     now = time.monotonic()
-    hold = Task(lambda: go_on.wait(PATIENCE_S), print, now + PATIENCE_S)
+    hold = SolverTask(lambda: go_on.wait(PATIENCE_S), print, now + PATIENCE_S)
     for _ in range(2):
         pool.put(hold, "a", is_long=False)
-    pool.put(Task(print, refused.set_result, now), "a", is_long=False)
+    pool.put(SolverTask(print, refused.set_result, now), "a", is_long=False)
     go_on.set()
     assert isinstance(refused.result(PATIENCE_S), Busy)
     pool.close()
@@ -219,6 +221,7 @@ def test_closing_finishes_what_has_begun_and_refuses_what_has_not():
 def test_an_ingest_thread_that_ended_or_stalls_is_noticed(app, make, monkeypatch):
     service = app.submissions.ingest
     service.require_alive()
+    monkeypatch.setattr(queue, "HEARTBEAT_S", 0.05)
     monkeypatch.setattr(queue, "STALLED_S", 0.5)
     go_on = threading.Event()
     look_up = service._queue._look_up

@@ -7,6 +7,7 @@ in the interface's description and in the app, so that new ones are read as well
 
 import json
 import re
+import time
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -27,6 +28,7 @@ from service.storage.sql import migrations
 from service.storage.sql.engines import database_url
 from service.storage.upkeep.verify import verify
 from service.web.app import create_app
+from service.web.requests.problem_types import types_with_pages
 from tests.databases.make import FOLDER, restore_postgresql, restore_sqlite
 from tests.web.conformance import check, reference
 from tests.web.serving import Server
@@ -114,6 +116,8 @@ def earlier(request, new_database):
                 base_url=address, timeout=60, headers=headers, event_hooks=hooks
             ) as client,
         ):
+            while client.get("/readyz").status_code != 200:
+                time.sleep(0.1)
             yield Earlier(url, before, after, schema, problems, client, app)
         assert verify(url) == []
 
@@ -248,6 +252,7 @@ def names_of(earlier):
         "advice/{name}": spacecraft,
         "latest/{name}": spacecraft,
         "runs/{run}": runs,
+        "problems/{slug}": list(types_with_pages()),
         "limits/{quantity}": [
             each["quantity"] for each in earlier.get(f"{API}/spacecraft/XTE/limits").json()["items"]
         ],
@@ -285,7 +290,8 @@ def queries(address, runs):
     if rest == "batches":
         shown = ("outcome=ambiguous", "outcome=unmatched", "status=good", "status=suspect")
         return by_run + [f"?run=*&{each}" for each in shown]
-    return by_run if rest in ("spacecraft", "overview", "attitudes", "worst") else [""]
+    by_run_alone = ("spacecraft", "overview", "attitudes", "attitude", "worst", "latest")
+    return by_run if rest in by_run_alone else [""]
 
 
 def runs_of(earlier, address):

@@ -241,7 +241,7 @@ def test_the_worst_are_those_of_sorting_everything(app, drawn, by, limit, bounds
     rows = rows_of(app, drawn, run)
     put(app, rows)
     start, end = shifted(START, bounds[0]), shifted(START, sum(bounds))
-    found = app.spacecraft.worst_batches("XTE", by=by, run=run, start=start, end=end, limit=limit)
+    found = app.spacecraft.ranking("XTE", by=by, run=run, start=start, end=end, limit=limit).items
     inside = [
         (abs(value), row["time_ns"], row["id"])
         for _, row in rows

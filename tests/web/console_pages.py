@@ -8,9 +8,9 @@ WITHOUT_CONTENT = ("latest_batch", "sign_in_page")
 
 
 def console_addresses() -> list[str]:
-    """Every page that needs no id; of spacecraft that of XTE."""
+    """Every page that needs no id; of spacecraft that of XTE, of problems one."""
     return [
-        page.path.format(name="XTE")
+        page.path.format(name="XTE", slug="bad-input")
         for name, page in PAGES.items()
         if name not in WITHOUT_CONTENT and "{id}" not in page.path
     ]

@@ -66,6 +66,12 @@ def walk(client: httpx.Client, app: App) -> Json:
     take("submit_batch", client.post(f"{API}/batches", content=b"{}"), "no_content_type")
 
     frame, file = _frame()
+    new = xte | {"batch": "1999-060-0003"}
+    asked = [new, xte, other, xte | {"spacecraft": "NOPE"}]
+    sent = client.post(f"{API}/batches/many", json=asked)
+    take("submit_batches", sent, "new_recorded_conflict_unknown", asked)
+    take("submit_batches", client.post(f"{API}/batches/many", json=[]), "none")
+
     take("submit_frame", _send(client, "IMAGER", frame, file), "attitude")
     cut_off = frame | {"batch": "cut-off"}
     take("submit_frame", _send(client, "IMAGER", cut_off, file[:5760]), "cut_off")
@@ -78,7 +84,11 @@ def walk(client: httpx.Client, app: App) -> Json:
     take("what_if", client.post(f"{here}/what-if", json=asked), "adopted", asked)
     take("get_batch", client.get(here), "superseded")
     take("list_batches", client.get(f"{API}/batches?spacecraft=XTE&limit=1"), "first_page")
+    mine = client.get(f"{API}/batches?spacecraft=XTE&batch=1999-060-0003")
+    take("list_batches", mine, "by_batch_id")
     take("list_batches", client.get(f"{API}/batches?limit=ten"), "limit")
+    take("get_latest", client.get(f"{API}/spacecraft/SOHO/latest"), "soho")
+    take("get_latest", client.get(f"{API}/spacecraft/XTE/latest?run=none"), "empty_run")
 
     take("list_spacecraft", client.get(f"{API}/spacecraft"), "all")
     take("get_spacecraft", client.get(f"{API}/spacecraft/SOHO"), "soho")
@@ -93,6 +103,7 @@ def walk(client: httpx.Client, app: App) -> Json:
     take("compare", client.post(f"{API}/compare", json=asked), "tighter", asked)
     _alarm(client, take)
     take("list_attitudes", client.get(f"{API}/spacecraft/SWAS/attitudes"), "one")
+    take("get_attitude", client.get(f"{API}/spacecraft/SWAS/attitude"), "one")
     take("list_rates", client.get(f"{API}/spacecraft/XTE/rates"), "one_hour")
 
     history = f"{API}/spacecraft/XTE/history"

@@ -28,6 +28,7 @@ PATH_PARAMETERS = {
     "id": "01JD0000000000000000000000",
     "run": "pass-7",
     "quantity": "ambiguous_share",
+    "slug": "bad-input",
 }
 OPEN_BESIDE_THE_ROUTES = {"/static", "/api/v1/openapi.json"}
 """What `docs/access.md` says is open, of what no policy is asked about."""
@@ -397,6 +398,26 @@ def test_a_session_ends_with_its_token(guarded):
         guarded.revoke("leaving")
         time.sleep(KNOWN_AGAIN_S)
         assert browser.get("/api/v1/session").status_code == 401
+
+
+def test_of_an_array_a_bound_token_records_its_own_spacecraft_alone(guarded, anybody, drawn):
+    array = [each | {"run": "array"} for each in (*drawn("SWAS", 2), *drawn("XTE", 1))]
+    sent = anybody.post("/api/v1/batches/many", json=array, headers=shown(guarded.swas))
+    items = sent.json()["items"]
+    assert [each["status"] for each in items] == [201, 201, 403]
+    assert items[2]["problem"]["type"] == "/problems/not-allowed"
+    listed = anybody.get("/api/v1/batches?run=array", headers=shown(guarded.all)).json()["items"]
+    assert {each["spacecraft"] for each in listed} == {"SWAS"}
+
+
+def test_an_array_uses_up_the_rate_of_its_token(guarded, anybody, drawn):
+    token = guarded.token("arrays", "submit", rate_per_s=0.5)
+    array = [each | {"run": "rated"} for each in drawn("SWAS", 8)]
+    answers = [
+        anybody.post("/api/v1/batches/many", json=array, headers=shown(token)) for _ in range(2)
+    ]
+    assert [each.status_code for each in answers] == [200, 429]
+    assert int(answers[1].headers["Retry-After"]) > 5
 
 
 def test_whoever_asks_too_often_is_told_when_to_come_again(guarded, anybody):

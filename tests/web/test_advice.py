@@ -7,7 +7,6 @@ from urllib.parse import parse_qs
 import httpx
 import pytest
 
-from service.times import parse_utc
 from tests.web.markup import Markup
 
 API = "/api/v1"
@@ -72,24 +71,16 @@ def test_the_page_of_nothing_says_so(address):
     assert "There are no batches in this period" in answer.text
 
 
-def test_the_front_page_leads_there(address, full_run):
-    text = httpx.get(f"{address}/", params={"run": full_run}).text
-    link = advice_link(text)
-    assert link["run"] == [full_run]
-
-
 def advice_link(text):
     """The query of the page's link to the advice for XTE."""
     (link,) = set(re.findall(r'href="/advice/XTE\?([^"]*)"', text))
     return parse_qs(html.unescape(link))
 
 
-@pytest.mark.parametrize("page", ["/", "/spacecraft/XTE"])
-def test_the_link_to_the_advice_asks_for_the_day_up_to_the_latest_batch(address, full_run, page):
-    text = httpx.get(f"{address}{page}", params={"run": full_run}).text
+def test_the_link_to_the_advice_asks_for_the_period_that_holds_the_run(address, full_run):
+    text = httpx.get(f"{address}/spacecraft/XTE", params={"run": full_run}).text
     link = advice_link(text)
-    start, end = (parse_utc(link[name][0]) for name in ("start", "end"))
-    assert (end.tai_ns - start.tai_ns) / 1e9 == pytest.approx(86400)
+    assert link["run"] == [full_run]
     answer = httpx.get(f"{address}/advice/XTE", params=link, timeout=60)
     assert "20 of 20 batches processed again" in answer.text
 

@@ -234,7 +234,7 @@ def test_a_wrong_query_is_named(client, url):
         "/static/../app.py",
         "/static/%2e%2e/page.py",
         "/static/nothing.css",
-        "/docs",
+        "/redoc",
     ],
 )
 def test_what_is_not_there_is_a_problem_too(client, url):

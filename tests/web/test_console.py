@@ -1,5 +1,6 @@
 """The console as markup: what its pages say, and what they do not let through."""
 
+import base64
 import itertools
 import math
 import re
@@ -15,12 +16,12 @@ from service.observations.schema import submission_from_json
 from service.settings import Settings
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
-from service.storage.models.overview import Sparkline
 from service.vectors import angle_between_deg, matrix_from_quaternion
 from service.web.app import create_app
 from service.web.console import formatting, options
 from service.web.console.charts import sky_chart
-from service.web.console.charts.sparkline import HEIGHT, WIDTH, sparkline
+from service.web.console.charts.heat_map import packed
+from service.web.console.charts.sparkline import HEIGHT, PAD, WIDTH, common_top, sparkline
 from tests.web.console_pages import console_addresses
 from tests.web.markup import Markup
 from tests.web.serving import Server
@@ -130,6 +131,8 @@ def test_with_nothing_recorded_it_says_what_to_do(empty):
     assert answer.status_code == 200
     assert "No live batches yet" in answer.text
     assert "POST /api/v1/batches" in answer.text
+    # Commands to copy, with the address at which the reader found the service.
+    assert f"acquire replay xte.ndjson --run live --url {empty.base_url}" in answer.text
     assert "No live batches of XTE yet" in text_of(empty.get("/spacecraft/XTE"))
     assert "No zones are cached" in text_of(empty.get("/zones"))
 
@@ -138,7 +141,20 @@ def test_with_only_named_runs_it_leads_to_them(empty, batch):
     empty.post("/api/v1/batches", json=batch | {"run": "pass-7"}, timeout=60)
     text = empty.get("/").text
     assert "No live batches yet" in text
-    assert '<a href="/?run=pass-7">pass-7</a> (1)' in text
+    assert '<a href="/?run=pass-7">pass-7</a>, 1 batch<' in text
+    assert "acquire replay xte.ndjson --run live" in text
+
+
+def test_a_named_run_is_first_shown_over_the_range_that_holds_it(client, full_run):
+    # 20 batches of XTE last ten minutes, those of SOHO more than an hour and a half.
+    for name, fitting in (("XTE", "hour"), ("SOHO", "day")):
+        page = client.get(f"/spacecraft/{name}", params={"run": full_run}).text
+        (current,) = re.findall(
+            r'<a class="button" data-go href="[^"]*" aria-current="true">(\w+)', page
+        )
+        assert current == fitting
+    page = client.get("/spacecraft/XTE", params={"run": full_run, "range": "year"}).text
+    assert re.findall(r'aria-current="true">(\w+)</a>', page) == ["year"]
 
 
 @pytest.mark.parametrize(
@@ -168,7 +184,7 @@ def test_what_is_not_there_is_told_on_a_page(client, full_run, place, status, sa
 
 
 def test_a_failed_solve_shows_no_attitude_as_the_present_one(client, post, batch, run):
-    """The last attitude stands with its own time and in its own words, in overview and page."""
+    """The last attitude stands with its own time, in overview and page."""
     lone = batch["observations"][0] | {"stars": batch["observations"][0]["stars"][:1]}
     first = post(batch | {"run": run}).json()
     later = {"time": "1999-03-01T05:00:00.000Z", "batch": "later", "observations": [lone]}
@@ -177,7 +193,7 @@ def test_a_failed_solve_shows_no_attitude_as_the_present_one(client, post, batch
     row = overview[overview.index("XTE") :]
     assert "no attitude" in row
     assert "fewer than two unique stars" in row
-    assert "last one was good, at 1999-03-01 (060) 00:00:00 UTC" in row
+    assert "last good 03-01 00:00" in row
     shown = [f"{abs(q):.6f}" for q in first["attitude"]["quaternion"]]
     assert not any(each in row for each in shown)
     page = text_of(client.get(f"/spacecraft/XTE?run={run}"))
@@ -348,22 +364,97 @@ def test_brighter_stars_are_larger_and_the_faintest_are_still_seen():
     assert sizes[-1] >= 1.0
 
 
+def points_of(path):
+    """The points of a path of relative moves, in parts between gaps."""
+    parts = []
+    for kind, text in re.findall(r"([Mhl])([-\d ]+)", path):
+        numbers = [int(each) for each in text.split()]
+        if kind == "M":
+            parts.append([tuple(numbers)])
+        else:
+            x, y = parts[-1][-1]
+            parts[-1].append((x + numbers[0], y + (numbers[1] if kind == "l" else 0)))
+    return parts
+
+
 def test_a_sparkline_has_a_gap_where_nothing_was_recorded():
-    series = Sparkline(
-        bucket_s=60,
-        unix_s=[0, 60, 120, 600, 660, 1200],
-        batches=[1] * 6,
-        unique_share=[0.0] * 6,
-        ambiguous_share=[0.0, 0.5, 0.0, 1.0, 0.0, 0.25],
-        unmatched_share=[0.0] * 6,
+    shares = [0.0, 0.5, 0.0, math.nan, 1.0, math.nan, 0.25, 0.25, 0.5]
+    path = sparkline({"ambiguous_share": np.array(shares)}, top=1.0).paths["ambiguous_share"]
+    parts = points_of(path)
+    assert [part[0][0] for part in parts] == [
+        round(PAD + k * (WIDTH - 2 * PAD) / 8) for k in (0, 4, 6)
+    ]
+    assert path == "M2 20l16 -9l15 9M64 2h0M95 16h15l16 -5"
+    assert parts[1] == [(64, PAD), (64, PAD)]
+    for x, y in itertools.chain(*parts):
+        assert 0 <= x <= WIDTH
+        assert 0 <= y <= HEIGHT
+
+
+def test_every_sparkline_of_a_page_has_one_scale():
+    assert [common_top(each) for each in (0.0, 0.05, 0.06, 0.3, 1.0)] == [0.05, 0.05, 0.1, 0.5, 1]
+    low, high = (
+        points_of(sparkline({"a": np.array([share] * 2)}, top=0.5).paths["a"])[0][0][1]
+        for share in (0.1, 0.4)
     )
-    line = sparkline(series, 0, 1260)
-    assert line.ambiguous.count("M") == 2
-    assert [name for name, _, _ in line.dots] == ["ambiguous", "unmatched"]
-    assert line.top == 1.0
-    for x, y in re.findall(r"([\d.]+) ([\d.]+)", line.ambiguous):
-        assert 0 <= float(x) <= WIDTH
-        assert 0 <= float(y) <= HEIGHT
+    assert HEIGHT - PAD - low == pytest.approx((HEIGHT - PAD - high) / 4, abs=1)
+
+
+def test_packed_cells_tell_no_batch_from_no_share():
+    cells = base64.b64decode(packed(np.array([[math.nan, 0.0], [0.5, 1.0]])))
+    assert list(cells) == [0, 1, 128, 255]
+
+
+# ---- colours -------------------------------------------------------------------------------------
+
+ROLES = ("--link", "--curve", "--limit", "--accent")
+SEEN_AS = {
+    "every colour": np.eye(3),
+    "no red": [
+        [0.152286, 1.052583, -0.204868],
+        [0.114503, 0.786281, 0.099216],
+        [-0.003882, -0.048116, 1.051998],
+    ],
+    "no green": [
+        [0.367322, 0.860646, -0.227968],
+        [0.280085, 0.672501, 0.047413],
+        [-0.01182, 0.04294, 0.968881],
+    ],
+    "no blue": [
+        [1.255528, -0.076749, -0.178779],
+        [-0.078411, 0.930809, 0.147602],
+        [0.004733, 0.691367, 0.3039],
+    ],
+}
+"""Machado, Oliveira and Fernandes (2009), of linear sRGB at full severity."""
+XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+
+
+def linear(colour):
+    part = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255
+    return np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
+
+
+def lab(rgb):
+    part = XYZ @ np.clip(rgb, 0, 1) / np.array([0.95047, 1.0, 1.08883])
+    f = np.where(part > 0.008856, np.cbrt(part), 7.787 * part + 16 / 116)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+def test_link_curve_limit_and_alarm_are_told_apart_in_both_schemes(client):
+    """Also without one of the three cones; a difference of 20 in CIELAB is plain to see."""
+    css = client.get("/static/console.css").text
+    blocks = re.findall(r"--paper: #[^}]+", css)
+    assert len(blocks) == 3
+    for block in blocks:
+        tones = dict(re.findall(r"(--[\w-]+): (#[0-9a-f]{6})", block))
+        for (a, b), seen in itertools.product(itertools.combinations(ROLES, 2), SEEN_AS):
+            matrix = np.array(SEEN_AS[seen])
+            apart = np.linalg.norm(lab(matrix @ linear(tones[a])) - lab(matrix @ linear(tones[b])))
+            assert apart > 20, (a, b, seen)
+        for role, least in zip(ROLES, (4.5, 3, 3, 4.5), strict=True):
+            light = sorted(XYZ[1] @ linear(tones[each]) + 0.05 for each in (role, "--panel"))
+            assert light[1] / light[0] >= least, role
 
 
 # ---- words ---------------------------------------------------------------------------------------

@@ -41,6 +41,12 @@ def test_every_route_is_described():
     assert len(set(NAMED)) == len(NAMED)
 
 
+def test_every_subject_is_described():
+    """A page or a client that lists operations by subject would leave out the others."""
+    described = {each["name"] for each in reference()["tags"]}
+    assert described == {tag for _, _, operation in OPERATIONS for tag in operation["tags"]}
+
+
 def test_every_reference_leads_somewhere():
     def walk(node):
         if isinstance(node, dict):

@@ -1,5 +1,6 @@
 """The quick start is true: its commands are run as they stand and give the outputs shown."""
 
+import json
 import re
 import shutil
 import signal
@@ -41,7 +42,8 @@ def server(folder, port):
     """The first block starts it."""
     kind, start = BLOCKS[0]
     assert (kind, "acquire serve" in start) == ("sh", True)
-    command = ["bash", "-c", "exec " + start.strip().replace("8000", port)]
+    (folder / "outside").mkdir()
+    command = ["bash", "-c", "exec " + moved(start, folder, port).strip()]
     process = subprocess.Popen(command, cwd=folder)
     for _ in range(1200):
         try:
@@ -68,11 +70,33 @@ def test_every_command_gives_the_output_that_is_shown(folder, port):
     with shell:
         for index, (kind, text) in enumerate(BLOCKS[1:], start=1):
             if kind == "sh":
-                said = run(shell, text.replace("8000", port))
+                said = run(shell, moved(text, folder, port))
                 shown = BLOCKS[index + 1][1] if BLOCKS[index + 1 : index + 2] else ""
                 follows = index + 1 < len(BLOCKS) and BLOCKS[index + 1][0] == "text"
                 assert said == (shown if follows else ""), text
         shell.stdin.close()
+    # The checkout is as it was, and the folder outside is gone.
+    assert sorted(each.name for each in folder.iterdir()) == [".venv", "docs", "tests"]
+
+
+def moved(text, folder, port):
+    """Commands with the folder and the port of a test in the place of the usual ones."""
+    return text.replace("/tmp/acquire-quickstart", str(folder / "outside")).replace("8000", port)
+
+
+@pytest.mark.usefixtures("server")
+def test_the_lines_of_the_readme_print_the_attitude_that_it_shows(folder, port):
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    shown = json.loads(re.search(r"with more digits\n`(\[.*\])`", text).group(1))
+    for language, program in (("sh", ["bash", "-c"]), ("python", [".venv/bin/python", "-c"])):
+        (lines,) = re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+        command = [*program, "set -e\n" * (language == "sh") + moved(lines, folder, port)]
+        for _ in range(600):
+            done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+            if done.returncode == 0:
+                break
+            time.sleep(0.1)  # the service answers 503 until it is ready
+        assert json.loads(done.stdout) == pytest.approx(shown, abs=1e-5), done.stderr
 
 
 def run(shell, commands):

@@ -8,15 +8,15 @@ import pytest
 from fastapi import Query as InQuery
 
 from service.app.factory import open_app
-from service.app.output_formats import OUTPUT_FORMATS, OutputFormat
 from service.cli import main
+from service.products.formats import OUTPUT_FORMATS, OutputFormat, table_formats
 from service.settings import Settings
 from service.web.app import bare_app, create_app
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import PAGES, console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import POLICIES, Policy
-from service.web.requests.problems import ProblemType
+from service.web.requests.problem_types import ProblemType
 from tests.web.console_pages import console_addresses
 from tests.web.serving import Server
 
@@ -24,9 +24,10 @@ ROUTE = "/api/v1/spacecraft/XTE/history"
 NDJSON = "application/x-ndjson"
 
 
-def write_ndjson(columns, pages):
-    for rows in pages:
-        yield "".join(json.dumps(dict(zip(columns, row, strict=True))) + "\n" for row in rows)
+def write_ndjson(table):
+    for page in table.pages:
+        rows = (dict(zip(table.names, row, strict=True)) for row in zip(*page, strict=True))
+        yield "".join(json.dumps(row) + "\n" for row in rows).encode()
 
 
 @pytest.fixture
@@ -70,8 +71,10 @@ def test_a_new_format_is_written_by_the_api(ndjson, address, client, full_run):
 def test_a_new_format_is_described(ndjson):
     operation = bare_app().openapi()["paths"]["/api/v1/spacecraft/{name}/history"]["get"]
     (parameter,) = [each for each in operation["parameters"] if each["name"] == "format"]
-    assert parameter["schema"]["enum"] == ["json", "csv", "ndjson"]
-    assert set(operation["responses"]["200"]["content"]) == {"application/json", "text/csv", NDJSON}
+    assert parameter["schema"]["enum"] == ["json", *table_formats()]
+    types = {each.media_type for each in table_formats().values()}
+    assert set(operation["responses"]["200"]["content"]) == {"application/json", *types}
+    assert NDJSON in types
 
 
 def test_a_new_format_is_written_by_the_command(ndjson, app, full_run, capsys):
@@ -94,7 +97,7 @@ def test_an_unknown_format_is_refused_with_the_known_ones_named(client):
     (fault,) = answer.json()["errors"]
     assert fault == {
         "field": "format",
-        "message": "Input should be 'json' or 'csv'",
+        "message": "Input should be 'json', 'csv', 'parquet' or 'fits'",
         "value": "'xml'",
     }
 

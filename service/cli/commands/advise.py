@@ -3,7 +3,15 @@
 from argparse import Namespace
 from typing import Any
 
-from service.cli.arguments import MISSION, add_command, add_database, add_period, count
+from service.cli.arguments import (
+    MISSION,
+    add_command,
+    add_database,
+    add_json,
+    add_period,
+    count,
+    print_json,
+)
 from service.cli.configuration import period_of, settings_of, settings_of_existing
 
 
@@ -17,7 +25,7 @@ def add(commands: Any) -> None:
         "settings, and the lines to change in the mission file.  Changes nothing.",
         """
         acquire advise --spacecraft XTE
-        acquire advise --spacecraft XTE --from 1996-010T00:00:00Z --to 1996-020T00:00:00Z
+        acquire advise --spacecraft XTE --start 1996-010T00:00:00Z --end 1996-020T00:00:00Z
         acquire advise --spacecraft SOHO --run pass-7 --sample 2000 --try separation_deg=0.01
         """,
         run,
@@ -39,15 +47,13 @@ def add(commands: Any) -> None:
         metavar="NAME=VALUE",
         help="try this tolerance too; may be repeated, to try several together",
     )
-    parser.add_argument("--json", action="store_true", help="print the API's JSON")
+    add_json(parser, "what the API answers,")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     add_database(parser)
 
 
 def run(parsed: Namespace) -> int:
     """Print what recorded batches say of a mission's settings."""
-    import json
-
     import msgspec
     from tqdm import tqdm
 
@@ -76,7 +82,7 @@ def run(parsed: Namespace) -> int:
     finally:
         app.close()
     if parsed.json:
-        print(json.dumps(msgspec.to_builtins(advice), ensure_ascii=False, indent=1))
+        print_json(msgspec.to_builtins(advice))
     else:
         print(advice_text(advice))
     return 0

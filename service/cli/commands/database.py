@@ -4,7 +4,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from service.cli.arguments import add_command, add_database, add_group
+from service.cli.arguments import add_command, add_database, add_group, add_json, print_json
 from service.cli.configuration import settings_of, settings_of_existing
 
 MAX_PROBLEMS = 100
@@ -43,6 +43,7 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--fresh", action="store_true", help="check the migrations on an empty database"
     )
+    add_json(parser, "the differences")
     add_database(parser)
     parser = add_command(
         group,
@@ -68,7 +69,26 @@ def add(commands: Any) -> None:
         """,
         verify,
     )
+    add_json(parser, "the faults")
     add_database(parser)
+    _add_split_trackers(group)
+    _add_prune(group)
+
+
+def _add_split_trackers(group: Any) -> None:
+    parser = add_command(
+        group,
+        "split-trackers",
+        "Split the batches of earlier versions by tracker, for trends of each tracker of a "
+        "spacecraft with several.  The service does the same by itself, more slowly.  It can be "
+        "stopped at any time and goes on when started again.",
+        "acquire database split-trackers",
+        split_trackers,
+    )
+    add_database(parser)
+
+
+def _add_prune(group: Any) -> None:
     parser = add_command(
         group,
         "prune",
@@ -103,6 +123,9 @@ def check(parsed: Namespace) -> int:
     from service.storage.sql.migrations import check_fresh
 
     differences = check_fresh() if parsed.fresh else check_schema(settings_of(parsed).database)
+    if parsed.json:
+        print_json({"differences": differences})
+        return 1 if differences else 0
     for difference in differences:
         print(difference if len(difference) <= 120 else difference[:119] + "…")
     if not differences:
@@ -143,6 +166,9 @@ def verify(parsed: Namespace) -> int:
             seen = done
 
         problems = verify_records(settings_of(parsed).database, step)
+    if parsed.json:
+        print_json({"batches": seen, "faults": problems})
+        return 1 if problems else 0
     for problem in problems[:MAX_PROBLEMS]:
         print(problem)
     if len(problems) > MAX_PROBLEMS:
@@ -150,6 +176,22 @@ def verify(parsed: Namespace) -> int:
     if not problems:
         print(f"nothing is wrong with {seen} batches")
     return 1 if problems else 0
+
+
+def split_trackers(parsed: Namespace) -> int:
+    """Split older batches by tracker."""
+    from tqdm import tqdm
+
+    from service.app.factory import open_app
+
+    app = open_app(settings_of_existing(parsed))
+    try:
+        with tqdm(total=None, unit=" batches", desc="splitting", disable=None, leave=False) as bar:
+            done = app.tracker_split.splitter.split(lambda done: bar.update(done - bar.n))
+    finally:
+        app.close()
+    print(f"{done} batches were looked at; every batch is split by tracker")
+    return 0
 
 
 def prune(parsed: Namespace) -> int:

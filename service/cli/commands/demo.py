@@ -4,7 +4,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from service.cli.arguments import add_command, count
+from service.cli.arguments import add_command, add_json, count
 from service.cli.configuration import settings_of
 
 
@@ -34,6 +34,7 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="default 1")
     parser.add_argument("--once", action="store_true", help="stop after printing the table")
+    add_json(parser, "the table's figures")
 
 
 def run(parsed: Namespace) -> int:
@@ -46,4 +47,5 @@ def run(parsed: Namespace) -> int:
         batches=parsed.batches,
         seed=parsed.seed,
         once=parsed.once,
+        as_json=parsed.json,
     )

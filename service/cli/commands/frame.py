@@ -20,7 +20,7 @@ from service.cli.frame_submitters import FrameRefused, frame_submitter
 from service.errors import BadInput, Fault, shown_value
 
 SIDECAR = """\
-What is known of a frame stands in a JSON file of its name beside it, FILE.json for
+The metadata of a frame are in a JSON file of its name beside it, FILE.json for
 FILE.fits, as `acquire simulate frames` writes it: the fields of a batch but its stars
 (time, a_priori, body_rates_deg_per_s, ...).  Options of the command come first."""
 
@@ -88,7 +88,7 @@ def add(commands: Any) -> None:
 
 
 def _add_lens(parser: ArgumentParser) -> None:
-    """What may be known of the lens of a picture without a spacecraft."""
+    """Options for the lens of a picture without a spacecraft."""
     lens = parser.add_argument_group(
         "without a spacecraft", "what is known of the camera; of its lens within a quarter"
     )

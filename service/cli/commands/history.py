@@ -4,9 +4,9 @@ import sys
 from argparse import Namespace
 from typing import Any
 
-from service.app.output_formats import OUTPUT_FORMATS
 from service.cli.arguments import MISSION, add_command, add_database, add_period
 from service.cli.configuration import period_of, settings_of_existing
+from service.products.formats import table_formats, write_table
 
 
 def add(commands: Any) -> None:
@@ -17,20 +17,22 @@ def add(commands: Any) -> None:
         "Print the quantities of every recorded batch of a spacecraft, a row a batch.",
         """
         acquire history --spacecraft XTE --format csv
-        acquire history --spacecraft XTE --run pass-7 --from 1996-010T00:00:00Z
+        acquire history --spacecraft XTE --run pass-7 --start 1996-010T00:00:00Z
         """,
         run,
     )
     parser.add_argument("--spacecraft", required=True, metavar="NAME", help=MISSION)
     add_period(parser, "the run that is read; default live")
-    parser.add_argument(
-        "--format", choices=tuple(OUTPUT_FORMATS), default="csv", help="default csv"
-    )
+    way = parser.add_mutually_exclusive_group()
+    way.add_argument("--format", choices=tuple(table_formats()), default="csv", help="default csv")
+    way.add_argument("--json", action="store_true", help="print a JSON object a row, one a line")
     add_database(parser)
 
 
 def run(parsed: Namespace) -> int:
     """Write the table to the standard output, page by page."""
+    import json
+
     from service.app.factory import open_app
     from service.app.history_table import batch_table
 
@@ -39,8 +41,13 @@ def run(parsed: Namespace) -> int:
     try:
         pages = app.spacecraft.every_batch(parsed.spacecraft, run=parsed.run, start=start, end=end)
         table = batch_table(pages)
-        for text in OUTPUT_FORMATS[parsed.format].write(table.columns, table.pages):
-            sys.stdout.write(text)
+        if parsed.json:
+            for page in table.pages:
+                for row in zip(*page, strict=True):
+                    print(json.dumps(dict(zip(table.names, row, strict=True))))
+            return 0
+        for piece in write_table(parsed.format, table):
+            sys.stdout.buffer.write(piece)
     finally:
         app.close()
     return 0

@@ -4,7 +4,15 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from service.cli.arguments import LOCAL, add_command, add_database, count, speed
+from service.cli.arguments import (
+    LOCAL,
+    add_command,
+    add_database,
+    add_json,
+    count,
+    print_json,
+    speed,
+)
 from service.cli.configuration import settings_of
 from service.errors import BadInput, Fault, shown_value
 
@@ -82,6 +90,7 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--progress", action="store_true", help="show the progress bar even without a terminal"
     )
+    add_json(parser, "the counts")
     add_database(parser)
 
 
@@ -147,6 +156,9 @@ def run(parsed: Namespace) -> int:
                     token=token,
                     query={"alarms": "true"} if parsed.alarms else None,
                 )
-    print(f"{'run':<20}{run}")
-    print(summary.table())
+    if parsed.json:
+        print_json({"run": run, **summary.counts()})
+    else:
+        print(f"{'run':<20}{run}")
+        print(summary.table())
     return 1 if summary.refused else 0

@@ -6,7 +6,14 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from service.cli.arguments import add_command, add_database, add_period, count
+from service.cli.arguments import (
+    add_command,
+    add_database,
+    add_json,
+    add_period,
+    count,
+    print_json,
+)
 from service.cli.configuration import period_of, settings_of, settings_of_existing
 from service.errors import BadInput, Fault
 
@@ -21,7 +28,7 @@ def add(commands: Any) -> None:
         "an interruption, run the same command again to continue.  With SQLite, stop the "
         "service first.",
         """
-        acquire reprocess --from 1996-010T00:00:00Z --to 1996-020T00:00:00Z
+        acquire reprocess --start 1996-010T00:00:00Z --end 1996-020T00:00:00Z
         acquire reprocess --mission wider.toml --run wider
         acquire reprocess --source pass-7 --spacecraft XTE --run pass-7-again --json
         """,
@@ -42,15 +49,13 @@ def add(commands: Any) -> None:
         "its batches",
     )
     parser.add_argument("--processes", type=count, metavar="N", help="default: one per core")
-    parser.add_argument("--json", action="store_true", help="print the comparison as JSON")
+    add_json(parser, "the comparison")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     add_database(parser)
 
 
 def run(parsed: Namespace) -> int:
     """Run recorded batches again into another run, and print how both compare."""
-    import json
-
     import msgspec
     from tqdm import tqdm
 
@@ -101,7 +106,7 @@ def run(parsed: Namespace) -> int:
         counts = {
             name: getattr(progress, name) for name in ("total", "before", "recorded", "refused")
         }
-        print(json.dumps(counts | msgspec.to_builtins(compared), indent=1))
+        print_json(counts | msgspec.to_builtins(compared))
     else:
         print(comparison_text(progress, compared))
     return 1 if progress.refused else 0

@@ -6,7 +6,7 @@ The commands write straight into the database, also while a service is using it.
 from argparse import Namespace
 from typing import Any
 
-from service.cli.arguments import add_command, add_database, add_group, count
+from service.cli.arguments import add_command, add_database, add_group, add_json, count
 from service.cli.configuration import settings_of, settings_of_existing
 
 
@@ -69,6 +69,7 @@ def add(commands: Any) -> None:
     parser = add_command(
         group, "list", "Show every token, without its secret.", "acquire token list", show
     )
+    add_json(parser, "the tokens")
     add_database(parser)
     parser = add_command(
         group,
@@ -94,7 +95,7 @@ def show(parsed: Namespace) -> int:
     """Print every token."""
     from service.cli import tokens
 
-    return tokens.show(settings_of_existing(parsed))
+    return tokens.show(settings_of_existing(parsed), as_json=parsed.json)
 
 
 def revoke(parsed: Namespace) -> int:

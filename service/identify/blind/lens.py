@@ -16,7 +16,7 @@ FREE_SCALE, SCALE_BEND, SCALE_CENTER = 4, 5, 7
 PARAMETERS = ("focal_px", "bend", "off_u", "off_v")
 """Of a lens, in the order in which they are fitted."""
 _ROUNDS = 12
-_CONVERGED = 1e-9
+_CONVERGED = 1e-8
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Lens:
             true = np.hypot(x, y) * self.focal_px / self.radius_px
             true[~(true < 1.6)] = np.nan
             seen = true.copy()
-            for _ in range(8):
+            for _ in range(8 if self.bend else 0):
                 seen -= (seen * (1.0 + self.bend * seen**2) - true) / (
                     1.0 + 3.0 * self.bend * seen**2
                 )

@@ -28,6 +28,8 @@ FAINTEST_SHARE = 2.5
 """Catalog stars looked for, for every point: clutter and gaps move the limits apart."""
 LEAST_STARS, MOST_STARS = 12, 400
 MODELS = (FREE_SCALE, SCALE_BEND, SCALE_CENTER)
+FIRST_MODEL = 3
+"""The round from which models are fitted; those before it look for matches."""
 LEAST_MATCHES = {FREE_SCALE: 4, SCALE_BEND: 7, SCALE_CENTER: 12}
 """Matches from which a model is fitted; of those that are, the evidence chooses."""
 HOPELESS_LOG_ODDS = 0.0
@@ -126,10 +128,12 @@ def verify(
     """The attitude and lens refined from what they match; None where they match too little."""
     sigma = np.maximum(points.sigma_px, LEAST_SIGMA_PX)
     best = None
-    for number, parameters in enumerate((0, 0, 0, *MODELS)):
+    for number, parameters in enumerate((*[0] * FIRST_MODEL, *MODELS)):
         if number == 2 and (best is None or best.log_odds < HOPELESS_LOG_ODDS):
             return best
-        rows, at, seen = _matches(points, stars, attitude, lens, gate_px)
+        if number <= FIRST_MODEL:
+            # All models are fitted to what the last round matched.
+            rows, at, seen = _matches(points, stars, attitude, lens, gate_px)
         if len(seen) < LEAST_MATCHES[parameters or FREE_SCALE]:
             return best
         fit = _refit(points, stars, attitude, lens, rows[at], seen, sigma, parameters)
@@ -157,13 +161,16 @@ def refine(
         rows, at, seen = _matches(points, stars, attitude, lens, gate_px)
         allowed = [each for each in MODELS if len(seen) >= LEAST_REFINED[each]]
         if not allowed:
-            return refined
+            break
         fit = _refit(points, stars, attitude, lens, rows[at], seen, sigma, allowed[-1])
         scale = _scale(fit, sigma[seen])
-        refined = _weighed(points, stars, fit, sigma * scale, log_focal_range)
+        refined = fit, scale
         attitude, lens = fit.attitude, fit.lens
         gate_px = min(gate_px, max(GATE_SIGMAS * scale * float(np.median(sigma[seen])), 0.8))
-    return refined
+    if refined is None:
+        return None
+    fit, scale = refined
+    return _weighed(points, stars, fit, sigma * scale, log_focal_range)
 
 
 def _refit(

@@ -76,17 +76,18 @@ def require_light(frame: Frame, saturation_counts: float) -> None:
     Also for a count that is too large to work with, of either sign.
     """
     known = np.isfinite(frame.counts)
-    share = float(known.mean())
+    share = np.count_nonzero(known) / known.size
     if share < LEAST_KNOWN:
         raise bad_frame("has no number in most of its pixels", f"NaN in {1.0 - share:.0%}")
-    least = float(np.min(frame.counts, where=known, initial=np.inf))
-    most = float(np.max(frame.counts, where=known, initial=-np.inf))
+    numbers = frame.counts if share == 1.0 else frame.counts[known]
+    least, most = float(numbers.min()), float(numbers.max())
     largest = max(least, most, key=abs)
     if abs(largest) > LARGEST_COUNT:
         message = f"holds a count beyond {LARGEST_COUNT:.4g}, the largest of single precision"
         raise bad_frame(message, f"{largest:.4g}")
     if least == most:
         raise bad_frame("has no contrast: every pixel holds the same count", f"{least:g}")
-    full = float((frame.counts >= min(saturation_counts, frame.full_scale)).mean())
+    full_counts = min(saturation_counts, frame.full_scale)
+    full = np.count_nonzero(frame.counts >= full_counts) / known.size
     if full > MOST_FULL:
         raise bad_frame("is saturated", f"{full:.0%} of its pixels are full")

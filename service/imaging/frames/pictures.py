@@ -2,9 +2,7 @@
 
 import math
 import os
-import re
 import struct
-from contextlib import suppress
 from typing import IO, Any
 
 import numpy as np
@@ -13,6 +11,13 @@ import numpy.typing as npt
 from service.errors import BadFile
 from service.imaging.frames.arrays import as_counts, full_scale_of
 from service.imaging.frames.deep_color import deep_light, is_deep
+from service.imaging.frames.exif import (
+    MAX_EXIF_BYTES,
+    bytes_beyond,
+    directory,
+    exposure_of,
+    require_small_exif,
+)
 from service.imaging.frames.frame import Frame, FrameLimits, bad_frame
 
 GREY = ("L", "I;16", "I;16B", "I;16L", "I", "F")
@@ -26,10 +31,6 @@ MAX_TAGS = 256
 MAX_TAG_BYTES = 1 << 20
 MAX_TILE_PIXELS = 1 << 22
 _TILE_WIDTH, _TILE_LENGTH = 322, 323
-_TAG_TYPE_BYTES = (1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4)
-_EXIF, _EXPOSURE, _TAKEN, _OFFSET = 0x8769, 33434, 36867, 36881
-_LONGEST_EXPOSURE_S = 3600.0
-_TIME = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d):(\d\d):(\d\d)")
 
 
 def read_picture(file: IO[bytes], file_format: str, limits: FrameLimits, digest: str) -> Frame:
@@ -41,6 +42,8 @@ def read_picture(file: IO[bytes], file_format: str, limits: FrameLimits, digest:
 
     if file_format == "TIFF":
         _require_small_tags(file)
+    elif file_format == "JPEG":
+        require_small_exif(file)
     try:
         with Image.open(file, formats=(file_format,)) as image:
             limits.require(*image.size)
@@ -48,7 +51,7 @@ def read_picture(file: IO[bytes], file_format: str, limits: FrameLimits, digest:
                 raise bad_frame(SEVERAL)
             # To look for EXIF may decode the picture, and takes the word of its depth away.
             deep = is_deep(image)
-            told = _told(image)
+            told = exposure_of(image)
             if deep:
                 values, full_scale = deep_light(image, file, file_format), 3.0 * 65535.0
             else:
@@ -75,40 +78,6 @@ def _light(image: Any) -> tuple[npt.NDArray[Any], float]:
     return channels.sum(axis=2, dtype=np.uint16), 3.0 * 255.0
 
 
-def _told(image: Any) -> tuple[str | None, float | None]:
-    """The UTC of mid exposure and the exposure in seconds, each None where EXIF does not tell.
-
-    A camera's clock without its offset from UTC tells no time.
-    """
-    try:
-        exif = image.getexif().get_ifd(_EXIF)
-    except Exception:
-        # What is not EXIF is no reason to refuse a picture.
-        return None, None
-    exposure_s = None
-    with suppress(TypeError, ValueError, ZeroDivisionError, OverflowError):
-        value = float(exif[_EXPOSURE]) if _EXPOSURE in exif else math.nan
-        exposure_s = value if 0.0 < value <= _LONGEST_EXPOSURE_S else None
-    return _utc(exif.get(_TAKEN), exif.get(_OFFSET), exposure_s or 0.0), exposure_s
-
-
-def _utc(taken: object, offset: object, exposure_s: float) -> str | None:
-    from datetime import UTC, datetime, timedelta, timezone
-
-    found = _TIME.match(taken) if isinstance(taken, str) else None
-    zone = re.match(r"([+-])(\d\d):(\d\d)", offset) if isinstance(offset, str) else None
-    if found is None or zone is None:
-        return None
-    try:
-        minutes = (60 * int(zone[2]) + int(zone[3])) * (-1 if zone[1] == "-" else 1)
-        local = datetime(*(int(each) for each in found.groups()))  # type: ignore[arg-type]
-        local = local.replace(tzinfo=timezone(timedelta(minutes=minutes)))
-        middle = local.astimezone(UTC) + timedelta(seconds=0.5 * exposure_s)
-    except (ValueError, OverflowError):
-        return None
-    return middle.strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"
-
-
 def _require_small_tags(file: IO[bytes]) -> None:
     """Raise `BadFile` for a TIFF whose tags alone, or one tile, would take much memory.
 
@@ -120,23 +89,24 @@ def _require_small_tags(file: IO[bytes]) -> None:
     order = "<" if start[:2] == b"II" else ">"
     try:
         (at,) = struct.unpack(order + "4xL", start)
-        file.seek(at)
-        (tags,) = struct.unpack(order + "H", file.read(2))
-        if tags > MAX_TAGS:
-            raise bad_frame(f"has more than {MAX_TAGS} tags", str(tags))
-        entries = [struct.unpack(order + "HHL4s", file.read(12)) for _ in range(tags)]
+        entries = directory(file, order, at)
+        if len(entries) > MAX_TAGS:
+            raise bad_frame(f"has more than {MAX_TAGS} tags", str(len(entries)))
         (following,) = struct.unpack(order + "L", file.read(4))
+        told_bytes = bytes_beyond(file, order, entries)
     except struct.error:
         raise bad_frame(f"is cut off: its TIFF directory lies beyond its {end} bytes") from None
     if following:
         raise bad_frame(SEVERAL)
+    if told_bytes > MAX_EXIF_BYTES:
+        raise bad_frame(f"has more than {MAX_EXIF_BYTES} bytes of EXIF", str(told_bytes))
     tile = 1
-    for tag, kind, count, value in entries:
-        size = _TAG_TYPE_BYTES[kind] if kind < len(_TAG_TYPE_BYTES) else 8
-        if size * count > MAX_TAG_BYTES:
-            raise bad_frame(f"has a TIFF tag of more than {MAX_TAG_BYTES} bytes", f"tag {tag}")
-        if tag in (_TILE_WIDTH, _TILE_LENGTH):
-            tile *= struct.unpack(order + ("H2x" if kind == 3 else "L"), value)[0]
+    for entry in entries:
+        if entry.size_bytes > MAX_TAG_BYTES:
+            message = f"has a TIFF tag of more than {MAX_TAG_BYTES} bytes"
+            raise bad_frame(message, f"tag {entry.tag}")
+        if entry.tag in (_TILE_WIDTH, _TILE_LENGTH):
+            tile *= entry.whole(order)
     if tile > MAX_TILE_PIXELS:
         raise bad_frame(f"has tiles of more than {MAX_TILE_PIXELS} pixels", str(tile))
     file.seek(0)

@@ -1,8 +1,8 @@
-"""Who asks, and what was changed."""
+"""The caller, and the audit list of changes."""
 
 from typing import Annotated, ClassVar, Literal
 
-from service.storage.models.base import Id, Moment, Record, doc
+from service.storage.models.base import Id, Record, Stamp, doc
 
 Scope = Literal["read", "submit", "operate"]
 
@@ -25,7 +25,7 @@ class AuditEntry(Record, frozen=True, kw_only=True):
 
     component: ClassVar[str] = "AuditRow"
     id: Id
-    moment: Moment
+    moment: Stamp
     who: Annotated[str, doc("The token's name; `local` while access is open.")]
     action: Annotated[str, doc("The operation's name in this description.")]
     about: Annotated[str, doc("Path and query of the request.")]

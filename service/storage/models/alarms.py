@@ -4,8 +4,8 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from service.alarms.limits import LimitSettings
 from service.alarms.quantities import QuantityName
-from service.alarms.state_machine import Action, State
-from service.storage.models.base import DescribedAs, Id, Moment, Record, doc
+from service.alarms.state_machine import AlarmActionName, AlarmState
+from service.storage.models.base import DescribedAs, Id, Moment, Record, Stamp, doc
 
 SeverityName = Literal["watch", "warning", "critical"]
 
@@ -16,9 +16,12 @@ class Limit(Record, frozen=True, kw_only=True):
     component: ClassVar[str] = "LimitOut"
     spacecraft: str
     quantity: QuantityName
+    tracker: Annotated[str | None, doc("null: of the spacecraft as a whole.")] = None
     unit: str
-    is_default: Annotated[bool, doc("Whether this is the shipped limit.")]
-    since: Annotated[Moment | None, doc("null: it was never changed.")]
+    is_default: Annotated[
+        bool, doc("Whether this is the shipped limit; of a tracker, that of its spacecraft.")
+    ]
+    since: Annotated[Stamp | None, doc("null: it was never changed.")]
     who: str | None
     comment: str | None
     settings: Annotated[dict[str, Any], DescribedAs(LimitSettings)]
@@ -53,7 +56,7 @@ class AlarmRaised(AlarmValue, frozen=True, kw_only=True):
     """The value that raised an alarm."""
 
     component: ClassVar[str] = "RaisedOut"
-    at: Annotated[Moment, doc("By the service's clock.")]
+    at: Stamp
     bound: Annotated[float, doc("The bound of the worst severity so far.")]
 
 
@@ -61,7 +64,7 @@ class Acted(Record, frozen=True, kw_only=True):
     """The author and the time of an action."""
 
     component: ClassVar[str] = "ActedOut"
-    at: Moment
+    at: Stamp
     who: str
 
 
@@ -69,7 +72,7 @@ class Shelved(Acted, frozen=True, kw_only=True):
     """Shelved until a time."""
 
     component: ClassVar[str] = "ShelfOut"
-    until: Moment
+    until: Stamp
 
 
 class Alarm(Record, frozen=True, kw_only=True):
@@ -80,18 +83,21 @@ class Alarm(Record, frozen=True, kw_only=True):
     spacecraft: str
     run: str
     quantity: QuantityName
+    tracker: Annotated[
+        str | None, doc("The tracker that it is about; null: the spacecraft as a whole.")
+    ] = None
     unit: str
-    state: State
+    state: AlarmState
     severity: Annotated[SeverityName, doc("The worst severity so far.")]
     current_severity: Annotated[SeverityName | None, doc("null: the value is back in limits.")]
     in_limits: bool
     raised: AlarmRaised
     worst: AlarmValue
     latest: AlarmValue
-    returned_at: Moment | None
+    returned_at: Stamp | None
     acknowledged: Acted | None
     shelved: Shelved | None
-    cleared_at: Moment | None
+    cleared_at: Stamp | None
 
 
 class AlarmPage(Record, frozen=True, kw_only=True):
@@ -106,8 +112,8 @@ class AlarmAction(Record, frozen=True, kw_only=True):
     """A change of an alarm, by its value or by a person."""
 
     component: ClassVar[str] = "ActionOut"
-    at: Moment
-    action: Action
+    at: Stamp
+    action: AlarmActionName
     who: str | None
     comment: str | None
     severity: SeverityName | None

@@ -23,10 +23,11 @@ from service.storage.models.base import (
     Reason,
     Record,
     Shape,
+    Stamp,
     Status,
     doc,
 )
-from service.storage.models.frames import Frame, FrameWithStars
+from service.storage.models.frames import FrameSummary, FrameWithStars
 
 
 class StarRef(Record, frozen=True, kw_only=True):
@@ -237,7 +238,8 @@ class Answer(Record, frozen=True, kw_only=True):
     ) = UNSET
     recorded: Annotated[bool, doc("For a what-if: whether it was recorded.")] | UnsetType = UNSET
     frame: (
-        Annotated[Frame | None, doc("Only for a batch that was made from a frame.")] | UnsetType
+        Annotated[FrameSummary | None, doc("Only for a batch that was made from a frame.")]
+        | UnsetType
     ) = UNSET
 
 
@@ -271,8 +273,8 @@ class Summary(Record, frozen=True, kw_only=True):
     batch: str
     run: str
     time: Moment
-    received: Annotated[Moment, doc("Time at which the service first received the batch.")]
-    created: Annotated[Moment, doc("Time at which this result was recorded.")]
+    received: Annotated[Stamp, doc("Time at which the service first received the batch.")]
+    created: Annotated[Stamp, doc("Time at which this result was recorded.")]
     identifier: str
     options: Annotated[MissionSettings, doc("Options that replaced the mission's settings.")]
     counts: StarCounts

@@ -1,4 +1,4 @@
-"""What all records have in common, and how OpenAPI describes them.
+"""The base of all records, and their descriptions in OpenAPI.
 
 A record is a msgspec struct: storage functions make it, and the API encodes it as
 it is.  Its annotations carry pydantic's `Field` for descriptions and bounds, which
@@ -33,7 +33,24 @@ Quaternion = Annotated[
         description="Transforms inertial into body components; scalar last, qc >= 0.",
     ),
 ]
-Moment = Annotated[str, Field(description="UTC.", examples=["1996-01-10T12:00:00.000Z"])]
+Moment = Annotated[
+    str,
+    Field(
+        description="UTC.",
+        examples=["1996-01-10T12:00:00.000Z"],
+        json_schema_extra={"pattern": r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3,9}Z$"},
+    ),
+]
+"""The time of a batch, which may be in a leap second."""
+Stamp = Annotated[
+    str,
+    Field(
+        description="UTC, by the service's clock.",
+        examples=["2026-03-01T12:00:00.000Z"],
+        json_schema_extra={"format": "date-time"},
+    ),
+]
+"""A time that the service notes itself: RFC 3339."""
 Id = Annotated[
     str, Field(min_length=26, max_length=26, description="Ids sort by the time of recording.")
 ]

@@ -17,7 +17,7 @@ class FrameTimings(Record, frozen=True, kw_only=True):
     centroid: Count
 
 
-class Frame(Record, frozen=True, kw_only=True):
+class FrameSummary(Record, frozen=True, kw_only=True):
     """The frame of a batch, and the numbers of detected stars."""
 
     component: ClassVar[str] = "FrameOut"
@@ -76,7 +76,7 @@ class Detection(Record, frozen=True, kw_only=True):
     left_out: Annotated[str | None, doc("Why it is not in the batch.")]
 
 
-class FrameWithStars(Frame, frozen=True, kw_only=True):
+class FrameWithStars(FrameSummary, frozen=True, kw_only=True):
     """A frame with every candidate."""
 
     component: ClassVar[str] = "FrameRecordOut"

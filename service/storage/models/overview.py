@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field
 
 from service.storage.models.alarms import Alarm, AlarmSummary
-from service.storage.models.base import Components, Count, Digest, Moment, Record, doc
+from service.storage.models.base import Components, Count, Digest, Moment, Record, Stamp, doc
 from service.storage.models.spacecraft import SpacecraftRow
 
 Shares = list[float]
@@ -64,7 +64,7 @@ class Overview(Record, frozen=True, kw_only=True):
     run: str
     default_run: Annotated[str, doc("`live`; while it is empty, the newest run.")]
     as_of: Annotated[Moment | None, doc("The time of the run's latest batch.")]
-    now: Annotated[Moment, doc("The service's clock.")]
+    now: Annotated[Stamp, doc("The service's clock.")]
     alarms: AlarmSummary
     items: list[OverviewRow]
 
@@ -92,7 +92,7 @@ class About(Record, frozen=True, kw_only=True):
 
     component: ClassVar[str] = "About"
     version: str
-    started: Moment
+    started: Stamp
     database: Annotated[str, Field(examples=["sqlite", "postgresql"])]
     catalog: CatalogAbout
     missions: list[MissionAbout]

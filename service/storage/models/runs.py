@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar, Literal
 from msgspec import UNSET, UnsetType
 from pydantic import Field
 
-from service.storage.models.base import Count, Id, Moment, Record, doc
+from service.storage.models.base import Count, Id, Record, Stamp, doc
 from service.storage.models.problems import FieldFault
 
 ReplayStateName = Literal["running", "done", "interrupted", "failed", "cancelled"]
@@ -16,7 +16,7 @@ class Run(Record, frozen=True, kw_only=True):
 
     component: ClassVar[str] = "RunRow"
     run: str
-    created: Moment
+    created: Stamp
     alarms: Annotated[bool, doc("Whether its batches can raise alarms.")]
     batches: Count
     spacecraft: list[str]
@@ -80,8 +80,8 @@ class ReplayProgress(Record, frozen=True, kw_only=True):
     state: ReplayStateName
     lines: ReplayLines
     counts: ReplayCounts
-    started: Moment
-    finished: Moment | None
+    started: Stamp
+    finished: Stamp | None
 
 
 class Replay(ReplayProgress, frozen=True, kw_only=True):

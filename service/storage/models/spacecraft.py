@@ -13,6 +13,7 @@ from service.storage.models.base import (
     Moment,
     Quaternion,
     Record,
+    Stamp,
     Status,
     doc,
 )
@@ -83,7 +84,7 @@ class MissionThen(MissionNow, frozen=True, kw_only=True):
     """The settings of a mission at some time."""
 
     component: ClassVar[str] = "MissionThen"
-    since: Moment
+    since: Stamp
 
 
 class SpacecraftState(SpacecraftRow, frozen=True, kw_only=True):

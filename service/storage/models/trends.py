@@ -32,6 +32,17 @@ class History(Record, frozen=True, kw_only=True):
     component: ClassVar[str] = "History"
     spacecraft: str
     run: str
+    tracker: Annotated[str, doc("If the request names one.")] | UnsetType = UNSET
+    not_split: (
+        Annotated[
+            bool,
+            doc(
+                "With `tracker`: true while older batches of the run are not split by tracker yet, "
+                "and so are missing here."
+            ),
+        ]
+        | UnsetType
+    ) = UNSET
     start: Moment | None
     end: Moment | None
     strategy: Literal["minmax", "latest"]
@@ -69,4 +80,9 @@ class Ranking(Record, frozen=True, kw_only=True):
 
     component: ClassVar[str] = "WorstList"
     by: QuantityName
+    tracker: Annotated[str, doc("If the request names one.")] | UnsetType = UNSET
+    not_split: (
+        Annotated[bool, doc("With `tracker`: true while older batches are not split by tracker.")]
+        | UnsetType
+    ) = UNSET
     items: list[RankedBatch]

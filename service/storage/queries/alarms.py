@@ -7,7 +7,7 @@ from sqlalchemy import ColumnElement, Connection, and_, insert, or_, select, upd
 
 from service.alarms.limits import Severity
 from service.alarms.quantities import quantity_named
-from service.alarms.state_machine import Action, Changes, Step, state_of
+from service.alarms.state_machine import AlarmActionName, AlarmUpdate, Changes, state_of
 from service.errors import BadBatch, Fault, NotFound, shown_value
 from service.storage.models.alarms import (
     Acted,
@@ -23,7 +23,7 @@ from service.storage.models.alarms import (
 from service.storage.models.base import Page
 from service.storage.recording import events
 from service.storage.recording.ids import is_ulid
-from service.storage.recording.unsaved_result import Row
+from service.storage.sql.columns import Row
 from service.storage.sql.tables import alarm_actions, alarms
 
 StateFilter = Literal["open", "acknowledged", "shelved", "active", "cleared", "all"]
@@ -94,7 +94,7 @@ def read_alarm(connection: Connection, id: str, now: str) -> AlarmWithActions:
 def act(
     connection: Connection,
     id: str,
-    step: Callable[[Row], Step],
+    step: Callable[[Row], AlarmUpdate],
     *,
     who: str,
     comment: str | None,
@@ -111,13 +111,13 @@ def change(
     connection: Connection,
     alarm: Row,
     changes: Changes,
-    actions: Sequence[Action],
+    actions: Sequence[AlarmActionName],
     now: str,
     *,
     who: str | None = None,
     comment: str | None = None,
 ) -> Row:
-    """Change a stored alarm, note what was done and tell of it; the alarm as it is then."""
+    """Change a stored alarm, record the actions and add an event; returns the changed alarm."""
     if changes:
         connection.execute(update(alarms).where(alarms.c.id == alarm["id"]).values(changes))
     whole = {**alarm, **changes}
@@ -128,18 +128,18 @@ def change(
 def record_action(
     connection: Connection,
     alarm: Row,
-    actions: Sequence[Action],
+    actions: Sequence[AlarmActionName],
     now: str,
     *,
     who: str | None = None,
     comment: str | None = None,
 ) -> None:
-    """Write down what was done about an alarm, and tell of it."""
+    """Record actions on an alarm, and add an event."""
     if not actions:
         return
     point = {"value": alarm["latest_value"], "time": alarm["latest_time"]}
     severity = {"severity": alarm["current_severity"]}
-    # Of several things at once the first is what somebody did; the others follow from it.
+    # The first action is the user's; the others follow from it.
     by = [{"who": who, "comment": comment}] + [{"who": None, "comment": None}] * len(actions)
     rows = [
         {"alarm_id": alarm["id"], "at": now, "action": action, **point, **severity, **whom}
@@ -147,7 +147,7 @@ def record_action(
     ]
     connection.execute(insert(alarm_actions), rows)
     shown = shown_alarm(alarm, now)
-    events.note(connection, "alarm", shown, run=alarm["run"], spacecraft=alarm["spacecraft"])
+    events.add_event(connection, "alarm", shown, run=alarm["run"], spacecraft=alarm["spacecraft"])
 
 
 def shown_alarm(alarm: Any, now: str) -> Alarm:
@@ -159,6 +159,7 @@ def _fields(alarm: Any, now: str) -> Row:
     raised = {"at": alarm["raised_at"], "bound": alarm["bound"]}
     return {
         **{name: alarm[name] for name in ("id", "spacecraft", "run", "quantity")},
+        "tracker": alarm["tracker"] or None,
         "unit": quantity_named(alarm["quantity"]).unit,
         "state": state_of(alarm, now),
         "severity": alarm["severity"],

@@ -8,17 +8,24 @@ from typing import Any
 from sqlalchemy import Connection, bindparam, insert, select, update
 
 from service.alarms.limits import LimitSettings
-from service.alarms.quantities import QUANTITIES, QuantityName, default_limits, limited_names
+from service.alarms.quantities import (
+    QUANTITIES,
+    QuantityName,
+    default_limits,
+    limited_names,
+    tracker_names,
+)
+from service.alarms.subjects import Subject, limits_of_subjects, subject_of
 from service.missions.mission import Mission
 from service.storage.models.alarms import Limit, LimitHistory
 from service.storage.recording import events
-from service.storage.recording.unsaved_result import Row
+from service.storage.sql.columns import Row
 from service.storage.sql.prepared import prepared
 from service.storage.sql.tables import limits
 
-LimitsInForce = Mapping[QuantityName, LimitSettings]
+LimitsInForce = Mapping[Subject, LimitSettings]
 
-_SHIPPED: dict[tuple[str, tuple[str, ...]], LimitsInForce] = {}
+_SHIPPED: dict[tuple[str, tuple[str, ...]], Mapping[QuantityName, LimitSettings]] = {}
 # Run with every batch of a live spacecraft.
 _IN_FORCE = prepared(
     select(limits).where(
@@ -28,18 +35,18 @@ _IN_FORCE = prepared(
 
 
 def limits_of(connection: Connection, mission: Mission) -> LimitsInForce:
-    """The limits in force for a spacecraft: its own in place of the shipped ones."""
+    """The limits in force for a spacecraft and its trackers: own ones in place of the shipped."""
     # Read with every batch; a process meets few missions.
     key = mission.digest, limited_names()
     shipped = _SHIPPED.get(key)
     if shipped is None:
         shipped = _SHIPPED[key] = default_limits(mission)
     own = {
-        row["quantity"]: _read(row["settings"])
+        subject_of(row["quantity"], row["tracker"]): _read(row["settings"])
         for row in _in_force(connection, mission.name)
-        if row["settings"] is not None and row["quantity"] in shipped
+        if row["settings"] is not None
     }
-    return {**shipped, **own}
+    return limits_of_subjects(mission, shipped, own)
 
 
 @lru_cache(maxsize=256)
@@ -48,30 +55,51 @@ def _read(settings: str) -> LimitSettings:
     return LimitSettings.model_validate_json(settings)
 
 
-def list_limits(connection: Connection, mission: Mission) -> list[Limit]:
-    """The limit of every quantity, with its time and who set it."""
-    rows = {row["quantity"]: row for row in _in_force(connection, mission.name)}
+def list_limits(connection: Connection, mission: Mission, tracker: str = "") -> list[Limit]:
+    """The limit of every quantity, with its time and who set it; or every one of a tracker."""
+    rows = {
+        row["quantity"]: row
+        for row in _in_force(connection, mission.name)
+        if row["tracker"] == tracker
+    }
     return [
-        shown_limit(mission.name, name, settings, rows.get(name))
-        for name, settings in default_limits(mission).items()
+        shown_limit(mission.name, name, settings, rows.get(name), tracker)
+        for name, settings in _inherited(connection, mission, tracker).items()
     ]
 
 
-def limit_history(connection: Connection, mission: Mission, quantity: QuantityName) -> LimitHistory:
+def limit_history(
+    connection: Connection, mission: Mission, quantity: QuantityName, tracker: str = ""
+) -> LimitHistory:
     """The limit in force for a quantity, the shipped one, and every one set, newest first."""
-    shipped = default_limits(mission)[quantity]
+    shipped = _inherited(connection, mission, tracker)[quantity]
     query = (
         select(limits)
-        .where(limits.c.spacecraft == mission.name, limits.c.quantity == quantity)
+        .where(
+            limits.c.spacecraft == mission.name,
+            limits.c.quantity == quantity,
+            limits.c.tracker == tracker,
+        )
         .order_by(limits.c.id.desc())
     )
     rows = [dict(row) for row in connection.execute(query).mappings()]
     latest = next((row for row in rows if row["until"] is None), None)
     return LimitHistory(
-        limit=shown_limit(mission.name, quantity, shipped, latest),
+        limit=shown_limit(mission.name, quantity, shipped, latest, tracker),
         default=shipped.model_dump(mode="json"),
-        history=[shown_limit(mission.name, quantity, shipped, row) for row in rows],
+        history=[shown_limit(mission.name, quantity, shipped, row, tracker) for row in rows],
     )
+
+
+def _inherited(
+    connection: Connection, mission: Mission, tracker: str
+) -> Mapping[QuantityName, LimitSettings]:
+    """The limits that hold where none was set: the shipped ones, or a tracker's spacecraft's."""
+    shipped = default_limits(mission)
+    if not tracker:
+        return shipped
+    whole = limits_of(connection, mission)
+    return {name: whole[name] for name in shipped if name in tracker_names()}
 
 
 def set_limit(
@@ -83,13 +111,19 @@ def set_limit(
     who: str,
     comment: str | None,
     now: str,
+    tracker: str = "",
 ) -> Limit:
     """Set a limit from now on; None restores the shipped one.  The one before stays in history."""
-    place = (limits.c.spacecraft == mission.name, limits.c.quantity == quantity)
+    place = (
+        limits.c.spacecraft == mission.name,
+        limits.c.quantity == quantity,
+        limits.c.tracker == tracker,
+    )
     connection.execute(update(limits).where(*place, limits.c.until.is_(None)).values(until=now))
     row = {
         "spacecraft": mission.name,
         "quantity": quantity,
+        "tracker": tracker,
         "settings": None if settings is None else settings.model_dump_json(),
         "who": who,
         "comment": comment,
@@ -97,19 +131,25 @@ def set_limit(
         "until": None,
     }
     connection.execute(insert(limits), row)
-    shown = shown_limit(mission.name, quantity, default_limits(mission)[quantity], row)
-    events.note(connection, "limit", shown, spacecraft=mission.name)
+    inherited = _inherited(connection, mission, tracker)[quantity]
+    shown = shown_limit(mission.name, quantity, inherited, row, tracker)
+    events.add_event(connection, "limit", shown, spacecraft=mission.name)
     return shown
 
 
 def shown_limit(
-    spacecraft: str, quantity: QuantityName, shipped: LimitSettings, row: Any | None
+    spacecraft: str,
+    quantity: QuantityName,
+    shipped: LimitSettings,
+    row: Any | None,
+    tracker: str = "",
 ) -> Limit:
     """A limit as the interface shows it; without a row the shipped one."""
     own = None if row is None else row["settings"]
     return Limit(
         spacecraft=spacecraft,
         quantity=quantity,
+        tracker=tracker or None,
         unit=QUANTITIES[quantity].unit,
         is_default=own is None,
         since=row and row["since"],

@@ -23,7 +23,7 @@ from service.storage.queries.time_buckets import (
     totals,
 )
 from service.storage.queries.trends import latest_time
-from service.storage.recording.unsaved_result import Row
+from service.storage.sql.columns import Row
 from service.storage.sql.rollup_tables import COUNTS, rollups_daily
 from service.storage.sql.tables import runs
 from service.times import DAY_S, HOUR_S, Utc, recorded_utc, shifted

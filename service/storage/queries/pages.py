@@ -17,7 +17,7 @@ from service.times import Utc
 T = TypeVar("T")
 
 PLACE = (results.c.time_ns, results.c.batch_id)
-"""What a list is ordered by.  Of a batch, not of a result: adopting one moves nothing."""
+"""The order of a list.  Columns of the batch, not of the result: adopting changes no order."""
 
 
 @dataclass(frozen=True)

@@ -7,15 +7,15 @@ order of it until no batch of the remaining hours can be worse than those found.
 from collections.abc import Iterator
 from typing import Any
 
-from sqlalchemy import Case, ColumnElement, Connection, case, func, select
+from sqlalchemy import Case, ColumnElement, Connection, Select, Table, case, func, select
 
 from service.alarms.quantities import QUANTITIES, RankedName
 from service.storage.models.trends import RankedBatch
 from service.storage.queries.pages import PLACE, ResultFilter
 from service.storage.queries.results import summary_fields, summary_query
-from service.storage.recording.rollup_sql import value_sql
-from service.storage.sql.rollup_tables import rollups_hourly
-from service.storage.sql.tables import results
+from service.storage.recording.rollup_sql import OF_TRACKERS, value_sql
+from service.storage.sql.rollup_tables import rollups_hourly, tracker_rollups_hourly
+from service.storage.sql.tables import results, tracker_values
 from service.times import HOUR_S, Utc, bucket_start
 
 RankedRow = tuple[float, int, str, str]
@@ -23,15 +23,20 @@ RankedRow = tuple[float, int, str, str]
 
 
 def worst_batches(
-    connection: Connection, selected: ResultFilter, by: RankedName, limit: int
+    connection: Connection,
+    selected: ResultFilter,
+    by: RankedName,
+    limit: int,
+    tracker: str | None = None,
 ) -> list[RankedBatch]:
     """The `limit` batches with the greatest value, the worst first, of equals the newest.
 
-    Of an offset its size counts, whichever its sign.
+    Of an offset its size counts, whichever its sign.  With a tracker, of a spacecraft with
+    several, the values are the tracker's.
     """
-    badness = _badness(by)
+    badness = _badness(by, results if tracker is None else tracker_values)
     found: list[RankedRow] = []
-    for begin, end, most in _hours(connection, selected, by, limit):
+    for begin, end, most in _hours(connection, selected, by, limit, tracker):
         if len(found) == limit and (most, end) < (found[-1][0], found[-1][1]):
             break
         query = (
@@ -47,23 +52,38 @@ def worst_batches(
             .order_by(badness.desc(), *(column.desc() for column in PLACE))
             .limit(limit)
         )
+        query = _of_tracker(query, tracker)
         found += [(float(row[0]), row[1], row[2], row[3]) for row in connection.execute(query)]
         found = sorted(found, reverse=True)[:limit]
-    return _shown(connection, [each[-1] for each in found], by)
+    return _shown(connection, [each[-1] for each in found], by, tracker)
+
+
+def _of_tracker(query: Select[Any], tracker: str | None) -> Select[Any]:
+    """The query over `results` with the values of a tracker beside them, if there is one."""
+    if tracker is None:
+        return query
+    return query.select_from(OF_TRACKERS).where(tracker_values.c.tracker == tracker)
 
 
 def _hours(
-    connection: Connection, selected: ResultFilter, by: RankedName, limit: int
+    connection: Connection,
+    selected: ResultFilter,
+    by: RankedName,
+    limit: int,
+    tracker: str | None,
 ) -> Iterator[tuple[int, int, float]]:
     """The hours of a period as (begin, end, the greatest value in it), the greatest first.
 
     An hour that the period cuts is narrowed; its greatest value may lie outside.
     """
-    table = rollups_hourly.c
-    most = _greatest(by)
+    rollup = rollups_hourly if tracker is None else tracker_rollups_hourly
+    table = rollup.c
+    most = _greatest(by, rollup)
     query = select(table.bucket, most).where(
         table.spacecraft == selected.spacecraft, table.run == selected.run, most.is_not(None)
     )
+    if tracker is not None:
+        query = query.where(table.tracker == tracker)
     if selected.start is not None:
         query = query.where(table.bucket >= selected.start.bucket(HOUR_S))
     if selected.end is not None:
@@ -86,21 +106,28 @@ def _narrowed(rows: Any, start: Utc | None, end: Utc | None) -> Iterator[tuple[i
             yield begin, over, float(most)
 
 
-def _badness(by: RankedName) -> ColumnElement[Any]:
-    value = value_sql(QUANTITIES[by])
+def _badness(by: RankedName, of: Table) -> ColumnElement[Any]:
+    value = value_sql(QUANTITIES[by], of)
     return func.abs(value) if QUANTITIES[by].worse == "size" else value
 
 
-def _greatest(by: RankedName) -> ColumnElement[Any] | Case[Any]:
-    high: ColumnElement[Any] = rollups_hourly.c[f"{by}_max"]
+def _greatest(by: RankedName, of: Table) -> ColumnElement[Any] | Case[Any]:
+    high: ColumnElement[Any] = of.c[f"{by}_max"]
     if QUANTITIES[by].worse == "high":
         return high
-    low = -rollups_hourly.c[f"{by}_min"]
+    low = -of.c[f"{by}_min"]
     return case((low > high, low), else_=high)
 
 
-def _shown(connection: Connection, ids: list[str], by: RankedName) -> list[RankedBatch]:
+def _shown(
+    connection: Connection, ids: list[str], by: RankedName, tracker: str | None
+) -> list[RankedBatch]:
     query = summary_query().where(results.c.id.in_(ids))
     rows = {row["id"]: dict(row) for row in connection.execute(query).mappings()}
+    values = rows
+    if tracker is not None:
+        chosen = select(results.c.id, tracker_values)
+        own = _of_tracker(chosen.where(results.c.id.in_(ids)), tracker)
+        values = {row["id"]: dict(row) for row in connection.execute(own).mappings()}
     value_of: Any = QUANTITIES[by].value_of
-    return [RankedBatch(**summary_fields(rows[id]), value=value_of(rows[id])) for id in ids]
+    return [RankedBatch(**summary_fields(rows[id]), value=value_of(values[id])) for id in ids]

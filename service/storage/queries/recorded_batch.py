@@ -13,7 +13,7 @@ from service.observations.schema import OptionsIn, submission_from_json
 from service.storage.models.answers import Answer
 from service.storage.queries.pages import PLACE, ResultFilter
 from service.storage.queries.results import answer_from_json, read_result
-from service.storage.recording.unsaved_result import Row
+from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, missions, results
 
 _SENT = ("input", "time", "time_ns")

@@ -123,7 +123,7 @@ def mark_cancelled(connection: Connection, id: str, now: str) -> None:
     if replay.state == "running":
         ended = structs.replace(replay.progress(), state=CANCELLED, finished=now)
         update_replay(connection, ended, None)
-        events.note(connection, "replay", ended, run=ended.run)
+        events.add_event(connection, "replay", ended, run=ended.run)
 
 
 def require_cancellable(state: str) -> None:

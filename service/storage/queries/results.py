@@ -5,16 +5,18 @@ from typing import Any, Literal
 
 import msgspec
 from msgspec import UNSET
-from sqlalchemy import Connection, Select, select
+from sqlalchemy import ColumnElement, Connection, Select, select
 
 from service.alarms.quantities import QUANTITIES, value_names
 from service.errors import NotFound, shown_value
 from service.storage.models.answers import Answer, Result, StarCounts, Summary
 from service.storage.models.base import Page
 from service.storage.models.frames import FrameWithStars
-from service.storage.queries.pages import ResultFilter, newest_first, page_of
-from service.storage.recording.unsaved_result import STARS, Row
-from service.storage.sql.tables import batches, frames, missions, results
+from service.storage.queries.pages import ResultFilter, newest, newest_first, page_of
+from service.storage.recording.unsaved_result import STARS
+from service.storage.sql.columns import Row
+from service.storage.sql.tables import batches, frames, missions, results, runs
+from service.times import Utc
 
 OutcomeName = Literal["unique", "ambiguous", "unmatched"]
 StatusName = Literal["good", "suspect", "none"]
@@ -26,21 +28,44 @@ def list_batches(
     *,
     outcome: OutcomeName | None,
     status: StatusName | None,
+    batch: str | None,
     limit: int,
     cursor: str | None,
 ) -> Page[Summary]:
     """Current results, newest batch time first.
 
     `outcome` keeps batches with at least one star of it; `status` those whose
-    attitude is good or suspect, or that have none.
+    attitude is good or suspect, or that have none; `batch` the one with this batch id in each
+    selected run.
     """
-    chosen = selected.conditions()
+    chosen = _conditions(selected, batch)
     if outcome is not None:
         chosen.append(results.c[outcome] > 0)
     if status is not None:
         chosen.append(results.c.status == (None if status == "none" else status))
     query = newest_first(summary_query().where(*chosen), cursor)
     return page_of(connection, query, limit, summary_of)
+
+
+def newest_id(connection: Connection, selected: ResultFilter, now: Utc) -> str | None:
+    """The id of the newest of the selected results; see `pages.newest`."""
+    row = newest(connection, select(results.c.id), selected, now)
+    return None if row is None else str(row["id"])
+
+
+def _conditions(selected: ResultFilter, batch: str | None) -> list[ColumnElement[bool]]:
+    if batch is None:
+        return selected.conditions()
+    # The unique index begins with spacecraft and run: neither is left open.  Both are asked of the
+    # batch alone: asked of its result, they lead SQLite through all results of the spacecraft.
+    in_runs = select(runs.c.name) if selected.run is None else [selected.run]
+    ids = select(batches.c.id).where(
+        batches.c.spacecraft == selected.spacecraft,
+        batches.c.run.in_(in_runs),
+        batches.c.batch == batch,
+    )
+    times = ResultFilter(None, None, selected.start, selected.end)
+    return [*times.conditions(), results.c.batch_id.in_(ids)]
 
 
 def read_result(connection: Connection, id: str) -> Row:
@@ -96,7 +121,7 @@ def _frame_of(row: Any) -> FrameWithStars:
 
 
 def frame_of_result(connection: Connection, id: str) -> Row:
-    """What an overlay of a result is drawn from; raises `NotFound`, also where there is no frame.
+    """The data for an overlay of a result; raises `NotFound`, also where there is no frame.
 
     The `settings` are those of the mission as they were for that result.
     """

@@ -13,10 +13,17 @@ from typing import Any, Literal
 import numpy as np
 from sqlalchemy import BigInteger, Connection, Select, Table, bindparam, case, func, select
 
-from service.storage.recording.rollup_sql import SUMMED
-from service.storage.recording.unsaved_result import Row
-from service.storage.sql.rollup_tables import COUNTS, ROLLED_UP, rollups_daily, rollups_hourly
-from service.storage.sql.tables import results
+from service.storage.recording.rollup_sql import OF_TRACKERS, SUMMED, SUMMED_OF_TRACKERS
+from service.storage.sql.columns import Row
+from service.storage.sql.rollup_tables import (
+    COUNTS,
+    ROLLED_UP,
+    rollups_daily,
+    rollups_hourly,
+    tracker_rollups_daily,
+    tracker_rollups_hourly,
+)
+from service.storage.sql.tables import results, tracker_values
 from service.times import DAY_S, HOUR_S, UNIX_DAY, Utc, bucket_start, unix_seconds
 from service.vectors import Matrix, Vector
 
@@ -28,20 +35,26 @@ Names = tuple[str, ...]
 MAX_BATCHES_SUMMED = 10_000
 """Of a period of hours, for one answer; one with more is shown by the hour at the finest."""
 
-_COARSE: dict[Level, tuple[Table, int]] = {
-    "hour": (rollups_hourly, HOUR_S),
-    "day": (rollups_daily, DAY_S),
+_WIDTH_S: dict[Level, int] = {"hour": HOUR_S, "day": DAY_S}
+_ROLLUPS: dict[Level, Table] = {"hour": rollups_hourly, "day": rollups_daily}
+_TRACKER_ROLLUPS: dict[Level, Table] = {
+    "hour": tracker_rollups_hourly,
+    "day": tracker_rollups_daily,
 }
 
 
 @dataclass(frozen=True)
 class BucketFilter:
-    """A spacecraft's current results in a run, from `start` to before `end`."""
+    """A spacecraft's current results in a run, from `start` to before `end`.
+
+    Or those of one of its trackers, if it has several.
+    """
 
     spacecraft: str
     run: str
     start: Utc
     end: Utc
+    tracker: str | None = None
 
 
 def batches_about(connection: Connection, span: BucketFilter) -> int:
@@ -60,7 +73,7 @@ def read_buckets(
     connection: Connection, span: BucketFilter, level: Level, names: Names = ROLLED_UP
 ) -> Columns:
     """The buckets of a span, in order of time; those without a batch are left out."""
-    table, width_s = _COARSE[level]
+    width_s = _WIDTH_S[level]
     first, last = (_at_or_after(span.start, width_s), span.end.bucket(width_s))
     if first > last:
         return _finer(connection, span, level, names)
@@ -68,7 +81,7 @@ def read_buckets(
     return _joined(
         [
             _finer(connection, replace(span, end=begin), level, names),
-            _whole(connection, span, table, names, first, last),
+            _whole(connection, span, level, names, first, last),
             _finer(connection, replace(span, start=end), level, names),
         ]
     )
@@ -100,20 +113,24 @@ def read_steps(
             "width_ns": width_s * 10**9,
             "last": DAY_S // width_s - 1,
         }
-        rows = connection.execute(_steps_query(names), asked).all()
+        query = _steps_query(names, span.tracker is not None)
+        rows = connection.execute(query, asked).all()
         parts.append(_steps_of(rows, midnight, width_s, names))
         day, begin = day + 1, end
     return _joined(parts)
 
 
 @cache
-def _steps_query(names: Names) -> Select[Any]:
+def _steps_query(names: Names, of_tracker: bool) -> Select[Any]:
     since_ns = results.c.time_ns - bindparam("midnight_ns", type_=BigInteger)
     number = since_ns // bindparam("width_ns", type_=BigInteger)
     # A leap second is of the step that it ends, as of its hour and day.
     last = bindparam("last", type_=BigInteger)
     step = case((number > last, last), else_=number).label("step")
-    query = select(step, *(SUMMED[name] for name in names))
+    summed = SUMMED_OF_TRACKERS if of_tracker else SUMMED
+    query = select(step, *(summed[name] for name in names))
+    if of_tracker:
+        query = query.select_from(OF_TRACKERS).where(_OF_TRACKER)
     return query.where(*_IN_SPAN).group_by(step).order_by(step)
 
 
@@ -147,7 +164,7 @@ def _at_or_after(moment: Utc, width_s: int) -> int:
 def _whole_query(table: Table, names: Names) -> Select[Any]:
     """The rows of a rollup in a period; made once, for to make it takes longer than to run it."""
     columns = table.c
-    return (
+    query = (
         select(columns.bucket, *(columns[name] for name in names))
         .where(
             columns.spacecraft == bindparam("spacecraft"),
@@ -158,16 +175,17 @@ def _whole_query(table: Table, names: Names) -> Select[Any]:
         )
         .order_by(columns.bucket)
     )
+    return query.where(columns.tracker == bindparam("tracker")) if "tracker" in columns else query
 
 
 def _whole(
-    connection: Connection, span: BucketFilter, table: Table, names: Names, first: int, last: int
+    connection: Connection, span: BucketFilter, level: Level, names: Names, first: int, last: int
 ) -> Columns:
-    asked = {"spacecraft": span.spacecraft, "run": span.run, "first": first, "last": last}
+    table = (_ROLLUPS if span.tracker is None else _TRACKER_ROLLUPS)[level]
+    asked = _owner(span) | {"first": first, "last": last}
     read = _table(connection.execute(_whole_query(table, names), asked).all(), names)
-    width_s = DAY_S if table is rollups_daily else HOUR_S
     return {
-        "unix_s": read[0] * width_s - UNIX_DAY * DAY_S,
+        "unix_s": read[0] * _WIDTH_S[level] - UNIX_DAY * DAY_S,
         **dict(zip(names, read[1:], strict=True)),
     }
 
@@ -181,10 +199,13 @@ _IN_SPAN = (
 )
 
 
+_OF_TRACKER = tracker_values.c.tracker == bindparam("tracker")
+
+
 def _asked(span: BucketFilter) -> Row:
-    return {
-        "spacecraft": span.spacecraft,
-        "run": span.run,
-        "start_ns": span.start.tai_ns,
-        "end_ns": span.end.tai_ns,
-    }
+    return _owner(span) | {"start_ns": span.start.tai_ns, "end_ns": span.end.tai_ns}
+
+
+def _owner(span: BucketFilter) -> Row:
+    owner = {"spacecraft": span.spacecraft, "run": span.run}
+    return owner if span.tracker is None else owner | {"tracker": span.tracker}

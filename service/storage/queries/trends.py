@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, Select, select
 
 from service.alarms.quantities import QUANTITIES, BatchShare, QuantityName, Rate, StarShare
 from service.storage.models.trends import History, Numbers, Series
@@ -27,7 +27,7 @@ from service.storage.queries.time_buckets import (
     read_buckets,
     read_steps,
 )
-from service.storage.sql.tables import MEASURED, batches, results
+from service.storage.sql.tables import COUNTED, MEASURED, batches, results, tracker_values
 from service.times import DAY_S, HOUR_S, Utc, parse_utc, shifted, unix_seconds, utc_now
 from service.vectors import Vector
 
@@ -55,6 +55,8 @@ class HistoryRequest:
     quantities: Sequence[QuantityName]
     strategy: Strategy
     size: int
+    tracker: str | None = None
+    """Of a spacecraft with several: the one whose values they are."""
 
 
 def history(
@@ -71,7 +73,7 @@ def history(
     Without an end it ends just after the latest batch, without a start it
     begins a day before its end.
     """
-    span = _span(connection, spacecraft, run, start, end)
+    span = _span(connection, spacecraft, run, start, end, request.tracker)
     if span is None:
         return _empty(spacecraft, run, start, end, request)
     if request.strategy == "latest":
@@ -94,14 +96,20 @@ def latest_time(
 
 
 def _span(
-    connection: Connection, spacecraft: str, run: str, start: Utc | None, end: Utc | None
+    connection: Connection,
+    spacecraft: str,
+    run: str,
+    start: Utc | None,
+    end: Utc | None,
+    tracker: str | None,
 ) -> BucketFilter | None:
     if end is None:
         latest = latest_time(connection, run, spacecraft, now=utc_now())
         if latest is None:
             return None
         end = shifted(latest, 1e-6)
-    span = BucketFilter(spacecraft, run, shifted(end, -DAY_S) if start is None else start, end)
+    begin = shifted(end, -DAY_S) if start is None else start
+    span = BucketFilter(spacecraft, run, begin, end, tracker)
     return span if span.start.tai_ns <= end.tai_ns else replace(span, end=span.start)
 
 
@@ -221,10 +229,24 @@ def _listed(values: Vector) -> Numbers:
     return list(values.tolist())
 
 
-_COUNTED = ("id", "observed", "unique", "ambiguous", "unmatched", "status", *MEASURED)
-_OF_BATCHES = select(
-    *(results.c[name] for name in _COUNTED), *PLACE, batches.c.batch, batches.c.time
-).join_from(results, batches, results.c.batch_id == batches.c.id)
+_VALUES = (*COUNTED, "status", *MEASURED)
+_SHOWN = (results.c.id, *PLACE, batches.c.batch, batches.c.time)
+_OF_BATCHES = select(*(results.c[name] for name in _VALUES), *_SHOWN).join_from(
+    results, batches, results.c.batch_id == batches.c.id
+)
+_OF_TRACKERS = (
+    select(*(tracker_values.c[name] for name in _VALUES), *_SHOWN)
+    .join_from(results, batches, results.c.batch_id == batches.c.id)
+    .join(tracker_values, tracker_values.c.batch_id == results.c.batch_id)
+)
+
+
+def _values_query(span: BucketFilter) -> Select[Any]:
+    """The values of each batch of a span, or of its tracker in each."""
+    chosen = ResultFilter(span.run, span.spacecraft, span.start, span.end).conditions()
+    if span.tracker is None:
+        return _OF_BATCHES.where(*chosen)
+    return _OF_TRACKERS.where(*chosen, tracker_values.c.tracker == span.tracker)
 
 
 def every_batch(
@@ -235,23 +257,24 @@ def every_batch(
     start: Utc | None,
     end: Utc | None,
     quantities: Sequence[QuantityName],
+    tracker: str | None = None,
 ) -> Iterator[History]:
     """The batches of a period as `history` gives the latest, oldest first, in pages.
 
     At least one page is given, which may hold none.  Between two pages no
     connection is held, so that a slow reader keeps none from others.
     """
-    request = HistoryRequest(quantities, "latest", PAGE)
+    request = HistoryRequest(quantities, "latest", PAGE, tracker)
     with reading() as connection:
-        span = _span(connection, spacecraft, run, start, end)
+        span = _span(connection, spacecraft, run, start, end, tracker)
     if span is None:
         yield _empty(spacecraft, run, start, end, request)
         return
-    chosen = ResultFilter(run, spacecraft, span.start, span.end).conditions()
+    query = _values_query(span)
     cursor: str | None = None
     while True:
         with reading() as connection:
-            page = page_of(connection, oldest_first(_OF_BATCHES.where(*chosen), cursor), PAGE, dict)
+            page = page_of(connection, oldest_first(query, cursor), PAGE, dict)
         yield _of_batches(page.items, span, request)
         cursor = page.next_cursor
         if cursor is None:
@@ -259,9 +282,8 @@ def every_batch(
 
 
 def _latest(connection: Connection, span: BucketFilter, request: HistoryRequest) -> History:
-    chosen = ResultFilter(span.run, span.spacecraft, span.start, span.end).conditions()
     # One more than requested tells whether there are more.
-    query = newest_first(_OF_BATCHES.where(*chosen)).limit(request.size + 1)
+    query = newest_first(_values_query(span)).limit(request.size + 1)
     rows = list(connection.execute(query).mappings())
     thinned = len(rows) > request.size
     return _of_batches(rows[: request.size][::-1], span, request, thinned=thinned)
@@ -309,9 +331,13 @@ def _empty(
         source="batch",
         thinned=False,
         unix_s=[],
-        **{name: [] for name in lists},
+        **_no_rows(lists),
         series={
             name: Series(unit=QUANTITIES[name].unit, **{column: [] for column in columns})
             for name in request.quantities
         },
     )
+
+
+def _no_rows(names: Sequence[str]) -> dict[str, Any]:
+    return {name: [] for name in names}

@@ -4,10 +4,11 @@ from sqlalchemy import Connection, bindparam, insert, select, update
 
 from service.alarms import state_machine
 from service.alarms.limits import LimitSettings, Severity
+from service.alarms.subjects import Subject, quantity_and_tracker, subject_of
 from service.alarms.window import Point
 from service.storage.queries.alarms import change, record_action
 from service.storage.recording.ids import Ulids
-from service.storage.recording.unsaved_result import Row
+from service.storage.sql.columns import Row
 from service.storage.sql.prepared import prepared
 from service.storage.sql.tables import alarms
 
@@ -38,60 +39,64 @@ _UPDATE_VALUES = prepared(
 
 
 class ActiveAlarms:
-    """The alarms that are not cleared, by quantity; their rows stay locked until the commit."""
+    """The alarms that are not cleared, by subject; their rows stay locked until the commit."""
 
     def __init__(self, connection: Connection, spacecraft: str, run: str) -> None:
         self._connection = connection
         self._place = {"spacecraft": spacecraft, "run": run}
         rows = _ACTIVE.read(connection, {"of_spacecraft": spacecraft, "of_run": run})
-        self._alarms: dict[str, Row] = {row["quantity"]: row for row in rows}
-        self._unsaved: set[str] = set()
+        self._alarms: dict[Subject, Row] = {
+            subject_of(row["quantity"], row["tracker"]): row for row in rows
+        }
+        self._unsaved: set[Subject] = set()
 
-    def has(self, quantity: str) -> bool:
-        """Whether a quantity has an active alarm."""
-        return quantity in self._alarms
+    def has(self, subject: Subject) -> bool:
+        """Whether a subject has an active alarm."""
+        return subject in self._alarms
 
-    def is_out(self, quantity: str) -> bool:
-        """Whether a quantity has an active alarm and is out of limits."""
-        return self.has(quantity) and self._alarms[quantity]["current_severity"] is not None
+    def is_out(self, subject: Subject) -> bool:
+        """Whether a subject has an active alarm and is out of limits."""
+        return self.has(subject) and self._alarms[subject]["current_severity"] is not None
 
     def observe(
         self,
-        quantity: str,
+        subject: Subject,
         severity: Severity | None,
         limits: LimitSettings,
         point: Point,
         now: str,
         worst: Point | None = None,
     ) -> None:
-        """Apply a new value to the quantity's alarm, or raise an alarm if it has none."""
-        alarm = self._alarms.get(quantity)
+        """Apply a new value to the subject's alarm, or raise an alarm if it has none."""
+        alarm = self._alarms.get(subject)
         if alarm is None:
             if severity is not None:
                 columns, actions = state_machine.raised(severity, limits, point, now, worst)
-                alarm = {"id": _IDS.new(), "quantity": quantity, **self._place, **columns}
+                quantity, tracker = quantity_and_tracker(subject)
+                what = {"quantity": quantity, "tracker": tracker}
+                alarm = {"id": _IDS.new(), **what, **self._place, **columns}
                 self._connection.execute(insert(alarms), alarm)
                 record_action(self._connection, alarm, actions, now)
-                self._alarms[quantity] = alarm
+                self._alarms[subject] = alarm
             return
         changes, actions = state_machine.observed(alarm, severity, limits, point, now, worst)
         if actions:
             # The changes that were not written yet go with it.
             values = {name: alarm[name] for name in _VALUES}
             alarm = change(self._connection, alarm, values | changes, actions, now)
-            self._unsaved.discard(quantity)
+            self._unsaved.discard(subject)
         else:
             # Values alone are written once, by `save`.
             alarm = alarm | changes
-            self._unsaved.add(quantity)
-        self._alarms[quantity] = alarm
+            self._unsaved.add(subject)
+        self._alarms[subject] = alarm
         if alarm["cleared_at"] is not None:
-            del self._alarms[quantity]
+            del self._alarms[subject]
 
     def save(self) -> None:
         """Write the latest values of the alarms that did not change otherwise."""
         if self._unsaved:
-            found = [self._alarms[quantity] for quantity in sorted(self._unsaved)]
+            found = [self._alarms[subject] for subject in sorted(self._unsaved)]
             rows = [
                 {name: alarm[name] for name in _VALUES} | {"of_id": alarm["id"]} for alarm in found
             ]

@@ -6,21 +6,23 @@ both are stored or neither.  The row in `watches` is locked, so that several
 processes evaluate one after the other.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import msgspec
 from msgspec import Struct
 from sqlalchemy import Connection, bindparam, select, update
 
 from service.alarms.limits import LimitSettings
-from service.alarms.quantities import QUANTITIES, SILENCE, QuantityName
-from service.alarms.window import BatchRef, Point, Window
+from service.alarms.quantities import SILENCE
+from service.alarms.subjects import Subject, sampler
+from service.alarms.window import BatchRef, Point, Sample, SampleWindow
 from service.missions.mission import Mission
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.limits import limits_of
 from service.storage.recording.active_alarms import ActiveAlarms
 from service.storage.recording.silence import silence_severity
-from service.storage.recording.unsaved_result import Row, UnsavedResult
+from service.storage.recording.unsaved_result import UnsavedResult
+from service.storage.sql.columns import Row
 from service.storage.sql.prepared import prepared
 from service.storage.sql.statements import insert_missing
 from service.storage.sql.tables import batches, missions, results, runs, watches
@@ -80,7 +82,7 @@ class LimitEvaluator:
     ) -> None:
         self._connection = connection
         self._spacecraft, self._run = spacecraft, run
-        self._drafts = unsaved_results
+        self._new = unsaved_results
         self._limits = limits_of(connection, _mission(connection, unsaved_results[0]))
         row = self._locked()
         if row is None:
@@ -90,8 +92,8 @@ class LimitEvaluator:
             row = self._locked()
         assert row is not None
         self._row = row
-        self._saved = _LAST_SAVED.pop((spacecraft, run), _NOTHING_SAVED)
-        self._windows = self._saved.windows_of(row["state"])
+        saved = _LAST_SAVED.pop((spacecraft, run), _NOTHING_SAVED)
+        self._windows = saved.windows_of(row["state"])
         self._active = ActiveAlarms(connection, spacecraft, run)
 
     def evaluate(self) -> None:
@@ -99,8 +101,8 @@ class LimitEvaluator:
         due = self._due()
         row, newest = self._row, None
         latest_ns, received = row["time_ns"], row["received"]
-        received_ns = self._saved.ns_of(received)
-        for unsaved in self._drafts:
+        received_ns = recorded_utc(received).tai_ns
+        for unsaved in self._new:
             batch = unsaved.batch
             assert batch is not None
             gap_ns = batch["time_ns"] - latest_ns
@@ -115,7 +117,7 @@ class LimitEvaluator:
                 self._evaluate_batch(unsaved, due)
             if unsaved.received_ns > received_ns:
                 received, received_ns = batch["received"], unsaved.received_ns
-        self._save(newest, received, received_ns)
+        self._save(newest, received)
         self._active.save()
 
     def _check_silence(self, gap_s: float, latest: BatchRef, now: str) -> None:
@@ -135,21 +137,19 @@ class LimitEvaluator:
         if self._active.has(SILENCE):
             self._active.observe(SILENCE, None, limits, Point(0.0, *latest), now)
 
-    def _due(self) -> list[tuple[QuantityName, LimitSettings]]:
-        """The quantities that need an evaluation batch by batch; the others are done here.
+    def _due(self) -> list[tuple[Subject, LimitSettings]]:
+        """The subjects that need an evaluation batch by batch; the others are done here.
 
         Most quantities are in limits all the time, and evaluating each batch by
         itself takes as long as recording it.  An alarm that is back in limits
         needs the latest value alone: of those before it nothing would be stored.
         """
         due = []
-        new = [unsaved.result for unsaved in self._drafts]
         for name, limits in self._limits.items():
-            sample_of = QUANTITIES[name].sample_of
-            samples = [sample for each in new if (sample := sample_of(each))]
+            samples = list(filter(None, self._samples(name, self._new)))
             if not samples:
                 continue
-            window = self._windows.setdefault(name, Window())
+            window = self._windows.setdefault(name, SampleWindow())
             if self._active.is_out(name) or not window.add_if_within(samples, limits):
                 due.append((name, limits))
             elif self._active.has(name) and (value := window.value(limits)) is not None:
@@ -158,14 +158,25 @@ class LimitEvaluator:
                 self._active.observe(name, None, limits, point, batch["received"])
         return due
 
-    def _latest_with(self, name: QuantityName) -> Row:
-        """The latest new batch that has a value of a quantity."""
-        sample_of = QUANTITIES[name].sample_of
+    def _latest_with(self, name: Subject) -> Row:
+        """The latest new batch that has a value of a subject."""
+        latest_first = self._new[::-1]
+        samples = self._samples(name, latest_first)
         return next(
             unsaved.batch
-            for unsaved in reversed(self._drafts)
-            if unsaved.batch and sample_of(unsaved.result)
+            for unsaved, sample in zip(latest_first, samples, strict=True)
+            if unsaved.batch and sample
         )
+
+    @staticmethod
+    def _samples(
+        subject: Subject, unsaved_results: Sequence[UnsavedResult]
+    ) -> Iterator[Sample | None]:
+        """What each of the results adds to the value of a subject; None: nothing."""
+        sample_of = sampler(subject)
+        for each in unsaved_results:
+            trackers = each.trackers and _by_tracker(each)
+            yield sample_of(each.result, trackers or {})
 
     def _latest_in_window(self, batch: Row, latest_ns: int) -> BatchRef:
         """The latest batch of a window: the one given, unless it comes late."""
@@ -188,11 +199,11 @@ class LimitEvaluator:
         return (found[0], found[1]) if found else _reference(batch)
 
     def _evaluate_batch(
-        self, unsaved: UnsavedResult, due: Sequence[tuple[QuantityName, LimitSettings]]
+        self, unsaved: UnsavedResult, due: Sequence[tuple[Subject, LimitSettings]]
     ) -> None:
         assert unsaved.batch is not None
         for name, limits in due:
-            sample = QUANTITIES[name].sample_of(unsaved.result)
+            (sample,) = self._samples(name, [unsaved])
             if sample is None:
                 continue
             window = self._windows[name]
@@ -208,7 +219,7 @@ class LimitEvaluator:
         place = {"of_spacecraft": self._spacecraft, "of_run": self._run}
         return next(iter(_LOCK.read(self._connection, place)), None)
 
-    def _save(self, newest: Row | None, received: str, received_ns: int) -> None:
+    def _save(self, newest: Row | None, received: str) -> None:
         windows = {name: window.to_json() for name, window in self._windows.items()}
         state = msgspec.json.encode(windows).decode()
         row = self._row | (_columns_of(newest) if newest else {})
@@ -217,8 +228,7 @@ class LimitEvaluator:
         _SAVE.run(self._connection, [place | {name: row[name] for name in _COLUMNS}])
         if len(_LAST_SAVED) >= _MAX_SAVED:
             _LAST_SAVED.clear()
-        saved = _SavedWindows(state, self._windows, received, received_ns)
-        _LAST_SAVED[self._spacecraft, self._run] = saved
+        _LAST_SAVED[self._spacecraft, self._run] = _SavedWindows(state, self._windows)
 
 
 class _SavedWindows(Struct):
@@ -228,25 +238,25 @@ class _SavedWindows(Struct):
     """
 
     state: str
-    windows: dict[str, Window]
-    received: str
-    received_ns: int
+    windows: dict[str, SampleWindow]
 
-    def windows_of(self, state: str) -> dict[str, Window]:
+    def windows_of(self, state: str) -> dict[str, SampleWindow]:
         """The windows that a stored text holds."""
         if self.state == state:
             return self.windows
         stored = msgspec.json.decode(state)
-        return {name: Window.from_json(each) for name, each in stored.items()}
-
-    def ns_of(self, received: str) -> int:
-        """A time of receipt as `Utc.tai_ns`."""
-        return self.received_ns if self.received == received else recorded_utc(received).tai_ns
+        return {name: SampleWindow.from_json(each) for name, each in stored.items()}
 
 
-_NOTHING_SAVED = _SavedWindows("", {}, "", 0)
+_NOTHING_SAVED = _SavedWindows("", {})
 _LAST_SAVED: dict[tuple[str, str], _SavedWindows] = {}
 _MAX_SAVED = 64
+
+
+def _by_tracker(unsaved: UnsavedResult) -> Mapping[str, Row]:
+    """The values of each tracker of a result as those of a result of its own."""
+    time_ns = {"time_ns": unsaved.result["time_ns"]}
+    return {row["tracker"]: row | time_ns for row in unsaved.trackers}
 
 
 def _mission(connection: Connection, unsaved: UnsavedResult) -> Mission:

@@ -25,7 +25,7 @@ from service.storage.models.answers import (
     TrackerFit,
     TrackerStars,
 )
-from service.storage.models.frames import Frame
+from service.storage.models.frames import FrameSummary
 from service.vectors import ra_dec_of
 
 FRAME = "EME2000"
@@ -53,7 +53,7 @@ def answer_of(
     id: str | None,
     parent: str | UnsetType = UNSET,
     recorded: bool | UnsetType = UNSET,
-    frame: Frame | UnsetType = UNSET,
+    frame: FrameSummary | UnsetType = UNSET,
     warnings: Sequence[str] = (),
 ) -> Answer:
     """The answer to a batch; `id` is None for what is not recorded.

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 from sqlalchemy import Connection, delete, select
 
-from service.storage.recording.unsaved_result import Row
+from service.storage.sql.columns import Row
 from service.storage.sql.prepared import execute
 from service.storage.sql.statements import insert_all
 from service.storage.sql.tables import event_counter, events
@@ -37,7 +37,7 @@ class Event:
     data: str
 
 
-def note(
+def add_event(
     connection: Connection,
     kind: str,
     data: object,

@@ -1,4 +1,4 @@
-"""Who was first: which batches and Idempotency-Keys are recorded, and with what body."""
+"""Recorded batches and Idempotency-Keys, and the fingerprints of their bodies."""
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
@@ -22,8 +22,8 @@ OwnKey = tuple[str, str]
 The id is empty where a key came without a token.
 """
 
-# What is looked for comes as one value, so that the text of each statement never changes: to
-# make one for so many values takes longer than to run it.
+# The wanted identities and keys are one JSON value, so that the text of each statement never
+# changes: compiling a statement for many values takes longer than running it.
 _BY_IDENTITY = {
     "sqlite": """
         SELECT b.spacecraft, b.run, b.batch, b.id, b.fingerprint
@@ -64,13 +64,13 @@ class ExistingResult(Struct, frozen=True):
 
 
 def identity_of(batch: ObservationBatch) -> Identity:
-    """What is unique among submissions."""
+    """The identity of a batch, which is unique among submissions."""
     return batch.spacecraft, batch.run, batch.batch
 
 
 @dataclass
 class Registry:
-    """What is already there of some identities and keys."""
+    """The recorded ones of some identities and keys."""
 
     identities: dict[Identity, ExistingResult] = field(default_factory=dict)
     keys: dict[OwnKey, ExistingResult] = field(default_factory=dict)
@@ -78,7 +78,7 @@ class Registry:
     def first(
         self, identity: Identity, key: OwnKey | None, fingerprint: str
     ) -> ExistingResult | None:
-        """Who recorded this body before; None: nobody did.
+        """The recorded result of this body; None: there is none.
 
         Raises `KeyReused` where the key belongs to another body, which is
         looked at first, and `Conflict` where the identity does.
@@ -97,7 +97,7 @@ class Registry:
         return by_identity
 
     def enter(self, identity: Identity, key: OwnKey | None, taken: ExistingResult) -> None:
-        """Note a new holder, so that whoever comes next finds it."""
+        """Note a new holder, so that later submissions find it."""
         self.identities[identity] = taken
         if key is not None:
             self.keys[key] = taken
@@ -106,7 +106,7 @@ class Registry:
 def look_up(
     connection: Connection, identities: Collection[Identity], keys: Collection[OwnKey] = ()
 ) -> Registry:
-    """What is recorded under these identities and keys."""
+    """The recorded results of these identities and keys."""
     registry = Registry()
     dialect = connection.dialect.name
     if identities:

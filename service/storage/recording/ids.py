@@ -9,7 +9,7 @@ _RANDOM_BITS = 80
 _AT_ONCE = 64
 """Identifiers whose random bits are requested together: a system call is slow."""
 LENGTH = 26
-_SHIFTS = range(10 * (LENGTH // 2 - 2), -1, -10)
+_SHIFTS = range(10 * (LENGTH // 2 - 1), -1, -10)
 _PAIRS = [first + second for first in _ALPHABET for second in _ALPHABET]
 
 
@@ -20,7 +20,6 @@ class Ulids:
         self._lock = threading.Lock()
         self._last = 0
         self._random = b""
-        self._head, self._head_of = "", -1
 
     def new(self) -> str:
         """The next identifier: 48 bits of Unix milliseconds, 80 random ones."""
@@ -34,12 +33,8 @@ class Ulids:
             self._last = (
                 fresh if fresh >> _RANDOM_BITS > self._last >> _RANDOM_BITS else self._last + 1
             )
-            rest, last = divmod(self._last, len(_PAIRS))
-            if rest != self._head_of:
-                # Within a millisecond only the last characters change.
-                self._head = "".join([_PAIRS[rest >> shift & 1023] for shift in _SHIFTS])
-                self._head_of = rest
-            return self._head + _PAIRS[last]
+            value = self._last
+        return "".join([_PAIRS[value >> shift & 1023] for shift in _SHIFTS])
 
 
 def unguessable_ulid() -> str:

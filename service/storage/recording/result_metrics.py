@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 from itertools import chain
-from typing import Any
 
 from service.acquire import Acquisition
 from service.alarms.quantities import QUANTITIES, Measured
+from service.storage.sql.columns import Row
 from service.storage.sql.rollup_tables import (
     COUNTS,
     MAXIMA,
@@ -15,8 +15,6 @@ from service.storage.sql.rollup_tables import (
     SUMS,
     VALUES,
 )
-
-Row = dict[str, Any]
 
 
 def metrics_of(acquisition: Acquisition) -> Row:

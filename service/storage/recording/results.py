@@ -1,10 +1,12 @@
 """Writing results: every row of a result, its part in the trends included, in one transaction."""
 
+import json
 from collections.abc import Sequence
 
-from sqlalchemy import Connection, and_, insert, select, update
+from sqlalchemy import Connection, and_, delete, insert, select, update
 
 from service.errors import AcquisitionError
+from service.storage.queries.tracker_splits import split_anew
 from service.storage.recording import events, rollups
 from service.storage.recording.alarm_evaluation import evaluate_limits
 from service.storage.recording.identity import (
@@ -14,8 +16,9 @@ from service.storage.recording.identity import (
     look_up,
     stored_answers,
 )
-from service.storage.recording.unsaved_result import Answered, Row, UnsavedResult
+from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.sql.access_tables import audit
+from service.storage.sql.columns import Row
 from service.storage.sql.statements import insert_all, insert_missing
 from service.storage.sql.tables import (
     batches,
@@ -28,9 +31,10 @@ from service.storage.sql.tables import (
     runs,
     solutions,
     star_results,
+    tracker_values,
 )
 
-Outcome = Answered | AcquisitionError
+RecordOutcome = Answered | AcquisitionError
 
 _RUNS = "runs"
 """Where a connection remembers the runs that it has inserted, or found there."""
@@ -49,9 +53,19 @@ def register(connection: Connection, mission_rows: Sequence[Row], catalog_row: R
             .order_by(mission_uses.c.id.desc())
             .limit(1)
         )
-        if connection.execute(latest).scalar() != row["digest"]:
+        before = connection.execute(latest).scalar()
+        if before != row["digest"]:
+            if before is not None and _trackers(row["settings"]) > 1:
+                query = select(missions.c.settings).where(missions.c.digest == before)
+                if _trackers(connection.execute(query).scalar_one()) == 1:
+                    split_anew(connection, row["spacecraft"])
             use = {"spacecraft": row["spacecraft"], "digest": row["digest"]}
             connection.execute(insert(mission_uses), use | {"since": row["first_used"]})
+
+
+def _trackers(settings: str) -> int:
+    """The number of a mission's trackers."""
+    return len(json.loads(settings)["trackers"])
 
 
 def set_run_alarms(connection: Connection, run: str, watched: bool, now: str) -> None:
@@ -62,7 +76,7 @@ def set_run_alarms(connection: Connection, run: str, watched: bool, now: str) ->
 
 def record(
     connection: Connection, unsaved_results: Sequence[UnsavedResult], assume_new: bool = False
-) -> list[Outcome]:
+) -> list[RecordOutcome]:
     """Record those results that are new; one outcome each, in order.
 
     Look, then insert: a submission that is already there, in the tables or
@@ -153,6 +167,9 @@ def _insert(
     insert_all(connection, frames, [unsaved.frame for unsaved, _ in firsts if unsaved.frame])
     _insert_results(connection, firsts)
     rollups.add(connection, ((unsaved.buckets, unsaved.result) for unsaved, _ in firsts))
+    split = [(unsaved.buckets, row) for unsaved, _ in firsts for row in unsaved.trackers]
+    insert_all(connection, tracker_values, [row for _, row in split])
+    rollups.add_trackers(connection, split)
     # What-ifs go one by one: of two that are adopted, the second supersedes the first.
     adopted = []
     for unsaved, body in fresh:
@@ -180,7 +197,7 @@ def _note_events(connection: Connection, fresh: Sequence[UnsavedResult]) -> None
         elif unsaved.result["current"]:
             about = {"spacecraft": spacecraft, "run": run, "id": unsaved.id}
             about["batch_id"] = unsaved.result["batch_id"]
-            events.note(connection, "adopted", about, run=run, spacecraft=spacecraft)
+            events.add_event(connection, "adopted", about, run=run, spacecraft=spacecraft)
     for (run, spacecraft), unsaved_results in new.items():
         latest = max(unsaved_results, key=lambda unsaved: int(unsaved.result["time_ns"]))
         assert latest.batch is not None
@@ -189,7 +206,7 @@ def _note_events(connection: Connection, fresh: Sequence[UnsavedResult]) -> None
         newest["counts"] = latest.counts
         note: Row = {"spacecraft": spacecraft, "run": run, "batches": len(unsaved_results)}
         note["latest"] = newest
-        events.note(connection, "batches", note, run=run, spacecraft=spacecraft)
+        events.add_event(connection, "batches", note, run=run, spacecraft=spacecraft)
 
 
 def _insert_results(
@@ -204,9 +221,11 @@ def _insert_results(
 
 
 def _supersede(connection: Connection, unsaved: UnsavedResult) -> None:
-    """Mark the current result of a batch as superseded by an unsaved one."""
+    """Mark the current result of a batch as superseded by an unsaved one, tracker by tracker."""
     batch_id = unsaved.result["batch_id"]
     # The lock on the batch orders the adoptions of several processes.
     connection.execute(select(batches.c.id).where(batches.c.id == batch_id).with_for_update())
     current = and_(results.c.batch_id == batch_id, results.c.current)
     connection.execute(update(results).where(current).values(current=False))
+    connection.execute(delete(tracker_values).where(tracker_values.c.batch_id == batch_id))
+    insert_all(connection, tracker_values, unsaved.trackers)

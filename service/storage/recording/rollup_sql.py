@@ -7,28 +7,29 @@ current results has every column that is read here.
 from collections.abc import Mapping
 from typing import Any
 
-from sqlalchemy import BigInteger, ColumnElement, Double, case, func
+from sqlalchemy import BigInteger, ColumnElement, Double, Table, case, func
 
 from service.alarms.quantities import QUANTITIES, Quantity, Ratio, StarShare
 from service.storage.sql.rollup_tables import SHARES, VALUES
-from service.storage.sql.tables import results
-
-_STARS = {name: results.c[name] for name in ("unique", "ambiguous", "unmatched")}
-_COUNTS: Mapping[str, ColumnElement[Any]] = {
-    "observed": _STARS["unique"] + _STARS["ambiguous"] + _STARS["unmatched"],
-    **_STARS,
-}
+from service.storage.sql.tables import COUNTED, results, tracker_values
 
 
-def value_sql(quantity: Quantity) -> ColumnElement[Any]:
-    """The value of one result; null where it has none."""
+def _counts(of: Table) -> Mapping[str, ColumnElement[Any]]:
+    stars = {name: of.c[name] for name in COUNTED if name != "observed"}
+    # The sum of the others, which the index has.
+    return {"observed": stars["unique"] + stars["ambiguous"] + stars["unmatched"], **stars}
+
+
+def value_sql(quantity: Quantity, of: Table = results) -> ColumnElement[Any]:
+    """The value of one result, or of one tracker in it; null where it has none."""
     match quantity.source:
         case StarShare(part):
-            return _over(part(_COUNTS), _COUNTS["observed"])
+            counts = _counts(of)
+            return _over(part(counts), counts["observed"])
         case Ratio(numerator, denominator):
-            return _over(results.c[numerator], results.c[denominator])
+            return _over(of.c[numerator], of.c[denominator])
         case _:
-            return results.c[quantity.name]
+            return of.c[quantity.name]
 
 
 def _sum(of: ColumnElement[Any]) -> ColumnElement[Any]:
@@ -40,22 +41,26 @@ def _over(part: ColumnElement[Any], whole: ColumnElement[Any]) -> ColumnElement[
     return part.cast(Double) / func.nullif(whole, 0).cast(Double)
 
 
-def _summed() -> Mapping[str, ColumnElement[Any]]:
+def _summed(of: Table) -> Mapping[str, ColumnElement[Any]]:
     columns: dict[str, ColumnElement[Any]] = {
         "batches": func.count(),
-        **{name: _sum(count) for name, count in _COUNTS.items()},
-        "solved": func.count(results.c.status),
-        "suspect": _sum(case((results.c.status == "suspect", 1), else_=0)),
+        **{name: _sum(count) for name, count in _counts(of).items()},
+        "solved": func.count(of.c.status),
+        "suspect": _sum(case((of.c.status == "suspect", 1), else_=0)),
     }
     for name in VALUES:
-        value = value_sql(QUANTITIES[name])
+        value = value_sql(QUANTITIES[name], of)
         columns[f"{name}_n"] = func.count(value)
         columns[f"{name}_sum"] = func.coalesce(func.sum(value), 0.0)
     for name in (*SHARES, *VALUES):
-        value = value_sql(QUANTITIES[name])
+        value = value_sql(QUANTITIES[name], of)
         columns[f"{name}_min"], columns[f"{name}_max"] = func.min(value), func.max(value)
-    return columns
+    return {name: column.label(name) for name, column in columns.items()}
 
 
-SUMMED = {name: column.label(name) for name, column in _summed().items()}
+SUMMED = _summed(results)
 """Each column as SQL over `results`, for a query that groups them or sums up all."""
+SUMMED_OF_TRACKERS = _summed(tracker_values)
+"""The same over `tracker_values`."""
+OF_TRACKERS = results.join(tracker_values, tracker_values.c.batch_id == results.c.batch_id)
+"""What a query over `tracker_values` reads, so that it can choose current results."""

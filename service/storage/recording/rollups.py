@@ -1,29 +1,42 @@
 """Trends: sums and extremes per spacecraft, run and UTC hour or day, by the time of the batch.
 
+Of spacecraft with several trackers also per tracker.
+
 They are changed in the transaction that records a result or adopts one, and so
 are at every moment what a count of the current results would give.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
-from sqlalchemy import ColumnElement, Connection, Table, and_, delete, select, update
+from sqlalchemy import ColumnElement, Connection, Select, Table, and_, delete, select, update
 
 from service.errors import BadInput, Fault
 from service.storage.recording.result_metrics import merge, rolled_up
-from service.storage.recording.rollup_sql import SUMMED
-from service.storage.recording.unsaved_result import Buckets, Row
-from service.storage.sql.rollup_tables import COUNTS, rollups_daily, rollups_hourly
-from service.storage.sql.statements import add_rollups
-from service.storage.sql.tables import batches, results
+from service.storage.recording.rollup_sql import OF_TRACKERS, SUMMED, SUMMED_OF_TRACKERS
+from service.storage.recording.unsaved_result import Buckets
+from service.storage.sql.columns import Row
+from service.storage.sql.rollup_tables import (
+    COUNTS,
+    rollups_daily,
+    rollups_hourly,
+    tracker_rollups_daily,
+    tracker_rollups_hourly,
+)
+from service.storage.sql.statements import add_rollups, insert_all
+from service.storage.sql.tables import batches, results, tracker_values
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, parse_utc
 
 Bucket = Literal["hour", "day"]
-Key = tuple[str, str, int]
+BucketKey = tuple[str, str, int]
 """(spacecraft, run, bucket)."""
-Rollups = dict[Key, Row]
+TrackerKey = tuple[str, str, str, int]
+"""(spacecraft, run, tracker, bucket)."""
+Rollups = dict[Any, Row]
+"""By `BucketKey`, or by `TrackerKey`."""
 _KEY = ("spacecraft", "run", "bucket")
+_TRACKER_KEY = ("spacecraft", "run", "tracker", "bucket")
 MAX_RATES = 20_000
 """Of one answer: two years of hours, or half a century of days."""
 
@@ -31,30 +44,63 @@ MAX_RATES = 20_000
 @dataclass(frozen=True)
 class _Trend:
     table: Table
+    tracker_table: Table
     width_s: int
 
 
 _TRENDS: dict[Bucket, _Trend] = {
-    "hour": _Trend(rollups_hourly, HOUR_S),
-    "day": _Trend(rollups_daily, DAY_S),
+    "hour": _Trend(rollups_hourly, tracker_rollups_hourly, HOUR_S),
+    "day": _Trend(rollups_daily, tracker_rollups_daily, DAY_S),
 }
 
 
 def add(connection: Connection, new: Iterable[tuple[Buckets, Row]]) -> None:
     """Add new current results, rows of theirs, to the hours and days that they belong to."""
-    of_hour: dict[Key, list[Row]] = {}
+    of_hour: dict[BucketKey, list[Row]] = {}
     for buckets, result in new:
         of_hour.setdefault((buckets.spacecraft, buckets.run, buckets.hour), []).append(result)
+    _add(connection, of_hour, (rollups_hourly, rollups_daily), _KEY)
+
+
+def add_trackers(connection: Connection, new: Iterable[tuple[Buckets, Row]]) -> None:
+    """Add rows of `tracker_values` to the hours and days of their trackers.
+
+    The rows of `rollups_hourly` and `rollups_daily` for these hours and days must be
+    locked: whoever changes them (`add`, `renew`) may also change those of trackers.
+    """
+    of_hour: dict[TrackerKey, list[Row]] = {}
+    for buckets, row in new:
+        key = buckets.spacecraft, buckets.run, row["tracker"], buckets.hour
+        of_hour.setdefault(key, []).append(row)
+    _add(connection, of_hour, (tracker_rollups_hourly, tracker_rollups_daily), _TRACKER_KEY)
+
+
+def lock(connection: Connection, hours: Iterable[BucketKey]) -> None:
+    """Lock the hours of spacecraft, and their days, so that only this transaction changes them."""
+    keys = sorted(set(hours))
+    for key in keys:
+        _lock(connection, rollups_hourly, key)
+    for key in sorted({(*key[:2], key[2] // 24) for key in keys}):
+        _lock(connection, rollups_daily, key)
+
+
+def _add(
+    connection: Connection,
+    of_hour: Mapping[Any, list[Row]],
+    tables: tuple[Table, Table],
+    names: tuple[str, ...],
+) -> None:
     hourly = {key: rolled_up(found) for key, found in of_hour.items()}
     daily: Rollups = {}
-    for (spacecraft, run, hour), row in hourly.items():
-        _put(daily, (spacecraft, run, hour // 24), row)
-    for table, found in ((rollups_hourly, hourly), (rollups_daily, daily)):
+    for (*owner, hour), row in hourly.items():
+        _put(daily, (*owner, hour // 24), row)
+    for table, found in zip(tables, (hourly, daily), strict=True):
         # In one order everywhere, so that two writers wait for each other but never cross.
-        add_rollups(connection, table, [_keyed(key, found[key]) for key in sorted(found)])
+        rows = [dict(zip(names, key, strict=True)) | found[key] for key in sorted(found)]
+        add_rollups(connection, table, rows)
 
 
-def renew(connection: Connection, hours: Iterable[Key]) -> None:
+def renew(connection: Connection, hours: Iterable[BucketKey]) -> None:
     """Count hours anew in which a current result was replaced or taken out, and their days.
 
     An extreme that is gone cannot be subtracted.  A row is locked before what it
@@ -68,65 +114,102 @@ def renew(connection: Connection, hours: Iterable[Key]) -> None:
     for spacecraft, run, day in sorted({(key[0], key[1], key[2] // 24) for key in changed}):
         row = _of_day(connection, (spacecraft, run, day))
         _put_back(connection, rollups_daily, (spacecraft, run, day), row)
+    _renew_trackers(connection, changed)
 
 
-def _of_hour(connection: Connection, key: Key) -> Row | None:
-    """What the current results of an hour come to."""
+def _renew_trackers(connection: Connection, changed: Iterable[BucketKey]) -> None:
+    """Count the same hours and days anew for each tracker; those of the spacecraft are locked."""
+    tracker = tracker_values.c.tracker
+    for key in changed:
+        query = select(tracker, *SUMMED_OF_TRACKERS.values()).select_from(OF_TRACKERS)
+        found = connection.execute(_within_hour(query, key).group_by(tracker)).mappings()
+        _replace(
+            connection, tracker_rollups_hourly, key, {row["tracker"]: dict(row) for row in found}
+        )
+    for spacecraft, run, day in sorted({(key[0], key[1], key[2] // 24) for key in changed}):
+        hours = _hours_of_day(connection, tracker_rollups_hourly, (spacecraft, run, day))
+        of_day: Rollups = {}
+        for row in hours:
+            _put(of_day, row["tracker"], row)
+        _replace(connection, tracker_rollups_daily, (spacecraft, run, day), of_day)
+
+
+def _replace(
+    connection: Connection,
+    table: Table,
+    key: BucketKey,
+    of_tracker: Mapping[str, Mapping[str, Any]],
+) -> None:
+    """Replace the rows of all trackers of an hour or a day."""
+    connection.execute(delete(table).where(_place(table, key)))
+    own = dict(zip(_KEY, key, strict=True))
+    rows = [dict(row) | own | {"tracker": tracker} for tracker, row in sorted(of_tracker.items())]
+    insert_all(connection, table, rows)
+
+
+def _of_hour(connection: Connection, key: BucketKey) -> Row | None:
+    """The rollup of the current results of an hour."""
     _lock(connection, rollups_hourly, key)
+    query = _within_hour(select(*SUMMED.values()), key)
+    row = dict(connection.execute(query).mappings().one())
+    return row if row["batches"] else None
+
+
+def _within_hour(query: Select[Any], key: BucketKey) -> Select[Any]:
+    """The query over the current results of an hour."""
     spacecraft, run, hour = key
-    query = select(*SUMMED.values()).where(
+    return query.where(
         results.c.current,
         results.c.spacecraft == spacecraft,
         results.c.run == run,
         results.c.time_ns >= bucket_start(hour, HOUR_S).tai_ns,
         results.c.time_ns < bucket_start(hour + 1, HOUR_S).tai_ns,
     )
-    row = dict(connection.execute(query).mappings().one())
-    return row if row["batches"] else None
 
 
-def _of_day(connection: Connection, key: Key) -> Row | None:
-    """What the hours of a day come to."""
+def _of_day(connection: Connection, key: BucketKey) -> Row | None:
+    """The rollup of the hours of a day."""
     _lock(connection, rollups_daily, key)
-    spacecraft, run, day = key
-    query = select(rollups_hourly).where(
-        rollups_hourly.c.spacecraft == spacecraft,
-        rollups_hourly.c.run == run,
-        rollups_hourly.c.bucket >= 24 * day,
-        rollups_hourly.c.bucket < 24 * (day + 1),
-    )
     found: Rollups = {}
-    for row in connection.execute(query.order_by(rollups_hourly.c.bucket)).mappings():
+    for row in _hours_of_day(connection, rollups_hourly, key):
         _put(found, key, {name: row[name] for name in row if name not in _KEY})
     return found.get(key)
 
 
-def _lock(connection: Connection, table: Table, key: Key) -> None:
+def _hours_of_day(connection: Connection, table: Table, key: BucketKey) -> list[Row]:
+    """The rows of a rollup by hour that belong to a day, in order of time."""
+    spacecraft, run, day = key
+    query = select(table).where(
+        table.c.spacecraft == spacecraft,
+        table.c.run == run,
+        table.c.bucket >= 24 * day,
+        table.c.bucket < 24 * (day + 1),
+    )
+    return [dict(row) for row in connection.execute(query.order_by(table.c.bucket)).mappings()]
+
+
+def _lock(connection: Connection, table: Table, key: BucketKey) -> None:
     connection.execute(select(table.c.bucket).where(_place(table, key)).with_for_update())
 
 
-def _put_back(connection: Connection, table: Table, key: Key, row: Row | None) -> None:
+def _put_back(connection: Connection, table: Table, key: BucketKey, row: Row | None) -> None:
     place = _place(table, key)
     connection.execute(
         delete(table).where(place) if row is None else update(table).where(place).values(row)
     )
 
 
-def _put(found: Rollups, key: Key, row: Row) -> None:
+def _put(found: Rollups, key: Any, row: Row) -> None:
     if key in found:
         merge(found[key], row)
     else:
-        # A copy: what is merged into it belongs to nobody else.
+        # A copy: merging changes it in place.
         found[key] = dict(row)
 
 
-def _place(table: Table, key: Key) -> ColumnElement[bool]:
+def _place(table: Table, key: BucketKey) -> ColumnElement[bool]:
     spacecraft, run, number = key
     return and_(table.c.spacecraft == spacecraft, table.c.run == run, table.c.bucket == number)
-
-
-def _keyed(key: Key, row: Row) -> Row:
-    return {"spacecraft": key[0], "run": key[1], "bucket": key[2], **row}
 
 
 def rates(
@@ -169,22 +252,28 @@ def rates(
     ]
 
 
-def stored(connection: Connection, bucket: Bucket) -> Rollups:
-    """The trends as they are kept."""
+def stored(connection: Connection, bucket: Bucket, *, of_trackers: bool = False) -> Rollups:
+    """The trends as they are kept: of spacecraft, or of their trackers."""
+    trend = _TRENDS[bucket]
+    table, names = (trend.tracker_table, _TRACKER_KEY) if of_trackers else (trend.table, _KEY)
     return {
-        (row["spacecraft"], row["run"], row["bucket"]): {
-            name: row[name] for name in row if name not in _KEY
-        }
-        for row in connection.execute(select(_TRENDS[bucket].table)).mappings()
+        tuple(row[name] for name in names): {name: row[name] for name in row if name not in names}
+        for row in connection.execute(select(table)).mappings()
     }
 
 
-def recount(connection: Connection, bucket: Bucket) -> Rollups:
+def recount(connection: Connection, bucket: Bucket, *, of_trackers: bool = False) -> Rollups:
     """The trends counted anew from the current results: what `stored` must equal."""
+    place = results.c.spacecraft, results.c.run, batches.c.time
+    query = select(results, batches.c.time).join_from(results, batches)
+    if of_trackers:
+        source = OF_TRACKERS.join(batches, batches.c.id == results.c.batch_id)
+        query = select(tracker_values, *place).select_from(source)
     width_s = _TRENDS[bucket].width_s
     found: Rollups = {}
-    query = select(results, batches.c.time).join_from(results, batches).where(results.c.current)
-    for row in connection.execute(query).mappings():
-        key = row["spacecraft"], row["run"], parse_utc(row["time"]).bucket(width_s)
+    for row in connection.execute(query.where(results.c.current)).mappings():
+        tracker = (row["tracker"],) if of_trackers else ()
+        number = parse_utc(row["time"]).bucket(width_s)
+        key = row["spacecraft"], row["run"], *tracker, number
         _put(found, key, rolled_up([dict(row)]))
     return found

@@ -1,4 +1,4 @@
-"""What changes without a batch: spacecraft that fall silent, and shelving that expires."""
+"""Alarm changes without a batch: silent spacecraft, and shelving that expires."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -7,7 +7,8 @@ from sqlalchemy import Connection, select
 
 from service.alarms import state_machine
 from service.alarms.limits import LimitSettings, Severity
-from service.alarms.quantities import SILENCE, QuantityName
+from service.alarms.quantities import SILENCE
+from service.alarms.subjects import Subject
 from service.alarms.window import Point
 from service.missions.mission import Mission
 from service.storage.queries.alarms import change
@@ -18,7 +19,7 @@ from service.storage.sql.tables import alarms, watches
 from service.times import Utc, recorded_utc
 
 
-def silence_severity(limits: Mapping[QuantityName, LimitSettings], gap_s: float) -> Severity | None:
+def silence_severity(limits: Mapping[Subject, LimitSettings], gap_s: float) -> Severity | None:
     """The worst severity whose limit a gap between batches exceeds; None within limits."""
     exceeded = limits[SILENCE].severities_out(gap_s)
     return exceeded[-1] if exceeded else None

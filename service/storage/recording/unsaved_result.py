@@ -8,28 +8,27 @@ objects.
 
 import json
 import time
-from collections.abc import Mapping
-from functools import lru_cache
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
 from msgspec import UNSET, Struct, structs
 
 from service.acquire import Acquisition
-from service.missions.mission import Identifier, Mission, SolverName
+from service.missions.mission import Mission
 from service.observations.frame_record import FrameRecord
 from service.observations.schema import Submission
 from service.storage.models.answers import Answer
-from service.storage.models.frames import Frame, FrameTimings
+from service.storage.models.frames import FrameSummary, FrameTimings
 from service.storage.queries.future_dated import AHEAD_NS, LIVE
 from service.storage.recording.answer import answer_of, rows_of_stars
 from service.storage.recording.result_metrics import metrics_of
+from service.storage.recording.tracker_values import values_of_trackers
+from service.storage.sql.columns import Row
 from service.times import DAY_S, HOUR_S, Utc
 
-Row = dict[str, Any]
-
 STARS = ("observed", "unique", "ambiguous", "unmatched")
-"""What is counted of a result's stars."""
+"""The counts of a result's stars."""
 
 _RECORD = b'"record":'
 _NOT_RECORDED = _RECORD + b"null"
@@ -79,8 +78,10 @@ class UnsavedResult(Struct, eq=False):
     """Of a live batch: dated so far ahead that its time cannot be believed."""
     handed_over_ns: int | None = None
     """When it was handed to the writer, on the clock of `time.perf_counter_ns`."""
+    trackers: Sequence[Row] = ()
+    """The values of each tracker, of a mission with several (`tracker_values`)."""
     audit: Row | None = None
-    """The entry of the audit list that is stored with it, of a what-if that somebody recorded."""
+    """The entry of the audit list that is stored with a recorded what-if."""
 
     def __reduce__(self) -> tuple[type["UnsavedResult"], tuple[Any, ...]]:
         # To another process without what stands first, the settings of its mission: they are many.
@@ -194,13 +195,14 @@ def _unsaved_result(
         buckets,
         key,
         received.tai_ns,
+        trackers=values_of_trackers(acquisition, answer, result["batch_id"]),
     )
 
 
-def _frame_of(frame: FrameRecord) -> Frame:
-    """What the answer tells of the frame."""
+def _frame_of(frame: FrameRecord) -> FrameSummary:
+    """The summary of the frame in the answer."""
     told = frame.summary()
-    return Frame(**(told | {"timings_us": FrameTimings(**told["timings_us"])}))
+    return FrameSummary(**(told | {"timings_us": FrameTimings(**told["timings_us"])}))
 
 
 def _frame_row(frame: FrameRecord, batch_id: str) -> Row:
@@ -247,23 +249,7 @@ def _result_row(
 
 def options_text(acquisition: Acquisition) -> str:
     """The options that a result was computed with, as JSON, what was not named left out."""
-    options = acquisition.batch.options
-    if not (options.tests or options.tolerances):
-        return _few_options(options.identifier, options.solver, options.zone_grid_deg)
-    return _options_text(structs.asdict(options))
-
-
-@lru_cache(maxsize=256, typed=True)
-def _few_options(
-    identifier: Identifier | None, solver: SolverName | None, zone_grid_deg: float | None
-) -> str:
-    # The same text again and again: to put it together takes longer than to insert a star.
-    return _options_text(
-        {"identifier": identifier, "solver": solver, "zone_grid_deg": zone_grid_deg}
-    )
-
-
-def _options_text(named: Mapping[str, object]) -> str:
+    named = structs.asdict(acquisition.batch.options)
     return json.dumps({name: value for name, value in named.items() if value not in (None, {})})
 
 

@@ -9,7 +9,7 @@ access_tokens = Table(
     metadata,
     Column("id", Id, primary_key=True),
     Column("name", String(64), nullable=False, unique=True),
-    # Of the token the digest alone is kept: whoever reads the database cannot use it.
+    # Only the digest of a token is stored: a reader of the database cannot use it.
     Column("digest", String(64), nullable=False, unique=True),
     Column("scopes", Text, nullable=False),
     Column("spacecraft", Text),

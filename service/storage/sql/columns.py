@@ -1,6 +1,11 @@
-"""The metadata of all tables, and the types of columns that several of them have."""
+"""The metadata of all tables, the types of shared columns, and the values of a row."""
+
+from typing import Any
 
 from sqlalchemy import MetaData, String
+
+Row = dict[str, Any]
+"""The values of a row by column name."""
 
 metadata = MetaData(
     naming_convention={

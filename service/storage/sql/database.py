@@ -42,10 +42,10 @@ class Readers:
         serving: bool = False,
         file: DatabaseFile | None = None,
     ) -> None:
-        """Nothing is connected yet; raises `BadConfiguration` for what is no database's URL.
+        """Connects to nothing yet; raises `BadConfiguration` for an invalid database URL.
 
-        While `serving`, nobody waits long for a database that does not answer.  Of SQLite
-        the file that is there now must stay the same.
+        With `serving`, waiting for a database that does not answer is bounded.  The file of
+        SQLite must stay the one that is there now.
         """
         self.url = database_url(database)
         self.file = file or database_file(self.url)
@@ -113,15 +113,15 @@ class Store(Readers):
         """Open a database: SQLite is created and migrated, PostgreSQL must be up to date.
 
         Without `create` SQLite's file must be there.
-        `serving` is for who must answer in time; see `Readers`.
+        `serving` bounds the waiting times; see `Readers`.
         Raises `BadConfiguration` with what to do.
         """
         url = database_url(database)
         file = database_file(url)
         if file is not None and not create:
             file.require_there()
-        bounds = TO_COMMIT if serving else None
-        self._writing = writing_engine(url, file=file, create=create, bounds=bounds)
+        timeouts = TO_COMMIT if serving else None
+        self._writing = writing_engine(url, file=file, create=create, timeouts=timeouts)
         try:
             if self._writing.dialect.name == "sqlite":
                 bring_up_to_date(self._writing)

@@ -1,7 +1,7 @@
 """The file of a SQLite database, which must stay the one that was opened.
 
-Moved, replaced or deleted, it goes on taking what is written through an open
-connection, and nobody finds that again.
+A file that was moved, replaced or deleted still accepts writes through an open connection,
+and these would be lost.
 """
 
 import logging

@@ -35,7 +35,7 @@ of pages, and its reader a page of answers.
 
 
 @dataclass(frozen=True)
-class Bounds:
+class Timeouts:
     """How long a connection waits while a client waits for the answer.
 
     `lock_s` for a lock that another holds, `statement_s` for a statement; for the
@@ -50,9 +50,9 @@ class Bounds:
 
 # A post waits at most 5 s for its turn, then for one look-up, for the turn to write and for one
 # transaction, of which one ends with a time-out: 15 s in all.
-TO_LOOK_UP = Bounds(lock_s=2.0, statement_s=3.0)
-TO_COMMIT = Bounds(lock_s=2.0, statement_s=4.0, idle_s=30.0)
-TO_SHOW = Bounds(lock_s=2.0, statement_s=12.0)
+TO_LOOK_UP = Timeouts(lock_s=2.0, statement_s=3.0)
+TO_COMMIT = Timeouts(lock_s=2.0, statement_s=4.0, idle_s=30.0)
+TO_SHOW = Timeouts(lock_s=2.0, statement_s=12.0)
 """For pages and lists, some of which read much."""
 PATIENT_S = 60.0
 """For a statement of a bulk load, which has time: posts do not wait for it."""
@@ -103,16 +103,16 @@ def writing_engine(
     *,
     file: DatabaseFile | None = None,
     create: bool = True,
-    bounds: Bounds | None = None,
+    timeouts: Timeouts | None = None,
 ) -> Engine:
     """The engine of the one connection that writes.
 
     SQLite's file is created by the first connection, where `create` allows it, and by
-    no other; `file` remembers which one it is.  Without `bounds` the connection waits for
+    no other; `file` remembers which one it is.  Without `timeouts` the connection waits for
     as long as it takes.
     """
     if url.drivername != "sqlite":
-        return _postgresql(url, bounds, pool_size=1, max_overflow=0)
+        return _postgresql(url, timeouts, pool_size=1, max_overflow=0)
     _check_place(Path(url.database or ""))
     engine = create_engine(url, poolclass=QueuePool, pool_size=1, max_overflow=0)
     _open_as_file(engine, file, create)
@@ -121,47 +121,47 @@ def writing_engine(
     # SQLite's default checkpoint after a thousand pages stays: with four thousand the writer waits
     # 20 ms for each, and nothing is gained.
     pragmas = ("journal_mode = WAL", "synchronous = FULL", *kept)
-    _set_up_sqlite(engine, *pragmas, begin=TO_WRITE, bounds=bounds)
+    _set_up_sqlite(engine, *pragmas, begin=TO_WRITE, timeouts=timeouts)
     return engine
 
 
-def reading_engine(url: URL, bounds: Bounds | None = None, most: int = MAX_READERS) -> Engine:
+def reading_engine(url: URL, timeouts: Timeouts | None = None, most: int = MAX_READERS) -> Engine:
     """The engine of the readers, none of which can write.
 
     As many connections are kept as were ever in use at once, up to `most`: to
     open one costs more than a dozen reads.
     """
     pool: dict[str, Any] = {"pool_size": most, "max_overflow": 0}
-    if bounds is not None:
+    if timeouts is not None:
         pool["pool_timeout"] = FREE_S
     if url.drivername != "sqlite":
-        engine = _postgresql(url, bounds, **pool)
+        engine = _postgresql(url, timeouts, **pool)
         return engine.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
     engine = create_engine(url, poolclass=QueuePool, **pool)
     _open_as_file(engine)
-    _set_up_sqlite(engine, "query_only = ON", begin=TO_READ, bounds=bounds)
+    _set_up_sqlite(engine, "query_only = ON", begin=TO_READ, timeouts=timeouts)
     return engine
 
 
-def _postgresql(url: URL, bounds: Bounds | None, **pool: Any) -> Engine:
+def _postgresql(url: URL, timeouts: Timeouts | None, **pool: Any) -> Engine:
     try:
-        if bounds is None:
+        if timeouts is None:
             return create_engine(url, pool_pre_ping=True, **pool)
-        return _bounded(url, bounds, pool)
+        return _bounded(url, timeouts, pool)
     except (ModuleNotFoundError, NoSuchModuleError):
         raise BadConfiguration(
             "ACQUIRE_DATABASE: PostgreSQL needs psycopg: install attitude-acquisition[postgresql]"
         ) from None
 
 
-def _bounded(url: URL, bounds: Bounds, pool: dict[str, Any]) -> Engine:
-    """An engine whose connections wait no longer than the bounds; what the URL says holds."""
+def _bounded(url: URL, timeouts: Timeouts, pool: dict[str, Any]) -> Engine:
+    """An engine whose connections wait no longer than the timeouts; what the URL says holds."""
     from service.storage.sql.postgresql import BoundedConnection
 
     seconds = {
-        "lock_timeout": bounds.lock_s,
-        "statement_timeout": bounds.statement_s,
-        "idle_in_transaction_session_timeout": bounds.idle_s,
+        "lock_timeout": timeouts.lock_s,
+        "statement_timeout": timeouts.statement_s,
+        "idle_in_transaction_session_timeout": timeouts.idle_s,
     }
     options = [f"-c {name}={round(1000 * value)}" for name, value in seconds.items()]
     own = url.query.get("options", ())
@@ -177,7 +177,7 @@ def _bounded(url: URL, bounds: Bounds, pool: dict[str, Any]) -> Engine:
     @event.listens_for(engine, "do_connect")
     def _connect(_dialect: Any, _record: Any, cargs: Any, cparams: Any) -> Any:
         connection = BoundedConnection.connect(*cargs, **cparams)
-        connection.answer_s = bounds.statement_s + MORE_S
+        connection.answer_s = timeouts.statement_s + MORE_S
         return connection
 
     return engine
@@ -207,8 +207,10 @@ def _check_place(file: Path) -> None:
         raise BadConfiguration(f"ACQUIRE_DATABASE: {file}: is a folder, not a file")
 
 
-def _set_up_sqlite(engine: Engine, *pragmas: str, begin: str, bounds: Bounds | None = None) -> None:
-    busy_ms = BUSY_TIMEOUT_MS if bounds is None else round(1000 * bounds.lock_s)
+def _set_up_sqlite(
+    engine: Engine, *pragmas: str, begin: str, timeouts: Timeouts | None = None
+) -> None:
+    busy_ms = BUSY_TIMEOUT_MS if timeouts is None else round(1000 * timeouts.lock_s)
 
     @event.listens_for(engine, "connect")
     def _connected(connection: sqlite3.Connection, _record: Any) -> None:

@@ -28,6 +28,6 @@ class BoundedConnection(psycopg.Connection[tuple[object, ...]]):
         try:
             return super().wait(gen, interval, timeout)
         except psycopg.errors._WaitTimeout as error:
-            # What the server does meanwhile is not known: nothing more is asked of it.
+            # The state of the server is unknown: the connection is not used again.
             self.pgconn.finish()
             raise psycopg.OperationalError(f"no answer within {timeout:g} s") from error

@@ -15,9 +15,8 @@ from typing import Any
 from sqlalchemy import Connection, Executable
 from sqlalchemy.dialects import postgresql, sqlite
 
+from service.storage.sql.columns import Row
 from service.storage.sql.connections import TranslatedErrors
-
-Row = dict[str, Any]
 
 ROWS_AT_ONCE = (64, 8)
 """Few sizes, so that the driver keeps what it made of each statement."""

@@ -21,7 +21,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.exc import DBAPIError
 
-from service.storage.recording.unsaved_result import Row
+from service.storage.sql.columns import Row
 from service.storage.sql.prepared import Prepared
 from service.storage.sql.rollup_tables import COUNTS, MAXIMA, MINIMA, SUMS
 

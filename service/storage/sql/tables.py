@@ -6,6 +6,7 @@
     missions, catalogs ──┘
     idempotency_keys ── results
     mission_uses ── missions                       from when each settings were in use
+    tracker_values ── batches                      its current result, tracker by tracker
     rollups_hourly, rollups_daily                  of current results (rollup_tables.py)
     limits                                         every setting ever made; one per quantity is open
     watches, alarms ── alarm_actions               state of the evaluation, alarms, actions
@@ -47,7 +48,12 @@ from sqlalchemy import (
 
 from service.alarms.quantities import QUANTITIES, Measured
 from service.storage.sql.columns import Digest, Id, Moment, Name, RunName, metadata
-from service.storage.sql.rollup_tables import rollups_daily, rollups_hourly
+from service.storage.sql.rollup_tables import (
+    rollups_daily,
+    rollups_hourly,
+    tracker_rollups_daily,
+    tracker_rollups_hourly,
+)
 
 runs = Table(
     "runs",
@@ -114,6 +120,8 @@ frames = Table(
 
 MEASURED = tuple(n for n, each in QUANTITIES.items() if isinstance(each.source, Measured))
 """The columns of measured quantities."""
+COUNTED = ("observed", "unique", "ambiguous", "unmatched")
+"""The columns that count stars."""
 
 results = Table(
     "results",
@@ -130,10 +138,7 @@ results = Table(
     Column("options", Text, nullable=False),
     Column("mission_digest", Digest, ForeignKey(missions.c.digest), nullable=False),
     Column("catalog_digest", Digest, ForeignKey(catalogs.c.digest), nullable=False),
-    Column("observed", Integer, nullable=False),
-    Column("unique", Integer, nullable=False),
-    Column("ambiguous", Integer, nullable=False),
-    Column("unmatched", Integer, nullable=False),
+    *(Column(name, Integer, nullable=False) for name in COUNTED),
     # Of the attitude: good or suspect; null where there is none, and then a reason.
     Column("status", String(16)),
     Column("reason", String(64)),
@@ -186,7 +191,7 @@ Index(
     postgresql_where=results.c.parent_id.is_not(None),
 )
 
-# Whoever deletes a result is asked who refers to it.
+# Deleting a result checks the foreign key of its what-ifs.
 Index(
     "ix_results_parent",
     results.c.parent_id,
@@ -206,6 +211,19 @@ star_results = Table(
     Column("runner_up", Integer, nullable=False),
     Column("probability", Double),
     Column("residual_arcsec", Double),
+    sqlite_with_rowid=False,
+)
+
+# Only of spacecraft with several trackers: of one alone the result has the same values.
+tracker_values = Table(
+    "tracker_values",
+    metadata,
+    Column("batch_id", Id, ForeignKey(batches.c.id), primary_key=True),
+    Column("tracker", Name, primary_key=True),
+    *(Column(name, Integer, nullable=False) for name in COUNTED),
+    # Of the attitude: good, or suspect if this is the tracker that disagrees; null without.
+    Column("status", String(16)),
+    *(Column(name, Double) for name in MEASURED),
     sqlite_with_rowid=False,
 )
 
@@ -243,8 +261,7 @@ replays = Table(
     Column("name", Text, nullable=False),
     Column("state", String(16), nullable=False),
     Column("lines_total", BigInteger),
-    Column("lines_done", BigInteger, nullable=False),
-    Column("lines_refused", BigInteger, nullable=False),
+    *(Column(name, BigInteger, nullable=False) for name in ("lines_done", "lines_refused")),
     Column("errors", Text, nullable=False),
     Column("counts", Text),
     Column("started", Moment, nullable=False),
@@ -257,6 +274,8 @@ limits = Table(
     Column("id", Integer, primary_key=True),
     Column("spacecraft", Name, nullable=False),
     Column("quantity", String(32), nullable=False),
+    # Empty: of the spacecraft as a whole.
+    Column("tracker", Name, nullable=False, server_default=text("''")),
     # JSON; null: the shipped ones hold again.
     Column("settings", Text),
     Column("who", String(64), nullable=False),
@@ -268,8 +287,9 @@ _OPEN_LIMIT: dict[str, Any] = {
     "sqlite_where": limits.c.until.is_(None),
     "postgresql_where": limits.c.until.is_(None),
 }
-Index("uq_limits_open", limits.c.spacecraft, limits.c.quantity, unique=True, **_OPEN_LIMIT)
-Index("ix_limits_history", limits.c.spacecraft, limits.c.quantity, limits.c.id)
+_LIMITED = (limits.c.spacecraft, limits.c.quantity, limits.c.tracker)
+Index("uq_limits_open", *_LIMITED, unique=True, **_OPEN_LIMIT)
+Index("ix_limits_history", *_LIMITED, limits.c.id)
 
 watches = Table(
     "watches",
@@ -292,6 +312,8 @@ alarms = Table(
     Column("spacecraft", Name, nullable=False),
     Column("run", RunName, nullable=False),
     Column("quantity", String(32), nullable=False),
+    # Empty: of the spacecraft as a whole.
+    Column("tracker", Name, nullable=False, server_default=text("''")),
     # The worst so far, and that of now: null is back in limits.
     Column("severity", String(16), nullable=False),
     Column("current_severity", String(16)),
@@ -319,6 +341,7 @@ Index(
     alarms.c.run,
     alarms.c.spacecraft,
     alarms.c.quantity,
+    alarms.c.tracker,
     unique=True,
     **_ACTIVE,
 )
@@ -362,8 +385,11 @@ WRITTEN_BY_POSTS = (
     results,
     star_results,
     solutions,
+    tracker_values,
     rollups_hourly,
     rollups_daily,
+    tracker_rollups_hourly,
+    tracker_rollups_daily,
     idempotency_keys,
     watches,
     alarms,

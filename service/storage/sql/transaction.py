@@ -18,21 +18,22 @@ from sqlalchemy.exc import (
 )
 
 from service.storage.recording import events
-from service.storage.recording.results import Outcome, record
+from service.storage.recording.results import RecordOutcome, record
 from service.storage.recording.unsaved_result import UnsavedResult
 from service.storage.sql.prepared import execute
 
-Results = list[Outcome | Exception]
+WriteOutcome = RecordOutcome | Exception
+WriteOutcomes = list[WriteOutcome]
 
 MAX_LOOKS = 5
 
 
 @dataclass(eq=False)
 class QueuedJob:
-    """Results to record, or another change to make, and what is called with what comes of it."""
+    """Results to record, or another change to make, and the function that takes the outcome."""
 
     settle: Callable[[Any], object]
-    """Called with the `Results`, with what the change returns, or with an error."""
+    """Called with the `WriteOutcomes`, with what the change returns, or with an error."""
     unsaved_results: Sequence[UnsavedResult] = ()
     change: Callable[[Connection], Any] | None = None
     low_priority: bool = False
@@ -50,11 +51,11 @@ def transact(connection: Connection, jobs: Sequence[QueuedJob], careful: bool) -
 
     A first try assumes that every result is new and looks nothing up, and it has no
     savepoints, for which SQLite keeps each page as it was: whatever fails ends the
-    transaction.  A `careful` try finds what is recorded, and keeps each failure to itself.
+    transaction.  A `careful` try looks up recorded batches first and isolates each failure.
     """
     with events.numbered(connection):
         unsaved_results = [unsaved for job in jobs for unsaved in job.unsaved_results]
-        recorded: Sequence[Outcome | Exception]
+        recorded: Sequence[WriteOutcome]
         if careful:
             recorded = _record(connection, unsaved_results)
         else:
@@ -68,7 +69,7 @@ def transact(connection: Connection, jobs: Sequence[QueuedJob], careful: bool) -
         ]
 
 
-def _record(connection: Connection, unsaved_results: Sequence[UnsavedResult]) -> Results:
+def _record(connection: Connection, unsaved_results: Sequence[UnsavedResult]) -> WriteOutcomes:
     """Record all together; if that fails, each by itself, so that one fails no other."""
     if not unsaved_results:
         return []

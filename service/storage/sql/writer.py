@@ -13,18 +13,19 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from sqlalchemy import Connection, Engine, update
 from sqlalchemy.exc import DBAPIError
 
 from service.errors import Busy, Stopping
-from service.storage.recording.unsaved_result import Row, UnsavedResult
+from service.storage.recording.unsaved_result import UnsavedResult
 from service.storage.sql.connections import PersistentConnection, RolledBack
 from service.storage.sql.database_file import DatabaseFile
 from service.storage.sql.engines import TO_WRITE, patience
 from service.storage.sql.tables import WRITTEN_BY_POSTS, event_counter
-from service.storage.sql.transaction import QueuedJob, Results, is_of_the_database, transact
+from service.storage.sql.transaction import QueuedJob, WriteOutcomes, is_of_the_database, transact
 
 log = logging.getLogger(__name__)
 
@@ -37,6 +38,18 @@ RETRY_AFTER_S = 5
 
 # PostgreSQL's codes for two writers that crossed; it stopped one, which begins again.
 _CROSSED = ("40001", "40P01")
+
+
+@dataclass(frozen=True)
+class WriterState:
+    """Records that wait to be written, the age of the oldest, and how writing goes."""
+
+    queued: int
+    oldest_s: float
+    succeeded: bool
+    """Whether the last write did."""
+    failed: int
+    """Batches and changes that could not be written since the start."""
 
 
 class Writer:
@@ -73,7 +86,7 @@ class Writer:
     def queue(
         self,
         unsaved_results: Sequence[UnsavedResult],
-        settle: Callable[[Results | Exception], object],
+        settle: Callable[[WriteOutcomes | Exception], object],
         low_priority: bool = False,
     ) -> None:
         """Queue results for one transaction; raises `Busy` when too much is waiting.
@@ -87,9 +100,9 @@ class Writer:
 
     def record(
         self, unsaved_results: Sequence[UnsavedResult], low_priority: bool = False
-    ) -> "Future[Results]":
+    ) -> "Future[WriteOutcomes]":
         """`queue` with a future that gives the outcomes, or raises `Busy`."""
-        done: Future[Results] = Future()
+        done: Future[WriteOutcomes] = Future()
         self.queue(unsaved_results, _settling(done), low_priority)
         return done
 
@@ -120,16 +133,12 @@ class Writer:
         if self._is_failing:
             self.change(_try_to_write).result()
 
-    def state(self) -> Row:
-        """Whether the last write `succeeded`, how many `failed`, and what waits, since when."""
+    def state(self) -> WriterState:
+        """The state of the writes and of their queue."""
         with self._changed:
             heads = [queue[0].since_s for queue in (self._queue, self._low_priority) if queue]
-            return {
-                "succeeded": not self._is_failing,
-                "failed": self._failures,
-                "queued": self._queued,
-                "oldest_s": time.monotonic() - min(heads) if heads else 0.0,
-            }
+            oldest_s = time.monotonic() - min(heads) if heads else 0.0
+            return WriterState(self._queued, oldest_s, not self._is_failing, self._failures)
 
     def close(self) -> None:
         """Refuse new work, write what is queued, and end the thread."""
@@ -169,11 +178,11 @@ class Writer:
             self._tell()
 
     def _take(self) -> list[QueuedJob]:
-        """What is written next, in one transaction; nothing when all is over."""
+        """The jobs of the next transaction; empty after `close`."""
         with self._changed:
             while not (self._queue or self._low_priority) and not self._closing:
                 self._changed.wait()
-            # What has low priority lets the rest pass, but for one transaction only.
+            # Low-priority jobs wait for the others, but for one transaction only.
             if self._low_priority and (self._has_waited or not self._queue):
                 jobs = [self._low_priority.popleft()]
                 self._has_waited = False
@@ -260,12 +269,12 @@ class Writer:
             try:
                 told()
             except Exception:
-                # What is written is written, whatever a listener does.
+                # The transaction is committed: an error of a listener does not change that.
                 log.exception("a listener failed after a commit")
 
 
 def _settling(done: "Future[Any]") -> Callable[[Any], None]:
-    """What sets a future: the change of a client that has gone is made all the same."""
+    """A function that sets a future; the change is made even if the client has gone."""
     done.set_running_or_notify_cancel()
 
     def settle(outcome: Any) -> None:

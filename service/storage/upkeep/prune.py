@@ -19,11 +19,12 @@ from service.storage.sql.tables import (
     results,
     solutions,
     star_results,
+    tracker_values,
 )
 from service.times import HOUR_S, Utc, bucket_start
 
 OF_A_RESULT = (star_results, solutions, idempotency_keys)
-OF_A_BATCH = (frames,)
+OF_A_BATCH = (frames, tracker_values)
 _AT_ONCE = 1_000
 
 

@@ -8,6 +8,7 @@ import hashlib
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import product
 from typing import Any, get_args
 
 import msgspec
@@ -17,11 +18,19 @@ from sqlalchemy.exc import DatabaseError
 from service.errors import BadInput
 from service.observations.batch import ObservationBatch
 from service.observations.schema import submission_from_json
+from service.storage.queries.tracker_splits import is_waiting
 from service.storage.recording import rollups
-from service.storage.recording.unsaved_result import Row
+from service.storage.sql.columns import Row
 from service.storage.sql.engines import database_url, reading_engine
 from service.storage.sql.migrations import check, reported
-from service.storage.sql.tables import batches, frames, results, solutions, star_results
+from service.storage.sql.tables import (
+    batches,
+    frames,
+    results,
+    solutions,
+    star_results,
+    tracker_values,
+)
 
 AT_ONCE = 500
 OUTCOMES = ("unique", "ambiguous", "unmatched")
@@ -33,7 +42,7 @@ Step = Callable[[int, int], object]
 
 
 def verify(database: str, step: Step = lambda done, total: None) -> list[str]:
-    """What is wrong with a database, a sentence each; empty: nothing.
+    """The faults of a database, a sentence each; empty: none.
 
     Looks at the file itself (SQLite), the schema, every batch with all that
     was made of it, and the trends.  Raises `BadConfiguration` where there is
@@ -47,7 +56,7 @@ def verify(database: str, step: Step = lambda done, total: None) -> list[str]:
     try:
         with reported(url):
             found = _of_the_file(engine)
-            # What a damaged file gives to read says nothing of what was written.
+            # The content of a damaged file is not evidence of what was written.
             if not found:
                 found += _of_the_batches(engine, step)
                 found += _of_the_trends(engine)
@@ -124,10 +133,44 @@ def _of_a_chunk(connection: Connection, chunk: Mapping[str, Row]) -> Iterator[st
     of_batch: dict[str, list[Row]] = {id: [] for id in chunk}
     for row in made:
         of_batch[row["batch_id"]].append(row)
+    yield from _of_the_trackers(connection, chunk, made)
     for id, batch in chunk.items():
         yield from _of_a_batch(batch, of_batch[id], framed.get(id))
         for row in of_batch[id]:
             yield from _of_a_result(row, batch, stars.get(row["id"], Counter()), solved)
+
+
+def _of_the_trackers(
+    connection: Connection, chunk: Mapping[str, Row], made: Sequence[Row]
+) -> Iterator[str]:
+    """The faults of what is stored of each tracker: it must be what its stars say.
+
+    A batch of several trackers that has none must be waiting for it.
+    """
+    current = {row["id"]: row["batch_id"] for row in made if row["current"]}
+    stars = star_results.c
+    counted = (
+        select(stars.result_id, stars.tracker, stars.outcome, func.count())
+        .where(stars.result_id.in_(current))
+        .group_by(stars.result_id, stars.tracker, stars.outcome)
+    )
+    seen: dict[str, dict[str, Counter[str]]] = {}
+    for id, tracker, outcome, count in connection.execute(counted):
+        of_batch = seen.setdefault(current[id], {})
+        of_batch.setdefault(tracker, Counter())[outcome] = count
+    stored: dict[str, dict[str, Counter[str]]] = {}
+    rows = select(tracker_values).where(tracker_values.c.batch_id.in_(chunk))
+    for row in connection.execute(rows).mappings():
+        of_batch = stored.setdefault(row["batch_id"], {})
+        of_batch[row["tracker"]] = Counter({name: row[name] for name in OUTCOMES})
+    for id, batch in chunk.items():
+        of_stars, of_rows = seen.get(id, {}), stored.get(id, {})
+        if of_rows:
+            # A tracker may have seen no star.
+            if {name: each for name, each in of_rows.items() if each.total()} != of_stars:
+                yield f"batch {id}: its trackers' counts are not those of their stars"
+        elif len(of_stars) > 1 and not is_waiting(connection, batch["spacecraft"], batch["run"]):
+            yield f"batch {id}: it has several trackers and is not split by them"
 
 
 def _of_a_batch(batch: Row, made: Sequence[Row], frame: Row | None) -> Iterator[str]:
@@ -203,19 +246,20 @@ def _of_a_result(row: Row, batch: Row, stars: "Counter[str]", solved: set[Any]) 
 
 
 def _of_the_trends(engine: Engine) -> Iterator[str]:
-    for bucket in get_args(rollups.Bucket):
+    for bucket, of_trackers in product(get_args(rollups.Bucket), (False, True)):
         with engine.begin() as connection:
             stored, counted = (
                 {key: row for key, row in found.items() if row["batches"]}
                 for found in (
-                    rollups.stored(connection, bucket),
-                    rollups.recount(connection, bucket),
+                    rollups.stored(connection, bucket, of_trackers=of_trackers),
+                    rollups.recount(connection, bucket, of_trackers=of_trackers),
                 )
             )
         for key in sorted(stored.keys() | counted.keys()):
             if not _alike(stored.get(key), counted.get(key)):
-                of = f"trends of {key[0]}, run {key[1]}, {bucket} {key[2]}"
-                yield f"{of}: not those of the results"
+                spacecraft, run, *tracker, number = key
+                of = ", ".join([f"trends of {spacecraft}, run {run}", *tracker])
+                yield f"{of}, {bucket} {number}: not those of the results"
 
 
 def _alike(one: Row | None, other: Row | None) -> bool:

@@ -24,7 +24,14 @@ from service.web.openapi.route import LINK, ResponseDoc, route_docs
 from service.web.requests.access import AuditDep, CallerDep
 from service.web.requests.dependencies import AppDep, json_response, page_response
 from service.web.requests.path_parameters import SpacecraftPath
-from service.web.requests.query_parameters import NO_QUERY, AlarmQuery, Comment, StatementQuery, Who
+from service.web.requests.query_parameters import (
+    NO_QUERY,
+    AlarmQuery,
+    Comment,
+    LimitQuery,
+    LimitStatementQuery,
+    Who,
+)
 from service.web.requests.request_body import JsonBody, read_model
 
 router = APIRouter(prefix="/api/v1", tags=["alarms"])
@@ -73,27 +80,31 @@ class LimitIn(StatementIn):
 
 @router.get(
     LIMITS,
-    dependencies=[NO_QUERY],
     **route_docs({200: ResponseDoc("Every limit.", LimitList)}, problems=(404,)),
 )
-def list_limits(name: SpacecraftPath, app: AppDep) -> Response:
-    """The limits of every quantity of a spacecraft, set or shipped."""
-    return json_response({"items": app.limits.all(name)})
+def list_limits(
+    name: SpacecraftPath, query: Annotated[LimitQuery, InQuery()], app: AppDep
+) -> Response:
+    """The limits of every quantity of a spacecraft or a tracker, set or shipped."""
+    return json_response({"items": app.limits.all(name, query.tracker)})
 
 
 @router.get(
     LIMITS + "/{quantity}",
-    dependencies=[NO_QUERY],
     **route_docs({200: ResponseDoc("The limit and its history.", LimitHistory)}, problems=(404,)),
 )
-def get_limit(name: SpacecraftPath, quantity: QuantityPath, app: AppDep) -> Response:
+def get_limit(
+    name: SpacecraftPath,
+    quantity: QuantityPath,
+    query: Annotated[LimitQuery, InQuery()],
+    app: AppDep,
+) -> Response:
     """The limit of one quantity, the shipped limit, and the history of changes."""
-    return json_response(app.limits.get(name, _quantity_with_limits(quantity)))
+    return json_response(app.limits.get(name, _quantity_with_limits(quantity), query.tracker))
 
 
 @router.put(
     LIMITS + "/{quantity}",
-    dependencies=[NO_QUERY],
     **route_docs(
         {200: ResponseDoc("The limit, which applies from the next batch on.", Limit)},
         body=LimitIn,
@@ -103,6 +114,7 @@ def get_limit(name: SpacecraftPath, quantity: QuantityPath, app: AppDep) -> Resp
 def set_limit(
     name: SpacecraftPath,
     quantity: QuantityPath,
+    query: Annotated[LimitQuery, InQuery()],
     body: JsonBody,
     app: AppDep,
     caller: CallerDep,
@@ -113,7 +125,13 @@ def set_limit(
     limited, who = _quantity_with_limits(quantity), _who(caller, asked.who)
     return json_response(
         app.limits.set(
-            name, limited, asked.settings, who=who, comment=asked.comment, entry=audited.entry()
+            name,
+            limited,
+            asked.settings,
+            who=who,
+            comment=asked.comment,
+            entry=audited.entry(),
+            tracker=query.tracker,
         )
     )
 
@@ -127,7 +145,7 @@ def set_limit(
 def reset_limit(
     name: SpacecraftPath,
     quantity: QuantityPath,
-    query: Annotated[StatementQuery, InQuery()],
+    query: Annotated[LimitStatementQuery, InQuery()],
     app: AppDep,
     caller: CallerDep,
     audited: AuditDep,
@@ -135,7 +153,15 @@ def reset_limit(
     """Restore the shipped limit; earlier limits stay in the history."""
     limited, who = _quantity_with_limits(quantity), _who(caller, query.who)
     return json_response(
-        app.limits.set(name, limited, None, who=who, comment=query.comment, entry=audited.entry())
+        app.limits.set(
+            name,
+            limited,
+            None,
+            who=who,
+            comment=query.comment,
+            entry=audited.entry(),
+            tracker=query.tracker,
+        )
     )
 
 

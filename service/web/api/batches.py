@@ -4,13 +4,17 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path
 from fastapi import Query as InQuery
+from msgspec import Raw
 from pydantic import Field, StrictBool
 from starlette.requests import Request
 from starlette.responses import Response
 
+from service.app.submissions import MAX_ARRAY, Outcome
 from service.errors import BadInput
 from service.observations.schema import BatchIn, OptionsIn, Wire
 from service.storage.models.answers import Answer, BatchPage, Result
+from service.storage.models.outcomes import BatchOutcome, BatchOutcomes
+from service.storage.recording.unsaved_result import Answered
 from service.web.openapi.route import (
     IDEMPOTENCY_KEY,
     LINK,
@@ -20,8 +24,15 @@ from service.web.openapi.route import (
     route_docs,
 )
 from service.web.requests.access import AuditDep, CallerDep, require_scope
-from service.web.requests.dependencies import AppDep, answer_response, json_response, page_response
-from service.web.requests.headers import NO_IDEMPOTENCY_KEY, idempotency_key
+from service.web.requests.dependencies import (
+    AppDep,
+    MetricsDep,
+    answer_response,
+    json_response,
+    page_response,
+)
+from service.web.requests.headers import NO_IDEMPOTENCY_KEY, NO_KEY_OF_MANY, idempotency_key
+from service.web.requests.problems import problem_within
 from service.web.requests.query_parameters import NO_QUERY, BatchQuery, require_no_query
 from service.web.requests.request_body import BINARY, JsonBody, json_body, read_model, refused
 
@@ -72,6 +83,43 @@ async def submit_batch(request: Request) -> Response:
     if answered.replayed:
         held.metrics.count_repeat()
     return answer_response(answered)
+
+
+@router.post(
+    "/many",
+    dependencies=[NO_QUERY, NO_KEY_OF_MANY],
+    **route_docs(
+        {200: ResponseDoc("An outcome for each batch, in the order sent.", BatchOutcomes)},
+        array_of=(BatchIn, MAX_ARRAY),
+    ),
+)
+async def submit_batches(
+    request: Request, body: JsonBody, app: AppDep, caller: CallerDep, metrics: MetricsDep
+) -> Response:
+    """Submit an array of batches; each is recorded or refused by itself.
+
+    The answer comes when every batch has its outcome. An array counts as many requests as it has
+    batches. To repeat it after a lost connection, send it again.
+    """
+    try:
+        read = await app.submissions.read_array(body)
+    except BadInput as error:
+        raise refused(body, error) from None
+    # Beside the one that every request counts as.
+    app.access.count_request(caller, len(read) - 1)
+    outcomes = await app.submissions.answered_each(read, caller)
+    for each in outcomes:
+        if isinstance(each, Answered) and each.replayed:
+            metrics.count_repeat()
+    return json_response(BatchOutcomes(items=[_outcome(request, each) for each in outcomes]))
+
+
+def _outcome(request: Request, outcome: Outcome) -> BatchOutcome:
+    if isinstance(outcome, Answered):
+        status = 200 if outcome.replayed else 201
+        return BatchOutcome(status=status, answer=Raw(outcome.body), problem=None)
+    problem = problem_within(request, outcome)
+    return BatchOutcome(status=problem.status, answer=None, problem=problem)
 
 
 @router.get("", **route_docs({200: ResponseDoc("A page of results.", BatchPage, LINK)}))

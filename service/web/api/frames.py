@@ -21,7 +21,7 @@ from service.web.requests.access import CallerDep
 from service.web.requests.dependencies import AppDep, MetricsDep, answer_response
 from service.web.requests.headers import IdempotencyKey
 from service.web.requests.path_parameters import SpacecraftPath
-from service.web.requests.query_parameters import Query
+from service.web.requests.query_parameters import TIME_SCHEMA, Query
 from service.web.requests.request_body import frame_body
 
 router = APIRouter(prefix="/api/v1/spacecraft", tags=["frames"])
@@ -37,7 +37,10 @@ class FrameQuery(Query):
     ] = None
     time: Annotated[
         str | None,
-        Field(description="UTC of mid exposure. Default: DATE-AVG, or DATE-OBS, of a FITS file."),
+        Field(
+            description="UTC of mid exposure. Default: DATE-AVG, or DATE-OBS, of a FITS file.",
+            examples=TIME_SCHEMA["examples"],
+        ),
     ] = None
     run: Annotated[str, Field(description="The run; `live` for the batches of pipelines.")] = "live"
     tracker: Annotated[

@@ -8,6 +8,8 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.app.history_table import batch_table, history_table
+from service.products.formats import JSON_FORMAT
+from service.storage.models.answers import Result
 from service.storage.models.spacecraft import (
     AttitudePage,
     RateList,
@@ -15,13 +17,12 @@ from service.storage.models.spacecraft import (
     SpacecraftState,
 )
 from service.storage.models.trends import History, Ranking
-from service.web.openapi.route import LINK, ResponseDoc, route_docs
+from service.web.openapi.route import CONTENT_LOCATION, LINK, ResponseDoc, route_docs
 from service.web.requests.access import CallerDep
 from service.web.requests.dependencies import AppDep, json_response, page_response
 from service.web.requests.history_files import THINNED, history_file, streamed_file, thinned_header
 from service.web.requests.path_parameters import SpacecraftPath
 from service.web.requests.query_parameters import (
-    JSON_FORMAT,
     HistoryQuery,
     PeriodPageQuery,
     RatesQuery,
@@ -52,6 +53,25 @@ def get_spacecraft(
 ) -> Response:
     """One spacecraft: state in a run, mission settings and their history."""
     return json_response(app.spacecraft.state(name, query.run))
+
+
+@router.get(
+    "/{name}/latest",
+    **route_docs(
+        {200: ResponseDoc("The result and its batch.", Result, CONTENT_LOCATION)}, problems=(404,)
+    ),
+)
+def get_latest(
+    name: SpacecraftPath, query: Annotated[RunQuery, InQuery()], app: AppDep
+) -> Response:
+    """The newest current result of a run, by batch time; it may have no attitude.
+
+    A live batch that is dated more than an hour in the future counts only where there is no other.
+    """
+    latest = app.results.latest(name, query.run)
+    return json_response(
+        latest, headers={"Content-Location": f"/api/v1/batches/{latest.answer.id}"}
+    )
 
 
 @router.get(
@@ -94,15 +114,18 @@ def get_history(
     Thinned out to as many points as can be drawn, or as a table of every batch.
     """
     where = query.run_and_times
-    file = f"{name}-{query.run}-history"
+    file = "-".join(filter(None, (name, query.tracker, query.run, "history")))
     if query.of_every_batch:
-        pages = app.spacecraft.every_batch(name, quantities=query.quantity, **where)
+        pages = app.spacecraft.every_batch(
+            name, quantities=query.quantity, tracker=query.tracker, **where
+        )
         return streamed_file(batch_table(pages), query.format, file)
     history = app.spacecraft.history(
         name,
         quantities=query.quantity,
         strategy=query.strategy or "minmax",
         size=query.size or DEFAULT_SIZE,
+        tracker=query.tracker,
         **where,
     )
     if query.format != JSON_FORMAT:
@@ -118,5 +141,4 @@ def list_worst(
     name: SpacecraftPath, query: Annotated[WorstQuery, InQuery()], app: AppDep
 ) -> Response:
     """The batches with the worst values of a quantity in a period, worst first."""
-    worst = app.spacecraft.worst_batches(name, **query.asked())
-    return json_response(Ranking(by=query.by, items=worst))
+    return json_response(app.spacecraft.ranking(name, **query.asked()))

@@ -62,6 +62,13 @@ def utc(moment: Utc | str | None, seconds: bool = True) -> Markup:
     )
 
 
+def utc_short(moment: str) -> Markup:
+    """Month, day and time of day, for a narrow column; the element has all of it."""
+    return Markup('<time datetime="{}" title="{} UTC">{}</time>').format(
+        moment, with_day_of_year(moment), f"{moment[5:10]} {moment[11:16]}"
+    )
+
+
 def age(seconds: float | None) -> str:
     """A length of time in its two largest units."""
     if seconds is None:
@@ -175,6 +182,7 @@ def quantity(value: float | None, name: str) -> str:
 
 FILTERS: Mapping[str, Callable[..., Any]] = {
     "utc": utc,
+    "utc_short": utc_short,
     "age": age,
     "share": share,
     "num": number,

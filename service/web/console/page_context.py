@@ -1,6 +1,6 @@
-"""What every page is given: the app and the reader, and the layout around its content."""
+"""The context of every page: the app and the reader, and the layout around its content."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 from fastapi import Depends
@@ -10,6 +10,7 @@ from starlette.requests import Request
 from service.access.tokens import Caller
 from service.app.factory import App
 from service.observations.schema import RunName
+from service.storage.queries.alarms import summary
 from service.storage.queries.future_dated import LIVE
 from service.times import Utc
 from service.web.console.formatting import present
@@ -39,7 +40,7 @@ class RunChoice:
 
 @dataclass(frozen=True)
 class Layout:
-    """What surrounds the content of a page: its title, run, reader and time."""
+    """The layout around the content of a page: its title, run, reader and time."""
 
     run: str
     runs: tuple[RunChoice, ...]
@@ -49,10 +50,18 @@ class Layout:
     last_event: int | None = None
     """The number of the latest event when the page was begun; the page asks for later ones."""
     stream: str | None = None
-    """The spacecraft whose events the page follows; None: all; "none": there is no such stream."""
+    """The spacecraft whose events the page follows; None: all; "none": there is no such stream.
+
+    "off": the page follows no events.
+    """
     reader: str | None = None
     """The name of the signed-in token; None while access is open."""
     may_operate: bool = False
+    address: str = ""
+    """Of the service, as the reader's browser has it."""
+    open_alarms: int = 0
+    """Alarms of the run that nobody has acknowledged or shelved; every page counts them."""
+    worst_alarm: str | None = None
 
     @property
     def is_live(self) -> bool:
@@ -70,13 +79,28 @@ class Layout:
         return tuple(run for run in self.runs if run.batches and run.name != self.run)
 
 
+OFF = "off"
 EMPTY_LAYOUT = Layout(LIVE, (RunChoice(LIVE, None),), "", "", present())
 """Of pages without a reader: sign in, and errors."""
 
 
+def open_layout(run: str, title: str, section: str) -> Layout:
+    """The layout of a page that needs no token and shows nothing that is recorded."""
+    runs = tuple(RunChoice(name, None) for name in dict.fromkeys((LIVE, run)))
+    return replace(
+        EMPTY_LAYOUT,
+        run=run,
+        runs=runs,
+        title=title,
+        section=section,
+        now=present(),
+        stream=OFF,
+    )
+
+
 @dataclass(frozen=True)
 class PageContext:
-    """What the handler of a page works with.
+    """The context of the handler of a page.
 
     `last_event` is read before anything else: the page may hear of something
     that it shows already, but never misses anything.
@@ -86,6 +110,7 @@ class PageContext:
     caller: Caller
     page: ConsolePage
     last_event: int
+    address: str
 
     def layout(self, run: str) -> Layout:
         """The layout of the page that shows a run."""
@@ -94,6 +119,8 @@ class PageContext:
             for each in self.app.runs.all()
             if any(self.caller.may_see(name) for name in each.spacecraft)
         }
+        active = self.app.alarms.active(run)
+        alarms = summary([each for each in active if self.caller.may_see(each.spacecraft)])
         names = sorted({LIVE, run, *batches}, key=lambda name: (name != LIVE, name))
         return Layout(
             run=run,
@@ -105,6 +132,9 @@ class PageContext:
             stream=self._stream(),
             reader=self.caller.name if self.caller.token_id else None,
             may_operate="operate" in self.caller.scopes,
+            address=self.address,
+            open_alarms=alarms.open,
+            worst_alarm=alarms.worst,
         )
 
     def _stream(self) -> str | None:
@@ -121,7 +151,8 @@ class PageContext:
 
 def _page_context(request: Request, app: AppDep, caller: CallerDep) -> PageContext:
     page = PAGES[request.scope["route"].name]
-    return PageContext(app, caller, page, app.events.last())
+    address = str(request.base_url).rstrip("/")
+    return PageContext(app, caller, page, app.events.last(), address)
 
 
 ContextDep = Annotated[PageContext, Depends(_page_context)]

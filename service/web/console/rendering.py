@@ -18,13 +18,13 @@ from service import __version__
 from service.errors import AcquisitionError, BadInput, Busy, problem_of, problem_of_faults
 from service.web.console.formatting import FILTERS, present
 from service.web.console.page_context import EMPTY_LAYOUT, LIVE, Layout
-from service.web.requests.problems import (
+from service.web.requests.problem_types import (
     INTERNAL_ERROR,
     PROBLEM_TYPES,
     ProblemType,
-    faults_in_query,
     problem_type_of,
 )
+from service.web.requests.problems import faults_in_query
 
 HEADERS: Mapping[str, str] = {
     "Content-Security-Policy": (
@@ -71,6 +71,11 @@ def rendered(template: str, layout: Layout, status: int = 200, **values: Any) ->
     """A page of the console."""
     text = _ENVIRONMENT.get_template(template).render(layout=layout, **values)
     return HTMLResponse(text, status, headers=dict(HEADERS))
+
+
+def rendered_part(template: str, **values: Any) -> Markup:
+    """A part of a page that depends on neither reader nor run, so that it can be kept."""
+    return Markup(_ENVIRONMENT.get_template(template).render(**values))
 
 
 class PageRoute(APIRoute):

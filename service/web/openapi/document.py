@@ -17,11 +17,23 @@ from service.storage.models.base import Record, component_name, described
 from service.web.api.alarms import CommentIn, LimitIn, ShelveIn, StatementIn
 from service.web.api.batches import WhatIfIn
 from service.web.api.compare import CompareIn
+from service.web.api.events import EVENT_STREAM
 from service.web.api.runs import RunIn
 from service.web.api.tokens import SignIn
 from service.web.api.zones import WarmIn
-from service.web.openapi.route import SCHEMAS, add_table_formats, auth_responses
+from service.web.conditional import API
+from service.web.openapi.route import (
+    ATTITUDES,
+    ETAG,
+    SCHEMAS,
+    TABLES,
+    add_table_formats,
+    auth_responses,
+)
 from service.web.requests.access import POLICIES
+from service.web.requests.query_parameters import TIME_SCHEMA
+
+_NOT_MODIFIED = "The client holds this answer already: `If-None-Match` names its `ETag`."
 
 DESCRIPTION = """\
 Send the stars that a star tracker observed; the service identifies them, solves for
@@ -31,13 +43,15 @@ Quaternions have the scalar part last and transform inertial (EME2000) component
 body components. Times are UTC, in calendar form or with the day of the year. Names end
 in their unit. Every error is a problem (RFC 9457, `application/problem+json`). Long
 lists come in pages; the `Link` header holds the address of the next page. The service
-refuses parameters and fields that are not described here.
+refuses parameters and fields that are not described here. Answers are compressed for
+clients that accept gzip.
 """
 
 TAGS = {
     "batches": "Batches of observed stars, and their results.",
     "frames": "Frames of star trackers.",
     "spacecraft": "Settings, state, attitude history and star rates.",
+    "products": "Recorded attitudes as files for other programs.",
     "zones": "The cached zones in which the service searches for stars.",
     "runs and replays": "Named runs, which are separate from live batches, and the files "
     "replayed into them.",
@@ -86,12 +100,15 @@ def reference_of(app: FastAPI) -> dict[str, Any]:
         openapi_version="3.1.0",
         description=DESCRIPTION,
         license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"},
+        servers=[{"url": "/", "description": "The service that returned this description."}],
         tags=[{"name": name, "description": text} for name, text in TAGS.items()],
         routes=app.routes,
     )
     described["components"] = {"schemas": _schemas(), "securitySchemes": SECURITY}
-    for path in described["paths"].values():
-        for operation in path.values():
+    for address, methods in described["paths"].items():
+        for method, operation in methods.items():
+            if method == "get" and address.startswith(API):
+                _add_conditional(operation)
             _finish(operation)
     return described
 
@@ -119,6 +136,8 @@ def _schemas() -> dict[str, Any]:
     )
     names = {shape.__name__: component_name(shape) for shape in REQUESTS}
     defined = {names.get(name, name): schema for name, schema in found["$defs"].items()}
+    # A validator says more than a pattern: it is only described here.
+    defined["BatchIn"]["properties"]["time"] |= TIME_SCHEMA
     return dict(sorted(defined.items()))
 
 
@@ -127,6 +146,17 @@ def _records(kind: type[Record]) -> Iterator[type[Record]]:
         if vars(each).get("component"):
             yield each
         yield from _records(each)
+
+
+def _add_conditional(operation: dict[str, Any]) -> None:
+    """Describe what `ConditionalAnswers` adds to the answers that come in one piece."""
+    responses = operation["responses"]
+    # Attitudes are always streamed.
+    if EVENT_STREAM in responses["200"]["content"] or ATTITUDES in responses["200"]:
+        return
+    if TABLES not in responses["200"]:  # Tables may be streamed.
+        responses["200"]["headers"] = {**responses["200"].get("headers", {}), **ETAG}
+    responses["304"] = {"description": _NOT_MODIFIED, "headers": ETAG, "content": {}}
 
 
 def _finish(operation: dict[str, Any]) -> None:

@@ -10,14 +10,14 @@ from typing import Any
 from pydantic import BaseModel
 from starlette.responses import Response
 
-from service.app.output_formats import OUTPUT_FORMATS
+from service.products.formats import attitude_formats, table_formats
 from service.storage.models.base import Record, component_name
 from service.web.requests.problems import MEDIA_TYPE as PROBLEM_JSON
 from service.web.requests.request_body import BINARY, FRAMES, JSON, NDJSON
 
 SCHEMAS = "#/components/schemas/"
-TABLES = "x-tables"
-"""Marks a response that is a table in the output formats, until the document is made."""
+TABLES, ATTITUDES = "x-tables", "x-attitudes"
+"""Mark a response in the formats of tables, or of attitudes, until the document is made."""
 
 REPLAYED = {
     "Replayed": {
@@ -27,6 +27,18 @@ REPLAYED = {
 }
 LOCATION = {
     "Location": {"description": "The address of the new resource.", "schema": {"type": "string"}}
+}
+CONTENT_LOCATION = {
+    "Content-Location": {
+        "description": "The address of this result.",
+        "schema": {"type": "string"},
+    }
+}
+ETAG = {
+    "ETag": {
+        "description": "Changes with the answer; send it as `If-None-Match`.",
+        "schema": {"type": "string"},
+    }
 }
 LINK = {
     "Link": {
@@ -93,6 +105,8 @@ class ResponseDoc:
     """Another media type that the client can ask for, as plain text or bytes."""
     tables: bool = False
     """Whether the client can ask for it as a table in each of the output formats."""
+    attitudes: bool = False
+    """Whether the client can ask for it in each format of attitudes."""
 
 
 def route_docs(
@@ -100,14 +114,23 @@ def route_docs(
     *,
     body: type[BaseModel] | None = None,
     lines_of: type[BaseModel] | None = None,
+    array_of: tuple[type[BaseModel], int] | None = None,
     frame: bool = False,
     problems: Sequence[int] = (),
     parameters: Sequence[Mapping[str, Any]] = (),
 ) -> dict[str, Any]:
-    """The arguments for a route's decorator that describe it."""
+    """The arguments for a route's decorator that describe it.
+
+    `array_of` is the model of an array's elements, and how many there may be.
+    """
     extra: dict[str, Any] = {}
     if body is not None:
         extra["requestBody"] = {"required": True, "content": {JSON: {"schema": _ref(body)}}}
+        problems = (*problems, *READING_JSON)
+    if array_of is not None:
+        element, most = array_of
+        array = {"type": "array", "items": _ref(element), "minItems": 1, "maxItems": most}
+        extra["requestBody"] = {"required": True, "content": {JSON: {"schema": array}}}
         problems = (*problems, *READING_JSON)
     if lines_of is not None:
         description = f"A `{lines_of.__name__}` a line."
@@ -156,13 +179,19 @@ def _answer(doc: ResponseDoc) -> dict[str, Any]:
         answer["content"][doc.also] = {"schema": _plain(doc.also)}
     if doc.tables:
         answer[TABLES] = True
+    if doc.attitudes:
+        answer[ATTITUDES] = True
     return answer
 
 
 def add_table_formats(response: dict[str, Any]) -> None:
     """Add the media types of the output formats that are registered by now."""
-    if response.pop(TABLES, False):
-        for each in OUTPUT_FORMATS.values():
+    formats = {
+        **(table_formats() if response.pop(TABLES, False) else {}),
+        **(attitude_formats() if response.pop(ATTITUDES, False) else {}),
+    }
+    for each in formats.values():
+        if each.media_type not in response["content"]:
             response["content"][each.media_type] = {"schema": _plain(each.media_type)}
 
 

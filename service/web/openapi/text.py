@@ -20,7 +20,7 @@ _Dumper.add_representer(str, _text)
 
 
 def openapi_yaml() -> str:
-    """What `openapi.yaml` holds; nothing is served for it."""
+    """The text of `openapi.yaml`, made without a running service."""
     # Once through JSON: YAML would mark what is shared between places.
     plain = json.loads(json.dumps(bare_app().openapi()))
     return str(yaml.dump(plain, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100))

@@ -1,1 +1,1 @@
-"""What the handlers of API and console share: access, bodies, parameters, responses, problems."""
+"""Shared by the handlers of API and console: access, bodies, parameters, responses, problems."""

@@ -34,7 +34,7 @@ SpacecraftPlace = Literal["nothing", "path", "query", "result", "body", "every"]
 
 @dataclass(frozen=True)
 class Policy:
-    """What a route requires of its caller.
+    """The access that a route requires of its caller.
 
     `spacecraft_in` says which part of the request names the spacecraft, for tokens
     bound to some: the `path`; the `query`, which must then name it; the recorded
@@ -68,6 +68,7 @@ POLICIES: dict[str, Policy] = {
     "sign_out": OPEN,
     "session": Policy("read", "nothing"),
     "submit_batch": Policy("submit", "body"),
+    "submit_batches": Policy("submit", "body"),
     "list_batches": Policy("read", "query"),
     "get_batch": Policy("read", "result"),
     "what_if": Policy("read", "result"),
@@ -75,7 +76,9 @@ POLICIES: dict[str, Policy] = {
     "get_spacecraft": Policy("read", "path"),
     "submit_frame": Policy("submit", "path"),
     "get_overlay": Policy("read", "result"),
+    "get_latest": Policy("read", "path"),
     "list_attitudes": Policy("read", "path"),
+    "get_attitude": Policy("read", "path"),
     "list_rates": Policy("read", "path"),
     "get_history": Policy("read", "path"),
     "list_worst": Policy("read", "path"),
@@ -86,8 +89,7 @@ POLICIES: dict[str, Policy] = {
     "list_runs": READ,
     "start_replay": Policy("submit", "body"),
     "list_replays": READ,
-    # Its id can be known only from having started it, or from somebody who may read everything:
-    # see `lone_ulid`.
+    # Its id is unguessable: only the client that started it and readers of everything know it.
     "get_replay": Policy("read", "nothing", or_scope="submit"),
     # Of tokens that are bound to spacecraft only the one that started it: see the handler.
     "cancel_replay": Policy("submit", "nothing", audited=True),
@@ -115,7 +117,7 @@ _LINK_NAVIGATION = (
     ("sec-fetch-dest", "document"),
     ("sec-fetch-user", "?1"),
 )
-"""What a browser sends when its user follows a link; scripts and frames send other values."""
+"""Sent by a browser when its user follows a link; scripts and frames send other values."""
 
 _CALLER_THREADS = CapacityLimiter(8)
 """Apart from those of handlers, which may wait for a commit: looking up a caller must not."""

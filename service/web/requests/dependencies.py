@@ -1,7 +1,7 @@
-"""What handlers are given: the app and the metrics, and the forms of their responses.
+"""Dependencies of handlers: the app and the metrics; and the forms of responses.
 
-All dependencies are asynchronous: they never wait for a worker thread, which a
-probe could wait for in vain.
+All dependencies are asynchronous: they never wait for a worker thread, because
+all of them may be busy when a probe arrives.
 """
 
 from typing import Annotated, Any

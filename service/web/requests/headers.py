@@ -1,6 +1,6 @@
 """Request headers with a meaning of their own."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import Depends
 from starlette.requests import Request
@@ -22,13 +22,21 @@ async def idempotency_key(request: Request) -> str | None:
 IdempotencyKey = Annotated[str | None, Depends(idempotency_key)]
 
 
-async def _no_idempotency_key(request: Request) -> None:
-    key = request.headers.get("Idempotency-Key")
-    if key is not None:
-        # Ignored, it would let a client believe that a repeat is harmless.
-        message = "belongs to new batches: a what-if that is recorded twice is there twice"
-        raise BadBatch(Fault("Idempotency-Key", message, shown_value(key)))
+def _no_idempotency_key(message: str) -> Any:
+    async def require_none(request: Request) -> None:
+        key = request.headers.get("Idempotency-Key")
+        if key is not None:
+            # Ignored, it would let a client believe something of it.
+            raise BadBatch(Fault("Idempotency-Key", message, shown_value(key)))
+
+    return Depends(require_none)
 
 
-NO_IDEMPOTENCY_KEY = Depends(_no_idempotency_key)
+NO_IDEMPOTENCY_KEY = _no_idempotency_key(
+    "belongs to new batches: a what-if that is recorded twice is there twice"
+)
 """For a route where a repeat makes another result."""
+NO_KEY_OF_MANY = _no_idempotency_key(
+    "belongs to one batch: of an array, each batch is recognised by its own batch id"
+)
+"""For a route that takes several batches."""

@@ -2,8 +2,8 @@
 
 from starlette.responses import Response, StreamingResponse
 
-from service.app.history_table import Table
-from service.app.output_formats import OUTPUT_FORMATS
+from service.products.formats import OUTPUT_FORMATS, file_suffix, write_table
+from service.products.tables import Table
 
 THINNED = {
     "Thinned": {
@@ -15,16 +15,16 @@ THINNED = {
 
 def history_file(table: Table, format: str, name: str, *, is_thinned: bool) -> Response:
     """A short table as a file of that name."""
-    written = OUTPUT_FORMATS[format]
-    text = "".join(written.write(table.columns, table.pages))
-    return Response(text, 200, _headers(name, format, is_thinned), media_type=written.media_type)
+    media_type = OUTPUT_FORMATS[format].media_type
+    content = b"".join(write_table(format, table))
+    return Response(content, 200, _headers(name, format, is_thinned), media_type=media_type)
 
 
 def streamed_file(table: Table, format: str, name: str) -> Response:
     """A table of every batch as a file of that name, sent as it is read."""
-    written = OUTPUT_FORMATS[format]
-    text = written.write(table.columns, table.pages)
-    return StreamingResponse(text, 200, _headers(name, format, False), written.media_type)
+    media_type = OUTPUT_FORMATS[format].media_type
+    content = write_table(format, table)
+    return StreamingResponse(content, 200, _headers(name, format, False), media_type)
 
 
 def thinned_header(is_thinned: bool) -> dict[str, str]:
@@ -33,5 +33,10 @@ def thinned_header(is_thinned: bool) -> dict[str, str]:
 
 
 def _headers(name: str, format: str, is_thinned: bool) -> dict[str, str]:
-    file = f"{name}.{format}".replace(":", "_")
-    return {"Content-Disposition": f'attachment; filename="{file}"'} | thinned_header(is_thinned)
+    return attached_as(name, format) | thinned_header(is_thinned)
+
+
+def attached_as(name: str, format: str) -> dict[str, str]:
+    """The header that names the file that an answer is saved as."""
+    file = f"{name}.{file_suffix(format)}".replace(":", "_")
+    return {"Content-Disposition": f'attachment; filename="{file}"'}

@@ -15,11 +15,10 @@ from starlette.types import Scope
 
 from service.alarms.limits import Severity
 from service.app.factory import App
-from service.ingest.submit import Recorded
+from service.ingest.submit import Backlog, Recorded
 from service.storage.models.alarms import Alarm
 from service.storage.models.zones import ZoneCache
 from service.storage.queries.future_dated import LIVE
-from service.storage.recording.unsaved_result import Row
 
 log = logging.getLogger(__name__)
 
@@ -133,18 +132,18 @@ def _of_alarms(app: App, active: Sequence[Alarm]) -> Metric:
     return family
 
 
-def _of_backlog(backlog: Row) -> Iterator[Metric]:
+def _of_backlog(backlog: Backlog) -> Iterator[Metric]:
     """The queues, and the state of the writes."""
-    posts, writes = backlog["posts"], backlog["writes"]
+    posts, writes = backlog.posts, backlog.writes
     yield CounterMetricFamily(
         "starid_writes_failed",
         "Batches and changes that could not be written, or not be looked up before that.",
-        value=writes["failed"],
+        value=writes.failed,
     )
     yield GaugeMetricFamily(
         "starid_last_write_succeeded",
         "1 where the last write succeeded, 0 where it failed.",
-        value=float(writes["succeeded"]),
+        value=float(writes.succeeded),
     )
     depth = GaugeMetricFamily(
         "starid_queue_depth",
@@ -154,9 +153,10 @@ def _of_backlog(backlog: Row) -> Iterator[Metric]:
     age = GaugeMetricFamily(
         "starid_queue_oldest_seconds", "The age of the oldest of them.", labels=("queue",)
     )
-    for name, queue in (("posts", posts), ("writes", writes)):
-        depth.add_metric((name,), queue["queued"])
-        age.add_metric((name,), queue["oldest_s"])
+    depth.add_metric(("posts",), posts.queued)
+    depth.add_metric(("writes",), writes.queued)
+    age.add_metric(("posts",), posts.oldest_s)
+    age.add_metric(("writes",), writes.oldest_s)
     yield depth
     yield age
 
@@ -215,7 +215,7 @@ class Metrics:
     def count_request(self, scope: Scope, status: int, seconds: float) -> None:
         """Count one request under its route's template, so that ids make no new series."""
         if getattr(scope.get("route"), "name", None) == "events":
-            return  # a stream lasts as long as somebody listens
+            return  # the duration of a stream says nothing
         method = scope["method"] if scope["method"] in _METHODS else "other"
         route = getattr(scope.get("route"), "path", "none")
         labels = method, route, status

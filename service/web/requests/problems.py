@@ -1,4 +1,4 @@
-"""Errors as problems (RFC 9457): the one place that maps an error to its status.
+"""Errors as problems (RFC 9457).
 
 A client's error names the field and the value.  An internal error is logged, and
 its answer tells nothing about the inside of the service.
@@ -7,12 +7,12 @@ its answer tells nothing about the inside of the service.
 import json
 import logging
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Any
 
 from fastapi import FastAPI
 from fastapi.exceptions import RequestValidationError
+from msgspec import convert
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
@@ -22,18 +22,19 @@ from service.errors import (
     AcquisitionError,
     BadInput,
     Busy,
-    Conflict,
     Fault,
-    Forbidden,
-    KeyReused,
-    NotAvailable,
-    NotFound,
     RateLimited,
     Unauthenticated,
-    WrongState,
     problem_of,
     problem_of_faults,
     shown_value,
+)
+from service.storage.models.problems import Problem
+from service.web.requests.problem_types import (
+    INTERNAL_ERROR,
+    PROBLEM_TYPES,
+    ProblemType,
+    problem_type_of,
 )
 
 MEDIA_TYPE = "application/problem+json"
@@ -41,48 +42,7 @@ MEDIA_TYPE = "application/problem+json"
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class ProblemType:
-    """What all problems of one type share; a `slug` gives the type an address of its own."""
-
-    status: int
-    title: str
-    slug: str | None = None
-
-    @property
-    def type(self) -> str:
-        """The problem's `type`; without a slug the status says all."""
-        return "about:blank" if self.slug is None else f"/problems/{self.slug}"
-
-
-PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
-    BadInput: ProblemType(422, "Invalid input", "bad-input"),
-    NotAvailable: ProblemType(422, "Not available", "not-available"),
-    Unauthenticated: ProblemType(401, "Unauthorized", "not-admitted"),
-    Forbidden: ProblemType(403, "Forbidden", "not-allowed"),
-    RateLimited: ProblemType(429, "Too many requests", "too-often"),
-    NotFound: ProblemType(404, "Not found", "not-found"),
-    Conflict: ProblemType(409, "The batch is already recorded with another body", "conflict"),
-    WrongState: ProblemType(409, "The state does not allow this", "not-now"),
-    KeyReused: ProblemType(422, "The Idempotency-Key was used with another body", "key-reused"),
-    Busy: ProblemType(503, "The service is busy", "busy"),
-}
-INTERNAL_ERROR = ProblemType(500, HTTPStatus(500).phrase)
-
-
-def problem_type_of(error: AcquisitionError) -> ProblemType:
-    """The problem type of an error: that of its class, or of the nearest base class."""
-    return next(
-        (PROBLEM_TYPES[each] for each in type(error).__mro__ if each in PROBLEM_TYPES),
-        INTERNAL_ERROR,
-    )
-
-
-class NotJson(BadInput):
-    """A body that is not JSON: truncated, empty, or in another encoding."""
-
-
-PROBLEM_TYPES[NotJson] = ProblemType(400, "The body is not JSON", "not-json")
+_FAILED = {"detail": "The service has failed; its log contains the cause."}
 
 
 def problem_response(
@@ -92,7 +52,14 @@ def problem_response(
     headers: dict[str, str] | None = None,
 ) -> Response:
     """The response for a problem: its type, the address, and `details` with its `detail`."""
-    content: dict[str, object] = {
+    content = _content(request, kind, details)
+    # ASCII only: a client's text may hold lone surrogates, which UTF-8 cannot carry.
+    body = json.dumps(content, ensure_ascii=True, separators=(",", ":"))
+    return Response(body, kind.status, headers, media_type=MEDIA_TYPE)
+
+
+def _content(request: Request, kind: ProblemType, details: Mapping[str, Any]) -> dict[str, Any]:
+    return {
         "type": kind.type,
         "title": kind.title,
         "status": kind.status,
@@ -100,9 +67,14 @@ def problem_response(
         "instance": request.url.path,
         **details,
     }
-    # ASCII only: a client's text may hold lone surrogates, which UTF-8 cannot carry.
-    body = json.dumps(content, ensure_ascii=True, separators=(",", ":"))
-    return Response(body, kind.status, headers, media_type=MEDIA_TYPE)
+
+
+def problem_within(request: Request, error: BaseException) -> Problem:
+    """The problem of a part of a request whose other parts are answered."""
+    if not isinstance(error, AcquisitionError) or problem_type_of(error) is INTERNAL_ERROR:
+        log.error("%s %s failed in part", request.method, request.url.path, exc_info=error)
+        return convert(_content(request, INTERNAL_ERROR, _FAILED), Problem)
+    return convert(_content(request, problem_type_of(error), problem_of(error)), Problem)
 
 
 async def _on_acquisition_error(request: Request, error: Exception) -> Response:
@@ -171,9 +143,7 @@ def _methods_at(request: Request) -> list[str]:
 def internal_error(request: Request, error: Exception) -> Response:
     """Log an unexpected error, and answer without details of it."""
     log.error("%s %s failed", request.method, request.url.path, exc_info=error)
-    return problem_response(
-        request, INTERNAL_ERROR, {"detail": "The service has failed; its log contains the cause."}
-    )
+    return problem_response(request, INTERNAL_ERROR, _FAILED)
 
 
 async def _on_disconnect(request: Request, error: Exception) -> Response:

@@ -1,26 +1,35 @@
 """Query parameters: each is checked, unknown ones are refused."""
 
+from collections.abc import Callable
 from typing import Annotated, Any, Literal, Self, TypedDict
 
 from fastapi import Depends
 from pydantic import (
-    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
+    GetCoreSchemaHandler,
     GetJsonSchemaHandler,
     PlainValidator,
     WithJsonSchema,
     field_validator,
     model_validator,
 )
-from pydantic_core import CoreSchema
+from pydantic_core import CoreSchema, core_schema
 from starlette.requests import Request
 
 from service.alarms.quantities import QuantityName, RankedName, trend_names
-from service.app.output_formats import OUTPUT_FORMATS
 from service.errors import BadBatch, BadInput, Fault, shown_value
 from service.observations.schema import Key, RunName
+from service.products.attitudes import (
+    DEFAULT_LARGEST_GAP_S,
+    DEFAULT_NAIF_ID,
+    MAX_LARGEST_GAP_S,
+    MIN_NAIF_ID,
+    OBJECT_ID,
+    StatusWanted,
+)
+from service.products.formats import JSON_FORMAT, attitude_formats, table_formats
 from service.storage.queries.alarms import StateFilter
 from service.storage.queries.results import OutcomeName, StatusName
 from service.storage.queries.trends import MAX_SIZE, Strategy
@@ -37,9 +46,14 @@ def _time(value: object) -> Utc:
         raise ValueError(error.faults[0].message) from None
 
 
-_TIME_SCHEMA = {"type": "string", "examples": ["1996-01-10T12:00:00.000Z", "1996-010T12:00:00Z"]}
+TIME_SCHEMA: dict[str, Any] = {
+    "type": "string",
+    "pattern": r"^\d{4}-(\d\d-\d\d|\d{3})T\d\d:\d\d:\d\d(\.\d{1,9})?Z?$",
+    "examples": ["1996-01-10T12:00:00.000Z", "1996-010T12:00:00Z"],
+}
+"""UTC in calendar form or with the day of the year; `format: date-time` knows no leap second."""
 
-Time = Annotated[Utc, PlainValidator(_time), WithJsonSchema(_TIME_SCHEMA)]
+Time = Annotated[Utc, PlainValidator(_time), WithJsonSchema(TIME_SCHEMA)]
 """UTC text, calendar or day-of-year, as the core's own type."""
 
 Start = Annotated[Time | None, Field(description="Start of the period, included.")]
@@ -54,7 +68,26 @@ Cursor = Annotated[
         description="Start of the page, taken from a `Link` header.",
     ),
 ]
+OfTracker = Annotated[
+    Key | None,
+    Field(
+        description="Of this tracker's own stars, for the quantities that a tracker has: shares of "
+        "its stars, residuals, magnitude offset; `suspect_share` is then the share of batches in "
+        "which it is the tracker that disagrees."
+    ),
+]
 SpacecraftFilter = Annotated[Key | None, Field(description="Only items of this spacecraft.")]
+
+
+LargestGap = Annotated[
+    float,
+    Field(
+        gt=0,
+        le=MAX_LARGEST_GAP_S,
+        allow_inf_nan=False,
+        description="Attitudes farther apart than this, in seconds, belong to two stretches.",
+    ),
+]
 
 
 class Query(BaseModel):
@@ -126,6 +159,16 @@ class BatchQuery(PeriodPageQuery):
         StatusName | None,
         Field(description="Only batches with a good attitude, with a suspect one, or with none."),
     ] = None
+    batch: Annotated[
+        Key | None,
+        Field(description="Only the batch with this batch id; needs `spacecraft`."),
+    ] = None
+
+    @model_validator(mode="after")
+    def _batch_of_a_spacecraft(self) -> Self:
+        if self.batch is not None and self.spacecraft is None:
+            raise ValueError("batch needs spacecraft: batch ids of two spacecraft may be the same")
+        return self
 
 
 class RunQuery(Query):
@@ -142,30 +185,32 @@ class RatesQuery(PeriodQuery):
     bucket: Annotated[Bucket, Field(description="The width of a bucket, in UTC.")] = "hour"
 
 
-JSON_FORMAT = "json"
-"""The API's own form of a history; every other format is a table."""
-
-
 class FormatNames:
-    """Puts the names of the output formats into the OpenAPI document."""
+    """Checks a parameter `format`, and puts the names that it may have into the OpenAPI document.
+
+    `names` gives those that are registered by now.
+    """
+
+    def __init__(self, names: Callable[[], list[str]]) -> None:
+        self._names = names
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        """Text that is one of the names."""
+        return core_schema.no_info_after_validator_function(self._checked, handler(source))
+
+    def _checked(self, name: str) -> str:
+        names = [repr(each) for each in self._names()]
+        if repr(name) not in names:
+            raise ValueError(f"Input should be {', '.join(names[:-1])} or {names[-1]}")
+        return name
 
     def __get_pydantic_json_schema__(
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
         """The schema of the parameter, with the formats that are registered by now."""
-        return {"enum": format_names(), "type": "string"}
-
-
-def format_names() -> list[str]:
-    """Every value of the parameter `format`."""
-    return [JSON_FORMAT, *OUTPUT_FORMATS]
-
-
-def _format(name: str) -> str:
-    names = [repr(each) for each in format_names()]
-    if repr(name) not in names:
-        raise ValueError(f"Input should be {', '.join(names[:-1])} or {names[-1]}")
-    return name
+        return {"enum": self._names(), "type": "string"}
 
 
 class HistoryQuery(PeriodQuery):
@@ -178,6 +223,7 @@ class HistoryQuery(PeriodQuery):
             "quantities with a history."
         ),
     ] = []
+    tracker: OfTracker = None
     strategy: Annotated[
         Strategy | None,
         Field(
@@ -197,8 +243,7 @@ class HistoryQuery(PeriodQuery):
     ] = None
     format: Annotated[
         str,
-        AfterValidator(_format),
-        FormatNames(),
+        FormatNames(lambda: [JSON_FORMAT, *table_formats()]),
         Field(description="`json`: columns; any other: a table, as a file."),
     ] = JSON_FORMAT
 
@@ -216,6 +261,40 @@ class HistoryQuery(PeriodQuery):
         return list(dict.fromkeys(names))
 
 
+class AttitudeQuery(PeriodQuery):
+    """Attitudes of a period, in a format."""
+
+    format: Annotated[
+        str,
+        FormatNames(lambda: [*attitude_formats()]),
+        Field(description="`json`: objects; any other: a file."),
+    ] = JSON_FORMAT
+    status: Annotated[
+        StatusWanted,
+        Field(description="Only good attitudes, only suspect ones, or `all`."),
+    ] = "good"
+    order: Annotated[
+        Literal["oldest", "newest"],
+        Field(description="Which come first. `newest` is for JSON and tables alone."),
+    ] = "oldest"
+    largest_gap_s: LargestGap = DEFAULT_LARGEST_GAP_S
+    object_id: Annotated[
+        str | None,
+        Field(
+            pattern=f"^{OBJECT_ID}$",
+            description="OBJECT_ID of CCSDS messages, such as 1995-074A. Default: the name.",
+        ),
+    ] = None
+    naif_id: Annotated[
+        int,
+        Field(
+            ge=MIN_NAIF_ID,
+            le=-1,
+            description="NAIF's id of the spacecraft, for SPICE kernels.",
+        ),
+    ] = DEFAULT_NAIF_ID
+
+
 class WorstQuery(PeriodQuery):
     """Which batches are worst, by what."""
 
@@ -223,6 +302,7 @@ class WorstQuery(PeriodQuery):
         RankedName,
         Field(description="The quantity. For `magnitude_offset_mag`, its absolute value."),
     ] = "ambiguous_share"
+    tracker: OfTracker = None
     limit: Annotated[int, Field(ge=1, le=100, description="Maximum number of items.")] = 20
 
 
@@ -258,6 +338,22 @@ class StatementQuery(Query):
 
     who: Who = None
     comment: Comment = None
+
+
+class LimitQuery(Query):
+    """Whose limits."""
+
+    tracker: Annotated[
+        Key | None,
+        Field(
+            description="Of this tracker, if the spacecraft has several; default: of the "
+            "spacecraft as a whole. A tracker without limits of its own has the spacecraft's."
+        ),
+    ] = None
+
+
+class LimitStatementQuery(StatementQuery, LimitQuery):
+    """Whose limits change, who changes them, and a comment on it."""
 
 
 async def require_no_query(request: Request) -> None:

@@ -1,10 +1,11 @@
 """`acquire simulate imaging`: the claims of the star image detection report."""
 
+import io
 from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from service.cli.arguments import add_command
+from service.cli.arguments import STANDARD_OUTPUT, add_command, add_json_file
 
 
 def add(group: Any) -> None:
@@ -26,9 +27,7 @@ def add(group: Any) -> None:
     )
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="default 1")
     parser.add_argument("--quick", action="store_true", help="small samples and coarser grids")
-    parser.add_argument(
-        "--json", type=Path, metavar="OUT", help="write the claims with their figures"
-    )
+    add_json_file(parser, "the claims with their figures")
     parser.add_argument(
         "--plots", type=Path, metavar="FOLDER", help="write the figures (needs matplotlib)"
     )
@@ -42,14 +41,18 @@ def add(group: Any) -> None:
 
 def run(parsed: Namespace) -> int:
     """Hold the star image detection report beside what is measured; 1 where a claim is off."""
-    from service.studies.star_image_report.command import run_imaging
+    from service.studies.star_image_report.command import as_json, run_imaging
 
+    prints_json = parsed.json == STANDARD_OUTPUT
     rows = run_imaging(
         parsed.row,
         parsed.seed,
         parsed.quick,
-        json_path=parsed.json,
+        json_path=None if prints_json else parsed.json,
         plots_folder=parsed.plots,
         report_path=parsed.report,
+        out=io.StringIO() if prints_json else None,
     )
+    if prints_json:
+        print(as_json(rows), end="")
     return 0 if all(row.holds for row in rows) else 1

@@ -1,10 +1,18 @@
 """`acquire simulate paper`: the experiments of the papers beside their tables."""
 
+import io
 from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from service.cli.arguments import add_command, count, table
+from service.cli.arguments import (
+    STANDARD_OUTPUT,
+    add_command,
+    add_json_file,
+    count,
+    print_json,
+    table,
+)
 from service.errors import BadInput, Fault, shown_value
 from service.missions.identifiers import IDENTIFIERS
 
@@ -36,6 +44,7 @@ def add(group: Any) -> None:
         acquire simulate paper --table ptp-6 --scenes 2000 --seed 7
         acquire simulate paper --table ptp --plots docs/plots --report docs/ptp.md
         acquire simulate paper --json rates.json
+        acquire simulate paper --table 3 --stars 2000 --json
         acquire simulate paper --identifier starid --seed 1 2 3 --plots docs/plots --report paper.md
         acquire simulate paper --identifier verified --report verified.md
         """,
@@ -55,7 +64,7 @@ def add(group: Any) -> None:
         help="named tables: fields per condition; default 10000",
     )
     parser.add_argument("--seed", type=int, nargs="+", default=[1], metavar="S", help="default 1")
-    parser.add_argument("--json", type=Path, metavar="OUT", help="write the rates, one row per run")
+    add_json_file(parser, "the rates, one row per run")
     parser.add_argument("--plots", type=Path, metavar="FOLDER", help="write the figures")
     parser.add_argument(
         "--report",
@@ -84,36 +93,44 @@ def run(parsed: Namespace) -> int:
                 "--scenes", "goes with a table by name, such as --table ptp-6", str(parsed.scenes)
             )
         )
-    from service.studies.paper_1994.command import DEFAULT_STARS, run_paper
+    from service.studies.paper_1994.command import DEFAULT_STARS, rows_of, run_paper
 
-    run_paper(
+    prints_json = parsed.json == STANDARD_OUTPUT
+    tallies = run_paper(
         parsed.table,
         parsed.stars or DEFAULT_STARS,
         parsed.seed,
-        parsed.json,
+        None if prints_json else parsed.json,
         parsed.identifier,
         processes=parsed.processes,
         plots=parsed.plots,
         report_path=parsed.report,
+        out=io.StringIO() if prints_json else None,
     )
+    if prints_json:
+        print_json(rows_of(tallies))
     return 0
 
 
 def _run_ptp(parsed: Namespace) -> int:
-    from service.studies.ptp_2015.command import DEFAULT_SCENES, run_ptp
+    from service.studies.ptp_2015.command import DEFAULT_SCENES, rows_of, run_ptp
 
     if parsed.stars is not None:
         message = "goes with a table by number; a named one takes --scenes"
         raise BadInput(Fault("--stars", message, str(parsed.stars)))
     if len(parsed.seed) > 1:
         raise BadInput(Fault("--seed", "is one with a table by name", shown_value(parsed.seed)))
-    run_ptp(
+    prints_json = parsed.json == STANDARD_OUTPUT
+    found = run_ptp(
         parsed.table,
         parsed.scenes or DEFAULT_SCENES,
         parsed.seed[0],
-        parsed.json,
+        None if prints_json else parsed.json,
         parsed.processes,
         parsed.plots,
         parsed.report,
+        io.StringIO() if prints_json else None,
     )
+    if prints_json:
+        print_json(rows_of(found))
     return 0

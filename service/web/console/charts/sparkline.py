@@ -1,54 +1,60 @@
 """The geometry of a sparkline: shares over a stretch of time; a gap where nothing was."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-from service.storage.models.overview import Sparkline as Shares
+import numpy as np
 
-WIDTH, HEIGHT = 132, 30
-PAD = 2.0
+from service.vectors import Vector
+
+WIDTH, HEIGHT = 128, 22
+PAD = 2
+TOPS = (0.05, 0.1, 0.25, 0.5, 1.0)
+"""What the top of a sparkline may stand for: a handful of stars shall not look like a lot."""
 
 
 @dataclass(frozen=True)
 class SparklineDrawing:
-    """Two lines and the share that the top stands for; lone points are dots."""
+    """A path for each quantity; a lone cell is a dot, drawn as a line without length."""
 
-    ambiguous: str
-    unmatched: str
-    dots: tuple[tuple[str, float, float], ...]
-    top: float
+    paths: Mapping[str, str]
     width: int = WIDTH
     height: int = HEIGHT
 
 
-def sparkline(series: Shares, start_s: float, end_s: float) -> SparklineDrawing:
-    """The picture of `sparkline_hour` or `sparkline_day` of an overview, from start to end."""
-    moments: Sequence[float] = series.unix_s
-    shares: dict[str, list[float]] = {
-        "ambiguous": series.ambiguous_share,
-        "unmatched": series.unmatched_share,
-    }
-    # A handful of stars shall not look like a lot: the top is a twentieth at least.
-    top: float = max(0.05, *(max(each, default=0.0) for each in shares.values()))
-    step_s = float(series.bucket_s)
-    span_s = max(end_s - start_s, step_s)
+def common_top(greatest: float) -> float:
+    """The share that the top of every sparkline of a page stands for."""
+    return next(top for top in TOPS if greatest <= top or top == TOPS[-1])
 
-    def x(moment_s: float) -> float:
-        along = (moment_s + step_s / 2 - start_s) / span_s
-        return PAD + min(1.0, max(0.0, along)) * (WIDTH - 2 * PAD)
 
-    def y(part: float) -> float:
-        return HEIGHT - PAD - part / top * (HEIGHT - 2 * PAD)
+def sparkline(shares: Mapping[str, Vector], top: float) -> SparklineDrawing:
+    """The picture of shares in cells of equal width; NaN where there was no batch."""
+    return SparklineDrawing({name: _path(values, top) for name, values in shares.items()})
 
-    paths, dots = {}, []
-    for name, values in shares.items():
-        parts: list[list[tuple[float, float]]] = []
-        for k, (moment_s, value) in enumerate(zip(moments, values, strict=True)):
-            if k == 0 or moment_s - moments[k - 1] > 1.5 * step_s:
-                parts.append([])
-            parts[-1].append((x(moment_s), y(value)))
-        paths[name] = "".join(
-            "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in part) for part in parts if len(part) > 1
-        )
-        dots += [(name, *part[0]) for part in parts if len(part) == 1]
-    return SparklineDrawing(paths["ambiguous"], paths["unmatched"], tuple(dots), top)
+
+def _path(values: Vector, top: float) -> str:
+    """Whole pixels, relative to the point before: a fleet's page has thousands of points."""
+    known = np.isfinite(values)
+    step = (WIDTH - 2 * PAD) / max(len(values) - 1, 1)
+    xs = np.rint(PAD + step * np.arange(len(values))).astype(int).tolist()
+    part = np.minimum(np.where(known, values, 0.0) / top, 1.0)
+    ys = np.rint(HEIGHT - PAD - part * (HEIGHT - 2 * PAD)).astype(int).tolist()
+    text: list[str] = []
+    before, level = None, 0
+    for x, y, is_known in zip(xs, ys, known.tolist(), strict=True):
+        if before is not None and is_known and y == before[1]:
+            level += x - before[0]
+        else:
+            if before is not None:
+                text += _level(level, is_end=not is_known, text=text)
+            level = 0
+            if is_known:
+                text.append(f"l{x - before[0]} {y - before[1]}" if before else f"M{x} {y}")
+        before = (x, y) if is_known else None
+    return "".join(text + _level(level, is_end=True, text=text))
+
+
+def _level(length: int, is_end: bool, text: list[str]) -> list[str]:
+    """A level line of that length; none of no length, but a dot where a part has one point."""
+    is_lone = is_end and bool(text) and text[-1].startswith("M")
+    return [f"h{length}"] if length or is_lone else []

@@ -1,32 +1,55 @@
-"""The pages of alarms: the list of a run by state, and one with its history."""
+"""The pages of alarms: the list of a run by state, and one with its cause and its history."""
 
 from typing import Annotated, Literal
 
 from fastapi import Path
 from fastapi import Query as InQuery
+from msgspec import UNSET
 from starlette.responses import Response
 
+from service.alarms.causes import CAUSES
+from service.alarms.quantities import trend_names
+from service.alarms.subjects import limited_trackers
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key
-from service.times import recorded_utc, shifted
-from service.web.console.page_context import ContextDep, PageQuery
+from service.storage.models.alarms import Alarm, AlarmWithActions
+from service.times import recorded_utc, shifted, unix_seconds
+from service.web.console.charts.alarm_trend import AlarmTrend, alarm_trend
+from service.web.console.page_context import ContextDep, PageContext, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
-from service.web.requests.query_parameters import Cursor
+from service.web.requests.query_parameters import Cursor, Query
 
-ROWS = 50
+ROWS = 200
 STATES = ("active", "open", "acknowledged", "shelved", "cleared", "all")
 BEFORE_S, AFTER_S = 1800.0, 1800.0
-"""The period of the trend that is shown around the time at which an alarm was raised."""
+"""Around the time at which an alarm was raised: what its links and its trend show."""
+TREND_BEFORE_S, TREND_POINTS = 4 * 3600.0, 160
+TOGETHER_S = 1800.0
+"""Alarms of one spacecraft that were raised within this time are likely to have one cause."""
+
+Clock = Literal["telemetry", "receipt"]
+CLOCKS: dict[Clock, str] = {
+    "telemetry": "telemetry time, that of the batches",
+    "receipt": "receipt time, by the clock of the service",
+}
 
 
 class AlarmsQuery(PageQuery):
-    """Which alarms; an empty spacecraft stands for every one."""
+    """Which alarms, by which clock; an empty spacecraft stands for every one."""
 
     state: Literal["active", "open", "acknowledged", "shelved", "cleared", "all"] = "active"
     spacecraft: Key | Literal[""] = ""
     cursor: Cursor = None
+    clock: Clock = "telemetry"
+
+
+class AlarmQuery(Query):
+    """By which clock the history of an alarm is shown."""
+
+    run: str | None = None
+    clock: Clock = "telemetry"
 
 
 @console_page("/alarms", "Alarms", Policy("read", "nothing"), position=20)
@@ -49,24 +72,93 @@ def alarms_page(query: Annotated[AlarmsQuery, InQuery()], context: ContextDep) -
         query=query,
         page=page,
         states=STATES,
+        clocks=CLOCKS,
         spacecraft=context.spacecraft,
     )
 
 
 @console_page("/alarms/{id}", "Alarm", Policy("read", "nothing"), section="/alarms")
-def alarm_page(id: Annotated[str, Path()], context: ContextDep) -> Response:
-    """One alarm: how it was raised, its state, and what operators did about it."""
+def alarm_page(
+    id: Annotated[str, Path()], query: Annotated[AlarmQuery, InQuery()], context: ContextDep
+) -> Response:
+    """One alarm: how it was raised, its usual cause, and what operators did about it."""
     alarm = context.app.alarms.get(id)
     if not context.caller.may_see(alarm.spacecraft):
         # As if it did not exist: probing for ids of others must tell nothing.
         raise NotFound(f"there is no alarm with the id {shown_value(id)}")
     raised = recorded_utc(alarm.raised.time)
+    around = {"start": shifted(raised, -BEFORE_S).text, "end": shifted(raised, AFTER_S).text}
     return rendered(
         "alarm.html.jinja",
         context.layout(alarm.run),
         alarm=alarm,
-        around={
-            "start": shifted(raised, -BEFORE_S).text,
-            "end": shifted(raised, AFTER_S).text,
-        },
+        clock=query.clock,
+        clocks=CLOCKS,
+        cause=CAUSES.get(alarm.quantity),
+        related=_related(context, alarm),
+        trend=_trend(context, alarm),
+        around=around,
+        trends_around=around | ({"tracker": alarm.tracker} if _has_tracker(context, alarm) else {}),
+    )
+
+
+def _has_tracker(context: PageContext, alarm: Alarm) -> bool:
+    """Whether the alarm is about a tracker that the mission still has."""
+    mission = context.app.missions.get(alarm.spacecraft)
+    return mission is not None and alarm.tracker in limited_trackers(mission)
+
+
+def _related(context: PageContext, alarm: AlarmWithActions) -> list[Alarm]:
+    """Active alarms that may have the same cause.
+
+    The same quantity of other spacecraft, and other quantities of this one that
+    left their limits at about the same time.
+    """
+    raised_ns = recorded_utc(alarm.raised.time).tai_ns
+
+    def is_related(other: Alarm) -> bool:
+        if other.id == alarm.id or not context.caller.may_see(other.spacecraft):
+            return False
+        if other.spacecraft != alarm.spacecraft:
+            return other.quantity == alarm.quantity
+        apart_ns = abs(recorded_utc(other.raised.time).tai_ns - raised_ns)
+        return apart_ns <= TOGETHER_S * 1e9
+
+    return [other for other in context.app.alarms.active(alarm.run) if is_related(other)]
+
+
+def _trend(context: PageContext, alarm: AlarmWithActions) -> AlarmTrend | None:
+    """The quantity before and since the raise; None without a history."""
+    if alarm.quantity not in trend_names() or alarm.spacecraft not in context.app.missions:
+        return None
+    if alarm.tracker is not None and not _has_tracker(context, alarm):
+        return None
+    raised = recorded_utc(alarm.raised.time)
+    start = shifted(raised, -TREND_BEFORE_S)
+    # The latest batch belongs to the period.
+    end = max(
+        shifted(raised, AFTER_S),
+        shifted(recorded_utc(alarm.latest.time), 0.001),
+        key=lambda moment: moment.tai_ns,
+    )
+    found = context.app.spacecraft.history(
+        alarm.spacecraft,
+        run=alarm.run,
+        start=start,
+        end=end,
+        size=TREND_POINTS,
+        quantities=[alarm.quantity],
+        tracker=alarm.tracker,
+    )
+    means = found.series[alarm.quantity].mean
+    assert means is not UNSET
+    start_s, end_s, raised_s = unix_seconds([each.tai_ns for each in (start, end, raised)]).tolist()
+    return alarm_trend(
+        found.unix_s,
+        means,
+        start_s=start_s,
+        end_s=end_s,
+        step_s=float(found.bucket_s or 1),
+        bound=alarm.raised.bound,
+        raised_s=raised_s,
     )

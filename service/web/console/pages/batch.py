@@ -10,6 +10,7 @@ from msgspec import structs
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
+from service.alarms.quantities import QUANTITIES
 from service.errors import BadBatch, Fault, shown_value
 from service.storage.models.answers import Answer
 from service.storage.models.answers import Star as FoundStar
@@ -30,7 +31,10 @@ from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
 
 VIEWS = ("all", "field")
-"""What the chart shows: all candidates of the answer, or the field of view alone."""
+"""The content of the chart: all candidates of the answer, or the field of view alone."""
+
+SCALE = 3.0
+"""What the bars of the trackers' residuals reach to at least, in predicted residuals."""
 
 ResultId = Annotated[str, Path()]
 
@@ -81,6 +85,7 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
         answer=answer,
         tried=tried,
         shown=shown,
+        trackers=_trackers(context.app.results.trackers(id, tried)),
         stars=_stars(shown, answer if tried else None, field),
         charts=[sky_chart(each, field.through, view) for each in field.trackers],
         view=view,
@@ -123,6 +128,17 @@ def _stars(shown: Answer, before: Answer | None, field: StarField) -> list[VoteR
                 )
             )
     return stars
+
+
+def _trackers(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Each tracker with its residual over the predicted one, on one scale for all."""
+    ratio_of = QUANTITIES["residual_ratio"].value_of
+    ratios = [ratio_of(row) for row in rows]
+    scale = max(SCALE, *(each or 0.0 for each in ratios)) if ratios else SCALE
+    return [
+        row | {"ratio": ratio, "width": (ratio or 0.0) / scale, "mark": 1.0 / scale}
+        for row, ratio in zip(rows, ratios, strict=True)
+    ]
 
 
 def _pointing(shown: Answer) -> list[dict[str, Any]]:

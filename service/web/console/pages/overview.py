@@ -1,16 +1,21 @@
-"""The first page: the state of every spacecraft, a row each."""
+"""The first page: the state of every spacecraft, a row each, the worst first."""
 
 from dataclasses import dataclass
-from datetime import datetime
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
+import numpy as np
 from fastapi import Query as InQuery
+from pydantic import Field
 from starlette.responses import Response
 
-from service.storage.models.overview import OverviewRow
-from service.storage.models.overview import WindowCounts as Sums
+from service.alarms.limits import Severity
+from service.alarms.quantities import QUANTITIES, BatchShare, OneOf, StarShare
+from service.storage.models.fleet import Fleet, FleetCells, FleetRow
+from service.storage.queries.fleet import PERIODS_S, Period
 from service.times import DAY_S, parse_utc, shifted
-from service.web.console.charts.sparkline import SparklineDrawing, sparkline
+from service.vectors import Matrix
+from service.web.console.charts.heat_map import packed
+from service.web.console.charts.sparkline import SparklineDrawing, common_top, sparkline
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
@@ -18,66 +23,204 @@ from service.web.requests.access import Policy
 
 STALE_AFTER_S = 3600.0
 """A spacecraft this far behind the latest batch of its run is marked as stale."""
+Order = Literal["worst", "name", "behind", "unique", "ambiguous", "unmatched", "alarms"]
+Shown = Literal["all", "trouble", "alarm", "stale", "good", "suspect", "no_attitude", "no_batches"]
+SHOWN: dict[Shown, str] = {
+    "all": "all",
+    "trouble": "in trouble",
+    "alarm": "with an alarm",
+    "stale": "behind the run",
+    "good": "good",
+    "suspect": "suspect",
+    "no_attitude": "no attitude",
+    "no_batches": "no batches",
+}
+MARKED_SHARE = 0.15
+"""Of ambiguous or unmatched stars in the last hour: as shipped, the bound of `watch`."""
+_STATES = ("good", "suspect", "no_attitude")
+SPARK_QUANTITIES = ("ambiguous_share", "unmatched_share")
 
 
-@dataclass(frozen=True)
-class OverviewWindow:
-    """The hour or day before the run's latest batch: sums and a sparkline."""
+def share_names() -> tuple[str, ...]:
+    """The quantities of the heat map."""
+    return tuple(name for name, each in QUANTITIES.items() if each.is_share)
 
-    sums: Sums | None
-    spark: SparklineDrawing | None
+
+class OverviewQuery(PageQuery):
+    """Which rows, in which order, over which period."""
+
+    period: Period = "day"
+    sort: Order = "worst"
+    descending: bool | None = None
+    q: Annotated[str, Field(max_length=64)] = ""
+    show: Shown = "all"
+    heat: Annotated[str, OneOf(share_names)] | None = None
+
+    def address(self, **changed: Any) -> dict[str, Any]:
+        """The parameters of this page with some changed; those at their default are left out."""
+        asked = {name: changed.get(name, value) for name, value in self if name != "run"}
+        fields = type(self).model_fields
+        kept = {name: value for name, value in asked.items() if value != fields[name].default}
+        return {
+            name: str(value).lower() if name == "descending" else value
+            for name, value in kept.items()
+        }
 
 
 @dataclass(frozen=True)
 class OverviewLine:
-    """One spacecraft's row."""
+    """One spacecraft's row; `place` is that of its cells."""
 
-    item: OverviewRow
-    windows: tuple[tuple[str, OverviewWindow], ...]
-
-    @property
-    def last_day(self) -> tuple[str, str]:
-        """The bounds of the day that ends with the spacecraft's latest batch."""
-        latest = self.item.latest_batch
-        assert latest is not None
-        # The latest batch belongs to it, and the end of a stretch does not.
-        end = shifted(parse_utc(latest.time), 0.001)
-        return shifted(end, -DAY_S).text, end.text
+    item: FleetRow
+    place: int
+    spark: SparklineDrawing | None
 
     @property
     def is_stale(self) -> bool:
         """Whether it has fallen behind the run."""
-        age_s = self.item.age_s
-        return age_s is not None and age_s > STALE_AFTER_S
+        return self.item.age_s is not None and self.item.age_s > STALE_AFTER_S
+
+    @property
+    def in_trouble(self) -> bool:
+        """Whether it needs a look: out of limits, without a good attitude, or behind."""
+        item = self.item
+        return bool(item.alarms_now) or self.is_stale or item.state in ("suspect", "no_attitude")
+
+    @property
+    def last_day(self) -> dict[str, str]:
+        """The bounds of the day that ends with its latest batch."""
+        assert self.item.latest_batch is not None
+        # The latest batch belongs to it, and the end of a stretch does not.
+        end = shifted(parse_utc(self.item.latest_batch.time), 0.001)
+        return {"start": shifted(end, -DAY_S).text, "end": end.text}
+
+    def share(self, outcome: str) -> float:
+        """The share of an outcome in the last hour; -1 where nothing was observed."""
+        counts = self.item.last_hour
+        if counts is None or not counts.observed:
+            return -1.0
+        return float(getattr(counts, outcome)) / counts.observed
+
+    def is_marked(self, outcome: str) -> bool:
+        """Whether the share of an outcome needs attention."""
+        return outcome != "unique" and self.share(outcome) > MARKED_SHARE
 
 
 @console_page("/", "Overview", Policy("read", "nothing"), position=10)
-def overview_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
+def overview_page(query: Annotated[OverviewQuery, InQuery()], context: ContextDep) -> Response:
     """State, attitude, shares, alarms and age of every spacecraft in a run."""
-    overview = context.app.spacecraft.overview(query.run)
-    lines = [
-        OverviewLine(
-            item, (("last hour", _window(item, "hour")), ("last day", _window(item, "day")))
-        )
-        for item in overview.items
-        if context.caller.may_see(item.name)
-    ]
+    fleet = context.app.spacecraft.fleet(context.spacecraft, query.run, query.period)
+    shares = {} if fleet.cells is None else _shares(fleet.cells)
+    top = common_top(
+        max((_greatest(shares[name]) for name in SPARK_QUANTITIES if shares), default=0)
+    )
+    every = [_line(fleet, place, shares, top) for place in range(len(fleet.rows))]
+    lines = _sorted([line for line in every if _is_shown(line, query)], query)
     return rendered(
         "overview.html.jinja",
         context.layout(query.run),
-        overview=overview,
-        lines=sorted(lines, key=lambda line: line.item.latest_batch is None),
-        any_batch=any(line.item.latest_batch for line in lines),
+        query=query,
+        fleet=fleet,
+        lines=lines,
+        any_batch=fleet.as_of is not None and any(line.item.latest_batch for line in every),
+        every=every,
+        top=top,
+        periods=list(PERIODS_S),
+        shown=SHOWN,
+        heat=_heat(fleet, lines, shares, query.period),
     )
 
 
-def _window(item: OverviewRow, name: str) -> OverviewWindow:
-    sums, series = getattr(item, f"last_{name}"), getattr(item, f"sparkline_{name}")
-    if not sums or not sums.batches:
-        return OverviewWindow(sums, None)
-    return OverviewWindow(sums, sparkline(series, _unix_s(sums.start), _unix_s(sums.end)))
+def _shares(cells: FleetCells) -> dict[str, Matrix]:
+    """Every share with a history, of each spacecraft and cell; NaN without a batch."""
+    found = {}
+    for quantity in QUANTITIES.values():
+        match quantity.source:
+            case StarShare(part):
+                whole = cells.counts["observed"]
+            case BatchShare(part):
+                whole = cells.counts["batches"]
+            case _:
+                continue
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found[quantity.name] = np.where(whole > 0, part(cells.counts) / whole, np.nan)
+    return found
 
 
-def _unix_s(text: str) -> float:
-    """POSIX seconds; within a leap second those of the second before."""
-    return datetime.fromisoformat(text.replace(":60", ":59")).timestamp()
+def _greatest(shares: Matrix) -> float:
+    return float(np.nanmax(shares)) if np.isfinite(shares).any() else 0.0
+
+
+def _line(fleet: Fleet, place: int, shares: dict[str, Matrix], top: float) -> OverviewLine:
+    item = fleet.rows[place]
+    if not shares or item.latest_batch is None:
+        return OverviewLine(item, place, None)
+    drawn = {name: shares[name][place] for name in SPARK_QUANTITIES}
+    return OverviewLine(item, place, sparkline(drawn, top))
+
+
+def _is_shown(line: OverviewLine, query: OverviewQuery) -> bool:
+    wanted, item = query.q.strip().casefold(), line.item
+    if wanted and wanted not in f"{item.name} {item.description}".casefold():
+        return False
+    match query.show:
+        case "all":
+            return True
+        case "trouble":
+            return line.in_trouble
+        case "alarm":
+            return any(each.state != "shelved" for each in item.alarms)
+        case "stale":
+            return line.is_stale
+        case state:
+            return item.state == state
+
+
+def _sorted(lines: list[OverviewLine], query: OverviewQuery) -> list[OverviewLine]:
+    """In the asked order; the worst or the greatest first, names from A on."""
+    ordered = sorted(lines, key=lambda line: line.item.name)
+    if query.sort == "name":
+        return ordered[::-1] if query.descending else ordered
+    keys: dict[Order, Any] = {
+        "worst": _badness,
+        "behind": lambda line: (line.item.age_s or 0.0, line.item.received_age_s or 0.0),
+        "alarms": lambda line: (_severity(line), len(line.item.alarms)),
+    }
+    key = keys.get(query.sort) or (lambda line: line.share(query.sort))
+    ordered.sort(key=key, reverse=query.descending is not False)
+    # What has no batch has no place in an order of values.
+    return sorted(ordered, key=lambda line: line.item.latest_batch is None)
+
+
+def _badness(line: OverviewLine) -> tuple[float, ...]:
+    item = line.item
+    state = _STATES.index(item.state) if item.state in _STATES else -1
+    share = line.share("ambiguous") + line.share("unmatched")
+    return _severity(line), state, line.is_stale, len(item.alarms_returned), share
+
+
+def _severity(line: OverviewLine) -> int:
+    """The worst severity of its alarms now; 0 without any."""
+    words = [each.current_severity or each.severity for each in line.item.alarms_now]
+    return max((int(Severity[word.upper()]) for word in words), default=0)
+
+
+def _heat(
+    fleet: Fleet, lines: list[OverviewLine], shares: dict[str, Matrix], period: Period
+) -> dict[str, Any] | None:
+    """The heat map: its rows are those of the table, its quantities all shares."""
+    shown = [line for line in lines if line.item.latest_batch]
+    if fleet.cells is None or not shown:
+        return None
+    places = [line.place for line in shown]
+    return {
+        "start": fleet.cells.start_s,
+        "width": fleet.cells.width_s,
+        "columns": fleet.cells.columns,
+        "period": period,
+        "names": [line.item.name for line in shown],
+        "quantities": [
+            {"name": name, "label": QUANTITIES[name].label, "cells": packed(values[places])}
+            for name, values in shares.items()
+        ],
+    }

@@ -2,17 +2,20 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 from urllib.parse import quote, urlencode
 
 from fastapi import Path
 from fastapi import Query as InQuery
+from pydantic import Field, ValidationInfo, field_validator
 from starlette.responses import Response
 
 from service.alarms.quantities import QUANTITIES, RankedName, ranked_names, trend_names
-from service.app.output_formats import OUTPUT_FORMATS
+from service.alarms.subjects import limited_trackers
+from service.observations.schema import Key
+from service.products.formats import table_formats
 from service.storage.models.answers import Summary
-from service.storage.models.trends import RankedBatch
+from service.storage.models.trends import Ranking
 from service.times import DAY_S, HOUR_S, Utc, parse_utc, shifted
 from service.web.console.page_context import LIVE, ContextDep, PageContext, PageQuery
 from service.web.console.registry import console_page
@@ -20,13 +23,18 @@ from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
 from service.web.requests.query_parameters import End, Start
 
-Range = Literal["hour", "day", "month", "year"]
-RANGES_S: dict[Range, int] = {
+RANGES_S: dict[str, int] = {
     "hour": HOUR_S,
     "day": DAY_S,
+    "week": 7 * DAY_S,
     "month": 30 * DAY_S,
     "year": 365 * DAY_S,
 }
+UNITS_S = {"min": 60, "h": HOUR_S, "d": DAY_S, "w": 7 * DAY_S}
+Range = Annotated[
+    str, Field(pattern=rf"^({'|'.join(RANGES_S)}|[1-9][0-9]{{0,3}}({'|'.join(UNITS_S)}))$")
+]
+"""The length of a period that ends with the latest batch: by its name, or such as `6h`."""
 POINTS = 240
 """The most points of a curve: as many as a chart can show."""
 WORST, LATEST = 10, 10
@@ -57,15 +65,25 @@ CHARTS: Sequence[tuple[str, str, tuple[str, ...]]] = (
 UNITS = {"arcsec": "″", "deg": "°", "mag": " mag"}
 
 
-def charts() -> list[dict[str, Any]]:
-    """The charts of every quantity that has a history."""
+TRACKER_CHARTS = {"batches": "Batches in which the tracker disagrees with the others"}
+"""Titles that differ for the quantities of one tracker."""
+
+
+def charts(tracker: str | None = None) -> list[dict[str, Any]]:
+    """The charts of every quantity that has a history, or that a tracker has."""
     shown = {name for _, _, names in CHARTS for name in names}
     others = [
         (name.replace("_", "-"), QUANTITIES[name].label.capitalize(), (name,))
         for name in trend_names()
         if name not in shown
     ]
-    return [_chart(*each) for each in (*CHARTS, *others)]
+    if tracker is None:
+        return [_chart(*each) for each in (*CHARTS, *others)]
+    of_tracker = [
+        (id, TRACKER_CHARTS.get(id, title), [name for name in names if QUANTITIES[name].by_tracker])
+        for id, title, names in (*CHARTS, *others)
+    ]
+    return [_chart(*each) for each in of_tracker if each[-1]]
 
 
 def _chart(id: str, title: str, names: Sequence[str]) -> dict[str, Any]:
@@ -80,19 +98,38 @@ def _chart(id: str, title: str, names: Sequence[str]) -> dict[str, Any]:
 
 
 class SpacecraftQuery(PageQuery):
-    """Which period: a range that ends with the latest batch, or explicit bounds."""
+    """Which period: a range that ends with the latest batch, or explicit bounds.
 
-    range: Range = "day"
+    Without any, a day of live batches, and of a named run the shortest range that holds it.
+    """
+
+    range: Range | None = None
     start: Start = None
     end: End = None
     by: RankedName | None = None
+    tracker: Key | None = None
+
+    @field_validator("start", "end", "range", mode="before")
+    @classmethod
+    def _without_empty_fields(cls, value: object, info: ValidationInfo) -> object:
+        """A field of the form that was left empty counts as not given."""
+        default = cls.model_fields[info.field_name or ""].default
+        return default if value == "" else value
+
+
+def range_s(text: str) -> int:
+    """The length of a range."""
+    if text in RANGES_S:
+        return RANGES_S[text]
+    number = text.rstrip("".join(UNITS_S))
+    return int(number) * UNITS_S[text.removeprefix(number)]
 
 
 @dataclass(frozen=True)
 class ShownPeriod:
     """The shown period; `range` is None where the address has explicit bounds."""
 
-    range: Range | None
+    range: str | None
     start: Utc
     end: Utc
 
@@ -118,8 +155,10 @@ def spacecraft_page(
     """Trends of one spacecraft in a run, its worst batches, and its latest ones."""
     state = context.app.spacecraft.state(name)
     latest = context.app.results.page(spacecraft=name, run=query.run, limit=LATEST).items
-    stretch = _shown_period(query, latest)
-    by, worst = _worst(context, name, query, stretch)
+    stretch = _shown_period(context, name, query, latest)
+    trackers = limited_trackers(context.app.missions[name])
+    ranking = _worst(context, name, query, stretch)
+    ranked = [each for each in ranked_names() if not query.tracker or QUANTITIES[each].by_tracker]
     return rendered(
         "spacecraft.html.jinja",
         context.layout(query.run),
@@ -129,41 +168,70 @@ def spacecraft_page(
         attitude=_attitude(context, latest),
         stretch=stretch,
         ranges=list(RANGES_S),
-        by=by,
-        quantities=ranked_names(),
-        charts=charts(),
-        worst=worst,
-        limits=context.app.limits.all(name),
-        formats=OUTPUT_FORMATS,
-        history=lambda **more: stretch and _history_address(name, query.run, stretch, more),
+        by=ranking.by,
+        trackers=trackers,
+        tracker=query.tracker,
+        not_split=ranking.not_split is True,
+        quantities=ranked,
+        charts=charts(query.tracker),
+        worst=ranking.items,
+        limits=context.app.limits.all(name, query.tracker if trackers else None),
+        formats=table_formats(),
+        history=lambda **more: stretch and _history_address(name, query, stretch, more),
     )
 
 
-def _shown_period(query: SpacecraftQuery, latest: list[Summary]) -> ShownPeriod | None:
+def _shown_period(
+    context: PageContext, name: str, query: SpacecraftQuery, latest: list[Summary]
+) -> ShownPeriod | None:
     """The period that the address names; None without any batch."""
     if not latest:
         return None
     # The latest batch belongs to the stretch, whose end does not.
     end = query.end or shifted(parse_utc(latest[0].time), 0.001)
-    start = query.start or shifted(end, -RANGES_S[query.range])
-    return ShownPeriod(None if query.start or query.end else query.range, start, end)
+    if query.start or query.end:
+        start = query.start or shifted(end, -range_s(query.range or "day"))
+        return ShownPeriod(None, start, end)
+    chosen = query.range or _fitting_range(context, name, query.run, end)
+    return ShownPeriod(chosen, shifted(end, -range_s(chosen)), end)
+
+
+def _fitting_range(context: PageContext, name: str, run: str, end: Utc) -> Range:
+    """The range to show first: the shortest that holds the attitudes of a named run."""
+    if run == LIVE:
+        return "day"
+    first = context.app.spacecraft.attitudes(name, run=run, limit=1).items
+    if not first:
+        return "day"
+    length_s = (end.tai_ns - parse_utc(first[0].time).tai_ns) / 1e9
+    return next((each for each, width_s in RANGES_S.items() if width_s >= length_s), "year")
 
 
 def _worst(
     context: PageContext, name: str, query: SpacecraftQuery, stretch: ShownPeriod | None
-) -> tuple[RankedName, list[RankedBatch]]:
-    """The worst batches and their quantity: by default the first one with a value above zero."""
-    if stretch is None:
-        return query.by or FIRST_LOOKED_AT[0], []
+) -> Ranking:
+    """The worst batches by a quantity: by default the first one with a value above zero."""
     asked = (query.by,) if query.by else FIRST_LOOKED_AT
-    found: dict[RankedName, list[RankedBatch]] = {}
+    if query.tracker and not query.by:
+        asked = tuple(by for by in FIRST_LOOKED_AT if QUANTITIES[by].by_tracker)
+    if stretch is None:
+        return Ranking(by=asked[0], items=[])
+    found = []
     for by in asked:
-        found[by] = context.app.spacecraft.worst_batches(
-            name, by=by, run=query.run, start=stretch.start, end=stretch.end, limit=WORST
+        found.append(
+            context.app.spacecraft.ranking(
+                name,
+                by=by,
+                run=query.run,
+                start=stretch.start,
+                end=stretch.end,
+                limit=WORST,
+                tracker=query.tracker,
+            )
         )
-        if found[by] and found[by][0].value:
-            return by, found[by]
-    return asked[0], found[asked[0]]
+        if found[-1].items and found[-1].items[0].value:
+            return found[-1]
+    return found[0]
 
 
 def _attitude(context: PageContext, latest: list[Summary]) -> Any:
@@ -173,7 +241,11 @@ def _attitude(context: PageContext, latest: list[Summary]) -> Any:
     return context.app.results.get(latest[0].id).answer.attitude
 
 
-def _history_address(name: str, run: str, stretch: ShownPeriod, more: dict[str, Any]) -> str:
-    asked: dict[str, object] = {} if run == LIVE else {"run": run}
+def _history_address(
+    name: str, query: SpacecraftQuery, stretch: ShownPeriod, more: dict[str, Any]
+) -> str:
+    asked: dict[str, object] = {} if query.run == LIVE else {"run": query.run}
+    if query.tracker:
+        asked["tracker"] = query.tracker
     asked |= {"start": stretch.start.text, "end": stretch.end.text, "size": POINTS} | more
     return f"/api/v1/spacecraft/{quote(name)}/history?{urlencode(asked)}"

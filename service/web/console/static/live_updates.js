@@ -7,6 +7,7 @@ import { fetchLatest, swapRegions } from "./regions.js";
 
 const EVENT_KINDS = ["batches", "alarm", "limit", "replay", "adopted"];
 const DRAW_EVERY_MS = 1000;
+const SHARE_OF_DRAWING = 0.2;
 const FIRST_RETRY_MS = 1000;
 const LONGEST_RETRY_MS = 30000;
 const SHOW_LOST_AFTER_MS = 3000;
@@ -22,6 +23,7 @@ let retryMs = FIRST_RETRY_MS;
 let retry = null;
 let refused = false;
 let stale = false;
+let drawEveryMs = DRAW_EVERY_MS;
 
 function clock(moment) {
   return moment.toISOString().slice(0, 19).replace("T", " ");
@@ -37,13 +39,17 @@ function concernsRun(data) {
   return data.run === undefined || data.run === run;
 }
 
-// Redraws the page soon, at most once a second however much is recorded.
+// Redraws the page soon, at most once a second however much is recorded; less often if the page
+// takes so long that it would keep the service busy.
 export function refreshSoon() {
   drawing ??= setTimeout(async () => {
     drawing = null;
+    const begun = performance.now();
     try {
       const fresh = await fetchLatest(location.href);
       if (fresh === null) return;
+      const wishedMs = (performance.now() - begun) / SHARE_OF_DRAWING;
+      drawEveryMs = Math.min(POLL_MS, Math.max(DRAW_EVERY_MS, wishedMs));
       swapRegions(fresh);
       document.dispatchEvent(new CustomEvent("drawn"));
       if (stale && lostAt === null && !refused) showState("live", "● Connected");
@@ -53,7 +59,7 @@ export function refreshSoon() {
       showState("lost", `▲ Not up to date: ${error.message}; trying again every ${POLL_MS / 1000} s; the page shows the previous state`);
       setTimeout(refreshSoon, POLL_MS);
     }
-  }, DRAW_EVERY_MS);
+  }, drawEveryMs);
 }
 
 // Ages on the page, counted on from the time at which it was drawn.
@@ -167,6 +173,8 @@ function showLost() {
 }
 
 export function keepFresh() {
+  // Nothing that is recorded changes such a page.
+  if (document.body.dataset.stream === "off") return;
   // There is no stream for a token that is bound to several spacecraft.
   if (document.body.dataset.stream === "none") {
     setInterval(() => document.hidden || refreshSoon(), POLL_MS);

@@ -38,6 +38,8 @@ function isBusy(region) {
 
 // Replaces every region of the page that has changed; focus and open details stay where they were.
 export function swapRegions(fresh, selector = "[data-region]") {
+  // The title counts the open alarms.
+  if (fresh.title) document.title = fresh.title;
   for (const region of document.querySelectorAll(selector)) {
     const next = fresh.getElementById(region.id);
     if (!next || isBusy(region)) continue;

@@ -6,7 +6,7 @@ import { Trend } from "./trend.js";
 const stretch = () => document.getElementById("stretch");
 const status = document.getElementById("charts-status");
 
-const LINES = [{ tone: "--accent" }, { tone: "--soft", dash: [5, 4] }];
+const LINES = [{ tone: "--curve" }, { tone: "--soft", dash: [5, 4] }];
 
 let trends = [];
 let asked = 0;

@@ -83,7 +83,7 @@ function merged(lines, names) {
 function drawLimits(chart, lines) {
   const { ctx, bbox } = chart;
   ctx.save();
-  ctx.strokeStyle = ctx.fillStyle = colour("--accent-ink");
+  ctx.strokeStyle = ctx.fillStyle = colour("--limit");
   ctx.textAlign = "left";
   ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
   for (const { severity, value, text } of lines) {
@@ -102,13 +102,20 @@ function drawLimits(chart, lines) {
   ctx.restore();
 }
 
+// The usual time from a bucket with batches to the next: batches may come less often than buckets.
+function usualStep({ unix_s: starts, bucket_s: width }) {
+  const steps = starts.slice(1).map((start, index) => start - starts[index]).sort((a, b) => a - b);
+  return Math.max(width, steps[Math.floor(steps.length / 2)] ?? 0);
+}
+
 // Values of a quantity, with a gap of one point wherever buckets are missing.
 function withGaps(history) {
   const moments = [];
   const places = [];
   const width = history.bucket_s;
+  const step = usualStep(history);
   history.unix_s.forEach((start, index) => {
-    if (index && start - history.unix_s[index - 1] > 1.5 * width) {
+    if (index && start - history.unix_s[index - 1] > 1.5 * step) {
       moments.push(history.unix_s[index - 1] + width);
       places.push(null);
     }

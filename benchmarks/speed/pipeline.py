@@ -75,12 +75,12 @@ def run(quick: bool, seed: int) -> Report:
     figures: dict[str, Any] = {}
     bounds: list[Bound] = []
     count = QUICK_BATCHES if quick else BATCHES
-    with tqdm(total=len(PLACES) * count, desc="staircase", unit="batch") as bar:
+    with tqdm(total=len(PLACES) * count, desc="pipeline", unit="batch") as bar:
         for name in PLACES:
             place = measured(name, count, np.random.default_rng(seed), sky, bar.update)
             figures |= {f"{name}: {key}": value for key, value in place.figures.items()}
             bounds += [replace(each, figure=f"{name}: {each.figure}") for each in place.bounds]
-    return Report("staircase", figures, bounds)
+    return Report("pipeline", figures, bounds)
 
 
 def measured(
@@ -144,7 +144,7 @@ def measured(
         f"zones built by {CONCURRENT} first requests at once": built,
         "identify, median us": statistics.median(identify),
         "solve, median us": statistics.median(solve),
-        "whole staircase, median us": statistics.median(whole),
+        "whole pipeline, median us": statistics.median(whole),
         "identify and solve in empty compiled calls": both / empty_us,
         PLAIN: plain_us / statistics.median(whole),
         HELD: sum(judge.comparison.outcomes.values()),
@@ -155,7 +155,7 @@ def measured(
         at_least("1994 deadline over cold zone", factor, DEADLINE_FACTOR),
         equal(f"zones built by {CONCURRENT} first requests at once", built, 1),
         at_most("identify and solve together, median", both, BOUND_US[kind], "µs"),
-        at_most("whole staircase, median", statistics.median(whole), WHOLE_US[kind], "µs"),
+        at_most("whole pipeline, median", statistics.median(whole), WHOLE_US[kind], "µs"),
         at_most("identify and solve in empty compiled calls", both / empty_us, EMPTY_CALLS[kind]),
         at_least(PLAIN, figures[PLAIN], LEAST_OVER_PLAIN),
         at_least(HELD, figures[HELD], 4 * count),

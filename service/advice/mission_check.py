@@ -1,0 +1,232 @@
+"""Findings about a mission file: settings that are allowed but that its author rarely means.
+
+A file that cannot be read at all is refused by `read_mission`.  The bounds here are wide
+about the shipped missions, which pass.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from service.advice.zone_census import Spread, ZoneCensus, share_below, spread_of, stars_in_view
+from service.missions.mission import Band, Mission, Tracker
+from service.sky.catalog.run_catalog import RunCatalog
+from service.vectors import separation_deg
+
+Level = Literal["wrong", "unusual"]
+
+LEAST_SIGMAS, MOST_SIGMAS = 3.0, 30.0
+"""A tolerance below the first loses true stars, above the second lets in chance ones."""
+FEW_STARS = 3
+"""Fewer stars in the field of view seldom give an identification that can be trusted."""
+FEW_SHARE = 0.05
+MANY_STARS = 100
+MANY_PAIRS = 300_000
+"""Of one zone: 5 MB, and as many pairs to look through for each batch."""
+SIGMAS_ARCSEC = 0.1, 120.0
+SAME_BORESIGHT_DEG = 0.1
+COELEVATION_DEG = 0.5
+CORNER_SHARE = 0.05
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One setting by its key, and what about it is wrong or unusual."""
+
+    level: Level
+    key: str
+    text: str
+
+
+@dataclass(frozen=True)
+class TrackerView:
+    """How many stars of the run catalog a tracker sees over the whole sky."""
+
+    tracker: str
+    stars: Spread
+    few_share: float
+    """The share of the sky where it sees fewer than `FEW_STARS`."""
+
+
+def tracker_views(mission: Mission, run_catalog: RunCatalog) -> list[TrackerView]:
+    """The view of each tracker."""
+    found = []
+    for tracker in mission.trackers:
+        counts = stars_in_view(run_catalog, tracker.field_of_view_radius_deg)
+        found.append(TrackerView(tracker.name, spread_of(counts), share_below(counts, FEW_STARS)))
+    return found
+
+
+def axis_findings(mission: Mission) -> list[Finding]:
+    """Faults of the zone's axis; with them no zone can be built, and none is counted."""
+    length = math.hypot(*mission.zone.axis_body)
+    if not (math.isfinite(length) and length > 1e-6):
+        return [Finding("wrong", "zone.axis_body", "has no direction: give a unit vector")]
+    if abs(length - 1.0) > 1e-3:
+        text = f"has the length {length:g}; it is used as a direction, so check its components"
+        return [Finding("unusual", "zone.axis_body", text)]
+    return []
+
+
+def findings(
+    mission: Mission,
+    faintest_mag: float,
+    views: list[TrackerView],
+    zones: list[ZoneCensus],
+) -> list[Finding]:
+    """Everything that is wrong or unusual, what is wrong first.
+
+    `faintest_mag` is the magnitude of the star catalog's faintest stars.
+    """
+    found = [
+        *axis_findings(mission),
+        *_zone(mission),
+        *_tolerances(mission),
+        *_trackers(mission),
+        *_stars(mission, faintest_mag, views, zones),
+    ]
+    return sorted(found, key=lambda each: each.level != "wrong")
+
+
+def _zone(mission: Mission) -> Iterator[Finding]:
+    zone = mission.zone
+    widest_deg = max(each.field_of_view_radius_deg for each in mission.trackers)
+    if not isinstance(zone, Band):
+        if zone.radius_deg <= widest_deg:
+            yield Finding(
+                "unusual",
+                "zone.radius_deg",
+                f"{zone.radius_deg:g} is no more than the field of view of {widest_deg:g} deg: it "
+                "leaves no room for an error of the a priori attitude; it should be the field of "
+                "view and that error together",
+            )
+        off_deg = [separation_deg(t.boresight_body, mission.axis_body) for t in mission.trackers]
+        if min(off_deg) > SAME_BORESIGHT_DEG:
+            yield Finding(
+                "unusual",
+                "zone.axis_body",
+                f"no tracker looks along it, the nearest is {min(off_deg):.2f} deg away: an a "
+                "priori boresight without roll will be refused",
+            )
+        return
+    if zone.half_width_deg < widest_deg:
+        yield Finding(
+            "unusual",
+            "zone.half_width_deg",
+            f"{zone.half_width_deg:g} is less than the field of view of {widest_deg:g} deg: stars "
+            "at its edge are not in the zone",
+        )
+    for place, tracker in enumerate(mission.trackers):
+        told_deg = tracker.coelevation_deg or zone.coelevation_deg
+        true_deg = separation_deg(tracker.boresight_body, mission.axis_body)
+        off = abs(told_deg - true_deg)
+        if off <= COELEVATION_DEG:
+            continue
+        never = off > zone.half_width_deg + tracker.field_of_view_radius_deg
+        yield Finding(
+            "wrong" if never else "unusual",
+            f"trackers.{place}.coelevation_deg" if tracker.coelevation_deg else "zone",
+            f"{tracker.name} looks {true_deg:.2f} deg from the pole by its axes, and at the "
+            f"coelevation of {told_deg:g} deg by the file"
+            + (": its stars are never in the band" if never else ""),
+        )
+
+
+def _tolerances(mission: Mission) -> Iterator[Finding]:
+    told = mission.tolerances
+    widest_deg = 2.0 * max(each.field_of_view_radius_deg for each in mission.trackers)
+    limit_deg = told.pair_separation_max_deg
+    if limit_deg > 1.05 * widest_deg:
+        yield Finding(
+            "unusual",
+            "tolerances.pair_separation_max_deg",
+            f"{limit_deg:g}: no two stars of a field of {widest_deg:g} deg are so far apart; the "
+            "pair index is larger for nothing",
+        )
+    elif limit_deg < 0.5 * widest_deg:
+        yield Finding(
+            "unusual",
+            "tolerances.pair_separation_max_deg",
+            f"{limit_deg:g} is less than half of the field of {widest_deg:g} deg: most pairs of "
+            "a field are not in the index",
+        )
+    checked = [("separation_deg", told.separation_deg, "sigma_arcsec", math.sqrt(2.0) / 3600.0)]
+    if mission.tests.magnitude:
+        checked.append(("magnitude_mag", told.magnitude_mag, "magnitude_sigma_mag", 1.0))
+    for name, tolerance, sigma_name, factor in checked:
+        sigmas = [tolerance / (factor * getattr(each, sigma_name)) for each in mission.trackers]
+        if min(sigmas) < LEAST_SIGMAS:
+            end = "true stars will fail the test"
+            yield _of_sigmas(name, tolerance, min(sigmas), end)
+        elif max(sigmas) > MOST_SIGMAS:
+            end = "stars that fit by chance will pass the test"
+            yield _of_sigmas(name, tolerance, max(sigmas), end)
+
+
+def _of_sigmas(name: str, tolerance: float, sigmas: float, end: str) -> Finding:
+    text = f"{tolerance:g} is {sigmas:.1f} times the error that the tracker's sigma predicts: {end}"
+    return Finding("unusual", f"tolerances.{name}", text)
+
+
+def _trackers(mission: Mission) -> Iterator[Finding]:
+    least, most = SIGMAS_ARCSEC
+    for place, tracker in enumerate(mission.trackers):
+        key = f"trackers.{place}"
+        if not least <= tracker.sigma_arcsec <= most:
+            text = f"{tracker.sigma_arcsec:g} arcsec per axis is unusual for a star tracker"
+            yield Finding("unusual", f"{key}.sigma_arcsec", text)
+        if tracker.magnitude_sigma_mag > 1.0:
+            text = f"{tracker.magnitude_sigma_mag:g} mag hardly tells stars apart"
+            yield Finding("unusual", f"{key}.magnitude_sigma_mag", text)
+        if abs(tracker.calibration.scale - 1.0) > 0.1:
+            text = f"{tracker.calibration.scale:g} changes angles by more than a tenth"
+            yield Finding("unusual", f"{key}.calibration.scale", text)
+        yield from _camera(key, tracker)
+        for other in mission.trackers[:place]:
+            if separation_deg(other.boresight_body, tracker.boresight_body) < SAME_BORESIGHT_DEG:
+                text = f"looks where {other.name} looks: are its axes those of the other?"
+                yield Finding("unusual", f"{key}.z_axis_body", f"{tracker.name} {text}")
+
+
+def _camera(key: str, tracker: Tracker) -> Iterator[Finding]:
+    if tracker.camera is None:
+        return
+    corner_deg, told_deg = tracker.camera.corner_radius_deg, tracker.field_of_view_radius_deg
+    if not math.isclose(corner_deg, told_deg, rel_tol=CORNER_SHARE):
+        yield Finding(
+            "unusual",
+            f"{key}.field_of_view_radius_deg",
+            f"{told_deg:g}, but the corner of the camera's frame is {corner_deg:.2f} deg from the "
+            "boresight",
+        )
+
+
+def _stars(
+    mission: Mission, faintest_mag: float, views: list[TrackerView], zones: list[ZoneCensus]
+) -> Iterator[Finding]:
+    limit_mag = mission.catalog.magnitude_limit_mag
+    if limit_mag > faintest_mag:
+        text = f"{limit_mag:g}: the star catalog ends at about {faintest_mag:.1f} mag"
+        yield Finding("unusual", "catalog.magnitude_limit_mag", text)
+    for view in views:
+        if view.few_share > FEW_SHARE:
+            yield Finding(
+                "unusual",
+                "catalog.magnitude_limit_mag",
+                f"{limit_mag:g}: {view.tracker} sees fewer than {FEW_STARS} stars in "
+                f"{100.0 * view.few_share:.0f} % of the sky",
+            )
+        elif view.stars.median > MANY_STARS:
+            yield Finding(
+                "unusual",
+                "catalog.magnitude_limit_mag",
+                f"{limit_mag:g}: {view.tracker} sees {view.stars.median} stars of the run catalog "
+                "in a usual field; fewer are enough, and faster",
+            )
+    for each in zones:
+        if int(np.max(each.pairs)) > MANY_PAIRS:
+            text = f"a {each.of} holds up to {int(np.max(each.pairs)):,} pairs: slow and large"
+            yield Finding("unusual", "zone", text)

@@ -1,0 +1,63 @@
+"""The usual cause of an alarm, and what to do about it, by quantity.
+
+The page of an alarm shows them, and docs/operators.md has the table of all.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Why a quantity usually leaves its limits, and what to do then."""
+
+    cause: str
+    remedy: str
+
+
+_SIGMA = Cause(
+    "The mission's sigma is too small, or the focal plane has changed.",
+    "Open the advice for the time of the alarm: it says how many times its sigma each tracker has, "
+    "and which lines to change.",
+)
+
+CAUSES: Mapping[str, Cause] = {
+    "ambiguous_share": Cause(
+        "Fewer or fainter stars than usual, or a crowded or sparse region of the sky.",
+        "Open the worst batch. If its residuals are as predicted, wait until the region has "
+        "passed, or try the separation tolerance that the advice names.",
+    ),
+    "unmatched_share": Cause(
+        "The a priori attitude drifts, so that stars lie beyond the edge of the zone; or false "
+        "stars: particles, planets, radiation.",
+        "Look at the angle from the a priori attitude. If it grows too, correct the a priori "
+        "attitude; if it stays, look in the worst batch where the false stars stand.",
+    ),
+    "no_attitude_share": Cause(
+        "Too few unique stars, or an a priori attitude that is wrong by more than the zone covers.",
+        "Open a batch without an attitude: it states the reason. Try it as lost in space; if that "
+        "finds an attitude, correct the a priori attitude.",
+    ),
+    "suspect_share": Cause(
+        "A misidentified star, or two trackers that disagree.",
+        "Open a suspect batch and compare its trackers. The advice measures the alignment of the "
+        "one that has moved.",
+    ),
+    "residual_rms_arcsec": _SIGMA,
+    "residual_ratio": _SIGMA,
+    "magnitude_offset_mag": Cause(
+        "The tracker's magnitudes have shifted.",
+        "Open the advice for the time of the alarm: it gives the offset. Until it is corrected, "
+        "widen the magnitude tolerance.",
+    ),
+    "a_priori_angle_deg": Cause(
+        "The a priori attitude drifts, or a slew was not announced.",
+        "Check where the a priori attitude comes from. Until it is corrected, send the batches as "
+        "lost in space, or widen the zone.",
+    ),
+    "silence_s": Cause(
+        "Telemetry, not the sky: the link, or the program that sends the batches.",
+        "Check that the sender runs and reaches the service, and whether its batches are refused.",
+    ),
+}
+"""Of every quantity with limits as shipped; one that is added may have none."""

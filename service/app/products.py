@@ -1,0 +1,77 @@
+"""Products: the attitudes of a spacecraft as a series, for any format."""
+
+from typing import Literal
+
+from service import __version__
+from service.app.context import Context
+from service.errors import BadBatch, Fault
+from service.missions.mission import mission_named
+from service.products.attitudes import (
+    DEFAULT_LARGEST_GAP_S,
+    DEFAULT_NAIF_ID,
+    AttitudeSeries,
+    SeriesInfo,
+    StatusWanted,
+    series_of,
+)
+from service.storage.queries.attitude_rows import attitude_pages, count_results
+from service.storage.queries.future_dated import LIVE
+from service.storage.queries.pages import ResultFilter
+from service.times import Utc, utc_now
+
+Order = Literal["oldest", "newest"]
+
+
+class Products:
+    """Reads what leaves the service as files."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+
+    def attitudes(
+        self,
+        name: str,
+        *,
+        run: str | None = None,
+        start: Utc | None = None,
+        end: Utc | None = None,
+        status: StatusWanted = "good",
+        order: Order = "oldest",
+        largest_gap_s: float = DEFAULT_LARGEST_GAP_S,
+        object_id: str | None = None,
+        naif_id: int = DEFAULT_NAIF_ID,
+        most_batches: int | None = None,
+    ) -> AttitudeSeries:
+        """The attitudes of a spacecraft's current results in a run; see `series_of`.
+
+        They are read as the series is.  Raises `BadBatch` where a period has more than
+        `most_batches`.
+        """
+        mission_named(self._context.missions, name)
+        about = SeriesInfo(
+            spacecraft=name,
+            run=run or LIVE,
+            created=utc_now().text,
+            version=__version__,
+            start=None if start is None else start.text,
+            end=None if end is None else end.text,
+            status=status,
+            newest_first=order == "newest",
+            largest_gap_s=largest_gap_s,
+            object_id=object_id,
+            naif_id=naif_id,
+        )
+        selected = ResultFilter(about.run, name, start, end)
+        if most_batches is not None:
+            with self._context.reading() as connection:
+                _require_at_most(
+                    most_batches, count_results(connection, selected, most_batches + 1)
+                )
+        pages = attitude_pages(self._context.reading, selected, newest_first=about.newest_first)
+        return series_of(about, pages)
+
+
+def _require_at_most(most: int, count: int) -> None:
+    if count > most:
+        message = f"the period has more than the {most:,} batches that a file of this format takes"
+        raise BadBatch(Fault("start", f"{message}; choose a shorter one"))

@@ -1,0 +1,138 @@
+"""The check of a mission file for a terminal, as JSON and as a picture."""
+
+import textwrap
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from service.advice.mission_check import (
+    FEW_STARS,
+    Finding,
+    TrackerView,
+    axis_findings,
+    findings,
+    tracker_views,
+)
+from service.advice.zone_census import ZoneCensus, axes_deg, zone_censuses
+from service.errors import BadInput, Fault, shown_value
+from service.sky.catalog.run_catalog import RunCatalog, build_run_catalog
+from service.times import FIRST_YEAR, LAST_YEAR, utc_now
+
+if TYPE_CHECKING:
+    from service.missions.mission import Mission
+    from service.sky.catalog.star_catalog import Catalog
+
+WIDTH = 96
+SHADES = " .:-=+*#%@"
+FAINTEST_SHARE = 99.0
+"""The percentile of magnitudes that is called the end of a star catalog."""
+
+
+@dataclass(frozen=True)
+class MissionReport:
+    """A mission with all that the check found."""
+
+    mission: "Mission"
+    run_catalog: RunCatalog
+    views: list[TrackerView]
+    zones: list[ZoneCensus]
+    findings: list[Finding]
+
+
+def examined(mission: "Mission", catalog: "Catalog", epoch: float | None) -> MissionReport:
+    """Check a mission with the run catalog of an epoch in years, by default this year's."""
+    year = utc_now().julian_year if epoch is None else epoch
+    if not FIRST_YEAR <= year <= LAST_YEAR + 1:
+        message = f"must be from {FIRST_YEAR} to {LAST_YEAR + 1}, as the time of a batch"
+        raise BadInput(Fault("--epoch", message, shown_value(epoch)))
+    run_catalog = build_run_catalog(catalog, mission.catalog, mission.catalog.epoch_of(year))
+    wrong = [each for each in axis_findings(mission) if each.level == "wrong"]
+    if wrong or len(run_catalog) == 0:
+        empty = Finding("wrong", "catalog", "leaves no star in the run catalog")
+        found = wrong or [empty]
+        return MissionReport(mission, run_catalog, [], [], found)
+    views, zones = tracker_views(mission, run_catalog), zone_censuses(mission, run_catalog)
+    faintest_mag = float(np.percentile(catalog.magnitude_v_mag, FAINTEST_SHARE))
+    found = findings(mission, faintest_mag, views, zones)
+    return MissionReport(mission, run_catalog, views, zones, found)
+
+
+def refusals(error: Exception, file: Path) -> list[dict[str, str]]:
+    """The faults of a file that cannot be read as a mission, by key."""
+    found = []
+    for line in str(error).splitlines():
+        key, _, text = line.removeprefix(f"{file}: ").partition(": ")
+        found.append({"level": "wrong", "key": key, "text": text})
+    return found
+
+
+def report_json(report: MissionReport) -> dict[str, Any]:
+    """The report as plain values."""
+    ra_deg, dec_deg = axes_deg()
+    return {
+        "mission": report.mission.name,
+        "epoch_year": report.run_catalog.epoch_year,
+        "run_catalog_stars": len(report.run_catalog),
+        "findings": [asdict(each) for each in report.findings],
+        "trackers": [asdict(each) for each in report.views],
+        "zones": [
+            {
+                "of": each.of,
+                **{name: asdict(spread) for name, spread in each.spread.items()},
+                "ra_deg": ra_deg.tolist(),
+                "dec_deg": dec_deg.tolist(),
+                "pairs_by_dec_ra": each.pairs.tolist(),
+            }
+            for each in report.zones
+        ],
+    }
+
+
+def report_text(report: MissionReport) -> str:
+    """The report as lines of text, with a map of the pairs of each shape of zone."""
+    mission, stars = report.mission, len(report.run_catalog)
+    lines = [
+        (
+            f"{mission.name}: {len(mission.trackers)} tracker(s), {stars} stars to "
+            f"{mission.catalog.magnitude_limit_mag:g} mag in the run catalog of "
+            f"{report.run_catalog.epoch_year:g}"
+        ),
+        "",
+    ]
+    for each in report.findings:
+        lines += textwrap.wrap(
+            f"{each.level:<10}{each.key}: {each.text}", WIDTH, subsequent_indent=" " * 10
+        )
+    if not report.findings:
+        lines.append("ok        nothing is wrong, nothing is unusual")
+    lines += ["", f"{'over the whole sky':<44}{'least':>10}{'median':>10}{'most':>10}"]
+    for view in report.views:
+        lines.append(_row(f"stars in the view of {view.tracker}", view.stars))
+        lines.append(
+            f"  fewer than {FEW_STARS} of them in {100.0 * view.few_share:.1f} % of the sky"
+        )
+    for zone in report.zones:
+        lines.append(zone.of)
+        lines += [_row(f"  {name}", spread) for name, spread in zone.spread.items()]
+    for zone in report.zones:
+        lines += ["", *_map(zone)]
+    return "\n".join(lines)
+
+
+def _row(title: str, of: Any) -> str:
+    return f"{title:<44}{of.least:>10,}{of.median:>10,}{of.most:>10,}"
+
+
+def _map(zone: ZoneCensus) -> list[str]:
+    """Pairs by the direction of the zone's axis, a character each."""
+    _, dec_deg = axes_deg()
+    most = max(1, int(zone.pairs.max()))
+    shade = np.minimum(zone.pairs * len(SHADES) // most, len(SHADES) - 1).astype(int)
+    lines = [f"pairs in a {zone.of}, by the direction of its axis; '@' is {most:,}"]
+    # East is to the left, as on the sky.
+    for dec, row in zip(dec_deg, shade[:, ::-1], strict=True):
+        lines.append(f"{dec:+5.0f} |{''.join(SHADES[each] for each in row)}|")
+    half = " " * 33
+    return [*lines, f"  RA  360{half}180{half}0 deg"]

@@ -1,0 +1,134 @@
+"""The time of a picture from its EXIF, which is read only where it is small.
+
+Pillow turns every number of an EXIF directory into an object, twenty times as large as the
+number in the file.
+"""
+
+import io
+import math
+import re
+import struct
+from contextlib import suppress
+from typing import IO, Any, NamedTuple
+
+from service.imaging.frames.frame import bad_frame
+
+MAX_EXIF_BYTES = 1 << 20
+_TYPE_BYTES = (8, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4)
+"""By the number of the type, of which 0 is none."""
+_EXIF, _EXPOSURE, _TAKEN, _OFFSET = 0x8769, 33434, 36867, 36881
+_LONGEST_EXPOSURE_S = 3600.0
+_TIME = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d):(\d\d):(\d\d)")
+_POINTERS = (_EXIF, 0x8825, 0xA005)
+"""Tags that lead to a directory of further ones: of EXIF, of GPS, of interoperability."""
+_MARK = b"Exif\0\0"
+_MAX_SEGMENTS = MAX_EXIF_BYTES // 65536
+_BLOCK_BYTES = 1 << 20
+
+
+class Entry(NamedTuple):
+    """One tag of a directory of TIFF, with the four bytes that are its value or its place."""
+
+    tag: int
+    kind: int
+    number: int
+    value: bytes
+
+    @property
+    def size_bytes(self) -> int:
+        """Of all its numbers."""
+        known = self.kind < len(_TYPE_BYTES)
+        return self.number * (_TYPE_BYTES[self.kind] if known else 8)
+
+    def whole(self, order: str) -> int:
+        """The value of a tag of one whole number."""
+        form = order + ("H2x" if self.kind == 3 else "L")
+        return int(struct.unpack(form, self.value)[0])
+
+
+def directory(file: IO[bytes], order: str, at: int) -> list[Entry]:
+    """The entries of a directory of TIFF; raises `struct.error` where the file ends before."""
+    file.seek(at)
+    (count,) = struct.unpack(order + "H", file.read(2))
+    return [Entry(*struct.unpack(order + "HHL4s", file.read(12))) for _ in range(count)]
+
+
+def bytes_beyond(file: IO[bytes], order: str, entries: list[Entry], depth: int = 2) -> int:
+    """The size of all tags in the directories to which entries lead, and these in turn."""
+    total = 0
+    # The first of equal tags counts.
+    for tag, entry in {entry.tag: entry for entry in reversed(entries)}.items():
+        if tag in _POINTERS and entry.number == 1:
+            with suppress(struct.error):
+                inside = directory(file, order, entry.whole(order))
+                total += sum(each.size_bytes for each in inside)
+                total += bytes_beyond(file, order, inside, depth - 1) if depth > 1 else 0
+    return total
+
+
+def require_small_exif(file: IO[bytes]) -> None:
+    """Raise `BadFile` for a JPEG with much EXIF, of which Pillow reads some on opening it.
+
+    One piece has up to 64 KiB; Pillow joins all that there are.
+    """
+    file.seek(0)
+    found, before = 0, b""
+    while block := file.read(_BLOCK_BYTES):
+        found += (before + block).count(_MARK)
+        before = block[1 - len(_MARK) :]
+    if found > _MAX_SEGMENTS:
+        raise bad_frame(f"has more than {MAX_EXIF_BYTES} bytes of EXIF", f"{found} pieces")
+    file.seek(0)
+
+
+def exposure_of(image: Any) -> tuple[str | None, float | None]:
+    """The UTC of mid exposure and the exposure in seconds, each None where EXIF does not tell.
+
+    A camera's clock without its offset from UTC tells no time.
+    """
+    if not _is_small(image):
+        return None, None
+    try:
+        exif = image.getexif().get_ifd(_EXIF)
+    except Exception:
+        # Pillow raises many kinds of errors for broken EXIF. The picture is solved without it.
+        return None, None
+    exposure_s = None
+    with suppress(TypeError, ValueError, ZeroDivisionError, OverflowError):
+        value = float(exif[_EXPOSURE]) if _EXPOSURE in exif else math.nan
+        exposure_s = value if 0.0 < value <= _LONGEST_EXPOSURE_S else None
+    return _utc(exif.get(_TAKEN), exif.get(_OFFSET), exposure_s or 0.0), exposure_s
+
+
+def _utc(taken: object, offset: object, exposure_s: float) -> str | None:
+    from datetime import UTC, datetime, timedelta, timezone
+
+    found = _TIME.match(taken) if isinstance(taken, str) else None
+    zone = re.match(r"([+-])(\d\d):(\d\d)", offset) if isinstance(offset, str) else None
+    if found is None or zone is None:
+        return None
+    try:
+        minutes = (60 * int(zone[2]) + int(zone[3])) * (-1 if zone[1] == "-" else 1)
+        year, month, day, hour, minute, second = map(int, found.groups())
+        offset_utc = timezone(timedelta(minutes=minutes))
+        local = datetime(year, month, day, hour, minute, second, tzinfo=offset_utc)
+        middle = local.astimezone(UTC) + timedelta(seconds=0.5 * exposure_s)
+    except (ValueError, OverflowError):
+        return None
+    return middle.strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"
+
+
+def _is_small(image: Any) -> bool:
+    """Whether EXIF outside of the directories of a TIFF takes little memory."""
+    exif = image.info.get("exif", b"")
+    if len(exif) > MAX_EXIF_BYTES:
+        return False
+    block = exif.removeprefix(_MARK)
+    order = "<" if block[:2] == b"II" else ">"
+    file = io.BytesIO(block)
+    try:
+        entries = directory(file, order, *struct.unpack(order + "4xL", file.read(8)))
+    except struct.error:
+        return True
+    total = sum(entry.size_bytes for entry in entries)
+    return total + bytes_beyond(file, order, entries) <= MAX_EXIF_BYTES

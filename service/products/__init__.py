@@ -1,0 +1,1 @@
+"""Products: attitudes and tables in the formats that other programs read."""

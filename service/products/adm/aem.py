@@ -1,0 +1,147 @@
+"""AEM version 2: attitudes as a time series, a segment for each unbroken stretch.
+
+REF_FRAME_A and REF_FRAME_B fix the direction, from A to B; quaternions are scalar-last.
+Version 1 had keywords for both, which version 2 has no longer.  A rate is in the axes of
+the body, ANGVEL_FRAME.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from service.products.adm.forms import Pairs, kvn, time_text, xml, xml_closing, xml_opening
+from service.products.adm.header import (
+    RATE_WORDS,
+    REF_FRAME_A,
+    REF_FRAME_B,
+    TIME_SYSTEM,
+    header,
+    identity,
+)
+from service.products.attitudes import (
+    AttitudeBlock,
+    AttitudeSeries,
+    SeriesInfo,
+    stretches,
+)
+from service.products.spool import pieces, spool
+
+
+@dataclass(frozen=True)
+class Form:
+    """How a message is written: its opening, metadata, states, ends."""
+
+    opening: Callable[[Pairs], str]
+    metadata: Callable[[Pairs], str]
+    states: Callable[[AttitudeBlock], str]
+    end_of_segment: str
+    closing: str
+
+
+def write_aem(series: AttitudeSeries, form: Form) -> Iterator[bytes]:
+    """Write a series.
+
+    The states of a stretch are kept in a temporary file, because its metadata begins with
+    the time of its last one.
+    """
+    yield form.opening(header(series.about)).encode()
+    for stretch in stretches(series):
+        with spool() as file:
+            metadata = _metadata(series.about, _spooled(stretch, form, file.write))
+            yield form.metadata(metadata).encode()
+            yield from pieces(file)
+        yield form.end_of_segment.encode()
+    yield form.closing.encode()
+
+
+def _spooled(
+    stretch: Iterable[AttitudeBlock], form: Form, write: Callable[[bytes], object]
+) -> Iterator[AttitudeBlock]:
+    for part in stretch:
+        write(form.states(part).encode())
+        yield part
+
+
+def _metadata(about: SeriesInfo, parts: Iterable[AttitudeBlock]) -> Pairs:
+    """The metadata of a stretch; reads all of it."""
+    start = stop = ""
+    origins: set[str] = set()
+    for part in parts:
+        start, stop = start or part.time[0], part.time[-1]
+        origins.update(part.rate_origin.tolist())
+    words = RATE_WORDS.get(frozenset(origins))
+    told: Pairs = [] if words is None else [("COMMENT", f"Angular velocity {words}")]
+    rates: Pairs = [] if words is None else [("ANGVEL_FRAME", REF_FRAME_B)]
+    return [
+        *told,
+        *identity(about),
+        ("REF_FRAME_A", REF_FRAME_A),
+        ("REF_FRAME_B", REF_FRAME_B),
+        ("TIME_SYSTEM", TIME_SYSTEM),
+        ("START_TIME", time_text(start)),
+        ("STOP_TIME", time_text(stop)),
+        ("ATTITUDE_TYPE", "QUATERNION" if words is None else "QUATERNION/ANGVEL"),
+        *rates,
+    ]
+
+
+def _values(part: AttitudeBlock) -> Iterator[tuple[float, ...]]:
+    """The numbers of each state: the quaternion and, where there is one, the rate in deg/s."""
+    values = part.quaternion
+    if not np.isnan(part.rate_deg_per_s).any():
+        values = np.concatenate([values, part.rate_deg_per_s], axis=1)
+    return map(tuple, values.tolist())
+
+
+def _kvn_opening(pairs: Pairs) -> str:
+    return kvn([("CCSDS_AEM_VERS", "2.0")]) + kvn(pairs)
+
+
+def _kvn_metadata(pairs: Pairs) -> str:
+    return f"\nMETA_START\n{kvn(pairs)}META_STOP\n\nDATA_START\n"
+
+
+def _kvn_states(part: AttitudeBlock) -> str:
+    return "".join(
+        f"{time[:-1]} {' '.join(map(repr, values))}\n"
+        for time, values in zip(part.time.tolist(), _values(part), strict=True)
+    )
+
+
+def _xml_opening(pairs: Pairs) -> str:
+    return xml_opening("aem", pairs)
+
+
+def _xml_metadata(pairs: Pairs) -> str:
+    return f"    <segment>\n      <metadata>\n{xml(pairs, 8)}      </metadata>\n      <data>\n"
+
+
+_QUATERNION = "<quaternion><Q1>%r</Q1><Q2>%r</Q2><Q3>%r</Q3><QC>%r</QC></quaternion>"
+_ANGVEL = (
+    '<angVel><ANGVEL_X units="deg/s">%r</ANGVEL_X><ANGVEL_Y units="deg/s">%r</ANGVEL_Y>'
+    '<ANGVEL_Z units="deg/s">%r</ANGVEL_Z></angVel>'
+)
+_STATE = "        <attitudeState><%s><EPOCH>%%s</EPOCH>%s</%s></attitudeState>\n"
+_STATES = {
+    4: _STATE % ("quaternionEphemeris", _QUATERNION, "quaternionEphemeris"),
+    7: _STATE % ("quaternionAngVel", _QUATERNION + _ANGVEL, "quaternionAngVel"),
+}
+"""By the number of values of a state."""
+
+
+def _xml_states(part: AttitudeBlock) -> str:
+    return "".join(
+        _STATES[len(values)] % (time[:-1], *values)
+        for time, values in zip(part.time.tolist(), _values(part), strict=True)
+    )
+
+
+KVN = Form(_kvn_opening, _kvn_metadata, _kvn_states, "DATA_STOP\n", "")
+XML = Form(
+    _xml_opening,
+    _xml_metadata,
+    _xml_states,
+    "      </data>\n    </segment>\n",
+    xml_closing("aem"),
+)

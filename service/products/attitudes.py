@@ -1,0 +1,295 @@
+"""Attitudes in order of time: unbroken stretches, continuous signs, rates.
+
+Quaternions are scalar-last and transform J2000 (EME2000) into body components.  Covariances
+are of the small error rotation about the body axes, arcsec^2.  Rates are of the body relative
+to inertial, in body axes, deg/s.
+"""
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, fields, replace
+from itertools import groupby, pairwise
+from typing import Any, Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from service.errors import BadBatch, Fault, shown_value
+from service.products.rotations import rotation_vectors
+from service.vectors import Vector
+
+Integers = npt.NDArray[np.int64]
+Texts = npt.NDArray[np.object_]
+
+StatusWanted = Literal["good", "suspect", "all"]
+OWN, DERIVED, NONE = "own", "derived", "none"
+SAME_MOMENT_NS = 1_000
+"""Of attitudes that are closer than this the last one counts: clocks of kernels have 1 us."""
+DEFAULT_LARGEST_GAP_S = 60.0
+"""Attitudes that are farther apart belong to two stretches."""
+MAX_LARGEST_GAP_S = 86_400.0
+DEFAULT_NAIF_ID = -999
+MIN_NAIF_ID = -2_000_000
+"""The ids of a spacecraft's instruments have three digits more, and 32 bits."""
+OBJECT_ID = r"[A-Za-z0-9][A-Za-z0-9 ._+/-]{0,63}"
+
+
+@dataclass(frozen=True)
+class SeriesInfo:
+    """What a series of attitudes is of: the spacecraft, the filters, and its identifiers.
+
+    `start` and `end` are UTC as text, None where the period is open.
+    """
+
+    spacecraft: str
+    run: str
+    created: str
+    version: str
+    start: str | None = None
+    end: str | None = None
+    status: StatusWanted = "good"
+    newest_first: bool = False
+    largest_gap_s: float = DEFAULT_LARGEST_GAP_S
+    object_id: str | None = None
+    naif_id: int = DEFAULT_NAIF_ID
+
+    def __post_init__(self) -> None:
+        """Raise `BadBatch` with the name and value of what is out of its range."""
+        faults = [
+            Fault(name, expected, shown_value(getattr(self, name)))
+            for name, is_good, expected in (
+                (
+                    "largest_gap_s",
+                    0 < self.largest_gap_s <= MAX_LARGEST_GAP_S,
+                    f"must be above 0 and at most {MAX_LARGEST_GAP_S:g}",
+                ),
+                (
+                    "naif_id",
+                    MIN_NAIF_ID <= self.naif_id < 0,
+                    f"must be from {MIN_NAIF_ID} to -1",
+                ),
+                (
+                    "object_id",
+                    self.object_id is None or re.fullmatch(OBJECT_ID, self.object_id),
+                    f"must match {OBJECT_ID}",
+                ),
+            )
+            if not is_good
+        ]
+        if faults:
+            raise BadBatch(faults)
+
+    def described(self) -> str:
+        """What the series is of, for a message."""
+        words = "attitudes" if self.status == "all" else f"{self.status} attitudes"
+        period = "".join(
+            f" {word} {moment}"
+            for word, moment in (("from", self.start), ("to before", self.end))
+            if moment
+        )
+        return f"{words} of {self.spacecraft} in run {self.run}{period}"
+
+    def provenance(self) -> dict[str, str]:
+        """Where the attitudes come from, as texts by name."""
+        return {
+            "spacecraft": self.spacecraft,
+            "object_id": self.object_id or self.spacecraft,
+            "run": self.run,
+            "status": self.status,
+            "start": self.start or "",
+            "end": self.end or "",
+            "largest_gap_s": repr(self.largest_gap_s),
+            "created": self.created,
+            "originator": f"attitude-acquisition {self.version}",
+            "frame": "EME2000 to spacecraft body; quaternion scalar last",
+        }
+
+
+@dataclass(frozen=True)
+class AttitudeRows:
+    """Results of batches in order of time, a row each, as they are recorded.
+
+    `status` is None and the numbers are NaN where a batch has no attitude; `rate_deg_per_s`
+    is NaN where the batch came without one.  `time_ns` is `Utc.tai_ns`.
+    """
+
+    time_ns: Integers
+    time: Texts
+    id: Texts
+    batch: Texts
+    status: Texts
+    method: Texts
+    quaternion: Vector
+    covariance_arcsec2: Vector
+    """Of shape (n, 6): 11, 12, 13, 22, 23, 33."""
+    rate_deg_per_s: Vector
+    residual_rms_arcsec: Vector
+    predicted_rms_arcsec: Vector
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+    def taken(self, places: Any) -> Self:
+        """The rows at some places, or where a mask is true."""
+        return replace(self, **{f.name: getattr(self, f.name)[places] for f in fields(self)})
+
+    def followed_by(self, other: Self) -> Self:
+        """These rows and then others."""
+        pairs = {f.name: (getattr(self, f.name), getattr(other, f.name)) for f in fields(self)}
+        return replace(self, **{name: np.concatenate(pair) for name, pair in pairs.items()})
+
+
+@dataclass(frozen=True)
+class AttitudeBlock(AttitudeRows):
+    """Attitudes of a series, with the number of their stretch, which counts from 0.
+
+    Within a stretch the quaternions have continuous signs.  `rate_origin` says whether a
+    rate is the batch's `own`, `derived` from the attitudes before and after, or `none`.
+    `gaps` counts the batches without a wanted attitude up to each row.
+    """
+
+    stretch: Integers
+    rate_origin: Texts
+    gaps: Integers
+
+
+@dataclass(frozen=True)
+class AttitudeSeries:
+    """Attitudes in order of time, block by block."""
+
+    about: SeriesInfo
+    blocks: Iterable[AttitudeBlock]
+
+
+def series_of(about: SeriesInfo, pages: Iterable[AttitudeRows]) -> AttitudeSeries:
+    """The series of recorded rows, which come in order of time; see `AttitudeBlock`.
+
+    Between two attitudes a stretch ends where they are farther apart than the largest gap, or
+    a batch between them has no attitude of the wanted status.
+    """
+    return AttitudeSeries(about, _blocks(about, pages))
+
+
+def stretches(series: AttitudeSeries) -> Iterator[Iterator[AttitudeBlock]]:
+    """The unbroken stretches of a series, each in parts, which are read in their order."""
+    for _, parts in groupby(_parts(series.blocks), key=lambda part: int(part.stretch[0])):
+        yield parts
+
+
+def _parts(blocks: Iterable[AttitudeBlock]) -> Iterator[AttitudeBlock]:
+    for block in blocks:
+        begins = np.flatnonzero(np.diff(block.stretch)) + 1
+        edges = [0, *begins.tolist(), len(block)]
+        for first, end in pairwise(edges):
+            yield block.taken(slice(first, end))
+
+
+def _blocks(about: SeriesInfo, pages: Iterable[AttitudeRows]) -> Iterator[AttitudeBlock]:
+    assembler = _Assembler(about)
+    for page in pages:
+        if len(block := assembler.fed(page)):
+            yield block
+    if (rest := assembler.rest()) is not None:
+        yield rest
+
+
+class _Assembler:
+    """Holds the last row given, for rates and signs, and those after it, which wait.
+
+    Two rows wait: the last may still be replaced by one of the same moment, and the rate of the
+    one before depends on it.
+    """
+
+    def __init__(self, about: SeriesInfo) -> None:
+        self._about = about
+        self._wanted = ("good", "suspect") if about.status == "all" else (about.status,)
+        self._unwanted = 0
+        self._held: AttitudeBlock | None = None
+        self._given = 0
+
+    def fed(self, page: AttitudeRows) -> AttitudeBlock:
+        """The rows that are finished now that a page is known too; perhaps none."""
+        is_wanted = np.isin(page.status.astype(str), self._wanted)
+        gaps = self._unwanted + np.cumsum(~is_wanted)
+        self._unwanted = int(gaps[-1]) if len(gaps) else self._unwanted
+        new = _unfinished(page.taken(is_wanted), gaps[is_wanted])
+        rows = new if self._held is None else self._held.followed_by(new)
+        return self._finished(rows, waiting=2)
+
+    def rest(self) -> AttitudeBlock | None:
+        """The rows that still waited, or None where there were none."""
+        if self._held is None or len(self._held) == self._given:
+            return None
+        return self._finished(self._held, waiting=0)
+
+    def _finished(self, rows: AttitudeBlock, waiting: int) -> AttitudeBlock:
+        rows = self._without_repeats(rows)
+        given = self._given
+        first = rows.stretch[0] if given else 0
+        rows = _with_stretches(rows, self._about.largest_gap_s, first)
+        end = max(given, len(rows) - waiting)
+        finished = _with_rates(rows).taken(slice(given, end))
+        # The last one given stays, for the rate and the sign of the next.
+        self._given = min(end, 1)
+        self._held = rows.taken(slice(end - self._given, None))
+        return finished
+
+    def _without_repeats(self, rows: AttitudeBlock) -> AttitudeBlock:
+        close = np.abs(np.diff(rows.time_ns)) < SAME_MOMENT_NS
+        dropped = np.zeros(len(rows), dtype=bool)
+        if self._about.newest_first:
+            dropped[1:] = close
+        else:
+            dropped[:-1] = close
+        dropped[: self._given] = False
+        return rows.taken(~dropped) if dropped.any() else rows
+
+
+def _unfinished(rows: AttitudeRows, gaps: Integers) -> AttitudeBlock:
+    n = len(rows)
+    origin = np.where(np.isnan(rows.rate_deg_per_s[:, 0]), NONE, OWN).astype(object)
+    own = {f.name: getattr(rows, f.name) for f in fields(AttitudeRows)}
+    return AttitudeBlock(**own, stretch=np.zeros(n, np.int64), rate_origin=origin, gaps=gaps)
+
+
+def _with_stretches(rows: AttitudeBlock, largest_gap_s: float, first: int) -> AttitudeBlock:
+    """The rows with numbers of stretches, the first row's being `first`, and continuous signs."""
+    if not len(rows):
+        return rows
+    begins = np.abs(np.diff(rows.time_ns)) > round(largest_gap_s * 1e9)
+    begins |= np.diff(rows.gaps) != 0
+    stretch = first + np.concatenate([[0], np.cumsum(begins)])
+    along = np.sum(rows.quaternion[1:] * rows.quaternion[:-1], axis=1)
+    turned = np.where((along < 0) & ~begins, -1.0, 1.0)
+    sign = np.cumprod(np.concatenate([[1.0], turned]))
+    # Each stretch keeps the sign of its own first attitude.
+    begin = np.maximum.accumulate(
+        np.where(np.concatenate([[True], begins]), np.arange(len(sign)), 0)
+    )
+    sign *= sign[begin]
+    return replace(rows, stretch=stretch, quaternion=rows.quaternion * sign[:, None])
+
+
+def _with_rates(rows: AttitudeBlock) -> AttitudeBlock:
+    """The rows with rates derived from their neighbours where batches gave none.
+
+    Between the steps before and after a row the rate is interpolated linearly; at the ends of
+    a stretch it is that of the one step.  A lone attitude has none.
+    """
+    if len(rows) < 2 or not np.any(rows.rate_origin != OWN):
+        return rows
+    step_s = np.diff(rows.time_ns) * 1e-9
+    joined = np.diff(rows.stretch) == 0
+    turn = rotation_vectors(rows.quaternion[:-1], rows.quaternion[1:])
+    rate = np.full_like(turn, np.nan)
+    rate[joined] = np.degrees(turn[joined]) / step_s[joined, None]
+    none = np.full((1, 3), np.nan)
+    before, after = np.concatenate([none, rate]), np.concatenate([rate, none])
+    width = np.abs(np.concatenate([[0.0], step_s, [0.0]]))[:, None]
+    between = (before * width[1:] + after * width[:-1]) / (width[1:] + width[:-1])
+    derived = np.where(np.isnan(before), after, np.where(np.isnan(after), before, between))
+    missing = rows.rate_origin == NONE
+    missing &= ~np.isnan(derived[:, 0])
+    result = np.where(missing[:, None], derived, rows.rate_deg_per_s)
+    origin = np.where(missing, DERIVED, rows.rate_origin)
+    return replace(rows, rate_deg_per_s=result, rate_origin=origin)

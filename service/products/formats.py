@@ -1,0 +1,196 @@
+"""The registry of output formats: of tables, and of attitudes.
+
+Everything that names formats derives from it: the parameters `format` of the API, their
+media types in the OpenAPI document, the links of the console, `acquire history --format`
+and `acquire export`.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from itertools import chain, islice
+from typing import TYPE_CHECKING
+
+from service.errors import BadBatch, Fault, NotAvailable, NotFound, shown_value
+from service.products.tables import Table, write_csv
+
+if TYPE_CHECKING:
+    from service.products.attitudes import AttitudeSeries
+
+MOST_BATCHES = 5_000_000
+"""Of a period whose attitudes are kept in a temporary file: up to 400 bytes each."""
+
+TableWriter = Callable[[Table], Iterator[bytes]]
+AttitudeWriter = Callable[["AttitudeSeries"], Iterator[bytes]]
+
+
+@dataclass(frozen=True)
+class OutputFormat:
+    """A way to write a table, attitudes, or both; `title` is its name for people.
+
+    A format with `write_table` writes attitudes as a table.  `suffix` is that of a file,
+    by default the name of the format.  `extra` is the extra of this project that the format
+    needs, with the `package` that tells whether it is installed.  A format of `any_order`
+    takes attitudes in descending order of time too; one that `may_be_empty` can hold none.
+    A format that keeps attitudes in a temporary file takes periods of `most_batches` at most.
+    """
+
+    title: str
+    media_type: str
+    write_table: TableWriter | None = None
+    write_attitudes: AttitudeWriter | None = None
+    suffix: str = ""
+    extra: str = ""
+    package: str = ""
+    any_order: bool = True
+    may_be_empty: bool = True
+    most_batches: int | None = None
+
+    def require(self, name: str) -> None:
+        """Raise `NotAvailable` with the command that installs what the format lacks."""
+        require_extra(self.extra, self.package, "format", name)
+
+
+def require_extra(extra: str, package: str, field: str, value: str) -> None:
+    """Raise `NotAvailable` unless a package of an extra is installed."""
+    if package and find_spec(package) is None:
+        message = (
+            f"needs the package {package}; install it with: "
+            f"pip install 'attitude-acquisition[{extra}]'"
+        )
+        raise NotAvailable(Fault(field, message, shown_value(value)))
+
+
+def table_formats() -> dict[str, OutputFormat]:
+    """The formats of tables, by name."""
+    return {name: each for name, each in OUTPUT_FORMATS.items() if each.write_table is not None}
+
+
+def attitude_formats() -> dict[str, OutputFormat]:
+    """The formats of attitudes, by name: JSON first, which the API answers by default."""
+    return {JSON_FORMAT: JSON, **OUTPUT_FORMATS}
+
+
+def file_suffix(name: str) -> str:
+    """The suffix of a file of a format, without the dot."""
+    return attitude_formats()[name].suffix or name
+
+
+def write_attitudes(name: str, series: "AttitudeSeries") -> Iterator[bytes]:
+    """Attitudes in a format, in pieces; raises `NotAvailable` where a package is missing."""
+    written = attitude_formats()[name]
+    written.require(name)
+    if series.about.newest_first and not written.any_order:
+        raise BadBatch(Fault("order", f"must be oldest for the format {name}", "'newest'"))
+    blocks = iter(series.blocks)
+    # Errors of the database are raised here, and not when part of a file is sent already.
+    first = list(islice(blocks, 1))
+    if not first and not written.may_be_empty:
+        raise NotFound(f"{series.about.described()}: none, and {written.title} cannot be empty")
+    series = replace(series, blocks=chain(first, blocks))
+    if written.write_attitudes is not None:
+        return written.write_attitudes(series)
+    from service.products.attitude_table import attitude_table
+
+    assert written.write_table is not None
+    return written.write_table(attitude_table(series))
+
+
+def write_table(name: str, table: Table) -> Iterator[bytes]:
+    """A table in a format, in pieces; raises `NotAvailable` where a package is missing."""
+    written = OUTPUT_FORMATS[name]
+    written.require(name)
+    assert written.write_table is not None
+    return written.write_table(table)
+
+
+# Each writer imports its own libraries when it is called: a command that prints help loads none.
+
+
+def _json(series: "AttitudeSeries") -> Iterator[bytes]:
+    from service.products.json_file import write_json
+
+    return write_json(series)
+
+
+def _aem(series: "AttitudeSeries") -> Iterator[bytes]:
+    from service.products.adm.aem import KVN, write_aem
+
+    return write_aem(series, KVN)
+
+
+def _aem_xml(series: "AttitudeSeries") -> Iterator[bytes]:
+    from service.products.adm.aem import XML, write_aem
+
+    return write_aem(series, XML)
+
+
+def _ck(series: "AttitudeSeries") -> Iterator[bytes]:
+    from service.products.spice.ck import write_ck
+
+    return write_ck(series)
+
+
+def _parquet(table: Table) -> Iterator[bytes]:
+    from service.products.parquet import write_parquet
+
+    return write_parquet(table)
+
+
+def _fits(table: Table) -> Iterator[bytes]:
+    from service.products.fits_file import write_fits
+
+    return write_fits(table)
+
+
+JSON_FORMAT = "json"
+JSON = OutputFormat("JSON", "application/json", write_attitudes=_json)
+"""The API's own form; a history as JSON is no table."""
+
+OUTPUT_FORMATS: dict[str, OutputFormat] = {
+    "csv": OutputFormat("CSV", "text/csv", write_table=write_csv),
+    "parquet": OutputFormat(
+        "Parquet",
+        "application/vnd.apache.parquet",
+        write_table=_parquet,
+        extra="tables",
+        package="pyarrow",
+    ),
+    "fits": OutputFormat(
+        "FITS",
+        "application/fits",
+        write_table=_fits,
+        extra="tables",
+        package="astropy",
+        most_batches=MOST_BATCHES,
+    ),
+    "aem": OutputFormat(
+        "CCSDS AEM",
+        "text/plain",
+        write_attitudes=_aem,
+        any_order=False,
+        may_be_empty=False,
+        most_batches=MOST_BATCHES,
+    ),
+    "aem-xml": OutputFormat(
+        "CCSDS AEM (XML)",
+        "application/xml",
+        write_attitudes=_aem_xml,
+        suffix="aem.xml",
+        any_order=False,
+        may_be_empty=False,
+        most_batches=MOST_BATCHES,
+    ),
+    "ck": OutputFormat(
+        "SPICE CK",
+        "application/zip",
+        write_attitudes=_ck,
+        suffix="ck.zip",
+        extra="spice",
+        package="spiceypy",
+        any_order=False,
+        may_be_empty=False,
+        most_batches=MOST_BATCHES,
+    ),
+}
+"""By name."""

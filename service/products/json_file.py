@@ -1,0 +1,48 @@
+"""Attitudes as JSON: one object whose `items` are written as they are read."""
+
+from collections.abc import Iterator
+
+import msgspec
+import numpy as np
+
+from service.products.attitudes import AttitudeBlock, AttitudeSeries
+
+_ENCODER = msgspec.json.Encoder()
+
+
+def write_json(series: AttitudeSeries) -> Iterator[bytes]:
+    """Write the series: `about` and its `items`, an object an attitude."""
+    yield b'{"about":' + _ENCODER.encode(series.about.provenance()) + b',"items":['
+    is_first = True
+    for block in series.blocks:
+        text = _ENCODER.encode(items(block))[1:-1]
+        yield text if is_first else b"," + text
+        is_first = False
+    yield b"]}"
+
+
+def items(block: AttitudeBlock) -> list[dict[str, object]]:
+    """The attitudes of a block as plain objects."""
+    covariance = block.covariance_arcsec2[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    known = ~np.isnan(block.rate_deg_per_s[:, 0])
+    names = (
+        "time", "quaternion", "covariance_arcsec2", "rate_deg_per_s", "rate_origin", "status",
+        "method", "residual_rms_arcsec", "predicted_rms_arcsec", "stretch", "batch", "id",
+    )  # fmt: skip
+    rates = zip(block.rate_deg_per_s.tolist(), known.tolist(), strict=True)
+    values = zip(
+        block.time.tolist(),
+        block.quaternion.tolist(),
+        covariance.tolist(),
+        [rate if is_known else None for rate, is_known in rates],
+        block.rate_origin.tolist(),
+        block.status.tolist(),
+        block.method.tolist(),
+        block.residual_rms_arcsec.tolist(),
+        block.predicted_rms_arcsec.tolist(),
+        block.stretch.tolist(),
+        block.batch.tolist(),
+        block.id.tolist(),
+        strict=True,
+    )
+    return [dict(zip(names, row, strict=True)) for row in values]

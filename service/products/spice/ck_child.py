@@ -1,0 +1,77 @@
+"""Writes a C-kernel of type 3 from records; run as a program of its own.
+
+    python ck_child.py FOLDER FILE INSTRUMENT
+
+FOLDER holds `records`, rows of encoded clock, quaternion (scalar first) and angular
+velocity, and `begins`: the first row of each stretch, and whether it has rates.
+"""
+
+import os
+import sys
+from collections.abc import Iterator
+
+import numpy as np
+
+IN_SEGMENT = 50_000
+"""Records of a segment at most.  A longer stretch goes on in the next with its last record
+again, so that no interval is lost between both."""
+
+Piece = tuple[int, int, bool]
+
+
+def pieces(begins: "np.ndarray[tuple[int, int], np.dtype[np.int64]]", count: int) -> list[Piece]:
+    """Stretches as first row, end, and whether it has rates; long ones in overlapping pieces."""
+    ends = [*begins[1:, 0].tolist(), count]
+    found = []
+    for (first, rated), end in zip(begins.tolist(), ends, strict=True):
+        while end - first > IN_SEGMENT:
+            found.append((first, first + IN_SEGMENT, bool(rated)))
+            first += IN_SEGMENT - 1
+        found.append((first, end, bool(rated)))
+    return found
+
+
+def segments(parts: list[Piece]) -> Iterator[list[Piece]]:
+    """Pieces drawn together into segments, of which each has rates or has none."""
+    group: list[Piece] = []
+    for part in parts:
+        size = part[1] - (group[0][0] if group else part[0])
+        if group and (size > IN_SEGMENT or part[2] != group[0][2] or part[0] < group[-1][1]):
+            yield group
+            group = []
+        group.append(part)
+    yield group
+
+
+def main() -> None:
+    """Write the kernel."""
+    import spiceypy
+
+    place, file, instrument = sys.argv[1:]
+    os.chdir(place)
+    records = np.memmap("records", dtype=np.float64, mode="r").reshape(-1, 8)
+    begins = np.fromfile("begins", dtype=np.int64).reshape(-1, 2)
+    handle = spiceypy.ckopn(file, "attitude", 0)
+    for number, group in enumerate(segments(pieces(begins, len(records)))):
+        first, end = group[0][0], group[-1][1]
+        rows = np.array(records[first:end])
+        spiceypy.ckw03(
+            handle,
+            rows[0, 0],
+            rows[-1, 0],
+            int(instrument),
+            "J2000",
+            group[0][2],
+            f"attitude {number}",
+            len(rows),
+            np.ascontiguousarray(rows[:, 0]),
+            np.ascontiguousarray(rows[:, 1:5]),
+            np.ascontiguousarray(rows[:, 5:]),
+            len(group),
+            np.ascontiguousarray(rows[[part[0] - first for part in group], 0]),
+        )
+    spiceypy.ckcls(handle)
+
+
+if __name__ == "__main__":
+    main()

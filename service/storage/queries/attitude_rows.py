@@ -1,0 +1,109 @@
+"""Current results of a spacecraft with their attitudes, in order of time, page by page."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from typing import Any
+
+import msgspec
+import numpy as np
+from sqlalchemy import Connection, Select, func, select, tuple_
+
+from service.products.attitudes import AttitudeRows
+from service.storage.queries.pages import PLACE, ResultFilter
+from service.storage.sql.tables import batches, results, solutions
+from service.vectors import Vector
+
+PAGE = 5_000
+"""Rows that are read together."""
+
+_SOLVED = ("q1", "q2", "q3", "qc", "p11", "p12", "p13", "p22", "p23", "p33")
+_QUALITY = ("residual_rms_arcsec", "predicted_rms_arcsec")
+_QUERY: Select[Any] = (
+    select(
+        *PLACE,
+        results.c.id,
+        results.c.status,
+        batches.c.batch,
+        batches.c.time,
+        batches.c.input,
+        solutions.c.method,
+        *(solutions.c[name] for name in (*_SOLVED, *_QUALITY)),
+    )
+    .join_from(results, batches, results.c.batch_id == batches.c.id)
+    .outerjoin(solutions, solutions.c.result_id == results.c.id)
+)
+
+
+class _Rates(msgspec.Struct):
+    """Of a recorded input, the rates alone."""
+
+    body_rates_deg_per_s: tuple[float, float, float] | None = None
+
+
+_RATES = msgspec.json.Decoder(_Rates)
+_UNKNOWN = (np.nan, np.nan, np.nan)
+
+
+def attitude_pages(
+    reading: Callable[[], AbstractContextManager[Connection]],
+    selected: ResultFilter,
+    *,
+    newest_first: bool = False,
+    page: int = PAGE,
+) -> Iterator[AttitudeRows]:
+    """Every current result that is selected, with its attitude, page by page.
+
+    Between two pages no connection is held, so that a slow reader keeps none from others.
+    """
+    order = [column.desc() if newest_first else column for column in PLACE]
+    query = _QUERY.where(*selected.conditions()).order_by(*order).limit(page)
+    last: tuple[int, str] | None = None
+    while True:
+        beyond = query
+        if last is not None:
+            place = tuple_(*PLACE)
+            before = tuple_(*last)
+            beyond = query.where(place < before if newest_first else place > before)
+        with reading() as connection:
+            rows = connection.execute(beyond).all()
+        if rows:
+            yield _columns(rows)
+        if len(rows) < page:
+            return
+        last = rows[-1][0], rows[-1][1]
+
+
+def count_results(connection: Connection, selected: ResultFilter, most: int) -> int:
+    """How many current results are selected; no more than `most` are counted."""
+    some = select(results.c.batch_id).where(*selected.conditions()).limit(most).subquery()
+    return int(connection.scalar(select(func.count()).select_from(some)) or 0)
+
+
+def _columns(rows: Sequence[Any]) -> AttitudeRows:
+    time_ns, _, id, status, batch, time, sent, method, *numbers = zip(*rows, strict=True)
+    values = np.array(numbers, dtype=np.float64)
+    rates = [_RATES.decode(each).body_rates_deg_per_s for each in sent]
+    return AttitudeRows(
+        time_ns=np.array(time_ns, dtype=np.int64),
+        time=_texts(time),
+        id=_texts(id),
+        batch=_texts(batch),
+        status=_texts(status),
+        method=_texts(method),
+        quaternion=_across(values[:4]),
+        covariance_arcsec2=_across(values[4:10]),
+        # A batch that came without rates is recorded like one with rates of zero.
+        rate_deg_per_s=np.array([each if each and any(each) else _UNKNOWN for each in rates]),
+        residual_rms_arcsec=values[10],
+        predicted_rms_arcsec=values[11],
+    )
+
+
+def _across(values: Vector) -> Vector:
+    return np.ascontiguousarray(values.T)
+
+
+def _texts(values: Sequence[Any]) -> Any:
+    column = np.empty(len(values), dtype=object)
+    column[:] = values
+    return column

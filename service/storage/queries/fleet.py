@@ -1,0 +1,318 @@
+"""The state of many spacecraft in a few queries, whose number does not grow with the fleet."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from typing import Any, Literal
+
+import numpy as np
+from sqlalchemy import BigInteger, Connection, Select, bindparam, case, func, select
+
+from service.missions.mission import Mission
+from service.storage.models.alarms import Alarm
+from service.storage.models.answers import Summary
+from service.storage.models.fleet import (
+    Fleet,
+    FleetCells,
+    FleetRow,
+    KnownAttitude,
+    TrackerCounts,
+)
+from service.storage.models.overview import WindowCounts
+from service.storage.queries.alarms import active_alarms, summary
+from service.storage.queries.future_dated import AHEAD_NS, LIVE
+from service.storage.queries.pages import PLACE
+from service.storage.queries.results import summary_of, summary_query
+from service.storage.queries.trends import latest_time
+from service.storage.recording.rollup_sql import SUMMED
+from service.storage.sql.rollup_tables import COUNTS, rollups_hourly
+from service.storage.sql.tables import batches, mission_uses, results, solutions, star_results
+from service.times import (
+    DAY_S,
+    HOUR_S,
+    UNIX_DAY,
+    Utc,
+    bucket_start,
+    recorded_utc,
+    shifted,
+    unix_seconds,
+)
+
+Period = Literal["hour", "day", "week"]
+PERIODS_S: Mapping[Period, int] = {"hour": HOUR_S, "day": DAY_S, "week": 7 * DAY_S}
+CELLS_S: Mapping[Period, int] = {"hour": 120, "day": 1800, "week": 4 * HOUR_S}
+"""The width of a cell: each divides a day."""
+MOST_SUMMED = 20_000
+"""Batches of a day that are summed up one by one; a day with more is shown by the hour."""
+
+_TICK_S = 1e-6
+_Sums = Sequence[tuple[Any, ...]]
+"""Rows of spacecraft, POSIX time at which a cell begins, and counts."""
+
+
+def fleet(
+    connection: Connection, missions: Iterable[Mission], run: str, period: Period, now: Utc
+) -> Fleet:
+    """Every mission in a run; the last hour and the period end with the run's latest batch."""
+    named = {mission.name: mission for mission in missions}
+    as_of = latest_time(connection, run, now=now)
+    active = [each for each in active_alarms(connection, run, now.text) if each.spacecraft in named]
+    if as_of is None:
+        rows = tuple(_row(each, None, now, active) for each in named.values())
+        return Fleet(run, None, summary(active), rows, None)
+    facts = _Facts(connection, list(named), run, as_of, now)
+    rows = tuple(_row(each, facts, now, active) for each in named.values())
+    cells = _cells(connection, list(named), run, as_of, period)
+    return Fleet(run, as_of, summary(active), rows, cells)
+
+
+class _Facts:
+    """What is known of every spacecraft, by name or by the id of its latest result."""
+
+    def __init__(
+        self, connection: Connection, names: list[str], run: str, as_of: Utc, now: Utc
+    ) -> None:
+        self.as_of = as_of
+        ids = _latest_ids(connection, names, run, now)
+        self.latest = _summaries(connection, ids)
+        self.trackers = _tracker_counts(connection, ids.values())
+        unsolved = [name for name, each in self.latest.items() if each.status is None]
+        solved_ids = {name: id for name, id in ids.items() if name not in unsolved}
+        solved_ids |= _latest_ids(connection, unsolved, run, now, solved=True)
+        self.attitudes = _attitudes(connection, solved_ids)
+        self.last_hour = _last_hours(connection, names, run, as_of)
+
+
+def _row(mission: Mission, facts: _Facts | None, now: Utc, active: Sequence[Alarm]) -> FleetRow:
+    name = mission.name
+    batch = None if facts is None else facts.latest.get(name)
+    alarms = tuple(each for each in active if each.spacecraft == name)
+    if facts is None or batch is None:
+        return FleetRow(
+            name, mission.description, "no_batches", None, None, (), None, None, None, alarms
+        )
+    return FleetRow(
+        name=name,
+        description=mission.description,
+        state=batch.status or "no_attitude",
+        latest_batch=batch,
+        last_attitude=facts.attitudes.get(name),
+        trackers=_of_every_tracker(mission, facts.trackers.get(batch.id, {})),
+        age_s=max(0.0, (facts.as_of.tai_ns - recorded_utc(batch.time).tai_ns) * 1e-9),
+        received_age_s=(now.tai_ns - recorded_utc(batch.received).tai_ns) * 1e-9,
+        last_hour=facts.last_hour.get(name),
+        alarms=alarms,
+    )
+
+
+def _of_every_tracker(mission: Mission, counted: Mapping[str, Any]) -> tuple[TrackerCounts, ...]:
+    """The counts of a mission's trackers, in its order; none of one that saw no star."""
+    names = [each.name for each in mission.trackers]
+    return tuple(TrackerCounts(name, *counted.get(name, (0, 0))) for name in names)
+
+
+def _latest_ids(
+    connection: Connection, names: list[str], run: str, now: Utc, solved: bool = False
+) -> dict[str, str]:
+    """The id of each spacecraft's newest current result, as `pages.newest` has it."""
+    found: dict[str, str] = {}
+    bounds_ns = [now.tai_ns + AHEAD_NS] if run == LIVE else []
+    for bound_ns in (*bounds_ns, (1 << 63) - 1):
+        missing = [name for name in names if name not in found]
+        if missing:
+            asked = {"names": missing, "run": run, "bound_ns": bound_ns}
+            rows = connection.execute(_newest_query(solved), asked)
+            found |= {name: id for name, id in rows if id is not None}
+    return found
+
+
+@cache
+def _newest_query(solved: bool) -> Select[Any]:
+    # Every spacecraft of a mission file is noted with its settings when the service starts.
+    known = select(mission_uses.c.spacecraft.label("name")).distinct()
+    asked = known.where(
+        mission_uses.c.spacecraft.in_(bindparam("names", expanding=True))
+    ).subquery()
+    newest = select(results.c.id).where(
+        results.c.current,
+        results.c.spacecraft == asked.c.name,
+        results.c.run == bindparam("run"),
+        results.c.time_ns <= bindparam("bound_ns", type_=BigInteger),
+    )
+    if solved:
+        newest = newest.where(results.c.status.is_not(None))
+    newest = newest.order_by(*(column.desc() for column in PLACE)).limit(1).correlate(asked)
+    return select(asked.c.name, newest.scalar_subquery())
+
+
+def _summaries(connection: Connection, ids: Mapping[str, str]) -> dict[str, Summary]:
+    query = summary_query().where(results.c.id.in_(list(ids.values())))
+    found = (summary_of(row) for row in connection.execute(query).mappings())
+    return {each.spacecraft: each for each in found}
+
+
+def _tracker_counts(
+    connection: Connection, ids: Iterable[str]
+) -> dict[str, dict[str, tuple[int, int]]]:
+    """Stars and unique stars of each tracker, by the id of the result."""
+    columns = star_results.c
+    unique = func.sum(case((columns.outcome == "unique", 1), else_=0))
+    query = (
+        select(columns.result_id, columns.tracker, func.count(), unique)
+        .where(columns.result_id.in_(list(ids)))
+        .group_by(columns.result_id, columns.tracker)
+    )
+    found: dict[str, dict[str, tuple[int, int]]] = {}
+    for id, tracker, observed, sure in connection.execute(query):
+        found.setdefault(id, {})[tracker] = (int(observed), int(sure))
+    return found
+
+
+def _attitudes(connection: Connection, ids: Mapping[str, str]) -> dict[str, KnownAttitude]:
+    columns = solutions.c
+    query = (
+        select(
+            results.c.spacecraft,
+            results.c.id,
+            batches.c.time,
+            columns.status,
+            *(columns.p11, columns.p22, columns.p33),
+        )
+        .join_from(results, batches, results.c.batch_id == batches.c.id)
+        .join(solutions, columns.result_id == results.c.id)
+        .where(results.c.id.in_(list(ids.values())))
+    )
+    return {
+        name: KnownAttitude(id, time, status, (_root(p11), _root(p22), _root(p33)))
+        for name, id, time, status, p11, p22, p33 in connection.execute(query)
+    }
+
+
+def _root(variance: float) -> float:
+    return math.sqrt(max(variance, 0.0))
+
+
+def _last_hours(
+    connection: Connection, names: list[str], run: str, as_of: Utc
+) -> dict[str, WindowCounts]:
+    """The counts of the hour that ends with the run's latest batch."""
+    # The latest batch belongs to the window, one just an hour before it does not.
+    end = shifted(as_of, _TICK_S)
+    start = shifted(end, -HOUR_S)
+    query = select(results.c.spacecraft, *(SUMMED[name] for name in COUNTS))
+    asked = {"names": names, "run": run, "start_ns": start.tai_ns, "end_ns": end.tai_ns}
+    rows = connection.execute(query.where(*_IN_SPAN).group_by(results.c.spacecraft), asked)
+    return {
+        name: WindowCounts(
+            start=start.text, end=as_of.text, **dict(zip(COUNTS, map(int, counts), strict=True))
+        )
+        for name, *counts in rows
+    }
+
+
+def _cells(
+    connection: Connection, names: list[str], run: str, as_of: Utc, period: Period
+) -> FleetCells:
+    width_s, span_s = CELLS_S[period], PERIODS_S[period]
+    if period == "day":
+        # Hours tell how many batches there are, and serve where those are too many.
+        rows = _hours(connection, names, run, as_of, span_s, HOUR_S)
+        if sum(row[2] for row in rows) > MOST_SUMMED:
+            return _table(names, rows, as_of, span_s, HOUR_S)
+    if width_s < HOUR_S:
+        rows = _steps(connection, names, run, as_of, span_s, width_s)
+    else:
+        rows = _hours(connection, names, run, as_of, span_s, width_s)
+    return _table(names, rows, as_of, span_s, width_s)
+
+
+def _first_cell_s(as_of: Utc, span_s: int, width_s: int) -> float:
+    end_s = float(unix_seconds([as_of.tai_ns])[0])
+    return (end_s - span_s) // width_s * width_s + width_s
+
+
+def _table(
+    names: list[str], rows: Iterable[tuple[Any, ...]], as_of: Utc, span_s: int, width_s: int
+) -> FleetCells:
+    """Sums as a table of spacecraft and time."""
+    start_s = _first_cell_s(as_of, span_s, width_s)
+    place = {name: k for k, name in enumerate(names)}
+    counts = {name: np.zeros((len(names), span_s // width_s)) for name in COUNTS}
+    found = [(place[row[0]], int((row[1] - start_s) // width_s), row[2:]) for row in rows]
+    kept = [each for each in found if 0 <= each[1] < span_s // width_s]
+    if kept:
+        at = np.array([(each[0], each[1]) for each in kept]).T
+        values = np.array([each[2] for each in kept], dtype=float).T
+        for name, column in zip(COUNTS, values, strict=True):
+            np.add.at(counts[name], tuple(at), column)
+    return FleetCells(start_s, width_s, counts)
+
+
+def _hours(
+    connection: Connection, names: list[str], run: str, as_of: Utc, span_s: int, width_s: int
+) -> _Sums:
+    """Sums of whole hours, from the rollups."""
+    table, hours = rollups_hourly.c, width_s // HOUR_S
+    first = shifted(as_of, -span_s).bucket(HOUR_S)
+    cell = (table.bucket // hours).label("cell")
+    query = (
+        select(table.spacecraft, cell, *(func.sum(table[name]) for name in COUNTS))
+        .where(
+            table.run == run,
+            table.spacecraft.in_(names),
+            table.bucket.between(first, as_of.bucket(HOUR_S)),
+            table.batches > 0,
+        )
+        .group_by(table.spacecraft, cell)
+    )
+    return [
+        (name, number * width_s - UNIX_DAY * DAY_S, *counts)
+        for name, number, *counts in connection.execute(query)
+    ]
+
+
+_IN_SPAN = (
+    results.c.current,
+    results.c.spacecraft.in_(bindparam("names", expanding=True)),
+    results.c.run == bindparam("run"),
+    results.c.time_ns >= bindparam("start_ns"),
+    results.c.time_ns < bindparam("end_ns"),
+)
+
+
+def _steps(
+    connection: Connection, names: list[str], run: str, as_of: Utc, span_s: int, width_s: int
+) -> _Sums:
+    """Sums of less than an hour, from the batches.
+
+    Each day is read by itself: between two of them there may be a leap second.
+    """
+    end = shifted(as_of, _TICK_S)
+    begin = shifted(end, -span_s)
+    found: list[tuple[Any, ...]] = []
+    for day in range(begin.bucket(DAY_S), as_of.bucket(DAY_S) + 1):
+        midnight, next_midnight = bucket_start(day, DAY_S), bucket_start(day + 1, DAY_S)
+        asked = {
+            "names": names,
+            "run": run,
+            "start_ns": max(begin.tai_ns, midnight.tai_ns),
+            "end_ns": min(end.tai_ns, next_midnight.tai_ns),
+            "midnight_ns": midnight.tai_ns,
+        }
+        midnight_s = float(unix_seconds([midnight.tai_ns])[0])
+        found += [
+            (name, midnight_s + step * width_s, *counts)
+            for name, step, *counts in connection.execute(_steps_query(width_s), asked)
+        ]
+    return found
+
+
+@cache
+def _steps_query(width_s: int) -> Select[Any]:
+    since_ns = results.c.time_ns - bindparam("midnight_ns", type_=BigInteger)
+    number = since_ns // (width_s * 10**9)
+    # A leap second belongs to the cell that it ends.
+    last = DAY_S // width_s - 1
+    step = case((number > last, last), else_=number).label("step")
+    query = select(results.c.spacecraft, step, *(SUMMED[name] for name in COUNTS))
+    return query.where(*_IN_SPAN).group_by(results.c.spacecraft, step)

@@ -1,0 +1,21 @@
+"""Which older batches are still to be split by tracker; see `upkeep.split_trackers`."""
+
+from sqlalchemy import Connection, delete, insert, select
+
+from service.storage.sql.rollup_tables import rollups_daily, tracker_splits
+
+
+def is_waiting(connection: Connection, spacecraft: str, run: str) -> bool:
+    """Whether batches of a spacecraft's run are still to be split."""
+    query = select(tracker_splits.c.run).where(
+        tracker_splits.c.spacecraft == spacecraft, tracker_splits.c.run == run
+    )
+    return connection.execute(query).first() is not None
+
+
+def split_anew(connection: Connection, spacecraft: str) -> None:
+    """Have all batches of a spacecraft looked at: from now on it has several trackers."""
+    connection.execute(delete(tracker_splits).where(tracker_splits.c.spacecraft == spacecraft))
+    daily = rollups_daily.c
+    runs = select(daily.spacecraft, daily.run).where(daily.spacecraft == spacecraft).distinct()
+    connection.execute(insert(tracker_splits).from_select(["spacecraft", "run"], runs))

@@ -1,0 +1,228 @@
+"""Splits older batches by tracker: what recording does by itself since schema 0008.
+
+A few batches at a time: they are read and computed beside the writer, and written
+in one short transaction, which also notes how far it came.  Killed, it has split
+whole steps; the next call goes on from there.  A batch that another process split,
+or whose result was replaced meanwhile, is left as it is.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection, Select, select, tuple_, update
+from sqlalchemy import delete as deleted
+
+from service.errors import BadInput, Busy
+from service.missions.mission import Mission
+from service.observations.calibrate import correct
+from service.observations.schema import submission_from_json
+from service.sky.model import SkyModel
+from service.storage.models.answers import Answer
+from service.storage.queries.pages import PLACE, newest_first
+from service.storage.queries.recorded_batch import recorded_mission
+from service.storage.queries.results import answer_from_json
+from service.storage.recording import rollups
+from service.storage.recording.tracker_values import tracker_rows
+from service.storage.recording.unsaved_result import Buckets
+from service.storage.sql.columns import Row
+from service.storage.sql.database import Store
+from service.storage.sql.rollup_tables import tracker_splits
+from service.storage.sql.statements import insert_all
+from service.storage.sql.tables import batches, results, tracker_values
+from service.times import DAY_S, HOUR_S, parse_utc
+from service.vectors import Vector
+
+log = logging.getLogger(__name__)
+
+AT_ONCE = 50
+PAUSE_S = 0.25
+"""Between two steps of the service, each of which takes the writer some milliseconds."""
+RETRY_S = 30.0
+Owner = tuple[str, str]
+"""(spacecraft, run)."""
+Place = tuple[int | None, str | None]
+"""The `time_ns` and id of the batch that was looked at last; None at the beginning."""
+
+
+@dataclass
+class TrackerSplitter:
+    """Splits the older batches of missions with several trackers."""
+
+    store: Store
+    sky: SkyModel
+    missions: Mapping[str, Mission]
+    _recorded: dict[str, Mission] = field(default_factory=dict)
+    _catalogs: dict[str, dict[str, float]] = field(default_factory=dict)
+
+    def waiting(self) -> list[Owner]:
+        """The runs of spacecraft with several trackers whose batches are still to be split."""
+        several = [each.name for each in self.missions.values() if len(each.trackers) > 1]
+        columns = tracker_splits.c.spacecraft, tracker_splits.c.run
+        query = select(*columns).where(tracker_splits.c.spacecraft.in_(several))
+        with self.store.reading() as connection:
+            return [(row[0], row[1]) for row in connection.execute(query.order_by(*columns))]
+
+    def split(
+        self,
+        step: Callable[[int], object] = lambda done: None,
+        *,
+        pause_s: float = 0.0,
+        is_stopped: Callable[[], bool] = lambda: False,
+    ) -> int:
+        """Split all that is waiting; how many batches were looked at.
+
+        `step` is called with that number as it grows.  After each step it pauses, so that
+        batches that are sent meanwhile do not wait.
+        """
+        done = 0
+        for owner in self.waiting():
+            while not is_stopped() and (looked_at := self._step(owner)):
+                done += looked_at
+                step(done)
+                time.sleep(pause_s)
+        return done
+
+    def _step(self, owner: Owner) -> int:
+        """Split the next batches of a run; 0 when it is done."""
+        with self.store.reading() as connection:
+            place = _place(connection, owner)
+            if place is None:
+                return 0
+            rows = [dict(row) for row in connection.execute(_next(owner, place)).mappings()]
+            for digest in {row["mission_digest"] for row in rows} - self._recorded.keys():
+                self._recorded[digest] = recorded_mission(connection, digest)
+        split = {row["id"]: self._split(row) for row in rows}
+        self.store.writer.change(
+            lambda connection: _write(connection, owner, place, rows, split)
+        ).result()
+        return len(rows)
+
+    def _split(self, row: Row) -> list[Row]:
+        """The values of the trackers of a recorded batch, as its answer gives them."""
+        answer = answer_from_json(row["answer"])
+        mission = self._recorded[row["mission_digest"]]
+        try:
+            batch = submission_from_json(row["input"]).batch
+            corrected = correct(batch, mission)
+        except BadInput:
+            # `verify` tells of an input that cannot be read.
+            return []
+        known = self._catalog_mag(answer, mission, row["time"])
+        magnitudes = [_magnitudes(each.stars, known) for each in answer.observations]
+        return tracker_rows(row["batch_id"], answer, corrected, magnitudes)
+
+    def _catalog_mag(self, answer: Answer, mission: Mission, time: str) -> Mapping[str, float]:
+        """Catalog magnitudes by star; empty if the answer's catalog is no longer there."""
+        digest = answer.provenance.run_catalog
+        if digest not in self._catalogs:
+            catalog = self.sky.run_catalog(mission, parse_utc(time))
+            pairs = zip(catalog.star_id, catalog.magnitude_mag.tolist(), strict=True)
+            self._catalogs[digest] = dict(pairs) if catalog.digest == digest else {}
+        return self._catalogs[digest]
+
+
+class BackgroundSplit:
+    """Splits what is waiting, in a thread, once."""
+
+    def __init__(self, splitter: TrackerSplitter) -> None:
+        self.splitter = splitter
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Begin, if anything is waiting."""
+        if self._thread is None and self.splitter.waiting():
+            self._thread = threading.Thread(target=self._run, name="split-by-tracker")
+            self._thread.start()
+
+    def stop(self) -> None:
+        """End after the present step; the next start goes on."""
+        self._stopping.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            try:
+                done = self.splitter.split(pause_s=PAUSE_S, is_stopped=self._stopping.is_set)
+            except Busy:
+                self._stopping.wait(RETRY_S)
+                continue
+            except Exception:
+                # Trends of trackers stay incomplete and say so; everything else goes on.
+                log.exception("older batches could not be split by tracker")
+                return
+            if not self._stopping.is_set():
+                log.info("%d older batches were looked at and split by tracker", done)
+            return
+
+
+def _magnitudes(stars: Iterable[Any], known: Mapping[str, float]) -> Vector:
+    return np.array([known.get(star.star.id, np.nan) if star.star else np.nan for star in stars])
+
+
+def _place(connection: Connection, owner: Owner, *, lock: bool = False) -> Place | None:
+    """How far the batches of a run were looked at; None if all are."""
+    query = select(tracker_splits.c.time_ns, tracker_splits.c.batch_id).where(_is(owner))
+    row = connection.execute(query.with_for_update() if lock else query).first()
+    return None if row is None else (row[0], row[1])
+
+
+def _is(owner: Owner) -> Any:
+    return tuple_(tracker_splits.c.spacecraft, tracker_splits.c.run) == tuple_(*owner)
+
+
+def _next(owner: Owner, place: Place) -> Select[Any]:
+    """The next batches to be looked at, the newest first, with what their values need."""
+    spacecraft, run = owner
+    query = (
+        select(
+            *(results.c[name] for name in ("id", "batch_id", "mission_digest", "time_ns")),
+            results.c.answer,
+            batches.c.input,
+            batches.c.time,
+        )
+        .join_from(results, batches, results.c.batch_id == batches.c.id)
+        .where(results.c.current, results.c.spacecraft == spacecraft, results.c.run == run)
+    )
+    if place != (None, None):
+        query = query.where(tuple_(*PLACE) < tuple_(*place))
+    return newest_first(query).limit(AT_ONCE)
+
+
+def _write(
+    connection: Connection,
+    owner: Owner,
+    place: Place,
+    rows: list[Row],
+    split: Mapping[str, list[Row]],
+) -> None:
+    if _place(connection, owner, lock=True) != place:
+        # Another process was here.
+        return
+    if not rows:
+        connection.execute(deleted(tracker_splits).where(_is(owner)))
+        return
+    hours = {row["id"]: parse_utc(row["time"]).bucket(HOUR_S) for row in rows}
+    rollups.lock(connection, ((*owner, hour) for hour in hours.values()))
+    ids = [row["id"] for row in rows]
+    current = set(
+        connection.scalars(select(results.c.id).where(results.c.id.in_(ids), results.c.current))
+    )
+    of_batches = tracker_values.c.batch_id.in_([row["batch_id"] for row in rows])
+    there = set(connection.scalars(select(tracker_values.c.batch_id).where(of_batches)))
+    new = [
+        (Buckets(*owner, hours[row["id"]], parse_utc(row["time"]).bucket(DAY_S)), values)
+        for row in rows
+        if row["id"] in current and row["batch_id"] not in there
+        for values in split[row["id"]]
+    ]
+    insert_all(connection, tracker_values, [values for _, values in new])
+    rollups.add_trackers(connection, new)
+    last = {"time_ns": rows[-1]["time_ns"], "batch_id": rows[-1]["batch_id"]}
+    connection.execute(update(tracker_splits).where(_is(owner)).values(last))

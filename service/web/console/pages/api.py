@@ -1,0 +1,43 @@
+"""The API's description for people, from the document that programs get."""
+
+from functools import cache
+from typing import Annotated
+
+from fastapi import FastAPI
+from fastapi import Query as InQuery
+from markupsafe import Markup
+from starlette.requests import Request
+from starlette.responses import Response
+
+from service.web.console.api_reference import reference_for_people
+from service.web.console.page_context import PageQuery, open_layout
+from service.web.console.registry import console_page
+from service.web.console.rendering import rendered, rendered_part
+from service.web.requests.access import OPEN
+
+
+@console_page("/docs", "API", OPEN)
+def api_page(request: Request, query: Annotated[PageQuery, InQuery()]) -> Response:
+    """Every route of the API with its parameters, answers and examples."""
+    layout = open_layout(query.run, "API", "/docs")
+    shown = _operations(request.app)
+    return rendered("api.html.jinja", layout, heading="API", reference=shown)
+
+
+@console_page("/docs/shapes", "API shapes", OPEN, section="/docs")
+def api_shapes_page(request: Request, query: Annotated[PageQuery, InQuery()]) -> Response:
+    """The shapes of requests and answers, field by field."""
+    layout = open_layout(query.run, "API shapes", "/docs")
+    shown = _shapes(request.app)
+    return rendered("api.html.jinja", layout, heading="API: shapes", reference=shown)
+
+
+# Made once: anybody may ask for these pages, without a token.
+@cache
+def _operations(app: FastAPI) -> Markup:
+    return rendered_part("_api.html.jinja", reference=reference_for_people(app))
+
+
+@cache
+def _shapes(app: FastAPI) -> Markup:
+    return rendered_part("_api_shapes.html.jinja", reference=reference_for_people(app))

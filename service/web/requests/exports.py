@@ -1,0 +1,97 @@
+"""Exports: files that are written as they are sent, a bounded number at a time."""
+
+from collections import Counter
+from collections.abc import Callable, Generator, Iterator
+from threading import Lock
+from typing import Annotated
+
+from anyio import CancelScope
+from anyio.to_thread import run_sync
+from fastapi import Depends
+from starlette.requests import Request
+from starlette.responses import Response, StreamingResponse
+from starlette.types import Receive, Scope, Send
+
+from service.access.tokens import Caller
+from service.errors import Busy, RateLimited
+
+MAX_OF_ONE_TOKEN = 2
+MAX_EXPORTS = 8
+"""At a time, of all callers: each occupies a thread while it is written."""
+RETRY_AFTER_S = 5
+
+
+class Exports:
+    """Counts the exports that are under way."""
+
+    def __init__(self) -> None:
+        self._under_way: Counter[str | None] = Counter()
+        self._lock = Lock()
+
+    def response(
+        self,
+        caller: Caller,
+        write: Callable[[], Iterator[bytes]],
+        media_type: str,
+        headers: dict[str, str] | None = None,
+    ) -> Response:
+        """The response that sends what `write` gives.
+
+        Raises `RateLimited` where the caller's token has as many exports as it may, `Busy`
+        where there are too many of all callers, and what `write` raises.
+        """
+        self._begin(caller)
+        try:
+            content = write()
+        except BaseException:
+            self._end(caller)
+            raise
+        return FileResponse(content, media_type, headers, lambda: self._end(caller))
+
+    def _begin(self, caller: Caller) -> None:
+        token = caller.token_id
+        with self._lock:
+            if token is not None and self._under_way[token] >= MAX_OF_ONE_TOKEN:
+                message = f"{caller.name} has {MAX_OF_ONE_TOKEN} exports under way, which is most"
+                raise RateLimited(message, RETRY_AFTER_S)
+            if self._under_way.total() >= MAX_EXPORTS:
+                raise Busy(f"{MAX_EXPORTS} exports are under way", RETRY_AFTER_S)
+            self._under_way[token] += 1
+
+    def _end(self, caller: Caller) -> None:
+        with self._lock:
+            self._under_way[caller.token_id] -= 1
+            self._under_way += Counter()
+
+
+class FileResponse(StreamingResponse):
+    """A file that is written as it is sent; `leave` is called at the end, however it comes."""
+
+    def __init__(
+        self,
+        content: Iterator[bytes],
+        media_type: str,
+        headers: dict[str, str] | None,
+        leave: Callable[[], object],
+    ) -> None:
+        super().__init__(content, 200, headers, media_type)
+        self._written, self._leave = content, leave
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the file; what it was written with is closed also where the client has left."""
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._leave()
+            if isinstance(self._written, Generator):
+                with CancelScope(shield=True):
+                    await run_sync(self._written.close)
+
+
+async def _exports(request: Request) -> Exports:
+    exports = request.app.state.exports
+    assert isinstance(exports, Exports)
+    return exports
+
+
+ExportsDep = Annotated[Exports, Depends(_exports)]

@@ -1,0 +1,165 @@
+"""The types of problems: the one place that gives an error its status and its explanation."""
+
+from dataclasses import dataclass
+from http import HTTPStatus
+
+from service.errors import (
+    AcquisitionError,
+    BadInput,
+    Busy,
+    Conflict,
+    Forbidden,
+    KeyReused,
+    NotAvailable,
+    NotFound,
+    RateLimited,
+    Unauthenticated,
+    WrongState,
+)
+
+
+@dataclass(frozen=True)
+class ProblemType:
+    """What all problems of one type share; a `slug` gives the type a page of its own.
+
+    The page says what the problem means and what the client should do.
+    """
+
+    status: int
+    title: str
+    slug: str | None = None
+    meaning: str = ""
+    remedy: str = ""
+
+    @property
+    def type(self) -> str:
+        """The problem's `type`; without a slug the status says all."""
+        return "about:blank" if self.slug is None else f"/problems/{self.slug}"
+
+
+class NotJson(BadInput):
+    """A body that is not JSON: truncated, empty, or in another encoding."""
+
+
+PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
+    NotJson: ProblemType(
+        400,
+        "The body is not JSON",
+        "not-json",
+        "The body was cut off, is empty, is no JSON, or is not in UTF-8. Nothing of it was used.",
+        "Check that the client sends the whole body. The detail names the place of the first "
+        "fault.",
+    ),
+    BadInput: ProblemType(
+        422,
+        "Invalid input",
+        "bad-input",
+        "A field of the body, a parameter of the query or a header has a value that the service "
+        "does not accept, or that does not fit the mission. Nothing was recorded.",
+        "Correct every field that errors names; each entry has the field, what is expected and "
+        "the value that was received. The same request will fail again.",
+    ),
+    NotAvailable: ProblemType(
+        422,
+        "Not available",
+        "not-available",
+        "The value is known, but this version or this installation lacks what it needs.",
+        "Choose another value, or ask the operator of the service for the missing part; the "
+        "detail names it.",
+    ),
+    Unauthenticated: ProblemType(
+        401,
+        "Unauthorized",
+        "not-admitted",
+        "The request has no token, or one that is unknown, has expired or was revoked. The "
+        "service does not say which.",
+        "Send the header Authorization: Bearer acq_... with a valid token. On the machine of the "
+        "service, acquire token list shows the valid ones and acquire token create makes another. "
+        "In a browser, sign in again.",
+    ),
+    Forbidden: ProblemType(
+        403,
+        "Forbidden",
+        "not-allowed",
+        "The token is valid, but lacks the scope of this request or is bound to other spacecraft; "
+        "or a page of another site sent the request.",
+        "Use a token with the scope that the detail names. A token that is bound to spacecraft "
+        "must name one of them.",
+    ),
+    RateLimited: ProblemType(
+        429,
+        "Too many requests",
+        "too-often",
+        "The rate of the token is used up, or its ten event streams. An array of batches counts "
+        "as many requests as it has batches.",
+        "Wait for as many seconds as the header Retry-After says, then send the same request "
+        "again.",
+    ),
+    NotFound: ProblemType(
+        404,
+        "Not found",
+        "not-found",
+        "There is no spacecraft, batch, alarm, run or replay of the name or id in the address, or "
+        "the token may not see it.",
+        "Check the name in the address. GET /api/v1/spacecraft and GET /api/v1/batches list what "
+        "there is.",
+    ),
+    Conflict: ProblemType(
+        409,
+        "The batch is already recorded with another body",
+        "conflict",
+        "Spacecraft, run and batch id together identify a batch. One with the same three is "
+        "recorded, and its body differs from the one that was sent. The recorded batch stays as "
+        "it is.",
+        "Give the new batch another batch id. To process the recorded one with other options, "
+        "use a what-if.",
+    ),
+    WrongState: ProblemType(
+        409,
+        "The state does not allow this",
+        "not-now",
+        "The alarm is already acknowledged or cleared, or is not shelved; or the replay has ended.",
+        "Read the alarm or the replay again: somebody else may have acted in the meantime.",
+    ),
+    KeyReused: ProblemType(
+        422,
+        "The Idempotency-Key was used with another body",
+        "key-reused",
+        "The same token sent another body with this Idempotency-Key before. Nothing was recorded.",
+        "Use a new key for each new body. A batch needs no key: its batch id already makes a "
+        "repeat harmless.",
+    ),
+    Busy: ProblemType(
+        503,
+        "The service is busy",
+        "busy",
+        "The service is starting or stopping, its queue is full, or its database does not answer. "
+        "It decided nothing about the request.",
+        "Wait for as many seconds as the header Retry-After says, then send the same request "
+        "again. A batch that was recorded after all is not recorded twice.",
+    ),
+}
+WRONG_HOST = ProblemType(
+    421,
+    "Misdirected request",
+    "not-this-host",
+    "While access is open, the service answers only requests for a name of its own machine, so "
+    "that pages of other sites cannot reach it.",
+    "Use localhost or 127.0.0.1 in the address, or create a token: with tokens, every name is "
+    "answered.",
+)
+INTERNAL_ERROR = ProblemType(500, HTTPStatus(500).phrase)
+
+
+def problem_type_of(error: AcquisitionError) -> ProblemType:
+    """The problem type of an error: that of its class, or of the nearest base class."""
+    return next(
+        (PROBLEM_TYPES[each] for each in type(error).__mro__ if each in PROBLEM_TYPES),
+        INTERNAL_ERROR,
+    )
+
+
+def types_with_pages() -> dict[str, ProblemType]:
+    """Every type that has a page, by its slug, in the order of their statuses."""
+    kinds = sorted((*PROBLEM_TYPES.values(), WRONG_HOST), key=lambda kind: kind.status)
+    return {kind.slug: kind for kind in kinds if kind.slug is not None}

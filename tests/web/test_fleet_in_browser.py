@@ -1,0 +1,175 @@
+"""The overview of 40 and of 200 spacecraft in a real browser, six of them in trouble."""
+
+import gzip
+import json
+from pathlib import Path
+
+import httpx
+import pytest
+
+from service.app.factory import open_app
+from service.settings import Settings
+from service.web.app import create_app
+from tests.web import fleet
+from tests.web.browser import CHROMIUM, Browser
+from tests.web.serving import Server
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
+
+AXE = (Path(__file__).parent / "axe" / "axe.min.js").read_text(encoding="utf-8")
+FAULTS = """axe.run(document, {resultTypes: ["violations"]}).then(found => found.violations
+    .map(each => [each.id, each.nodes.map(node => node.html).slice(0, 3)]))"""
+ROWS = "[...document.querySelectorAll('.fleet tbody tr')]"
+NAMES = f"{ROWS}.map(row => row.querySelector('th').innerText)"
+DRAWN = "document.getElementById('heat').dataset.drawn"
+MOST_BYTES = 300_000
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    with Browser(tmp_path_factory.mktemp("profile")) as browser:
+        yield browser
+
+
+@pytest.fixture(scope="module", params=(40, 200))
+def filled(request, browser, tmp_path_factory):
+    """A service with so many spacecraft in trouble and out of it: how many, and its address."""
+    folder = tmp_path_factory.mktemp("fleet")
+    missions = fleet.write_missions(folder / "missions", request.param)
+    settings = Settings(database=f"sqlite:///{folder}/acquire.db", missions=missions)
+    app = open_app(settings)
+    fleet.fill(app, request.param)
+    with Server(create_app(app)) as address:
+        yield request.param, address
+        # So that it does not look for the service that ends.
+        browser.call("Page.navigate", url="about:blank")
+
+
+def shown_names(browser):
+    return [each for each in browser.run(NAMES) if each.startswith("SAT-")]
+
+
+def test_all_in_trouble_stand_in_the_first_900_pixels(browser, filled):
+    size, address = filled
+    browser.open(address)
+    browser.wait(lambda: browser.run(DRAWN) == str(size))
+    assert set(shown_names(browser)[: fleet.IN_TROUBLE]) == set(fleet.troubled(size))
+    places = browser.run(
+        f"{ROWS}.map(row => row.getBoundingClientRect()).map(b => [b.bottom, b.height])"
+    )
+    assert places[fleet.IN_TROUBLE - 1][0] <= 900
+    assert max(height for _, height in places) <= 32
+    loaded = browser.run("performance.getEntriesByType('resource').map(each => each.name)")
+    files = {each for each in [address, *loaded] if "/events" not in each}
+    assert sum(len(gzip.compress(httpx.get(each).content)) for each in files) < MOST_BYTES
+    assert browser.complaints == []
+
+
+def test_it_fits_wide_and_narrow_light_and_dark_without_any_fault(browser, filled):
+    size, address = filled
+    for width, dark in ((1440, True), (400, False), (400, True)):
+        browser.open(address, width=width, dark=dark)
+        browser.wait(lambda: browser.run(DRAWN) == str(size))
+        assert browser.run("document.documentElement.scrollWidth") <= width
+        browser.run(AXE + ";0")
+        assert browser.run(FAULTS) == [], (width, dark)
+    assert browser.complaints == []
+
+
+def test_rows_are_filtered_and_sorted_and_the_address_says_how(browser, filled):
+    size, address = filled
+    browser.open(address)
+    browser.wait(lambda: browser.run(DRAWN) == str(size))
+    browser.run(
+        "(box => { box.value = 'sat-02'; box.dispatchEvent(new Event('input', {bubbles: true})); })"
+        "(document.querySelector('#filter input[type=search]'))"
+    )
+    browser.wait(lambda: len(browser.run(NAMES)) == 10)
+    assert "q=sat-02" in browser.run("location.search")
+    browser.wait(lambda: browser.run(DRAWN) == "10")
+    order = "document.querySelector('.fleet th.c-name').ariaSort"
+    for wanted in ("ascending", "descending"):
+        browser.run("document.querySelector('.fleet .c-name a[data-go]').click()")
+        browser.wait(lambda wanted=wanted: browser.run(order) == wanted)
+    assert browser.run(NAMES) == [f"SAT-{k:03d}" for k in range(29, 19, -1)]
+    browser.open(browser.run("location.href"))
+    assert browser.run(NAMES)[0] == "SAT-029"
+    browser.open(f"{address}/?show=trouble")
+    assert sorted(browser.run(NAMES)) == fleet.troubled(size)
+    assert browser.complaints == []
+
+
+def test_a_cell_of_the_heat_map_is_read_by_keyboard_and_leads_to_the_spacecraft(browser, filled):
+    size, address = filled
+    browser.open(f"{address}/?heat=unmatched_share")
+    browser.wait(lambda: browser.run(DRAWN) == str(size))
+    label = "document.getElementById('heat-map').getAttribute('aria-label')"
+    worst = fleet.troubled(size)[0]
+    assert browser.run(label).startswith(
+        f"unmatched stars of {size} spacecraft; greatest 40 %, {worst}"
+    )
+    browser.run("document.getElementById('heat-map').focus()")
+    browser.press("ArrowLeft")
+    said = browser.run("document.getElementById('heat-readout').textContent")
+    assert said.startswith(f"{worst}, 1999-03-0")
+    assert said.endswith("40 % unmatched stars")
+    browser.press("Enter")
+    browser.wait(lambda: browser.run("location.pathname") == f"/spacecraft/{worst}")
+    assert "start=1999-03-01T" in browser.run("location.search")
+    browser.complaints.clear()
+
+
+def test_without_scripts_the_rows_are_all_there(filled):
+    size, address = filled
+    page = httpx.get(address, params={"sort": "unmatched", "show": "no_attitude"}).text
+    for name in fleet.troubled(size):
+        assert json.dumps(name) in page or f">{name}</a>" in page
+    assert page.count('<tr class="trouble">') == fleet.IN_TROUBLE
+
+
+def test_many_alarms_are_acknowledged_at_once_and_the_header_counts_down(browser, filled):
+    _, address = filled
+    browser.open(f"{address}/alarms")
+    browser.wait(
+        lambda: browser.run("document.getElementById('connection').dataset.state") == "live"
+    )
+    assert browser.run("document.title").startswith(f"({fleet.IN_TROUBLE}) ")
+    selected = "document.getElementById('message').textContent"
+    browser.run("document.querySelector('[data-select-all]').click()")
+    assert browser.run(selected) == f"{fleet.IN_TROUBLE} selected."
+    browser.run("document.querySelector('[data-select]').click()")
+    browser.run("document.querySelector('#bulk input[name=who]').value = 'J. Operator'")
+    browser.run("document.querySelector('#bulk [data-act=acknowledge]').click()")
+    browser.wait(lambda: browser.run(selected) == f"{fleet.IN_TROUBLE - 1} acknowledged.")
+    browser.wait(lambda: browser.run("document.title").startswith("(1) "))
+    found = httpx.get(f"{address}/api/v1/alarms").json()["items"]
+    assert sorted(each["state"] for each in found) == ["acknowledged"] * 5 + ["open"]
+    browser.run("document.querySelector('[data-select]').click()")
+    browser.run("document.querySelector('#bulk [data-act=shelve]').click()")
+    browser.wait(lambda: browser.run(selected) == "1 shelved.")
+    browser.wait(lambda: browser.run("document.querySelector('#open-alarms').textContent") == "")
+    browser.run(AXE + ";0")
+    assert browser.run(FAULTS) == []
+    assert browser.complaints == []
+
+
+def test_a_period_is_entered_by_its_length_or_by_its_ends(browser, filled):
+    size, address = filled
+    name = fleet.troubled(size)[0]
+    browser.open(f"{address}/spacecraft/{name}")
+    fill = "document.querySelector('.entries input[name={0}]').value = '{1}'"
+    browser.run(fill.format("range", "6h"))
+    browser.run("document.querySelector('.entries form').requestSubmit()")
+    browser.wait(lambda: "range=6h" in browser.run("location.search"))
+    bounds = "[stretch.dataset.start, stretch.dataset.end].map(each => Date.parse(each))"
+    browser.wait(lambda: browser.run("document.readyState") == "complete")
+    start_ms, end_ms = browser.run(bounds)
+    assert end_ms - start_ms == 6 * 3600 * 1000
+    browser.run(fill.format("start", "1999-060T12:00:00Z"))
+    browser.run(fill.format("end", ""))
+    browser.run("document.querySelectorAll('.entries form')[1].requestSubmit()")
+    browser.wait(lambda: "start=1999-060" in browser.run("location.search"))
+    browser.wait(lambda: browser.run("document.readyState") == "complete")
+    start_ms, end_ms = browser.run(bounds)
+    assert end_ms - start_ms == pytest.approx(12 * 3600 * 1000, abs=10)
+    browser.complaints.clear()
