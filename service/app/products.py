@@ -6,14 +6,7 @@ from service import __version__
 from service.app.context import Context
 from service.errors import BadBatch, Fault
 from service.missions.mission import mission_named
-from service.products.attitudes import (
-    DEFAULT_LARGEST_GAP_S,
-    DEFAULT_NAIF_ID,
-    AttitudeSeries,
-    SeriesInfo,
-    StatusWanted,
-    series_of,
-)
+from service.products.attitudes import AttitudeSeries, SeriesInfo, StatusWanted, series_of
 from service.storage.queries.attitude_rows import attitude_pages, count_results
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
@@ -37,17 +30,17 @@ class Products:
         end: Utc | None = None,
         status: StatusWanted = "good",
         order: Order = "oldest",
-        largest_gap_s: float = DEFAULT_LARGEST_GAP_S,
+        largest_gap_s: float | None = None,
         object_id: str | None = None,
-        naif_id: int = DEFAULT_NAIF_ID,
+        naif_id: int | None = None,
         most_batches: int | None = None,
     ) -> AttitudeSeries:
         """The attitudes of a spacecraft's current results in a run; see `series_of`.
 
-        They are read as the series is.  Raises `BadBatch` where a period has more than
-        `most_batches`.
+        They are read as the series is.  The largest gap and the identifiers are the mission's
+        where they are None.  Raises `BadBatch` where a period has more than `most_batches`.
         """
-        mission_named(self._context.missions, name)
+        own = mission_named(self._context.missions, name).products
         about = SeriesInfo(
             spacecraft=name,
             run=run or LIVE,
@@ -57,9 +50,9 @@ class Products:
             end=None if end is None else end.text,
             status=status,
             newest_first=order == "newest",
-            largest_gap_s=largest_gap_s,
-            object_id=object_id,
-            naif_id=naif_id,
+            largest_gap_s=own.largest_gap_s if largest_gap_s is None else largest_gap_s,
+            object_id=own.object_id if object_id is None else object_id,
+            naif_id=own.naif_id if naif_id is None else naif_id,
         )
         selected = ResultFilter(about.run, name, start, end)
         if most_batches is not None:

@@ -28,6 +28,7 @@ from service.errors import BadConfiguration, BadInput, Fault, NotFound, shown_va
 from service.missions.camera import Camera
 from service.missions.camera_defaults import with_camera_defaults
 from service.missions.identifiers import IDENTIFIERS
+from service.missions.product_settings import DEFAULT_PRODUCTS, ProductSettings, beside
 from service.missions.strict import Strict
 from service.vectors import Matrix, Vector, read_only, unit
 
@@ -246,6 +247,7 @@ class Mission(Strict):
     tests: Tests = Field(default=Tests(), validate_default=True)
     catalog: RunCatalogSettings
     trackers: tuple[Tracker, ...] = Field(min_length=1, max_length=16)
+    products: ProductSettings = Field(default=DEFAULT_PRODUCTS, exclude_if=DEFAULT_PRODUCTS.__eq__)
 
     @field_validator("trackers")
     @classmethod
@@ -317,7 +319,8 @@ class Mission(Strict):
 def parse_mission(text: str, file: str) -> Mission:
     """Read one mission from TOML; raises `BadConfiguration` naming file, key and allowed values."""
     try:
-        return Mission.model_validate(with_camera_defaults(tomllib.loads(text)))
+        told = with_camera_defaults(tomllib.loads(text))
+        return Mission.model_validate(told, context=beside(file))
     except tomllib.TOMLDecodeError as error:
         raise BadConfiguration(f"{file}: not TOML: {error}") from None
     except ValidationError as error:
@@ -357,13 +360,11 @@ def _allowed_keys(location: tuple[str | int, ...]) -> list[str]:
         "trackers": Tracker,
         "calibration": Calibration,
         "camera": Camera,
+        "products": ProductSettings,
     }
     for part in location:
-        found = tables.get(str(part))
-        if isinstance(found, dict):
-            model = found[str(location[1])]
-        elif found is not None:
-            model = found
+        found = tables.get(str(part), model)
+        model = found[str(location[1])] if isinstance(found, dict) else found
     return list(model.model_fields)
 
 

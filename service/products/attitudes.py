@@ -15,6 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from service.errors import BadBatch, Fault, shown_value
+from service.missions.product_settings import (
+    DEFAULT_LARGEST_GAP_S,
+    DEFAULT_NAIF_ID,
+    MAX_LARGEST_GAP_S,
+    MIN_NAIF_ID,
+    OBJECT_ID,
+)
 from service.products.rotations import rotation_vectors
 from service.vectors import Vector
 
@@ -25,13 +32,6 @@ StatusWanted = Literal["good", "suspect", "all"]
 OWN, DERIVED, NONE = "own", "derived", "none"
 SAME_MOMENT_NS = 1_000
 """Of attitudes that are closer than this the last one counts: clocks of kernels have 1 us."""
-DEFAULT_LARGEST_GAP_S = 60.0
-"""Attitudes that are farther apart belong to two stretches."""
-MAX_LARGEST_GAP_S = 86_400.0
-DEFAULT_NAIF_ID = -999
-MIN_NAIF_ID = -2_000_000
-"""The ids of a spacecraft's instruments have three digits more, and 32 bits."""
-OBJECT_ID = r"[A-Za-z0-9][A-Za-z0-9 ._+/-]{0,63}"
 
 
 @dataclass(frozen=True)

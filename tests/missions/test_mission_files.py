@@ -100,6 +100,11 @@ MISTAKES = [
         XTE.replace("pole = false", "pole = true"),
         ("tests", "a cap has no pole", "false is allowed"),
     ),
+    (XTE + "\n[products]\nlargest_gap_s = 0\n", ("products.largest_gap_s", "greater than 0")),
+    (XTE + '\n[products]\nobject_id = "1995\\n074A"\n', ("products.object_id", "pattern")),
+    (XTE + "\n[products]\nnaif_id = 95\n", ("products.naif_id", "less than 0", "95")),
+    (XTE + "\n[products]\ngap_s = 10\n", ("products.gap_s", "no such key", "largest_gap_s")),
+    (XTE + '\n[products]\nsclk_kernel = "x.tsc"\n', ("products", "needs naif_id")),
     (XTE + "\n[surprise]\nx = 1\n", ("surprise", "trackers")),
     ("name = ", ("not TOML",)),
     ("", ("name", "required")),
@@ -202,3 +207,57 @@ def test_rules_hold_every_tolerance_and_test_as_the_kernels_read_them(missions):
         other = tests.model_copy(update={name: not getattr(tests, name)})
         apart = np.not_equal(rules_of(tolerances, other).switches, missions["SOHO"].rules.switches)
         assert np.flatnonzero(apart).tolist() == [place]
+
+
+CLOCK = "KPL/SCLK\n\\begindata\nSCLK_DATA_TYPE_95 = ( 1 )\n"
+PRODUCTS = """
+[products]
+largest_gap_s = 10.0
+object_id = "1995-074A"
+naif_id = -95
+sclk_kernel = "clocks/xte.tsc"
+"""
+
+
+def test_a_mission_without_products_is_what_it_was_before_it_could_have_them(missions):
+    """The digests were printed by the version before the table `[products]`."""
+    assert missions["XTE"].digest == (
+        "sha256:1a499a850b01d14896a3cbb4a999e8c7c4fc00f57655296d0228dc9e6e019ca3"
+    )
+    assert "products" not in missions["XTE"].model_dump_json()
+    assert parse_mission(XTE + "\n[products]\n", "x.toml").digest == missions["XTE"].digest
+    own = missions["XTE"].products
+    assert (own.largest_gap_s, own.object_id, own.naif_id) == (60.0, None, -999)
+    assert own.sclk_kernel is None
+
+
+def test_a_mission_names_its_identifiers_and_a_clock_beside_its_file(tmp_path, missions):
+    (tmp_path / "clocks").mkdir()
+    (tmp_path / "clocks" / "xte.tsc").write_text(CLOCK)
+    (tmp_path / "xte.toml").write_text(XTE + PRODUCTS)
+    mission = load_missions(tmp_path)["XTE"]
+    own = mission.products
+    assert (own.largest_gap_s, own.object_id, own.naif_id) == (10.0, "1995-074A", -95)
+    assert own.sclk_kernel == tmp_path / "clocks" / "xte.tsc"
+    assert mission.digest != missions["XTE"].digest
+    assert str(tmp_path) not in mission.model_dump_json()
+
+
+@pytest.mark.parametrize(
+    ("clock", "words"),
+    [
+        (None, "xte.tsc: cannot be read: No such file"),
+        (CLOCK.replace("_95", "_96"), "no clock of -95: it has no SCLK_DATA_TYPE_95"),
+        (CLOCK.replace("_95", "_950"), "no clock of -95: it has no SCLK_DATA_TYPE_95"),
+        ("DAF/CK", "must begin with KPL/SCLK"),
+    ],
+)
+def test_a_clock_that_is_not_the_spacecraft_s_is_refused_by_file(tmp_path, clock, words):
+    (tmp_path / "clocks").mkdir()
+    if clock is not None:
+        (tmp_path / "clocks" / "xte.tsc").write_text(clock)
+    (tmp_path / "xte.toml").write_text(XTE + PRODUCTS)
+    with pytest.raises(BadConfiguration) as refusal:
+        load_missions(tmp_path)
+    assert f"{tmp_path / 'xte.toml'}: products" in str(refusal.value)
+    assert words in str(refusal.value)

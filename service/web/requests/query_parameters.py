@@ -20,15 +20,9 @@ from starlette.requests import Request
 
 from service.alarms.quantities import QuantityName, RankedName, trend_names
 from service.errors import BadBatch, BadInput, Fault, shown_value
+from service.missions.product_settings import MAX_LARGEST_GAP_S, MIN_NAIF_ID, OBJECT_ID
 from service.observations.schema import Key, RunName
-from service.products.attitudes import (
-    DEFAULT_LARGEST_GAP_S,
-    DEFAULT_NAIF_ID,
-    MAX_LARGEST_GAP_S,
-    MIN_NAIF_ID,
-    OBJECT_ID,
-    StatusWanted,
-)
+from service.products.attitudes import StatusWanted
 from service.products.formats import JSON_FORMAT, attitude_formats, table_formats
 from service.storage.queries.alarms import StateFilter
 from service.storage.queries.results import OutcomeName, StatusName
@@ -80,12 +74,13 @@ SpacecraftFilter = Annotated[Key | None, Field(description="Only items of this s
 
 
 LargestGap = Annotated[
-    float,
+    float | None,
     Field(
         gt=0,
         le=MAX_LARGEST_GAP_S,
         allow_inf_nan=False,
-        description="Attitudes farther apart than this, in seconds, belong to two stretches.",
+        description="Attitudes farther apart than this, in seconds, belong to two stretches. "
+        "Default: the mission's.",
     ),
 ]
 
@@ -277,22 +272,23 @@ class AttitudeQuery(PeriodQuery):
         Literal["oldest", "newest"],
         Field(description="Which come first. `newest` is for JSON and tables alone."),
     ] = "oldest"
-    largest_gap_s: LargestGap = DEFAULT_LARGEST_GAP_S
+    largest_gap_s: LargestGap = None
     object_id: Annotated[
         str | None,
         Field(
             pattern=f"^{OBJECT_ID}$",
-            description="OBJECT_ID of CCSDS messages, such as 1995-074A. Default: the name.",
+            description="OBJECT_ID of CCSDS messages, such as 1995-074A. Default: the mission's, "
+            "or else the name.",
         ),
     ] = None
     naif_id: Annotated[
-        int,
+        int | None,
         Field(
             ge=MIN_NAIF_ID,
             le=-1,
-            description="NAIF's id of the spacecraft, for SPICE kernels.",
+            description="NAIF's id of the spacecraft, for SPICE kernels. Default: the mission's.",
         ),
-    ] = DEFAULT_NAIF_ID
+    ] = None
 
 
 class WorstQuery(PeriodQuery):

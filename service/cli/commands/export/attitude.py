@@ -38,13 +38,16 @@ def add(commands: Any) -> None:
         "--largest-gap",
         type=positive,
         metavar="SECONDS",
-        help="attitudes farther apart belong to two stretches; default 60",
+        help="attitudes farther apart belong to two stretches; default: the mission's",
     )
     parser.add_argument(
-        "--object-id", metavar="ID", help="OBJECT_ID of CCSDS messages; default: the name"
+        "--object-id", metavar="ID", help="OBJECT_ID of CCSDS messages; default: the mission's"
     )
     parser.add_argument(
-        "--naif-id", type=int, metavar="ID", help="NAIF's id of the spacecraft; default -999"
+        "--naif-id",
+        type=int,
+        metavar="ID",
+        help="NAIF's id of the spacecraft; default: the mission's",
     )
     parser.add_argument(
         "--output", type=Path, metavar="FILE", help="the file to write; default: standard output"
