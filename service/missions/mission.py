@@ -28,6 +28,8 @@ from service.errors import BadConfiguration, BadInput, Fault, NotFound, shown_va
 from service.missions.camera import Camera
 from service.missions.camera_defaults import with_camera_defaults
 from service.missions.identifiers import IDENTIFIERS
+from service.missions.keys import allowed_keys, dotted_key
+from service.missions.packets import Packets
 from service.missions.product_settings import DEFAULT_PRODUCTS, ProductSettings, beside
 from service.missions.strict import Strict
 from service.vectors import Matrix, Vector, read_only, unit
@@ -233,6 +235,10 @@ class Tracker(Strict):
         return read_only(self.body_from_tracker[:, 2].copy())
 
 
+def _is_missing(table: object) -> bool:
+    return table is None
+
+
 class Mission(Strict):
     """All that is fixed for a mission."""
 
@@ -248,6 +254,8 @@ class Mission(Strict):
     catalog: RunCatalogSettings
     trackers: tuple[Tracker, ...] = Field(min_length=1, max_length=16)
     products: ProductSettings = Field(default=DEFAULT_PRODUCTS, exclude_if=DEFAULT_PRODUCTS.__eq__)
+    packets: Packets | None = Field(default=None, exclude_if=_is_missing)
+    """Which parameters of space packets fill a batch; missing, it is no part of the digest."""
 
     @field_validator("trackers")
     @classmethod
@@ -256,6 +264,18 @@ class Mission(Strict):
         if len(set(names)) != len(names):
             raise ValueError(f"two trackers share a name: {', '.join(names)}")
         return trackers
+
+    @field_validator("packets")
+    @classmethod
+    def _packets_are_of_its_trackers(
+        cls, packets: Packets | None, info: ValidationInfo
+    ) -> Packets | None:
+        # Trackers that are themselves at fault are not there to be compared with.
+        known = [tracker.name for tracker in info.data.get("trackers", ())]
+        for each in packets.trackers if packets and known else ():
+            if each.tracker not in known:
+                raise ValueError(f"trackers: {each.tracker}: the mission has {', '.join(known)}")
+        return packets
 
     @field_validator("tests")
     @classmethod
@@ -325,7 +345,8 @@ def parse_mission(text: str, file: str) -> Mission:
         raise BadConfiguration(f"{file}: not TOML: {error}") from None
     except ValidationError as error:
         lines = [
-            f"{file}: {_key(e['loc'])}: {_explained(e)} (got {shown_value(e['input'])})"
+            f"{file}: {dotted_key(Mission, e['loc'])}: {_explained(e)} "
+            f"(got {shown_value(e['input'])})"
             for e in error.errors()
         ]
         raise BadConfiguration("\n".join(lines)) from None
@@ -340,32 +361,11 @@ def read_mission(path: Path) -> Mission:
     return parse_mission(text, str(path))
 
 
-def _key(location: tuple[str | int, ...]) -> str:
-    return ".".join(str(part) for part in location if part not in ("cap", "band")) or "the file"
-
-
 def _explained(error: Mapping[str, Any]) -> str:
     if error["type"] != "extra_forbidden":
         return str(error["msg"])
-    return f"no such key; allowed here: {', '.join(_allowed_keys(error['loc'][:-1]))}"
-
-
-def _allowed_keys(location: tuple[str | int, ...]) -> list[str]:
-    model: Any = Mission
-    tables = {
-        "zone": {"cap": Cap, "band": Band},
-        "tolerances": Tolerances,
-        "tests": Tests,
-        "catalog": RunCatalogSettings,
-        "trackers": Tracker,
-        "calibration": Calibration,
-        "camera": Camera,
-        "products": ProductSettings,
-    }
-    for part in location:
-        found = tables.get(str(part), model)
-        model = found[str(location[1])] if isinstance(found, dict) else found
-    return list(model.model_fields)
+    allowed = allowed_keys(Mission, error["loc"][:-1])
+    return f"no such key; allowed here: {', '.join(allowed)}"
 
 
 def load_missions(folder: Path | None = None) -> dict[str, Mission]:

@@ -1,0 +1,225 @@
+"""A mission's table `[packets]`: which telemetry parameters of CCSDS space packets fill a batch.
+
+Parameters have the names of the mission's XTCE file.  The table says nothing of bits: where a
+parameter lies in a packet, how it is encoded and calibrated, is said by the XTCE file alone.
+"""
+
+import math
+import re
+from datetime import date, datetime
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, Field, model_validator
+
+from service.missions.strict import Strict
+
+MOST_SLOTS = 250
+SLOT_NUMBER = "{}"
+
+ParameterName = Annotated[str, Field(pattern=r"^[^\s./:{}]{1,128}$")]
+_SLOT_NAME = re.compile(r"[^\s./:{}]*\{\}[^\s./:{}]*|[^\s./:{}]+", re.ASCII)
+
+
+def _slot_name(text: str) -> str:
+    if len(text) > 128 or not _SLOT_NAME.fullmatch(text):
+        raise ValueError("must name an XTCE array, or parameters as in ST_H_{}, with one {}")
+    return text
+
+
+SlotNames = (
+    Annotated[str, AfterValidator(_slot_name)]
+    | Annotated[tuple[ParameterName, ...], Field(min_length=1, max_length=MOST_SLOTS)]
+)
+"""One parameter for each slot: an XTCE array, numbered names with `{}`, or a list of names."""
+Triple = ParameterName | tuple[ParameterName, ParameterName, ParameterName]
+Quadruple = ParameterName | tuple[ParameterName, ParameterName, ParameterName, ParameterName]
+
+
+def element_names(names: str | tuple[str, ...], count: int, first: int = 0) -> tuple[str, ...]:
+    """The XTCE names of `count` values: elements of an array, numbered names from `first`, a list.
+
+    An element of an array is written NAME[0], from 0 up, as XTCE references have it.
+    """
+    if not isinstance(names, str):
+        return names
+    if SLOT_NUMBER in names:
+        return tuple(names.replace(SLOT_NUMBER, str(first + index)) for index in range(count))
+    return tuple(f"{names}[{index}]" for index in range(count))
+
+
+class CdsTime(Strict):
+    """CCSDS day segmented time: a day number, and milliseconds of the day in UTC.
+
+    Day and milliseconds must be fields of one time: at midnight a day taken from another field
+    of the packet is a day off.
+    """
+
+    kind: Literal["cds"]
+    day: ParameterName
+    millisecond: ParameterName
+    microsecond: ParameterName | None = None
+    """Microseconds of the millisecond."""
+    epoch: date = date(1958, 1, 1)
+    """The day whose number is 0."""
+
+
+class CucTime(Strict):
+    """CCSDS unsegmented time: seconds since an epoch, and a binary fraction of a second."""
+
+    kind: Literal["cuc"]
+    coarse: ParameterName
+    fine: ParameterName | None = None
+    fine_bits: int = Field(default=16, ge=1, le=64)
+    """The fine time counts in units of 2^-fine_bits s."""
+    epoch: datetime = datetime(1958, 1, 1)
+    """On the clock of `scale`."""
+    scale: Literal["tai", "gps", "utc"] = "tai"
+    """`tai` and `gps` count leap seconds; `utc` leaves them out, as POSIX time does."""
+
+    @model_validator(mode="after")
+    def _epoch_has_no_zone(self) -> Self:
+        if self.epoch.tzinfo is not None or self.epoch.microsecond:
+            raise ValueError("epoch must be whole seconds without a zone: 1980-01-06T00:00:00")
+        return self
+
+
+PacketTime = Annotated[CdsTime | CucTime, Field(discriminator="kind")]
+
+
+class PacketTracker(Strict):
+    """The stars of one tracker, in slots numbered from `first_slot`."""
+
+    tracker: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")
+    slots: int = Field(ge=1, le=MOST_SLOTS)
+    first_slot: int = Field(default=1, ge=0, le=1000)
+    """The number that stands for `{}` in the names of the first slot."""
+    h: SlotNames | None = None
+    v: SlotNames | None = None
+    angle_unit: Literal["deg", "arcmin", "arcsec", "rad"] = "deg"
+    """Of h and v after the calibration that the XTCE file describes."""
+    vector: tuple[SlotNames, SlotNames, SlotNames] | None = None
+    """In place of h and v: unit vectors in tracker axes."""
+    magnitude: SlotNames | None = None
+    time_offset_s: SlotNames | None = None
+    sigma_arcsec: SlotNames | None = None
+    count: ParameterName | None = None
+    """So many slots, from the first, hold a star."""
+    valid: SlotNames | None = None
+    """A slot holds a star where this is not zero."""
+
+    @model_validator(mode="after")
+    def _names_fit(self) -> Self:
+        angles = (self.h is not None, self.v is not None)
+        if self.vector is None and not all(angles):
+            raise ValueError("needs either vector, or both h and v")
+        if self.vector is not None and any(angles):
+            raise ValueError("takes either vector, or h and v, not both")
+        columns = {
+            name: getattr(self, name)
+            for name in ("h", "v", "magnitude", "time_offset_s", "sigma_arcsec", "valid")
+        }
+        columns |= {f"vector.{i}": names for i, names in enumerate(self.vector or ())}
+        for name, names in columns.items():
+            if isinstance(names, tuple) and len(names) != self.slots:
+                raise ValueError(f"{name} names {len(names)} parameters for {self.slots} slots")
+        return self
+
+
+class PacketPrior(Strict):
+    """The a priori attitude: a quaternion in the packet of the stars or in another one."""
+
+    quaternion: Quadruple | None = None
+    scalar: Literal["last", "first"] = "last"
+    direction: Literal["inertial_to_body", "body_to_inertial"] = "inertial_to_body"
+    frame: Literal["EME2000", "ICRF", "GCRF"] = "EME2000"
+    time: PacketTime | None = None
+    """Of an attitude with a time of its own; by default the time of its packet."""
+    max_age_s: float = Field(default=10.0, gt=0, le=86400)
+    """An attitude of another packet serves stars that are at most so far from it in time."""
+    sun_pointed: bool = False
+    """In place of a quaternion: the mission's pole is always at the Sun, its roll unknown."""
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if (self.quaternion is not None) == self.sun_pointed:
+            raise ValueError("needs either quaternion or sun_pointed = true")
+        return self
+
+
+class PacketRates(Strict):
+    """Body rates, in body axes and relative to inertial space."""
+
+    components: Triple
+    unit: Literal["deg_per_s", "rad_per_s"] = "deg_per_s"
+
+
+class PacketGyro(Strict):
+    """Counts of a gyro about the body axes, in place of body rates."""
+
+    counts: Triple
+    kind: Literal["angle", "rate"] = "angle"
+    """`angle`: a counter that accumulates; a rate is its change from the packet before."""
+    scale_deg: tuple[float, float, float]
+    """Degrees, or of `rate` degrees per second, of one count about each axis."""
+    counter_bits: int = Field(default=16, ge=2, le=64)
+    """An accumulated angle starts again after 2^counter_bits counts."""
+    max_gap_s: float = Field(default=10.0, gt=0, le=3600)
+    """Packets farther apart give no rate."""
+
+    @model_validator(mode="after")
+    def _scale_is_not_zero(self) -> Self:
+        if any(scale == 0.0 or not math.isfinite(scale) for scale in self.scale_deg):
+            raise ValueError("scale_deg must hold three numbers other than 0")
+        return self
+
+
+class PacketVelocity(Strict):
+    """The geocentric velocity of the spacecraft, EME2000."""
+
+    components: Triple
+    unit: Literal["km_per_s", "m_per_s"] = "km_per_s"
+
+
+class PacketPosition(Strict):
+    """The geocentric position of the spacecraft, EME2000."""
+
+    components: Triple
+    unit: Literal["km", "m"] = "km"
+
+
+class Packets(Strict):
+    """How the parameters of an XTCE file fill the fields of a batch.
+
+    A packet that holds the parameters of `time` and those of a tracker gives a batch.
+    """
+
+    root_container: ParameterName = "CCSDSPacket"
+    """The container of the XTCE file that every packet is read as."""
+    prefix_bytes: int = Field(default=0, ge=0, le=4096)
+    """Bytes before each packet in a file, which are skipped."""
+    apids: tuple[Annotated[int, Field(ge=0, le=2047)], ...] = ()
+    """Only packets of these APIDs are read, others are counted; empty: all that XTCE describes."""
+    time: PacketTime
+    trackers: tuple[PacketTracker, ...] = Field(default=(), max_length=16)
+    """Without trackers the packets give a priori attitudes alone."""
+    join_within_s: float = Field(default=0.0, ge=0, le=60)
+    """Packets of different trackers make one batch if their times differ by at most this."""
+    batch: ParameterName | None = None
+    """Text or number that names a batch; by default APID, time and sequence count do."""
+    prior: PacketPrior | None = None
+    rates: PacketRates | None = None
+    gyro: PacketGyro | None = None
+    velocity: PacketVelocity | None = None
+    position: PacketPosition | None = None
+    aberration: Literal["to_correct", "applied_upstream", "ignore"] = "to_correct"
+
+    @model_validator(mode="after")
+    def _say_each_thing_once(self) -> Self:
+        if self.rates is not None and self.gyro is not None:
+            raise ValueError("takes either rates or gyro, not both")
+        if not self.trackers and (self.prior is None or self.prior.quaternion is None):
+            raise ValueError("needs trackers, or a prior with a quaternion")
+        names = [each.tracker for each in self.trackers]
+        if len(set(names)) != len(names):
+            raise ValueError(f"a tracker occurs twice: {', '.join(names)}")
+        return self
