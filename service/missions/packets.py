@@ -16,8 +16,8 @@ from service.missions.strict import Strict
 MOST_SLOTS = 250
 SLOT_NUMBER = "{}"
 
-ParameterName = Annotated[str, Field(pattern=r"^[^\s./:{}]{1,128}$")]
-_SLOT_NAME = re.compile(r"[^\s./:{}]*\{\}[^\s./:{}]*|[^\s./:{}]+", re.ASCII)
+ParameterName = Annotated[str, Field(pattern=r"^[^\s/:{}]{1,128}$")]
+_SLOT_NAME = re.compile(r"[^\s/:{}]*\{\}[^\s/:{}]*|[^\s/:{}]+", re.ASCII)
 
 
 def _slot_name(text: str) -> str:
