@@ -187,6 +187,15 @@ def test_a_spurious_star_is_named_by_hardly_any_and_spoils_no_other(sky, rng, ta
     assert named < 0.05
 
 
+def test_two_real_stars_of_five_are_named_where_the_a_priori_attitude_is_close(sky, rng):
+    """No mirror image of the field, whose boresight would lie elsewhere, keeps their names back."""
+    drawn = identified(sky, rng, 2, the_paper().runs_of([2])[0].run, 200, spurious(3))
+    right, wrong, named = tally(drawn)
+    assert wrong == 0
+    assert right > 0.985
+    assert named < 0.01
+
+
 def test_the_weight_of_magnitudes_is_that_of_normal_distributions(rng):
     """The closed form against scipy's multivariate normal, scale by scale."""
     difference = rng.normal(0.3, 0.4, 5)
@@ -209,6 +218,18 @@ def test_the_prior_of_the_attitude_is_a_density():
     tilt = [evidence.log_prior(a, evidence.PRIOR_DIRECTION) for a in angle[::10]]
     measure = 2.0 * math.pi * np.sin(angle[::10]) * 2.0 * math.pi
     assert np.trapezoid(np.exp(tilt) * measure, angle[::10]) == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("radius_deg", [0.0, 90.0])
+def test_the_prior_of_an_axis_on_a_circle_is_a_density(radius_deg):
+    """About a point, and about a great circle, it integrates to one over places and rolls."""
+    radius = math.radians(radius_deg)
+    off = np.concatenate([[0.0], np.geomspace(1e-7, math.pi - radius, 20_001)])
+    density = np.exp([evidence.log_prior_on_circle(each, radius) for each in off])
+    measure = 2.0 * math.pi * np.sin(radius + off) * 2.0 * math.pi
+    sides = 1.0 if radius == 0.0 else 2.0
+    total = sides * np.trapezoid(density * measure, off)
+    assert total == pytest.approx(1.0, abs=0.05)
 
 
 def scene_of(direction):

@@ -37,7 +37,7 @@ TWO_STARS_BONUS, TWO_STARS_PER_SQUARE, TWO_STARS_SIGMA_MAG = 0.5, 0.25, 0.35
 Of two random points the wide scales of noise let 20 in 50,000 pass for stars, with these seven do,
 while as many real pairs pass as before.
 """
-TWO_OF_MANY = -3.0
+TWO_OF_MANY = -2.0
 """Added where other stars stay unexplained: of many random points some two agree with a pair."""
 ROTATION_SCALES_DEG = np.array([0.05, 0.3, 2.0, 10.0, 45.0])
 """Heavy tails: the a priori attitude is off by a normal deviate of one of these, all alike."""
@@ -107,6 +107,21 @@ def log_prior(angle, kind):  # type: ignore[no-untyped-def]
     for scale_deg in TILT_SCALES_DEG:
         scale = math.radians(scale_deg)
         density += math.exp(-0.5 * (angle / scale) ** 2) / (2.0 * math.pi * scale**2)
+    return math.log(density / (len(TILT_SCALES_DEG) + 1) / (2.0 * math.pi))
+
+
+@njit_no_refcount
+def log_prior_on_circle(off, radius):  # type: ignore[no-untyped-def]
+    """Log density of an attitude, per cubed radian, of which one axis lies near a circle.
+
+    `off` is that axis' distance from the circle of that `radius`; any place along it
+    and any roll are alike.  A circle narrower than a scale of the tilts is a point.
+    """
+    density = 1.0 / (4.0 * math.pi)
+    for scale_deg in TILT_SCALES_DEG:
+        scale = math.radians(scale_deg)
+        length = max(scale, math.sqrt(2.0 * math.pi) * math.sin(radius))
+        density += math.exp(-0.5 * (off / scale) ** 2) / (2.0 * math.pi * scale * length)
     return math.log(density / (len(TILT_SCALES_DEG) + 1) / (2.0 * math.pi))
 
 

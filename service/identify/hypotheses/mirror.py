@@ -20,6 +20,7 @@ from service.identify.hypotheses.scene import (
     with_magnitude,
 )
 from service.identify.hypotheses.search import search
+from service.identify.sighting import PRIOR_DIRECTION
 
 LOG_MIRRORED = -7.0
 """Prior log odds of a tracker with mirrored axes: one in a thousand."""
@@ -81,31 +82,44 @@ def in_a_mirror(observed, image):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def gained_by_mirror(observed, image, stars, pairs, max_work, scratch, ledger):  # type: ignore[no-untyped-def]
-    """By how much the mirror image explains more than the field, in logarithms; with the work.
+def weigh_in_a_mirror(image, boresight, stars, pairs, max_work):  # type: ignore[no-untyped-def]
+    """The log weight of the mirror image's heaviest hypothesis; with the work.
 
-    Minus infinity where fewer than three of its stars fit.  The prior is left
-    out of both: which way the axes are mirrored is not known, and a wrong guess
-    turns the image about the boresight.
+    Minus infinity where fewer than three of its stars fit.
     """
-    n = len(observed.direction)
-    other_scratch, other_ledger = scratch_for(n), ledger_for(n)
-    progress, _ = search(image, stars, pairs, False, max_work, other_scratch, other_ledger)
+    n = len(image.direction)
+    scratch, ledger = scratch_for(n), ledger_for(n)
+    progress, _ = search(image, stars, pairs, False, max_work, scratch, ledger)
+    match = scratch.match
     matched = 0
-    for row in other_ledger.heaviest_match:
-        matched += row >= 0
+    for k in range(n):
+        match[k] = ledger.heaviest_match[k]
+        matched += match[k] >= 0
     if matched < FEWEST_MIRRORED:
         return -math.inf, progress.work
-    mirrored = _without_prior(image, stars, other_scratch, other_ledger)
-    return mirrored - _without_prior(observed, stars, scratch, ledger), progress.work
+    weight = weigh(image, stars, match, scratch)
+    angle = prior_angle(scratch.t, image.prior_axis, image.prior_kind)
+    without_prior = weight - evidence.log_prior(angle, image.prior_kind)
+    return without_prior + _log_prior_of_image(image, boresight, scratch.t), progress.work
 
 
 @njit_no_refcount
-def _without_prior(observed, stars, scratch, ledger):  # type: ignore[no-untyped-def]
-    """The log weight of the heaviest hypothesis of a search, less that of its attitude's prior."""
-    match = scratch.match
-    for k in range(len(match)):
-        match[k] = ledger.heaviest_match[k]
-    weight = weigh(observed, stars, match, scratch)
-    angle = prior_angle(scratch.t, observed.prior_axis, observed.prior_kind)
-    return weight - evidence.log_prior(angle, observed.prior_kind)
+def _log_prior_of_image(image, boresight, t):  # type: ignore[no-untyped-def]
+    """The log density of an attitude that the image was found at, per cubed radian of rotation.
+
+    Which way the axes are mirrored is not known, and a wrong guess turns the image about the
+    boresight.  What is presumed says no more of it than the angle between boresight and
+    presumed axis or, where that is a whole attitude, where the boresight points.
+    """
+    presumed, found = 1.0, 0.0
+    if image.prior_kind == PRIOR_DIRECTION:
+        presumed = 0.0
+        for i in range(3):
+            presumed += boresight[i] * image.prior_axis[i]
+    for j in range(3):
+        carried = boresight[0] * t[0, j] + boresight[1] * t[1, j] + boresight[2] * t[2, j]
+        axis = image.prior_axis[j] if image.prior_kind == PRIOR_DIRECTION else boresight[j]
+        found += carried * axis
+    presumed_angle = math.acos(min(1.0, max(-1.0, presumed)))
+    found_angle = math.acos(min(1.0, max(-1.0, found)))
+    return evidence.log_prior_on_circle(found_angle - presumed_angle, presumed_angle)

@@ -14,10 +14,10 @@ from service.identify.hypotheses.evidence import log_sum
 from service.identify.hypotheses.marginals import StarPosterior, marginals
 from service.identify.hypotheses.mirror import (
     LOG_MIRRORED,
-    gained_by_mirror,
     in_a_mirror,
     may_be_mirrored,
     reflect,
+    weigh_in_a_mirror,
 )
 from service.identify.hypotheses.scene import (
     ObservedStars,
@@ -143,9 +143,9 @@ def _weigh(sighted, zone, bounds, exhaustive, max_work, posterior):  # type: ign
         reflect(observed.direction, sighted.boresight, image)
         reflected = in_a_mirror(observed, image)
         left = max_work - work
-        gained, more = gained_by_mirror(observed, reflected, stars, pairs, left, scratch, ledger)
-        mirrored, work = gained > 0.0, work + more
+        weight, more = weigh_in_a_mirror(reflected, sighted.boresight, stars, pairs, left)
+        mirrored, work = weight > ledger.heaviest[0], work + more
         bounded = bounded or more >= left
-        unexplored_weight = log_sum(unexplored_weight, ledger.heaviest[0] + gained + LOG_MIRRORED)
+        unexplored_weight = log_sum(unexplored_weight, weight + LOG_MIRRORED)
     marginals(ledger, progress.count, unexplored_weight, posterior)
     return bounded, mirrored, work
