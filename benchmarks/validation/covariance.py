@@ -1,4 +1,4 @@
-"""Whether errors scatter as the covariance says, through the whole staircase.
+"""Whether errors scatter as the covariance says, through the whole pipeline.
 
 Batches of apparent star directions with two-axis Gaussian noise, seen from a
 spacecraft in orbit; the solved attitude is held against the true one.
@@ -192,7 +192,7 @@ def write(quick: bool, seed: int) -> Written:
     """The section of the verification."""
     report = run(quick, seed)
     text = f"""
-Nominal batches of up to five stars with two-axis Gaussian noise, through the whole staircase:
+Nominal batches of up to five stars with two-axis Gaussian noise, through the whole pipeline:
 identified, corrected for aberration and solved. With e the attitude error about the body axes and
 P the covariance, e^T P^-1 e is chi-square with three degrees of freedom, and TASTE with 2N - 3: it
 has the mean 2N - 3 and the variance 2 (2N - 3). An attitude is suspect beyond the 99.9 % point of

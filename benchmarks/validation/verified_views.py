@@ -1,7 +1,7 @@
 """Views with known truth for the benchmarks of verified identification.
 
 They are the views of the paper's simulator, spoilt as a condition says, and go
-through the whole staircase.
+through the whole pipeline.
 """
 
 from collections.abc import Iterator

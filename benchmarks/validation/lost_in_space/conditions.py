@@ -159,10 +159,10 @@ def _off_by(scene: Scene, deg: float) -> Matrix:
 
 
 def _with_prior(condition: Condition, deg: float, with_peers: bool) -> list[Solver]:
-    """The whole staircase with its a priori attitude, and tetra3rs told the same."""
+    """The whole pipeline with its a priori attitude, and tetra3rs told the same."""
     import importlib.util
 
-    solvers = [_staircase(condition.conditions, deg)]
+    solvers = [_pipeline(condition.conditions, deg)]
     if with_peers and importlib.util.find_spec("tetra3rs"):
         solvers.append(
             tetra3rs_solver(
@@ -206,7 +206,7 @@ def mission_of(conditions: Conditions) -> Mission:
     )
 
 
-def _staircase(conditions: Conditions, prior_deg: float) -> Solver:
+def _pipeline(conditions: Conditions, prior_deg: float) -> Solver:
     mission = mission_of(conditions)
     sky = SkyModel(load_embedded(), LruCache(64 << 20))
     run_catalog = sky.run_catalog(mission, parse_utc(MOMENT))
@@ -242,7 +242,7 @@ def _staircase(conditions: Conditions, prior_deg: float) -> Solver:
 
     # Its database is the run catalog: directions, magnitudes, names.
     return Solver(
-        "staircase, a priori",
+        "pipeline, a priori",
         run_catalog.nbytes / 1e6,
         ready,
         lambda batch: acquire(batch, mission, sky),

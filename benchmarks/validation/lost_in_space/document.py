@@ -11,7 +11,7 @@ from benchmarks.record import CORE, SIMULATOR, record_of
 from benchmarks.validation.lost_in_space.conditions import UNCALIBRATED_MAG, WITHOUT_MAGNITUDES
 from benchmarks.validation.lost_in_space.rows import Row, interval, more_often
 
-OURS = ("lost_in_space", "staircase, a priori")
+OURS = ("lost_in_space", "pipeline, a priori")
 SOURCES = (
     *CORE,
     *SIMULATOR,
@@ -167,7 +167,7 @@ fields with at least six detected stars of the database.
 
 - **five brightest**: of the fields of 4 deg radius that show five stars or more, at 0.1 px.
 - **prior**: the same with an a priori attitude off by so much about any axis, through the whole
-  staircase (`verified`, a zone of stars to V 7.5 built for every scene) and tetra3rs in its
+  pipeline (`verified`, a zone of stars to V 7.5 built for every scene) and tetra3rs in its
   tracking mode.
 - **ten and N spurious**: the ten brightest stars with N points anywhere, as bright as stars are.
 - **random points**: 5 to 20; **mirrored**: one axis turned round at 1 px. Nothing is right there.
