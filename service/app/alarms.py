@@ -5,13 +5,14 @@ from collections.abc import Callable
 from service.access.audit import Entry
 from service.alarms import state_machine
 from service.app.context import ALL_RUNS, Context, known_id
-from service.storage.models.alarms import Alarm, AlarmWithActions
+from service.storage.models.alarms import Alarm, AlarmSpan, AlarmWithActions
 from service.storage.models.base import Page
 from service.storage.queries import alarms
 from service.storage.queries.future_dated import LIVE
+from service.storage.queries.period.alarms import alarm_spans
 from service.storage.recording.silence import evaluate_by_clock, is_due_by_clock
 from service.storage.sql.columns import Row
-from service.times import shifted, utc_now
+from service.times import Utc, shifted, utc_now
 
 
 class Alarms:
@@ -45,6 +46,11 @@ class Alarms:
         """Every alarm of a run that is not cleared, the worst first."""
         with self._context.reading() as connection:
             return alarms.active_alarms(connection, run, utc_now().text)
+
+    def of_period(self, spacecraft: str, run: str, start: Utc, end: Utc) -> list[AlarmSpan]:
+        """When alarms of a spacecraft were out of their limits; see `alarm_spans`."""
+        with self._context.reading() as connection:
+            return alarm_spans(connection, run, spacecraft, start, end)
 
     def get(self, id: str) -> AlarmWithActions:
         """One alarm with its history."""

@@ -10,11 +10,14 @@ from service.missions.mission import mission_named
 from service.observations.schema import OptionsIn
 from service.storage.models.answers import Answer, Neighbours, Result, Summary
 from service.storage.models.base import Page
+from service.storage.models.period import PeriodStars
 from service.storage.models.star_field import StarField
 from service.storage.queries import results
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.neighbours import neighbours
 from service.storage.queries.pages import ResultFilter
+from service.storage.queries.period.sample import sample_period
+from service.storage.queries.period.stars import period_stars
 from service.storage.queries.recorded_batch import recorded_batch, recorded_mission
 from service.storage.queries.results import OutcomeName, StatusName
 from service.storage.queries.star_field import star_field_of
@@ -116,6 +119,19 @@ class Results:
                 return []
             mission = recorded_mission(connection, answer.provenance.mission)
         return tracker_comparison(batch, mission, self._context.sky, answer)
+
+    def period(
+        self, spacecraft: str, *, run: str | None = None, start: Utc, end: Utc
+    ) -> PeriodStars:
+        """The stars and attitudes of a period, of some batches where there are many.
+
+        See `period.sample.sample_period`, which also bounds what is read.
+        """
+        mission_named(self._context.missions, spacecraft)
+        selected = ResultFilter(run or LIVE, spacecraft, start, end)
+        with self._context.reading() as connection:
+            sample = sample_period(connection, selected)
+        return period_stars(sample, self._context.sky)
 
     def settings_for(self, id: str) -> Choices:
         """The settings that a what-if of a result changes."""

@@ -209,3 +209,15 @@ def test_a_type_that_is_none_and_a_file_that_is_too_large(address, send, frames)
     lines = (f"POST {URL} HTTP/1.1", "Host: localhost", "Content-Type: image/png")
     head = "\r\n".join([*lines, f"Content-Length: {65 << 20}", "", ""])
     assert raw(address, head.encode()).startswith(b"HTTP/1.1 413")
+
+
+def test_the_page_of_its_batch_shows_the_frame_with_the_stars(client, recorded):
+    answer, _ = recorded
+    page = client.get(f"/batches/{answer['id']}").raise_for_status().text
+    address = f"/api/v1/batches/{answer['id']}/overlay"
+    assert f'src="{address}"' in page
+    assert f"The frame of this batch with {answer['counts']['observed']} stars" in page
+    picture = client.get(address, headers={"Accept": "image/avif,image/webp,image/png,*/*"})
+    assert picture.headers["Content-Type"] == "image/png"
+    with Image.open(io.BytesIO(picture.content)) as shown:
+        assert min(shown.size) > 700

@@ -128,6 +128,17 @@ class AlarmWithActions(Alarm, frozen=True, kw_only=True):
     actions: Annotated[list[AlarmAction], doc("Oldest first.")]
 
 
+class AlarmSpan(Record, frozen=True, kw_only=True):
+    """A span of telemetry time in which an alarm was out of its limits, for a chart."""
+
+    id: Id
+    quantity: QuantityName
+    tracker: str | None
+    severity: SeverityName
+    start: Moment
+    end: Annotated[Moment | None, doc("null: it still is.")]
+
+
 class AlarmSummary(Record, frozen=True, kw_only=True):
     """How many alarms are active, by state."""
 

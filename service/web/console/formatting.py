@@ -103,6 +103,13 @@ def number(value: float | None, decimals: int = 2) -> str:
     return f"{value:.{decimals}f}".replace("-", "−")
 
 
+def level(value: float) -> str:
+    """A number to four digits, without the exponent that small ones would have."""
+    if value == 0.0:
+        return "0"
+    return number(value, min(9, max(0, 3 - math.floor(math.log10(abs(value))))))
+
+
 def arcsec(value: float | None) -> str:
     """Arcseconds to three digits; degrees where they become many."""
     if value is None or not math.isfinite(value):
@@ -186,6 +193,7 @@ FILTERS: Mapping[str, Callable[..., Any]] = {
     "age": age,
     "share": share,
     "num": number,
+    "level": level,
     "arcsec": arcsec,
     "deg": degrees,
     "mag": magnitude,

@@ -13,7 +13,7 @@ from service.alarms.subjects import limited_trackers
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key
 from service.storage.models.alarms import Alarm, AlarmWithActions
-from service.times import recorded_utc, shifted, unix_seconds
+from service.times import Utc, recorded_utc, shifted, unix_seconds
 from service.web.console.charts.alarm_trend import AlarmTrend, alarm_trend
 from service.web.console.page_context import ContextDep, PageContext, PageQuery
 from service.web.console.registry import console_page
@@ -88,6 +88,7 @@ def alarm_page(
         raise NotFound(f"there is no alarm with the id {shown_value(id)}")
     raised = recorded_utc(alarm.raised.time)
     around = {"start": shifted(raised, -BEFORE_S).text, "end": shifted(raised, AFTER_S).text}
+    of_tracker = {"tracker": alarm.tracker} if _has_tracker(context, alarm) else {}
     return rendered(
         "alarm.html.jinja",
         context.layout(alarm.run),
@@ -98,7 +99,8 @@ def alarm_page(
         related=_related(context, alarm),
         trend=_trend(context, alarm),
         around=around,
-        trends_around=around | ({"tracker": alarm.tracker} if _has_tracker(context, alarm) else {}),
+        trends_around=around | of_tracker,
+        since={"start": around["start"], "end": _end(alarm).text, **of_tracker},
     )
 
 
@@ -106,6 +108,14 @@ def _has_tracker(context: PageContext, alarm: Alarm) -> bool:
     """Whether the alarm is about a tracker that the mission still has."""
     mission = context.app.missions.get(alarm.spacecraft)
     return mission is not None and alarm.tracker in limited_trackers(mission)
+
+
+def _end(alarm: Alarm) -> Utc:
+    """Some time after the alarm was raised, or its latest batch, whichever is later."""
+    after = shifted(recorded_utc(alarm.raised.time), AFTER_S)
+    # The latest batch belongs to the period, the end of which does not.
+    latest = shifted(recorded_utc(alarm.latest.time), 0.001)
+    return max(after, latest, key=lambda moment: moment.tai_ns)
 
 
 def _related(context: PageContext, alarm: AlarmWithActions) -> list[Alarm]:
@@ -135,12 +145,7 @@ def _trend(context: PageContext, alarm: AlarmWithActions) -> AlarmTrend | None:
         return None
     raised = recorded_utc(alarm.raised.time)
     start = shifted(raised, -TREND_BEFORE_S)
-    # The latest batch belongs to the period.
-    end = max(
-        shifted(raised, AFTER_S),
-        shifted(recorded_utc(alarm.latest.time), 0.001),
-        key=lambda moment: moment.tai_ns,
-    )
+    end = _end(alarm)
     found = context.app.spacecraft.history(
         alarm.spacecraft,
         run=alarm.run,

@@ -7,6 +7,7 @@ from urllib.parse import quote, urlencode
 
 from fastapi import Path
 from fastapi import Query as InQuery
+from msgspec import structs
 from pydantic import Field, ValidationInfo, field_validator
 from starlette.responses import Response
 
@@ -155,7 +156,7 @@ def spacecraft_page(
     """Trends of one spacecraft in a run, its worst batches, and its latest ones."""
     state = context.app.spacecraft.state(name)
     latest = context.app.results.page(spacecraft=name, run=query.run, limit=LATEST).items
-    stretch = _shown_period(context, name, query, latest)
+    stretch = shown_period(context, name, query, latest)
     trackers = limited_trackers(context.app.missions[name])
     ranking = _worst(context, name, query, stretch)
     ranked = [each for each in ranked_names() if not query.tracker or QUANTITIES[each].by_tracker]
@@ -174,6 +175,7 @@ def spacecraft_page(
         not_split=ranking.not_split is True,
         quantities=ranked,
         charts=charts(query.tracker),
+        alarms=_alarms(context, name, query, stretch),
         worst=ranking.items,
         limits=context.app.limits.all(name, query.tracker if trackers else None),
         formats=table_formats(),
@@ -181,7 +183,7 @@ def spacecraft_page(
     )
 
 
-def _shown_period(
+def shown_period(
     context: PageContext, name: str, query: SpacecraftQuery, latest: list[Summary]
 ) -> ShownPeriod | None:
     """The period that the address names; None without any batch."""
@@ -232,6 +234,20 @@ def _worst(
         if found[-1].items and found[-1].items[0].value:
             return found[-1]
     return found[0]
+
+
+def _alarms(
+    context: PageContext, name: str, query: SpacecraftQuery, stretch: ShownPeriod | None
+) -> list[dict[str, Any]]:
+    """When alarms were out of their limits; with a tracker, its own and those of all trackers."""
+    if stretch is None:
+        return []
+    found = context.app.alarms.of_period(name, query.run, stretch.start, stretch.end)
+    return [
+        structs.asdict(each)
+        for each in found
+        if query.tracker is None or each.tracker in (None, query.tracker)
+    ]
 
 
 def _attitude(context: PageContext, latest: list[Summary]) -> Any:

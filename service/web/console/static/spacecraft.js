@@ -1,6 +1,7 @@
 // The trends of one spacecraft: charts of the period in the address.
 import { requestJson } from "./requests.js";
 import { fetchLatest, swapRegions } from "./regions.js";
+import { AlarmBars, posix } from "./alarm_bars.js";
 import { Trend } from "./trend.js";
 
 const stretch = () => document.getElementById("stretch");
@@ -12,7 +13,6 @@ let trends = [];
 let asked = 0;
 let shown = null;
 
-const posix = (text) => Date.parse(text.replace(":60", ":59").replace(/(\.\d{3})\d*/, "$1")) / 1000;
 const asText = (seconds) => new Date(seconds * 1000).toISOString();
 
 function make() {
@@ -21,19 +21,23 @@ function make() {
     const holder = document.querySelector(`[data-chart="${id}"]`);
     const readout = document.querySelector(`[data-readout="${id}"]`);
     const lines = quantities.map((each, index) => ({ ...each, ...LINES[index % LINES.length] }));
-    return new Trend(holder, readout, { ...chart, quantities: lines }, limits, "trends", zoom);
+    const bars = new AlarmBars(document.querySelector(`[data-bars="${id}"]`), quantities);
+    return new Trend(holder, readout, { ...chart, quantities: lines, bars }, limits, "trends", zoom);
   });
 }
 
 async function draw() {
   const mine = ++asked;
-  const { history, start, end } = stretch().dataset;
+  const { history, start, end, alarms } = stretch().dataset;
   delete document.getElementById("charts").dataset.drawn;
   try {
     const found = await requestJson(history);
     if (mine !== asked) return;
     shown = found;
-    for (const trend of trends) trend.show(shown, posix(start), posix(end));
+    for (const trend of trends) {
+      trend.show(shown, posix(start), posix(end));
+      trend.definition.bars.show(JSON.parse(alarms), posix(start), posix(end));
+    }
     status.textContent = "";
     document.getElementById("charts").dataset.drawn = String(found.unix_s.length);
   } catch (error) {

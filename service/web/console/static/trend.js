@@ -195,7 +195,7 @@ export class Trend {
         { ...axis, size: labelWidth, values: (_, splits) => splits.map((value) => `${+value.toPrecision(6)}${this.definition.unit}`) },
       ],
       hooks: {
-        draw: [(chart) => drawLimits(chart, lines)],
+        draw: [(chart) => drawLimits(chart, lines), ({ bbox }) => this.definition.bars?.align(bbox.left / devicePixelRatio, bbox.width / devicePixelRatio)],
         setSelect: [(chart) => chart.select.width > 4 && this.onZoom([chart.posToVal(chart.select.left, "x"), chart.posToVal(chart.select.left + chart.select.width, "x")])],
         setCursor: [(chart) => this.read(chart.cursor.idx)],
       },

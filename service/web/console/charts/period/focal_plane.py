@@ -1,0 +1,152 @@
+"""The residuals of one tracker over its focal plane: a mean arrow and the spread of each cell."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from service.storage.models.period import TrackerStarsOfPeriod
+from service.vectors import Vector
+
+SIZE = 420.0
+CELLS = 8
+"""Cells along each side of the square about the field of view."""
+LEAST_STARS = 5
+"""Fewer stars have no mean that is worth an arrow."""
+LONGEST = 1.1
+"""The length of the longest arrow, in cells."""
+CLEAR = 3.3
+"""Standard errors.  Of cells without any distortion one in 300 has so long a mean residual."""
+STEPS = (1.25, 1.5, 2.0, 3.0)
+"""Spread over what is expected, from which on a cell has the next shade."""
+ROUND = (1.0, 2.0, 5.0)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell: its centre, its stars, their mean residual, and its spread over the expected.
+
+    `is_clear` says whether the mean is certainly not that of noise alone.
+    """
+
+    h_deg: float
+    v_deg: float
+    stars: int
+    mean_arcsec: tuple[float, float]
+    spread: float
+    is_clear: bool
+    x: float
+    y: float
+    shade: int
+    arrow: str
+    """A path; empty for too few stars."""
+
+
+@dataclass(frozen=True)
+class FocalPlaneMap:
+    """The map; `key_px` is the length of an arrow of `key_arcsec`."""
+
+    tracker: str
+    cells: tuple[Cell, ...]
+    stars: int
+    spread: float
+    radius_deg: float
+    key_arcsec: float
+    key_px: float
+    side: float = SIZE / CELLS
+    size: float = SIZE
+    steps: tuple[float, ...] = STEPS
+
+
+def focal_plane_map(tracker: TrackerStarsOfPeriod) -> FocalPlaneMap | None:
+    """The map of a tracker; None where no star has a residual."""
+    known = np.isfinite(tracker.residual_arcsec[:, 0]) & np.isfinite(tracker.expected_arcsec).all(
+        axis=1
+    )
+    place, residual = tracker.place_deg[known], tracker.residual_arcsec[known]
+    expected, radius_deg = tracker.expected_arcsec[known], tracker.field_of_view_radius_deg
+    if not len(place):
+        return None
+    step_deg = 2.0 * radius_deg / CELLS
+    # Stars beyond the field of view belong to the cells at its edge.
+    number = np.clip(np.floor((place + radius_deg) / step_deg), 0, CELLS - 1).astype(int)
+    cell = number[:, 1] * CELLS + number[:, 0]
+    found = [_of_cell(residual[cell == k], expected[cell == k]) for k in np.unique(cell)]
+    lengths = [math.hypot(*mean) for count, mean, *_ in found if count >= LEAST_STARS]
+    longest = max(lengths, default=0.0)
+    px_per_arcsec = LONGEST * SIZE / CELLS / longest if longest else 0.0
+    cells = [
+        _drawn(int(k), each, radius_deg, px_per_arcsec)
+        for k, each in zip(np.unique(cell), found, strict=True)
+    ]
+    key_arcsec = _round_below(longest)
+    return FocalPlaneMap(
+        tracker=tracker.tracker,
+        cells=tuple(cells),
+        stars=len(place),
+        spread=_spread(residual, expected),
+        radius_deg=radius_deg,
+        key_arcsec=key_arcsec,
+        key_px=key_arcsec * px_per_arcsec,
+    )
+
+
+_Found = tuple[int, tuple[float, float], float, bool]
+
+
+def _of_cell(residual: Vector, expected: Vector) -> _Found:
+    """Stars, mean residual, spread over the expected, and whether the mean is clear."""
+    mean = residual.mean(axis=0)
+    error = np.sqrt(np.mean(expected**2, axis=0) / len(residual))
+    spread = _spread(residual, expected)
+    # Noisier stars than expected have a less certain mean.
+    far = float(np.max(np.abs(mean) / error)) / max(spread, 1.0)
+    is_clear = len(residual) >= LEAST_STARS and far > CLEAR
+    return len(residual), (float(mean[0]), float(mean[1])), spread, is_clear
+
+
+def _spread(residual: Vector, expected: Vector) -> float:
+    """The root mean square of residuals over what is expected of them; 1 is normal."""
+    return float(np.sqrt(np.mean((residual / expected) ** 2)))
+
+
+def _drawn(number: int, found: _Found, radius_deg: float, px_per_arcsec: float) -> Cell:
+    row, column = divmod(number, CELLS)
+    stars, mean, spread, is_clear = found
+    side, step_deg = SIZE / CELLS, 2.0 * radius_deg / CELLS
+    x, y = (column + 0.5) * side, SIZE - (row + 0.5) * side
+    along, down = mean[0] * px_per_arcsec, -mean[1] * px_per_arcsec
+    return Cell(
+        h_deg=(column + 0.5) * step_deg - radius_deg,
+        v_deg=(row + 0.5) * step_deg - radius_deg,
+        stars=stars,
+        mean_arcsec=mean,
+        spread=spread,
+        is_clear=is_clear,
+        x=x,
+        y=y,
+        shade=sum(spread >= step for step in STEPS),
+        arrow=arrow(x - along / 2, y - down / 2, along, down) if stars >= LEAST_STARS else "",
+    )
+
+
+def arrow(x: float, y: float, along: float, down: float) -> str:
+    """The path of an arrow with its head."""
+    length = math.hypot(along, down)
+    if length < 1.0:
+        return f"M{x:.1f} {y:.1f}h0"
+    u, v = along / length, down / length
+    back, wide = min(6.0, length * 0.5), min(3.0, length * 0.3)
+    head_x, head_y = x + along - u * back, y + down - v * back
+    return (
+        f"M{x:.1f} {y:.1f}l{along:.1f} {down:.1f}"
+        f"M{head_x - v * wide:.1f} {head_y + u * wide:.1f}L{x + along:.1f} {y + down:.1f}"
+        f"L{head_x + v * wide:.1f} {head_y - u * wide:.1f}"
+    )
+
+
+def _round_below(longest: float) -> float:
+    if longest <= 0.0:
+        return 0.0
+    power = 10.0 ** math.floor(math.log10(longest))
+    return max(factor * power for factor in ROUND if factor * power <= longest * 1.000001)

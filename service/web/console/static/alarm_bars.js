@@ -1,0 +1,53 @@
+// Bars under a chart of trends: when alarms of its quantities were out of their limits.
+
+const SHAPES = { watch: "△", warning: "▲", critical: "◆" };
+const MOST_ROWS = 4;
+
+export const posix = (text) => Date.parse(text.replace(":60", ":59").replace(/(\.\d{3})\d*/, "$1")) / 1000;
+const clock = (text) => text.slice(0, 19).replace("T", " ");
+
+export class AlarmBars {
+  constructor(holder, quantities) {
+    Object.assign(this, { holder, labels: new Map(quantities.map(({ name, label }) => [name, label])) });
+  }
+
+  // The left end and the width of the chart's own area, below which the bars stand.
+  align(left, width) {
+    this.holder.style.marginLeft = `${left}px`;
+    this.holder.style.width = `${width}px`;
+  }
+
+  // A row for each quantity and tracker; the page of alarms has those beyond the last row.
+  show(alarms, start, end) {
+    const rows = new Map();
+    for (const alarm of alarms) {
+      if (!this.labels.has(alarm.quantity)) continue;
+      const name = [...(alarm.tracker ? [alarm.tracker] : []), this.labels.get(alarm.quantity)].join(": ");
+      rows.set(name, [...(rows.get(name) ?? []), alarm]);
+    }
+    this.holder.hidden = rows.size === 0;
+    const shown = [...rows].slice(0, MOST_ROWS).map(([name, spans]) => {
+      const row = document.createElement("div");
+      row.append(...spans.map((each) => this.bar(each, name, start, end)));
+      return row;
+    });
+    this.holder.replaceChildren(...shown);
+  }
+
+  bar({ id, severity, start: from, end: until }, name, start, end) {
+    const bar = document.createElement("a");
+    const part = (text) => Math.min(1, Math.max(0, (posix(text) - start) / (end - start)));
+    const left = part(from);
+    const right = until === null ? 1 : part(until);
+    const run = new URLSearchParams(location.search).get("run");
+    bar.href = `/alarms/${id}${run ? `?run=${encodeURIComponent(run)}` : ""}`;
+    bar.className = severity;
+    // A short bar at the end of the chart stays within it.
+    bar.style.left = `min(${100 * left}%, 100% - 6px)`;
+    bar.style.width = `${100 * (right - left)}%`;
+    bar.textContent = `${SHAPES[severity]} ${name}`;
+    bar.title = `${severity}: ${name}, from ${clock(from)} ${until === null ? "until now" : `to ${clock(until)}`} UTC`;
+    bar.setAttribute("aria-label", bar.title);
+    return bar;
+  }
+}
