@@ -49,6 +49,8 @@ def test_a_file_that_is_refused_is_told_and_the_others_go_on(acquire, frames, tm
         ("frame x.fits --spacecraft NO --in-process", "no such file"),
         ("frame a b --batch one --spacecraft IMAGER", "--batch: names one frame"),
         ("frame a --spacecraft IMAGER --database sqlite:///x.db", "goes with --in-process"),
+        ("frame a --spacecraft IMAGER --dark b.png", "--dark: goes without --spacecraft"),
+        ("frame a --spacecraft IMAGER --fov 20", "--fov: goes without --spacecraft"),
         ("frame a --spacecraft IMAGER --a-priori {", "--a-priori: is not JSON"),
         ("frame a --spacecraft IMAGER --centroid best", "invalid choice"),
         ("simulate frames --spacecraft XTE --frames 1 out", "describes no camera"),
