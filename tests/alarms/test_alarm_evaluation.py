@@ -11,7 +11,7 @@ from service.errors import NotFound, WrongState
 from service.observations.schema import OptionsIn, submission_from_json
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
-from service.storage.sql.tables import watches
+from service.storage.sql.alarm_tables import watches
 from service.times import shifted, utc_now
 
 TIGHT = LimitSettings.model_validate(

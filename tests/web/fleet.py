@@ -14,8 +14,9 @@ from service.alarms.quantities import QUANTITIES
 from service.app.factory import App
 from service.missions.mission import load_missions
 from service.storage.recording.ids import Ulids
+from service.storage.sql.alarm_tables import alarms
 from service.storage.sql.statements import insert_all
-from service.storage.sql.tables import alarms, solutions, star_results
+from service.storage.sql.tables import solutions, star_results
 from service.times import Utc, parse_utc, shifted
 from tests.storage.bulk import put, result_row
 

@@ -23,8 +23,8 @@ from service.storage.models.alarms import (
 from service.storage.models.base import Page
 from service.storage.recording import events
 from service.storage.recording.ids import is_ulid
+from service.storage.sql.alarm_tables import alarm_actions, alarms
 from service.storage.sql.columns import Row
-from service.storage.sql.tables import alarm_actions, alarms
 
 StateFilter = Literal["open", "acknowledged", "shelved", "active", "cleared", "all"]
 

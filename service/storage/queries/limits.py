@@ -19,9 +19,9 @@ from service.alarms.subjects import Subject, limits_of_subjects, subject_of
 from service.missions.mission import Mission
 from service.storage.models.alarms import Limit, LimitHistory
 from service.storage.recording import events
+from service.storage.sql.alarm_tables import limits
 from service.storage.sql.columns import Row
 from service.storage.sql.prepared import prepared
-from service.storage.sql.tables import limits
 
 LimitsInForce = Mapping[Subject, LimitSettings]
 

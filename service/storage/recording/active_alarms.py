@@ -8,9 +8,9 @@ from service.alarms.subjects import Subject, quantity_and_tracker, subject_of
 from service.alarms.window import Point
 from service.storage.queries.alarms import change, record_action
 from service.storage.recording.ids import Ulids
+from service.storage.sql.alarm_tables import alarms
 from service.storage.sql.columns import Row
 from service.storage.sql.prepared import prepared
-from service.storage.sql.tables import alarms
 
 _IDS = Ulids()
 

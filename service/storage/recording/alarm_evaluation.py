@@ -22,10 +22,11 @@ from service.storage.queries.limits import limits_of
 from service.storage.recording.active_alarms import ActiveAlarms
 from service.storage.recording.silence import silence_severity
 from service.storage.recording.unsaved_result import UnsavedResult
+from service.storage.sql.alarm_tables import watches
 from service.storage.sql.columns import Row
 from service.storage.sql.prepared import prepared
 from service.storage.sql.statements import insert_missing
-from service.storage.sql.tables import batches, missions, results, runs, watches
+from service.storage.sql.tables import batches, missions, results, runs
 from service.times import recorded_utc
 
 # Run with every batch of a live spacecraft, or with a few of them.

@@ -15,7 +15,7 @@ from service.storage.queries.alarms import change
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.limits import limits_of
 from service.storage.recording.active_alarms import ActiveAlarms
-from service.storage.sql.tables import alarms, watches
+from service.storage.sql.alarm_tables import alarms, watches
 from service.times import Utc, recorded_utc
 
 

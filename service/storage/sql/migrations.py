@@ -21,7 +21,7 @@ from service.storage.sql.engines import database_url, reading_engine, shown_url,
 if TYPE_CHECKING:
     from alembic.config import Config
 
-HEAD = "0008"
+HEAD = "0009"
 """The latest revision of `migrations/`."""
 
 
@@ -80,7 +80,7 @@ def check(database: str) -> list[str]:
         from alembic.runtime.migration import MigrationContext
 
         # Every table must be known to the metadata.
-        from service.storage.sql import access_tables, tables  # noqa: F401
+        from service.storage.sql import access_tables, alarm_tables, tables  # noqa: F401
 
         context = MigrationContext.configure(connection, opts={"compare_type": True})
         return [_in_words(difference) for difference in compare_metadata(context, metadata)]
