@@ -1,8 +1,11 @@
-"""The log of events that the records keep."""
+"""The log of events that the records keep, and the audit list of changes."""
 
 from collections.abc import Callable, Sequence
 
+from service.access import audit
 from service.app.context import Context
+from service.storage.models.access import AuditEntry
+from service.storage.models.base import Page
 from service.storage.recording import events
 from service.storage.recording.events import Event
 
@@ -30,3 +33,15 @@ class Events:
     def unlisten(self, listener: Callable[[], object]) -> None:
         """Stop calling a function after each commit."""
         self._context.store.writer.after_commit.remove(listener)
+
+
+class Audit:
+    """Reads the audit list."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+
+    def page(self, limit: int = 100, cursor: str | None = None) -> Page[AuditEntry]:
+        """The audit list of changes, newest first."""
+        with self._context.reading() as connection:
+            return audit.list_entries(connection, limit, cursor)

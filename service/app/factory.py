@@ -4,10 +4,10 @@ from service.access.sessions import Access
 from service.acquire.kernel_build import KernelBuild
 from service.app.advice import AdviceService
 from service.app.alarms import Alarms
-from service.app.audit import Audit
+from service.app.annotations import Annotations
 from service.app.comparisons import Comparisons
 from service.app.context import Context
-from service.app.events import Events
+from service.app.events import Audit, Events
 from service.app.frames import Frames
 from service.app.limits import Limits
 from service.app.products import Products
@@ -53,6 +53,7 @@ class App:
         self.products = Products(context)
         self.limits = Limits(context)
         self.alarms = Alarms(context)
+        self.annotations = Annotations(context)
         self.runs = Runs(context)
         self.replays = Replays(context, self.submissions)
         self.advice = AdviceService(context, self.submissions)

@@ -18,6 +18,7 @@ from service.products.formats import OUTPUT_FORMATS
 from service.web.api import (
     advice,
     alarms,
+    annotations,
     batches,
     compare,
     events,
@@ -58,6 +59,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     runs.router,
     overview.router,
     alarms.router,
+    annotations.router,
     events.router,
     access.router,
     probes.router,

@@ -223,11 +223,13 @@ class Live:
 def _concerns(event: Event, run: str | None, spacecraft: str | None) -> bool:
     """Whether an event passes the filters of a stream.
 
-    An event without a run concerns every run.  A replay names no spacecraft: its lines may be
-    about any, and its id gives access to their errors, so it passes only without a filter.
+    An event without a run concerns every run, an annotation without a spacecraft every
+    spacecraft.  A replay names no spacecraft: its lines may be about any, and its id gives
+    access to their errors, so it passes only without a filter.
     """
+    about_all = event.kind == "annotation" and event.spacecraft is None
     return (event.run is None or run is None or event.run == run) and (
-        spacecraft is None or event.spacecraft == spacecraft
+        spacecraft is None or event.spacecraft == spacecraft or about_all
     )
 
 

@@ -102,6 +102,7 @@ def walk(client: httpx.Client, app: App) -> Json:
     }
     take("compare", client.post(f"{API}/compare", json=asked), "tighter", asked)
     _alarm(client, take)
+    _annotation(client, take)
     take("list_attitudes", client.get(f"{API}/spacecraft/SWAS/attitudes"), "one")
     take("get_attitude", client.get(f"{API}/spacecraft/SWAS/attitude"), "one")
     take("list_rates", client.get(f"{API}/spacecraft/XTE/rates"), "one_hour")
@@ -170,6 +171,24 @@ def _alarm(client: httpx.Client, take: Any) -> None:
     take("acknowledge_alarm", client.post(acknowledge, json=said), "seen_before")
     take("get_alarm", client.get(alarm), "with_what_was_done")
     take("reset_limit", client.delete(f"{limit}?who=J.%20Operator"), "shipped_again")
+
+
+def _annotation(client: httpx.Client, take: Any) -> None:
+    here = f"{API}/annotations"
+    asked = {
+        "spacecraft": "XTE",
+        "start": "1999-03-01T00:00:00.000Z",
+        "end": "1999-03-01T00:20:00.000Z",
+        "text": "Wheel 2 unloaded; the slew ends at 00:20.",
+        "who": "J. Operator",
+    }
+    written = take("add_annotation", client.post(here, json=asked), "period", asked)
+    backwards = asked | {"end": "1999-02-28T00:00:00.000Z"}
+    take("add_annotation", client.post(here, json=backwards), "backwards")
+    take("list_annotations", client.get(f"{here}?spacecraft=XTE"), "of_xte")
+    note = f"{here}/{written['id']}?who=J.%20Operator"
+    take("delete_annotation", client.delete(note), "deleted")
+    take("delete_annotation", client.delete(note), "deleted_before")
 
 
 def _sign_in(client: httpx.Client, app: App, take: Any) -> None:

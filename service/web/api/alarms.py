@@ -11,7 +11,7 @@ from starlette.responses import Response
 from service.access.tokens import Caller
 from service.alarms.limits import LimitSettings
 from service.alarms.quantities import QuantityName, limited_names
-from service.errors import BadBatch, Fault, NotFound
+from service.errors import NotFound
 from service.observations.schema import Wire
 from service.storage.models.alarms import (
     AlarmPage,
@@ -21,7 +21,7 @@ from service.storage.models.alarms import (
     LimitList,
 )
 from service.web.openapi.route import LINK, ResponseDoc, route_docs
-from service.web.requests.access import AuditDep, CallerDep
+from service.web.requests.access import AuditDep, CallerDep, author
 from service.web.requests.dependencies import AppDep, json_response, page_response
 from service.web.requests.path_parameters import SpacecraftPath
 from service.web.requests.query_parameters import (
@@ -122,7 +122,7 @@ def set_limit(
 ) -> Response:
     """Set a limit; the previous one stays in the history."""
     asked = read_model(LimitIn, body)
-    limited, who = _quantity_with_limits(quantity), _who(caller, asked.who)
+    limited, who = _quantity_with_limits(quantity), author(caller, asked.who)
     return json_response(
         app.limits.set(
             name,
@@ -151,7 +151,7 @@ def reset_limit(
     audited: AuditDep,
 ) -> Response:
     """Restore the shipped limit; earlier limits stay in the history."""
-    limited, who = _quantity_with_limits(quantity), _who(caller, query.who)
+    limited, who = _quantity_with_limits(quantity), author(caller, query.who)
     return json_response(
         app.limits.set(
             name,
@@ -196,7 +196,7 @@ def acknowledge_alarm(
     """Acknowledge an alarm; it is cleared if the quantity is back in limits."""
     asked = read_model(StatementIn, body)
     _visible_alarm(app, id, caller)
-    who = _who(caller, asked.who)
+    who = author(caller, asked.who)
     return json_response(app.alarms.acknowledge(id, who, asked.comment, audited.entry()))
 
 
@@ -215,7 +215,7 @@ def shelve_alarm(
     """Shelve an alarm for some minutes; it returns by itself."""
     asked = read_model(ShelveIn, body)
     _visible_alarm(app, id, caller)
-    who = _who(caller, asked.who)
+    who = author(caller, asked.who)
     return json_response(app.alarms.shelve(id, who, asked.minutes, asked.comment, audited.entry()))
 
 
@@ -234,7 +234,7 @@ def unshelve_alarm(
     """Unshelve an alarm."""
     asked = read_model(StatementIn, body)
     _visible_alarm(app, id, caller)
-    who = _who(caller, asked.who)
+    who = author(caller, asked.who)
     return json_response(app.alarms.unshelve(id, who, asked.comment, audited.entry()))
 
 
@@ -251,7 +251,7 @@ def comment_alarm(
     """Add a comment to an alarm."""
     asked = read_model(CommentIn, body)
     _visible_alarm(app, id, caller)
-    who = _who(caller, asked.who)
+    who = author(caller, asked.who)
     return json_response(app.alarms.comment(id, who, asked.comment, audited.entry()))
 
 
@@ -260,15 +260,6 @@ def _quantity_with_limits(quantity: str) -> QuantityName:
         known = ", ".join(limited_names())
         raise NotFound(f"limits do not apply to {quantity[:80]!r}, only to {known}")
     return quantity
-
-
-def _who(caller: Caller, named: str | None) -> str:
-    """The name of the token; without tokens, the name that the request gives."""
-    if caller.token_id is not None:
-        return caller.name
-    if named is None:
-        raise BadBatch(Fault("who", "is required while access is open: 1 to 64 characters"))
-    return named
 
 
 def _visible_alarm(app: AppDep, id: str, caller: Caller) -> AlarmWithActions:

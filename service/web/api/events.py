@@ -99,7 +99,7 @@ async def events(
     live: Annotated[Live, Depends(_live)],
     caller: CallerDep,
 ) -> Response:
-    """A stream of server-sent events: batches, alarms, limits, replays."""
+    """A stream of server-sent events: batches, alarms, limits, annotations, replays."""
     last = _last_event_id(request, query)
     listener = Listener(caller, *credentials(request))
     lines = await live.stream(listener, last, query.run, query.spacecraft)

@@ -15,6 +15,7 @@ from service import __version__
 from service.observations.schema import BatchIn
 from service.storage.models.base import Record, component_name, described
 from service.web.api.alarms import CommentIn, LimitIn, ShelveIn, StatementIn
+from service.web.api.annotations import AnnotationIn
 from service.web.api.batches import WhatIfIn
 from service.web.api.compare import CompareIn
 from service.web.api.events import EVENT_STREAM
@@ -57,6 +58,7 @@ TAGS = {
     "replayed into them.",
     "access": "The caller, the session of a browser, and the audit list.",
     "alarms": "Limits, alarms, and actions on alarms.",
+    "annotations": "Notes that people write on times and periods.",
     "events": "Live events.",
     "probes": "Probes and metrics for operation and monitoring.",
 }
@@ -122,6 +124,7 @@ REQUESTS: Sequence[type[BaseModel]] = (
     StatementIn,
     ShelveIn,
     CommentIn,
+    AnnotationIn,
     LimitIn,
     SignIn,
 )

@@ -21,7 +21,7 @@ from service.access.audit import Entry
 from service.access.sessions import OPEN_CALLER, Access
 from service.access.tokens import Caller
 from service.app.factory import App
-from service.errors import Forbidden, NotFound, Unauthenticated
+from service.errors import BadBatch, Fault, Forbidden, NotFound, Unauthenticated
 from service.storage.models.access import Scope
 
 COOKIE = "acquire_session"
@@ -105,6 +105,10 @@ POLICIES: dict[str, Policy] = {
     "shelve_alarm": Policy("operate", "nothing"),
     "unshelve_alarm": Policy("operate", "nothing"),
     "comment_alarm": Policy("operate", "nothing"),
+    "list_annotations": Policy("read", "query"),
+    "add_annotation": Policy("operate", "body"),
+    # Of tokens that are bound to spacecraft only notes on these: see the handler.
+    "delete_annotation": Policy("operate", "nothing"),
     "get_about": Policy("read", "nothing"),
     "get_overview": Policy("read", "nothing"),
     "events": Policy("read", "query"),
@@ -244,6 +248,15 @@ def require_all_spacecraft(caller: Caller) -> None:
     """Raise `Forbidden` where a caller is bound to spacecraft."""
     if caller.spacecraft is not None:
         raise Forbidden(f"{caller.name} is bound to spacecraft; this request is about all of them")
+
+
+def author(caller: Caller, named: str | None) -> str:
+    """The name of the token; without tokens, the name that the request gives."""
+    if caller.token_id is not None:
+        return caller.name
+    if named is None:
+        raise BadBatch(Fault("who", "is required while access is open: 1 to 64 characters"))
+    return named
 
 
 def bearer(request: Request) -> str | None:

@@ -95,6 +95,12 @@ class Query(BaseModel):
         return {name: getattr(self, name) for name in type(self).model_fields}
 
 
+def _require_order(start: Utc | None, end: Utc | None) -> None:
+    """Raise `ValueError` for a period that ends before it starts."""
+    if start and end and start.tai_ns > end.tai_ns:
+        raise ValueError(f"start {start} must not be after end {end}")
+
+
 class RunAndTimes(TypedDict):
     """A run and a period."""
 
@@ -119,8 +125,7 @@ class PeriodQuery(Query):
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
-        if self.start and self.end and self.start.tai_ns > self.end.tai_ns:
-            raise ValueError(f"start {self.start} must not be after end {self.end}")
+        _require_order(self.start, self.end)
         return self
 
 
@@ -329,10 +334,33 @@ Who = Annotated[
 Comment = Annotated[str | None, Field(max_length=2_000, description="A comment.")]
 
 
-class StatementQuery(Query):
-    """Who makes a change, and a comment on it."""
+class AnnotationQuery(Query):
+    """Which annotations."""
+
+    spacecraft: Annotated[
+        Key | None,
+        Field(description="Only those of this spacecraft, and those about every spacecraft."),
+    ] = None
+    start: Start = None
+    end: End = None
+    limit: PageLimit = 100
+    cursor: Cursor = None
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        _require_order(self.start, self.end)
+        return self
+
+
+class AuthorQuery(Query):
+    """Who makes a change."""
 
     who: Who = None
+
+
+class StatementQuery(AuthorQuery):
+    """Who makes a change, and a comment on it."""
+
     comment: Comment = None
 
 
