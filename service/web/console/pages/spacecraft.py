@@ -15,9 +15,11 @@ from service.alarms.quantities import QUANTITIES, RankedName, ranked_names, tren
 from service.alarms.subjects import limited_trackers
 from service.observations.schema import Key
 from service.products.formats import table_formats
+from service.storage.models.annotations import Annotation
 from service.storage.models.answers import Summary
+from service.storage.models.base import Page
 from service.storage.models.trends import Ranking
-from service.times import DAY_S, HOUR_S, Utc, parse_utc, shifted
+from service.times import DAY_S, HOUR_S, Utc, parse_utc, recorded_utc, shifted
 from service.web.console.page_context import LIVE, ContextDep, PageContext, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
@@ -39,6 +41,7 @@ Range = Annotated[
 POINTS = 240
 """The most points of a curve: as many as a chart can show."""
 WORST, LATEST = 10, 10
+ANNOTATIONS = 100
 FIRST_LOOKED_AT: tuple[RankedName, ...] = (
     "ambiguous_share",
     "unmatched_share",
@@ -159,6 +162,7 @@ def spacecraft_page(
     stretch = shown_period(context, name, query, latest)
     trackers = limited_trackers(context.app.missions[name])
     ranking = _worst(context, name, query, stretch)
+    notes = _annotations(context, name, stretch)
     ranked = [each for each in ranked_names() if not query.tracker or QUANTITIES[each].by_tracker]
     return rendered(
         "spacecraft.html.jinja",
@@ -179,6 +183,10 @@ def spacecraft_page(
         worst=ranking.items,
         limits=context.app.limits.all(name, query.tracker if trackers else None),
         formats=table_formats(),
+        annotations=sorted(notes.items, key=lambda each: recorded_utc(each.start).tai_ns),
+        more_annotations=notes.next_cursor is not None,
+        may_write="operate" in context.caller.scopes,
+        may_write_of_all=context.caller.spacecraft is None,
         history=lambda **more: stretch and _history_address(name, query, stretch, more),
     )
 
@@ -255,6 +263,15 @@ def _attitude(context: PageContext, latest: list[Summary]) -> Any:
     if not latest or latest[0].status is None:
         return None
     return context.app.results.get(latest[0].id).answer.attitude
+
+
+def _annotations(context: PageContext, name: str, stretch: ShownPeriod | None) -> Page[Annotation]:
+    """The annotations that touch the shown period."""
+    if stretch is None:
+        return Page([], None)
+    return context.app.annotations.page(
+        spacecraft=name, start=stretch.start, end=stretch.end, limit=ANNOTATIONS
+    )
 
 
 def _history_address(

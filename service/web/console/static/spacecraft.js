@@ -1,4 +1,5 @@
 // The trends of one spacecraft: charts of the period in the address.
+import { annotationsShown } from "./annotations.js";
 import { requestJson } from "./requests.js";
 import { fetchLatest, swapRegions } from "./regions.js";
 import { AlarmBars, posix } from "./alarm_bars.js";
@@ -35,7 +36,7 @@ async function draw() {
     if (mine !== asked) return;
     shown = found;
     for (const trend of trends) {
-      trend.show(shown, posix(start), posix(end));
+      trend.show(shown, posix(start), posix(end), annotationsShown(posix));
       trend.definition.bars.show(JSON.parse(alarms), posix(start), posix(end));
     }
     status.textContent = "";

@@ -6,6 +6,7 @@ const LABEL_PX = 16;
 
 // Room for half of a label at the top and at the right end of an axis.
 const PADDING = [12, 32, 0, 0];
+const MARK_PX = 16;
 
 function colour(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
@@ -86,20 +87,84 @@ function drawLimits(chart, lines) {
   ctx.strokeStyle = ctx.fillStyle = colour("--limit");
   ctx.textAlign = "left";
   ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
-  for (const { severity, value, text } of lines) {
-    const y = chart.valToPos(value, "y", true);
+  const labels = [];
+  // A label is above its line, or below it if there is no room.
+  const isHigh = (y) => y - bbox.top < LABEL_PX * devicePixelRatio;
+  const shown = lines.map((line) => ({ ...line, y: chart.valToPos(line.value, "y", true) }));
+  for (const { severity, text, y } of shown.sort((a, b) => b.y - a.y)) {
     if (y < bbox.top || y > bbox.top + bbox.height) continue;
     ctx.setLineDash(DASHES[severity].map((each) => each * devicePixelRatio));
     ctx.beginPath();
     ctx.moveTo(bbox.left, y);
     ctx.lineTo(bbox.left + bbox.width, y);
     ctx.stroke();
-    // Above its line, or below it if there is no room.
-    const isHigh = y - bbox.top < LABEL_PX * devicePixelRatio;
-    ctx.textBaseline = isHigh ? "top" : "bottom";
-    ctx.fillText(text, bbox.left + 4 * devicePixelRatio, y + (isHigh ? 3 : -2) * devicePixelRatio);
+    // Lines that are close to each other share a label.
+    const last = labels.at(-1);
+    if (last && last.y - y < (isHigh(y) ? 2 : 1) * LABEL_PX * devicePixelRatio) last.text += `, ${text}`;
+    else labels.push({ text, y });
+  }
+  for (const { text, y } of labels) {
+    ctx.textBaseline = isHigh(y) ? "top" : "bottom";
+    ctx.fillText(text, bbox.left + 4 * devicePixelRatio, y + (isHigh(y) ? 3 : -2) * devicePixelRatio);
   }
   ctx.restore();
+}
+
+// A line at the beginning of each annotation, a shade for its period, its number above.
+function drawAnnotations(chart, annotations) {
+  const { ctx, bbox } = chart;
+  const px = devicePixelRatio;
+  const right = bbox.left + bbox.width;
+  const marks = [];
+  ctx.save();
+  ctx.font = `${11 * px}px system-ui, sans-serif`;
+  ctx.textAlign = "left";
+  ctx.textBaseline = "bottom";
+  for (const { number, start, end } of annotations) {
+    const from = chart.valToPos(start, "x", true);
+    const to = end === null ? from : chart.valToPos(end, "x", true);
+    if (to < bbox.left || from > right) continue;
+    const left = Math.max(from, bbox.left);
+    ctx.fillStyle = colour("--shade");
+    ctx.fillRect(left, bbox.top, Math.min(to, right) - left, bbox.height);
+    ctx.strokeStyle = colour("--ink");
+    ctx.lineWidth = px;
+    ctx.beginPath();
+    ctx.moveTo(left, bbox.top - 3 * px);
+    ctx.lineTo(left, bbox.top + bbox.height);
+    ctx.stroke();
+    marks.push({ left, number });
+  }
+  ctx.fillStyle = colour("--ink");
+  for (const { left, text } of joined(marks.sort((a, b) => a.left - b.left), (text) => ctx.measureText(text).width + 4 * px)) {
+    ctx.fillText(text, Math.min(left, right - ctx.measureText(text).width), bbox.top - 3 * px);
+  }
+  ctx.restore();
+}
+
+// Numbers that would overlap become one text.
+function joined(marks, width) {
+  const groups = [];
+  for (const { left, number } of marks) {
+    const last = groups.at(-1);
+    if (!last || left > last.left + width(last.text)) groups.push({ left, numbers: [number], text: String(number) });
+    else {
+      last.numbers.push(number);
+      last.text = last.numbers.length === 2 ? last.numbers.join(",") : `${last.numbers[0]}…${number}`;
+    }
+  }
+  return groups;
+}
+
+// Tells the page the time of a click; the end of a drag is none.
+function reportClicks(chart) {
+  let pressedAt = null;
+  chart.over.addEventListener("mousedown", (event) => (pressedAt = event.clientX));
+  chart.over.addEventListener("click", (event) => {
+    if (pressedAt === null || Math.abs(event.clientX - pressedAt) > 3) return;
+    const seconds = chart.posToVal(event.clientX - chart.over.getBoundingClientRect().left, "x");
+    document.dispatchEvent(new CustomEvent("moment", { detail: seconds }));
+  });
 }
 
 // The usual time from a bucket with batches to the next: batches may come less often than buckets.
@@ -136,8 +201,9 @@ export class Trend {
     return { width: this.holder.clientWidth, height: this.holder.clientHeight };
   }
 
-  show(history, start, end) {
+  show(history, start, end, annotations = []) {
     this.history = history;
+    this.annotations = annotations;
     this.bounds = [start, end];
     const { quantities } = this.definition;
     const known = quantities.filter((each) => history.series[each.name]?.count.some((count) => count > 0));
@@ -183,7 +249,7 @@ export class Trend {
     const lines = merged(limitLines(this.limits, names), names).map((line) => ({ ...line, value: line.value * scale }));
     return {
       ...this.size(),
-      padding: PADDING,
+      padding: this.annotations.length ? [MARK_PX, ...PADDING.slice(1)] : PADDING,
       tzDate: (seconds) => uPlot.tzDate(new Date(seconds * 1000), "Etc/UTC"),
       legend: { show: false },
       cursor: { sync: { key: this.group }, drag: { x: true, y: false, setScale: false }, points: { size: 6 }, bind: { dblclick: () => () => this.onZoom(null) } },
@@ -195,6 +261,8 @@ export class Trend {
         { ...axis, size: labelWidth, values: (_, splits) => splits.map((value) => `${+value.toPrecision(6)}${this.definition.unit}`) },
       ],
       hooks: {
+        ready: [reportClicks],
+        drawAxes: [(chart) => drawAnnotations(chart, this.annotations)],
         draw: [(chart) => drawLimits(chart, lines), ({ bbox }) => this.definition.bars?.align(bbox.left / devicePixelRatio, bbox.width / devicePixelRatio)],
         setSelect: [(chart) => chart.select.width > 4 && this.onZoom([chart.posToVal(chart.select.left, "x"), chart.posToVal(chart.select.left + chart.select.width, "x")])],
         setCursor: [(chart) => this.read(chart.cursor.idx)],
@@ -239,6 +307,7 @@ export class Trend {
     });
     this.legend = this.known.map(({ label, dash }) => `${dash ? "╌" : "━"} ${label}`).join("   ") + "; shaded: least to greatest";
     this.readout.textContent = this.legend;
-    this.holder.setAttribute("aria-label", `${this.definition.title}. ${values.join("; ")}`);
+    const marked = this.annotations.length ? `; annotations: ${this.annotations.length}, listed below` : "";
+    this.holder.setAttribute("aria-label", `${this.definition.title}. ${values.join("; ")}${marked}`);
   }
 }
