@@ -1,15 +1,34 @@
 """Limits of quantities: those that hold, their history, and new ones."""
 
+from collections.abc import Callable
+from typing import cast
+
 from service.access.audit import Entry
 from service.alarms.limits import LimitSettings
-from service.alarms.quantities import QuantityName, tracker_names
-from service.alarms.subjects import limited_trackers
+from service.alarms.preview import Preview, preview_of, preview_of_gaps
+from service.alarms.quantities import SILENCE, QuantityName, tracker_names
+from service.alarms.subjects import limited_trackers, subject_of
+from service.alarms.window import Sample
 from service.app.context import Context
 from service.errors import BadBatch, Fault, shown_value
 from service.missions.mission import Mission, mission_named
-from service.storage.models.alarms import Limit, LimitHistory
+from service.storage.models.alarms import (
+    Limit,
+    LimitExcursion,
+    LimitHistory,
+    LimitPreview,
+    LimitTrial,
+    SeverityName,
+)
 from service.storage.queries import limits
-from service.times import utc_now
+from service.storage.queries.future_dated import LIVE
+from service.storage.queries.pages import ResultFilter
+from service.times import DAY_S, shifted, utc_now
+
+PREVIEW_DAYS = 7
+MOST_PREVIEWED = 50_000
+"""Batches of one preview: to read them takes about a second."""
+MOST_EXCURSIONS = 50
 
 
 class Limits:
@@ -62,6 +81,81 @@ class Limits:
             ),
             entry,
         )
+
+    def preview(
+        self,
+        name: str,
+        quantity: QuantityName,
+        settings: LimitSettings,
+        *,
+        run: str | None = None,
+        days: int = PREVIEW_DAYS,
+        tracker: str | None = None,
+    ) -> LimitPreview:
+        """How a limit and the one in force evaluate the days up to the run's latest batch.
+
+        Of more than `MOST_PREVIEWED` batches it takes the latest ones.  They are evaluated in the
+        order of their time, whenever they came.
+        """
+        mission = mission_named(self._context.missions, name)
+        own = _checked_tracker(mission, tracker, quantity)
+        subject = subject_of(quantity, own)
+        with self._context.reading() as connection:
+            in_force = limits.limits_of(connection, mission)[subject]
+            last = limits.latest_time(connection, ResultFilter(run or LIVE, name), utc_now())
+            time_ns: list[int] = []
+            samples: list[Sample] = []
+            if last is not None:
+                # The latest batch belongs to the period.
+                start, end = shifted(last, -DAY_S * days), shifted(last, 0.001)
+                period = ResultFilter(run or LIVE, name, start, end)
+                time_ns, samples = limits.latest_samples(
+                    connection, period, subject, MOST_PREVIEWED
+                )
+
+        def moment(at_ns: int) -> str:
+            assert last is not None
+            return shifted(last, (at_ns - last.tai_ns) / 1e9).text
+
+        def trial(tried: LimitSettings) -> LimitTrial:
+            of_gaps = quantity == SILENCE
+            found = preview_of_gaps(time_ns, tried) if of_gaps else preview_of(samples, tried)
+            return _trial(found, tried, moment)
+
+        return LimitPreview(
+            spacecraft=name,
+            run=run or LIVE,
+            quantity=quantity,
+            tracker=own or None,
+            start=moment(time_ns[0]) if time_ns else None,
+            end=moment(time_ns[-1]) if time_ns else None,
+            batches=len(time_ns),
+            is_cut=len(time_ns) == MOST_PREVIEWED,
+            proposed=trial(settings),
+            in_force=trial(in_force),
+        )
+
+
+def _trial(found: Preview, tried: LimitSettings, moment: Callable[[int], str]) -> LimitTrial:
+    """A preview as the interface shows it; `moment` gives the text of a time in TAI ns."""
+    return LimitTrial(
+        settings=tried.model_dump(mode="json"),
+        evaluated=found.evaluated,
+        beyond={
+            cast(SeverityName, severity.word): count for severity, count in found.beyond.items()
+        },
+        alarms=len(found.excursions),
+        excursions=[
+            LimitExcursion(
+                severity=cast(SeverityName, each.severity.word),
+                start=moment(each.start_ns),
+                end=None if each.end_ns is None else moment(each.end_ns),
+                worst=each.worst,
+                bound=each.bound,
+            )
+            for each in found.excursions[-MOST_EXCURSIONS:]
+        ],
+    )
 
 
 def _checked_tracker(

@@ -136,3 +136,24 @@ def test_live_alarms_are_counted_for_prometheus(client, drawn):
     (alarm,) = client.get("/api/v1/alarms?spacecraft=SWAS").json()["items"]
     client.post(f"/api/v1/alarms/{alarm['id']}/acknowledge", json={"who": "jb"}).raise_for_status()
     assert counted() == {("warning", "acknowledged")}
+
+
+def test_a_preview_sets_nothing_and_names_what_is_wrong(client, alarm):
+    here = f"{LIMITS}/no_attitude_share"
+    before = client.get(here).json()
+    tried = {"settings": TIGHT | {"warning": {"high": 1.5}}}
+    told = client.post(f"{here}/preview?run=watched", json=tried)
+    assert told.status_code == 200, told.text
+    assert (told.json()["proposed"]["alarms"], told.json()["in_force"]["alarms"]) == (0, 1)
+    assert told.json()["in_force"]["settings"] == before["limit"]["settings"]
+    assert client.get(here).json() == before
+    for query, body, field in (
+        ("?days=0", tried, "days"),
+        ("?tracker=STARTRACKER_9", tried, "tracker"),
+        ("", {"settings": {"warning": {"high": "x"}}}, "settings.warning.high"),
+        ("", {}, "settings"),
+    ):
+        answer = client.post(f"{here}/preview{query}", json=body)
+        assert answer.status_code == 422
+        assert [each["field"] for each in answer.json()["errors"]] == [field]
+    assert client.post(f"{LIMITS}/colour/preview", json=tried).status_code == 404

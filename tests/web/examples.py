@@ -102,7 +102,6 @@ def walk(client: httpx.Client, app: App) -> Json:
     }
     take("compare", client.post(f"{API}/compare", json=asked), "tighter", asked)
     _alarm(client, take)
-    _annotation(client, take)
     take("list_attitudes", client.get(f"{API}/spacecraft/SWAS/attitudes"), "one")
     take("get_attitude", client.get(f"{API}/spacecraft/SWAS/attitude"), "one")
     take("list_rates", client.get(f"{API}/spacecraft/XTE/rates"), "one_hour")
@@ -134,6 +133,7 @@ def walk(client: httpx.Client, app: App) -> Json:
     take("watch_run", client.put(f"{API}/runs/pass-7", json=asked), "watched", asked)
 
     take("list_audit", client.get(f"{API}/audit"), "two_changes")
+    _annotation(client, take)
     take("cancel_replay", client.delete(begun.headers["Location"]), "ended_already")
     # The same batch again and again: it is cancelled long before its end.
     content = gzip.compress(f"{json.dumps(xte)}\n".encode() * 100_000)
@@ -152,6 +152,9 @@ def _alarm(client: httpx.Client, take: Any) -> None:
     settings = {"warning": {"high": 0.5}, "minimum_count": 2, "duration_s": 0}
     asked = {"settings": settings, "who": "J. Operator", "comment": "for the next pass"}
     limit = f"{here}/no_attitude_share"
+    tried = {"settings": settings}
+    preview = client.post(f"{limit}/preview", json=tried)
+    take("preview_limit", preview, "of_one_batch", tried)
     take("set_limit", client.put(limit, json=asked), "changed", asked)
     take("get_limit", client.get(limit), "with_history")
     take("list_limits", client.get(here), "of_swas")

@@ -114,6 +114,21 @@ def test_limits_of_a_tracker_over_http(client):
     assert gone["is_default"]
 
 
+def test_the_page_of_limits_has_a_choice_of_tracker(client):
+    body = {"settings": QUICK | {"warning": {"high": 7.0}}, "who": "J. Operator"}
+    path, whose = f"{LIMITS}/residual_ratio", {"tracker": SECOND}
+    client.put(path, params=whose, json=body).raise_for_status()
+    shown = client.get("/spacecraft/XTE/limits", params=whose).raise_for_status().text
+    Markup(shown)
+    assert f"tracker={FIRST}" in shown
+    assert 'data-limit="residual_ratio" data-spacecraft="XTE" data-tracker="' + SECOND in shown
+    assert 'data-limit="silence_s"' not in shown
+    assert 'inputmode="decimal" size="7" value="7"' in shown
+    assert 'inputmode="decimal" size="7" value="7"' not in client.get("/spacecraft/XTE/limits").text
+    assert client.get("/spacecraft/XTE/limits?tracker=none").status_code == 422
+    client.delete(path, params=whose | {"who": "J. Operator"}).raise_for_status()
+
+
 def test_the_page_of_a_batch_compares_trackers_and_names_the_one_that_disagrees(client, filled):
     outliers = {each["attitude"].get("outlier") for each in filled if each["attitude"]}
     assert SECOND in outliers

@@ -43,6 +43,49 @@ class LimitHistory(Record, frozen=True, kw_only=True):
     history: Annotated[list[Limit], doc("Newest first.")]
 
 
+class LimitExcursion(Record, frozen=True, kw_only=True):
+    """A time for which an alarm would have been out of limits."""
+
+    component: ClassVar[str] = "LimitExcursion"
+    severity: Annotated[SeverityName, doc("The worst.")]
+    start: Annotated[Moment, doc("Time of the batch that would have raised the alarm.")]
+    end: Annotated[Moment | None, doc("First batch back in limits; null: out to the end.")]
+    worst: Annotated[float, doc("Value furthest beyond the bound.")]
+    bound: float
+
+
+class LimitTrial(Record, frozen=True, kw_only=True):
+    """How recorded batches are evaluated against a limit."""
+
+    component: ClassVar[str] = "LimitTrial"
+    settings: Annotated[dict[str, Any], DescribedAs(LimitSettings)]
+    evaluated: Annotated[
+        int, doc("Batches at which there was a value: the mean over the latest minimum_count.")
+    ]
+    beyond: Annotated[
+        dict[SeverityName, int],
+        doc("Values beyond the bounds of each severity, whatever hysteresis and duration are."),
+    ]
+    alarms: Annotated[int, doc("How often the quantity would have left its limits.")]
+    excursions: Annotated[list[LimitExcursion], doc("The latest of these, oldest first.")]
+
+
+class LimitPreview(Record, frozen=True, kw_only=True):
+    """A limit that is not set, and the one in force, over the same recorded batches."""
+
+    component: ClassVar[str] = "LimitPreview"
+    spacecraft: str
+    run: str
+    quantity: QuantityName
+    tracker: str | None
+    start: Annotated[Moment | None, doc("Time of the first batch; null: there is none.")]
+    end: Annotated[Moment | None, doc("Time of the last batch.")]
+    batches: int
+    is_cut: Annotated[bool, doc("Whether the days have more batches: these are the latest.")]
+    proposed: LimitTrial
+    in_force: LimitTrial
+
+
 class AlarmValue(Record, frozen=True, kw_only=True):
     """An evaluated value with its time and its batch."""
 

@@ -15,13 +15,23 @@ from service.alarms.quantities import (
     limited_names,
     tracker_names,
 )
-from service.alarms.subjects import Subject, limits_of_subjects, subject_of
+from service.alarms.subjects import (
+    Subject,
+    limits_of_subjects,
+    quantity_and_tracker,
+    sampler,
+    subject_of,
+)
+from service.alarms.window import Sample
 from service.missions.mission import Mission
 from service.storage.models.alarms import Limit, LimitHistory
+from service.storage.queries.pages import ResultFilter, newest
 from service.storage.recording import events
 from service.storage.sql.alarm_tables import limits
 from service.storage.sql.columns import Row
 from service.storage.sql.prepared import prepared
+from service.storage.sql.tables import COUNTED, MEASURED, batches, results, tracker_values
+from service.times import Utc, recorded_utc
 
 LimitsInForce = Mapping[Subject, LimitSettings]
 
@@ -161,3 +171,29 @@ def shown_limit(
 
 def _in_force(connection: Connection, spacecraft: str) -> list[Row]:
     return _IN_FORCE.read(connection, {"of_spacecraft": spacecraft})
+
+
+def latest_time(connection: Connection, selected: ResultFilter, now: Utc) -> Utc | None:
+    """The time of the newest batch; None without any."""
+    query = select(batches.c.time).join_from(results, batches, results.c.batch_id == batches.c.id)
+    row = newest(connection, query, selected, now)
+    return None if row is None else recorded_utc(row["time"])
+
+
+def latest_samples(
+    connection: Connection, selected: ResultFilter, subject: Subject, limit: int
+) -> tuple[list[int], list[Sample]]:
+    """The times in TAI ns of the latest batches, and their samples of a subject, oldest first."""
+    _, tracker = quantity_and_tracker(subject)
+    values = tracker_values if tracker else results
+    columns = [values.c[name] for name in (*COUNTED, "status", *MEASURED)]
+    query = select(results.c.time_ns, *columns).where(*selected.conditions())
+    if tracker:
+        same_batch = tracker_values.c.batch_id == results.c.batch_id
+        of_tracker = tracker_values.c.tracker == tracker
+        query = query.join_from(results, tracker_values, same_batch).where(of_tracker)
+    query = query.order_by(results.c.time_ns.desc(), results.c.batch_id.desc()).limit(limit)
+    sample_of = sampler(subject)
+    rows = [dict(row) for row in connection.execute(query).mappings()][::-1]
+    samples = [sample_of(row, {tracker: row}) for row in rows]
+    return [row["time_ns"] for row in rows], [each for each in samples if each is not None]

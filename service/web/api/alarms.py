@@ -19,6 +19,7 @@ from service.storage.models.alarms import (
     Limit,
     LimitHistory,
     LimitList,
+    LimitPreview,
 )
 from service.web.openapi.route import LINK, ResponseDoc, route_docs
 from service.web.requests.access import AuditDep, CallerDep, author
@@ -30,6 +31,7 @@ from service.web.requests.query_parameters import (
     Comment,
     LimitQuery,
     LimitStatementQuery,
+    RunQuery,
     Who,
 )
 from service.web.requests.request_body import JsonBody, read_model
@@ -67,6 +69,21 @@ class CommentIn(StatementIn):
     model_config = ConfigDict(title=component)
 
     comment: Annotated[str, Field(min_length=1, max_length=2_000)]
+
+
+class LimitTrialIn(Wire):
+    """A limit to try."""
+
+    component: ClassVar[str] = "LimitTrialIn"
+    model_config = ConfigDict(title=component)
+
+    settings: LimitSettings
+
+
+class LimitPreviewQuery(LimitQuery, RunQuery):
+    """What a limit is tried on."""
+
+    days: Annotated[int, Field(ge=1, le=30, description="Up to the run's latest batch.")] = 7
 
 
 class LimitIn(StatementIn):
@@ -134,6 +151,27 @@ def set_limit(
             tracker=query.tracker,
         )
     )
+
+
+@router.post(
+    LIMITS + "/{quantity}/preview",
+    **route_docs(
+        {200: ResponseDoc("How this limit and the one in force evaluate them.", LimitPreview)},
+        body=LimitTrialIn,
+        problems=(404,),
+    ),
+)
+def preview_limit(
+    name: SpacecraftPath,
+    quantity: QuantityPath,
+    query: Annotated[LimitPreviewQuery, InQuery()],
+    body: JsonBody,
+    app: AppDep,
+) -> Response:
+    """Evaluate the latest days against a limit without setting it."""
+    asked = read_model(LimitTrialIn, body)
+    limited = _quantity_with_limits(quantity)
+    return json_response(app.limits.preview(name, limited, asked.settings, **query.asked()))
 
 
 @router.delete(

@@ -14,7 +14,7 @@ from pydantic.json_schema import GenerateJsonSchema, models_json_schema
 from service import __version__
 from service.observations.schema import BatchIn
 from service.storage.models.base import Record, component_name, described
-from service.web.api.alarms import CommentIn, LimitIn, ShelveIn, StatementIn
+from service.web.api.alarms import CommentIn, LimitIn, LimitTrialIn, ShelveIn, StatementIn
 from service.web.api.annotations import AnnotationIn
 from service.web.api.batches import WhatIfIn
 from service.web.api.compare import CompareIn
@@ -126,6 +126,7 @@ REQUESTS: Sequence[type[BaseModel]] = (
     CommentIn,
     AnnotationIn,
     LimitIn,
+    LimitTrialIn,
     SignIn,
 )
 

@@ -97,6 +97,7 @@ POLICIES: dict[str, Policy] = {
     "compare": Policy("read", "body"),
     "list_limits": Policy("read", "path"),
     "get_limit": Policy("read", "path"),
+    "preview_limit": Policy("read", "path"),
     "set_limit": Policy("operate", "path"),
     "reset_limit": Policy("operate", "path"),
     "list_alarms": Policy("read", "query"),

@@ -1,29 +1,54 @@
 """The page of a spacecraft's limits: their bounds, their history, and who set them."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import Path
 from fastapi import Query as InQuery
 from starlette.responses import Response
 
+from service.alarms.subjects import limited_trackers
+from service.observations.schema import Key
 from service.web.console.page_context import ContextDep, PageQuery
+from service.web.console.pages.spacecraft import charts
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
 
 SEVERITIES = ("watch", "warning", "critical")
+PREVIEW_DAYS = (1, 7, 30)
+
+
+class LimitsQuery(PageQuery):
+    """Whose limits: those of the spacecraft as a whole, or of one of its trackers."""
+
+    tracker: Key | None = None
 
 
 @console_page("/spacecraft/{name}/limits", "Limits", Policy("read", "path"), section="/alarms")
 def limits_page(
-    name: Annotated[str, Path()], query: Annotated[PageQuery, InQuery()], context: ContextDep
+    name: Annotated[str, Path()], query: Annotated[LimitsQuery, InQuery()], context: ContextDep
 ) -> Response:
-    """The bounds of every quantity, which can be changed, with their history."""
-    limits = context.app.limits.all(name)
+    """The bounds of every quantity, which can be previewed and changed, with their history."""
+    app, tracker = context.app, query.tracker
+    limits = app.limits.all(name, tracker)
     return rendered(
         "limits.html.jinja",
         context.layout(query.run),
         name=name,
-        limits=[context.app.limits.get(name, each.quantity) for each in limits],
+        tracker=tracker,
+        trackers=limited_trackers(app.missions[name]),
+        limits=[app.limits.get(name, each.quantity, tracker) for each in limits],
         severities=SEVERITIES,
+        days=PREVIEW_DAYS,
+        charts=_charts(),
+        may_write="operate" in context.caller.scopes,
     )
+
+
+def _charts() -> dict[str, Any]:
+    """The chart of each quantity that has a history, by itself."""
+    return {
+        quantity["name"]: chart | {"quantities": [quantity]}
+        for chart in charts()
+        for quantity in chart["quantities"]
+    }

@@ -1,6 +1,7 @@
 // Changes limits, one quantity at a time, with author and comment.
 import { refreshSoon } from "./live_updates.js";
 import { attempt, rememberWho, send } from "./actions.js";
+import { beginPreview, clearPreview, showPreview } from "./limit_preview.js";
 
 const message = document.getElementById("message");
 const signed = document.getElementById("signed");
@@ -27,8 +28,17 @@ function settingsIn(form) {
   return settings;
 }
 
-function addressOf(form) {
-  return `/api/v1/spacecraft/${encodeURIComponent(form.dataset.spacecraft)}/limits/${form.dataset.limit}`;
+function addressOf(form, query = {}, part = "") {
+  const { spacecraft, tracker, limit } = form.dataset;
+  const asked = new URLSearchParams(tracker ? { ...query, tracker } : query);
+  return `/api/v1/spacecraft/${encodeURIComponent(spacecraft)}/limits/${limit}${part}?${asked}`;
+}
+
+async function preview(form) {
+  const query = { days: signed.elements.days.value, run: document.body.dataset.run };
+  const found = await send("POST", addressOf(form, query, "/preview"), JSON.stringify({ settings: settingsIn(form) }));
+  await showPreview(found);
+  return "Preview: nothing is changed.";
 }
 
 function change(button, form, work) {
@@ -46,17 +56,24 @@ document.addEventListener("submit", (event) => {
   if (!form) return;
   event.preventDefault();
   change(event.submitter, form, async (who) => {
+    clearPreview(form.dataset.limit);
     await send("PUT", addressOf(form), JSON.stringify({ settings: settingsIn(form), ...who }));
     return `Changed: ${form.dataset.limit}.`;
   });
 });
 
 document.addEventListener("click", (event) => {
+  const trying = event.target.closest("[data-preview]");
+  if (trying) {
+    const form = trying.closest("form");
+    attempt(trying, beginPreview(form.dataset.limit), () => preview(form));
+    return;
+  }
   const button = event.target.closest("[data-default]");
   if (!button) return;
   const form = button.closest("form");
   change(button, form, async (who) => {
-    await send("DELETE", `${addressOf(form)}?${new URLSearchParams(who)}`);
+    await send("DELETE", addressOf(form, who));
     return `Shipped limit restored: ${form.dataset.limit}.`;
   });
 });

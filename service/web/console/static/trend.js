@@ -307,7 +307,7 @@ export class Trend {
     });
     this.legend = this.known.map(({ label, dash }) => `${dash ? "╌" : "━"} ${label}`).join("   ") + "; shaded: least to greatest";
     this.readout.textContent = this.legend;
-    const marked = this.annotations.length ? `; annotations: ${this.annotations.length}, listed below` : "";
+    const marked = this.annotations.length ? `; ${this.definition.marks ?? "annotations"}: ${this.annotations.length}, listed below` : "";
     this.holder.setAttribute("aria-label", `${this.definition.title}. ${values.join("; ")}${marked}`);
   }
 }
