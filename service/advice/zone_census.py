@@ -80,7 +80,7 @@ def zone_censuses(mission: Mission, run_catalog: RunCatalog) -> list[ZoneCensus]
 def stars_in_view(run_catalog: RunCatalog, radius_deg: float) -> Vector:
     """How many stars (ROWS, COLUMNS) of a run catalog a field of view shows."""
     tree: Any = cKDTree(run_catalog.direction)
-    counts = tree.query_ball_point(_axes(), _chord(radius_deg), return_length=True)
+    counts = tree.query_ball_point(axes_of_sky(), _chord(radius_deg), return_length=True)
     return np.asarray(counts).reshape(ROWS, COLUMNS)
 
 
@@ -114,12 +114,13 @@ def spread_of(counts: Vector) -> Spread:
 def _counts(
     direction: Vector, least_deg: float, most_deg: float, limit_deg: float
 ) -> tuple[Vector, Vector]:
-    found = [zone_counts(direction, axis, least_deg, most_deg, limit_deg) for axis in _axes()]
+    found = [zone_counts(direction, axis, least_deg, most_deg, limit_deg) for axis in axes_of_sky()]
     both = np.array(found).reshape(ROWS, COLUMNS, 2)
     return both[..., 0], both[..., 1]
 
 
-def _axes() -> Vector:
+def axes_of_sky() -> Vector:
+    """The axes of the grid as unit vectors (ROWS * COLUMNS, 3), row by row."""
     ra_deg, dec_deg = axes_deg()
     return from_ra_dec(np.tile(ra_deg, ROWS), np.repeat(dec_deg, COLUMNS))
 

@@ -1,21 +1,25 @@
 """Named runs: lists, alarms on or off, comparisons, and reprocessing into one."""
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 from service.access.audit import Entry
 from service.app.context import Context, checked_run_name
 from service.errors import BadBatch, Fault
 from service.ingest.reprocess import ReprocessPlan, ReprocessProgress, reprocess
 from service.missions.mission import Mission, mission_named
-from service.storage.models.compare import RunComparison
+from service.storage.models.compare import RunChange, RunComparison
 from service.storage.models.runs import Run, RunState
 from service.storage.queries import histories, overview
-from service.storage.queries.compare_runs import compare_runs
+from service.storage.queries.compare_runs import changed_batches, compare_runs
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
 from service.storage.recording.results import set_run_alarms
 from service.times import Utc, utc_now
+
+MOST_COMPARED = 2_000
+"""Batches of one page of two runs: to compare them takes less than a second."""
+MOST_CHANGED = 50
 
 
 class Runs:
@@ -55,6 +59,35 @@ class Runs:
         """The outcomes of the same stars in two runs, and the angles between their attitudes."""
         with self._context.reading() as connection:
             return compare_runs(connection, ResultFilter(run, spacecraft, start, end), other)
+
+    def compare_latest(
+        self, run: str, other: str, spacecraft: str
+    ) -> tuple[RunComparison, list[RunChange]]:
+        """The same of the latest batches of a spacecraft alone, and those that differ."""
+        mission_named(self._context.missions, spacecraft)
+        place = ResultFilter(run, spacecraft)
+        with self._context.reading() as connection:
+            found = compare_runs(connection, place, other, MOST_COMPARED)
+            changed = changed_batches(connection, place, other, MOST_COMPARED, MOST_CHANGED)
+        return found, changed
+
+    def comparable(
+        self, spacecraft: Collection[str], run: str | None = None
+    ) -> tuple[str, str, str] | None:
+        """Two runs with one of these spacecraft on the same days, and that spacecraft.
+
+        The first is `run`, or without one the live run or the newest.  None without such a pair.
+        """
+        found = sorted(self.all(), key=lambda each: (each.run == LIVE, each.created), reverse=True)
+        for one in found:
+            if run is not None and one.run != run:
+                continue
+            for other in found:
+                common = sorted({*one.spacecraft} & {*other.spacecraft} & {*spacecraft})
+                same_days = other.first_day <= one.last_day and one.first_day <= other.last_day
+                if other.run != one.run and common and same_days:
+                    return one.run, other.run, common[0]
+        return None
 
     def reprocess(
         self,

@@ -3,15 +3,23 @@
 from collections.abc import Sequence
 
 from service.acquire.prewarm import prewarm_zones
+from service.advice.zone_size import ZoneCost, ZoneSize, zone_cost, zone_size
 from service.app.context import Context
 from service.ingest.solver_pool import mission_in_input
+from service.missions.mission import Mission, mission_named
 from service.observations.schema import APrioriIn, prior_of
 from service.sky.cache import CacheEntry, Sized
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.zones import Zone
 from service.storage.models.answers import ZoneSummary
 from service.storage.models.zones import CachedRunCatalog, CachedZone, ZoneCache
-from service.times import Utc
+from service.storage.queries.future_dated import LIVE
+from service.storage.queries.limits import latest_samples, latest_time
+from service.storage.queries.pages import ResultFilter
+from service.times import Utc, utc_now
+
+MOST_ERRORS = 10_000
+MOST_COSTS = 1_000
 
 
 class Zones:
@@ -19,6 +27,7 @@ class Zones:
 
     def __init__(self, context: Context) -> None:
         self._context = context
+        self._costs: dict[tuple[str, str, float], ZoneCost] = {}
 
     def state(self) -> ZoneCache:
         """The content of the cache, least recently used first, and its counters."""
@@ -39,6 +48,30 @@ class Zones:
             evictions=state.evictions,
             build_us=state.build_us,
         )
+
+    def size(self, name: str, run: str | None = None) -> tuple[ZoneSize, list[ZoneCost]]:
+        """Advice on the size of a spacecraft's zone by a run's a priori errors, and the costs.
+
+        The errors are those of the latest `MOST_ERRORS` batches; a batch without an attitude
+        has none.
+        """
+        mission = mission_named(self._context.missions, name)
+        place = ResultFilter(run or LIVE, name)
+        with self._context.reading() as connection:
+            time = latest_time(connection, place, utc_now())
+            _, samples = latest_samples(connection, place, "a_priori_angle_deg", MOST_ERRORS)
+        run_catalog = self._context.sky.run_catalog(mission, time or utc_now())
+        size = zone_size(mission, [angle_deg for _, angle_deg, _ in samples])
+        return size, [self._cost(mission, run_catalog, each) for each in size.sizes_deg]
+
+    def _cost(self, mission: Mission, run_catalog: RunCatalog, size_deg: float) -> ZoneCost:
+        """The cost of a zone of this size; counting the whole sky takes up to a second."""
+        key = mission.digest, run_catalog.digest, size_deg
+        if key not in self._costs:
+            if len(self._costs) >= MOST_COSTS:
+                self._costs.clear()
+            self._costs[key] = zone_cost(mission, run_catalog.direction, size_deg)
+        return self._costs[key]
 
     def warm(self, spacecraft: str, a_priori: Sequence[APrioriIn], time: Utc) -> list[ZoneSummary]:
         """Build the zones that batches with these a priori attitudes will need."""

@@ -160,3 +160,20 @@ class RunComparison(Record, frozen=True, kw_only=True):
     batches: int
     stars: RunStars
     attitudes: RunAttitudes
+
+
+class RunChangeSide(Record, frozen=True, kw_only=True):
+    """What a batch came to in one of two runs."""
+
+    id: Id
+    counts: OutcomeCounts
+    status: str | None
+
+
+class RunChange(Record, frozen=True, kw_only=True):
+    """A batch that came to something else in another run."""
+
+    batch: str
+    time: Moment
+    before: RunChangeSide
+    after: RunChangeSide

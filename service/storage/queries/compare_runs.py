@@ -5,33 +5,37 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Subquery, and_, case, func, select
+from sqlalchemy import Connection, Subquery, and_, case, func, or_, select
 
 from service.storage.models.compare import (
     AngleStatistics,
     OutcomeCounts,
     RunAttitudes,
+    RunChange,
+    RunChangeSide,
     RunComparison,
     RunStars,
     RunTransition,
     StatusCounts,
 )
 from service.storage.queries.pages import ResultFilter
-from service.storage.sql.tables import batches, results, solutions, star_results
+from service.storage.sql.tables import COUNTED, batches, results, solutions, star_results
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
 _READ_AT_ONCE = 10_000
 _QUATERNION = ("q1", "q2", "q3", "qc")
 
 
-def compare_runs(connection: Connection, selected: ResultFilter, other: str) -> RunComparison:
+def compare_runs(
+    connection: Connection, selected: ResultFilter, other: str, latest: int | None = None
+) -> RunComparison:
     """The current results of a period beside those of the same batches in another run.
 
     `stars` counts what became of each, from the one run (`before`) to the other
     (`after`); `same_star` tells whether both name it, and alike.  `attitudes`
-    compares what both have.
+    compares what both have.  With `latest`, of the period's latest batches alone.
     """
-    pairs = _pairs(selected, other)
+    pairs = _pairs(selected, other, latest)
     transitions = _transitions(connection, pairs)
     return RunComparison(
         run=selected.run,
@@ -47,9 +51,62 @@ def compare_runs(connection: Connection, selected: ResultFilter, other: str) -> 
     )
 
 
-def _pairs(selected: ResultFilter, other: str) -> Subquery:
+def changed_batches(
+    connection: Connection, selected: ResultFilter, other: str, latest: int, limit: int
+) -> list[RunChange]:
+    """The batches whose counts of stars or whose status differ in the other run, latest first.
+
+    At most `limit` of the period's `latest` batches.
+    """
+    pairs = _pairs(selected, other, latest)
+    old, new = results.alias("old"), results.alias("changed")
+    differ = or_(
+        *(old.c[name] != new.c[name] for name in (*COUNTED, "status")),
+        # Without an attitude the status is null.
+        old.c.status.is_(None) != new.c.status.is_(None),
+    )
+    sides = [
+        each.c[name].label(f"{side}_{name}")
+        for side, each in (("before", old), ("after", new))
+        for name in ("id", *COUNTED, "status")
+    ]
+    query = (
+        select(batches.c.batch, batches.c.time, *sides)
+        .select_from(pairs)
+        .join(old, old.c.id == pairs.c.before)
+        .join(new, new.c.id == pairs.c.after)
+        .join(batches, batches.c.id == old.c.batch_id)
+        .where(differ)
+        .order_by(old.c.time_ns.desc(), old.c.batch_id.desc())
+        .limit(limit)
+    )
+    return [
+        RunChange(
+            batch=row["batch"],
+            time=row["time"],
+            before=_side(row, "before"),
+            after=_side(row, "after"),
+        )
+        for row in connection.execute(query).mappings()
+    ]
+
+
+def _side(row: Any, side: str) -> RunChangeSide:
+    counts = {name: row[f"{side}_{name}"] for name in ("unique", "ambiguous", "unmatched")}
+    return RunChangeSide(
+        id=row[f"{side}_id"], counts=OutcomeCounts(**counts), status=row[f"{side}_status"]
+    )
+
+
+def _pairs(selected: ResultFilter, other: str, latest: int | None = None) -> Subquery:
     """The ids and states of the two current results of each batch that is in both runs."""
     again, new = batches.alias("again"), results.alias("new")
+    of_run = selected.conditions()
+    if latest is not None:
+        # The limit comes first: to look for partners of millions of batches takes minutes.
+        chosen = select(results.c.id).where(*of_run)
+        chosen = chosen.order_by(results.c.time_ns.desc(), results.c.batch_id.desc())
+        of_run = [results.c.id.in_(select(chosen.limit(latest).subquery().c.id))]
     return (
         select(
             results.c.id.label("before"),
@@ -67,7 +124,7 @@ def _pairs(selected: ResultFilter, other: str) -> Subquery:
             ),
         )
         .join(new, and_(new.c.batch_id == again.c.id, new.c.current))
-        .where(*selected.conditions())
+        .where(*of_run)
         .subquery()
     )
 

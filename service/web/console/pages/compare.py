@@ -1,4 +1,4 @@
-"""The page that compares two sets of options over the same recorded batches."""
+"""The page that compares two runs, or two sets of options over the same recorded batches."""
 
 from typing import Annotated
 
@@ -7,13 +7,14 @@ from pydantic import Field, ValidationError
 from starlette.requests import Request
 from starlette.responses import Response
 
+from service.app.runs import MOST_COMPARED
 from service.errors import BadBatch, Fault, shown_value
-from service.observations.schema import Key, OptionsIn
+from service.observations.schema import Key, OptionsIn, RunName
 from service.storage.models.compare import Comparison
 from service.times import parse_utc
 from service.web.api.compare import WORK_S
 from service.web.console.options import asked_options, fields_of, settings_of_mission
-from service.web.console.page_context import ContextDep, PageQuery
+from service.web.console.page_context import ContextDep, PageContext, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
@@ -23,8 +24,12 @@ SIDES = ("a", "b")
 
 
 class CompareQuery(PageQuery):
-    """Which batches; the options of the sides are parameters with the prefixes `a.` and `b.`."""
+    """Which batches; the options of the sides are parameters with the prefixes `a.` and `b.`.
 
+    With `other` the run is compared with that run.
+    """
+
+    other: RunName | None = None
     spacecraft: Key | None = None
     start: Annotated[str, Field(max_length=40)] = ""
     end: Annotated[str, Field(max_length=40)] = ""
@@ -46,10 +51,15 @@ async def _query(request: Request) -> CompareQuery:
 def compare_page(
     request: Request, query: Annotated[CompareQuery, Depends(_query)], context: ContextDep
 ) -> Response:
-    """The form, and once a spacecraft is chosen the comparison."""
+    """A comparison of two runs, first of two that have data; or one of options, once asked for."""
+    pair = _pair(request, query, context)
+    if pair is None or (query.other is None and query.spacecraft is not None):
+        runs = None
+    else:
+        runs = context.app.runs.compare_latest(*pair)
     asked = {side: asked_options(request.query_params, f"{side}.") for side in SIDES}
     result = None
-    if query.spacecraft is not None:
+    if query.spacecraft is not None and query.other is None:
         context.caller.require(query.spacecraft)
         a, b = (OptionsIn.model_validate(asked[side]) for side in SIDES)
         result = context.app.comparisons.of_options(
@@ -62,11 +72,17 @@ def compare_page(
             b=b,
             limit_s=WORK_S,
         )
-    mission = context.app.missions.get(query.spacecraft or context.spacecraft[0])
+    run = pair[0] if pair and runs else query.run
+    name = query.spacecraft or (pair[2] if pair else context.spacecraft[0])
+    mission = context.app.missions.get(name)
     return rendered(
         "compare.html.jinja",
-        context.layout(query.run),
+        context.layout(run),
         query=query,
+        name=name,
+        other=pair[1] if pair else None,
+        runs=runs,
+        most_compared=MOST_COMPARED,
         spacecraft=context.spacecraft,
         forms={side: fields_of(asked[side], None, f"{side}.") for side in SIDES},
         now={} if mission is None else settings_of_mission(mission),
@@ -74,6 +90,19 @@ def compare_page(
         sides=SIDES,
         matrix=_matrix(result),
     )
+
+
+def _pair(
+    request: Request, query: CompareQuery, context: PageContext
+) -> tuple[str, str, str] | None:
+    """The run and the run that it is compared with, and the spacecraft; None without such two."""
+    run = query.run if "run" in request.query_params else None
+    found = context.app.runs.comparable(context.spacecraft, run)
+    if query.other is None:
+        return found
+    name = query.spacecraft or (found[2] if found else context.spacecraft[0])
+    context.caller.require(name)
+    return query.run, query.other, name
 
 
 def _matrix(result: Comparison | None) -> dict[tuple[str, str], int]:

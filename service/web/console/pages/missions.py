@@ -23,6 +23,16 @@ class SettingDifference:
     before: Any
     after: Any
 
+    @property
+    def factor(self) -> float | None:
+        """How many times the old number the new one is; None where either is no number."""
+        numbers = [
+            each
+            for each in (self.before, self.after)
+            if isinstance(each, int | float) and not isinstance(each, bool)
+        ]
+        return numbers[1] / numbers[0] if len(numbers) == 2 and numbers[0] else None
+
 
 @dataclass(frozen=True)
 class SettingsEntry:

@@ -1,21 +1,37 @@
-"""The page of the cache of zones: size, build time and use of each."""
+"""The page of zones: the size that a mission needs, and the cache with its size and use."""
 
 from typing import Annotated
 
 from fastapi import Query as InQuery
 from starlette.responses import Response
 
-from service.web.console.page_context import ContextDep, PageQuery
+from service.advice.zone_size import LEAST_BATCHES, Verdict
+from service.observations.schema import Key
+from service.web.console.page_context import ContextDep, PageContext, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import READ
 
 MOST_SHOWN = 60
+VERDICTS: dict[Verdict, str] = {
+    "too_few": f"No advice on its size: that needs {LEAST_BATCHES} batches.",
+    "fits": "The size fits.",
+    "too_small": "The zone is too small.",
+    "larger_than_needed": "The zone is larger than needed.",
+}
 
 
-@console_page("/zones", "Zones", READ, position=60)
-def zones_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
-    """Cached zones and run catalogs, the most recently used first."""
+class ZonesQuery(PageQuery):
+    """Whose zone is weighed: by default the first spacecraft with batches in the run."""
+
+    spacecraft: Key | None = None
+
+
+@console_page("/zones", "Zones", READ, position=75)
+def zones_page(query: Annotated[ZonesQuery, InQuery()], context: ContextDep) -> Response:
+    """The size of a zone, and cached zones and run catalogs, the most recently used first."""
+    name = query.spacecraft or _with_batches(context, query.run)
+    size, costs = context.app.zones.size(name, query.run)
     cache = context.app.zones.state()
     epochs = {each.digest: each.epoch_year for each in cache.run_catalogs}
     return rendered(
@@ -25,4 +41,16 @@ def zones_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> R
         zones=cache.items[::-1][:MOST_SHOWN],
         epochs=epochs,
         spacecraft=context.spacecraft,
+        name=name,
+        size=size,
+        costs=costs,
+        verdicts=VERDICTS,
+        may_write="operate" in context.caller.scopes,
     )
+
+
+def _with_batches(context: PageContext, run: str) -> str:
+    """The first spacecraft with batches in a run; without any, the first one."""
+    filled = (each.spacecraft for each in context.app.runs.all() if each.run == run)
+    known = [name for names in filled for name in names if name in context.app.missions]
+    return (sorted(known) or context.spacecraft)[0]

@@ -1,0 +1,63 @@
+"""What a zone of some size costs, and which size recorded errors need."""
+
+import numpy as np
+import pytest
+
+from service.advice.zone_census import zone_censuses
+from service.advice.zone_size import geometric_k_g, zone_cost, zone_size
+from service.sky.catalog.run_catalog import build_run_catalog
+from service.times import parse_utc
+
+TIME = parse_utc("1996-01-10T12:00:00Z")
+
+
+@pytest.mark.parametrize(("name", "k_g"), [("XTE", 0.4224), ("SWAS", 0.4224), ("SOHO", 0.0249)])
+def test_k_g_is_that_of_the_paper_s_tables_13_and_14(missions, name, k_g):
+    mission = missions[name]
+    size_deg = zone_size(mission, []).size_deg
+    assert round(geometric_k_g(mission, size_deg), 4) == k_g
+
+
+def test_soho_s_worst_band_is_about_that_of_the_paper(sky, missions):
+    """Table 14 has 3,124 stars and 106,802 pairs, with the catalog of its day."""
+    run_catalog = sky.run_catalog(missions["SOHO"], TIME)
+    cost = zone_cost(missions["SOHO"], run_catalog.direction, 2.1)
+    assert cost.stars == pytest.approx(3124, rel=0.02)
+    assert cost.pairs == pytest.approx(106_802, rel=0.05)
+    assert cost.pairs_by_k_g == pytest.approx(0.0249 * 3124 * 3123 / 2, rel=0.05)
+    assert cost.pairs_by_k_g > cost.pairs
+
+
+def test_the_richest_zone_is_that_of_the_census(sky, missions):
+    mission = missions["XTE"]
+    run_catalog = build_run_catalog(sky.catalog, mission.catalog, 2000.0)
+    (census,) = zone_censuses(mission, run_catalog)
+    cost = zone_cost(mission, run_catalog.direction, 10.66)
+    assert cost.stars == census.stars.max()
+    assert cost.pairs in census.pairs[census.stars == cost.stars]
+
+
+@pytest.mark.parametrize(
+    ("angles", "verdict", "covering"),
+    [
+        ([1.0] * 49, "too_few", None),
+        ([1.0] * 50, "larger_than_needed", 5.2),
+        ([5.0] * 50, "fits", 10.0),
+        ([5.0] * 50 + [7.0], "too_small", 12.4),
+        # One that is far beyond the others is no reason for a larger zone.
+        ([5.0] * 50 + [60.0], "fits", 10.0),
+    ],
+)
+def test_the_size_follows_the_usual_errors(missions, angles, verdict, covering):
+    found = zone_size(missions["XTE"], angles)
+    assert found.margin_deg == pytest.approx(6.66)
+    assert (found.verdict, found.covering_deg) == (verdict, covering)
+    assert found.errors.gross == sum(each > 50 for each in angles)
+    assert found.errors.largest_deg == max(angles)
+
+
+def test_without_errors_only_the_present_size_is_weighed(missions):
+    found = zone_size(missions["SOHO"], [])
+    assert (found.errors, found.sizes_deg) == (None, [2.1])
+    assert found.setting == "zone.half_width_deg"
+    assert np.isclose(found.margin_deg, 0.1)

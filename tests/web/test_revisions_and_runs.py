@@ -1,0 +1,125 @@
+"""Pages that compare: missions before and after a change, two runs, a zone and its errors."""
+
+import re
+
+import httpx
+import pytest
+
+from service.app.factory import open_app
+from service.missions.mission import Mission
+from service.settings import Settings
+from service.web.app import create_app
+from tests.web.markup import Markup
+from tests.web.serving import Server
+from tests.web.test_access import Guarded, shown
+
+
+def text_of(answer):
+    Markup(answer.raise_for_status().text)
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", answer.text))
+
+
+@pytest.fixture(scope="module")
+def two_runs(chosen_database, drawn):
+    """A service without live batches: the runs `votes` and `verified` have the same of XTE."""
+    app = open_app(Settings(database=chosen_database()))
+    with Server(create_app(app)) as url, httpx.Client(base_url=url, timeout=60) as client:
+        for each in drawn("XTE", 60, seed=4):
+            for run, identifier in (("votes", "starid"), ("verified", "verified")):
+                body = each | {"run": run, "options": {"identifier": identifier}}
+                client.post("/api/v1/batches", json=body).raise_for_status()
+        client.post("/api/v1/batches", json=drawn("SWAS", 1)[0] | {"run": "lonely"})
+        yield client
+
+
+def counts(client, run):
+    found = client.get("/api/v1/batches", params={"run": run, "limit": 100}).json()["items"]
+    return {each["batch"]: (each["counts"], each["status"]) for each in found}
+
+
+def test_compare_opens_on_two_runs_that_have_data(two_runs):
+    page = text_of(two_runs.get("/compare"))
+    assert "verified and votes, XTE" in page or "votes and verified, XTE" in page
+    assert "60 batches that are in both" in page
+    votes, verified = counts(two_runs, "votes"), counts(two_runs, "verified")
+    assert sum(each[0]["ambiguous"] for each in votes.values()) > 0
+    differ = [name for name in votes if votes[name] != verified[name]]
+    html = two_runs.get("/compare?run=votes&other=verified&spacecraft=XTE").text
+    shown_ones = re.findall(r'aria-label="(\S+) in votes"', html)
+    assert sorted(shown_ones) == sorted(differ)
+    for each in (votes, verified):
+        unique = sum(found["unique"] for found, _ in each.values())
+        assert f'data-name="unique">{unique} ' in html
+
+
+def test_a_run_without_a_partner_says_so(two_runs):
+    page = text_of(two_runs.get("/compare?run=lonely"))
+    assert "There are no two runs with batches of the same spacecraft" in page
+    page = text_of(two_runs.get("/compare?run=lonely&other=votes&spacecraft=XTE"))
+    assert "No batches in both runs" in page
+    assert two_runs.get("/compare?run=votes&other=none&spacecraft=NOPE").status_code == 404
+
+
+def test_options_are_compared_as_before(two_runs):
+    page = text_of(two_runs.get("/compare?run=votes&spacecraft=XTE&sample=5&b.identifier=verified"))
+    assert "5 of 60 batches of XTE" in page
+    assert "60 batches that are in both" not in page
+
+
+def test_a_bound_token_compares_the_runs_of_its_spacecraft(chosen_database, drawn):
+    service = Guarded(chosen_database())
+    everything = shown(service.token("all", "read", "submit"))
+    bound = shown(service.token("swas", "read", spacecraft=["SWAS"]))
+    with Server(create_app(service.app)) as url, httpx.Client(base_url=url, timeout=60) as client:
+        for name in ("XTE", "SWAS"):
+            for run in ("one", "two"):
+                body = drawn(name, 1)[0] | {"run": run}
+                client.post("/api/v1/batches", json=body, headers=everything).raise_for_status()
+        assert ", SWAS" in text_of(client.get("/compare", headers=bound))
+        asked = "/compare?run=one&other=two&spacecraft=XTE"
+        assert client.get(asked, headers=bound).status_code == 403
+        assert client.get(asked, headers=everything).status_code == 200
+
+
+def test_a_mission_shows_what_changed_between_its_revisions(chosen_database, missions, drawn):
+    settings = Settings(database=chosen_database())
+    changed = missions["XTE"].model_dump(mode="json")
+    changed["tolerances"]["separation_deg"] = 0.0132
+    changed["tests"]["match_groups"] = True
+    changed["trackers"][0]["sigma_arcsec"] = 4.5
+    first, second = drawn("XTE", 2)
+    for mission, batch in ((None, first), (Mission.model_validate(changed), second)):
+        with Server(create_app(open_app(settings, mission))) as url:
+            httpx.post(f"{url}/api/v1/batches", json=batch, timeout=60).raise_for_status()
+            answer = httpx.get(f"{url}/missions")
+    Markup(answer.text)
+    table = answer.text.partition('class="cards differences"')[2].partition("</table>")[0]
+    rows = re.findall(r"<code>([\w.]+)</code></th>.*?<del>(.*?)</del>.*?<ins>(.*?)</ins>", table)
+    assert rows == [
+        ("tests.match_groups", "off", "on"),
+        ("tolerances.separation_deg", "0.0066", "0.0132"),
+        ("trackers.STARTRACKER_1.sigma_arcsec", "2.1213203", "4.5"),
+    ]
+    assert "× 2<" in table
+
+
+def test_the_page_of_zones_weighs_the_zone_of_a_spacecraft_with_batches(two_runs):
+    page = text_of(two_runs.get("/zones?run=votes"))
+    assert "Size of the zone of XTE" in page
+    assert "The zone of 10.66° leaves room for an error of 6.66°" in page
+    assert "0.4224" in page
+    found = two_runs.get("/api/v1/spacecraft/XTE/history?run=votes&strategy=latest&size=100").json()
+    angles = [each for each in found["series"]["a_priori_angle_deg"]["value"] if each is not None]
+    assert f"The a priori attitude of the latest {len(angles)} batches of run votes" in page
+    assert "No batch of run votes" in text_of(two_runs.get("/zones?run=votes&spacecraft=SOHO"))
+    assert two_runs.get("/zones?spacecraft=NOPE").status_code == 404
+
+
+def test_only_operators_are_offered_to_change_the_cache(chosen_database):
+    service = Guarded(chosen_database())
+    reader, operator = (
+        shown(service.token(name, "read", *more)) for name, more in (("r", ()), ("o", ("operate",)))
+    )
+    with Server(create_app(service.app)) as url:
+        assert "Build a zone" not in httpx.get(f"{url}/zones", headers=reader, timeout=60).text
+        assert "Build a zone" in httpx.get(f"{url}/zones", headers=operator, timeout=60).text
