@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from sqlalchemy import Connection, or_, select
 
 from service.storage.models.alarms import AlarmSpan
+from service.storage.sql.alarm_tables import alarm_actions, alarms
 from service.storage.sql.columns import Row
-from service.storage.sql.tables import alarm_actions, alarms
 from service.times import Utc, recorded_utc
 
 MOST = 200

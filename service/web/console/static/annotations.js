@@ -1,4 +1,5 @@
 // Annotations of the shown period: the marks that charts draw, and the form that writes them.
+import { posix } from "./alarm_bars.js";
 import { attempt, rememberWho, send } from "./actions.js";
 import { refreshSoon } from "./live_updates.js";
 
@@ -6,7 +7,7 @@ const form = document.getElementById("annotate");
 const message = document.getElementById("annotate-status");
 
 // The annotations of the list, numbered as there.
-export function annotationsShown(posix) {
+export function annotationsShown() {
   return [...document.querySelectorAll("[data-annotation]")].map(({ dataset: { start, end } }, index) => ({
     number: index + 1,
     start: posix(start),

@@ -1,12 +1,11 @@
 // The preview of a limit: what it would have done to recorded batches, in words and on the trend.
+import { posix } from "./alarm_bars.js";
 import { requestJson } from "./requests.js";
 import { Trend, utc } from "./trend.js";
 
 const POINTS = 240;
 const MOST_LISTED = 8;
 const charts = JSON.parse(document.querySelector("[data-json]").content.textContent);
-
-const posix = (text) => Date.parse(text.replace(":60", ":59").replace(/(\.\d{3})\d*/, "$1")) / 1000;
 
 function element(name, text, className = "") {
   const made = document.createElement(name);

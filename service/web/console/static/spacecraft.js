@@ -36,7 +36,7 @@ async function draw() {
     if (mine !== asked) return;
     shown = found;
     for (const trend of trends) {
-      trend.show(shown, posix(start), posix(end), annotationsShown(posix));
+      trend.show(shown, posix(start), posix(end), annotationsShown());
       trend.definition.bars.show(JSON.parse(alarms), posix(start), posix(end));
     }
     status.textContent = "";
