@@ -34,14 +34,18 @@ from service.observations.readers.decompress import unpacked_lines
 from service.observations.readers.lines import MAX_LINE_BYTES
 from service.observations.readers.telemetry import read_lines
 from service.observations.schema import BatchIn, submission_from_json
+from service.products.reading.aem import read_aem
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import import_csv, import_sky2000, load, load_embedded, save
 from service.sky.model import SkyModel
 from tests.imaging.colour_files import colours, dng, png_of_16_bits, tiff_of_16_bits
+from tests.products.series import GOLDEN, rows, slew
+from tests.products.series import written as aem_file
 from tests.sky.sky2000_records import SIRIUS, written
 
+AEM_EXAMPLES = Path(__file__).parent / "products" / "adm-examples"
 MORE_MEMORY = 1 << 30
 """What a reader may take beyond what the process holds already."""
 FRAME_LIMITS = FrameLimits(max_pixels=1_000_000)
@@ -193,6 +197,18 @@ class Readers:
 
     def sky2000_gzip(self):
         return gzip.compress(self.sky2000()[0], mtime=0), self.sky2000()[1]
+
+    def aem(self):
+        good = aem_file("aem", rows(slew(3)), rows([GOLDEN], "1996-01-11T00:00:00Z"))
+        return good, lambda data: read_aem("x.aem", io.BytesIO(data))
+
+    def aem_of_version_1(self):
+        good = (AEM_EXAMPLES / "aem-AEMExample04.txt").read_bytes()
+        return good, lambda data: read_aem("x.aem", io.BytesIO(data))
+
+    def aem_xml(self):
+        good = aem_file("aem-xml", rows(slew(2)), rows([GOLDEN], "1996-01-11T00:00:00Z"))
+        return good, lambda data: read_aem("x.aem", io.BytesIO(data))
 
     def fits(self):
         file = io.BytesIO()

@@ -42,6 +42,7 @@ def add(commands: Any) -> None:
         acquire replay pass.ndjson --alarms            and raise alarms for the run
         acquire replay pass.ndjson --speed 60          one minute of telemetry per second
         acquire replay pass.ndjson --carry-attitude    use each attitude as the next a priori
+        acquire replay pass.ndjson --a-priori xte.aem  use the attitudes of a file as a priori
         """,
         run,
         CSV_HELP,
@@ -81,7 +82,15 @@ def add(commands: Any) -> None:
         "batch by batch. Without these options the service receives whole files, which is "
         "faster",
     )
-    parser.add_argument(
+    source = parser.add_mutually_exclusive_group()
+    source.add_argument(
+        "--a-priori",
+        type=Path,
+        metavar="FILE",
+        help="set each batch's a_priori to the attitude that a file gives for its time: an AEM "
+        "(KVN or XML), or a C-kernel; other batches keep their own",
+    )
+    source.add_argument(
         "--carry-attitude",
         action="store_true",
         help="set each batch's a_priori to the last good attitude of the same spacecraft, "
@@ -97,7 +106,9 @@ def add(commands: Any) -> None:
 def run(parsed: Namespace) -> int:
     """Send files through the service and print what became of them."""
     from service.observations.readers.telemetry import require_telemetry
+    from service.products.reading.files import read_attitudes
     from service.replay.carry_attitude import AttitudeCarrier
+    from service.replay.file_prior import FilePrior
     from service.replay.items import Pace, items_of, run_name
     from service.replay.summary import ReplaySummary
 
@@ -108,6 +119,10 @@ def run(parsed: Namespace) -> int:
         if parsed.results is not None and parsed.results.resolve() == file.resolve():
             raise BadInput(Fault("--results", "must not be a file that is replayed", str(file)))
     items, pace = items_of(parsed.files, run), Pace(parsed.speed)
+    prior = None
+    if parsed.a_priori is not None:
+        prior = FilePrior(read_attitudes(parsed.a_priori, "--a-priori"))
+        items = map(prior.prepared, items)
     progress = True if parsed.progress else None
     carrier = AttitudeCarrier() if parsed.carry_attitude else None
     if parsed.in_process:
@@ -133,7 +148,7 @@ def run(parsed: Namespace) -> int:
         token = settings_of(parsed).token
         with ReplaySummary(parsed.files, parsed.results, progress) as summary:
             watched = run if parsed.alarms else None
-            if carrier or parsed.results or parsed.speed or parsed.concurrency:
+            if carrier or prior or parsed.results or parsed.speed or parsed.concurrency:
                 # Each batch needs an answer of its own, or is sent at its own time.
                 many = parsed.concurrency or DEFAULT_CONCURRENCY
                 replay_over_http(
@@ -157,8 +172,11 @@ def run(parsed: Namespace) -> int:
                     query={"alarms": "true"} if parsed.alarms else None,
                 )
     if parsed.json:
-        print_json({"run": run, **summary.counts()})
+        given = {} if prior is None else {"a_priori_from_file": prior.given}
+        print_json({"run": run, **summary.counts(), **given})
     else:
         print(f"{'run':<20}{run}")
         print(summary.table())
+        if prior is not None:
+            print(f"{'a priori of file':<20}{prior.given:,} batches")
     return 1 if summary.refused else 0

@@ -1,0 +1,112 @@
+"""`acquire score`: recorded attitudes held against the truth of a file."""
+
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+from service.cli.arguments import (
+    MISSION,
+    add_command,
+    add_database,
+    add_json,
+    add_period,
+    print_json,
+)
+from service.cli.configuration import period_of, settings_of_existing
+from service.errors import BadInput, Fault, shown_value
+
+_BAR = 48
+
+
+def add(commands: Any) -> None:
+    """Declare the command."""
+    parser = add_command(
+        commands,
+        "score",
+        "Hold recorded attitudes against true ones: an AEM (KVN or XML) or a C-kernel. Prints "
+        "the errors about each body axis, and whether the covariances fit them.",
+        """
+        acquire score truth.aem --spacecraft XTE --run pass-7
+        acquire score truth.bc --spacecraft XTE --plot errors.svg --json
+        """,
+        run,
+        "Between two records of the truth the body is taken to turn at a constant rate. "
+        "Attitudes\noutside its segments are counted and left out.",
+    )
+    parser.add_argument("truth", type=Path, metavar="FILE", help="the true attitudes")
+    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=MISSION)
+    add_period(parser, "the run that is read; default live")
+    parser.add_argument(
+        "--status", choices=("good", "suspect", "all"), default="good", help="default good"
+    )
+    parser.add_argument("--plot", type=Path, metavar="OUT.svg", help="draw the errors as SVG")
+    add_json(parser, "the statistics and the histogram")
+    add_database(parser)
+
+
+def run(parsed: Namespace) -> int:
+    """Score the attitudes and print the statistics."""
+    from service.app.factory import open_app
+    from service.cli.output import written_to
+    from service.cli.score_picture import picture
+    from service.products.reading.files import read_attitudes
+    from service.products.scoring import errors_of, statistics
+
+    start, end = period_of(parsed)
+    truth = read_attitudes(parsed.truth, "FILE")
+    app = open_app(settings_of_existing(parsed))
+    try:
+        series = app.products.attitudes(
+            parsed.spacecraft, run=parsed.run, start=start, end=end, status=parsed.status
+        )
+        errors = errors_of(series.blocks, truth)
+    finally:
+        app.close()
+    if not len(errors.time_ns):
+        asked = f"{errors.outside} {series.about.described()}"
+        message = f"has no attitude for the time of any of {asked}"
+        raise BadInput(Fault("FILE", message, shown_value(str(parsed.truth))))
+    found = statistics(errors)
+    if parsed.plot is not None:
+        written_to(parsed.plot, iter([picture(errors, series.about.described()).encode()]))
+    if parsed.json:
+        print_json({"truth": str(parsed.truth), "spacecraft": parsed.spacecraft, **found})
+    else:
+        print(_table(found))
+    return 0
+
+
+def _table(found: dict[str, Any]) -> str:
+    """The statistics for people."""
+    names = ("mean", "std", "rms", "predicted_rms", "median", "p95", "p99", "max")
+    rows = {**{f"about {axis}": each for axis, each in found["axes"].items()}}
+    rows["total"] = found["total"]
+    head = "arcsec".ljust(10) + "".join(name.replace("_", " ").rjust(15) for name in names)
+    lines = [
+        f"{found['attitudes']:,} attitudes; {found['outside_truth']:,} outside the truth",
+        head,
+    ]
+    for title, each in rows.items():
+        cells = (each.get(f"{name}_arcsec") for name in names)
+        shown = ("" if value is None else f"{value:.4g}" for value in cells)
+        lines.append(title.ljust(10) + "".join(cell.rjust(15) for cell in shown))
+    mean = found["normalized"]["mean"]
+    lines.append(f"normalized error (e^T P^-1 e): mean {mean:.3g}; 3 if the covariances are right")
+    lines += _bars(found["histogram"])
+    return "\n".join(lines)
+
+
+def _bars(histogram: dict[str, Any]) -> list[str]:
+    """The histogram of each axis as rows of characters, four bins a row."""
+    edges = histogram["edges_arcsec"]
+    lines = []
+    for axis in ("x", "y", "z"):
+        counts = histogram[axis]
+        rows = [(edges[k], sum(counts[k : k + 4])) for k in range(0, len(counts), 4)]
+        most = max(count for _, count in rows)
+        lines.append(f"errors about {axis}, arcsec")
+        lines += [
+            f"{edge:>12.4g}  {'#' * round(_BAR * count / most):<{_BAR}} {count:,}"
+            for edge, count in rows
+        ]
+    return lines

@@ -1,0 +1,1 @@
+"""Attitudes read from files of other programs: AEM and C-kernels."""

@@ -1,0 +1,104 @@
+"""Reads C-kernels of type 3; run as a program of its own, because CSPICE is global.
+
+    python ck_reader_child.py OUT MOST CK KERNEL...
+
+Writes to the folder OUT `records`, rows of nanoseconds of TAI since J2000 (int64) and the four
+components of SPICE's quaternion (float64), and `segments`: rows of the first record and the
+number of records of each interval.  Prints a line of JSON: `error`, or the `object`.
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import spiceypy as spice
+
+Floats = np.ndarray[Any, np.dtype[np.float64]]
+TYPE = 3
+
+
+class Refused(Exception):
+    """A kernel that cannot be read, in words."""
+
+
+def segments(handle: int) -> list[list[int]]:
+    """Each segment's structure, frame, type, whether it has rates, first and last address."""
+    spice.dafbfs(handle)
+    found = []
+    while spice.daffna():
+        found.append([int(each) for each in spice.dafus(spice.dafgs(), 2, 6)[1]])
+    return found
+
+
+def records_of(handle: int, begin: int, end: int, rates: int) -> "tuple[Floats, Floats]":
+    """Records (n, 5) of a segment, clock first, and the clock at the start of its intervals."""
+    # The layout of type 3 ("CK Required Reading"): packets, times, directory of times,
+    # starts of intervals, directory of starts, number of intervals, number of packets.
+    intervals, count = (int(each) for each in spice.dafgda(handle, end - 1, end))
+    size = 7 if rates else 4
+    room = end - begin + 1
+    if not (0 < count <= room // (size + 1) and 0 < intervals <= count):
+        raise Refused("a segment of it is not as its type has it")
+    packets = np.array(spice.dafgda(handle, begin, begin + count * size - 1)).reshape(-1, size)
+    times_at = begin + count * size
+    times = np.array(spice.dafgda(handle, times_at, times_at + count - 1))
+    starts_at = times_at + count + (count - 1) // 100
+    starts = np.array(spice.dafgda(handle, starts_at, starts_at + intervals - 1))
+    return np.column_stack([times, packets[:, :4]]), starts
+
+
+def main() -> None:
+    """Read the kernel and write what it holds."""
+    out, most, ck, *kernels = sys.argv[1:]
+    for each in (*kernels, ck):
+        spice.furnsh(each)
+    handle = spice.dafopr(ck)
+    found = segments(handle)
+    if not found:
+        raise Refused("has no segment")
+    structures = sorted({each[0] for each in found})
+    if len(structures) > 1:
+        raise Refused(f"orients several structures: {', '.join(map(str, structures))}")
+    structure = structures[0]
+    clock = spice.ckmeta(structure, "SCLK")
+    try:
+        spice.dtpool(f"SCLK_DATA_TYPE_{-clock}")
+    except spice.NotFoundError:
+        raise Refused(
+            f"needs the clock of spacecraft {clock}: put its SCLK kernel (.tsc) in the same folder"
+        ) from None
+    count = 0
+    spans: list[tuple[int, int]] = []
+    with Path(out, "records").open("wb") as file:
+        for _, frame, kind, rates, begin, end in found:
+            if kind != TYPE:
+                raise Refused(f"has a segment of type {kind}; type {TYPE} is read")
+            if frame != 1:
+                raise Refused(f"refers to frame {spice.frmnam(frame) or frame}; J2000 is read")
+            rows, starts = records_of(handle, begin, end, rates)
+            count_here = len(rows)
+            if count + count_here > int(most):
+                raise Refused(f"has more than {int(most):,} records")
+            place = np.searchsorted(rows[:, 0], starts)
+            spans += [
+                (count + first, last - first)
+                for first, last in zip(place, [*place[1:], count_here], strict=True)
+            ]
+            tai_s = [spice.unitim(spice.sct2e(clock, t), "ET", "TAI") for t in rows[:, 0]]
+            ns = np.round(np.array(tai_s) * 1e9).astype(np.int64)
+            file.write(np.column_stack([ns.view(np.float64), rows[:, 1:]]).tobytes())
+            count += count_here
+    np.array(spans, dtype=np.int64).tofile(Path(out, "segments"))
+    print(json.dumps({"object": str(structure // 1000)}))
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except Refused as error:
+        print(json.dumps({"error": str(error)}))
+    except spice.exceptions.SpiceyError as error:
+        words = f"{error.short}: {error.long}".strip()
+        print(json.dumps({"error": f"is not read by SPICE: {words}"[:500]}))

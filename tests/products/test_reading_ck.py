@@ -1,0 +1,171 @@
+"""C-kernels, those of the service and those that CSPICE writes, read as attitudes."""
+
+import io
+import json
+import random
+import subprocess
+import sys
+import zipfile
+
+import numpy as np
+import pytest
+
+from service.errors import BadFile, BadInput
+from service.products.reading.files import read_attitudes
+from tests import scale
+from tests.mutations import mutated
+from tests.products.series import GOLDEN, random_quaternions, rows, slew, whole, written
+
+PAGES = [rows(slew(10)), rows(slew(3), "1996-01-10T12:30:00Z")]
+"""Attitudes in two stretches."""
+
+
+def unpacked(place, *pages):
+    zipfile.ZipFile(io.BytesIO(written("ck", *pages))).extractall(place)
+    return place / "xte.bc"
+
+
+def apart(known, block):
+    found = known.at(block.time_ns)
+    sign = np.sign(np.sum(found * block.quaternion, axis=1))[:, None]
+    return np.abs(found * sign - block.quaternion).max()
+
+
+@pytest.mark.parametrize("as_zip", [True, False])
+def test_every_record_that_the_service_wrote_is_read_again(as_zip, rng, tmp_path):
+    pages = [
+        rows(random_quaternions(rng, 1_000), "2016-12-31T23:50:00.5Z"),
+        rows(slew(60_001, step_s=0.1), "2018-01-10T12:00:00Z", step_s=0.1),
+        rows([GOLDEN], "2019-01-10T12:00:00Z"),
+    ]
+    file = unpacked(tmp_path, *pages)
+    if as_zip:
+        file = tmp_path / "all.zip"
+        file.write_bytes(written("ck", *pages))
+    known, block = read_attitudes(file, "FILE"), whole(*pages)
+    assert apart(known, block) < 1e-12
+    assert known.object_name == "-999"
+
+
+def test_intervals_are_segments_and_nothing_is_found_between(tmp_path):
+    known = read_attitudes(unpacked(tmp_path, *PAGES), "FILE")
+    assert [len(each.time_ns) for each in known.segments] == [10, 3]
+    times = whole(*PAGES).time_ns
+    assert np.isnan(known.at(times[[9, 12]] + 5 * 10**8)).all()
+    assert not np.isnan(known.at(times[[0, 8, 10]] + 5 * 10**8)).any()
+
+
+def test_between_records_the_attitude_is_that_of_spice(tmp_path):
+    """`ckgp` interpolates as the service does: at a constant rate."""
+    known = read_attitudes(unpacked(tmp_path, *PAGES), "FILE")
+    block = whole(*PAGES)
+    program = (
+        "import spiceypy as s, json; s.furnsh('xte.tm'); "
+        "et = s.str2et('1996-01-10T12:00:03.25'); "
+        "print(json.dumps(s.m2q(s.pxform('J2000', 'XTE_BODY', et)).tolist()))"
+    )
+    told = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, check=True, text=True
+    )
+    scalar, *vector = np.array(json.loads(told.stdout))
+    theirs = np.array([*(-np.array(vector)), scalar])
+    (ours,) = known.at(block.time_ns[[3]] + 250_000_000)
+    assert abs(ours @ theirs) == pytest.approx(1.0, abs=1e-12)
+    assert np.abs(ours * np.sign(ours @ theirs) - theirs).max() < 1e-8
+
+
+WRITER = """
+import sys, numpy as np, spiceypy as s
+kind, rates, frame = sys.argv[1], sys.argv[2] == "yes", sys.argv[3]
+h = s.ckopn("x.bc", "x", 0)
+t = np.arange(1, 6) * 1e6 + 7.6e14
+q = np.tile([1.0, 0.0, 0.0, 0.0], (5, 1)) * (0.9 if sys.argv[4] == "short" else 1.0)
+w = np.zeros((5, 3))
+if kind == "3":
+    s.ckw03(h, t[0], t[-1], -999000, frame, rates, "x", 5, t, q, w, 1, t[:1])
+else:
+    s.ckw01(h, t[0], t[-1], -999000, frame, rates, "x", 5, t, q, w)
+if sys.argv[4] == "several":
+    s.ckw03(h, t[0], t[-1], -998000, frame, rates, "x", 5, t, q, w, 1, t[:1])
+s.ckcls(h)
+"""
+
+
+@pytest.fixture
+def spice_wrote(tmp_path):
+    """A kernel that CSPICE wrote, with the service's clock beside it."""
+
+    def write(kind="3", rates="yes", frame="J2000", other=""):
+        unpacked(tmp_path, *PAGES)
+        (tmp_path / "xte.bc").unlink()
+        command = [sys.executable, "-c", WRITER, kind, rates, frame, other]
+        subprocess.run(command, cwd=tmp_path, check=True)
+        return tmp_path / "x.bc"
+
+    return write
+
+
+@pytest.mark.parametrize("rates", ["yes", "no"])
+def test_a_kernel_without_rates_is_read_like_one_with_them(spice_wrote, rates):
+    known = read_attitudes(spice_wrote(rates=rates), "FILE")
+    assert len(known) == 5
+    assert known.segments[0].quaternion[4].tolist() == [0.0, 0.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        ({"kind": "1"}, "x.bc: has a segment of type 1; type 3 is read"),
+        ({"frame": "B1950"}, "x.bc: refers to frame B1950; J2000 is read"),
+        ({"other": "short"}, "x.bc, record 1: quaternion: must have norm 1 within 0.001"),
+        ({"other": "several"}, "x.bc: orients several structures: -999000, -998000"),
+    ],
+)
+def test_a_kernel_that_is_not_read_is_refused_by_name(spice_wrote, told, words):
+    with pytest.raises(BadFile) as refusal:
+        read_attitudes(spice_wrote(**told), "FILE")
+    assert words in str(refusal.value)
+
+
+def test_a_kernel_without_its_clock_is_refused_with_what_it_needs(tmp_path):
+    file = unpacked(tmp_path, *PAGES)
+    (tmp_path / "xte.tsc").unlink()
+    with pytest.raises(BadFile, match=r"xte\.bc: needs the clock of spacecraft -999.*\.tsc"):
+        read_attitudes(file, "FILE")
+
+
+def test_a_kernel_that_was_cut_short_is_refused(tmp_path):
+    file = unpacked(tmp_path, *PAGES)
+    for size in (8, 900, 1024, 2000, 3000):
+        file.write_bytes(file.read_bytes()[:size])
+        with pytest.raises(BadFile, match=r"xte\.bc: "):
+            read_attitudes(file, "FILE")
+        file.unlink()
+        unpacked(tmp_path, *PAGES)
+
+
+@pytest.mark.torture
+@pytest.mark.parametrize("form", ["bc", "tsc", "zip"])
+def test_a_mutated_kernel_is_read_or_refused(form, seed, tmp_path):
+    """Fewer than of other readers: CSPICE needs a process a file."""
+    unpacked(tmp_path, *PAGES)
+    changed = tmp_path / f"xte.{form}"
+    good = written("ck", *PAGES) if form == "zip" else changed.read_bytes()
+    draw = random.Random(seed)
+    refused = 0
+    for _ in range(scale.size(1_000)):
+        changed.write_bytes(mutated(good, draw))
+        try:
+            read_attitudes(changed if form == "zip" else tmp_path / "xte.bc", "FILE")
+        except BadInput:
+            refused += 1
+    assert refused
+
+
+def test_a_zip_file_without_a_kernel_and_a_file_that_is_not_there_are_refused(tmp_path):
+    with zipfile.ZipFile(tmp_path / "x.zip", "w") as packed:
+        packed.writestr("../a.tsc", "KPL/SCLK")
+    with pytest.raises(BadFile, match=r"x\.zip: must hold one C-kernel \(\.bc\), not 0"):
+        read_attitudes(tmp_path / "x.zip", "FILE")
+    with pytest.raises(BadInput, match="--a-priori: cannot be read: No such file"):
+        read_attitudes(tmp_path / "nowhere.bc", "--a-priori")
