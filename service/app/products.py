@@ -6,7 +6,13 @@ from service import __version__
 from service.app.context import Context
 from service.errors import BadBatch, Fault
 from service.missions.mission import mission_named
-from service.products.attitudes import AttitudeSeries, SeriesInfo, StatusWanted, series_of
+from service.products.attitudes import (
+    AttitudeSeries,
+    SeriesInfo,
+    SeriesTracker,
+    StatusWanted,
+    series_of,
+)
 from service.storage.queries.attitude_rows import attitude_pages, count_results
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
@@ -40,7 +46,8 @@ class Products:
         They are read as the series is.  The largest gap and the identifiers are the mission's
         where they are None.  Raises `BadBatch` where a period has more than `most_batches`.
         """
-        own = mission_named(self._context.missions, name).products
+        mission = mission_named(self._context.missions, name)
+        own = mission.products
         about = SeriesInfo(
             spacecraft=name,
             run=run or LIVE,
@@ -53,6 +60,14 @@ class Products:
             largest_gap_s=own.largest_gap_s if largest_gap_s is None else largest_gap_s,
             object_id=own.object_id if object_id is None else object_id,
             naif_id=own.naif_id if naif_id is None else naif_id,
+            # The mission's clock is that of its own id.
+            sclk_kernel=own.sclk_kernel if naif_id in (None, own.naif_id) else None,
+            trackers=tuple(
+                SeriesTracker(
+                    each.name, tuple(map(tuple, each.body_from_tracker.tolist())), each.sigma_arcsec
+                )
+                for each in mission.trackers
+            ),
         )
         selected = ResultFilter(about.run, name, start, end)
         if most_batches is not None:

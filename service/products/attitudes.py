@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, replace
 from itertools import groupby, pairwise
+from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -35,10 +36,20 @@ SAME_MOMENT_NS = 1_000
 
 
 @dataclass(frozen=True)
+class SeriesTracker:
+    """A tracker that saw the stars: its alignment, body = this @ tracker, and its noise."""
+
+    name: str
+    body_from_tracker: tuple[tuple[float, ...], ...]
+    sigma_arcsec: float
+
+
+@dataclass(frozen=True)
 class SeriesInfo:
     """What a series of attitudes is of: the spacecraft, the filters, and its identifiers.
 
-    `start` and `end` are UTC as text, None where the period is open.
+    `start` and `end` are UTC as text, None where the period is open.  `sclk_kernel` is the
+    spacecraft's clock; without it kernels have a clock of our own.
     """
 
     spacecraft: str
@@ -52,6 +63,8 @@ class SeriesInfo:
     largest_gap_s: float = DEFAULT_LARGEST_GAP_S
     object_id: str | None = None
     naif_id: int = DEFAULT_NAIF_ID
+    sclk_kernel: Path | None = None
+    trackers: tuple[SeriesTracker, ...] = ()
 
     def __post_init__(self) -> None:
         """Raise `BadBatch` with the name and value of what is out of its range."""
@@ -125,6 +138,8 @@ class AttitudeRows:
     rate_deg_per_s: Vector
     residual_rms_arcsec: Vector
     predicted_rms_arcsec: Vector
+    stars: Integers
+    """Of shape (n, 4): observed, unique, ambiguous, unmatched."""
 
     def __len__(self) -> int:
         return len(self.time_ns)

@@ -125,6 +125,18 @@ def _aem_xml(series: "AttitudeSeries") -> Iterator[bytes]:
     return write_aem(series, XML)
 
 
+def _apm(series: "AttitudeSeries") -> Iterator[bytes]:
+    from service.products.adm.apm import write_apm
+
+    return write_apm(series)
+
+
+def _acm(series: "AttitudeSeries") -> Iterator[bytes]:
+    from service.products.adm.acm import write_acm
+
+    return write_acm(series)
+
+
 def _ck(series: "AttitudeSeries") -> Iterator[bytes]:
     from service.products.spice.ck import write_ck
 
@@ -177,6 +189,21 @@ OUTPUT_FORMATS: dict[str, OutputFormat] = {
         "application/xml",
         write_attitudes=_aem_xml,
         suffix="aem.xml",
+        any_order=False,
+        may_be_empty=False,
+        most_batches=MOST_BATCHES,
+    ),
+    "apm": OutputFormat(
+        "CCSDS APM (the last attitude)",
+        "text/plain",
+        write_attitudes=_apm,
+        any_order=False,
+        may_be_empty=False,
+    ),
+    "acm": OutputFormat(
+        "CCSDS ACM",
+        "text/plain",
+        write_attitudes=_acm,
         any_order=False,
         may_be_empty=False,
         most_batches=MOST_BATCHES,

@@ -62,7 +62,61 @@ def aem(source, shift_s):
     ]
 
 
-READERS = {"aem": aem}
+def apm(source, shift_s):
+    message = ParserBuilder().buildApmParser().parseMessage(source)
+    (segment,) = list(message.getSegments())
+    data = segment.getData()
+    quaternion = data.getQuaternionBlock().getQuaternion()
+    rate = data.getAngularVelocityBlock()
+    return {
+        "name": str(segment.getMetadata().getObjectName()),
+        "tai_s": data.getEpoch().durationFrom(J2000_TAI),
+        "quaternion": [
+            quaternion.getQ1(),
+            quaternion.getQ2(),
+            quaternion.getQ3(),
+            quaternion.getQ0(),
+        ],
+        "from": str(data.getQuaternionBlock().getEndpoints().getFrameA().getName()),
+        "rate_rad_per_s": rate and [rate.getAngVelX(), rate.getAngVelY(), rate.getAngVelZ()],
+    }
+
+
+def acm(source, shift_s):
+    message = ParserBuilder().buildAcmParser().parseMessage(source)
+    data = message.getSegments().get(0).getData()
+    determination = data.getAttitudeDeterminationBlock()
+    return {
+        "stretches": [
+            [state_of(each.shiftedBy(float(shift_s))) for each in block.getAngularCoordinates()]
+            for block in data.getAttitudeBlocks()
+        ],
+        "covariances": [
+            {
+                "frame": str(block.getMetadata().getCovReferenceFrame().getName()),
+                "states": [
+                    [each.getMatrix().getEntry(k, k) for k in range(3)]
+                    for each in block.getCovariances()
+                ],
+            }
+            for block in data.getCovarianceBlocks()
+        ],
+        "method": str(determination.getMethod()),
+        "sensors": [
+            {
+                "name": str(each.getSensorUsed()),
+                "sigma_rad": [float(sigma) for sigma in each.getSensorNoiseCovariance()],
+            }
+            for each in determination.getSensorsUsed()
+        ],
+        "user": {
+            str(entry.getKey()): str(entry.getValue())
+            for entry in data.getUserDefinedBlock().getParameters().entrySet()
+        },
+    }
+
+
+READERS = {"aem": aem, "apm": apm, "acm": acm}
 
 
 def main():

@@ -40,6 +40,7 @@ def rows(quaternions, times=START, *, step_s=1.0, status="good", rates=None):
         rate_deg_per_s=np.full((n, 3), math.nan) if rates is None else np.array(rates, dtype=float),
         residual_rms_arcsec=known[:, 0] * 1.25,
         predicted_rms_arcsec=known[:, 0] * 1.5,
+        stars=np.tile([9, 6, 2, 1], (n, 1)),
     )
 
 

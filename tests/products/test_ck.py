@@ -1,5 +1,6 @@
 """C-kernels, read by CSPICE."""
 
+import dataclasses
 import io
 import json
 import subprocess
@@ -12,7 +13,7 @@ import pytest
 from service.products.rotations import matrices
 from service.times import parse_utc
 from tests import scale
-from tests.products.series import GOLDEN, random_quaternions, rows, slew, whole, written
+from tests.products.series import ABOUT, GOLDEN, random_quaternions, rows, slew, whole, written
 
 READER = """
 import json, sys
@@ -42,8 +43,9 @@ json.dump(out, sys.stdout)
 def read(tmp_path):
     """What CSPICE finds in a kernel of pages: in a process of its own, as it is global."""
 
-    def read(*pages, ticks=(), utc=(), lone=()):
-        zipfile.ZipFile(io.BytesIO(written("ck", *pages))).extractall(tmp_path)
+    def read(*pages, ticks=(), utc=(), lone=(), about=ABOUT):
+        packed = written("ck", *pages, about=about)
+        zipfile.ZipFile(io.BytesIO(packed)).extractall(tmp_path)
         asked = {"ticks": list(ticks), "utc": list(utc), "lone": list(lone)}
         done = subprocess.run(
             [sys.executable, "-c", READER],
@@ -125,3 +127,33 @@ def test_a_stretch_longer_than_a_segment_is_one_interval(read, rng):
     assert np.abs(a[:3] - matrices(block.quaternion[around])).max() < 1e-12
     middles = slew(120_002, step_s=0.05)[[2 * k + 1 for k in around]]
     assert np.abs(a[3:] - matrices(middles)).max() < 1e-9
+
+
+CLOCK = """KPL/SCLK
+\\begindata
+SCLK_KERNEL_ID            = ( @1996-01-01 )
+SCLK_DATA_TYPE_999        = ( 1 )
+SCLK01_TIME_SYSTEM_999    = ( 1 )
+SCLK01_N_FIELDS_999       = ( 2 )
+SCLK01_MODULI_999         = ( 4294967296 65536 )
+SCLK01_OFFSETS_999        = ( 0 0 )
+SCLK01_OUTPUT_DELIM_999   = ( 1 )
+SCLK_PARTITION_START_999  = ( 0.0 )
+SCLK_PARTITION_END_999    = ( 2.8147497671065E+14 )
+SCLK01_COEFFICIENTS_999   = ( 0.0 -189345600.0 1.00000002 )
+\\begintext
+"""
+"""A clock that drifts, in units of 1/65536 s since 1994-01-01 TDB."""
+
+
+def test_a_mission_s_own_clock_times_the_kernel(read, tmp_path):
+    (tmp_path / "own.tsc").write_text(CLOCK)
+    about = dataclasses.replace(ABOUT, sclk_kernel=tmp_path / "own.tsc")
+    page = rows(slew(100))
+    moments = ["1996-01-10T12:00:00.5", "1996-01-10T12:01:38.5"]
+    found = read(page, utc=moments, about=about)
+    assert (tmp_path / "xte.tsc").read_text() == CLOCK
+    ((begin, end),) = found["intervals"]
+    assert (end - begin) / 65536 == pytest.approx(99.0 / 1.00000002, abs=1e-5)
+    middles = slew(200, step_s=0.5)[[1, 197]]
+    assert np.abs(np.array(found["matrices"]) - matrices(middles)).max() < 1e-8

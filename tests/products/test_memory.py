@@ -35,5 +35,6 @@ def peak_bytes(name, count):
 def test_memory_does_not_grow_with_the_attitudes(name):
     peak_bytes(name, 1)
     size, peak = peak_bytes(name, 30)
-    assert size > 500_000
+    # An APM holds one attitude.
+    assert size > (500 if name == "apm" else 500_000)
     assert peak < MOST_BYTES

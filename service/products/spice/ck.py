@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from service.errors import AcquisitionError
-from service.products.attitudes import AttitudeBlock, AttitudeSeries, stretches
+from service.errors import AcquisitionError, BadConfiguration
+from service.products.attitudes import AttitudeBlock, AttitudeSeries, SeriesInfo, stretches
 from service.products.rotations import matrices
 from service.products.spice import kernels
 from service.products.spool import folder, pieces
@@ -32,22 +32,34 @@ def write_ck(series: AttitudeSeries) -> Iterator[bytes]:
     name = kernels.body_name(about).lower()
     with folder() as temporary:
         place = Path(temporary)
-        _keep_records(series, place)
-        _run_child(place, f"{name}.bc", kernels.instrument_id(about))
         texts = {
             f"{name}.tls": kernels.leap_second_kernel(),
-            f"{name}.tsc": kernels.clock_kernel(about),
+            f"{name}.tsc": _clock(about),
             f"{name}.tf": kernels.frame_kernel(about),
         }
         texts[f"{name}.tm"] = kernels.list_of_kernels([*texts, f"{name}.bc"])
         told = (f"{key}: {value}\n" for key, value in about.provenance().items())
         texts["README.txt"] = "".join(told)
+        for file, text in texts.items():
+            (place / file).write_text(text, encoding="utf-8", newline="")
+        _keep_records(series, place)
+        its_clock = [] if about.sclk_kernel is None else [f"{name}.tls", f"{name}.tsc"]
+        _run_child(place, f"{name}.bc", kernels.instrument_id(about), its_clock)
         with zipfile.ZipFile(place / "kernels.zip", "w", zipfile.ZIP_DEFLATED) as packed:
-            packed.write(place / f"{name}.bc", f"{name}.bc")
-            for file, text in texts.items():
-                packed.writestr(file, text)
+            for file in (f"{name}.bc", *texts):
+                packed.write(place / file, file)
         with (place / "kernels.zip").open("rb") as whole:
             yield from pieces(whole)
+
+
+def _clock(about: SeriesInfo) -> str:
+    """The kernel of the spacecraft's clock: its own, or the one that we define."""
+    if about.sclk_kernel is None:
+        return kernels.clock_kernel(about)
+    try:
+        return about.sclk_kernel.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise BadConfiguration(f"{about.sclk_kernel}: cannot be read: {error.strerror}") from None
 
 
 def _keep_records(series: AttitudeSeries, place: Path) -> None:
@@ -65,7 +77,7 @@ def _keep_records(series: AttitudeSeries, place: Path) -> None:
 
 
 def _records(part: AttitudeBlock) -> Vector:
-    """Rows of encoded clock, SPICE's quaternion, and angular velocity in J2000, rad/s."""
+    """Rows of encoded clock (of ours), SPICE's quaternion, and angular velocity in J2000, rad/s."""
     ticks = kernels.clock_ticks(part.time_ns)[:, None]
     vector, scalar = part.quaternion[:, :3], part.quaternion[:, 3:]
     rate = np.radians(np.nan_to_num(part.rate_deg_per_s))
@@ -73,8 +85,8 @@ def _records(part: AttitudeBlock) -> Vector:
     return np.concatenate([ticks, scalar, -vector, inertial], axis=1)
 
 
-def _run_child(place: Path, file: str, instrument: int) -> None:
-    command = [sys.executable, "-P", str(_CHILD), str(place), file, str(instrument)]
+def _run_child(place: Path, file: str, instrument: int, its_clock: list[str]) -> None:
+    command = [sys.executable, "-P", str(_CHILD), str(place), file, str(instrument), *its_clock]
     done = subprocess.run(command, capture_output=True, timeout=CHILD_S, check=False)
     if done.returncode:
         raise AcquisitionError(f"the C-kernel could not be written: {done.stderr[-500:]!r}")

@@ -1,9 +1,11 @@
 """Writes a C-kernel of type 3 from records; run as a program of its own.
 
-    python ck_child.py FOLDER FILE INSTRUMENT
+    python ck_child.py FOLDER FILE INSTRUMENT [LSK SCLK]
 
 FOLDER holds `records`, rows of encoded clock, quaternion (scalar first) and angular
-velocity, and `begins`: the first row of each stretch, and whether it has rates.
+velocity, and `begins`: the first row of each stretch, and whether it has rates.  Without
+kernels the clock counts microseconds of TAI since 1972-01-01T00:00:00 TAI; with them the
+records are encoded by the spacecraft's clock.
 """
 
 import os
@@ -15,6 +17,9 @@ import numpy as np
 IN_SEGMENT = 50_000
 """Records of a segment at most.  A longer stretch goes on in the next with its last record
 again, so that no interval is lost between both."""
+
+CLOCK_ZERO_S = -883_656_000
+"""TAI seconds from 2000-01-01T12:00:00 to the zero of our clock, as in `kernels`."""
 
 Piece = tuple[int, int, bool]
 
@@ -47,14 +52,22 @@ def main() -> None:
     """Write the kernel."""
     import spiceypy
 
-    place, file, instrument = sys.argv[1:]
+    place, file, instrument, *its_clock = sys.argv[1:]
     os.chdir(place)
     records = np.memmap("records", dtype=np.float64, mode="r").reshape(-1, 8)
     begins = np.fromfile("begins", dtype=np.int64).reshape(-1, 2)
+    for kernel in its_clock:
+        spiceypy.furnsh(kernel)
     handle = spiceypy.ckopn(file, "attitude", 0)
     for number, group in enumerate(segments(pieces(begins, len(records)))):
         first, end = group[0][0], group[-1][1]
         rows = np.array(records[first:end])
+        if its_clock:
+            seconds = rows[:, 0] / 1e6 + CLOCK_ZERO_S
+            spacecraft = int(instrument) // 1000
+            rows[:, 0] = [
+                spiceypy.sce2c(spacecraft, spiceypy.unitim(each, "TAI", "ET")) for each in seconds
+            ]
         spiceypy.ckw03(
             handle,
             rows[0, 0],

@@ -10,7 +10,7 @@ from sqlalchemy import Connection, Select, func, select, tuple_
 
 from service.products.attitudes import AttitudeRows
 from service.storage.queries.pages import PLACE, ResultFilter
-from service.storage.sql.tables import batches, results, solutions
+from service.storage.sql.tables import COUNTED, batches, results, solutions
 from service.vectors import Vector
 
 PAGE = 5_000
@@ -28,6 +28,7 @@ _QUERY: Select[Any] = (
         batches.c.input,
         solutions.c.method,
         *(solutions.c[name] for name in (*_SOLVED, *_QUALITY)),
+        *(results.c[name] for name in COUNTED),
     )
     .join_from(results, batches, results.c.batch_id == batches.c.id)
     .outerjoin(solutions, solutions.c.result_id == results.c.id)
@@ -96,6 +97,7 @@ def _columns(rows: Sequence[Any]) -> AttitudeRows:
         rate_deg_per_s=np.array([each if each and any(each) else _UNKNOWN for each in rates]),
         residual_rms_arcsec=values[10],
         predicted_rms_arcsec=values[11],
+        stars=_across(values[12:]).astype(np.int64),
     )
 
 
