@@ -21,6 +21,7 @@ from service.storage.queries.period.stars import period_stars
 from service.storage.queries.recorded_batch import recorded_batch, recorded_mission
 from service.storage.queries.results import OutcomeName, StatusName
 from service.storage.queries.star_field import star_field_of
+from service.storage.queries.time_buckets import BucketFilter
 from service.storage.queries.tracker_comparison import tracker_comparison
 from service.storage.recording.ids import is_ulid
 from service.storage.recording.unsaved_result import Answered
@@ -128,9 +129,9 @@ class Results:
         See `period.sample.sample_period`, which also bounds what is read.
         """
         mission_named(self._context.missions, spacecraft)
-        selected = ResultFilter(run or LIVE, spacecraft, start, end)
+        span = BucketFilter(spacecraft, run or LIVE, start, end)
         with self._context.reading() as connection:
-            sample = sample_period(connection, selected)
+            sample = sample_period(connection, span)
         return period_stars(sample, self._context.sky)
 
     def settings_for(self, id: str) -> Choices:

@@ -9,9 +9,9 @@ from scipy import stats
 from service.observations.schema import submission_from_json
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
-from service.storage.queries.pages import ResultFilter
 from service.storage.queries.period.sample import sample_period
 from service.storage.queries.period.stars import period_stars
+from service.storage.queries.time_buckets import BucketFilter
 from service.times import parse_utc, shifted
 from service.vectors import angle_between_deg, from_ra_dec
 from tests.storage.bulk import put, result_row
@@ -83,33 +83,46 @@ def numbered(app, count):
 
 def sampled(app, **wanted):
     with app.store.reading() as connection:
-        return sample_period(connection, ResultFilter("live", "XTE"), **wanted)
+        return sample_period(connection, BucketFilter("XTE", "live", **WHOLE), **wanted)
+
+
+def minutes_of(found):
+    """The minutes of the batches since the first of all, each the number of its batch."""
+    first = parse_utc("1999-03-01T00:00:00Z").tai_ns
+    return np.array([(row["time_ns"] - first) // 60_000_000_000 for row in found.rows])
 
 
 def test_a_long_period_is_read_as_pairs_of_neighbours_spread_evenly(app):
-    numbered(app, 1000)
-    found = sampled(app, most=40)
-    assert (found.total, found.is_cut) == (1000, False)
-    assert 20 < len(found.rows) <= 40
-    assert np.sum(np.diff(found.rank) == 1) >= 20
-    # A pair of each twentieth of the period.
-    assert np.diff(found.rank).max() <= 100
-    assert found.rank[0] <= 50
-    assert found.rank[-1] > 950
-    minutes = np.diff([row["time_ns"] for row in found.rows]) / 60e9
-    assert minutes.tolist() == np.diff(found.rank).tolist()
+    numbered(app, 3000)
+    found = sampled(app, most=60)
+    assert found.total == 3000
+    number = minutes_of(found)
+    assert 50 < len(number) <= 60
+    # What is said to follow does, and every pair is one.
+    assert (np.diff(number) == 1).tolist() == found.follows[1:].tolist()
+    assert found.follows.sum() >= 28
+    # A pair of each thirtieth of the period.
+    assert np.diff(number).max() <= 200
+    assert number[0] <= 100
+    assert number[-1] >= 2900
+
+
+def test_a_sample_follows_the_batches_not_the_clock(app):
+    """Two dense hours, with a quiet month between them."""
+    start = parse_utc("1999-03-01T00:00:00Z")
+    times = [*np.arange(0, 3600, 4.0), *(30 * 86400.0 + np.arange(0, 3600, 4.0))]
+    put(app, [result_row(app, shifted(start, each), name="b") for each in times])
+    found = sampled(app, most=100)
+    late = sum(row["time_ns"] > start.tai_ns + 86400 * 10**9 for row in found.rows)
+    assert found.total == 1800
+    assert len(found.rows) > 80
+    assert 0.4 < late / len(found.rows) < 0.6
 
 
 def test_a_short_period_is_read_whole_and_an_empty_one_is_empty(app, sky):
     assert period_stars(sampled(app), sky).read == 0
     numbered(app, 30)
-    assert sampled(app, most=30).rank.tolist() == list(range(1, 31))
+    found = sampled(app, most=30)
+    assert minutes_of(found).tolist() == list(range(30))
+    assert found.follows.tolist() == [False, *[True] * 29]
     assert len(sampled(app, most=600).rows) == 30
-
-
-def test_of_too_many_batches_the_latest_are_considered(app):
-    numbered(app, 100)
-    found = sampled(app, most=10, most_counted=50)
-    assert (found.total, found.is_cut) == (50, True)
-    middle = shifted(parse_utc("1999-03-01T00:00:00Z"), 60.0 * 49.5)
-    assert min(row["time_ns"] for row in found.rows) > middle.tai_ns

@@ -71,6 +71,8 @@ def test_it_fits_wide_and_narrow_light_and_dark_without_any_fault(browser, fille
         browser.open(address, width=width, dark=dark)
         browser.wait(lambda: browser.run(DRAWN) == str(size))
         assert browser.run("document.documentElement.scrollWidth") <= width
+        last = f"{ROWS}[{fleet.IN_TROUBLE - 1}].getBoundingClientRect().bottom"
+        assert browser.run(last) <= 900
         browser.run(AXE + ";0")
         assert browser.run(FAULTS) == [], (width, dark)
     assert browser.complaints == []

@@ -87,7 +87,7 @@ def sky_of(rng, boresight, status=None, region=None):
     attitudes = attitudes_of(Rotation.identity(count), status=status or ("good",) * count)
     tracker = tracker_of(rng, 10, boresight=boresight, region=region)
     sun = np.tile(from_ra_dec(342.0, -7.6), (count, 1))
-    period = PeriodStars(count, False, attitudes, (tracker,), 0, sun, START, START)
+    period = PeriodStars(count, attitudes, (tracker,), 0, sun, START, START)
     return all_sky_chart(period, [tracker])
 
 

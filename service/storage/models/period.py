@@ -56,7 +56,7 @@ class TrackerStarsOfPeriod:
 
 @dataclass(frozen=True, eq=False)
 class PeriodStars:
-    """What was read of a period: `total` batches, or the latest of more, of which some were read.
+    """What was read of the `total` batches of a period: all, or some where there are many.
 
     `other_catalog` is how many of those read were identified with a star catalog that
     the service no longer has; they are without stars here.  `sun` (b, 3) are inertial
@@ -64,7 +64,6 @@ class PeriodStars:
     """
 
     total: int
-    is_cut: bool
     attitudes: PeriodAttitudes
     trackers: tuple[TrackerStarsOfPeriod, ...]
     other_catalog: int

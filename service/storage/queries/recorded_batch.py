@@ -1,13 +1,11 @@
 """Recorded batches, ready to run again: one, or a sample of many."""
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import msgspec
 import numpy as np
-from sqlalchemy import Column, Connection, bindparam, func, select
+from sqlalchemy import Connection, bindparam, func, select
 
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
@@ -18,11 +16,7 @@ from service.storage.queries.results import answer_from_json, read_result
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, missions, results
 
-_SAMPLED = (
-    results.c.id,
-    results.c.options,
-    *(batches.c[name] for name in ("input", "time", "time_ns")),
-)
+_SENT = ("input", "time", "time_ns")
 # SQLite takes 32,766 values in a statement.
 _READ_AT_ONCE = 1_000
 
@@ -93,9 +87,7 @@ def sample_batches(
     rows = [
         row
         for start in range(0, count, _READ_AT_ONCE)
-        for row in rows_at_ranks(
-            connection, selected, ranks[start : start + _READ_AT_ONCE].tolist(), _SAMPLED
-        )
+        for row in _at_ranks(connection, selected, ranks[start : start + _READ_AT_ONCE].tolist())
     ]
     times = [(row["time_ns"], row["time"]) for row in rows]
     drawn = tuple(rows[k] for k in rng.permutation(len(rows)))
@@ -108,19 +100,14 @@ def sample_batches(
     )
 
 
-def rows_at_ranks(
-    connection: Connection, selected: ResultFilter, ranks: list[int], shown: Sequence[Column[Any]]
-) -> list[Row]:
-    """Columns of the batches at these places, from 1, in the period's order of time.
-
-    At most a thousand of them.
-    """
+def _at_ranks(connection: Connection, selected: ResultFilter, ranks: list[int]) -> list[Row]:
+    """The batches at these places, from 1, in the period's order of time."""
     # The index holds all that the ranking needs; inputs are read of the chosen alone.
     rank = func.row_number().over(order_by=PLACE).label("rank")
     ranked = select(results.c.batch_id, rank).where(*selected.conditions()).subquery()
     chosen = select(ranked.c.batch_id).where(ranked.c.rank.in_(bindparam("ranks", expanding=True)))
     query = (
-        select(*shown)
+        select(results.c.id, results.c.options, *(batches.c[name] for name in _SENT))
         .join_from(results, batches, results.c.batch_id == batches.c.id)
         .where(results.c.current, results.c.batch_id.in_(chosen))
         .order_by(*PLACE)

@@ -99,7 +99,6 @@ def period_stars(sample: PeriodSample, sky: SkyModel) -> PeriodStars:
     times = [batch.time for batch, _, _ in read]
     return PeriodStars(
         total=sample.total,
-        is_cut=sample.is_cut,
         attitudes=_attitudes(sample, [answer for _, answer, _ in read]),
         trackers=tuple(_joined(each) for each in collected.values()),
         other_catalog=other_catalog,
@@ -219,7 +218,7 @@ def _attitudes(sample: PeriodSample, answers: list[Answer]) -> PeriodAttitudes:
         ),
         quaternion=quaternion,
         covariance_arcsec2=covariance,
-        follows=np.diff(sample.rank, prepend=-1) == 1,
+        follows=sample.follows,
     )
 
 
