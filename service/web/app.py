@@ -41,6 +41,7 @@ from service.web.requests.exports import Exports
 from service.web.requests.metrics import Metrics
 from service.web.requests.problems import add_error_handlers
 from service.web.requests.request_body import DEFAULT_LIMITS, BodyBudget, BodyLimits
+from service.web.supervisor import notify_supervisor, report_to_supervisor
 from service.web.warm_request import warm_request
 
 log = logging.getLogger(__name__)
@@ -84,10 +85,13 @@ def create_app(app: App, limits: BodyLimits = DEFAULT_LIMITS) -> FastAPI:
         here = asyncio.get_running_loop()
         warming = threading.Thread(target=_warm_up, args=(web_app, app, here), name="warm-up")
         warming.start()
+        reporting = asyncio.create_task(report_to_supervisor(app))
         try:
             await web_app.state.live.start()
             yield
         finally:
+            reporting.cancel()
+            notify_supervisor("STOPPING=1")
             await web_app.state.live.close()
             app.service.cancel_warmup()
             # The handlers' own threads may all be at work still.

@@ -25,6 +25,7 @@ log = logging.getLogger(__name__)
 WAIT_S = 1.0
 """The deadline of all reads: the scrape is due within two seconds."""
 OUTCOMES = ("unique", "ambiguous", "unmatched")
+RESULTS = ("attitude", "no_attitude")
 ALARM_STATES = ("open", "acknowledged", "shelved")
 _METHODS = ("GET", "POST", "DELETE", "PUT", "PATCH", "OPTIONS")
 _SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
@@ -198,11 +199,13 @@ class Metrics:
             # A counter that exists from the start shows its first increase.
             for outcome in OUTCOMES:
                 self._stars.labels(name, outcome)
+            for result in RESULTS:
+                self._batches.labels(name, LIVE, result)
 
     def count_batch(self, recorded: Recorded) -> None:
         """Count one newly recorded batch."""
         spacecraft, live = recorded.spacecraft, recorded.run == LIVE
-        result = "attitude" if recorded.has_attitude else "no_attitude"
+        result = RESULTS[0] if recorded.has_attitude else RESULTS[1]
         self._batches.labels(spacecraft, LIVE if live else "named", result).inc()
         if live:
             for outcome in OUTCOMES:
