@@ -13,12 +13,19 @@ from service.products.attitudes import (
     StatusWanted,
     series_of,
 )
+from service.products.moment import AtMethod, AttitudeAt, attitude_at
+from service.products.tables import Table
 from service.storage.queries.attitude_rows import attitude_pages, count_results
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
-from service.times import Utc, utc_now
+from service.storage.queries.tables.result_tables import batch_table, star_table
+from service.times import Utc, shifted, utc_now
 
 Order = Literal["oldest", "newest"]
+AROUND = 200
+"""Batches on either side of a moment among which its attitude is looked for."""
+TableKind = Literal["batches", "stars"]
+_TABLES = {"batches": batch_table, "stars": star_table}
 
 
 class Products:
@@ -77,6 +84,53 @@ class Products:
                 )
         pages = attitude_pages(self._context.reading, selected, newest_first=about.newest_first)
         return series_of(about, pages)
+
+    def attitude_at(
+        self,
+        name: str,
+        moment: Utc,
+        method: AtMethod,
+        *,
+        run: str | None = None,
+        status: StatusWanted = "good",
+        largest_gap_s: float | None = None,
+    ) -> AttitudeAt:
+        """The attitude of a spacecraft at a moment; see `moment.attitude_at`."""
+        about = self.attitudes(name, run=run, status=status, largest_gap_s=largest_gap_s).about
+        gap_s = about.largest_gap_s
+        before = ResultFilter(about.run, name, shifted(moment, -gap_s), moment)
+        # The end of a period is excluded.
+        after = ResultFilter(about.run, name, moment, shifted(moment, gap_s + 1e-6))
+        reading = self._context.reading
+        earlier = next(attitude_pages(reading, before, newest_first=True, page=AROUND), None)
+        later = next(attitude_pages(reading, after, page=AROUND), None)
+        pages = [
+            *([] if earlier is None else [earlier.taken(slice(None, None, -1))]),
+            *([] if later is None else [later]),
+        ]
+        return attitude_at(about, pages, moment, method)
+
+    def table(
+        self,
+        name: str,
+        kind: TableKind,
+        *,
+        run: str | None = None,
+        start: Utc | None = None,
+        end: Utc | None = None,
+    ) -> Table:
+        """A spacecraft's batches or their stars, oldest first; see `result_tables`."""
+        mission_named(self._context.missions, name)
+        selected = ResultFilter(run or LIVE, name, start, end)
+        about = {
+            "spacecraft": name,
+            "run": selected.run or LIVE,
+            "start": "" if start is None else start.text,
+            "end": "" if end is None else end.text,
+            "created": utc_now().text,
+            "originator": f"attitude-acquisition {__version__}",
+        }
+        return _TABLES[kind](self._context.reading, selected, about)
 
 
 def _require_at_most(most: int, count: int) -> None:

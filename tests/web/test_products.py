@@ -2,8 +2,10 @@
 
 import csv
 import dataclasses
+import html
 import io
 import json
+import re
 import threading
 import time
 
@@ -199,6 +201,16 @@ def test_trends_are_tables_with_units(client, full_run, tmp_path):
     assert {"bucket_s", "residual_rms_arcsec_max"} <= set(
         pyarrow.parquet.read_table(file).column_names
     )
+
+
+def test_the_console_links_the_attitudes_of_the_range_in_every_format(client, full_run):
+    page = client.get("/spacecraft/XTE", params={"run": full_run}).text
+    links = [html.unescape(each) for each in re.findall(r'href="([^"]+/attitude\?[^"]+)"', page)]
+    shown = {httpx.URL(each).params["format"]: each for each in links}
+    assert list(shown) == list(attitude_formats())
+    for name in ("json", "aem"):
+        assert httpx.URL(shown[name]).params["run"] == full_run
+        assert client.get(shown[name]).status_code == 200
 
 
 # ---- how many at once ----------------------------------------------------------------------------

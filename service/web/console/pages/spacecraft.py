@@ -14,7 +14,7 @@ from starlette.responses import Response
 from service.alarms.quantities import QUANTITIES, RankedName, ranked_names, trend_names
 from service.alarms.subjects import limited_trackers
 from service.observations.schema import Key
-from service.products.formats import table_formats
+from service.products.formats import attitude_formats, table_formats
 from service.storage.models.annotations import Annotation
 from service.storage.models.answers import Summary
 from service.storage.models.base import Page
@@ -183,6 +183,8 @@ def spacecraft_page(
         worst=ranking.items,
         limits=context.app.limits.all(name, query.tracker if trackers else None),
         formats=table_formats(),
+        attitude_formats=attitude_formats(),
+        attitude_file=lambda format: stretch and _attitude_address(name, query, stretch, format),
         annotations=sorted(notes.items, key=lambda each: recorded_utc(each.start).tai_ns),
         more_annotations=notes.next_cursor is not None,
         may_write="operate" in context.caller.scopes,
@@ -282,3 +284,14 @@ def _history_address(
         asked["tracker"] = query.tracker
     asked |= {"start": stretch.start.text, "end": stretch.end.text, "size": POINTS} | more
     return f"/api/v1/spacecraft/{quote(name)}/history?{urlencode(asked)}"
+
+
+def _attitude_address(name: str, query: SpacecraftQuery, stretch: ShownPeriod, format: str) -> str:
+    """The address of the good attitudes of the shown period as a file."""
+    asked = {
+        "run": query.run,
+        "start": stretch.start.text,
+        "end": stretch.end.text,
+        "format": format,
+    }
+    return f"/api/v1/spacecraft/{quote(name)}/attitude?{urlencode(asked)}"

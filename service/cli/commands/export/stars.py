@@ -1,0 +1,11 @@
+"""`acquire export stars`: a table for analysts."""
+
+from typing import Any
+
+from service.cli.table_export import add_table_export
+
+
+def add(commands: Any) -> None:
+    """Declare the command."""
+    summary = "Write the stars of a spacecraft's batches with their outcomes, a row a star."
+    add_table_export(commands, "stars", summary)

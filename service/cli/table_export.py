@@ -1,0 +1,47 @@
+"""The commands that export recorded results as tables."""
+
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+from service.cli.arguments import MISSION, add_command, add_database, add_period
+from service.cli.configuration import period_of, settings_of_existing
+from service.cli.output import written_to
+from service.products.formats import table_formats, write_table
+
+
+def add_table_export(commands: Any, kind: str, summary: str) -> None:
+    """Declare `acquire export KIND`; see `app.products.table`."""
+    parser = add_command(
+        commands,
+        kind,
+        f"{summary} Oldest first; units and descriptions stand in the metadata of Parquet files.",
+        f"""
+        acquire export {kind} --spacecraft XTE --format parquet --output {kind}.parquet
+        acquire export {kind} --spacecraft XTE --run pass-7 --start 1996-010T00:00:00Z
+        """,
+        _run,
+    )
+    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=MISSION)
+    add_period(parser, "the run that is read; default live")
+    parser.add_argument("--format", choices=tuple(table_formats()), default="csv")
+    parser.add_argument(
+        "--output", type=Path, metavar="FILE", help="the file to write; default: standard output"
+    )
+    parser.set_defaults(kind=kind)
+    add_database(parser)
+
+
+def _run(parsed: Namespace) -> int:
+    from service.app.factory import open_app
+
+    start, end = period_of(parsed)
+    app = open_app(settings_of_existing(parsed))
+    try:
+        table = app.products.table(
+            parsed.spacecraft, parsed.kind, run=parsed.run, start=start, end=end
+        )
+        written_to(parsed.output, write_table(parsed.format, table))
+    finally:
+        app.close()
+    return 0

@@ -1,0 +1,1 @@
+"""What is recorded as tables: batches with their quantities, and stars with their outcomes."""
