@@ -28,10 +28,11 @@ SIGMA_FLOOR_ARCSEC = 1.5
 AT_REST = np.zeros(3)
 COLOR_SIGMA_MAG = 0.3
 """What a magnitude is off by beside its noise: colour, and stars that vary."""
-FEW_MATCHES, LARGEST_SCATTER_MAG = 4, 0.5
+FEW_MATCHES, LARGEST_SCATTER_MAG = 4, 1.0
 """So few stars found without their magnitudes must have about the same offset of magnitude.
 
-Otherwise chance gives three random points an attitude in 1 of 15,000 batches.
+Otherwise chance gives three random points an attitude in 1 of 15,000 batches.  It is twice the
+noise of a tracker with poor photometry: half as much refuses real fields of four stars.
 """
 
 
