@@ -123,3 +123,7 @@ def test_only_operators_are_offered_to_change_the_cache(chosen_database):
     with Server(create_app(service.app)) as url:
         assert "Build a zone" not in httpx.get(f"{url}/zones", headers=reader, timeout=60).text
         assert "Build a zone" in httpx.get(f"{url}/zones", headers=operator, timeout=60).text
+
+
+def test_without_a_partner_options_are_offered_for_a_spacecraft_with_batches(two_runs):
+    assert "<option selected>SWAS" in two_runs.get("/compare?run=lonely").text

@@ -148,6 +148,13 @@ class PageContext:
         """The spacecraft that the reader may see."""
         return [name for name in sorted(self.app.missions) if self.caller.may_see(name)]
 
+    def filled_spacecraft(self, run: str) -> str:
+        """The first spacecraft with batches in a run; without any, the first one."""
+        found = {
+            name for each in self.app.runs.all() if each.run == run for name in each.spacecraft
+        }
+        return next((name for name in self.spacecraft if name in found), self.spacecraft[0])
+
 
 def _page_context(request: Request, app: AppDep, caller: CallerDep) -> PageContext:
     page = PAGES[request.scope["route"].name]

@@ -73,7 +73,7 @@ def compare_page(
             limit_s=WORK_S,
         )
     run = pair[0] if pair and runs else query.run
-    name = query.spacecraft or (pair[2] if pair else context.spacecraft[0])
+    name = query.spacecraft or (pair[2] if pair else context.filled_spacecraft(run))
     mission = context.app.missions.get(name)
     return rendered(
         "compare.html.jinja",
@@ -100,7 +100,7 @@ def _pair(
     found = context.app.runs.comparable(context.spacecraft, run)
     if query.other is None:
         return found
-    name = query.spacecraft or (found[2] if found else context.spacecraft[0])
+    name = query.spacecraft or (found[2] if found else context.filled_spacecraft(query.run))
     context.caller.require(name)
     return query.run, query.other, name
 

@@ -7,7 +7,7 @@ from starlette.responses import Response
 
 from service.advice.zone_size import LEAST_BATCHES, Verdict
 from service.observations.schema import Key
-from service.web.console.page_context import ContextDep, PageContext, PageQuery
+from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import READ
@@ -30,7 +30,7 @@ class ZonesQuery(PageQuery):
 @console_page("/zones", "Zones", READ, position=75)
 def zones_page(query: Annotated[ZonesQuery, InQuery()], context: ContextDep) -> Response:
     """The size of a zone, and cached zones and run catalogs, the most recently used first."""
-    name = query.spacecraft or _with_batches(context, query.run)
+    name = query.spacecraft or context.filled_spacecraft(query.run)
     size, costs = context.app.zones.size(name, query.run)
     cache = context.app.zones.state()
     epochs = {each.digest: each.epoch_year for each in cache.run_catalogs}
@@ -47,10 +47,3 @@ def zones_page(query: Annotated[ZonesQuery, InQuery()], context: ContextDep) -> 
         verdicts=VERDICTS,
         may_write="operate" in context.caller.scopes,
     )
-
-
-def _with_batches(context: PageContext, run: str) -> str:
-    """The first spacecraft with batches in a run; without any, the first one."""
-    filled = (each.spacecraft for each in context.app.runs.all() if each.run == run)
-    known = [name for names in filled for name in names if name in context.app.missions]
-    return (sorted(known) or context.spacecraft)[0]

@@ -1,0 +1,68 @@
+"""Every page of a service without data, with one spacecraft's and with 40: it fits, axe content."""
+
+import httpx
+import pytest
+
+from service.app.factory import open_app
+from service.settings import Settings
+from service.web.app import create_app
+from tests.web import fleet
+from tests.web.browser import CHROMIUM, Browser
+from tests.web.console_pages import console_addresses
+from tests.web.serving import Server
+from tests.web.test_fleet_in_browser import AXE, FAULTS
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
+
+BATCHES = 12
+ANNOTATION = {"start": "1999-03-01T00:10:00Z", "text": "Wheel 2 unloaded; " * 20, "who": "jb"}
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    with Browser(tmp_path_factory.mktemp("profile")) as browser:
+        yield browser
+
+
+@pytest.fixture(params=(0, 1, 40))
+def pages(request, browser, tmp_path, drawn):
+    """The addresses of every page of a service with data of so many spacecraft."""
+    size, missions, name = request.param, None, "XTE"
+    if size == 40:
+        missions, name = fleet.write_missions(tmp_path / "missions", size), fleet.troubled(size)[0]
+    settings = Settings(database=f"sqlite:///{tmp_path}/acquire.db", missions=missions)
+    app = open_app(settings)
+    if size == 40:
+        fleet.fill(app, size)
+        fleet.fill(app, size, run="again")
+    with (
+        Server(create_app(app)) as url,
+        httpx.Client(base_url=f"{url}/api/v1", timeout=60) as client,
+    ):
+        for each in drawn("XTE", BATCHES, seed=4) if size == 1 else ():
+            for run, identifier in (("live", "starid"), ("again", "verified")):
+                body = each | {"run": run, "options": {"identifier": identifier}}
+                client.post("/batches", json=body).raise_for_status()
+        if size:
+            note = ANNOTATION | {"spacecraft": name}
+            client.post("/annotations", json=note).raise_for_status()
+        alarms = client.get("/alarms").json()["items"]
+        found = [each.replace("XTE", name) for each in console_addresses()]
+        found += [f"/alarms/{each['id']}" for each in alarms[:1]]
+        if size == 40:
+            # Advice is computed from what was sent, of which the rows of the fleet have nothing.
+            found = [each for each in found if not each.startswith("/advice")]
+            found += [f"/spacecraft/{name}{page}?tracker=STARTRACKER_2" for page in ("", "/limits")]
+        yield [url + each for each in found]
+        browser.call("Page.navigate", url="about:blank")
+        browser.complaints.clear()
+
+
+def test_every_page_fits_and_axe_finds_nothing(browser, pages):
+    for page in pages:
+        for width, dark in ((1440, False), (400, True)):
+            browser.open(page, width=width, dark=dark)
+            assert browser.run("document.documentElement.scrollWidth") <= width, page
+            browser.run(AXE + ";0")
+            assert browser.run(FAULTS) == [], (page, width, dark)
+    assert browser.complaints == []
