@@ -57,6 +57,9 @@ def test_what_is_done_twice_is_told_of_and_changes_nothing(client, alarm):
     [
         ("shelve", {"who": "jb"}),
         ("shelve", {"who": "jb", "minutes": 0}),
+        ("acknowledge", {"who": "j\x00b"}),
+        ("acknowledge", {"who": "jb", "comment": "a\x00b"}),
+        ("comment", {"who": "jb", "comment": "a\x00b"}),
         ("shelve", {"who": "jb", "minutes": 100_000}),
         ("comment", {"who": "jb"}),
         ("comment", {"who": "jb", "comment": "x" * 3000}),

@@ -88,6 +88,8 @@ def test_a_note_about_all_is_one_of_each_spacecraft(client):
         ({"spacecraft": "NOPE"}, "spacecraft"),
         ({"who": None}, "who"),
         ({"who": ""}, "who"),
+        ({"who": "J.\x00"}, "who"),
+        ({"spacecraft": "X\x00"}, "spacecraft"),
         ({"colour": "red"}, "colour"),
     ],
 )

@@ -4,7 +4,7 @@ from typing import Annotated, ClassVar
 
 from fastapi import APIRouter, Path
 from fastapi import Query as InQuery
-from pydantic import ConfigDict, Field
+from pydantic import AfterValidator, ConfigDict, Field
 from starlette.requests import Request
 from starlette.responses import Response
 
@@ -28,13 +28,12 @@ from service.web.requests.path_parameters import SpacecraftPath
 from service.web.requests.query_parameters import (
     NO_QUERY,
     AlarmQuery,
-    Comment,
     LimitQuery,
     LimitStatementQuery,
     RunQuery,
-    Who,
 )
 from service.web.requests.request_body import JsonBody, read_model
+from service.web.requests.statements import Comment, Who, without_nul
 
 router = APIRouter(prefix="/api/v1", tags=["alarms"])
 
@@ -68,7 +67,7 @@ class CommentIn(StatementIn):
     component: ClassVar[str] = "CommentIn"
     model_config = ConfigDict(title=component)
 
-    comment: Annotated[str, Field(min_length=1, max_length=2_000)]
+    comment: Annotated[str, Field(min_length=1, max_length=2_000), AfterValidator(without_nul)]
 
 
 class LimitTrialIn(Wire):

@@ -29,6 +29,7 @@ from service.storage.queries.results import OutcomeName, StatusName
 from service.storage.queries.trends import MAX_SIZE, Strategy
 from service.storage.recording.rollups import Bucket
 from service.times import Utc, parse_utc
+from service.web.requests.statements import Comment, Who
 
 MAX_LIMIT = 500
 
@@ -320,18 +321,6 @@ class AlarmQuery(Query):
     ] = "active"
     limit: PageLimit = 100
     cursor: Cursor = None
-
-
-Who = Annotated[
-    str | None,
-    Field(
-        min_length=1,
-        max_length=64,
-        description="Your name. Required while access is open; with a token, the service uses "
-        "the token's name.",
-    ),
-]
-Comment = Annotated[str | None, Field(max_length=2_000, description="A comment.")]
 
 
 class AnnotationQuery(Query):
