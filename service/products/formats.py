@@ -7,11 +7,11 @@ and `acquire export`.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from itertools import chain, islice
 from typing import TYPE_CHECKING
 
-from service.errors import BadBatch, Fault, NotAvailable, NotFound, shown_value
+from service.errors import BadBatch, Fault, NotFound
+from service.extras import require_extra
 from service.products.tables import Table, write_csv
 
 if TYPE_CHECKING:
@@ -49,16 +49,6 @@ class OutputFormat:
     def require(self, name: str) -> None:
         """Raise `NotAvailable` with the command that installs what the format lacks."""
         require_extra(self.extra, self.package, "format", name)
-
-
-def require_extra(extra: str, package: str, field: str, value: str) -> None:
-    """Raise `NotAvailable` unless a package of an extra is installed."""
-    if package and find_spec(package) is None:
-        message = (
-            f"needs the package {package}; install it with: "
-            f"pip install 'attitude-acquisition[{extra}]'"
-        )
-        raise NotAvailable(Fault(field, message, shown_value(value)))
 
 
 def table_formats() -> dict[str, OutputFormat]:

@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from service.errors import BadFile, Fault
-from service.products.formats import require_extra
+from service.extras import require_extra
 from service.products.reading.known_attitudes import (
     MOST_RECORDS,
     KnownAttitudes,

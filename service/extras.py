@@ -1,0 +1,18 @@
+"""Optional packages: what an installation lacks, and the command that installs it."""
+
+from importlib.util import find_spec
+
+from service.errors import Fault, NotAvailable, shown_value
+
+
+def require_extra(extra: str, package: str, field: str, value: str) -> None:
+    """Raise `NotAvailable` unless a package of an extra is installed.
+
+    Without `package` nothing is needed.
+    """
+    if package and find_spec(package) is None:
+        message = (
+            f"needs the package {package}; install it with: "
+            f"pip install 'attitude-acquisition[{extra}]'"
+        )
+        raise NotAvailable(Fault(field, message, shown_value(value)))
