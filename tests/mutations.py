@@ -34,6 +34,9 @@ from service.observations.readers.decompress import unpacked_lines
 from service.observations.readers.lines import MAX_LINE_BYTES
 from service.observations.readers.telemetry import read_lines
 from service.observations.schema import BatchIn, submission_from_json
+from service.packets.definition import PacketDefinition
+from service.packets.reader import PacketReader
+from service.packets.upload import PacketLines, archive_of
 from service.products.reading.aem import read_aem
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
@@ -41,6 +44,7 @@ from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import import_csv, import_sky2000, load, load_embedded, save
 from service.sky.model import SkyModel
 from tests.imaging.colour_files import colours, dng, png_of_16_bits, tiff_of_16_bits
+from tests.packets.packing import mission_of_pass, packed, xtce
 from tests.products.series import GOLDEN, rows, slew
 from tests.products.series import written as aem_file
 from tests.sky.sky2000_records import SIRIUS, written
@@ -101,6 +105,13 @@ def pass_lines():
     return [each.batch for each in drawn]
 
 
+def pass_with_angles():
+    """One batch in the form that the test's packets have."""
+    stars = [{"h_deg": 0.1 * k, "v_deg": -0.2 * k, "magnitude": 5.0 + k} for k in range(4)]
+    (batch, *_) = pass_lines()
+    return [batch | {"observations": [{"tracker": "STARTRACKER_1", "stars": stars}]}]
+
+
 def read_telemetry(data, form):
     """Every line; raises the first fault at the end, so that it counts as refused."""
     faults = []
@@ -112,6 +123,13 @@ def read_telemetry(data, form):
             submission_from_json(line.body)
         except BadInput as error:
             faults += error.faults
+    if faults:
+        raise BadInput(faults)
+
+
+def require_no_faults(lines):
+    """Every line; raises the faults at the end, so that they count as refused."""
+    faults = [line.fault for line in lines if line.fault is not None]
     if faults:
         raise BadInput(faults)
 
@@ -250,6 +268,38 @@ class Readers:
     def tiff_of_16_bits_in_colour(self):
         good = tiff_of_16_bits(colours(np.random.default_rng(7), 12, 20))
         return good, read_frame_of
+
+    def packets(self):
+        """Packets of a pass, as a replay reads them."""
+        mission, definition = mission_of_pass(), PacketDefinition(xtce(), "x", "CCSDSPacket")
+
+        def read(data):
+            reader = PacketReader(mission, definition)
+            require_no_faults(reader.lines(io.BytesIO(data), "pass.dat"))
+
+        return packed(pass_with_angles()), read
+
+    def xtce(self):
+        """The file that describes them."""
+        data, mission = packed(pass_with_angles()), mission_of_pass()
+
+        def read(text):
+            reader = PacketReader(mission, PacketDefinition(text, "x", "CCSDSPacket"))
+            require_no_faults(reader.lines(io.BytesIO(data), "pass.dat"))
+
+        return xtce(), read
+
+    def packet_archive(self):
+        """Both, as they are uploaded."""
+        files = [self._folder / "pass.dat", self._folder / "test.xml"]
+        files[0].write_bytes(packed(pass_with_angles()))
+        files[1].write_bytes(xtce())
+        missions = {"XTE": mission_of_pass()}
+
+        def read(data):
+            require_no_faults(PacketLines(io.BytesIO(data), missions, None))
+
+        return b"".join(archive_of(files)), read
 
     def raw(self):
         good = dng(np.random.default_rng(8).integers(0, 4000, (64, 96)).astype(np.uint16))

@@ -1,0 +1,247 @@
+"""Packets to batches: the stars of a packet with what the packets before it said."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from pydantic import ValidationError
+
+from service.errors import Fault
+from service.observations.schema import BatchIn, checked_from_model, faults_of
+from service.packets.carried import GyroRates, Held, PacketAttitude, quaternion_in
+from service.packets.clock import NS, Moment, moment_of, names_of
+from service.packets.definition import PacketFault
+from service.packets.mapping import PacketMap, TrackerColumns
+from service.packets.stream import SpacePacket
+from service.packets.values import finite, finite_all, number, text, whole
+
+CARRIED_WITHIN_S = 10.0
+"""Rates, velocity and position of another packet serve stars that are so near in time."""
+
+Values = Mapping[str, Any]
+
+
+@dataclass
+class StarBatch:
+    """A batch in the making, with the packet that it began with."""
+
+    packet: SpacePacket
+    moment: Moment
+    body: dict[str, Any]
+    columns: list[TrackerColumns] = field(default_factory=list)
+    slots: list[list[int]] = field(default_factory=list)
+    """Of each tracker the slot of each of its stars."""
+
+    def has_stars(self) -> bool:
+        """Whether a slot of any tracker held a star."""
+        return any(self.slots)
+
+
+class BatchMaker:
+    """Makes batches of one spacecraft from the values of packets, in order."""
+
+    def __init__(self, spacecraft: str, mapped: PacketMap) -> None:
+        self._spacecraft = spacecraft
+        self._mapped = mapped
+        table = self._table = mapped.table
+        self._prior = table.prior
+        self._gyro = GyroRates(table.gyro, mapped.gyro) if table.gyro else None
+        self._rates_scale = (
+            180.0 / math.pi if table.rates and table.rates.unit == "rad_per_s" else 1.0
+        )
+        metres = 1e-3
+        self._velocity_scale = (
+            metres if table.velocity and table.velocity.unit == "m_per_s" else 1.0
+        )
+        self._position_scale = metres if table.position and table.position.unit == "m" else 1.0
+        self._attitude = Held(table.prior.max_age_s if table.prior else 0.0)
+        self._rates = Held(CARRIED_WITHIN_S)
+        self._velocity = Held(CARRIED_WITHIN_S)
+        self._position = Held(CARRIED_WITHIN_S)
+        self._pending: StarBatch | None = None
+
+    def attitude(self, values: Values) -> PacketAttitude | None:
+        """The a priori attitude in a packet; raises `PacketFault`."""
+        names, prior = self._mapped.quaternion, self._prior
+        if not names or prior is None or names[0] not in values:
+            return None
+        quaternion = quaternion_in(values, names, prior)
+        if quaternion is None:
+            return None
+        return PacketAttitude(moment_of(prior.time or self._table.time, values), quaternion)
+
+    def add(self, packet: SpacePacket, values: Values) -> Iterator[StarBatch]:
+        """Take a packet; gives the batch that is complete with it.  Raises `PacketFault`."""
+        attitude = self.attitude(values)
+        if attitude is not None:
+            self._attitude.hold(attitude.moment, list(attitude.quaternion))
+        mapped = self._mapped
+        trackers = [each for each in mapped.trackers if each.first in values]
+        state = (mapped.rates, mapped.gyro, mapped.velocity, mapped.position)
+        if not trackers and not any(names and names[0] in values for names in state):
+            return
+        moment = moment_of(self._table.time, values)
+        self._hold_state(values, moment)
+        if not trackers:
+            return
+        stars = [self._stars(each, values) for each in trackers]
+        pending = self._pending
+        if pending is not None and not self._joins(pending, moment, trackers):
+            self._pending = None
+            yield pending
+            pending = None
+        if pending is None:
+            pending = self._pending = self._begun(packet, values, moment)
+        later_s = (moment.tai_ns - pending.moment.tai_ns) / NS
+        for columns, (slots, seen) in zip(trackers, stars, strict=True):
+            _shift(seen, later_s)
+            pending.columns.append(columns)
+            pending.slots.append(slots)
+            pending.body["observations"].append({"tracker": columns.tracker, "stars": seen})
+        if self._table.join_within_s == 0.0:
+            self._pending = None
+            yield pending
+
+    def end(self) -> Iterator[StarBatch]:
+        """The batch that waits for further trackers."""
+        pending, self._pending = self._pending, None
+        if pending is not None:
+            yield pending
+
+    def _hold_state(self, values: Values, moment: Moment) -> None:
+        mapped = self._mapped
+        if mapped.rates and mapped.rates[0] in values:
+            self._rates.hold(moment, finite_all(values, mapped.rates, self._rates_scale))
+        if self._gyro is not None and mapped.gyro[0] in values:
+            self._rates.hold(moment, self._gyro.add(values, moment))
+        if mapped.velocity and mapped.velocity[0] in values:
+            self._velocity.hold(moment, finite_all(values, mapped.velocity, self._velocity_scale))
+        if mapped.position and mapped.position[0] in values:
+            self._position.hold(moment, finite_all(values, mapped.position, self._position_scale))
+
+    def _joins(self, pending: StarBatch, moment: Moment, trackers: list[TrackerColumns]) -> bool:
+        apart_ns = abs(moment.tai_ns - pending.moment.tai_ns)
+        held = {each.tracker for each in pending.columns}
+        return apart_ns <= self._table.join_within_s * NS and not any(
+            each.tracker in held for each in trackers
+        )
+
+    def _begun(self, packet: SpacePacket, values: Values, moment: Moment) -> StarBatch:
+        table = self._table
+        name = (
+            text(values, table.batch)
+            if table.batch
+            else f"{packet.apid}-{moment.text}-{packet.sequence_count}"
+        )
+        body: dict[str, Any] = {
+            "spacecraft": self._spacecraft,
+            "batch": name,
+            "time": moment.text,
+            "a_priori": self._a_priori(moment),
+            "aberration": table.aberration,
+            "observations": [],
+        }
+        optional = {
+            "body_rates_deg_per_s": self._rates.near(moment),
+            "velocity_km_per_s": self._velocity.near(moment),
+            "position_km": self._position.near(moment),
+        }
+        body |= {key: value for key, value in optional.items() if value is not None}
+        return StarBatch(packet, moment, body)
+
+    def _a_priori(self, moment: Moment) -> dict[str, Any] | None:
+        if self._prior is None:
+            return None
+        if self._prior.sun_pointed:
+            return {"sun_pointed": True, "frame": self._prior.frame}
+        quaternion = self._attitude.near(moment)
+        if quaternion is None:
+            return None
+        return {"quaternion": quaternion, "frame": self._prior.frame}
+
+    def _stars(
+        self, columns: TrackerColumns, values: Values
+    ) -> tuple[list[int], list[dict[str, Any]]]:
+        """The slots that hold a star, and the stars."""
+        used = columns.slots
+        if columns.count is not None:
+            used = whole(values, columns.count)
+            if not 0 <= used <= columns.slots:
+                message = f"must be from 0 to {columns.slots}, the number of slots"
+                raise PacketFault(columns.count, message, used)
+        slots, stars = [], []
+        for slot in range(used):
+            if columns.valid is not None and not number(values, columns.valid[slot]):
+                continue
+            direction = [number(values, each[slot]) for each in columns.directions]
+            if not all(map(math.isfinite, direction)):
+                continue
+            star: dict[str, Any]
+            if len(direction) == 3:
+                star = {"vector": direction}
+            else:
+                star = {
+                    "h_deg": direction[0] * columns.scale,
+                    "v_deg": direction[1] * columns.scale,
+                }
+            if columns.magnitude is not None:
+                magnitude = number(values, columns.magnitude[slot])
+                if not math.isnan(magnitude):
+                    star["magnitude"] = magnitude
+            if columns.time_offset_s is not None:
+                star["time_offset_s"] = finite(values, columns.time_offset_s[slot])
+            if columns.sigma_arcsec is not None:
+                sigma = number(values, columns.sigma_arcsec[slot])
+                if not math.isnan(sigma):
+                    star["sigma_arcsec"] = sigma
+            slots.append(slot)
+            stars.append(star)
+        return slots, stars
+
+    def json_of(self, batch: StarBatch) -> bytes:
+        """A batch as canonical JSON; raises `PacketFault` naming the parameter of the first fault.
+
+        The checks are those of every batch.
+        """
+        try:
+            model = BatchIn.model_validate(batch.body)
+        except ValidationError as error:
+            fault = faults_of(error)[0]
+            name = self._parameter_of(batch, fault)
+            raise PacketFault(name, f"{fault.field}: {fault.message}", fault.value) from None
+        return checked_from_model(model).text.encode()
+
+    def _parameter_of(self, batch: StarBatch, fault: Fault) -> str:
+        """The parameter from which a field of a batch was made."""
+        head, *rest = fault.field.split(".")
+        mapped = self._mapped
+        whole_fields = {
+            "batch": (mapped.table.batch or "",),
+            "time": names_of(mapped.table.time),
+            "a_priori": mapped.quaternion,
+            "body_rates_deg_per_s": mapped.rates or mapped.gyro,
+            "velocity_km_per_s": mapped.velocity,
+            "position_km": mapped.position,
+        }
+        if head != "observations":
+            return ", ".join(whole_fields.get(head, ()))
+        if len(rest) < 3 or not (rest[0].isdigit() and rest[2].isdigit()):
+            return ", ".join(each.first for each in batch.columns)
+        columns = batch.columns[int(rest[0])]
+        slot = batch.slots[int(rest[0])][int(rest[2])]
+        word = rest[3] if len(rest) > 3 else ""
+        directions = tuple(each[slot] for each in columns.directions)
+        if word in ("h_deg", "v_deg"):
+            return directions[("h_deg", "v_deg").index(word)]
+        if word in ("magnitude", "time_offset_s", "sigma_arcsec"):
+            names: tuple[str, ...] = getattr(columns, word) or directions
+            return names[slot] if names is not directions else ", ".join(directions)
+        return ", ".join(directions)
+
+
+def _shift(stars: list[dict[str, Any]], later_s: float) -> None:
+    """Times of stars from a packet that is later than the batch's first."""
+    if later_s:
+        for star in stars:
+            star["time_offset_s"] = star.get("time_offset_s", 0.0) + later_s

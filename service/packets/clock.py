@@ -1,0 +1,124 @@
+"""Times of packets: CCSDS day segmented and unsegmented codes to UTC (CCSDS 301.0-B-4)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, date, datetime, timedelta
+from functools import lru_cache
+from typing import Any
+
+from service.errors import BadInput
+from service.missions.packets import CdsTime, CucTime, PacketTime
+from service.packets.definition import PacketFault
+from service.packets.values import whole
+from service.times import DAY_S, parse_utc
+
+NS = 1_000_000_000
+MS_NS, US_NS = 1_000_000, 1_000
+DAY_NS = DAY_S * NS
+GPS_LESS_TAI_S = -19
+_TAI_ZERO = datetime(2000, 1, 1, 12)
+"""The zero of `Utc.tai_ns`, on the clock of TAI."""
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """A time as text in UTC, and in nanoseconds as `Utc.tai_ns` counts them."""
+
+    text: str
+    tai_ns: int
+
+
+def moment_of(time: PacketTime, values: Mapping[str, Any]) -> Moment:
+    """The time in a packet's values; raises `PacketFault` naming the parameter."""
+    return _of_days(time, values) if isinstance(time, CdsTime) else _of_seconds(time, values)
+
+
+def names_of(time: PacketTime) -> tuple[str, ...]:
+    """The parameters that a time is read from."""
+    if isinstance(time, CdsTime):
+        return tuple(filter(None, (time.day, time.millisecond, time.microsecond)))
+    return tuple(filter(None, (time.coarse, time.fine)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Day:
+    """A day of UTC: its date, the moment of its beginning, and its length."""
+
+    text: str
+    tai_ns: int
+    length_ns: int
+
+
+@lru_cache(maxsize=64)
+def _day(ordinal: int) -> _Day:
+    """A day by its ordinal; raises `BadInput` and `ValueError` for one that UTC does not have."""
+    text = date.fromordinal(ordinal).isoformat()
+    following = date.fromordinal(ordinal + 1).isoformat()
+    start_ns = parse_utc(f"{text}T00:00:00Z").tai_ns
+    return _Day(text, start_ns, parse_utc(f"{following}T00:00:00Z").tai_ns - start_ns)
+
+
+def _checked_day(ordinal: int, parameter: str, value: object) -> _Day:
+    try:
+        return _day(ordinal)
+    except (BadInput, ValueError, OverflowError):
+        raise PacketFault(parameter, "the day is not in 1972 to 2098", value) from None
+
+
+def _of_days(time: CdsTime, values: Mapping[str, Any]) -> Moment:
+    number = whole(values, time.day)
+    day = _checked_day(time.epoch.toordinal() + number, time.day, number)
+    milliseconds = whole(values, time.millisecond)
+    passed_ns = milliseconds * MS_NS
+    if not 0 <= passed_ns < day.length_ns:
+        message = f"there is no such millisecond of {day.text}"
+        raise PacketFault(time.millisecond, message, milliseconds)
+    if time.microsecond is not None:
+        microseconds = whole(values, time.microsecond)
+        if not 0 <= microseconds < 1000:
+            message = "must be microseconds of a millisecond, 0 to 999"
+            raise PacketFault(time.microsecond, message, microseconds)
+        passed_ns += microseconds * US_NS
+    return Moment(_text(day, passed_ns), day.tai_ns + passed_ns)
+
+
+def _of_seconds(time: CucTime, values: Mapping[str, Any]) -> Moment:
+    seconds = whole(values, time.coarse)
+    fraction_ns = 0
+    if time.fine is not None:
+        fine = whole(values, time.fine)
+        if not 0 <= fine < 1 << time.fine_bits:
+            raise PacketFault(time.fine, f"has more than {time.fine_bits} bits", fine)
+        fraction_ns = (fine * NS) >> time.fine_bits
+    if time.scale == "utc":
+        days, rest_s = divmod(seconds + _seconds_of_day(time.epoch), DAY_S)
+        day = _checked_day(time.epoch.toordinal() + days, time.coarse, seconds)
+        passed_ns = rest_s * NS + fraction_ns
+        return Moment(_text(day, passed_ns), day.tai_ns + passed_ns)
+    epoch_s = (time.epoch - _TAI_ZERO) // timedelta(seconds=1)
+    if time.scale == "gps":
+        epoch_s -= GPS_LESS_TAI_S
+    tai_ns = (epoch_s + seconds) * NS + fraction_ns
+    # TAI is ahead of UTC by less than a minute: it is this day or the one before.
+    ordinal = _TAI_ZERO.toordinal() + (tai_ns + DAY_NS // 2) // DAY_NS
+    day = _checked_day(ordinal, time.coarse, seconds)
+    if tai_ns < day.tai_ns:
+        day = _checked_day(ordinal - 1, time.coarse, seconds)
+    return Moment(_text(day, tai_ns - day.tai_ns), tai_ns)
+
+
+def _seconds_of_day(moment: datetime) -> int:
+    start = moment.replace(hour=0, minute=0, second=0, tzinfo=UTC)
+    return int((moment.replace(tzinfo=UTC) - start).total_seconds())
+
+
+def _text(day: _Day, passed_ns: int) -> str:
+    """UTC as `Utc.text` writes it; what is beyond 24 hours is in the leap second."""
+    seconds, nanoseconds = divmod(passed_ns, NS)
+    if seconds >= DAY_S:
+        hour, minute, second = 23, 59, seconds - DAY_S + 60
+    else:
+        hour, rest = divmod(seconds, 3600)
+        minute, second = divmod(rest, 60)
+    decimals = f"{nanoseconds:09d}".rstrip("0").ljust(3, "0") if nanoseconds else "000"
+    return f"{day.text}T{hour:02d}:{minute:02d}:{second:02d}.{decimals}Z"

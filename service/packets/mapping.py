@@ -1,0 +1,148 @@
+"""A mission's table `[packets]` against an XTCE file: the parameters of every field of a batch."""
+
+import difflib
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from service.errors import BadInput, Fault, shown_value
+from service.missions.mission import Mission
+from service.missions.packets import Packets, PacketTracker, element_names
+from service.packets.clock import names_of
+from service.packets.definition import PacketDefinition
+
+DEG_OF_UNIT = {"deg": 1.0, "arcmin": 1.0 / 60.0, "arcsec": 1.0 / 3600.0, "rad": 180.0 / math.pi}
+
+
+@dataclass(frozen=True)
+class TrackerColumns:
+    """The parameters of one tracker's stars, a name for each slot; None: there are none."""
+
+    tracker: str
+    slots: int
+    directions: tuple[tuple[str, ...], ...]
+    """Two columns, h and v, or three, the components of vectors."""
+    scale: float
+    """Degrees of one unit of h and v."""
+    magnitude: tuple[str, ...] | None
+    time_offset_s: tuple[str, ...] | None
+    sigma_arcsec: tuple[str, ...] | None
+    valid: tuple[str, ...] | None
+    count: str | None
+
+    @property
+    def first(self) -> str:
+        """The parameter that tells whether a packet holds this tracker."""
+        return self.directions[0][0]
+
+
+@dataclass(frozen=True)
+class PacketMap:
+    """The parameters of a batch: a table with every array and pattern written out."""
+
+    table: Packets
+    trackers: tuple[TrackerColumns, ...]
+    quaternion: tuple[str, ...]
+    rates: tuple[str, ...]
+    gyro: tuple[str, ...]
+    velocity: tuple[str, ...]
+    position: tuple[str, ...]
+
+
+def packet_map(table: Packets, definition: PacketDefinition) -> PacketMap:
+    """The map of a mission's table; raises `BadInput` naming each parameter that is missing.
+
+    The message names the key of the table and the XTCE file.
+    """
+    prior = table.prior
+    found = PacketMap(
+        table=table,
+        trackers=tuple(_columns(each) for each in table.trackers),
+        quaternion=_triple(prior.quaternion, 4) if prior and prior.quaternion else (),
+        rates=_triple(table.rates.components, 3) if table.rates else (),
+        gyro=_triple(table.gyro.counts, 3) if table.gyro else (),
+        velocity=_triple(table.velocity.components, 3) if table.velocity else (),
+        position=_triple(table.position.components, 3) if table.position else (),
+    )
+    faults = [
+        Fault(f"packets.{key}", _missing(name, definition), shown_value(name))
+        for key, names in _keys(found)
+        for name in names
+        if name not in definition.parameters
+    ]
+    if faults:
+        raise BadInput(faults[:20])
+    return found
+
+
+def packet_mission(missions: Mapping[str, Mission], name: str | None) -> Mission:
+    """The mission whose packets are read: the one named, or the only one with a table.
+
+    Raises `BadInput` naming `spacecraft` where there is none, or several.
+    """
+    able = [each for each in missions.values() if each.packets is not None]
+    known = ", ".join(each.name for each in able) or "none"
+    if name is not None:
+        found = [each for each in able if each.name == name]
+        if not found:
+            message = f"must be a mission with a table [packets]; there is {known}"
+            raise BadInput(Fault("spacecraft", message, shown_value(name)))
+        return found[0]
+    if len(able) != 1:
+        why = "is missing: " + ("no mission has" if not able else "several missions have")
+        raise BadInput(Fault("spacecraft", f"{why} a table [packets]; there is {known}"))
+    return able[0]
+
+
+def _triple(names: str | tuple[str, ...], count: int) -> tuple[str, ...]:
+    return element_names(names, count)
+
+
+def _columns(table: PacketTracker) -> TrackerColumns:
+    def column(names: str | tuple[str, ...] | None) -> tuple[str, ...] | None:
+        return None if names is None else element_names(names, table.slots, table.first_slot)
+
+    directions = table.vector if table.vector is not None else (table.h, table.v)
+    return TrackerColumns(
+        tracker=table.tracker,
+        slots=table.slots,
+        directions=tuple(
+            element_names(names, table.slots, table.first_slot)
+            for names in directions
+            if names is not None
+        ),
+        scale=DEG_OF_UNIT[table.angle_unit],
+        magnitude=column(table.magnitude),
+        time_offset_s=column(table.time_offset_s),
+        sigma_arcsec=column(table.sigma_arcsec),
+        valid=column(table.valid),
+        count=table.count,
+    )
+
+
+def _keys(found: PacketMap) -> Iterable[tuple[str, Iterable[str]]]:
+    """Every key of the table with its parameters."""
+    table = found.table
+    yield "time", names_of(table.time)
+    yield "batch", (table.batch,) if table.batch else ()
+    for index, each in enumerate(found.trackers):
+        at = f"trackers.{index}"
+        words = ("h", "v") if len(each.directions) == 2 else ("vector.0", "vector.1", "vector.2")
+        for word, names in zip(words, each.directions, strict=True):
+            yield f"{at}.{word}", names
+        for word in ("magnitude", "time_offset_s", "sigma_arcsec", "valid"):
+            yield f"{at}.{word}", getattr(each, word) or ()
+        yield f"{at}.count", (each.count,) if each.count else ()
+    if table.prior is not None and table.prior.time is not None:
+        yield "prior.time", names_of(table.prior.time)
+    yield "prior.quaternion", found.quaternion
+    yield "rates.components", found.rates
+    yield "gyro.counts", found.gyro
+    yield "velocity.components", found.velocity
+    yield "position.components", found.position
+
+
+def _missing(name: str, definition: PacketDefinition) -> str:
+    message = f"{definition.name} has no such parameter in a container"
+    near = difflib.get_close_matches(name, list(definition.parameters)[:5000], 3)
+    return f"{message}; near to it: {', '.join(near)}" if near else message

@@ -1,0 +1,158 @@
+"""Files of space packets as lines of telemetry, one batch each, with counts of the packets."""
+
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import IO
+
+from msgspec import Struct
+
+from service.errors import BadFile, BadInput, Fault
+from service.missions.mission import Mission
+from service.observations.readers.lines import Line
+from service.packets.batches import BatchMaker, StarBatch
+from service.packets.carried import PacketAttitude
+from service.packets.definition import PacketDefinition, PacketFault, UnknownPacket
+from service.packets.mapping import packet_map
+from service.packets.stream import (
+    IDLE_APID,
+    ApidCounts,
+    EndOfPackets,
+    SequenceCounter,
+    SpacePacket,
+    packets_in,
+)
+
+
+class PacketTotals(Struct, kw_only=True):
+    """What was in the packets that were read."""
+
+    packets: int = 0
+    bytes: int = 0
+    batches: int = 0
+    without_stars: int = 0
+    """Packets of a tracker that held no star."""
+    unknown: int = 0
+    """Packets that the XTCE file does not describe."""
+    not_asked: int = 0
+    """Packets of APIDs that the mission's table leaves out."""
+    idle: int = 0
+    gaps: int = 0
+    missing: int = 0
+    backward: int = 0
+    refused: int = 0
+    apids: list[ApidCounts] = []
+
+
+class PacketReader:
+    """Reads packets of one spacecraft; what later packets need is kept between files."""
+
+    def __init__(self, mission: Mission, definition: PacketDefinition) -> None:
+        """Raises `BadInput` naming each parameter of the mission's table that XTCE lacks."""
+        if mission.packets is None:
+            raise BadInput(Fault("packets", f"the mission file of {mission.name} has no [packets]"))
+        self._table = mission.packets
+        self._definition = definition
+        self._maker = BatchMaker(mission.name, packet_map(mission.packets, definition))
+        self._asked = frozenset(mission.packets.apids)
+        self._sequence = SequenceCounter()
+        self._totals = PacketTotals()
+
+    def totals(self) -> PacketTotals:
+        """The counts so far, with those of each APID in order."""
+        totals, apids = self._totals, sorted(self._sequence.apids.items())
+        totals.apids = [counts for _, counts in apids]
+        totals.gaps = sum(each.gaps for each in totals.apids)
+        totals.missing = sum(each.missing for each in totals.apids)
+        totals.backward = sum(each.backward for each in totals.apids)
+        return totals
+
+    def lines(self, stream: IO[bytes], name: str) -> Iterator[Line]:
+        """The batches of a file, and a fault in place of each packet that cannot be read.
+
+        A line has the number of its packet in the file.  A fault names the file, the packet, its
+        first byte and the parameter.  After the end of a file that is damaged nothing follows.
+        """
+        try:
+            for packet in packets_in(stream, self._table.prefix_bytes):
+                try:
+                    yield from self._read(packet, name)
+                except PacketFault as fault:
+                    yield self._refused(packet, fault, name)
+        except EndOfPackets as fault:
+            self._totals.refused += 1
+            yield Line(fault.number, None, _fault_at(fault.number, fault.offset, fault, name))
+        yield from self._lines_of(self._maker.end(), name)
+
+    def attitudes(self, stream: IO[bytes]) -> Iterator[PacketAttitude]:
+        """The a priori attitudes in a file; raises `BadFile` at the first damaged packet."""
+        number, offset = 1, 0
+        try:
+            for packet in packets_in(stream, self._table.prefix_bytes):
+                number, offset = packet.number, packet.offset
+                with suppress(UnknownPacket):
+                    found = self._maker.attitude(self._definition.read(packet.content))
+                    if found is not None:
+                        yield found
+        except EndOfPackets as fault:
+            raise BadFile(_fault_at(fault.number, fault.offset, fault, "packets")) from None
+        except PacketFault as fault:
+            raise BadFile(_fault_at(number, offset, fault, "packets")) from None
+
+    def _read(self, packet: SpacePacket, name: str) -> Iterator[Line]:
+        """The lines that are complete with a packet; raises `PacketFault`."""
+        totals = self._totals
+        totals.packets += 1
+        totals.bytes += len(packet.content)
+        counts = self._sequence.add(packet)
+        if packet.apid == IDLE_APID:
+            totals.idle += 1
+            return
+        if self._asked and packet.apid not in self._asked:
+            totals.not_asked += 1
+            return
+        try:
+            values = self._definition.read(packet.content)
+        except UnknownPacket:
+            counts.described = False
+            totals.unknown += 1
+            return
+        yield from self._lines_of(self._maker.add(packet, values), name)
+
+    def _lines_of(self, batches: Iterable[StarBatch], name: str) -> Iterator[Line]:
+        for batch in batches:
+            if batch.has_stars():
+                yield self._line(batch, name)
+            else:
+                self._totals.without_stars += 1
+
+    def _line(self, batch: StarBatch, name: str) -> Line:
+        try:
+            body = self._maker.json_of(batch)
+        except PacketFault as fault:
+            return self._refused(batch.packet, fault, name)
+        self._totals.batches += 1
+        return Line(batch.packet.number, body)
+
+    def _refused(self, packet: SpacePacket, fault: PacketFault, name: str) -> Line:
+        self._totals.refused += 1
+        self._sequence.apids[packet.apid].refused += 1
+        return Line(packet.number, None, _fault_at(packet.number, packet.offset, fault, name))
+
+
+def file_lines(reader: PacketReader, files: Iterable[Path]) -> Iterator[tuple[Path, Line]]:
+    """The lines of files on disk; raises `BadFile` for one that cannot be opened."""
+    for file in files:
+        try:
+            stream = file.open("rb")
+        except OSError as error:
+            raise BadFile(Fault(str(file), f"cannot be opened: {error.strerror}")) from None
+        with stream:
+            for line in reader.lines(stream, file.name):
+                yield file, line
+
+
+def _fault_at(number: int, offset: int, fault: PacketFault, name: str) -> Fault:
+    place = f"{name}, packet {number} at byte {offset}"
+    parameter = f": {fault.parameter}" if fault.parameter else ""
+    return Fault(place + parameter, fault.message, fault.value)

@@ -1,0 +1,126 @@
+"""Space packets in a file, one after another, and the sequence counts of each APID.
+
+Source of the primary header: CCSDS 133.0-B-2, section 4.1.3.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import IO
+
+from msgspec import Struct
+
+from service.packets.definition import PacketFault
+
+HEADER_BYTES = 6
+IDLE_APID = 2047
+SEQUENCE_COUNTS = 1 << 14
+
+
+@dataclass(frozen=True, slots=True)
+class SpacePacket:
+    """One packet with its header; `number` counts the packets of a file from 1."""
+
+    number: int
+    offset: int
+    """Of the packet's first byte in the file."""
+    content: bytes
+
+    @property
+    def apid(self) -> int:
+        """The application process identifier."""
+        return ((self.content[0] & 0x07) << 8) | self.content[1]
+
+    @property
+    def sequence_count(self) -> int:
+        """The 14 bits that count the packets of an APID."""
+        return ((self.content[2] & 0x3F) << 8) | self.content[3]
+
+
+class EndOfPackets(PacketFault):
+    """Nothing more of a file can be read; `number` and `offset` are those of the packet."""
+
+    def __init__(self, number: int, offset: int, message: str, value: object = None) -> None:
+        super().__init__("", message, value)
+        self.number = number
+        self.offset = offset
+
+
+def packets_in(stream: IO[bytes], prefix_bytes: int = 0) -> Iterator[SpacePacket]:
+    """The packets of a stream, each preceded by `prefix_bytes` bytes that are skipped.
+
+    Holds one packet at a time, at most 64 KiB.  Raises `EndOfPackets` where the stream ends
+    within a packet, and where a header is none of a space packet: after a wrong length the
+    next packet is not found.
+    """
+    offset, number = 0, 0
+    while True:
+        start = stream.read(prefix_bytes + HEADER_BYTES)
+        if not start:
+            return
+        number += 1
+        header = start[prefix_bytes:]
+        offset += prefix_bytes
+        if len(header) < HEADER_BYTES:
+            message = f"the file ends after {len(start)} bytes, within the header of a packet"
+            raise EndOfPackets(number, offset, message)
+        if header[0] >> 5:
+            message = (
+                "the version number of a space packet must be 0; this is no packet, or the "
+                "length of the packet before is wrong"
+            )
+            raise EndOfPackets(number, offset, message, header[0] >> 5)
+        length = (header[4] << 8 | header[5]) + 1
+        data = stream.read(length)
+        if len(data) < length:
+            message = (
+                f"the file ends after {HEADER_BYTES + len(data)} of the "
+                f"{HEADER_BYTES + length} bytes of the packet"
+            )
+            raise EndOfPackets(number, offset, message)
+        yield SpacePacket(number, offset, header + data)
+        offset += HEADER_BYTES + length
+
+
+class ApidCounts(Struct, kw_only=True):
+    """The packets of one APID."""
+
+    apid: int
+    packets: int = 0
+    described: bool = True
+    """Whether the XTCE file describes them."""
+    gaps: int = 0
+    """Places where the sequence count skips packets."""
+    missing: int = 0
+    """Packets that are missing in these places."""
+    backward: int = 0
+    """Places where the count repeats or goes back: a reset, or packets out of order."""
+    refused: int = 0
+
+
+class SequenceCounter:
+    """Counts the packets of each APID, and finds the gaps in their sequence counts."""
+
+    def __init__(self) -> None:
+        self.apids: dict[int, ApidCounts] = {}
+        self._last: dict[int, int] = {}
+
+    def add(self, packet: SpacePacket) -> ApidCounts:
+        """Count a packet; returns the counts of its APID.  Idle packets have no sequence."""
+        apid = packet.apid
+        counts = self.apids.get(apid)
+        if counts is None:
+            counts = self.apids[apid] = ApidCounts(apid=apid)
+        counts.packets += 1
+        if apid == IDLE_APID:
+            return counts
+        count, last = packet.sequence_count, self._last.get(apid)
+        self._last[apid] = count
+        if last is not None:
+            skipped = (count - last - 1) % SEQUENCE_COUNTS
+            # More than half of all counts is read as a step backward.
+            if skipped >= SEQUENCE_COUNTS // 2:
+                counts.backward += 1
+            elif skipped:
+                counts.gaps += 1
+                counts.missing += skipped
+        return counts
