@@ -4,6 +4,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TypedDict, Unpack
 
@@ -19,6 +20,7 @@ from service.ingest.local_workers import WorkerConfig
 from service.ingest.replays import RunningReplay
 from service.ingest.spool import Spool, SpooledReplay
 from service.observations.readers.decompress import Coding, unpacked_lines
+from service.packets.upload import PacketLines
 from service.storage.models.runs import Replay, ReplayCounts, ReplayLines
 from service.storage.queries.replays import (
     find_replay,
@@ -54,6 +56,19 @@ class ReplayOptions(TypedDict, total=False):
     """The token that starts the replay; see `cancel`."""
     entry: Entry | None
     """The entry of the audit list that is stored with it."""
+
+
+@dataclass(frozen=True)
+class UploadForm:
+    """How an upload is written."""
+
+    coding: Coding
+    longest_bytes: int
+    """A line is cut there."""
+    is_packets: bool = False
+    """An archive of space packets and their XTCE file, in place of lines."""
+    spacecraft: str | None = None
+    """Of packets: the mission; None: the only one that reads packets."""
 
 
 class Replays:
@@ -97,29 +112,36 @@ class Replays:
     def start_upload(
         self,
         file: IO[bytes],
-        coding: Coding,
+        form: UploadForm,
         run: str,
-        longest_bytes: int,
         caller: Caller,
         **options: Unpack[ReplayOptions],
     ) -> str:
         """`start` with the lines of an upload, which is stored until the replay is over.
 
-        A line is cut at `longest_bytes`.
+        Raises `BadInput` for packets that the mission's table and the XTCE file do not fit.
         """
         bound = None if caller.spacecraft is None else sorted(caller.spacecraft)
         options |= {"check": caller.require, "owner": caller.token_id}
         with ExitStack() as on_failure:
             on_failure.callback(discard_upload, file)
+            packets = self._packet_lines(file, form)
             replay = self._new(run, options, drop=self._spool.drop)
             on_failure.callback(replay.release_slot)
             about = SpooledReplay(
-                replay.id, coding, longest_bytes, caller.token_id, caller.name, bound
+                replay.id,
+                form.coding,
+                form.longest_bytes,
+                caller.token_id,
+                caller.name,
+                bound,
+                packets.spacecraft if packets else None,
             )
             on_failure.callback(self._spool.drop, replay.id)
             self._spool.keep(file, about)
             file.seek(0)
-            replay.start(_lines_of(file, about, replay), _stored_with(run, options))
+            lines = packets or _lines_of(file, about, replay)
+            replay.start(lines, _stored_with(run, options))
             on_failure.pop_all()
         return replay.id
 
@@ -144,7 +166,16 @@ class Replays:
         file = self._spool.open(about.id)
         replay = self._new(stored.run, options, stored, self._spool.drop)
         log.info("replay %s continues after line %d", about.id, stored.lines.done)
-        replay.resume(_lines_of(file, about, replay))
+        form = UploadForm(
+            about.coding, about.longest_bytes, about.packets is not None, about.packets
+        )
+        replay.resume(self._packet_lines(file, form) or _lines_of(file, about, replay))
+
+    def _packet_lines(self, file: IO[bytes], form: UploadForm) -> PacketLines | None:
+        """The batches of packets; None for an upload of lines."""
+        if not form.is_packets:
+            return None
+        return PacketLines(file, self._context.missions, form.spacecraft)
 
     def _new(
         self,
@@ -244,6 +275,7 @@ def _new_state(run: str, options: ReplayOptions) -> Replay:
         state="running",
         lines=ReplayLines(total=options.get("total"), done=0, refused=0),
         counts=ReplayCounts(**dict.fromkeys(ReplayCounts.__struct_fields__, 0)),
+        packets=None,
         errors=[],
         started=utc_now().text,
         finished=None,

@@ -12,6 +12,7 @@ from msgspec import UNSET, structs
 from sqlalchemy import Connection
 
 from service.errors import AcquisitionError, Stopping, problem_of
+from service.packets.reader import PacketTotals
 from service.storage.models.problems import FieldFault
 from service.storage.models.runs import (
     LineProblem,
@@ -19,6 +20,7 @@ from service.storage.models.runs import (
     Replay,
     ReplayCounts,
     ReplayLines,
+    ReplayPackets,
     ReplayProgress,
     ReplayStateName,
 )
@@ -36,6 +38,8 @@ MAX_ERRORS_KEPT = 1_000
 MAX_FAULTS_KEPT = 3
 """Of one line: all are stored again with every chunk that adds some, and read as a whole."""
 MAX_TEXT_KEPT = 300
+MAX_APIDS_KEPT = 100
+"""Those with the most packets; the sums are of all."""
 SAVE_EVERY_S = 0.2
 """Between two stored states: each is a transaction, and an event for all who listen."""
 SAVE_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
@@ -74,6 +78,8 @@ class ProgressRecorder:
         self._refused = replay.lines.refused
         self._errors = list(replay.errors)
         self._errors_changed = False
+        self.packets: Callable[[], PacketTotals | None] = lambda: None
+        """The counts of the packets that the lines are made of."""
         self._saving: Future[None] | None = None
         self._is_saved = True
         self._saved_s = 0.0
@@ -91,7 +97,7 @@ class ProgressRecorder:
     def insert(self, also: Callable[[Connection], object]) -> None:
         """Store the replay as new; `also` is called in the same transaction."""
         progress = self._progress("running", None)
-        replay = Replay(**structs.asdict(progress), errors=[])
+        replay = Replay(**structs.asdict(progress), packets=self._packet_counts(), errors=[])
 
         def store(connection: Connection) -> None:
             insert_replay(connection, replay)
@@ -127,6 +133,7 @@ class ProgressRecorder:
         """
         progress = self._progress(state, finished)
         errors = list(self._errors) if self._errors_changed else None
+        packets = self._packet_counts()
 
         def store(connection: Connection) -> None:
             stored = progress
@@ -134,7 +141,7 @@ class ProgressRecorder:
                 self._on_cancelled()
                 ended = finished or self._now()
                 stored = structs.replace(progress, state=CANCELLED, finished=ended)
-            update_replay(connection, stored, errors)
+            update_replay(connection, stored, packets, errors)
             events.add_event(connection, "replay", stored, run=self.run)
 
         self.require_saved()
@@ -178,6 +185,14 @@ class ProgressRecorder:
             ),
             finished=finished,
         )
+
+    def _packet_counts(self) -> ReplayPackets | None:
+        totals = self.packets()
+        if totals is None:
+            return None
+        most = sorted(totals.apids, key=lambda each: -each.packets)[:MAX_APIDS_KEPT]
+        kept = structs.replace(totals, apids=sorted(most, key=lambda each: each.apid))
+        return msgspec.convert(msgspec.to_builtins(kept), ReplayPackets)
 
     def _not_saved(self, error: Exception) -> None:
         # The next save has the same and more; the batches themselves are recorded.

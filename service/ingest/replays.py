@@ -15,6 +15,8 @@ from service.ingest.bulk import Bulk, BulkChunk, Check
 from service.ingest.replay_lines import LineGroup, line_groups
 from service.ingest.replay_progress import ProgressRecorder
 from service.ingest.submit import Answers
+from service.observations.readers.lines import Line
+from service.packets.upload import PacketLines
 from service.storage.models.runs import Replay, ReplayStateName
 from service.storage.queries.replays import CANCELLED
 from service.storage.sql.database import Store
@@ -25,6 +27,8 @@ STOP_WITHIN_S = 0.2
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
+ReplaySource = Iterable[bytes | Line]
+"""Lines of telemetry, or of `PacketLines`, which count the packets that they are made of."""
 
 
 @dataclass
@@ -73,7 +77,7 @@ class RunningReplay:
         """The id of the replay."""
         return self._progress.id
 
-    def start(self, lines: Iterable[bytes], also: Callable[[Connection], object]) -> None:
+    def start(self, lines: ReplaySource, also: Callable[[Connection], object]) -> None:
         """Store the replay as new and begin in a thread; `lines` are closed at the end.
 
         `also` is called in the transaction that stores it.
@@ -89,13 +93,15 @@ class RunningReplay:
         """Count as over: the replay could not be started."""
         self._over.set()
 
-    def resume(self, lines: Iterable[bytes]) -> None:
+    def resume(self, lines: ReplaySource) -> None:
         """Go on after the last line that an earlier process stored as done."""
         self._progress.save("running")
         self._progress.require_saved()
         self._start_thread(lines)
 
-    def _start_thread(self, lines: Iterable[bytes]) -> None:
+    def _start_thread(self, lines: ReplaySource) -> None:
+        if isinstance(lines, PacketLines):
+            self._progress.packets = lines.totals
         threading.Thread(target=self._work, args=(lines,), name=f"replay-{self.id}").start()
 
     @property
@@ -128,7 +134,7 @@ class RunningReplay:
             )
             raise BadBatch(Fault("body", message))
 
-    def _work(self, lines: Iterable[bytes]) -> None:
+    def _work(self, lines: ReplaySource) -> None:
         state: ReplayStateName = "failed"
         try:
             state = self._process(lines)
@@ -152,7 +158,7 @@ class RunningReplay:
             finally:
                 self._over.set()
 
-    def _process(self, lines: Iterable[bytes]) -> ReplayStateName:
+    def _process(self, lines: ReplaySource) -> ReplayStateName:
         """The state in the end; while a chunk is written, those after it are computed."""
         groups = line_groups(lines, self._skipped, lambda: self._bulk.lines, self.require_going_on)
         try:
@@ -196,6 +202,8 @@ class RunningReplay:
             raise
         except Busy:
             answers = self._compute_again(pending.lines.texts)
+        for number, fault in pending.lines.faults:
+            self._progress.refuse(number, BadBatch(fault))
         for number, answer in zip(pending.lines.numbers, answers, strict=True):
             if isinstance(answer, AcquisitionError):
                 self._progress.refuse(number, answer)

@@ -1,5 +1,7 @@
 """Replay through a running service as one upload, and poll its progress.
 
+Lines of telemetry are sent as NDJSON, files of space packets with their XTCE file as an archive.
+
 Suited to files of any length: no single answer is waited for.  Repeating a replay
 adds nothing, as with single posts.
 """
@@ -23,11 +25,13 @@ from service.errors import (
     problem_of_faults,
 )
 from service.observations.readers.telemetry import read_lines
+from service.packets.upload import MEDIA_TYPE, archive_of
 from service.replay.items import Item, LineOutcome, Problem, Report
 from service.replay.over_http import GIVE_UP_AFTER_S, checked_url, shown_error
 
 ROUTE = "/api/v1/replays"
 NDJSON = {"Content-Type": "application/x-ndjson"}
+ARCHIVE = {"Content-Type": MEDIA_TYPE}
 TIMEOUT = httpx.Timeout(120.0, connect=5.0)
 PAUSE_S = 0.25
 CANCEL_S = 10.0
@@ -40,6 +44,8 @@ ReplayState = dict[str, Any]
 
 class _SentLines:
     """The lines of files as they are sent, with the place of each."""
+
+    headers = NDJSON
 
     def __init__(self, files: Sequence[Path], report: Report) -> None:
         self._files = files
@@ -66,6 +72,22 @@ class _SentLines:
         return Item(self._files[which], self._places[index], None)
 
 
+class _SentPackets:
+    """Files of packets and their XTCE file as they are sent."""
+
+    headers = ARCHIVE
+
+    def __init__(self, files: Sequence[Path], xtce: Path) -> None:
+        self._files, self._xtce = files, xtce
+
+    def __iter__(self) -> Iterator[bytes]:
+        return archive_of([self._xtce, *self._files])
+
+    def item(self, number: int) -> Item:
+        """A packet by its number; of several files the problem names the one."""
+        return Item(self._files[0], number, None)
+
+
 def replay_in_bulk(
     url: str,
     files: Sequence[Path],
@@ -75,8 +97,11 @@ def replay_in_bulk(
     *,
     token: str | None = None,
     query: dict[str, str] | None = None,
+    xtce: Path | None = None,
 ) -> None:
     """Send files as one replay and follow it to its end.
+
+    With `xtce` they are files of space packets that this file describes.
 
     `progress` receives the state of the replay repeatedly and at the end;
     `report` receives every refused line, those beyond the first thousand without
@@ -85,7 +110,7 @@ def replay_in_bulk(
     does not answer or stopped early.  Interrupted, it has the service
     cancel the replay.
     """
-    lines = _SentLines(files, report)
+    lines = _SentLines(files, report) if xtce is None else _SentPackets(files, xtce)
     headers = {} if token is None else {"Authorization": f"Bearer {token}"}
     with httpx.Client(
         base_url=checked_url(url), timeout=TIMEOUT, trust_env=False, headers=headers
@@ -108,9 +133,11 @@ def replay_in_bulk(
         )
 
 
-def _begin(client: httpx.Client, url: str, query: dict[str, str], lines: _SentLines) -> str:
+def _begin(
+    client: httpx.Client, url: str, query: dict[str, str], lines: _SentLines | _SentPackets
+) -> str:
     try:
-        response = client.post(ROUTE, params=query, content=iter(lines), headers=NDJSON)
+        response = client.post(ROUTE, params=query, content=iter(lines), headers=lines.headers)
     except httpx.TransportError as error:
         raise Busy(
             f"no service answers at {url} ({shown_error(error)}); "

@@ -8,8 +8,10 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from service.errors import BadInput, Fault, problem_of, problem_of_faults, shown_value
+from service.observations.readers.lines import Line
 from service.observations.readers.telemetry import read_lines
 from service.observations.schema import RunName, Submission, submission_from_json
+from service.packets.reader import PacketReader, file_lines
 from service.times import Utc
 
 Problem = dict[str, Any]
@@ -45,14 +47,23 @@ def items_of(files: Sequence[Path], run: str) -> Iterator[Item]:
     """Every line of the files, in order, checked as a batch of that run."""
     for file in files:
         for line in read_lines(file):
-            if line.body is None:
-                assert line.fault is not None
-                yield Item(file, line.number, None, problem_of_faults([line.fault]))
-                continue
-            try:
-                yield Item(file, line.number, submission_from_json(line.body, run))
-            except BadInput as error:
-                yield Item(file, line.number, None, problem_of(error))
+            yield _item(file, line, run)
+
+
+def packet_items(reader: PacketReader, files: Sequence[Path], run: str) -> Iterator[Item]:
+    """Every batch that files of space packets hold, as `items_of` gives those of telemetry."""
+    for file, line in file_lines(reader, files):
+        yield _item(file, line, run)
+
+
+def _item(file: Path, line: Line, run: str) -> Item:
+    if line.body is None:
+        assert line.fault is not None
+        return Item(file, line.number, None, problem_of_faults([line.fault]))
+    try:
+        return Item(file, line.number, submission_from_json(line.body, run))
+    except BadInput as error:
+        return Item(file, line.number, None, problem_of(error))
 
 
 def run_name(files: Sequence[Path], run: str | None) -> str:

@@ -39,6 +39,8 @@ class ReplaySummary:
         self.new = self.replayed = self.refused = self.attitudes = 0
         self.stars: Counter[str] = Counter()
         self.seconds = 0.0
+        self.packets: dict[str, Any] | None = None
+        """The counts of space packets, as a replay of the service reports them."""
         self._path = results
         self._results: IO[bytes] | None = None
         if results is not None:
@@ -77,6 +79,7 @@ class ReplaySummary:
         counts, lines = state["counts"], state["lines"]
         self.new, self.replayed = counts["new"], counts["repeated"]
         self.attitudes = counts["attitudes"]
+        self.packets = state["packets"]
         self.stars = Counter({each: counts[each] for each in STARS})
         self._bar.update(lines["done"] - self._bar.n)
         if state["state"] != "running":
@@ -133,6 +136,7 @@ class ReplaySummary:
             "stars": {word: self.stars[word] for word in STARS},
             "attitudes": self.attitudes,
             "batches_per_s": self.batches / max(self.seconds, 1e-9),
+            **({} if self.packets is None else {"packets": self.packets}),
         }
 
     def table(self) -> str:
@@ -146,8 +150,29 @@ class ReplaySummary:
             for word in ("unique", "ambiguous", "unmatched")
         ]
         rows += [("attitudes", str(self.attitudes))]
+        rows += _packet_rows(self.packets)
         rows += [("speed", f"{self.batches / max(self.seconds, 1e-9):.0f} batches/s")]
         return "\n".join(f"{name:<20}{value}" for name, value in rows)
+
+
+def _packet_rows(packets: dict[str, Any] | None) -> list[tuple[str, str]]:
+    if packets is None:
+        return []
+    words = {
+        "unknown": "unknown",
+        "not_asked": "other APIDs",
+        "idle": "idle",
+        "without_stars": "without stars",
+        "refused": "unreadable",
+    }
+    rows = [("packets", str(packets["packets"]))]
+    rows += [(f"  {name}", str(packets[word])) for word, name in words.items()]
+    gaps = f"{packets['gaps']}  ({packets['missing']} packets missing)"
+    rows += [("  sequence gaps", gaps), ("  steps backward", str(packets["backward"]))]
+    unknown = [str(each["apid"]) for each in packets["apids"] if not each["described"]]
+    if unknown:
+        rows += [("  unknown APIDs", ", ".join(unknown[:20]))]
+    return rows
 
 
 def _share(part: int, whole: int) -> str:

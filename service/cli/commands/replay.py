@@ -1,8 +1,8 @@
 """`acquire replay`: send files of batches through the service."""
 
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from service.cli.arguments import (
     LOCAL,
@@ -14,7 +14,10 @@ from service.cli.arguments import (
     speed,
 )
 from service.cli.configuration import settings_of
-from service.errors import BadInput, Fault, shown_value
+from service.errors import BadFile, BadInput, Fault, shown_value
+
+if TYPE_CHECKING:
+    from service.packets.reader import PacketReader
 
 DEFAULT_CONCURRENCY = 4
 CSV_HELP = """\
@@ -43,13 +46,15 @@ def add(commands: Any) -> None:
         acquire replay pass.ndjson --speed 60          one minute of telemetry per second
         acquire replay pass.ndjson --carry-attitude    use each attitude as the next a priori
         acquire replay pass.ndjson --a-priori xte.aem  use the attitudes of a file as a priori
+        acquire replay --packets pass.dat --xtce mission.xml     CCSDS space packets
         """,
         run,
         CSV_HELP,
     )
     parser.add_argument(
-        "files", nargs="+", type=Path, metavar="FILE", help=".csv is CSV, else NDJSON"
+        "files", nargs="*", type=Path, metavar="FILE", help=".csv is CSV, else NDJSON"
     )
+    _add_packets(parser)
     way = parser.add_mutually_exclusive_group()
     way.add_argument("--url", default=LOCAL, help=f"the service; default {LOCAL}")
     way.add_argument(
@@ -103,26 +108,48 @@ def add(commands: Any) -> None:
     add_database(parser)
 
 
+def _add_packets(parser: ArgumentParser) -> None:
+    """Declare the arguments of space packets."""
+    parser.add_argument(
+        "--packets",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="FILE",
+        help="files of CCSDS space packets, in place of FILE; the mission's table [packets] says "
+        "which parameters fill a batch",
+    )
+    parser.add_argument(
+        "--xtce", type=Path, metavar="FILE", help="the XTCE file that describes the packets"
+    )
+    parser.add_argument(
+        "--spacecraft",
+        metavar="NAME",
+        help="the mission of the packets; default: the only one with a table [packets]",
+    )
+
+
 def run(parsed: Namespace) -> int:
     """Send files through the service and print what became of them."""
-    from service.observations.readers.telemetry import require_telemetry
+    from msgspec import to_builtins
+
     from service.products.reading.files import read_attitudes
     from service.replay.carry_attitude import AttitudeCarrier
     from service.replay.file_prior import FilePrior
-    from service.replay.items import Pace, items_of, run_name
+    from service.replay.items import Pace, items_of, packet_items, run_name
     from service.replay.summary import ReplaySummary
 
-    run = run_name(parsed.files, parsed.run)
-    for file in parsed.files:
-        # A file that is missing or is no telemetry is refused before anything is sent.
-        require_telemetry(file)
-        if parsed.results is not None and parsed.results.resolve() == file.resolve():
-            raise BadInput(Fault("--results", "must not be a file that is replayed", str(file)))
-    items, pace = items_of(parsed.files, run), Pace(parsed.speed)
+    files = _checked_files(parsed)
+    run = run_name(files, parsed.run)
+    pace = Pace(parsed.speed)
+    in_bulk = _is_in_bulk(parsed)
+    reader = _packet_reader(parsed) if parsed.packets and not in_bulk else None
+    items = items_of(files, run) if reader is None else packet_items(reader, files, run)
     prior = None
     if parsed.a_priori is not None:
         prior = FilePrior(read_attitudes(parsed.a_priori, "--a-priori"))
         items = map(prior.prepared, items)
+    sized = [] if parsed.packets else files
     progress = True if parsed.progress else None
     carrier = AttitudeCarrier() if parsed.carry_attitude else None
     if parsed.in_process:
@@ -134,7 +161,7 @@ def run(parsed: Namespace) -> int:
             app.service.ready()
             if parsed.alarms:
                 app.runs.watch(run)
-            with ReplaySummary(parsed.files, parsed.results, progress) as summary:
+            with ReplaySummary(sized, parsed.results, progress) as summary:
                 replay_in_process(app, items, summary.add, pace, carrier)
         finally:
             app.close()
@@ -146,10 +173,9 @@ def run(parsed: Namespace) -> int:
             message = "goes with --in-process; a running service has its own"
             raise BadInput(Fault("--database", message, shown_value(parsed.database)))
         token = settings_of(parsed).token
-        with ReplaySummary(parsed.files, parsed.results, progress) as summary:
+        with ReplaySummary(sized, parsed.results, progress) as summary:
             watched = run if parsed.alarms else None
-            if carrier or prior or parsed.results or parsed.speed or parsed.concurrency:
-                # Each batch needs an answer of its own, or is sent at its own time.
+            if not in_bulk:
                 many = parsed.concurrency or DEFAULT_CONCURRENCY
                 replay_over_http(
                     parsed.url,
@@ -164,13 +190,16 @@ def run(parsed: Namespace) -> int:
             else:
                 replay_in_bulk(
                     parsed.url,
-                    parsed.files,
+                    files,
                     run,
                     summary.add,
                     summary.follow,
                     token=token,
-                    query={"alarms": "true"} if parsed.alarms else None,
+                    query=_query(parsed),
+                    xtce=parsed.xtce,
                 )
+    if reader is not None:
+        summary.packets = to_builtins(reader.totals())
     if parsed.json:
         given = {} if prior is None else {"a_priori_from_file": prior.given}
         print_json({"run": run, **summary.counts(), **given})
@@ -180,3 +209,62 @@ def run(parsed: Namespace) -> int:
         if prior is not None:
             print(f"{'a priori of file':<20}{prior.given:,} batches")
     return 1 if summary.refused else 0
+
+
+def _is_in_bulk(parsed: Namespace) -> bool:
+    """False where each batch needs an answer of its own, or is sent at its own time."""
+    return not (
+        parsed.in_process
+        or parsed.carry_attitude
+        or parsed.a_priori
+        or parsed.results
+        or parsed.speed
+        or parsed.concurrency
+    )
+
+
+def _query(parsed: Namespace) -> dict[str, str]:
+    """The parameters of an upload beside its run."""
+    query = {"alarms": "true"} if parsed.alarms else {}
+    if parsed.spacecraft is not None:
+        query["spacecraft"] = parsed.spacecraft
+    return query
+
+
+def _checked_files(parsed: Namespace) -> list[Path]:
+    """The files to send; one that is missing or is no telemetry is refused before that."""
+    from service.observations.readers.telemetry import require_telemetry
+
+    if bool(parsed.files) == bool(parsed.packets):
+        raise BadInput(
+            Fault(
+                "FILE",
+                "is required, or else --packets FILE --xtce FILE (see `acquire replay --help`)",
+            )
+        )
+    if bool(parsed.packets) != (parsed.xtce is not None):
+        raise BadInput(Fault("--xtce", "goes with --packets, and --packets needs it"))
+    if parsed.spacecraft is not None and not parsed.packets:
+        message = "goes with --packets; a batch names its own spacecraft"
+        raise BadInput(Fault("--spacecraft", message, shown_value(parsed.spacecraft)))
+    files: list[Path] = parsed.packets or parsed.files
+    for file in files:
+        if not parsed.packets:
+            require_telemetry(file)
+        elif not file.is_file():
+            raise BadFile(Fault(str(file), "is not there, or is no file"))
+        if parsed.results is not None and parsed.results.resolve() == file.resolve():
+            raise BadInput(Fault("--results", "must not be a file that is replayed", str(file)))
+    return files
+
+
+def _packet_reader(parsed: Namespace) -> "PacketReader":
+    """The reader of packets in this process, with the missions of the settings."""
+    from service.missions.mission import load_missions
+    from service.packets.definition import read_definition
+    from service.packets.mapping import packet_mission
+    from service.packets.reader import PacketReader
+
+    mission = packet_mission(load_missions(settings_of(parsed).missions), parsed.spacecraft)
+    assert mission.packets is not None
+    return PacketReader(mission, read_definition(parsed.xtce, mission.packets.root_container))

@@ -55,6 +55,39 @@ class ReplayCounts(Record, frozen=True, kw_only=True):
     attitudes: Annotated[Count, doc("Batches with an attitude.")]
 
 
+class ApidPackets(Record, frozen=True, kw_only=True):
+    """The packets of one APID."""
+
+    component: ClassVar[str] = "ApidPackets"
+    apid: Annotated[int, Field(ge=0, le=2047)]
+    packets: Count
+    described: Annotated[bool, doc("Whether the XTCE file describes them.")]
+    gaps: Annotated[Count, doc("Places where the sequence count skips packets.")]
+    missing: Annotated[Count, doc("Packets that are missing in these places.")]
+    backward: Annotated[
+        Count, doc("Places where the count repeats or goes back: a reset, or a changed order.")
+    ]
+    refused: Count
+
+
+class ReplayPackets(Record, frozen=True, kw_only=True):
+    """The space packets of a replay so far."""
+
+    component: ClassVar[str] = "ReplayPackets"
+    packets: Count
+    bytes: Count
+    batches: Annotated[Count, doc("Batches that the packets hold.")]
+    without_stars: Annotated[Count, doc("Batches without a star, which are left out.")]
+    unknown: Annotated[Count, doc("Packets that the XTCE file does not describe.")]
+    not_asked: Annotated[Count, doc("Packets of APIDs that the mission's table leaves out.")]
+    idle: Annotated[Count, doc("Idle packets (APID 2047).")]
+    gaps: Count
+    missing: Count
+    backward: Count
+    refused: Annotated[Count, doc("Packets that could not be read.")]
+    apids: Annotated[list[ApidPackets], doc("The hundred APIDs with the most packets.")]
+
+
 class LineProblem(Record, frozen=True, kw_only=True):
     """The faults of a line."""
 
@@ -67,7 +100,7 @@ class RefusedLine(Record, frozen=True, kw_only=True):
     """A refused line; the replay continues with the next one."""
 
     component: ClassVar[str] = "RefusedLine"
-    line: Annotated[int, doc("Line number, from 1.")]
+    line: Annotated[int, doc("Number of the line, or of the packet in its file, from 1.")]
     problem: LineProblem
 
 
@@ -88,6 +121,7 @@ class Replay(ReplayProgress, frozen=True, kw_only=True):
     """A replay and its progress."""
 
     component: ClassVar[str] = "ReplayState"
+    packets: Annotated[ReplayPackets | None, doc("null unless the replay reads space packets.")]
     errors: Annotated[
         list[RefusedLine],
         doc("The first thousand refused lines; then, for a failed replay, the reason."),

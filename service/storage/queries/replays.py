@@ -12,6 +12,7 @@ from service.storage.models.runs import (
     Replay,
     ReplayCounts,
     ReplayLines,
+    ReplayPackets,
     ReplayProgress,
     ReplayStateName,
 )
@@ -46,6 +47,7 @@ def list_replays(connection: Connection) -> list[Replay]:
 def _replay(row: Any) -> Replay:
     # A row of an earlier version may have no counts.
     counts = _NO_COUNTS | msgspec.json.decode(row["counts"] or "{}")
+    packets = counts.pop("packets", None)
     return Replay(
         id=row["id"],
         run=row["run"],
@@ -55,6 +57,7 @@ def _replay(row: Any) -> Replay:
             total=row["lines_total"], done=row["lines_done"], refused=row["lines_refused"]
         ),
         counts=msgspec.convert(counts, ReplayCounts),
+        packets=None if packets is None else msgspec.convert(packets, ReplayPackets),
         errors=msgspec.json.decode(row["errors"], type=list[RefusedLine]),
         started=row["started"],
         finished=row["finished"],
@@ -70,23 +73,31 @@ def insert_replay(connection: Connection, replay: Replay) -> None:
         "lines_total": replay.lines.total,
         "started": replay.started,
     }
-    connection.execute(insert(replays), row | _progress(replay) | _errors(replay.errors))
+    connection.execute(
+        insert(replays), row | _progress(replay, replay.packets) | _errors(replay.errors)
+    )
 
 
 def update_replay(
-    connection: Connection, progress: ReplayProgress, errors: list[RefusedLine] | None
+    connection: Connection,
+    progress: ReplayProgress,
+    packets: ReplayPackets | None,
+    errors: list[RefusedLine] | None,
 ) -> None:
     """Store the progress of a replay, and the refused lines unless they are None."""
-    values = _progress(progress) | ({} if errors is None else _errors(errors))
+    values = _progress(progress, packets) | ({} if errors is None else _errors(errors))
     connection.execute(update(replays).where(replays.c.id == progress.id).values(values))
 
 
-def _progress(progress: ReplayProgress) -> dict[str, Any]:
+def _progress(progress: ReplayProgress, packets: ReplayPackets | None) -> dict[str, Any]:
+    counts = msgspec.to_builtins(progress.counts)
+    if packets is not None:
+        counts["packets"] = msgspec.to_builtins(packets)
     return {
         "state": progress.state,
         "lines_done": progress.lines.done,
         "lines_refused": progress.lines.refused,
-        "counts": msgspec.json.encode(progress.counts).decode(),
+        "counts": msgspec.json.encode(counts).decode(),
         "finished": progress.finished,
     }
 
@@ -122,7 +133,7 @@ def mark_cancelled(connection: Connection, id: str, now: str) -> None:
     require_cancellable(replay.state)
     if replay.state == "running":
         ended = structs.replace(replay.progress(), state=CANCELLED, finished=now)
-        update_replay(connection, ended, None)
+        update_replay(connection, ended, replay.packets, None)
         events.add_event(connection, "replay", ended, run=ended.run)
 
 

@@ -10,8 +10,9 @@ from pydantic import Field, StrictBool
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.app.replays import discard_upload
-from service.observations.schema import BatchIn, RunName, Wire
+from service.app.replays import UploadForm, discard_upload
+from service.errors import BadBatch, Fault, shown_value
+from service.observations.schema import BatchIn, Key, RunName, Wire
 from service.storage.models.runs import Replay, ReplayList, RunList, RunState
 from service.web.openapi.route import LOCATION, ResponseDoc, route_docs
 from service.web.requests.access import AuditDep, CallerDep, require_all_spacecraft
@@ -21,8 +22,8 @@ from service.web.requests.request_body import (
     MAX_JSON_BYTES,
     JsonBody,
     Spooled,
-    ndjson_body,
     read_model,
+    telemetry_body,
 )
 
 router = APIRouter(prefix="/api/v1", tags=["runs and replays"])
@@ -41,12 +42,19 @@ class RunIn(Wire):
 
 
 class _ReplayQuery(Query):
-    """Where the batches of a replay go."""
+    """Where the batches of a replay go, and what an archive of packets belongs to."""
 
     run: Annotated[
         RunName, Field(description="The run for every batch, in place of the batch's own.")
     ]
     alarms: Annotated[bool, Field(description="Raise alarms for the run.")] = False
+    spacecraft: Annotated[
+        Key | None,
+        Field(
+            description="Of space packets: the mission whose table `packets` maps them. Without "
+            "it the only mission with such a table."
+        ),
+    ] = None
 
 
 ReplayQuery = Annotated[_ReplayQuery, InQuery()]
@@ -56,8 +64,7 @@ ReplayQuery = Annotated[_ReplayQuery, InQuery()]
 class ReplayUpload:
     """A telemetry file and the run it goes to."""
 
-    run: str
-    alarms: bool
+    query: _ReplayQuery
     body: Spooled
 
 
@@ -69,8 +76,8 @@ async def _telemetry(
         # Like `watch_run`: the run may hold batches of every spacecraft.
         require_all_spacecraft(caller)
         request.state.changes = request.scope["route"].name
-    body = await ndjson_body(request, partial(app.replays.new_upload, caller), discard_upload)
-    return ReplayUpload(query.run, query.alarms, body)
+    body = await telemetry_body(request, partial(app.replays.new_upload, caller), discard_upload)
+    return ReplayUpload(query, body)
 
 
 @router.get(
@@ -107,6 +114,7 @@ def list_replays(app: AppDep) -> Response:
     **route_docs(
         {202: ResponseDoc("The replay, now running.", Replay, LOCATION)},
         lines_of=BatchIn,
+        archive="Files of CCSDS space packets, and one XTCE file (.xml or .xtce).",
         problems=(503,),
     ),
 )
@@ -116,17 +124,26 @@ def start_replay(
     caller: CallerDep,
     audited: AuditDep,
 ) -> Response:
-    """Accept a telemetry file with one batch per line, and process it in the background."""
+    """Accept a telemetry file and process it in the background.
+
+    The body has one batch per line, or is a tar archive of CCSDS space packets and the XTCE file
+    that describes them.
+    """
+    query, body = upload.query, upload.body
+    if query.spacecraft is not None and not body.is_packets:
+        discard_upload(body.file)
+        message = "goes with space packets; a batch names its own spacecraft"
+        raise BadBatch(Fault("spacecraft", message, shown_value(query.spacecraft)))
+    form = UploadForm(body.coding, MAX_JSON_BYTES, body.is_packets, query.spacecraft)
     id = app.replays.start_upload(
-        upload.body.file,
-        upload.body.coding,
-        upload.run,
-        name=upload.run,
-        total=upload.body.lines,
-        longest_bytes=MAX_JSON_BYTES,
+        body.file,
+        form,
+        query.run,
+        name=query.run,
+        total=body.lines,
         caller=caller,
-        alarms=upload.alarms,
-        entry=audited.entry(202) if upload.alarms else None,
+        alarms=query.alarms,
+        entry=audited.entry(202) if query.alarms else None,
     )
     location = {"Location": f"/api/v1/replays/{id}"}
     return json_response(app.replays.get(id), 202, location)

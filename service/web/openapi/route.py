@@ -13,7 +13,7 @@ from starlette.responses import Response
 from service.products.formats import attitude_formats, table_formats
 from service.storage.models.base import Record, component_name
 from service.web.requests.problems import MEDIA_TYPE as PROBLEM_JSON
-from service.web.requests.request_body import BINARY, FRAMES, JSON, NDJSON
+from service.web.requests.request_body import BINARY, FRAMES, JSON, NDJSON, PACKETS
 
 SCHEMAS = "#/components/schemas/"
 TABLES, ATTITUDES = "x-tables", "x-attitudes"
@@ -114,6 +114,7 @@ def route_docs(
     *,
     body: type[BaseModel] | None = None,
     lines_of: type[BaseModel] | None = None,
+    archive: str | None = None,
     array_of: tuple[type[BaseModel], int] | None = None,
     frame: bool = False,
     problems: Sequence[int] = (),
@@ -121,6 +122,7 @@ def route_docs(
 ) -> dict[str, Any]:
     """The arguments for a route's decorator that describe it.
 
+    `archive` says what an archive holds that can be sent in place of lines.
     `array_of` is the model of an array's elements, and how many there may be.
     """
     extra: dict[str, Any] = {}
@@ -136,6 +138,8 @@ def route_docs(
         description = f"A `{lines_of.__name__}` a line."
         lines = {"schema": _BINARY | {"description": description}}
         content = dict.fromkeys((NDJSON[0], BINARY), lines)
+        if archive is not None:
+            content[PACKETS] = {"schema": _BINARY | {"description": archive}}
         extra["requestBody"] = {"required": True, "content": content}
         problems = (*problems, *READING_NDJSON)
     if frame:

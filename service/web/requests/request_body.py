@@ -38,6 +38,8 @@ FRAMES = (
 """Media types of frames; the first bytes tell the format."""
 NDJSON = ("application/x-ndjson", "application/ndjson", "application/jsonl", BINARY)
 """Generated clients can send the last one: most know no type for lines."""
+PACKETS = "application/x-tar"
+"""Files of space packets with their XTCE file."""
 
 MAX_JSON_BYTES = 2 << 20
 """Enough for ten thousand stars, so that the error names their number and not the size."""
@@ -122,6 +124,10 @@ def _limits(request: Request) -> BodyLimits:
     return limits
 
 
+def _media_type(request: Request) -> str:
+    return request.headers.get("content-type", "").partition(";")[0].strip().lower()
+
+
 def _require_type(request: Request, allowed: tuple[str, ...]) -> None:
     # Also a protection: pages of other sites can send only form types without a preflight.
     sent = request.headers.get("content-type", "")
@@ -202,21 +208,26 @@ async def _json_body(request: Request, max_bytes: int) -> bytes:
 
 @dataclass(frozen=True)
 class Spooled:
-    """A body in a rewound file, with its number of lines where it is not compressed."""
+    """A body in a rewound file, with its number of lines where that is known."""
 
     file: IO[bytes]
     coding: Coding
     lines: int | None
+    is_packets: bool = False
 
 
-async def ndjson_body(
+async def telemetry_body(
     request: Request,
     new_file: Callable[[], IO[bytes]],
     discard: Callable[[IO[bytes]], object],
 ) -> Spooled:
-    """An NDJSON body, possibly compressed, in a new file; one that did not arrive is discarded."""
-    _require_type(request, NDJSON)
-    coding = _coding(request, ("identity", "gzip", "zstd"))
+    """A body of lines or of packets in a new file; one that did not arrive is discarded.
+
+    Lines (NDJSON) may be compressed.
+    """
+    _require_type(request, (*NDJSON, PACKETS))
+    is_packets = _media_type(request) == PACKETS
+    coding = _coding(request, ("identity",) if is_packets else ("identity", "gzip", "zstd"))
     limits = _limits(request)
     file = new_file()
     lines, last = 0, b"\n"
@@ -234,6 +245,8 @@ async def ndjson_body(
         discard(file)
         raise BadBatch(Fault("body", "has no lines; it must hold one batch per line"))
     file.seek(0)
+    if is_packets:
+        return Spooled(file, coding, None, is_packets)
     # The last line may lack its newline.
     return Spooled(file, coding, lines + (last != b"\n") if coding == "identity" else None)
 
