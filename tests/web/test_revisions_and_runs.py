@@ -45,7 +45,7 @@ def test_compare_opens_on_two_runs_that_have_data(two_runs):
     assert sum(each[0]["ambiguous"] for each in votes.values()) > 0
     differ = [name for name in votes if votes[name] != verified[name]]
     html = two_runs.get("/compare?run=votes&other=verified&spacecraft=XTE").text
-    shown_ones = re.findall(r'aria-label="(\S+) in votes"', html)
+    shown_ones = re.findall(r'aria-label="[\d, ]+: (\S+) in votes"', html)
     assert sorted(shown_ones) == sorted(differ)
     for each in (votes, verified):
         unique = sum(found["unique"] for found, _ in each.values())
