@@ -53,6 +53,8 @@ def notify_supervisor(message: str) -> None:
     path = "\0" + address[1:] if address.startswith("@") else address
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
+            # A supervisor that reads nothing must not hold up the event loop.
+            sender.setblocking(False)
             sender.connect(path)
             sender.sendall(message.encode())
     except OSError as error:

@@ -29,7 +29,8 @@ def lines(make):
 def upload(app, lines, caller=Caller("local", frozenset()), **options):  # noqa: B008
     file = app.replays.new_upload(caller)
     file.writelines(lines)
-    return app.replays.start_upload(file, "identity", "pass", LONGEST, caller, **options)
+    form = app_replays.UploadForm("identity", LONGEST)
+    return app.replays.start_upload(file, form, "pass", caller, **options)
 
 
 def recorded(app):
