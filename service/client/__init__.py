@@ -1,0 +1,70 @@
+"""A client of the attitude service: submit batches, read results, follow events.
+
+The package is also built alone, under the name `acquire_client`, so its modules import each
+other by relative names and nothing else of the service.
+"""
+
+from . import models
+from ._async.client import AsyncClient
+from ._async.events import AsyncEvents
+from ._async.pages import AsyncItems
+from ._sync.client import Client
+from ._sync.events import Events
+from ._sync.pages import Items
+from .errors import (
+    BadInput,
+    Busy,
+    ClientError,
+    Conflict,
+    EventsLost,
+    Forbidden,
+    KeyReused,
+    NoAnswer,
+    NotAvailable,
+    NotFound,
+    PackageMissing,
+    Problem,
+    RateLimited,
+    ReplayEnded,
+    ServiceFailed,
+    Unauthenticated,
+    UnexpectedAnswer,
+    WrongState,
+)
+from .event_lines import Event
+from .outcomes import BatchOutcome, RecordedAnswer
+from .retrying import Repeat
+
+__version__ = "0.2.0"
+
+__all__ = [
+    "AsyncClient",
+    "AsyncEvents",
+    "AsyncItems",
+    "BadInput",
+    "BatchOutcome",
+    "Busy",
+    "Client",
+    "ClientError",
+    "Conflict",
+    "Event",
+    "Events",
+    "EventsLost",
+    "Forbidden",
+    "Items",
+    "KeyReused",
+    "NoAnswer",
+    "NotAvailable",
+    "NotFound",
+    "PackageMissing",
+    "Problem",
+    "RateLimited",
+    "RecordedAnswer",
+    "Repeat",
+    "ReplayEnded",
+    "ServiceFailed",
+    "Unauthenticated",
+    "UnexpectedAnswer",
+    "WrongState",
+    "models",
+]

@@ -1,0 +1,140 @@
+"""Sending requests: again where that may help, and only where it is safe."""
+
+import ssl
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+import httpx
+
+from ..encoding import Query, checked_address, decoded, json_of, parameters_of
+from ..errors import NoAnswer, UnexpectedAnswer, problem_of
+from ..retrying import Patience, Repeat, shown
+from .backend import sleep
+
+T = TypeVar("T")
+
+CONNECT_S = 5.0
+JSON = {"Content-Type": "application/json"}
+
+
+class AsyncConnection:
+    """The connections to a service; `AsyncClient` explains the arguments."""
+
+    def __init__(
+        self,
+        url: str,
+        token: str | None = None,
+        *,
+        give_up_after_s: float = 30.0,
+        timeout_s: float = 60.0,
+        trust_env: bool = False,
+        verify: ssl.SSLContext | bool = True,
+    ) -> None:
+        self.url = checked_address(url)
+        self.give_up_after_s = give_up_after_s
+        self._http = httpx.AsyncClient(
+            base_url=self.url,
+            headers={} if token is None else {"Authorization": f"Bearer {token}"},
+            timeout=httpx.Timeout(timeout_s, connect=min(CONNECT_S, timeout_s)),
+            # As many as are asked for at once: `at_once` is the bound.
+            limits=httpx.Limits(max_connections=None, max_keepalive_connections=20),
+            trust_env=trust_env,
+            verify=verify,
+        )
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        await self.aclose()
+
+    async def aclose(self) -> None:
+        """Close the connections."""
+        await self._http.aclose()
+
+    async def ping(self) -> None:
+        """See that a service answers, at the first attempt.
+
+        Raises `NoAnswer` where none does, `UnexpectedAnswer` where it is not this service.
+        """
+        try:
+            response = await self._http.get("/livez")
+        except httpx.RequestError as error:
+            raise NoAnswer(shown(error)) from None
+        if not response.is_success:
+            status = response.status_code
+            raise UnexpectedAnswer(
+                f"{self.url} is not this service: GET /livez gives HTTP {status}"
+            )
+
+    async def request(
+        self,
+        method: str,
+        path: str,
+        *,
+        query: Query | None = None,
+        body: Any = None,
+        content: Any = None,
+        headers: dict[str, str] | None = None,
+        repeat: Repeat | None = None,
+    ) -> httpx.Response:
+        """The answer to any request of the API; `body` is sent as JSON, `content` as it is.
+
+        Methods other than GET, PUT and DELETE are sent again only where the service has not
+        received them, unless `repeat` says otherwise.  Raises `NoAnswer` or the `Problem` of
+        the answer.
+        """
+        if repeat is None:
+            safe = method.upper() in ("GET", "HEAD", "PUT", "DELETE")
+            repeat = Repeat.ALWAYS if safe else Repeat.IF_REFUSED
+        if body is not None:
+            content, headers = json_of(body), JSON | (headers or {})
+        parameters = parameters_of(query or {})
+        patience = Patience(self.give_up_after_s, repeat)
+        while True:
+            try:
+                response = await self._http.request(
+                    method, path, params=parameters, content=content, headers=headers
+                )
+                if response.is_success:
+                    return response
+                wait_s = patience.after_problem(problem_of(response))
+            except httpx.RequestError as error:
+                wait_s = patience.after_loss(error, self.url)
+            await sleep(wait_s)
+
+    @asynccontextmanager
+    async def stream(
+        self, path: str, query: Query, headers: dict[str, str], silence_s: float
+    ) -> AsyncIterator[AsyncIterator[bytes]]:
+        """The bytes of an answer as they come; raises the `Problem` of another answer.
+
+        A stream that is silent for `silence_s` counts as lost.  Nothing is sent again.
+        """
+        timeout = httpx.Timeout(silence_s, connect=CONNECT_S)
+        async with self._http.stream(
+            "GET", path, params=parameters_of(query), headers=headers, timeout=timeout
+        ) as response:
+            if not response.is_success:
+                await response.aread()
+                raise problem_of(response)
+            yield response.aiter_bytes()
+
+    async def get(self, kind: type[T], path: str, query: Query | None = None) -> T:
+        """The answer to a GET as a model."""
+        found: T = decoded(await self.request("GET", path, query=query), kind)
+        return found
+
+    async def post(
+        self, kind: type[T], path: str, body: Any, repeat: Repeat = Repeat.IF_REFUSED
+    ) -> T:
+        """The answer to a POST of JSON as a model."""
+        found: T = decoded(await self.request("POST", path, body=body, repeat=repeat), kind)
+        return found

@@ -1,0 +1,123 @@
+"""Spacecraft: state, attitudes and trends."""
+
+from collections.abc import Sequence
+
+from ..base import Page
+from ..encoding import Time, path_of
+from ..models import (
+    AttitudeRow,
+    History,
+    Ranking,
+    Rates,
+    SpacecraftRow,
+    SpacecraftState,
+)
+from .connection import AsyncConnection
+from .pages import AsyncItems
+
+
+class AsyncSpacecraft(AsyncConnection):
+    """The part of the client that is about spacecraft.  In each period `end` is excluded."""
+
+    async def fleet(self, *, run: str = "live") -> list[SpacecraftRow]:
+        """Every spacecraft with its state in a run.
+
+        >>> [each.name for each in await client.fleet() if each.attitude]
+        ['XTE']
+        """
+        page = await self.get(Page[SpacecraftRow], path_of("spacecraft"), {"run": run})
+        return page.items
+
+    async def spacecraft(self, name: str, *, run: str = "live") -> SpacecraftState:
+        """One spacecraft: state in a run, mission settings and their history."""
+        return await self.get(SpacecraftState, path_of("spacecraft", name), {"run": run})
+
+    def attitudes(
+        self,
+        spacecraft: str,
+        *,
+        run: str = "live",
+        start: Time | None = None,
+        end: Time | None = None,
+    ) -> AsyncItems[AttitudeRow]:
+        """The attitudes of a run, oldest first by batch time, suspect ones included.
+
+        >>> [round(row.quaternion[3], 4) async for row in client.attitudes("XTE")]
+        [0.3536]
+        >>> table = await client.attitudes("XTE").to_arrow()
+        >>> table.num_rows
+        1
+        """
+        query = {"run": run, "start": start, "end": end}
+        return AsyncItems(self, AttitudeRow, path_of("spacecraft", spacecraft, "attitudes"), query)
+
+    async def history(
+        self,
+        spacecraft: str,
+        quantities: Sequence[str] = (),
+        *,
+        run: str = "live",
+        start: Time | None = None,
+        end: Time | None = None,
+        tracker: str | None = None,
+        strategy: str | None = None,
+        size: int | None = None,
+    ) -> History:
+        """Quantities over a period, thinned out to at most `size` points; default: all, 500.
+
+        `strategy` is `minmax` for buckets, `latest` for the newest batches one by one.
+
+        >>> history = await client.history("XTE", ["residual_rms_arcsec"])
+        >>> history.to_arrow().column_names[-1]
+        'residual_rms_arcsec.max'
+        """
+        query = {
+            "quantity": list(quantities),
+            "run": run,
+            "start": start,
+            "end": end,
+            "tracker": tracker,
+            "strategy": strategy,
+            "size": size,
+        }
+        return await self.get(History, path_of("spacecraft", spacecraft, "history"), query)
+
+    async def rates(
+        self,
+        spacecraft: str,
+        *,
+        run: str = "live",
+        start: Time | None = None,
+        end: Time | None = None,
+        bucket: str = "hour",
+    ) -> list[Rates]:
+        """Stars by outcome for each hour or day with batches, oldest first.
+
+        >>> [(each.start, each.observed) for each in await client.rates("XTE")]
+        [('1996-01-10T12:00:00.000Z', 4)]
+        """
+        query = {"run": run, "start": start, "end": end, "bucket": bucket}
+        page = await self.get(Page[Rates], path_of("spacecraft", spacecraft, "rates"), query)
+        return page.items
+
+    async def worst(
+        self,
+        spacecraft: str,
+        by: str,
+        *,
+        run: str = "live",
+        start: Time | None = None,
+        end: Time | None = None,
+        tracker: str | None = None,
+        limit: int = 20,
+    ) -> Ranking:
+        """The batches with the worst values of a quantity in a period, worst first."""
+        query = {
+            "by": by,
+            "run": run,
+            "start": start,
+            "end": end,
+            "tracker": tracker,
+            "limit": limit,
+        }
+        return await self.get(Ranking, path_of("spacecraft", spacecraft, "worst"), query)

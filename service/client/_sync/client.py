@@ -1,0 +1,55 @@
+"""The client: every part together."""
+
+from ..encoding import path_of
+from ..models import Session
+from .alarms import Alarms
+from .batches import Batches
+from .events import Events
+from .gyro import Gyro
+from .replays import Replays
+from .spacecraft import Spacecraft
+
+
+class Client(Batches, Spacecraft, Alarms, Replays, Gyro):
+    """A client of the service at an address; a context manager that closes its connections.
+
+    `token` is sent with each request.  A request that may be sent twice is sent again after a
+    lost connection, and where the service asks for it, until the service has not answered for
+    `give_up_after_s`.  `timeout_s` is how long one attempt may wait for the next part of an
+    answer.  `trust_env` uses the proxies that the environment names; `verify` is the context of
+    TLS, or False to trust every certificate.
+
+    Raises `ValueError` for an address that is none; every method raises `NoAnswer` and the
+    `Problem` of the service's answer.
+    """
+
+    def session(self) -> Session:
+        """The caller as the service knows it: the token's name, its scopes and spacecraft.
+
+        Raises `Unauthenticated` where the service asks for a token, or for another one.
+
+        >>> session = client.session()
+        >>> session.scopes
+        ['operate', 'read', 'submit']
+        """
+        return self.get(Session, path_of("session"))
+
+    def events(
+        self,
+        *,
+        run: str | None = None,
+        spacecraft: str | None = None,
+        after: int | None = None,
+    ) -> Events:
+        """Live events from now on, or those after the event of that number.
+
+        They are followed through lost connections and restarts of the service.  Raises
+        `EventsLost` where the service no longer keeps all that were missed, `NoAnswer` where it
+        does not come back for `give_up_after_s`.
+
+        >>> for event in client.events(after=0):
+        ...     print(event.id, event.kind, event.data["latest"]["batch"])
+        ...     break
+        1 batches 1996-010-0110
+        """
+        return Events(self, {"run": run, "spacecraft": spacecraft}, after)

@@ -1,0 +1,138 @@
+"""Sending requests: again where that may help, and only where it is safe."""
+
+import ssl
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+import httpx
+
+from ..encoding import Query, checked_address, decoded, json_of, parameters_of
+from ..errors import NoAnswer, UnexpectedAnswer, problem_of
+from ..retrying import Patience, Repeat, shown
+from .backend import sleep
+
+T = TypeVar("T")
+
+CONNECT_S = 5.0
+JSON = {"Content-Type": "application/json"}
+
+
+class Connection:
+    """The connections to a service; `Client` explains the arguments."""
+
+    def __init__(
+        self,
+        url: str,
+        token: str | None = None,
+        *,
+        give_up_after_s: float = 30.0,
+        timeout_s: float = 60.0,
+        trust_env: bool = False,
+        verify: ssl.SSLContext | bool = True,
+    ) -> None:
+        self.url = checked_address(url)
+        self.give_up_after_s = give_up_after_s
+        self._http = httpx.Client(
+            base_url=self.url,
+            headers={} if token is None else {"Authorization": f"Bearer {token}"},
+            timeout=httpx.Timeout(timeout_s, connect=min(CONNECT_S, timeout_s)),
+            # As many as are asked for at once: `at_once` is the bound.
+            limits=httpx.Limits(max_connections=None, max_keepalive_connections=20),
+            trust_env=trust_env,
+            verify=verify,
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._http.close()
+
+    def ping(self) -> None:
+        """See that a service answers, at the first attempt.
+
+        Raises `NoAnswer` where none does, `UnexpectedAnswer` where it is not this service.
+        """
+        try:
+            response = self._http.get("/livez")
+        except httpx.RequestError as error:
+            raise NoAnswer(shown(error)) from None
+        if not response.is_success:
+            status = response.status_code
+            raise UnexpectedAnswer(
+                f"{self.url} is not this service: GET /livez gives HTTP {status}"
+            )
+
+    def request(
+        self,
+        method: str,
+        path: str,
+        *,
+        query: Query | None = None,
+        body: Any = None,
+        content: Any = None,
+        headers: dict[str, str] | None = None,
+        repeat: Repeat | None = None,
+    ) -> httpx.Response:
+        """The answer to any request of the API; `body` is sent as JSON, `content` as it is.
+
+        Methods other than GET, PUT and DELETE are sent again only where the service has not
+        received them, unless `repeat` says otherwise.  Raises `NoAnswer` or the `Problem` of
+        the answer.
+        """
+        if repeat is None:
+            safe = method.upper() in ("GET", "HEAD", "PUT", "DELETE")
+            repeat = Repeat.ALWAYS if safe else Repeat.IF_REFUSED
+        if body is not None:
+            content, headers = json_of(body), JSON | (headers or {})
+        parameters = parameters_of(query or {})
+        patience = Patience(self.give_up_after_s, repeat)
+        while True:
+            try:
+                response = self._http.request(
+                    method, path, params=parameters, content=content, headers=headers
+                )
+                if response.is_success:
+                    return response
+                wait_s = patience.after_problem(problem_of(response))
+            except httpx.RequestError as error:
+                wait_s = patience.after_loss(error, self.url)
+            sleep(wait_s)
+
+    @contextmanager
+    def stream(
+        self, path: str, query: Query, headers: dict[str, str], silence_s: float
+    ) -> Iterator[Iterator[bytes]]:
+        """The bytes of an answer as they come; raises the `Problem` of another answer.
+
+        A stream that is silent for `silence_s` counts as lost.  Nothing is sent again.
+        """
+        timeout = httpx.Timeout(silence_s, connect=CONNECT_S)
+        with self._http.stream(
+            "GET", path, params=parameters_of(query), headers=headers, timeout=timeout
+        ) as response:
+            if not response.is_success:
+                response.read()
+                raise problem_of(response)
+            yield response.iter_bytes()
+
+    def get(self, kind: type[T], path: str, query: Query | None = None) -> T:
+        """The answer to a GET as a model."""
+        found: T = decoded(self.request("GET", path, query=query), kind)
+        return found
+
+    def post(self, kind: type[T], path: str, body: Any, repeat: Repeat = Repeat.IF_REFUSED) -> T:
+        """The answer to a POST of JSON as a model."""
+        found: T = decoded(self.request("POST", path, body=body, repeat=repeat), kind)
+        return found

@@ -1,0 +1,85 @@
+"""What the client sends: addresses, queries and bodies."""
+
+import json
+from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TypeAlias
+from urllib.parse import quote
+
+import httpx
+import msgspec
+
+from .errors import UnexpectedAnswer
+
+Batch: TypeAlias = Mapping[str, Any] | str | bytes
+"""A batch as the API has it: a mapping, which may hold numpy's arrays, or its JSON."""
+
+Time: TypeAlias = str | datetime
+"""UTC as text, such as `1996-01-10T12:00:00Z` or `1996-010T12:00:00Z`, or with a time zone."""
+
+Query: TypeAlias = Mapping[str, str | int | float | bool | list[str] | datetime | None]
+
+PIECE_BYTES = 1 << 16
+
+
+def checked_address(url: str) -> httpx.URL:
+    """The address of a service; raises `ValueError` for one that is none."""
+    try:
+        parsed = httpx.URL(url)
+        valid = parsed.scheme in ("http", "https") and bool(parsed.host)
+    except httpx.InvalidURL:
+        valid = False
+    if not valid:
+        raise ValueError(
+            f"url must be the address of a service, such as http://127.0.0.1:8000 (got {url!r})"
+        )
+    return parsed
+
+
+def path_of(*parts: str) -> str:
+    """A path of the API, such as `/api/v1/batches/ID`."""
+    return "/api/v1/" + "/".join(quote(each, safe="") for each in parts)
+
+
+def parameters_of(query: Query) -> dict[str, Any]:
+    """The parameters of a query; those that are None are left out."""
+    return {name: _parameter(name, value) for name, value in query.items() if value is not None}
+
+
+def _parameter(name: str, value: object) -> object:
+    if not isinstance(value, datetime):
+        return value
+    if value.tzinfo is None:
+        raise ValueError(f"{name} must have a time zone, or be text in UTC (got {value!r})")
+    return value.astimezone(UTC).replace(tzinfo=None).isoformat() + "Z"
+
+
+def json_of(body: Batch) -> bytes:
+    """A body as JSON.  NaN stays NaN: the service refuses it and names the field."""
+    if isinstance(body, bytes):
+        return body
+    return (body if isinstance(body, str) else json.dumps(body, default=_plain)).encode()
+
+
+def _plain(value: Any) -> Any:
+    # Numpy's arrays and numbers have it.
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    raise TypeError(f"JSON has no form for {value!r}")
+
+
+def decoded(response: httpx.Response, kind: Any) -> Any:
+    """The body of an answer as a model of that kind."""
+    try:
+        return msgspec.json.decode(response.content, type=kind)
+    except msgspec.DecodeError as error:
+        request = response.request
+        raise UnexpectedAnswer(f"{request.method} {request.url}: {error}") from None
+
+
+def pieces_of(file: Path) -> Iterator[bytes]:
+    """The bytes of a file, piece by piece."""
+    with file.open("rb") as stream:
+        while piece := stream.read(PIECE_BYTES):
+            yield piece

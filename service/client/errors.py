@@ -1,0 +1,223 @@
+"""Every exception that the client raises, and the statuses of HTTP that they stand for.
+
+    ClientError
+    ├── NoAnswer                no service answers, or none long enough
+    ├── UnexpectedAnswer        something else than this service answers
+    ├── EventsLost              the service no longer keeps events that were missed
+    ├── ReplayEnded             a replay ended before its file did
+    ├── PackageMissing          a table needs a package that is not installed
+    └── Problem                 the service refuses; `type` is that of its problem document
+        ├── BadInput            invalid input: `errors` names each field and value
+        │   ├── NotAvailable    a feature that this version or installation lacks
+        │   └── KeyReused       the Idempotency-Key was used with another body
+        ├── Unauthenticated     the token is absent, unknown, expired or revoked
+        ├── Forbidden           the token lacks the scope or the spacecraft
+        ├── NotFound            no such spacecraft, batch, alarm or replay
+        ├── Conflict            the batch id is taken by another body; a gyro block likewise
+        ├── WrongState          the state does not allow this, as of a cleared alarm
+        ├── Busy                try again later: after `retry_after_s`
+        │   └── RateLimited     more requests than the token's rate allows
+        └── ServiceFailed       a fault of the service, whose log has the cause
+
+Not finding a star is a result and raises nothing.  Nothing but this module knows a status.
+"""
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
+from typing import TYPE_CHECKING
+
+import httpx
+import msgspec
+
+from .base import FieldFault, Model
+
+if TYPE_CHECKING:
+    from .models import Replay
+
+
+class ProblemDocument(Model, frozen=True):
+    """A problem as the service describes it (RFC 9457)."""
+
+    type: str
+    title: str
+    status: int
+    detail: str
+    instance: str
+    errors: Sequence[FieldFault] = ()
+
+
+class ClientError(Exception):
+    """The base of every error that the client raises itself."""
+
+
+class NoAnswer(ClientError):
+    """No service answers at the address, or none did for as long as the client waits."""
+
+
+class UnexpectedAnswer(ClientError):
+    """The answer is not one of this service, or of a version that the client does not know."""
+
+
+class EventsLost(ClientError):
+    """The service no longer keeps some of the events that were missed.
+
+    Those after `after` and up to `resumes_after` are lost: read again what you keep of them, and
+    go on with the events after `resumes_after`.
+    """
+
+    def __init__(self, after: int | None, resumes_after: int) -> None:
+        self.after, self.resumes_after = after, resumes_after
+        super().__init__(
+            f"the service no longer keeps all events after {after}; "
+            f"it can go on after {resumes_after}"
+        )
+
+
+class ReplayEnded(ClientError):
+    """A replay ended before its file did; `replay` is its last state."""
+
+    def __init__(self, replay: "Replay") -> None:
+        self.replay = replay
+        reason = f": {replay.errors[-1].problem.detail}" if replay.errors else ""
+        lines = replay.lines.done
+        super().__init__(f"the replay {replay.id} ended as {replay.state} at line {lines}{reason}")
+
+
+class PackageMissing(ClientError):
+    """A table needs a package that is not installed; the message has the command."""
+
+
+class Problem(ClientError):
+    """The service refuses a request."""
+
+    def __init__(self, document: ProblemDocument, retry_after_s: float | None = None) -> None:
+        self.document = document
+        self.retry_after_s = retry_after_s
+        super().__init__(document.detail)
+
+    @property
+    def status(self) -> int:
+        """The status of HTTP."""
+        return self.document.status
+
+    @property
+    def type(self) -> str:
+        """The type of the problem, such as `/problems/bad-input`: a page of the service."""
+        return self.document.type
+
+    @property
+    def detail(self) -> str:
+        """What is wrong, in a sentence."""
+        return self.document.detail
+
+    @property
+    def errors(self) -> Sequence[FieldFault]:
+        """Every fault, field by field."""
+        return self.document.errors
+
+
+class BadInput(Problem):
+    """Invalid input: the same request will fail again."""
+
+
+class NotAvailable(BadInput):
+    """A feature that this version or installation of the service lacks."""
+
+
+class KeyReused(BadInput):
+    """The Idempotency-Key was used with another body."""
+
+
+class Unauthenticated(Problem):
+    """The token is absent, unknown, expired or revoked."""
+
+
+class Forbidden(Problem):
+    """The token lacks the scope of this request, or is bound to other spacecraft."""
+
+
+class NotFound(Problem):
+    """There is no such spacecraft, batch, alarm or replay, or the token may not see it."""
+
+
+class Conflict(Problem):
+    """Another body has this batch id or name of a gyro block, or another block one of its times."""
+
+
+class WrongState(Problem):
+    """The state does not allow this: an alarm is already cleared, a replay has ended."""
+
+
+class Busy(Problem):
+    """The service cannot take the request now; the same request may succeed later."""
+
+
+class RateLimited(Busy):
+    """More requests than the token's rate allows, or more event streams."""
+
+
+class ServiceFailed(Problem):
+    """A fault of the service, or a status that the client does not know."""
+
+
+_BY_TYPE: dict[str, type[Problem]] = {
+    "/problems/not-available": NotAvailable,
+    "/problems/key-reused": KeyReused,
+    "/problems/not-now": WrongState,
+}
+_BY_STATUS: dict[int, type[Problem]] = {
+    400: BadInput,
+    401: Unauthenticated,
+    403: Forbidden,
+    404: NotFound,
+    405: NotAvailable,
+    408: Busy,
+    409: Conflict,
+    413: BadInput,
+    415: BadInput,
+    421: Forbidden,
+    422: BadInput,
+    429: RateLimited,
+    431: BadInput,
+    502: Busy,
+    503: Busy,
+    504: Busy,
+}
+
+
+def problem_of(response: httpx.Response) -> Problem:
+    """The problem that an answer describes; its body must have been read."""
+    try:
+        document = msgspec.json.decode(response.content, type=ProblemDocument)
+    except msgspec.DecodeError:
+        # Not of the service but of a proxy before it, for example.
+        status, text = response.status_code, response.text[:200].strip()
+        detail = f"HTTP {status}: {text}" if text else f"HTTP {status}"
+        path = response.request.url.path
+        document = ProblemDocument("about:blank", response.reason_phrase, status, detail, path)
+    kind = _BY_TYPE.get(document.type) or _BY_STATUS.get(response.status_code, ServiceFailed)
+    return kind(document, retry_after_s(response))
+
+
+def retry_after_s(response: httpx.Response) -> float | None:
+    """How long the answer asks to wait (`Retry-After`, RFC 9110): seconds, or until a date.
+
+    The date is compared with the service's own clock where the answer has its `Date`.
+    """
+    text = response.headers.get("Retry-After", "").strip()
+    if text.isascii() and text.isdigit():
+        return float(text[:9])
+    until = _date(text)
+    if until is None:
+        return None
+    now = _date(response.headers.get("Date", "")) or datetime.now(UTC)
+    return max(0.0, (until - now).total_seconds())
+
+
+def _date(text: str) -> datetime | None:
+    try:
+        found = parsedate_to_datetime(text)
+    except ValueError:
+        return None
+    return found if found.tzinfo is not None else found.replace(tzinfo=UTC)

@@ -1,0 +1,237 @@
+"""The answer to a batch, and recorded results.
+
+Quaternions have the scalar last and transform inertial (EME2000) into body components.  Times
+are UTC in calendar form, as text: they may be in a leap second and have nanoseconds.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from ..base import Model
+
+
+class StarRef(Model, frozen=True):
+    """A star of the catalog, such as `HIP 26311`."""
+
+    catalog: str
+    id: str
+
+
+class Star(Model, frozen=True, kw_only=True):
+    """The result for one observed star; `outcome` is unique, ambiguous or unmatched.
+
+    `probability` is that of `star`, of the most probable of `rivals`, or that it is no star of
+    the zone; None where the identifier gives none.
+    """
+
+    outcome: str
+    star: StarRef | None
+    votes: int
+    runner_up: int
+    rivals: Sequence[str] = ()
+    rival_probabilities: Sequence[float] = ()
+    probability: float | None
+    residual_arcsec: float | None
+    flags: Sequence[str]
+
+
+class SearchedZone(Model, frozen=True):
+    """The part of the sky in which the service searched for the stars of a tracker."""
+
+    kind: str
+    ra_deg: float
+    dec_deg: float
+    stars: int
+    pairs: int
+    cached: bool
+
+
+class TrackerStars(Model, frozen=True):
+    """One tracker's stars, in the order observed."""
+
+    tracker: str
+    zone: SearchedZone | None
+    stars: Sequence[Star]
+
+
+class StarCounts(Model, frozen=True):
+    """Stars by outcome."""
+
+    observed: int
+    unique: int
+    ambiguous: int
+    unmatched: int
+
+
+class TrackerFit(Model, frozen=True):
+    """Agreement of one tracker with the attitude from all trackers."""
+
+    tracker: str
+    stars: int
+    taste: float
+    outlier: bool
+
+
+class Rival(Model, frozen=True):
+    """A second attitude, from stars that the first one leaves unexplained."""
+
+    quaternion: Sequence[float]
+    covariance_arcsec2: Sequence[Sequence[float]]
+    probability: float
+    angle_deg: float
+    stars: Sequence[Sequence[str | None]]
+
+
+class Attitude(Model, frozen=True):
+    """An attitude with its accuracy; use it only where `status` is good.
+
+    `covariance_arcsec2` (3, 3) is of the small error rotation about the body axes.
+    """
+
+    quaternion: Sequence[float]
+    frame: str
+    covariance_arcsec2: Sequence[Sequence[float]]
+    method: str
+    residual_rms_arcsec: float
+    predicted_rms_arcsec: float
+    taste: float
+    degrees_of_freedom: int
+    status: str
+    triad: Sequence[float]
+    quest: Sequence[float]
+    triad_quest_angle_arcsec: float
+    trackers: Sequence[TrackerFit] = ()
+    outlier: str | None = None
+    rival: Rival | None = None
+
+
+class Timings(Model, frozen=True):
+    """Microseconds per step; `record` is None where nothing was recorded."""
+
+    zone: int
+    identify: int
+    solve: int
+    record: int | None
+
+
+class Provenance(Model, frozen=True):
+    """The versions of the data and the program that made the answer."""
+
+    catalog: str
+    run_catalog: str
+    epoch_year: float
+    mission: str
+    version: str
+
+
+class FrameTimings(Model, frozen=True):
+    """Microseconds per step from file to stars."""
+
+    read: int
+    detect: int
+    centroid: int
+
+
+class FrameSummary(Model, frozen=True, kw_only=True):
+    """The frame of a batch, and the numbers of detected stars."""
+
+    digest: str
+    format: str
+    tracker: str
+    width_px: int
+    height_px: int
+    exposure_s: float
+    centroid: str
+    background_counts: float
+    noise_counts: float
+    candidates: int
+    measured: int
+    used: int
+    hot_or_cosmic: int
+    timings_us: FrameTimings
+    remarks: Sequence[str] = ()
+
+
+class Detection(Model, frozen=True):
+    """One measured candidate.  The centre of the first pixel is (0, 0); u counts columns."""
+
+    u_px: float | None
+    v_px: float | None
+    sigma_u_px: float | None
+    sigma_v_px: float | None
+    flux_counts: float | None
+    magnitude: float | None
+    signal_ratio: float | None
+    flags: Sequence[str]
+    used: bool
+    left_out: str | None
+
+
+class FrameWithStars(FrameSummary, frozen=True, kw_only=True):
+    """A frame with every candidate; those in the batch come first."""
+
+    stars: Sequence[Detection]
+    hot_or_cosmic_px: Sequence[Sequence[float]]
+
+
+class Answer(Model, frozen=True, kw_only=True):
+    """The answer to a batch.  Without an attitude, `reason` says why there is none.
+
+    `id` is None for a what-if that was not recorded; `parent` is the result that a what-if
+    started from.
+    """
+
+    id: str | None
+    spacecraft: str
+    batch: str
+    run: str
+    time: str
+    identifier: str
+    path: str
+    observations: Sequence[TrackerStars]
+    counts: StarCounts
+    attitude: Attitude | None
+    reason: str | None
+    warnings: Sequence[str]
+    timings_us: Timings
+    provenance: Provenance
+    parent: str | None = None
+    recorded: bool = True
+    frame: FrameSummary | None = None
+
+
+class Summary(Model, frozen=True, kw_only=True):
+    """A result in a list, without its stars and its attitude; `status` is the attitude's.
+
+    `measures` has quantities of the result, None where they could not be measured.  `current`
+    tells whether this result stands for its batch.
+    """
+
+    id: str
+    spacecraft: str
+    batch: str
+    run: str
+    time: str
+    received: str
+    created: str
+    identifier: str
+    options: dict[str, Any]
+    counts: StarCounts
+    status: str | None
+    reason: str | None
+    measures: dict[str, float | None]
+    parent: str | None
+    current: bool
+
+
+class Result(Model, frozen=True, kw_only=True):
+    """A result with its batch as it was sent, and the other results of that batch."""
+
+    answer: Answer
+    input: dict[str, Any]
+    options: dict[str, Any]
+    measures: dict[str, float | None]
+    current: bool
+    parent: str | None
+    what_ifs: Sequence[Summary]
+    frame: FrameWithStars | None = None

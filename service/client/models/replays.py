@@ -1,0 +1,119 @@
+"""Runs and replays, and the caller of the service."""
+
+from collections.abc import Sequence
+
+from ..base import FieldFault, Model
+
+
+class Run(Model, frozen=True):
+    """A named set of batches; `alarms` tells whether they can raise alarms."""
+
+    run: str
+    created: str
+    alarms: bool
+    batches: int
+    spacecraft: Sequence[str]
+    first_day: str
+    last_day: str
+
+
+class RunState(Model, frozen=True):
+    """A run, and whether its batches can raise alarms."""
+
+    run: str
+    alarms: bool
+
+
+class ReplayLines(Model, frozen=True):
+    """The lines of a replay; `total` is None where it is not known in advance."""
+
+    total: int | None
+    done: int
+    refused: int
+
+
+class ReplayCounts(Model, frozen=True):
+    """Batches, stars and gyro blocks of the lines so far.
+
+    `attitudes` are batches with an attitude; the counts of gyro blocks may be absent.
+    """
+
+    new: int
+    repeated: int
+    observed: int
+    unique: int
+    ambiguous: int
+    unmatched: int
+    attitudes: int
+    gyro_new: int = 0
+    gyro_repeated: int = 0
+
+
+class LineProblem(Model, frozen=True):
+    """The faults of a line."""
+
+    detail: str
+    errors: Sequence[FieldFault] = ()
+
+
+class RefusedLine(Model, frozen=True):
+    """A refused line by its number, or a packet by its number in its file, from 1."""
+
+    line: int
+    problem: LineProblem
+
+
+class ApidPackets(Model, frozen=True):
+    """The space packets of one APID."""
+
+    apid: int
+    packets: int
+    described: bool
+    gaps: int
+    missing: int
+    backward: int
+    refused: int
+
+
+class ReplayPackets(Model, frozen=True):
+    """The space packets of a replay so far."""
+
+    packets: int
+    bytes: int
+    batches: int
+    without_stars: int
+    unknown: int
+    not_asked: int
+    idle: int
+    gaps: int
+    missing: int
+    backward: int
+    refused: int
+    apids: Sequence[ApidPackets]
+
+
+class Replay(Model, frozen=True):
+    """A replay and its progress.
+
+    `state` is running, done, interrupted, failed or cancelled.  `errors` has the first thousand
+    refused lines; the last error of a failed replay is the reason.
+    """
+
+    id: str
+    run: str
+    name: str
+    state: str
+    lines: ReplayLines
+    counts: ReplayCounts
+    started: str
+    finished: str | None
+    packets: ReplayPackets | None
+    errors: Sequence[RefusedLine]
+
+
+class Session(Model, frozen=True):
+    """The caller and its scopes; `spacecraft` is None where the token is bound to none."""
+
+    name: str | None
+    scopes: Sequence[str]
+    spacecraft: Sequence[str] | None

@@ -1,0 +1,145 @@
+"""Spacecraft: state, attitudes, histories of quantities, rates of stars."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from ..base import Model
+from ..tables import pandas_of, table_of_history
+from .answers import Summary
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+
+class AttitudeRow(Model, frozen=True):
+    """An attitude in a history; use it only where `status` is good."""
+
+    id: str
+    batch: str
+    time: str
+    quaternion: Sequence[float]
+    frame: str
+    covariance_arcsec2: Sequence[Sequence[float]]
+    residual_rms_arcsec: float
+    predicted_rms_arcsec: float
+    taste: float
+    method: str
+    status: str
+
+
+class SpacecraftRow(Model, frozen=True, kw_only=True):
+    """The state of a spacecraft in a run.
+
+    `attitude` is that of the latest batch, or None; `last_attitude` may be older.
+    """
+
+    name: str
+    description: str
+    state: str
+    latest_batch: Summary | None
+    attitude: AttitudeRow | None
+    last_attitude: AttitudeRow | None
+
+
+class MissionNow(Model, frozen=True):
+    """The present settings of a mission, with the names of the mission file."""
+
+    digest: str
+    settings: dict[str, Any]
+
+
+class MissionThen(Model, frozen=True):
+    """The settings of a mission since some time."""
+
+    digest: str
+    settings: dict[str, Any]
+    since: str
+
+
+class SpacecraftState(SpacecraftRow, frozen=True, kw_only=True):
+    """The state of a spacecraft, and its mission's settings with their history."""
+
+    mission: MissionNow
+    history: Sequence[MissionThen]
+
+
+class Rates(Model, frozen=True):
+    """Sums over the batches of an hour or day; `solved` and `suspect` count batches."""
+
+    start: str
+    batches: int
+    observed: int
+    unique: int
+    ambiguous: int
+    unmatched: int
+    solved: int
+    suspect: int
+
+
+class Series(Model, frozen=True, kw_only=True):
+    """A quantity over time; a list that the strategy does not give is empty.
+
+    `minmax`: `count`, `mean`, `min` and `max` of each bucket; `latest`: `value` of each batch.
+    """
+
+    unit: str
+    count: Sequence[int] = ()
+    mean: Sequence[float | None] = ()
+    min: Sequence[float | None] = ()
+    max: Sequence[float | None] = ()
+    value: Sequence[float | None] = ()
+
+
+class History(Model, frozen=True, kw_only=True):
+    """Quantities over a period, oldest first; None: unknown.
+
+    `unix_s` is the POSIX time of each bucket's beginning, or of each batch; `thinned` tells
+    whether the period has more batches than points.
+    """
+
+    spacecraft: str
+    run: str
+    tracker: str | None = None
+    not_split: bool = False
+    start: str | None
+    end: str | None
+    strategy: str
+    bucket_s: int | None
+    source: str
+    thinned: bool
+    unix_s: Sequence[float]
+    batches: Sequence[int] = ()
+    time: Sequence[str] = ()
+    id: Sequence[str] = ()
+    batch: Sequence[str] = ()
+    series: dict[str, Series]
+
+    def to_arrow(self) -> "pa.Table":
+        """A table with a row for each point; a column such as `residual_rms_arcsec.mean`.
+
+        Raises `PackageMissing` where pyarrow is not installed.
+        """
+        return table_of_history(self)
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """The same as a data frame.
+
+        Raises `PackageMissing` where pandas and pyarrow are not both installed.
+        """
+        return pandas_of(self.to_arrow())
+
+
+class RankedBatch(Summary, frozen=True, kw_only=True):
+    """A batch with its value of the quantity that was asked for."""
+
+    value: float
+
+
+class Ranking(Model, frozen=True, kw_only=True):
+    """The worst batches of a period by a quantity, worst first."""
+
+    by: str
+    tracker: str | None = None
+    not_split: bool = False
+    items: Sequence[RankedBatch]

@@ -1,0 +1,56 @@
+"""A real service, a client of it, and a proxy that cuts their connections."""
+
+import json
+from itertools import count
+from pathlib import Path
+
+import pytest
+
+from service.app.factory import open_app
+from service.client import Client
+from service.missions.mission import load_missions
+from service.settings import Settings
+from service.simulate.stretches import Pass
+from service.simulate.telemetry import draw_pass
+from service.web.app import create_app
+from tests.web.serving import Server
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "docs" / "example-batch.json"
+
+
+@pytest.fixture
+def example():
+    """The batch of the documents."""
+    return json.loads(EXAMPLE.read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def app(chosen_database):
+    """The real operations over a new database; the server closes them."""
+    return open_app(Settings(database=chosen_database()))
+
+
+@pytest.fixture(scope="module")
+def address(app):
+    with Server(create_app(app)) as url:
+        yield url
+
+
+@pytest.fixture
+def client(address):
+    with Client(address) as client:
+        yield client
+
+
+@pytest.fixture(scope="session")
+def drawn(sky, request):
+    """Batches of a pass of XTE over the real catalog, in a run of their own."""
+    numbers, seed = count(1), request.config.getoption("--seed")
+
+    def draw(batches, run=None):
+        number = next(numbers)
+        drawn = draw_pass(load_missions()["XTE"], sky, Pass(batches, seed + number))
+        return [each.batch | {"run": run or f"run-{number}"} for each in drawn]
+
+    return draw

@@ -1,0 +1,98 @@
+"""The models are those of openapi.yaml: every field, its type, and whether it may be absent."""
+
+import inspect
+from pathlib import Path
+
+import msgspec
+import pytest
+import yaml
+
+from service.client import errors, models
+from service.client.base import FieldFault, Model
+
+OPENAPI = yaml.safe_load((Path(__file__).parents[2] / "openapi.yaml").read_text(encoding="utf-8"))
+SCHEMAS = OPENAPI["components"]["schemas"]
+NAMES = {
+    "Acted": "ActedOut",
+    "Alarm": "AlarmOut",
+    "AlarmAction": "ActionOut",
+    "AlarmRaised": "RaisedOut",
+    "AlarmValue": "PointOut",
+    "AlarmWithActions": "AlarmRecord",
+    "Attitude": "AttitudeOut",
+    "Detection": "DetectionOut",
+    "FieldFault": "FaultOut",
+    "FrameSummary": "FrameOut",
+    "FrameTimings": "FrameTimingsOut",
+    "FrameWithStars": "FrameRecordOut",
+    "ProblemDocument": "Problem",
+    "Provenance": "ProvenanceOut",
+    "RankedBatch": "WorstBatch",
+    "Ranking": "WorstList",
+    "Replay": "ReplayState",
+    "Result": "Record",
+    "Rival": "RivalOut",
+    "Run": "RunRow",
+    "SearchedZone": "ZoneOut",
+    "Shelved": "ShelfOut",
+    "Star": "StarOut",
+    "StarCounts": "CountsOut",
+    "Timings": "TimingsOut",
+    "TrackerFit": "TrackerFitOut",
+    "TrackerStars": "TrackerOut",
+}
+"""The schemas whose names differ from those of the models."""
+MODELS = {
+    NAMES.get(name, name): model
+    for name, model in [
+        *inspect.getmembers(models, inspect.isclass),
+        ("FieldFault", FieldFault),
+        ("ProblemDocument", errors.ProblemDocument),
+    ]
+    if issubclass(model, Model)
+}
+
+
+def shape(schema, schemas, name_of):
+    """What a value may be, as a set of words and pairs; enumerations and bounds are left out."""
+    if "anyOf" in schema:
+        return frozenset().union(*(shape(each, schemas, name_of) for each in schema["anyOf"]))
+    if "$ref" in schema:
+        name = name_of(schema["$ref"].rpartition("/")[2])
+        if name in MODELS:
+            return frozenset([name])
+        # Free settings, which the client passes on as they are.
+        return shape(schemas[schema["$ref"].rpartition("/")[2]], schemas, name_of)
+    kind = schema.get("type")
+    if kind == "array":
+        return frozenset([("array", shape(schema["items"], schemas, name_of))])
+    if kind == "object" and isinstance(schema.get("additionalProperties"), dict):
+        values = shape(schema["additionalProperties"], schemas, name_of)
+        # Quantities come by their names, which the document lists and the client does not.
+        return frozenset(["object" if values <= {"number", "null"} else ("object", values)])
+    return frozenset([kind])
+
+
+def test_every_model_is_a_schema():
+    assert len(MODELS) > 40
+    assert [name for name in MODELS if name not in SCHEMAS] == []
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_model_has_the_fields_of_its_schema_with_their_types(name):
+    _, components = msgspec.json.schema_components([MODELS[name]], ref_template="#/{name}")
+    own = components[MODELS[name].__name__]
+    theirs = SCHEMAS[name]
+    assert set(own["properties"]) == set(theirs["properties"])
+    assert set(own.get("required", [])) == set(theirs["required"])
+    for field, schema in theirs["properties"].items():
+        here = shape(own["properties"][field], components, lambda each: NAMES.get(each, each))
+        there = shape(schema, SCHEMAS, lambda each: each)
+        # A field that may be absent is None then.
+        absent = set() if field in theirs["required"] else {"null"}
+        assert here - absent == there - absent, field
+
+
+def test_what_a_later_service_adds_is_ignored():
+    page = b'{"run": "a", "alarms": true, "added": {"later": [1]}}'
+    assert msgspec.json.decode(page, type=models.RunState) == models.RunState("a", alarms=True)
