@@ -1,0 +1,1 @@
+"""Webhooks in the records: what is registered, what waits, and who delivers."""

@@ -1,0 +1,214 @@
+"""The registered webhooks: written, read, and what their deliveries note of them."""
+
+import json
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from sqlalchemy import Connection, case, delete, func, insert, select, update
+
+from service.errors import NotFound, shown_value
+from service.storage.models.alarms import SeverityName
+from service.storage.recording.events import EventKind
+from service.storage.sql.access_tables import access_tokens
+from service.storage.sql.columns import Row
+from service.storage.sql.webhook_tables import webhook_deliveries, webhooks
+from service.storage.webhooks.models import Webhook, WebhookStateName
+
+_SHOWN = (
+    "id",
+    "name",
+    "url",
+    "severity",
+    "run",
+    "enabled",
+    "who",
+    "created",
+    "missed",
+    "failing_since",
+    "last_attempt",
+    "last_delivered",
+    "last_status",
+    "last_fault",
+)
+
+
+@dataclass(frozen=True)
+class Registered:
+    """A webhook as it is stored, with its secrets, which its text leaves out."""
+
+    id: str
+    name: str
+    url: str
+    kinds: Collection[EventKind] | None
+    spacecraft: Collection[str] | None
+    severity: SeverityName | None
+    run: str | None
+    secret: str = field(repr=False)
+    previous_secret: str | None = field(repr=False)
+    previous_until: str | None
+    position: int
+    held_until: str | None
+    state: WebhookStateName
+    reason: str | None
+
+    def secrets(self, now: str) -> list[str]:
+        """The secrets that sign at a time: the present one, then the one before it."""
+        if self.previous_secret is None or self.previous_until is None:
+            return [self.secret]
+        return [self.secret] + [self.previous_secret] * (now < self.previous_until)
+
+
+def add_webhook(connection: Connection, row: Row) -> None:
+    """Store a webhook."""
+    connection.execute(insert(webhooks).values(_stored(row)))
+
+
+def change_webhook(connection: Connection, id: str, changes: Row) -> None:
+    """Change a webhook; raises `NotFound`."""
+    changed = connection.execute(
+        update(webhooks).where(webhooks.c.id == id).values(_stored(changes))
+    )
+    if not changed.rowcount:
+        raise _unknown(id)
+
+
+def delete_webhook(connection: Connection, id: str) -> None:
+    """Delete a webhook with its deliveries; raises `NotFound`."""
+    connection.execute(delete(webhook_deliveries).where(webhook_deliveries.c.webhook_id == id))
+    if not connection.execute(delete(webhooks).where(webhooks.c.id == id)).rowcount:
+        raise _unknown(id)
+
+
+def count_webhooks(connection: Connection) -> int:
+    """How many webhooks there are."""
+    return int(connection.scalar(select(func.count()).select_from(webhooks)) or 0)
+
+
+def list_webhooks(
+    connection: Connection, now: str, is_open: bool, id: str | None = None
+) -> list[Webhook]:
+    """Every webhook, or one, as the API shows it; the oldest first.
+
+    `is_open`: whether access is open, so that a webhook needs no token.
+    """
+    of_each = {row["webhook_id"]: row for row in connection.execute(_counts()).mappings()}
+    return [
+        _shown(row, of_each.get(row["id"], {}), now, is_open)
+        for row in connection.execute(_with_token(id)).mappings()
+    ]
+
+
+def read_webhook(connection: Connection, id: str, now: str, is_open: bool) -> Webhook:
+    """One webhook as the API shows it; raises `NotFound`."""
+    for found in list_webhooks(connection, now, is_open, id):
+        return found
+    raise _unknown(id)
+
+
+def registered_webhooks(
+    connection: Connection, now: str, is_open: bool, id: str | None = None
+) -> Sequence[Registered]:
+    """Every webhook, or one, as it is sent to."""
+    return [
+        _registered(row, now, is_open) for row in connection.execute(_with_token(id)).mappings()
+    ]
+
+
+def registered_webhook(connection: Connection, id: str, now: str, is_open: bool) -> Registered:
+    """One webhook as it is sent to; raises `NotFound`."""
+    for found in registered_webhooks(connection, now, is_open, id):
+        return found
+    raise _unknown(id)
+
+
+def _with_token(id: str | None) -> Any:
+    tokens = access_tokens.c
+    query = (
+        select(
+            webhooks,
+            tokens.name.label("token_name"),
+            tokens.expires.label("token_expires"),
+            tokens.revoked.label("token_revoked"),
+        )
+        .outerjoin(access_tokens, tokens.id == webhooks.c.token_id)
+        .order_by(webhooks.c.id)
+    )
+    return query if id is None else query.where(webhooks.c.id == id)
+
+
+def _counts() -> Any:
+    row = webhook_deliveries.c
+    waits = ~row.dead
+    return select(
+        row.webhook_id,
+        func.sum(case((waits, 1), else_=0)).label("waiting"),
+        func.sum(case((row.dead, 1), else_=0)).label("dead"),
+        func.min(case((waits, row.queued), else_=None)).label("oldest"),
+    ).group_by(row.webhook_id)
+
+
+def _state(row: Any, now: str, is_open: bool) -> tuple[WebhookStateName, str | None]:
+    """Whether anything is sent, and why not."""
+    if row["gone_at"] is not None:
+        return "disabled", f"the receiver answered 410 Gone at {row['gone_at']}"
+    if not row["enabled"]:
+        return "paused", "it was paused; change it with `enabled` true to go on"
+    if row["token_id"] is None:
+        if is_open:
+            return "active", None
+        return "paused", "it was made without a token; change it with a token to go on"
+    if row["token_revoked"] is not None:
+        return "paused", f"the token {row['token_name']!r} was revoked at {row['token_revoked']}"
+    if row["token_expires"] <= now:
+        return "paused", f"the token {row['token_name']!r} has expired at {row['token_expires']}"
+    return "active", None
+
+
+def _shown(row: Any, counted: Any, now: str, is_open: bool) -> Webhook:
+    state, reason = _state(row, now, is_open)
+    until = row["previous_until"]
+    return Webhook(
+        **{name: row[name] for name in _SHOWN},
+        kinds=_listed(row["kinds"]),
+        spacecraft=_listed(row["spacecraft"]),
+        state=state,
+        reason=reason,
+        previous_until=until if until is not None and until > now else None,
+        waiting=int(counted.get("waiting", 0)),
+        dead=int(counted.get("dead", 0)),
+        oldest=counted.get("oldest"),
+    )
+
+
+def _registered(row: Any, now: str, is_open: bool) -> Registered:
+    state, reason = _state(row, now, is_open)
+    return Registered(
+        id=row["id"],
+        name=row["name"],
+        url=row["url"],
+        kinds=_listed(row["kinds"]),
+        spacecraft=_listed(row["spacecraft"]),
+        severity=row["severity"],
+        run=row["run"],
+        secret=row["secret"],
+        previous_secret=row["previous_secret"],
+        previous_until=row["previous_until"],
+        position=row["position"],
+        held_until=row["held_until"],
+        state=state,
+        reason=reason,
+    )
+
+
+def _stored(row: Row) -> Row:
+    lists = {name: row[name] for name in ("kinds", "spacecraft") if row.get(name) is not None}
+    return row | {name: json.dumps(sorted(set(value))) for name, value in lists.items()}
+
+
+def _listed(text: str | None) -> list[Any] | None:
+    return None if text is None else list(json.loads(text))
+
+
+def _unknown(id: str) -> NotFound:
+    return NotFound(f"there is no webhook with the id {shown_value(id)}")

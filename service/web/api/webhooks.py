@@ -1,0 +1,259 @@
+"""Webhooks: events that the service sends to receivers."""
+
+from typing import Annotated, Any, ClassVar, Literal
+
+from fastapi import APIRouter, Path
+from fastapi import Query as InQuery
+from pydantic import ConfigDict, Field, StringConstraints
+from starlette.requests import Request
+from starlette.responses import Response
+
+from service.access.tokens import Caller
+from service.observations.schema import Key, RunName, Wire
+from service.storage.models.alarms import SeverityName
+from service.storage.recording.events import EventKind
+from service.storage.webhooks.models import (
+    Webhook,
+    WebhookDeliveryPage,
+    WebhookList,
+    WebhookQueued,
+    WebhookTest,
+    WebhookWithSecret,
+)
+from service.web.openapi.route import LINK, LOCATION, ResponseDoc, route_docs
+from service.web.requests.access import AuditDep, CallerDep, require_scope
+from service.web.requests.dependencies import AppDep, json_response, page_response
+from service.web.requests.query_parameters import NO_QUERY, Cursor, PageLimit, Query, Time
+from service.web.requests.request_body import JsonBody, read_model
+
+router = APIRouter(prefix="/api/v1", tags=["webhooks"])
+
+WebhookId = Annotated[str, Path(description="The `id` of a webhook.")]
+ALL = "*"
+
+
+class WebhookIn(Wire):
+    """The settings of a webhook."""
+
+    component: ClassVar[str] = "WebhookIn"
+    model_config = ConfigDict(title=component)
+
+    name: Annotated[
+        str,
+        StringConstraints(strip_whitespace=True, min_length=1, max_length=64),
+        Field(pattern=r"^[^\x00-\x1f\x7f]+$", description="For people and for metrics."),
+    ]
+    url: Annotated[
+        str,
+        Field(
+            min_length=1,
+            max_length=2_000,
+            pattern=r"^[\x21-\x7e]+$",
+            description="https://...; port 80, 443 or one from 1024 on.",
+            examples=["https://receiver.example/acquire"],
+        ),
+    ]
+    kinds: Annotated[
+        list[EventKind] | None,
+        Field(min_length=1, max_length=20, description="Only events of these kinds; null: all."),
+    ] = None
+    spacecraft: Annotated[
+        list[Key] | None,
+        Field(min_length=1, max_length=200, description="Only events about these; null: all."),
+    ] = None
+    severity: Annotated[
+        SeverityName | None,
+        Field(description="Of alarms only those that were at least as severe."),
+    ] = None
+    run: Annotated[
+        RunName | Literal["*"],
+        Field(description="Only events of this run, and those of none; `*`: of every run."),
+    ] = "live"
+    enabled: Annotated[bool, Field(description="false: it is paused.")] = True
+
+    def settings(self) -> dict[str, Any]:
+        """The settings as they are stored."""
+        return self.model_dump() | {"run": None if self.run == ALL else self.run}
+
+
+class SecretIn(Wire):
+    """How long a replaced secret goes on signing."""
+
+    component: ClassVar[str] = "SecretIn"
+    model_config = ConfigDict(title=component)
+
+    previous_hours: Annotated[
+        int, Field(ge=0, le=168, strict=True, description="0: it signs no more.")
+    ] = 24
+
+
+class RetryIn(Wire):
+    """Which dead letters are sent again."""
+
+    component: ClassVar[str] = "RetryIn"
+    model_config = ConfigDict(title=component)
+
+    events: Annotated[
+        list[Annotated[int, Field(ge=1, lt=1 << 63, strict=True)]] | None,
+        Field(min_length=1, max_length=500, description="Numbers of events; null: all."),
+    ] = None
+
+
+class ReplayEventsIn(Wire):
+    """Which events are sent again, by the time at which they were recorded."""
+
+    component: ClassVar[str] = "ReplayEventsIn"
+    model_config = ConfigDict(title=component)
+
+    since: Annotated[Time, Field(description="By the service's clock, included.")]
+    until: Annotated[Time | None, Field(description="Excluded; null: now.")] = None
+
+
+class DeliveryQuery(Query):
+    """Which deliveries."""
+
+    state: Annotated[
+        Literal["waiting", "dead"] | None, Field(description="Only these; default: both.")
+    ] = None
+    limit: PageLimit = 100
+    cursor: Cursor = None
+
+
+@router.get(
+    "/webhooks",
+    dependencies=[NO_QUERY],
+    **route_docs({200: ResponseDoc("All webhooks.", WebhookList)}),
+)
+def list_webhooks(app: AppDep) -> Response:
+    """Every webhook, with its state and its last failure."""
+    return json_response({"items": app.webhooks.all()})
+
+
+@router.get(
+    "/webhooks/{id}",
+    dependencies=[NO_QUERY],
+    **route_docs({200: ResponseDoc("The webhook.", Webhook)}, problems=(404,)),
+)
+def get_webhook(id: WebhookId, app: AppDep) -> Response:
+    """One webhook."""
+    return json_response(app.webhooks.get(id))
+
+
+@router.post(
+    "/webhooks",
+    dependencies=[NO_QUERY],
+    **route_docs(
+        {201: ResponseDoc("The webhook, and its secret this once.", WebhookWithSecret, LOCATION)},
+        body=WebhookIn,
+        problems=(409, 503),
+    ),
+)
+def add_webhook(body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep) -> Response:
+    """Register a receiver, which is sent the events from now on, signed (Standard Webhooks)."""
+    _require_reader(caller)
+    asked = read_model(WebhookIn, body)
+    added = app.webhooks.add(asked.settings(), caller, audited.entry(201))
+    return json_response(added, 201, {"Location": f"/api/v1/webhooks/{added.id}"})
+
+
+@router.put(
+    "/webhooks/{id}",
+    dependencies=[NO_QUERY],
+    **route_docs({200: ResponseDoc("The webhook.", Webhook)}, body=WebhookIn, problems=(404, 503)),
+)
+def change_webhook(
+    id: WebhookId, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
+) -> Response:
+    """Replace all settings; a webhook that was paused or disabled goes on where it stopped."""
+    _require_reader(caller)
+    asked = read_model(WebhookIn, body)
+    return json_response(app.webhooks.change(id, asked.settings(), caller, audited.entry()))
+
+
+@router.delete(
+    "/webhooks/{id}",
+    dependencies=[NO_QUERY],
+    **route_docs({200: ResponseDoc("The webhook that was deleted.", Webhook)}, problems=(404, 503)),
+)
+def delete_webhook(id: WebhookId, app: AppDep, audited: AuditDep) -> Response:
+    """Delete a webhook with its queue and its dead letters."""
+    return json_response(app.webhooks.delete(id, audited.entry()))
+
+
+@router.post(
+    "/webhooks/{id}/secret",
+    dependencies=[NO_QUERY],
+    **route_docs(
+        {200: ResponseDoc("The webhook, and its new secret this once.", WebhookWithSecret)},
+        body=SecretIn,
+        problems=(404, 503),
+    ),
+)
+def rotate_webhook_secret(
+    id: WebhookId, body: JsonBody, app: AppDep, audited: AuditDep
+) -> Response:
+    """Make a new secret; deliveries are signed by the previous one too for some hours."""
+    asked = read_model(SecretIn, body)
+    return json_response(app.webhooks.rotate(id, asked.previous_hours, audited.entry()))
+
+
+@router.post(
+    "/webhooks/{id}/test",
+    dependencies=[NO_QUERY],
+    **route_docs(
+        {200: ResponseDoc("What came of the attempt.", WebhookTest)}, problems=(404, 409, 503)
+    ),
+)
+def test_webhook(id: WebhookId, app: AppDep) -> Response:
+    """Send an event of the type `test` at once, and wait for the receiver's answer."""
+    return json_response(app.webhooks.try_out(id))
+
+
+@router.get(
+    "/webhooks/{id}/deliveries",
+    **route_docs(
+        {200: ResponseDoc("A page of deliveries.", WebhookDeliveryPage, LINK)}, problems=(404,)
+    ),
+)
+def list_webhook_deliveries(
+    id: WebhookId, request: Request, query: Annotated[DeliveryQuery, InQuery()], app: AppDep
+) -> Response:
+    """Events that wait for a webhook, and its dead letters; the latest event first."""
+    dead = None if query.state is None else query.state == "dead"
+    page = app.webhooks.deliveries(id, dead, query.limit, query.cursor)
+    return page_response(request, page)
+
+
+@router.post(
+    "/webhooks/{id}/retry",
+    dependencies=[NO_QUERY],
+    **route_docs(
+        {200: ResponseDoc("How many were queued.", WebhookQueued)},
+        body=RetryIn,
+        problems=(404, 503),
+    ),
+)
+def retry_dead_letters(id: WebhookId, body: JsonBody, app: AppDep, audited: AuditDep) -> Response:
+    """Send dead letters again; new events of the spacecraft do not wait for them."""
+    asked = read_model(RetryIn, body)
+    return json_response(app.webhooks.retry(id, asked.events, audited.entry()))
+
+
+@router.post(
+    "/webhooks/{id}/replay",
+    dependencies=[NO_QUERY],
+    **route_docs(
+        {200: ResponseDoc("How many were queued.", WebhookQueued)},
+        body=ReplayEventsIn,
+        problems=(404, 503),
+    ),
+)
+def replay_events(id: WebhookId, body: JsonBody, app: AppDep, audited: AuditDep) -> Response:
+    """Send the kept events of a period again, with the ids that they had."""
+    asked = read_model(ReplayEventsIn, body)
+    return json_response(app.webhooks.replay(id, asked.since, asked.until, audited.entry()))
+
+
+def _require_reader(caller: Caller) -> None:
+    """Raise `Forbidden` unless the caller may read what the webhook is sent."""
+    require_scope(caller, "read")

@@ -1,0 +1,91 @@
+// Registers, tries out, pauses and deletes webhooks, and sends events again.
+import { attempt, send } from "./actions.js";
+import { refreshSoon } from "./live_updates.js";
+
+const HERE = "/api/v1/webhooks";
+const SETTINGS = ["name", "url", "kinds", "spacecraft", "severity", "run"];
+const message = document.getElementById("message");
+const shown = document.getElementById("secret-shown");
+
+function showSecret({ secret }) {
+  document.getElementById("secret").textContent = secret;
+  shown.hidden = false;
+}
+
+// The settings of a webhook with only `enabled` changed; null stands for every run.
+async function changed(address, enabled) {
+  const webhook = await send("GET", address);
+  const settings = Object.fromEntries(SETTINGS.map((name) => [name, webhook[name]]));
+  return send("PUT", address, JSON.stringify({ ...settings, run: webhook.run ?? "*", enabled }));
+}
+
+const ACTIONS = {
+  async test(address) {
+    const outcome = await send("POST", `${address}/test`, undefined);
+    if (!outcome.delivered) throw new Error(outcome.fault);
+    return `The receiver answered ${outcome.status} after ${outcome.duration_ms} ms.`;
+  },
+  async retry(address) {
+    const { queued } = await send("POST", `${address}/retry`, "{}");
+    return `Dead letters queued: ${queued}.`;
+  },
+  async pause(address) {
+    await changed(address, false);
+    return "Paused: nothing is sent until it goes on.";
+  },
+  async resume(address) {
+    await changed(address, true);
+    return "It goes on where it stopped.";
+  },
+  async secret(address) {
+    showSecret(await send("POST", `${address}/secret`, "{}"));
+    return "New secret. The previous one signs too for 24 hours.";
+  },
+  async delete(address) {
+    const webhook = await send("DELETE", address);
+    return `Deleted: ${webhook.name}.`;
+  },
+};
+
+document.addEventListener("click", (event) => {
+  const button = event.target.closest("[data-do]");
+  if (!button) return;
+  const address = `${HERE}/${button.closest("[data-webhook]").dataset.webhook}`;
+  attempt(button, message, async () => {
+    const said = await ACTIONS[button.dataset.do](address);
+    refreshSoon();
+    return said;
+  });
+});
+
+document.addEventListener("submit", (event) => {
+  const form = event.target.closest("[data-replay]");
+  if (!form) return;
+  event.preventDefault();
+  const { since, until } = form.elements;
+  const address = `${HERE}/${form.closest("[data-webhook]").dataset.webhook}/replay`;
+  attempt(event.submitter, message, async () => {
+    const body = { since: since.value.trim(), until: until.value.trim() || null };
+    const { queued } = await send("POST", address, JSON.stringify(body));
+    refreshSoon();
+    return `Events queued: ${queued}.`;
+  });
+});
+
+document.getElementById("new-webhook")?.addEventListener("submit", (event) => {
+  event.preventDefault();
+  const { name, url, kind, spacecraft, severity } = event.target.elements;
+  attempt(event.submitter, message, async () => {
+    const settings = {
+      name: name.value,
+      url: url.value.trim(),
+      kinds: kind.value ? [kind.value] : null,
+      spacecraft: spacecraft.value ? [spacecraft.value] : null,
+      severity: severity.value || null,
+    };
+    showSecret(await send("POST", HERE, JSON.stringify(settings)));
+    event.target.reset();
+    refreshSoon();
+    return `Added: ${settings.name}.`;
+  });
+});

@@ -1,0 +1,179 @@
+"""Addresses that webhooks may reach: public ones, and private networks that a setting names.
+
+The name of a receiver is resolved once for each attempt, every address is checked,
+and the connection is made to a checked address: an answer of the name server that
+changes between two look-ups leads nowhere else.
+"""
+
+import asyncio
+import ipaddress
+import socket
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+
+import httpx
+
+from service.errors import BadInput, Fault, shown_value
+from service.settings import Network, networks
+
+Address = ipaddress.IPv4Address | ipaddress.IPv6Address
+
+METADATA = frozenset(
+    ipaddress.ip_address(each)
+    for each in ("169.254.169.254", "fd00:ec2::254", "100.100.100.200", "168.63.129.16")
+)
+"""Addresses at which clouds tell a machine its own secrets; no setting allows them."""
+NAT64 = networks("64:ff9b::/96")
+NOT_PUBLIC = networks("64:ff9b:1::/48, 192.88.99.0/24, 2001::/32, fec0::/10, ::/96, ::ffff:0:0/96")
+"""Special networks that Python's own table counts, or once counted, as public."""
+NO_WEB_PORTS = frozenset(
+    (1719, 1720, 1723, 2049, 3659, 4045, 4190, 5060, 5061, 6000, 6566, 6679, 6697, 10080)
+) | frozenset(range(6665, 6670))
+"""Ports from 1024 on that browsers refuse too (WHATWG Fetch, "bad port")."""
+MAX_URL = 2_000
+MAX_ADDRESSES = 8
+MAX_LOOK_UPS = 64
+"""Of names at once; each has a thread, which a silent name server may hold for half a minute."""
+
+
+class Refused(Exception):
+    """The address of a receiver is one that webhooks must not reach; nothing was connected."""
+
+
+def require_url(url: str, allowed: Sequence[Network]) -> None:
+    """Raise `BadInput` for a URL that webhooks must not be sent to, whatever its name resolves to.
+
+    The address that stands in a URL is checked here; that of a name with each attempt.
+    """
+
+    def fault(message: str) -> BadInput:
+        # A URL may hold what only the receiver should know: the host alone is shown.
+        return BadInput(Fault("url", message, shown_value(url[:40])))
+
+    if len(url) > MAX_URL:
+        raise BadInput(Fault("url", f"may have at most {MAX_URL} characters"))
+    try:
+        parsed = httpx.URL(url)
+    except (httpx.InvalidURL, ValueError) as error:
+        raise fault(f"is no URL: {error}") from None
+    schemes = ("https", "http") if allowed else ("https",)
+    if parsed.scheme not in schemes:
+        raise fault(
+            "must begin with https://"
+            if parsed.scheme != "http"
+            else "must begin with https://; http is for networks in ACQUIRE_WEBHOOK_NETWORKS"
+        )
+    if not parsed.host:
+        raise fault("must name a host")
+    if parsed.userinfo:
+        raise BadInput(Fault("url", "must not hold a user name or a password"))
+    if parsed.fragment:
+        raise fault("must not have a fragment (#)")
+    port = parsed.port
+    if port is not None and port not in (80, 443) and not _is_web_port(port):
+        raise fault("must have port 80, 443, or one from 1024 on that is for the web")
+    if (address := _literal(parsed.host)) is not None:
+        try:
+            require_reachable(address, allowed, only_allowed=parsed.scheme == "http")
+        except Refused as error:
+            raise fault(str(error)) from None
+
+
+def require_reachable(
+    address: Address, allowed: Sequence[Network], *, only_allowed: bool = False
+) -> None:
+    """Raise `Refused` for an address that is neither public nor in an allowed network.
+
+    With `only_allowed` it must be in an allowed network.  An address that stands for
+    another one, as IPv4-mapped and 6to4 ones do, is refused where either is.
+    """
+    for each in (address, *_embedded(address)):
+        if each in METADATA:
+            raise Refused(f"{address} tells a machine its own secrets, and is never allowed")
+        if _is_in(each, allowed):
+            continue
+        if only_allowed:
+            raise Refused(f"{address} is not in ACQUIRE_WEBHOOK_NETWORKS, as plain http requires")
+        if not each.is_global or each.is_multicast or _is_in(each, NOT_PUBLIC):
+            raise Refused(f"{address} is not a public address, and no allowed network has it")
+
+
+async def reachable_addresses(
+    host: str, port: int, allowed: Sequence[Network], *, only_allowed: bool = False
+) -> list[str]:
+    """The addresses of a host, each of them checked; resolves a name once.
+
+    Raises `Refused` if any of them must not be reached, OSError for an unknown name.
+    """
+    literal = _literal(host)
+    found = [str(literal)] if literal is not None else await _look_up(host, port)
+    for each in found:
+        require_reachable(ipaddress.ip_address(each), allowed, only_allowed=only_allowed)
+    return found[:MAX_ADDRESSES]
+
+
+def _is_web_port(port: int) -> bool:
+    return 1024 <= port <= 65535 and port not in NO_WEB_PORTS
+
+
+def _literal(host: str) -> Address | None:
+    try:
+        return ipaddress.ip_address(host)
+    except ValueError:
+        return None
+
+
+def _is_in(address: Address, among: Sequence[Network]) -> bool:
+    return any(address in network for network in among)
+
+
+def _embedded(address: Address) -> Iterator[Address]:
+    """The IPv4 addresses that an IPv6 address stands for."""
+    if isinstance(address, ipaddress.IPv4Address):
+        return
+    if address.ipv4_mapped is not None:
+        yield address.ipv4_mapped
+    if address.sixtofour is not None:
+        yield address.sixtofour
+    if _is_in(address, NAT64):
+        yield ipaddress.IPv4Address(int(address) & 0xFFFFFFFF)
+
+
+_look_ups = threading.BoundedSemaphore(MAX_LOOK_UPS)
+
+
+async def _look_up(host: str, port: int) -> list[str]:
+    """The addresses of a name, in the order of the system's preference.
+
+    In a thread of its own, which nothing waits for: a look-up cannot be ended, and the
+    threads of a pool would hold up the end of the process.
+    """
+    loop = asyncio.get_running_loop()
+    done: asyncio.Future[list[str]] = loop.create_future()
+
+    def tell(found: list[str] | OSError) -> None:
+        if done.cancelled():
+            return
+        if isinstance(found, OSError):
+            done.set_exception(found)
+        else:
+            done.set_result(found)
+
+    def work() -> None:
+        found: list[str] | OSError
+        try:
+            answers = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+            found = list(dict.fromkeys(str(answer[4][0]) for answer in answers))
+        except (OSError, UnicodeError) as error:
+            found = error if isinstance(error, OSError) else OSError(f"{host}: {error}")
+        finally:
+            _look_ups.release()
+        # The loop may have ended meanwhile.
+        with suppress(RuntimeError):
+            loop.call_soon_threadsafe(tell, found)
+
+    if not _look_ups.acquire(blocking=False):
+        raise OSError("too many names are being looked up")
+    threading.Thread(target=work, name="webhook-name", daemon=True).start()
+    return await done

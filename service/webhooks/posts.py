@@ -1,0 +1,162 @@
+"""One attempt to deliver: a POST to a checked address, bounded in time and in what is read."""
+
+import asyncio
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from email.utils import parsedate_to_datetime
+
+import httpx
+
+from service import __version__
+from service.settings import Network
+from service.webhooks.addresses import Refused, reachable_addresses
+
+TOTAL_S = 10.0
+"""From the look-up of the name to the end of the answer."""
+MAX_ANSWER_BYTES = 64 << 10
+MAX_FAULT = 300
+PORTS = {"http": 80, "https": 443}
+GONE, TOO_MANY, UNAVAILABLE = 410, 429, 503
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of an attempt: a status, or the fault that kept the answer away.
+
+    `retry_after_s` is what the receiver asked for, in seconds.
+    """
+
+    status: int | None
+    fault: str | None
+    retry_after_s: float | None = None
+    duration_s: float = 0.0
+
+    @property
+    def delivered(self) -> bool:
+        """Whether the receiver has the event."""
+        return self.fault is None
+
+
+class CheckedTransport(httpx.AsyncBaseTransport):
+    """Connects to the checked addresses of a host; name and certificate stay those of the host."""
+
+    def __init__(self, allowed: Sequence[Network]) -> None:
+        self._allowed = allowed
+        context = httpx.create_ssl_context(trust_env=False)
+        # What the system trusts too, so that a site can add its own authority.
+        context.load_default_certs()
+        self._inner = httpx.AsyncHTTPTransport(
+            verify=context,
+            trust_env=False,
+            # A kept connection would serve another name that has the same address.
+            limits=httpx.Limits(max_connections=None, max_keepalive_connections=0),
+        )
+
+    async def handle_async_request(self, request: httpx.Request) -> httpx.Response:
+        """Send the request to the first address that accepts a connection.
+
+        Raises `Refused` where an address must not be reached.
+        """
+        url = request.url
+        addresses = await reachable_addresses(
+            url.host,
+            url.port or PORTS[url.scheme],
+            self._allowed,
+            only_allowed=url.scheme == "http",
+        )
+        # The header `Host` was made of the name before.
+        request.extensions = {**request.extensions, "sni_hostname": url.host}
+        limits = dict(request.extensions["timeout"])
+        for address in addresses[:-1]:
+            request.url = url.copy_with(host=address)
+            # One that does not answer leaves time for the others.
+            share_s = {"connect": TOTAL_S / len(addresses)}
+            request.extensions = {**request.extensions, "timeout": limits | share_s}
+            try:
+                return await self._inner.handle_async_request(request)
+            except (httpx.ConnectError, httpx.ConnectTimeout):
+                continue  # nothing was sent yet
+        request.extensions = {**request.extensions, "timeout": limits}
+        request.url = url.copy_with(host=addresses[-1])
+        return await self._inner.handle_async_request(request)
+
+    async def aclose(self) -> None:
+        """Close what is open."""
+        await self._inner.aclose()
+
+
+class Poster:
+    """Makes attempts, any number at a time."""
+
+    def __init__(self, allowed: Sequence[Network]) -> None:
+        self._client = httpx.AsyncClient(
+            transport=CheckedTransport(allowed),
+            trust_env=False,
+            follow_redirects=False,
+            timeout=TOTAL_S,
+            headers={
+                "Content-Type": "application/json",
+                "User-Agent": f"attitude-acquisition/{__version__}",
+                "Accept-Encoding": "identity",
+                "Connection": "close",
+            },
+        )
+
+    async def post(self, url: str, headers: Mapping[str, str], body: bytes) -> Outcome:
+        """Send a body; every failure is an outcome."""
+        begun_s = time.monotonic()
+        status: int | None = None
+        retry_after_s: float | None = None
+        fault: str | None
+        try:
+            async with asyncio.timeout(TOTAL_S):
+                async with self._client.stream(
+                    "POST", url, headers=headers, content=body
+                ) as answer:
+                    status = answer.status_code
+                    retry_after_s = _retry_after_s(answer.headers.get("retry-after"))
+                    received = 0
+                    # Raw: what unfolds is not read.
+                    async for piece in answer.aiter_raw():
+                        received += len(piece)
+                        if received > MAX_ANSWER_BYTES:
+                            break
+                fault = _fault_of(status)
+        except Refused as error:
+            fault = f"refused: {error}"
+        except (TimeoutError, httpx.TimeoutException):
+            fault = f"no complete answer within {TOTAL_S:g} s"
+        except httpx.ConnectError as error:
+            fault = f"no connection: {error}"
+        except httpx.HTTPError as error:
+            fault = f"the connection broke: {str(error) or type(error).__name__}"
+        except (OSError, httpx.InvalidURL, ValueError) as error:
+            fault = f"the name cannot be resolved: {error}"
+        if fault is not None:
+            fault = fault[:MAX_FAULT].replace("\x00", "")
+        return Outcome(status, fault, retry_after_s, time.monotonic() - begun_s)
+
+    async def close(self) -> None:
+        """Close what is open."""
+        await self._client.aclose()
+
+
+def _fault_of(status: int) -> str | None:
+    if 200 <= status < 300:
+        return None
+    if 300 <= status < 400:
+        return f"status {status}: redirects are not followed"
+    return f"status {status}"
+
+
+def _retry_after_s(text: str | None) -> float | None:
+    """The seconds of a header `Retry-After`, which has a number or a date; None: neither."""
+    if text is None:
+        return None
+    if text.isascii() and text.isdigit() and len(text) < 10:
+        return float(text)
+    try:
+        return max(0.0, parsedate_to_datetime(text).timestamp() - time.time())
+    except (ValueError, OverflowError):
+        return None

@@ -1,0 +1,372 @@
+"""Delivers recorded events to webhooks, from one thread with an event loop of its own.
+
+Each second, and after each commit, it queues new events for the webhooks that want
+them and begins to deliver the queues that are due, a few of each webhook at a time.
+A queue is the events of one spacecraft for one webhook: what fails there holds up
+nothing else.  Nothing here waits in the service's own event loop or in its writer.
+"""
+
+import asyncio
+import logging
+import random
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+from contextlib import suppress
+from functools import partial
+from typing import Any, TypeVar
+
+from sqlalchemy import Connection
+
+from service.errors import Busy, Stopping
+from service.settings import Network
+from service.storage.recording.events import Event, events_after, first_event, last_event
+from service.storage.recording.ids import unguessable_ulid
+from service.storage.sql.database import Store
+from service.storage.webhooks import deliveries
+from service.storage.webhooks.deliveries import Attempt, Queue, Waiting
+from service.storage.webhooks.registered import Registered, count_webhooks, registered_webhooks
+from service.times import DAY_S, recorded_utc, shifted, utc_now
+from service.webhooks.messages import delivery_row, test_message, wants
+from service.webhooks.posts import GONE, TOO_MANY, TOTAL_S, UNAVAILABLE, Outcome, Poster
+from service.webhooks.signing import signed_headers
+from service.webhooks.turn import Turn
+
+log = logging.getLogger(__name__)
+
+POLL_S = 1.0
+GATHER_S = 0.2
+"""After a commit: under load many events are queued at once."""
+PARALLEL = 4
+"""Attempts for one webhook at a time: a receiver that does not answer occupies its own alone."""
+READ_AT_ONCE = 500
+DELIVERED_AT_ONCE = 20
+"""Events that are noted as delivered together."""
+NOTED_AFTER_S = 2.0
+MAX_WAITING = 50_000
+"""Queued events of one webhook; further ones stay in the list of events as long as that is kept."""
+DEAD_AFTER_S = DAY_S
+FIRST_DELAY_S, LAST_DELAY_S = 5.0, 3600.0
+JITTER = 0.2
+NOTE_AGAIN_S = 1.0
+"""The pause after an outcome could not be noted, as while the writer's queue is full."""
+STOP_S = 2.0
+"""How long attempts that are under way may take when the service stops."""
+MAX_TESTS = 4
+LISTED_FOR_S = 5.0
+"""Nothing is sent by a list of webhooks that is older: a token may have been revoked."""
+
+T = TypeVar("T")
+
+
+def retry_delay_s(attempts: int, share: float) -> float:
+    """The pause after so many failed attempts: 5 s, twice that each time, an hour at most.
+
+    `share` from 0 to 1 is a random number: so much of a fifth is added.
+    """
+    doubled = FIRST_DELAY_S * 2.0 ** min(attempts - 1, 20)
+    return min(doubled, LAST_DELAY_S) * (1.0 + JITTER * share)
+
+
+class WebhookSender:
+    """Delivers events to webhooks between `start` and `stop`."""
+
+    def __init__(
+        self, store: Store, allowed: Sequence[Network], is_open: Callable[[], bool]
+    ) -> None:
+        """`allowed` are networks that webhooks may reach though they are not public.
+
+        `is_open` says whether access is open, so that a webhook needs no token.
+        """
+        self._store = store
+        self._allowed = allowed
+        self._is_open = is_open
+        self._turn = Turn(store, unguessable_ulid())
+        self._webhooks: dict[str, Registered] = {}
+        self._listed_s = -LISTED_FOR_S
+        self._changes = 0
+        self._positions: dict[str, int] = {}
+        self._is_stopping = False
+        self._under_way: dict[Queue, asyncio.Task[None]] = {}
+        self._tests = threading.BoundedSemaphore(MAX_TESTS)
+        self._readers = ThreadPoolExecutor(2, "webhook-reader")
+        self._poster: Poster | None = None
+        self._started = threading.Event()
+        self._thread: threading.Thread | None = None
+        self.counts: Counter[str] = Counter(delivered=0, failed=0, dead=0)
+        """Attempts since the start by outcome."""
+
+    def start(self) -> None:
+        """Begin to deliver."""
+        self._thread = threading.Thread(
+            target=lambda: asyncio.run(self._main()), name="webhooks", daemon=True
+        )
+        self._thread.start()
+        self._started.wait()
+        self._store.writer.after_commit.append(self._poke)
+
+    def stop(self) -> None:
+        """Wait a little for the attempts under way, and note those that have succeeded."""
+        if self._thread is None:
+            return
+        self._store.writer.after_commit.remove(self._poke)
+        with suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(self._task.cancel)
+        self._thread.join()
+        self._thread = None
+        self._readers.shutdown(wait=False)
+
+    def changed(self) -> None:
+        """Read the webhooks again before anything is sent: one was made, changed or deleted."""
+        self._changes += 1
+        self._listed_s = -LISTED_FOR_S
+        if self._thread is not None:
+            self._poke()
+
+    def try_out(self, webhook: Registered) -> tuple[str, Outcome]:
+        """Send a test event, and wait for what comes of it; returns its id too.
+
+        Raises `Busy` while too many are sent, or where nothing is sent from this process.
+        """
+        if self._thread is None:
+            raise Busy("webhooks are not delivered by this process now")
+        if not self._tests.acquire(blocking=False):
+            raise Busy(f"{MAX_TESTS} tests of webhooks are under way", int(TOTAL_S))
+        id, body = test_message(webhook.id, utc_now().text)
+        sending = self._post(webhook, id, body)
+        try:
+            return id, asyncio.run_coroutine_threadsafe(sending, self._loop).result()
+        except CancelledError:
+            raise Busy("the service is stopping") from None
+        finally:
+            self._tests.release()
+
+    # ---- the sender's thread -----------------------------------------------------------------
+
+    async def _main(self) -> None:
+        self._loop, self._news = asyncio.get_running_loop(), asyncio.Event()
+        task = asyncio.current_task()
+        assert task is not None
+        self._task = task
+        self._started.set()
+        try:
+            with suppress(asyncio.CancelledError):
+                await self._go_on()
+        finally:
+            self._is_stopping = True
+            under_way = list(self._under_way.values())
+            if under_way:
+                await asyncio.wait(under_way, timeout=STOP_S)
+            for each in under_way:
+                each.cancel()
+            await asyncio.gather(*under_way, return_exceptions=True)
+            with suppress(Exception):
+                await self._turn.give_up()
+            if self._poster is not None:
+                await self._poster.close()
+
+    async def _go_on(self) -> None:
+        while True:
+            self._news.clear()
+            try:
+                await self._round()
+            except Exception as error:
+                # The records are out of reach for a while: nothing is lost, it comes later.
+                log.warning("webhooks are not delivered: %s", error)
+                await asyncio.sleep(POLL_S)
+            with suppress(TimeoutError):
+                async with asyncio.timeout(POLL_S):
+                    await self._news.wait()
+                    await asyncio.sleep(GATHER_S)
+
+    def _poke(self) -> None:
+        with suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(self._news.set)
+
+    async def _round(self) -> None:
+        now_s = time.monotonic()
+        if now_s - self._listed_s >= POLL_S:
+            changes = self._changes
+            known = await self._read(self._list)
+            self._webhooks = {webhook.id: webhook for webhook in known}
+            # What changed meanwhile is perhaps not in the list.
+            self._listed_s = now_s if changes == self._changes else -LISTED_FOR_S
+        if not self._webhooks or not await self._turn.take(self._read):
+            return
+        active = [each for each in self._webhooks.values() if each.state == "active"]
+        if active:
+            last, waiting = await self._read(self._last_and_waiting)
+            for webhook in active:
+                await self._queue_news(webhook, last, MAX_WAITING - waiting.get(webhook.id, 0))
+            await self._begin_due()
+
+    async def _queue_news(self, webhook: Registered, last: int, room: int) -> None:
+        """Queue the events up to `last` that a webhook wants, while there is room for them."""
+        position = self._positions.get(webhook.id, webhook.position)
+        # It is beyond `last` where events were recorded after `last` was read.
+        while position < last and room > 0:
+            found, missed = await self._read(self._after, position)
+            now = utc_now().text
+            wanted = [event for event in found if wants(webhook, event)]
+            rows = [delivery_row(webhook.id, event, now) for event in wanted]
+            after = found[-1].id if found else last
+            if missed:
+                log.warning("webhook %s misses %d events that were deleted", webhook.id, missed)
+            move = partial(
+                deliveries.queue_events,
+                id=webhook.id,
+                before=position,
+                after=after,
+                missed=missed,
+                rows=rows,
+            )
+            if not await self._change(move):
+                # Another process moved it, or it was deleted: what is stored holds.
+                self._positions.pop(webhook.id, None)
+                self.changed()
+                return
+            self._positions[webhook.id] = position = after
+            room -= len(rows)
+
+    async def _begin_due(self) -> None:
+        now = utc_now().text
+        counts = Counter(queue.webhook_id for queue in self._under_way)
+        for queue, due in await self._read(self._heads):
+            if due > now:
+                break
+            if queue in self._under_way or counts[queue.webhook_id] >= PARALLEL:
+                continue
+            if self._receiver(queue.webhook_id) is not None:
+                counts[queue.webhook_id] += 1
+                self._under_way[queue] = asyncio.create_task(self._work_through(queue))
+
+    def _receiver(self, webhook_id: str) -> Registered | None:
+        """The webhook, where something may be sent to it now."""
+        webhook = self._webhooks.get(webhook_id)
+        is_listed = time.monotonic() - self._listed_s < LISTED_FOR_S
+        if webhook is None or webhook.state != "active":
+            return None
+        if self._is_stopping or not self._turn.is_fresh:
+            return None
+        is_held = webhook.held_until is not None and utc_now().text < webhook.held_until
+        return webhook if is_listed and not is_held else None
+
+    async def _work_through(self, queue: Queue) -> None:
+        """Deliver the first events of a queue in order, until one fails."""
+        try:
+            await self._deliver(queue)
+        except Exception as error:
+            log.warning("the deliveries of a webhook were interrupted: %s", error)
+        else:
+            self._poke()
+        finally:
+            del self._under_way[queue]
+
+    async def _deliver(self, queue: Queue) -> None:
+        begun_s = time.monotonic()
+        done: list[int] = []
+        failed, outcome = None, None
+        try:
+            for waiting in await self._read(self._next_of, queue):
+                webhook = self._receiver(queue.webhook_id)
+                if webhook is None:
+                    break
+                outcome = await self._post(webhook, waiting.message_id, waiting.body.encode())
+                if not outcome.delivered:
+                    failed = waiting
+                    break
+                done.append(waiting.event_id)
+                if time.monotonic() - begun_s >= NOTED_AFTER_S:
+                    break
+        finally:
+            # Also where the service stops meanwhile.
+            if outcome is not None:
+                attempt = self._attempt(queue, done, failed, outcome)
+                await self._note(attempt)
+                if attempt.gone or attempt.held_until is not None:
+                    self.changed()
+
+    async def _note(self, attempt: Attempt) -> None:
+        """Note what came of attempts; the queue waits, so that nothing is sent again meanwhile."""
+        while True:
+            try:
+                return await self._change(partial(deliveries.settle, attempt=attempt))
+            except Busy as error:
+                if self._is_stopping or isinstance(error, Stopping):
+                    raise
+                log.warning("deliveries of a webhook cannot be noted yet: %s", error)
+            await asyncio.sleep(NOTE_AGAIN_S)
+
+    async def _post(self, webhook: Registered, message_id: str, body: bytes) -> Outcome:
+        now, unix_s = utc_now().text, int(time.time())
+        headers = signed_headers(webhook.secrets(now), message_id, unix_s, body)
+        # Not before: to read the certificates of all authorities takes a while.
+        self._poster = self._poster or Poster(self._allowed)
+        return await self._poster.post(webhook.url, headers, body)
+
+    def _attempt(
+        self, queue: Queue, done: Sequence[int], failed: Waiting | None, outcome: Outcome
+    ) -> Attempt:
+        now = utc_now()
+        self.counts["delivered"] += len(done)
+        if failed is None:
+            return Attempt(queue, now.text, done, status=outcome.status)
+        end = shifted(recorded_utc(failed.queued), DEAD_AFTER_S).text
+        is_dead = end <= now.text and outcome.status != GONE
+        self.counts["dead" if is_dead else "failed"] += 1
+        asked_s = min(outcome.retry_after_s or 0.0, DEAD_AFTER_S)
+        delay_s = max(retry_delay_s(failed.attempts + 1, random.random()), asked_s)
+        holds = asked_s > 0 and outcome.status in (TOO_MANY, UNAVAILABLE)
+        return Attempt(
+            queue,
+            now.text,
+            done,
+            failed,
+            due=None if is_dead else min(shifted(now, delay_s).text, max(end, now.text)),
+            status=outcome.status,
+            fault=outcome.fault,
+            held_until=shifted(now, asked_s).text if holds else None,
+            gone=outcome.status == GONE,
+        )
+
+    # ---- the records -------------------------------------------------------------------------
+
+    async def _read(self, ask: Callable[..., T], *given: Any) -> T:
+        return await self._loop.run_in_executor(self._readers, ask, *given)
+
+    async def _change(self, change: Callable[[Connection], T]) -> T:
+        return await asyncio.wrap_future(self._store.writer.change(change))
+
+    def _list(self) -> Sequence[Registered]:
+        with self._store.reading() as connection:
+            if not count_webhooks(connection):
+                return ()
+        is_open = self._is_open()
+        with self._store.reading() as connection:
+            return registered_webhooks(connection, utc_now().text, is_open)
+
+    def _last_and_waiting(self) -> tuple[int, dict[str, int]]:
+        with self._store.reading() as connection:
+            return last_event(connection), deliveries.count_waiting(connection)
+
+    def _after(self, position: int) -> tuple[Sequence[Event], int]:
+        """The next events, and how many are no longer kept; none where the position is unknown."""
+        with self._store.reading() as connection:
+            found = events_after(connection, position, READ_AT_ONCE)
+            if found is not None:
+                return found, 0
+            first = first_event(connection)
+            if first is None or first <= position:
+                return (), 0
+            kept = events_after(connection, first - 1, READ_AT_ONCE)
+            return kept or (), first - 1 - position
+
+    def _heads(self) -> list[tuple[Queue, str]]:
+        with self._store.reading() as connection:
+            return deliveries.heads(connection)
+
+    def _next_of(self, queue: Queue) -> list[Waiting]:
+        with self._store.reading() as connection:
+            return deliveries.next_of(connection, queue, DELIVERED_AT_ONCE)

@@ -1,0 +1,180 @@
+"""Whose events a webhook is sent, what is kept secret, and what a wrong request is told."""
+
+import queue
+import time
+
+import pytest
+from sqlalchemy import select
+
+from service.storage.recording.ids import Ulids
+from service.storage.sql.access_tables import audit
+from service.storage.sql.webhook_tables import webhooks
+from service.storage.webhooks.sender import read_sender
+from tests.web.conformance import check
+from tests.web.test_access import KNOWN_AGAIN_S, Guarded, shown
+from tests.webhooks.conftest import HERE, serving, until
+
+SETTINGS = {"name": "pager", "url": "https://receiver.example/"}
+
+
+class Tokens(Guarded):
+    """Tokens for a service that is open already."""
+
+    def __init__(self, app):
+        self.app, self._ids = app, Ulids()
+
+
+def test_a_webhook_ends_with_its_token_and_goes_on_with_another(service, receiver):
+    tokens = Tokens(service.app)
+    headers = shown(tokens.token("first", "read", "operate"))
+    settings = {"name": "mine", "url": receiver.url}
+    until(lambda: not service.app.access.is_open)
+    made = service.client.post(HERE, json=settings, headers=headers).json()
+    assert made["who"] == "first"
+    service.note("seen")
+    receiver.next()
+    tokens.revoke("first")
+    time.sleep(KNOWN_AGAIN_S)
+    service.note("held")
+    headers = shown(tokens.token("second", "read", "operate"))
+
+    def state():
+        return service.client.get(f"{HERE}/{made['id']}", headers=headers).json()
+
+    assert state()["state"] == "paused"
+    assert "'first' was revoked" in state()["reason"]
+    with pytest.raises(queue.Empty):
+        receiver.next(1.5)
+    answer = service.client.put(f"{HERE}/{made['id']}", json=settings, headers=headers)
+    assert answer.json()["who"] == "second"
+    assert b"held" in receiver.next().body
+
+
+def test_a_webhook_of_open_access_is_paused_by_the_first_token(service, receiver):
+    hook = service.hook(receiver.url)
+    headers = shown(Tokens(service.app).token("op", "read", "operate"))
+    until(lambda: not service.app.access.is_open)
+    state = service.client.get(f"{HERE}/{hook['id']}", headers=headers).json()
+    assert (state["state"], "without a token" in state["reason"]) == ("paused", True)
+
+
+def test_a_token_that_may_not_read_or_is_bound_makes_none(service):
+    tokens = Tokens(service.app)
+    without_read = shown(tokens.token("op", "operate"))
+    bound = shown(tokens.token("bound", "read", "operate", spacecraft=["XTE"]))
+    until(lambda: not service.app.access.is_open)
+    for headers in (without_read, bound):
+        answer = service.client.post(HERE, json=SETTINGS, headers=headers)
+        assert answer.status_code == 403
+    assert service.client.get(HERE, headers=bound).status_code == 403
+    assert service.client.get(HERE, headers=without_read).json() == {"items": []}
+
+
+def test_the_secret_is_shown_once_and_every_change_is_in_the_audit_list(service, receiver, caplog):
+    caplog.set_level("DEBUG")
+    hook = service.hook(receiver.url)
+    here = f"{HERE}/{hook['id']}"
+    rotated = service.ask(hook, "secret").json()["secret"]
+    told = [
+        service.client.get(HERE).text,
+        service.client.get(here).text,
+        service.client.put(here, json=SETTINGS).text,
+        service.client.get("/webhooks").text,
+        service.client.get("/metrics").text,
+        service.ask(hook, "replay", since="1999-01-01T00:00:00Z").text,
+        service.ask(hook, "retry").text,
+        service.client.delete(here).text,
+        service.client.get("/api/v1/audit").text,
+        caplog.text,
+    ]
+    for secret in (hook["secret"], rotated):
+        assert not [each for each in told if secret in each]
+    with service.app.context.reading() as connection:
+        actions = list(connection.scalars(select(audit.c.action).order_by(audit.c.id)))
+        assert connection.execute(select(webhooks)).all() == []
+    assert actions == [
+        "add_webhook",
+        "rotate_webhook_secret",
+        "change_webhook",
+        "replay_events",
+        "retry_dead_letters",
+        "delete_webhook",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"name": ""}, "name"),
+        ({"name": "a\x00"}, "name"),
+        ({"url": "https://10.0.0.1/"}, "url"),
+        ({"url": "https://receiver.example/\x00"}, "url"),
+        ({"url": None}, "url"),
+        ({"kinds": []}, "kinds"),
+        ({"kinds": ["batch"]}, "kinds[0]"),
+        ({"severity": "bad"}, "severity"),
+        ({"spacecraft": ["NOPE"]}, "spacecraft"),
+        ({"run": "a b"}, "run"),
+        ({"secret": "whsec_AAAA"}, "secret"),
+    ],
+)
+def test_a_bad_field_is_named_and_nothing_is_stored(service, change, field):
+    answer = service.client.post(HERE, json=SETTINGS | change)
+    assert answer.status_code == 422, answer.text
+    named = answer.json()["errors"][0]["field"]
+    assert named.partition(".")[0].partition("[")[0] == field.partition("[")[0]
+    assert service.client.get(HERE).json() == {"items": []}
+
+
+def test_an_unknown_webhook_is_not_found_and_answers_are_as_described(service, receiver):
+    service.client.event_hooks = {"response": [check]}
+    for id in ("x", "01JD0000000000000000000000"):
+        here = f"{HERE}/{id}"
+        assert service.client.get(here).status_code == 404
+        assert service.client.put(here, json=SETTINGS).status_code == 404
+        assert service.client.delete(here).status_code == 404
+        assert service.client.get(f"{here}/deliveries").status_code == 404
+        for what, body in (("test", {}), ("secret", {}), ("retry", {})):
+            assert service.ask({"id": id}, what, **body).status_code == 404
+        replayed = service.ask({"id": id}, "replay", since="1999-01-01T00:00:00Z")
+        assert replayed.status_code == 404
+    receiver.answer = lambda handler, _: handler.say(500)
+    hook = service.hook(receiver.url)
+    for number in range(5):
+        service.note(f"n{number}")
+    until(lambda: service.read(hook)["waiting"] == 5 and service.read(hook)["last_fault"])
+    first = service.client.get(f"{HERE}/{hook['id']}/deliveries", params={"limit": 3})
+    rest = service.client.get(first.links["next"]["url"])
+    numbers = [each["event"] for each in first.json()["items"] + rest.json()["items"]]
+    assert numbers == sorted(numbers, reverse=True)
+    assert len(numbers) == 5
+    bad = service.client.get(f"{HERE}/{hook['id']}/deliveries", params={"cursor": "x"})
+    assert bad.json()["errors"][0]["field"] == "cursor"
+
+
+def test_there_are_at_most_fifty(service):
+    for number in range(50):
+        url = f"https://receiver.example/{number}"
+        service.hook(url, enabled=False)
+    answer = service.client.post(HERE, json=SETTINGS)
+    assert answer.status_code == 409
+    assert "50 webhooks" in answer.json()["detail"]
+
+
+def test_metrics_tell_what_waits_and_what_came_of_attempts(service, receiver):
+    receiver.answer = lambda handler, _: handler.say(500)
+    hook = service.hook(receiver.url, name="pager")
+    service.note("x")
+    until(lambda: service.read(hook)["last_fault"])
+    told = service.client.get("/metrics").text
+    labels = f'{{name="pager",webhook="{hook["id"]}"}}'
+    assert f"starid_webhook_waiting{labels} 1.0" in told
+    assert f"starid_webhook_active{labels} 1.0" in told
+    assert 'starid_webhook_attempts_total{result="failed"} 1.0' in told
+
+
+def test_a_service_without_webhooks_writes_nothing_of_them(chosen_database):
+    with serving(chosen_database()) as service:
+        service.note("x")
+        with service.app.context.reading() as connection:
+            assert read_sender(connection) == (None, 0)

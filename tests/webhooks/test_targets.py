@@ -1,0 +1,218 @@
+"""Webhooks reach public addresses and named networks only, on the address connected to."""
+
+import socket
+import ssl
+import subprocess
+from ipaddress import ip_address
+
+import pytest
+
+from service.errors import BadInput
+from service.settings import networks
+from service.webhooks.addresses import Refused, require_reachable, require_url
+from tests.webhooks.conftest import HERE, receiving, serving, until
+
+LITERALS = [
+    "https://127.0.0.1/",
+    "https://127.255.255.254/",
+    "https://10.0.0.1/",
+    "https://172.16.0.1/",
+    "https://192.168.1.1/",
+    "https://169.254.169.254/latest/meta-data",
+    "https://100.100.100.200/",
+    "https://168.63.129.16/",
+    "https://100.64.0.1/",
+    "https://0.0.0.0/",
+    "https://224.0.0.1/",
+    "https://239.255.255.250/",
+    "https://255.255.255.255/",
+    "https://240.0.0.1/",
+    "https://192.0.2.1/",
+    "https://[::1]/",
+    "https://[::]/",
+    "https://[fe80::1]/",
+    "https://[fc00::1]/",
+    "https://[fd00:ec2::254]/",
+    "https://[ff02::1]/",
+    "https://[::ffff:127.0.0.1]/",
+    "https://[::ffff:8.8.8.8]/",
+    "https://[::127.0.0.1]/",
+    "https://[2002:7f00:1::]/",
+    "https://[2002:a00:1::1]/",
+    "https://[64:ff9b::7f00:1]/",
+    "https://[64:ff9b::a9fe:a9fe]/",
+    "https://[64:ff9b:1::a00:1]/",
+    "https://[2001:0:7f00:1::]/",
+    "https://[2001:db8::1]/",
+]
+"""Each is refused by itself; those that stand for an IPv4 address, for that one."""
+
+FORMS = [
+    ("ftp://receiver.example/", "https"),
+    ("file:///etc/passwd", "https"),
+    ("http://receiver.example/", "https"),
+    ("https://user:hunter2@receiver.example/", "user name"),
+    ("https://receiver.example:22/", "port"),
+    ("https://receiver.example:25/", "port"),
+    ("https://receiver.example:6000/", "port"),
+    ("https://receiver.example:6667/", "port"),
+    ("https://receiver.example/#part", "fragment"),
+    ("https:///path", "host"),
+    ("receiver.example", "https"),
+    ("https://receiver.example:99999/", "port"),
+    ("https://[::1/", "URL"),
+    ("https://0177.0.0.1/", "URL"),
+]
+
+NAMES = [
+    "localhost",
+    "2130706433",
+    "0x7f000001",
+    "127.1",
+    "rebind.example",
+    "mixed.example",
+    "metadata.example",
+    "mapped.example",
+]
+"""They are refused when an attempt resolves them; the last four by a name server of ours."""
+
+
+@pytest.mark.parametrize("url", LITERALS)
+def test_an_address_that_is_not_public_is_refused(url):
+    with pytest.raises(BadInput) as refused:
+        require_url(url, ())
+    assert [fault.field for fault in refused.value.faults] == ["url"]
+
+
+@pytest.mark.parametrize(("url", "said"), FORMS)
+def test_another_form_of_url_is_refused(url, said):
+    with pytest.raises(BadInput, match=said) as refused:
+        require_url(url, ())
+    assert [fault.field for fault in refused.value.faults] == ["url"]
+    assert "hunter2" not in str(refused.value)
+
+
+@pytest.mark.parametrize("url", ["https://8.8.8.8/", "https://[2606:4700::1111]/", "https://x.y/"])
+def test_public_addresses_and_names_are_accepted(url):
+    require_url(url, ())
+
+
+def test_a_setting_allows_networks_but_never_metadata():
+    allowed = networks("10.0.0.0/8, 169.254.0.0/16, 127.0.0.2/32")
+    require_url("http://10.1.2.3/", allowed)
+    require_url("https://10.1.2.3:8443/", allowed)
+    for refused in ("https://169.254.169.254/", "https://127.0.0.1/", "http://8.8.8.8/"):
+        with pytest.raises(BadInput, match="url"):
+            require_url(refused, allowed)
+    with pytest.raises(Refused):
+        require_reachable(ip_address("::ffff:10.1.2.3"), allowed)
+
+
+@pytest.fixture
+def names(monkeypatch):
+    """A name server of ours: a list of answers for each name, and what was looked up."""
+    real, asked = socket.getaddrinfo, []
+    answers = {
+        "metadata.example": [["169.254.169.254"]],
+        "mapped.example": [["::ffff:127.0.0.1"]],
+        "mixed.example": [["127.0.0.2", "127.0.0.1"]],
+        "rebind.example": [["127.0.0.2"], ["127.0.0.1"]],
+        "good.example": [["127.0.0.2"]],
+    }
+
+    def getaddrinfo(host, port, *given, **named):
+        name = host.decode() if isinstance(host, bytes) else host
+        if name not in answers:
+            return real(host, port, *given, **named)
+        asked.append(name)
+        known = answers[name]
+        found = known.pop(0) if len(known) > 1 else known[0]
+        return [
+            (socket.AF_INET6 if ":" in each else socket.AF_INET, 1, 6, "", (each, port))
+            for each in found
+        ]
+
+    monkeypatch.setattr(socket, "getaddrinfo", getaddrinfo)
+    return asked
+
+
+@pytest.fixture
+def guarded(chosen_database):
+    """A service that may reach 127.0.0.2 alone, which stands for the world."""
+    with serving(chosen_database(), allowed="127.0.0.2/32") as service:
+        yield service
+
+
+def test_names_are_refused_on_the_address_that_they_resolve_to(guarded, names):
+    with receiving("127.0.0.2") as world, receiving("127.0.0.1", world.port) as inside:
+        for name in NAMES:
+            hook = guarded.hook(f"http://{name}:{world.port}/")
+            told = guarded.ask(hook, "test").json()
+            if name == "rebind.example":
+                # The first look-up is public, and the only one: it is where the request goes.
+                assert told["delivered"] is True
+                assert names.count(name) == 1
+                told = guarded.ask(hook, "test").json()
+                assert names.count(name) == 2
+            assert told["delivered"] is False, name
+            assert told["fault"].startswith("refused: "), (name, told)
+        assert inside.requests == []
+        assert len(world.requests) == 1
+        assert world.requests[0].headers["Host"] == f"rebind.example:{world.port}"
+
+
+def test_redirects_are_not_followed_and_proxies_not_asked(guarded, names, monkeypatch):
+    with receiving("127.0.0.2") as world, receiving("127.0.0.1") as inside:
+        for name in ("http_proxy", "HTTP_PROXY", "ALL_PROXY"):
+            monkeypatch.setenv(name, inside.url)
+        hook = guarded.hook(f"http://good.example:{world.port}/")
+        for status in (301, 302, 303, 307, 308):
+            world.answer = lambda handler, _, status=status: handler.say(
+                status, Location=inside.url
+            )
+            told = guarded.ask(hook, "test").json()
+            assert told["fault"] == f"status {status}: redirects are not followed"
+        assert inside.requests == []
+        assert len(world.requests) == 5
+
+
+def test_plain_http_is_for_named_networks_alone(chosen_database):
+    with serving(chosen_database(), allowed="") as service:
+        for url in ("http://receiver.example/", "https://127.0.0.1/", "https://u:p@x.example/"):
+            answer = service.client.post(HERE, json={"name": "n", "url": url})
+            assert answer.status_code == 422
+            assert [each["field"] for each in answer.json()["errors"]] == ["url"]
+
+
+@pytest.fixture
+def certificate(tmp_path):
+    """A certificate for good.example that signs itself, and its key."""
+    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
+    command = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2"]
+    command += ["-subj", "/CN=good.example", "-addext", "subjectAltName=DNS:good.example"]
+    made = subprocess.run(
+        [*command, "-keyout", key, "-out", certificate], capture_output=True, check=False
+    )
+    assert made.returncode == 0, made.stderr
+    return certificate, key
+
+
+def test_the_certificate_must_be_that_of_the_name(certificate, names, monkeypatch, chosen_database):
+    monkeypatch.setenv("SSL_CERT_FILE", str(certificate[0]))
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(*certificate)
+
+    def wrap(listening):
+        return context.wrap_socket(listening, server_side=True)
+
+    with (
+        receiving("127.0.0.2", wrap=wrap) as world,
+        serving(chosen_database(), allowed="127.0.0.2/32") as service,
+    ):
+        good = service.hook(f"https://good.example:{world.port}/")
+        assert service.ask(good, "test").json()["delivered"] is True
+        other = service.hook(f"https://rebind.example:{world.port}/")
+        fault = service.ask(other, "test").json()["fault"]
+        assert "certificate" in fault
+        assert len(world.requests) == 1
+        assert until(lambda: service.read(other))["last_fault"] is None
