@@ -1,0 +1,97 @@
+"""Filtered and smoothed attitudes: computed day by day from the record, and recorded."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from service.app.context import Context, checked_run_name
+from service.errors import NotFound
+from service.grades.day import grade_day, window_of
+from service.missions.mission import Mission, mission_named
+from service.storage.archive.reading import holds_any
+from service.storage.grades.days import DayKey, current_day, record_day, rows_of
+from service.storage.grades.inputs import days_with_batches, inputs_digest, recorded_in
+from service.storage.grades.models import GradedDayRow
+from service.storage.queries.future_dated import LIVE
+from service.storage.recording.ids import Ulids
+from service.times import Utc, utc_now
+
+
+@dataclass
+class SmoothProgress:
+    """How far a period is smoothed.
+
+    `total` counts its days with batches; `days` are the present revisions of those that have
+    attitudes, `new` the ids of the revisions that were recorded now.  `empty` counts days
+    without an attitude to start from, and `archived` those left as they are.
+    """
+
+    total: int
+    days: list[GradedDayRow] = field(default_factory=list)
+    new: set[str] = field(default_factory=set)
+    empty: int = 0
+    archived: int = 0
+
+    @property
+    def done(self) -> int:
+        """Days that are finished."""
+        return len(self.days) + self.empty + self.archived
+
+
+class Grades:
+    """Computes and reads filtered and smoothed attitudes."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self._ids = Ulids()
+
+    def smooth(
+        self,
+        name: str,
+        *,
+        run: str | None = None,
+        start: Utc | None = None,
+        end: Utc | None = None,
+        step: Callable[[SmoothProgress], object] = lambda progress: None,
+    ) -> SmoothProgress:
+        """Filter and smooth every UTC day of a period that has batches.
+
+        A day is recorded as a new revision where anything has changed that it is computed from;
+        else the revision stays that there is, as it does where batches that the day is computed
+        from are archived: those that are left would make a poorer one.
+
+        Raises `NotFound` where the period has no batch.
+        """
+        mission = mission_named(self._context.missions, name)
+        run = LIVE if run is None else checked_run_name(run)
+        with self._context.reading() as connection:
+            days = days_with_batches(connection, name, run, start, end)
+        if not days:
+            raise NotFound(f"{name} has no batch in run {run} in the period")
+        progress = SmoothProgress(len(days))
+        step(progress)
+        for day in days:
+            self._smooth_day(mission, DayKey(name, run, day), progress)
+            step(progress)
+        return progress
+
+    def _smooth_day(self, mission: Mission, key: DayKey, progress: SmoothProgress) -> None:
+        window = window_of(key.day)
+        with self._context.reading() as connection:
+            if holds_any(connection, key.spacecraft, key.run, *window):
+                progress.archived += 1
+                return
+            recorded = recorded_in(connection, key.spacecraft, key.run, *window)
+            before = current_day(connection, key)
+        inputs = inputs_digest(recorded, mission)
+        if before is not None and before.inputs == inputs:
+            progress.days.append(before)
+            return
+        graded = grade_day(recorded, mission, key.day)
+        if before is None and not graded.samples:
+            progress.empty += 1
+            return
+        rows = rows_of(key, graded, inputs, self._ids.new(), utc_now())
+        row = self._context.change(lambda connection: record_day(connection, key, rows))
+        progress.days.append(row)
+        if row.id == rows[0]["id"]:
+            progress.new.add(row.id)

@@ -1,0 +1,270 @@
+"""The filter of attitude and gyro bias: gyro samples and measurements to a history.
+
+A multiplicative extended Kalman filter (Lefferts, Markley & Shuster, 1982).
+"""
+
+import math
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from service.errors import BadInput, Fault
+from service.filtering.forward import (
+    AGREED,
+    CONFIRMED,
+    IN_A_ROW,
+    SINCE_NS,
+    Epochs,
+    Track,
+    run_filter,
+)
+from service.filtering.gyro import ConstantRateModel, FilterSettings, GyroModel
+from service.filtering.propagation import Noise, Timeline, workspace
+from service.filtering.result import AttitudeHistory, FilterResult, Innovations, Steps
+from service.filtering.samples import (
+    AttitudeMeasurements,
+    DirectionMeasurements,
+    GyroSamples,
+    no_attitudes,
+    no_directions,
+)
+from service.filtering.state import FilterState, Status
+from service.filtering.updates import ATTITUDE, DIRECTION, Measured
+from service.filtering.updates import Innovations as WrittenInnovations
+from service.vectors import Vector, read_only
+
+NS = 1e-9
+
+
+def filter_attitude(
+    model: GyroModel | ConstantRateModel,
+    gyro: GyroSamples | None = None,
+    attitudes: AttitudeMeasurements | None = None,
+    directions: DirectionMeasurements | None = None,
+    state: FilterState | None = None,
+    settings: FilterSettings | None = None,
+) -> FilterResult:
+    """Filter a stretch from `state`, or from the first measured attitude where there is none.
+
+    Epochs are all times of gyro samples and, up to the last sample, of measurements.  A
+    `GyroModel` needs `gyro`; a `ConstantRateModel` takes none, and its epochs are the
+    measurements.  Filtering in parts, each from the state at the end of the one
+    before, gives the same bytes as in one.
+
+    Raises `BadInput` for a rate beyond the gyro's limit, samples that are not later than
+    the state, measurements before it, and a stretch without any epoch.
+    """
+    attitudes, directions = attitudes or no_attitudes(), directions or no_directions()
+    if isinstance(model, ConstantRateModel):
+        if gyro is not None:
+            raise BadInput(Fault("gyro", "must be absent where the model is of a constant rate"))
+        times = np.unique(np.concatenate([attitudes.tai_ns, directions.tai_ns]))
+        if state is not None:
+            times = times[times >= state.tai_ns]
+        gyro, model = GyroSamples(times, np.zeros((len(times), 3))), model.as_gyro()
+    elif gyro is None:
+        raise BadInput(Fault("gyro", "must be given where the model is of a gyro"))
+    else:
+        gyro.check(model)
+        if state is not None and len(gyro.tai_ns) and gyro.tai_ns[0] <= state.tai_ns:
+            found = str(int(gyro.tai_ns[0]))
+            raise BadInput(Fault("gyro.tai_ns[0]", f"must be after {state.tai_ns}", found))
+    if not len(gyro.tai_ns):
+        raise BadInput(Fault("gyro", "must have at least one sample"))
+    kind, row = _order(attitudes, directions, state, gyro)
+    measured, tai_ns = _measured(attitudes, directions, kind, row)
+    timeline = _timeline(gyro, tai_ns, model, state)
+    noise = noise_of(model, settings)
+    track = _track(state, noise)
+    epochs, written = _room(len(timeline.tai_ns), len(kind))
+    run_filter(track, timeline, measured, noise, epochs, written, workspace())
+    for array in (*timeline, *epochs, *written, tai_ns, kind, row):
+        read_only(array)
+    outside = len(attitudes.tai_ns) + len(directions.tai_ns) - len(kind)
+    return FilterResult(
+        history=AttitudeHistory(
+            timeline.tai_ns,
+            epochs.quaternion,
+            epochs.rate,
+            epochs.bias,
+            epochs.covariance,
+            epochs.doubt_rad,
+            epochs.status,
+        ),
+        innovations=Innovations(tai_ns, kind, row, *written),
+        steps=Steps(
+            timeline.step_s,
+            timeline.rate_rad_s,
+            timeline.gap_s,
+            epochs.started,
+            epochs.updated,
+            epochs.shift,
+        ),
+        state=_state(track, int(timeline.tai_ns[-1]), gyro.rate_rad_s[-1]),
+        outside=outside,
+    )
+
+
+def _order(
+    attitudes: AttitudeMeasurements,
+    directions: DirectionMeasurements,
+    state: FilterState | None,
+    gyro: GyroSamples,
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Kind and row of the measurements within the gyro's samples, in order of time."""
+    for name, given in (("attitudes", attitudes), ("directions", directions)):
+        if state is not None and len(given.tai_ns) and given.tai_ns[0] < state.tai_ns:
+            expected = f"must be no earlier than the state, {state.tai_ns}"
+            raise BadInput(Fault(f"{name}.tai_ns[0]", expected, str(int(given.tai_ns[0]))))
+    a, d = len(attitudes.tai_ns), len(directions.tai_ns)
+    times = np.concatenate([attitudes.tai_ns, directions.tai_ns])
+    kind = np.repeat(np.array([ATTITUDE, DIRECTION]), [a, d])
+    row = np.concatenate([np.arange(a), np.arange(d)])
+    order = np.argsort(times, kind="stable")
+    begin = gyro.tai_ns[0] if state is None else state.tai_ns
+    order = order[(times[order] >= begin) & (times[order] <= gyro.tai_ns[-1])]
+    return kind[order], row[order]
+
+
+def _measured(
+    attitudes: AttitudeMeasurements,
+    directions: DirectionMeasurements,
+    kind: npt.NDArray[np.int64],
+    row: npt.NDArray[np.int64],
+) -> tuple[Measured, npt.NDArray[np.int64]]:
+    """The measurements as the kernels take them, and their times."""
+    m = len(kind)
+    found = Measured(
+        kind, np.zeros((m, 4)), np.zeros((m, 3, 3)), np.zeros((m, 3)), np.zeros((m, 3))
+    )
+    tai_ns = np.zeros(m, dtype=np.int64)
+    a, d = kind == ATTITUDE, kind == DIRECTION
+    tai_ns[a], tai_ns[d] = attitudes.tai_ns[row[a]], directions.tai_ns[row[d]]
+    q = attitudes.quaternion[row[a]]
+    found.quaternion[a] = q / np.linalg.norm(q, axis=1, keepdims=True)
+    found.covariance[a] = attitudes.covariance_rad2[row[a]]
+    found.body[d], found.inertial[d] = directions.body[row[d]], directions.inertial[row[d]]
+    found.covariance[d] = directions.sigma_rad[row[d]][:, None, None] ** 2 * np.eye(3)
+    return found, tai_ns
+
+
+def _timeline(
+    gyro: GyroSamples,
+    measured_ns: npt.NDArray[np.int64],
+    model: GyroModel,
+    state: FilterState | None,
+) -> Timeline:
+    """The epochs and the steps to them."""
+    tai_ns = np.unique(np.concatenate([gyro.tai_ns, measured_ns]))
+    begin_ns = int(gyro.tai_ns[0]) if state is None else state.tai_ns
+    before = gyro.rate_rad_s[:1] if state is None else state.rate_rad_s[None]
+    # The gyro's interval that each step is a part of: it ends with sample `sample`.
+    sample = np.searchsorted(gyro.tai_ns, tai_ns)
+    interval_begin_ns = np.append(begin_ns, gyro.tai_ns[:-1])[sample]
+    interval_s = (gyro.tai_ns[sample] - interval_begin_ns) * NS
+    step_begin_ns = np.append(begin_ns, tai_ns[:-1])
+    gap = interval_s > model.largest_step_s
+    rate = gyro.rate_rad_s[sample]
+    rate_before = np.concatenate([before, gyro.rate_rad_s[:-1]])[sample]
+    return Timeline(
+        tai_ns=tai_ns,
+        step_s=(tai_ns - step_begin_ns) * NS,
+        rate_rad_s=np.where(gap[:, None], 0.5 * (rate_before + rate), rate),
+        interval_s=interval_s,
+        gap_s=np.where(gap, (step_begin_ns - interval_begin_ns) * NS, -1.0),
+        first=np.append(0, np.searchsorted(measured_ns, tai_ns, side="right")),
+    )
+
+
+def noise_of(model: GyroModel, settings: FilterSettings | None = None) -> Noise:
+    """The model and the settings as the kernels take them."""
+    settings = settings or FilterSettings()
+    gate_2, gate_3 = _gates(settings.gate_tail)
+    return Noise(
+        angle=float(model.sigma_v_rad_s0_5**2),
+        bias=float(model.sigma_u_rad_s1_5**2),
+        coast=float(model.coast_rad_s1_5**2),
+        clock_step_s=float(model.clock_step_s),
+        first_bias=float(model.bias_sigma_rad_s**2),
+        scale=float(model.scale**2),
+        misalignment=float(model.misalignment_rad**2),
+        gate_2=gate_2,
+        gate_3=gate_3,
+        confirmations=settings.confirmations,
+        reset_after_ns=round(settings.reset_after_s / NS),
+        lost=float(settings.lost_rad**2),
+    )
+
+
+@lru_cache(maxsize=64)
+def _gates(tail: float) -> tuple[float, float]:
+    """What chi-square of two and of three degrees of freedom passes with this probability."""
+    # Imported here: loading it takes longer than filtering an hour.
+    from scipy.special import chdtri
+
+    return -2.0 * math.log(tail), float(chdtri(3, tail))
+
+
+def _track(state: FilterState | None, noise: Noise) -> Track:
+    """The state to work on; a copy of what is given."""
+    counts, doubt_rad = np.zeros(5, dtype=np.int64), np.zeros(1)
+    if state is None:
+        covariance = np.diag([0.0, 0.0, 0.0, *[noise.first_bias] * 3])
+        none, zero = np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
+        status = np.array([int(Status.NONE)])
+        return Track(none, zero, covariance, zero.copy(), none.copy(), status, counts, doubt_rad)
+    counts[CONFIRMED], counts[IN_A_ROW] = state.accepted, state.rejected
+    counts[AGREED], counts[SINCE_NS] = state.agreed, state.rejected_since_ns
+    doubt_rad[0] = state.doubt_rad
+    return Track(
+        state.quaternion.copy(),
+        state.bias_rad_s.copy(),
+        state.covariance.copy(),
+        state.anchor_rad_s.copy(),
+        state.rival.copy(),
+        np.array([int(state.status)]),
+        counts,
+        doubt_rad,
+    )
+
+
+def _state(track: Track, tai_ns: int, rate_rad_s: Vector) -> FilterState:
+    counts = track.counts.tolist()
+    return FilterState(
+        tai_ns=tai_ns,
+        quaternion=read_only(track.quaternion),
+        bias_rad_s=read_only(track.bias),
+        covariance=read_only(track.covariance),
+        rate_rad_s=rate_rad_s.copy(),
+        anchor_rad_s=read_only(track.anchor),
+        rival=read_only(track.rival),
+        status=Status(int(track.status[0])),
+        accepted=counts[CONFIRMED],
+        rejected=counts[IN_A_ROW],
+        agreed=counts[AGREED],
+        rejected_since_ns=counts[SINCE_NS],
+        doubt_rad=float(track.doubt_rad[0]),
+    )
+
+
+def _room(n: int, m: int) -> tuple[Epochs, WrittenInnovations]:
+    """What the kernel writes of n epochs and m measurements."""
+    epochs = Epochs(
+        quaternion=np.empty((n, 4)),
+        bias=np.empty((n, 3)),
+        rate=np.empty((n, 3)),
+        covariance=np.empty((n, 6, 6)),
+        doubt_rad=np.empty(n),
+        status=np.empty(n, dtype=np.int64),
+        started=np.zeros(n, dtype=np.bool_),
+        updated=np.zeros(n, dtype=np.bool_),
+        shift=np.zeros((n, 3)),
+    )
+    written = WrittenInnovations(
+        innovation=np.full((m, 3), np.nan),
+        covariance=np.full((m, 3, 3), np.nan),
+        nis=np.full(m, np.nan),
+        outcome=np.zeros(m, dtype=np.int64),
+    )
+    return epochs, written

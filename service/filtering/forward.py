@@ -1,0 +1,240 @@
+"""The filter's recursion over epochs and measurements, compiled."""
+
+import math
+from typing import Any, NamedTuple
+
+from service.compiled.jit import njit_no_refcount
+from service.filtering.matrices import cholesky, copy, solve_factored
+from service.filtering.propagation import bias_shift, predict
+from service.filtering.rotations import rotation_between, turn
+from service.filtering.state import Outcome, Status
+from service.filtering.updates import (
+    ATTITUDE,
+    add_curvature,
+    chi_square,
+    correct,
+    innovate,
+    innovation_covariance,
+)
+
+NONE, STARTING, GOOD = int(Status.NONE), int(Status.STARTING), int(Status.GOOD)
+DOUBTFUL, LOST = int(Status.DOUBTFUL), int(Status.LOST)
+UNUSED, ACCEPTED = int(Outcome.UNUSED), int(Outcome.ACCEPTED)
+REJECTED, STARTED = int(Outcome.REJECTED), int(Outcome.STARTED)
+UNDECIDED = int(Outcome.UNDECIDED)
+CONFIRMED, IN_A_ROW, AGREED, SINCE_NS, HERE = 0, 1, 2, 3, 4
+"""Rows of `Track.counts`; HERE counts those accepted at the present epoch."""
+
+
+class Track(NamedTuple):
+    """The state while it is worked on: see `FilterState`.
+
+    `status` (1,), `counts` (5,) by the rows above, `doubt_rad` (1,).
+    """
+
+    quaternion: Any
+    bias: Any
+    covariance: Any
+    anchor: Any
+    rival: Any
+    status: Any
+    counts: Any
+    doubt_rad: Any
+
+
+class Epochs(NamedTuple):
+    """What is written of n epochs, after their measurements.
+
+    `quaternion` (n, 4), `bias` (n, 3), `rate` (n, 3) less the bias, `covariance`
+    (n, 6, 6), `doubt_rad` (n,), `status` (n,), and `shift` (n, 3), which
+    `propagation.predict` was given.  `started` (n,): the state was replaced there;
+    `updated` (n,): it was, or a measurement was accepted.
+    """
+
+    quaternion: Any
+    bias: Any
+    rate: Any
+    covariance: Any
+    doubt_rad: Any
+    status: Any
+    started: Any
+    updated: Any
+    shift: Any
+
+
+@njit_no_refcount
+def run_filter(track, timeline, measured, noise, epochs, innovations, work):  # type: ignore[no-untyped-def]
+    """Filter all epochs of a timeline; `track` is at their end afterwards."""
+    for k in range(len(timeline.tai_ns)):
+        _propagate(track, k, timeline, noise, epochs.shift[k], work)
+        track.counts[HERE] = 0
+        for m in range(timeline.first[k], timeline.first[k + 1]):
+            _measure(track, m, timeline.tai_ns[k], measured, noise, innovations, work)
+            if innovations.outcome[m] == STARTED:
+                epochs.started[k] = True
+        epochs.updated[k] = epochs.started[k] or track.counts[HERE] > 0
+        _write(track, k, timeline, epochs)
+
+
+@njit_no_refcount
+def _propagate(track, k, timeline, noise, shift, work):  # type: ignore[no-untyped-def]
+    """Bring the state to epoch k; `shift` (3,) gets the variance that was added to the bias."""
+    rate = timeline.rate_rad_s[k]
+    if track.status[0] == NONE:
+        for i in range(3):
+            track.anchor[i] = rate[i]
+        return
+    dt = timeline.step_s[k]
+    # A step of no length changes nothing, not even the last bit.
+    if dt <= 0.0:
+        return
+    bias_shift(track.anchor, rate, timeline.interval_s[k], noise, shift)
+    for i in range(3):
+        work.rate[i] = rate[i] - track.bias[i]
+        work.theta[i] = work.rate[i] * dt
+    predict(track.covariance, work.rate, dt, timeline.gap_s[k], shift, noise, work)
+    turn(track.quaternion, work.theta, track.quaternion)
+    turn(track.rival, work.theta, track.rival)
+    for i in range(3):
+        if track.covariance[i, i] > noise.lost:
+            track.status[0] = LOST
+
+
+@njit_no_refcount
+def _measure(track, m, tai_ns, measured, noise, innovations, work):  # type: ignore[no-untyped-def]
+    """Take one measurement in, reject it, or start with it."""
+    kind, counts = measured.kind[m], track.counts
+    if track.status[0] == NONE or track.status[0] == LOST:
+        if kind != ATTITUDE:
+            innovations.outcome[m] = UNUSED
+        else:
+            # What was known of the bias before the attitude was lost still holds.
+            _start(track, m, measured, noise, track.status[0] == LOST)
+            innovations.outcome[m] = STARTED
+        return
+    z, s, h, r = innovations.innovation[m], innovations.covariance[m], work.partials, work.noise
+    size, angle = innovate(track.quaternion, measured, m, z, h, work.small)
+    gate = noise.gate_3 if size == 3 else noise.gate_2
+    copy(measured.covariance[m], r)
+    if kind != ATTITUDE:
+        add_curvature(track.covariance, r)
+    sound = innovation_covariance(track.covariance, h, size, r, s, work)
+    nis = chi_square(z, size, work) if sound else math.inf
+    innovations.nis[m] = nis
+    if nis <= gate and (counts[IN_A_ROW] == 0 or _decides(track, measured, m, gate, noise, work)):
+        innovations.outcome[m] = ACCEPTED
+        correct(track.covariance, z, h, size, r, work)
+        _accept(track, noise, work)
+        return
+    innovations.outcome[m] = REJECTED if nis > gate else UNDECIDED
+    # Before the start is confirmed, nothing speaks for the older measurement.
+    again = counts[CONFIRMED] < noise.confirmations
+    if not again and counts[HERE] == 0:
+        _contradict(track, tai_ns, nis > gate, angle, z, h, size, work)
+        again = tai_ns - counts[SINCE_NS] >= noise.reset_after_ns
+    if again and kind == ATTITUDE:
+        _start(track, m, measured, noise, False)
+        innovations.outcome[m] = STARTED
+
+
+@njit_no_refcount
+def _decides(track, measured, m, gate, noise, work):  # type: ignore[no-untyped-def]
+    """Whether a measurement that agrees with the state may end a doubt.
+
+    It has to exclude the rival, unless that lies within the state's own covariance by now.
+    `work` has the factor of the innovation's covariance in `small`, and keeps it.
+    """
+    copy(work.small, work.psi)
+    size, _ = innovate(track.rival, measured, m, work.dx, work.psi_square, work.small)
+    copy(work.psi, work.small)
+    if chi_square(work.dx, size, work) > gate:
+        return True
+    rotation_between(track.quaternion, track.rival, work.dx)
+    if not cholesky(track.covariance, 3, work.psi):
+        return False
+    for i in range(3):
+        work.theta[i] = work.dx[i]
+    solve_factored(work.psi, 3, work.theta)
+    apart = 0.0
+    for i in range(3):
+        apart += work.dx[i] * work.theta[i]
+    return apart <= noise.gate_3
+
+
+@njit_no_refcount
+def _contradict(track, tai_ns, rejected, angle, z, h, size, work):  # type: ignore[no-untyped-def]
+    """Begin or go on with a doubt; a rejected measurement says what the attitude may be instead.
+
+    The rival goes on with the gyro as the state does.  A measurement that agrees with
+    both decides nothing.
+    """
+    counts = track.counts
+    if counts[IN_A_ROW] == 0:
+        counts[SINCE_NS] = tai_ns
+    counts[AGREED] = 0
+    track.status[0] = DOUBTFUL
+    if not rejected:
+        return
+    counts[IN_A_ROW] += 1
+    track.doubt_rad[0] = max(track.doubt_rad[0], angle)
+    for j in range(3):
+        work.theta[j] = 0.0
+        for i in range(size):
+            work.theta[j] += h[i, j] * z[i]
+    turn(track.quaternion, work.theta, track.rival)
+
+
+@njit_no_refcount
+def _start(track, m, measured, noise, bias_is_known):  # type: ignore[no-untyped-def]
+    """Replace the attitude by a measured one; the bias keeps its value, or its variance too."""
+    p = track.covariance
+    for i in range(4):
+        track.quaternion[i] = measured.quaternion[m, i]
+    for i in range(3):
+        for j in range(3):
+            p[i, j] = measured.covariance[m, i, j]
+            p[i, j + 3] = p[j + 3, i] = 0.0
+            if not bias_is_known:
+                p[i + 3, j + 3] = noise.first_bias if i == j else 0.0
+    for i in range(5):
+        track.counts[i] = 0
+    track.counts[CONFIRMED] = 1
+    track.doubt_rad[0] = 0.0
+    track.status[0] = STARTING if noise.confirmations > 1 else GOOD
+
+
+@njit_no_refcount
+def _accept(track, noise, work):  # type: ignore[no-untyped-def]
+    """Correct the state by `work.dx`, and end a doubt that enough measurements contradict."""
+    counts = track.counts
+    turn(track.quaternion, work.dx[:3], track.quaternion)
+    for i in range(3):
+        track.bias[i] += work.dx[i + 3]
+    counts[HERE] += 1
+    counts[CONFIRMED] = min(counts[CONFIRMED] + 1, noise.confirmations)
+    if counts[IN_A_ROW] > 0:
+        counts[AGREED] += 1
+        # Short of a confirmation the rejected ones were single bad measurements.
+        if counts[AGREED] < noise.confirmations <= counts[IN_A_ROW]:
+            return
+        counts[IN_A_ROW] = counts[AGREED] = 0
+        track.doubt_rad[0] = 0.0
+    track.status[0] = GOOD if counts[CONFIRMED] >= noise.confirmations else STARTING
+
+
+@njit_no_refcount
+def _write(track, k, timeline, epochs):  # type: ignore[no-untyped-def]
+    """Write the state as epoch k; what there is not, is NaN."""
+    known = track.status[0] != NONE
+    for i in range(4):
+        epochs.quaternion[k, i] = track.quaternion[i] if known else math.nan
+    for i in range(3):
+        epochs.bias[k, i] = track.bias[i] if known else math.nan
+        epochs.rate[k, i] = timeline.rate_rad_s[k, i] - epochs.bias[k, i]
+    copy(track.covariance, epochs.covariance[k])
+    if not known:
+        for i in range(6):
+            for j in range(6):
+                epochs.covariance[k, i, j] = math.nan
+    epochs.doubt_rad[k] = track.doubt_rad[0]
+    epochs.status[k] = track.status[0]

@@ -1,0 +1,147 @@
+"""What the filter and the smoother give."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from service.errors import BadInput, Fault
+from service.filtering.state import FilterState, Outcome, Status
+from service.vectors import Vector
+
+Integers = npt.NDArray[np.int64]
+T = TypeVar("T", "AttitudeHistory", "Innovations", "Steps")
+
+
+@dataclass(frozen=True, eq=False)
+class Innovations:
+    """How m measurements met the prediction, in order of time.
+
+    `kind` (m,) is `updates.ATTITUDE` or `DIRECTION`, `row` (m,) the row among those given
+    of that kind, `outcome` (m,) an `Outcome`.  `innovation_rad` (m, 3) with its
+    `covariance_rad2` (m, 3, 3) is the rotation about the body axes from prediction to
+    measurement; a direction has two components across it.  `nis` (m,) is z^T S^-1 z.
+    All three are NaN where there is none: beyond the second component, or where a
+    measurement met no prediction.
+    """
+
+    tai_ns: Integers
+    kind: Integers
+    row: Integers
+    innovation_rad: Vector
+    covariance_rad2: Vector
+    nis: Vector
+    outcome: Integers
+
+    @property
+    def degrees(self) -> Integers:
+        """Degrees of freedom (m,) of each `nis`."""
+        return np.where(self.kind == 0, 3, 2)
+
+    @property
+    def accepted(self) -> npt.NDArray[np.bool_]:
+        """Which were accepted (m,)."""
+        return np.asarray(self.outcome == Outcome.ACCEPTED)
+
+    def counts(self) -> dict[str, int]:
+        """How many had each outcome, by its name in small letters."""
+        return {each.name.lower(): int(np.sum(self.outcome == each)) for each in Outcome}
+
+
+@dataclass(frozen=True, eq=False)
+class AttitudeHistory:
+    """Attitudes at n epochs, filtered or smoothed.
+
+    `tai_ns` (n,), `quaternion` (n, 4) inertial to body, `rate_rad_s` (n, 3) of the body
+    in the step that ends at the epoch, `bias_rad_s` (n, 3) of the gyro, `status` (n,) a
+    `Status`.  `model_covariance` (n, 6, 6) of attitude error (rad, body axes) and bias
+    (rad/s) is what the model says; `doubt_rad` (n,) is how far the attitude may be off
+    beyond that, because measurements contradict it.  Where the status is NONE all are NaN.
+    """
+
+    tai_ns: Integers
+    quaternion: Vector
+    rate_rad_s: Vector
+    bias_rad_s: Vector
+    model_covariance: Vector
+    doubt_rad: Vector
+    status: Integers
+
+    @property
+    def covariance(self) -> Vector:
+        """The covariance (n, 6, 6) to be relied on: a doubt is one more sigma about each axis."""
+        full = self.model_covariance.copy()
+        axes = np.arange(3)
+        full[:, axes, axes] += self.doubt_rad[:, None] ** 2
+        return full
+
+    @property
+    def good(self) -> npt.NDArray[np.bool_]:
+        """Where the attitude (n,) is GOOD."""
+        return np.asarray(self.status == Status.GOOD)
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """What the smoother needs of the steps to n epochs: see `propagation.Timeline`.
+
+    `started` (n,) says where the state was replaced and `updated` (n,) where it was, or a
+    measurement was accepted; `shift` (n, 3) was added to the variance of the bias before
+    the step.
+    """
+
+    step_s: Vector
+    measured_rate_rad_s: Vector
+    gap_s: Vector
+    started: npt.NDArray[np.bool_]
+    updated: npt.NDArray[np.bool_]
+    shift: Vector
+
+
+@dataclass(frozen=True, eq=False)
+class FilterResult:
+    """The filtered attitudes, what became of the measurements, and the state at the end.
+
+    `outside` counts measurements that were not processed because they are before the
+    first gyro sample or after the last: those after it belong to the next stretch.
+    """
+
+    history: AttitudeHistory
+    innovations: Innovations
+    steps: Steps
+    state: FilterState
+    outside: int
+
+    @property
+    def starts(self) -> int:
+        """How often the attitude was replaced by a measured one, the first time included."""
+        return int(np.sum(self.innovations.outcome == Outcome.STARTED))
+
+
+def joined(results: Sequence[FilterResult]) -> FilterResult:
+    """Consecutive results, each filtered from the state of the one before, as one.
+
+    The rows of the innovations stay those of each part.  Raises `BadInput` where
+    there is none, or the epochs are not in order.
+    """
+    if not results:
+        raise BadInput(Fault("results", "must be at least one"))
+    history = _joined([each.history for each in results])
+    if np.any(np.diff(history.tai_ns) < 0):
+        raise BadInput(Fault("results", "must be in order of time"))
+    return replace(
+        results[-1],
+        history=history,
+        innovations=_joined([each.innovations for each in results]),
+        steps=_joined([each.steps for each in results]),
+        outside=sum(each.outside for each in results),
+    )
+
+
+def _joined(parts: Sequence[T]) -> T:
+    """Records of arrays, one after the other."""
+    names = [each.name for each in fields(parts[0])]
+    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return type(parts[0])(**joined)

@@ -1,0 +1,1 @@
+"""Filtered and smoothed attitudes in the records."""

@@ -1,0 +1,1 @@
+"""Gyro blocks in the records."""

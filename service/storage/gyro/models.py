@@ -1,0 +1,43 @@
+"""Gyro blocks as they are recorded, and their samples."""
+
+from typing import Annotated, ClassVar
+
+from pydantic import Field
+
+from service.storage.models.base import Components, Id, Moment, Record, Stamp, doc
+
+
+class GyroBlockRow(Record, frozen=True, kw_only=True):
+    """A recorded gyro block."""
+
+    component: ClassVar[str] = "GyroBlock"
+    id: Id
+    spacecraft: str
+    run: str
+    block: str
+    start: Annotated[Moment, doc("Time of the first sample.")]
+    end: Annotated[Moment, doc("Time of the last sample.")]
+    samples: Annotated[int, Field(ge=1)]
+    step_s: Annotated[
+        float | None, doc("From each sample to the next; null: the block has times of its own.")
+    ]
+    received: Stamp
+
+
+class GyroBlockPage(Record, frozen=True, kw_only=True):
+    """A page of gyro blocks."""
+
+    component: ClassVar[str] = "GyroBlockPage"
+    items: list[GyroBlockRow]
+    next_cursor: str | None
+
+
+class GyroSamples(GyroBlockRow, frozen=True, kw_only=True):
+    """A recorded gyro block with its samples."""
+
+    component: ClassVar[str] = "GyroSamples"
+    times_s: Annotated[list[float], doc("Of each sample, in seconds of TAI after `start`.")]
+    rates_rad_per_s: Annotated[
+        list[Components],
+        doc("Of each sample, as it was sent: about the three axes of the mission's gyro."),
+    ]

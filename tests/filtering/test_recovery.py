@@ -1,0 +1,237 @@
+"""Bad measurements, gaps and steps of the clock: bounded, told, recovered from.
+
+The promise of each: where the status is GOOD, the error is one that the covariance allows.
+"""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from service.filtering.filter import filter_attitude
+from service.filtering.gyro import ConstantRateModel, FilterSettings
+from service.filtering.result import AttitudeHistory
+from service.filtering.samples import AttitudeMeasurements, GyroSamples
+from service.filtering.smoother import smooth
+from service.filtering.state import Outcome, Status
+from tests.filtering.simulated import (
+    attitude_errors,
+    attitudes_of,
+    directions_of,
+    gyro_of,
+    inertial_hold,
+    orbital_rate,
+    slews,
+    squares,
+    truth_of,
+)
+from tests.filtering.test_filter import FINE
+
+SIGMAS = (6.0, 6.0, 40.0)
+HOUR = 3600
+
+
+def confident_and_wrong(history: AttitudeHistory, truth, rows=slice(None)):
+    """Epochs that are GOOD although e^T P^-1 e of the attitude is beyond 36."""
+    known = history.status != Status.NONE
+    errors = np.zeros((len(history.tai_ns), 3))
+    estimated = Rotation.from_quat(history.quaternion[known])
+    errors[known] = (estimated.inv() * truth.attitude[rows][known]).as_rotvec()
+    squared = np.zeros(len(known))
+    squared[known] = squares(errors[known], history.covariance[known, :3, :3])
+    return np.flatnonzero(history.good & (squared > 36.0))
+
+
+def test_one_wrong_attitude_in_twenty_does_no_harm(rng):
+    truth = truth_of(slews, 1.5 * HOUR)
+    rows = np.arange(0, len(truth.time_s), 8)
+    wrong = rng.random(len(rows)) < 0.05
+    wrong[1] = True
+    offset = rng.normal(0.0, 0.05, (len(rows), 3)) * wrong[:, None]
+    gyro, _ = gyro_of(truth, FINE, rng)
+    result = filter_attitude(FINE, gyro, attitudes_of(truth, rows, SIGMAS, rng, offset))
+    outcome = result.innovations.outcome
+    assert not (outcome[wrong] == Outcome.ACCEPTED).any()
+    assert np.mean(outcome[~wrong] == Outcome.ACCEPTED) > 0.99
+    for history in (result.history, smooth(result, FINE)):
+        assert not len(confident_and_wrong(history, truth))
+    assert np.mean(smooth(result, FINE).good) > 0.99
+
+
+def test_a_start_from_a_wrong_attitude_is_taken_back_by_the_next(rng):
+    truth = truth_of(orbital_rate, 600.0)
+    rows = np.arange(0, 601, 8)
+    offset = np.zeros((len(rows), 3))
+    offset[0] = 0.3
+    gyro, _ = gyro_of(truth, FINE, rng)
+    result = filter_attitude(FINE, gyro, attitudes_of(truth, rows, SIGMAS, rng, offset))
+    assert result.starts == 2
+    assert result.history.status[0] == Status.STARTING
+    assert not len(confident_and_wrong(result.history, truth))
+    assert result.history.status[-1] == Status.GOOD
+    assert np.abs(attitude_errors(result.history, truth)[-1]).max() < 1e-4
+
+
+@pytest.mark.parametrize("offset_rad", [0.0008, 0.02, 1.5, 3.1])
+def test_a_tracker_that_lies_for_an_hour_moves_nothing_and_is_told(offset_rad, rng):
+    truth = truth_of(orbital_rate, 3.0 * HOUR)
+    rows = np.arange(0, len(truth.time_s), 8)
+    lies = (rows >= HOUR) & (rows < 2 * HOUR)
+    offset = np.where(lies[:, None], [offset_rad, 0.0, 0.0], 0.0)
+    gyro, _ = gyro_of(truth, FINE, rng)
+    result = filter_attitude(FINE, gyro, attitudes_of(truth, rows, SIGMAS, rng, offset))
+    history, smoothed = result.history, smooth(result, FINE)
+    assert result.starts == 1
+    assert (result.innovations.outcome[lies] == Outcome.REJECTED).all()
+    during = slice(HOUR, 2 * HOUR)
+    assert (history.status[during] == Status.DOUBTFUL).all()
+    # Both attitudes lie within what is told, that of the gyro and that of the tracker.
+    assert (history.doubt_rad[during] > 0.9 * min(offset_rad, 3.0)).all()
+    assert (history.status[2 * HOUR + 30 :] == Status.GOOD).all()
+    # Afterwards it is clear who was wrong.
+    assert (smoothed.status[100:] == Status.GOOD).all()
+    for each in (history, smoothed):
+        assert not len(confident_and_wrong(each, truth))
+
+
+def test_of_two_trackers_the_one_that_lies_is_left_out(rng):
+    truth = truth_of(orbital_rate, 1.0 * HOUR)
+    rows = np.arange(0, len(truth.time_s), 8)
+    lies = np.where((rows >= 600)[:, None], [0.01, 0.0, 0.0], 0.0)
+    gyro, _ = gyro_of(truth, FINE, rng)
+    true, false = (attitudes_of(truth, rows, SIGMAS, rng, offset) for offset in (None, lies))
+    both = [np.concatenate([vars(true)[name], vars(false)[name]]) for name in vars(true)]
+    order = np.argsort(both[0], kind="stable")
+    result = filter_attitude(FINE, gyro, AttitudeMeasurements(*(each[order] for each in both)))
+    assert (result.history.status[100:] == Status.GOOD).all()
+    assert not len(confident_and_wrong(result.history, truth))
+    assert result.innovations.counts()["rejected"] == pytest.approx((HOUR - 600) / 8, abs=3)
+
+
+def glitch(gyro, row, angle_rad):
+    """The same samples, one of which says a turn that did not happen."""
+    rates = gyro.rate_rad_s.copy()
+    rates[row] += angle_rad
+    return GyroSamples(gyro.tai_ns, rates)
+
+
+def test_after_a_false_turn_of_the_gyro_it_starts_from_the_tracker_in_the_end(rng):
+    """It cannot know who is wrong: first it says so, then it gives its own attitude up."""
+    truth = truth_of(orbital_rate, 3.0 * HOUR)
+    rows = np.arange(0, len(truth.time_s), 8)
+    gyro, _ = gyro_of(truth, FINE, rng)
+    attitudes = attitudes_of(truth, rows, SIGMAS, rng)
+    result = filter_attitude(
+        FINE, glitch(gyro, 1000, 0.05), attitudes, settings=FilterSettings(reset_after_s=1800.0)
+    )
+    history, smoothed = result.history, smooth(result, FINE)
+    assert result.starts == 2
+    assert (history.status[1001:2800] == Status.DOUBTFUL).all()
+    assert (history.status[2850:] == Status.GOOD).all()
+    # Between the false turn and the next measurement nobody can know.
+    assert set(confident_and_wrong(history, truth)) <= set(range(1000, 1008))
+    # Looking back it is known: the doubt reaches to the last measurement that agreed.
+    assert (smoothed.status[1000:2800] == Status.DOUBTFUL).all()
+    assert not len(confident_and_wrong(smoothed, truth))
+
+
+def test_a_sample_that_is_missing_costs_little(rng):
+    truth = truth_of(orbital_rate, 1.0 * HOUR)
+    gyro, _ = gyro_of(truth, FINE, rng)
+    keep = np.setdiff1d(np.arange(HOUR + 1), [1000, 2000, 3001])
+    samples = GyroSamples(gyro.tai_ns[keep], gyro.rate_rad_s[keep])
+    attitudes = attitudes_of(truth, keep[::4], SIGMAS, rng)
+    result = filter_attitude(FINE, samples, attitudes)
+    assert result.starts == 1
+    assert (result.history.status[100:] == Status.GOOD).all()
+    assert not len(confident_and_wrong(result.history, truth, keep))
+
+
+@pytest.mark.parametrize("rate", [orbital_rate, slews])
+@pytest.mark.parametrize("gap_s", [30, 600, HOUR])
+def test_a_gap_of_the_gyro_is_told_and_left_behind(rate, gap_s, rng):
+    truth = truth_of(rate, 2.0 * HOUR)
+    gyro, _ = gyro_of(truth, FINE, rng)
+    # It begins in a turn.
+    keep = np.concatenate([np.arange(1300), np.arange(1300 + gap_s, 2 * HOUR + 1)])
+    samples = GyroSamples(gyro.tai_ns[keep], gyro.rate_rad_s[keep])
+    attitudes = attitudes_of(truth, keep[::8], SIGMAS, rng)
+    result = filter_attitude(FINE, samples, attitudes)
+    assert (result.history.status[1300 + 100 :] == Status.GOOD).all()
+    for history in (result.history, smooth(result, FINE)):
+        assert not len(confident_and_wrong(history, truth, keep))
+
+
+def after_a_step_of_the_clock(step_s, rng, **settings):
+    """The truth, and the filter's result where all times after 1,400 s are late by a step."""
+    truth = truth_of(slews, 1.5 * HOUR)
+    gyro, _ = gyro_of(truth, FINE, rng)
+    attitudes = attitudes_of(truth, np.arange(0, len(truth.time_s), 8), SIGMAS, rng)
+    late_gyro = GyroSamples(stepped(gyro.tai_ns, step_s), gyro.rate_rad_s)
+    late = AttitudeMeasurements(
+        stepped(attitudes.tai_ns, step_s), attitudes.quaternion, attitudes.covariance_rad2
+    )
+    return truth, filter_attitude(FINE, late_gyro, late, settings=FilterSettings(**settings))
+
+
+def test_a_step_of_the_clock_that_leaves_a_gap_is_covered_by_the_covariance(rng):
+    truth, result = after_a_step_of_the_clock(1.0, rng)
+    assert result.starts == 1
+    assert not len(confident_and_wrong(result.history, truth))
+    assert (result.history.status[1450:] == Status.GOOD).all()
+
+
+def test_a_step_of_the_clock_that_leaves_none_makes_it_doubt_until_it_starts_anew(rng):
+    """The turns that follow bring the error into the axis that trackers see worst.
+
+    There a measurement agrees with both attitudes, and must not end the doubt.
+    """
+    truth, result = after_a_step_of_the_clock(-0.2, rng, reset_after_s=2700.0)
+    assert result.starts == 2
+    assert set(confident_and_wrong(result.history, truth)) <= set(range(1401, 1408))
+    assert result.innovations.counts()["undecided"] > 0
+    assert (result.history.status[1408:4108] == Status.DOUBTFUL).all()
+    assert (result.history.status[4150:] == Status.GOOD).all()
+    assert not len(confident_and_wrong(smooth(result, FINE), truth))
+
+
+def stepped(tai_ns, step_s):
+    """Times of which those after 1,400 s, in the middle of a turn, are late by a step."""
+    late = (tai_ns - tai_ns[0]) > 1400 * 10**9
+    return tai_ns + np.where(late, round(step_s * 1e9), 0)
+
+
+def test_long_without_measurements_the_attitude_is_lost_and_the_next_one_starts_it_again(rng):
+    truth = truth_of(orbital_rate, 1.0 * HOUR)
+    rows = np.concatenate([np.arange(0, 100, 10), np.arange(3000, 3601, 10)])
+    model = ConstantRateModel(rate_walk_rad_s1_5=1e-5)
+    attitudes = attitudes_of(truth, rows, SIGMAS, rng)
+    stars = directions_of(truth, np.array([2950]), [0.0, 0.0, 1.0], 6.0, rng)
+    result = filter_attitude(model, attitudes=attitudes, directions=stars)
+    assert result.innovations.counts()["unused"] == 1
+    assert result.history.status[10] == Status.LOST
+    assert result.starts == 2
+    assert result.history.status[-1] == Status.GOOD
+
+
+def test_stars_before_any_attitude_are_not_used(rng):
+    truth = truth_of(inertial_hold, 60.0)
+    gyro, _ = gyro_of(truth, FINE, rng)
+    stars = directions_of(truth, np.arange(0, 60, 10), [0.0, 0.0, 1.0], 6.0, rng)
+    result = filter_attitude(FINE, gyro, directions=stars)
+    counts = result.innovations.counts()
+    assert counts == {each.name.lower(): 6 if each == Outcome.UNUSED else 0 for each in Outcome}
+    assert (result.history.status == Status.NONE).all()
+    assert np.isnan(smooth(result, FINE).quaternion).all()
+
+
+def test_a_star_opposite_to_the_predicted_one_is_rejected(rng):
+    """In the plane across it would lie exactly where it is expected."""
+    truth = truth_of(inertial_hold, 60.0)
+    gyro, _ = gyro_of(truth, FINE, rng, np.zeros(3))
+    attitudes = attitudes_of(truth, np.arange(0, 50), SIGMAS, rng)
+    star = directions_of(truth, np.array([55]), [0.0, 0.0, 1.0], 6.0, rng)
+    opposite = type(star)(star.tai_ns, -star.body, star.inertial, star.sigma_rad)
+    result = filter_attitude(FINE, gyro, attitudes, opposite)
+    assert result.innovations.outcome[-1] == Outcome.REJECTED
+    assert result.history.status[-1] == Status.DOUBTFUL
+    assert result.history.doubt_rad[-1] > 3.0

@@ -1,0 +1,284 @@
+"""The grades of a day: what they promise of accuracy, of gaps, and of what is wrong."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from service.filtering.samples import AttitudeMeasurements, no_attitudes
+from service.filtering.state import Status
+from service.grades.day import day_bounds, grade_day, window_of
+from service.grades.measured import usable_attitudes
+from service.grades.packing import packed, unpacked
+from service.missions.gyro import GyroSettings
+from service.times import DAY_S, parse_utc
+from tests.filtering.simulated import (
+    ARCSEC,
+    attitudes_of,
+    gyro_of,
+    slews,
+    squares,
+    truth_of,
+)
+from tests.grades.passes import GYRO, MODEL, NOON_NS, graded, later, mission_with, recorded_of
+
+SIGMAS = (6.0, 6.0, 40.0)
+
+
+def errors_of(samples, truth, begin_ns):
+    """e (n, 3) in radians, as `attitude_error_arcsec`, of samples at whole seconds."""
+    rows = np.rint((samples.tai_ns - begin_ns) * 1e-9).astype(int)
+    found = Rotation.from_quat(samples.quaternion)
+    return -(found.inv() * truth.attitude[rows]).as_rotvec()
+
+
+@pytest.fixture(scope="module")
+def hours(missions):
+    """Three hours of slews with a gap of the gyro of a minute: truth and grades."""
+    rng = np.random.default_rng(7)
+    truth = truth_of(slews, 3 * 3600.0)
+    gyro, _ = gyro_of(truth, MODEL, rng)
+    attitudes = attitudes_of(truth, np.arange(0, 10801, 8), SIGMAS, rng)
+    kept = (truth.time_s < 5000.0) | (truth.time_s > 5060.0)
+    recorded = recorded_of(gyro.tai_ns[kept], gyro.rate_rad_s[kept], attitudes)
+    return truth, graded(recorded, mission_with(missions["XTE"], gyro=GYRO))
+
+
+def test_both_grades_have_errors_as_their_covariances_say(hours):
+    truth, day = hours
+    (stretch,) = day.stretches
+    assert stretch.model == "gyro"
+    for grade, samples in stretch.samples.items():
+        settled = samples.tai_ns > NOON_NS + 3600 * 10**9
+        upper = samples.covariance_arcsec2[settled] * ARCSEC**2
+        full = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        e = errors_of(samples, truth, NOON_NS)[settled]
+        assert 0.3 < np.mean(squares(e, full)) / 3.0 < 2.0, grade
+        assert (samples.status[settled] == Status.GOOD).all()
+
+
+def test_the_smoothed_grade_is_the_better_one(hours):
+    truth, day = hours
+    samples = day.stretches[0].samples
+    rms = {}
+    for grade, each in samples.items():
+        later = each.tai_ns > NOON_NS + 1800 * 10**9
+        rms[grade] = np.sqrt(np.mean(errors_of(each, truth, NOON_NS)[later] ** 2)) / ARCSEC
+    assert rms["smoothed"] < 0.8 * rms["filtered"] < 0.8 * 10.0
+
+
+def test_what_became_of_the_record_is_told(hours):
+    _, day = hours
+    assert day.measurements["started"] == 1
+    assert day.measurements["accepted"] == 1350
+    assert day.gyro == {"samples": 10740, "gaps": 1, "beyond_largest": 0}
+    assert 0.9 < day.nis_per_degree < 1.1
+
+
+def test_a_day_does_not_depend_on_what_lies_beyond_its_window(missions, rng):
+    """The window itself counts: six hours before, two after."""
+    mission = mission_with(missions["XTE"], gyro=GYRO)
+    day = parse_utc("1999-03-02T00:00:00Z").bucket(DAY_S)
+    (begin, end), (start, _) = window_of(day), day_bounds(day)
+    assert (start.tai_ns - begin.tai_ns, end.tai_ns - start.tai_ns) == (6 * 3600e9, 26 * 3600e9)
+    truth = truth_of(slews, 1800.0)
+    gyro, _ = gyro_of(truth, MODEL, rng)
+    attitudes = attitudes_of(truth, np.arange(0, 1801, 8), SIGMAS, rng)
+    shift = start.tai_ns - 900 * 10**9 - NOON_NS
+    found = grade_day(
+        later(recorded_of(gyro.tai_ns, gyro.rate_rad_s, attitudes), shift), mission, day
+    )
+    (stretch,) = found.stretches
+    samples = stretch.samples["filtered"]
+    # The quarter of an hour before midnight is of the day before.
+    assert len(samples) == 901
+    assert samples.tai_ns[0] == start.tai_ns
+    assert samples.status[0] == Status.GOOD
+    assert found.gyro["samples"] == 901
+
+
+def test_without_a_gyro_the_rate_is_taken_for_constant(missions, rng):
+    truth = truth_of(lambda t: np.tile([0.0, -1e-3, 0.0], (len(t), 1)), 900.0)
+    attitudes = attitudes_of(truth, np.arange(0, 901, 5), SIGMAS, rng)
+    mission = mission_with(missions["XTE"], motion={"rate_walk_rad_s1_5": 1e-7})
+    day = graded(recorded_of([], np.zeros((0, 3)), attitudes), mission)
+    (stretch,) = day.stretches
+    assert stretch.model == "constant_rate"
+    samples = stretch.samples["smoothed"]
+    assert np.isnan(samples.bias_deg_per_h).all()
+    middle = slice(60, 120)
+    expected = np.degrees([0.0, -1e-3, 0.0])
+    np.testing.assert_allclose(
+        samples.rate_deg_per_s[middle], np.tile(expected, (60, 1)), atol=2e-4
+    )
+    rms = np.sqrt(np.mean(errors_of(samples, truth, NOON_NS)[middle] ** 2)) / ARCSEC
+    assert rms < 12.0
+
+
+def test_samples_of_a_gyro_that_the_mission_does_not_describe_are_not_used(hours, missions, rng):
+    truth = truth_of(slews, 600.0)
+    gyro, _ = gyro_of(truth, MODEL, rng)
+    attitudes = attitudes_of(truth, np.arange(0, 601, 8), SIGMAS, rng)
+    day = graded(
+        recorded_of(gyro.tai_ns, gyro.rate_rad_s, attitudes),
+        missions["SWAS"].model_copy(update={"gyro": None}),
+    )
+    assert [each.model for each in day.stretches] == ["constant_rate"]
+
+
+def test_a_long_gap_of_the_gyro_is_bridged_at_a_constant_rate(missions, rng):
+    truth = truth_of(slews, 7200.0)
+    gyro, _ = gyro_of(truth, MODEL, rng)
+    attitudes = attitudes_of(truth, np.arange(0, 7201, 8), SIGMAS, rng)
+    kept = (truth.time_s < 2000.0) | (truth.time_s > 4000.0)
+    recorded = recorded_of(gyro.tai_ns[kept], gyro.rate_rad_s[kept], attitudes)
+    day = graded(recorded, mission_with(missions["XTE"], gyro=GYRO))
+    assert [each.model for each in day.stretches] == ["gyro", "constant_rate", "gyro"]
+    for before, after in zip(day.stretches[:-1], day.stretches[1:], strict=True):
+        assert before.samples["smoothed"].tai_ns[-1] < after.samples["smoothed"].tai_ns[0]
+
+
+def test_axes_steps_and_the_moment_of_samples_are_the_mission_s(missions, rng):
+    """The same motion as another gyro sends it: four times a second, other axes, instants."""
+    truth = truth_of(slews, 1200.0, 0.25)
+    gyro, _ = gyro_of(truth, MODEL, rng)
+    rows = np.arange(0, 4801, 32)
+    attitudes = attitudes_of(truth, rows, SIGMAS, rng)
+    axes = {"axes": ["-X", "Z", "Y"]}
+    sent = gyro.rate_rad_s * [-1.0, 1.0, 1.0]
+    sent = sent[:, [0, 2, 1]]
+    same = graded(
+        recorded_of(gyro.tai_ns, gyro.rate_rad_s, attitudes),
+        mission_with(missions["XTE"], gyro=GYRO),
+    )
+    other = graded(
+        recorded_of(gyro.tai_ns, sent, attitudes), mission_with(missions["XTE"], gyro=GYRO | axes)
+    )
+    one, two = (each.stretches[0].samples["smoothed"] for each in (same, other))
+    np.testing.assert_array_equal(one.quaternion, two.quaternion)
+    assert len(one) == 1201
+    # A median step of .25 s: nothing is a gap, though all is finer than a second.
+    assert same.gyro == {"samples": 4801, "gaps": 0, "beyond_largest": 0}
+    # Of a steady turn the instant and the mean are the same; of its beginning they are not.
+    instants = graded(
+        recorded_of(gyro.tai_ns, gyro.rate_rad_s, attitudes),
+        mission_with(missions["XTE"], gyro=GYRO | {"samples": "instant"}),
+    )
+    apart = instants.stretches[0].samples["smoothed"].quaternion - one.quaternion
+    assert 0.0 < np.abs(apart).max() < 1e-4
+
+
+def test_samples_beyond_the_largest_rate_are_left_out_and_counted(missions, rng):
+    truth = truth_of(slews, 600.0)
+    gyro, _ = gyro_of(truth, MODEL, rng)
+    rates = gyro.rate_rad_s.copy()
+    rates[100:103] = 1.0
+    attitudes = attitudes_of(truth, np.arange(0, 601, 8), SIGMAS, rng)
+    day = graded(
+        recorded_of(gyro.tai_ns, rates, attitudes), mission_with(missions["XTE"], gyro=GYRO)
+    )
+    assert day.gyro == {"samples": 601, "gaps": 1, "beyond_largest": 3}
+    errors = errors_of(day.stretches[0].samples["smoothed"], truth, NOON_NS)
+    assert np.abs(errors).max() < 120.0 * ARCSEC
+
+
+def test_a_tracker_that_is_wrong_for_an_hour_does_no_harm_to_good_attitudes(missions, rng):
+    truth = truth_of(slews, 4 * 3600.0)
+    gyro, _ = gyro_of(truth, MODEL, rng)
+    rows = np.arange(0, 4 * 3600 + 1, 8)
+    wrong = (rows > 3600) & (rows <= 7200)
+    offset = np.where(wrong[:, None], np.array([0.0, 400.0, 0.0]) * ARCSEC, 0.0)
+    attitudes = attitudes_of(truth, rows, SIGMAS, rng, offset=offset)
+    day = graded(
+        recorded_of(gyro.tai_ns, gyro.rate_rad_s, attitudes),
+        mission_with(missions["XTE"], gyro=GYRO),
+    )
+    assert day.measurements["rejected"] >= 440
+    for samples in day.stretches[0].samples.values():
+        good = samples.status == Status.GOOD
+        assert good.mean() > 0.7
+        assert np.abs(errors_of(samples, truth, NOON_NS)[good]).max() < 60.0 * ARCSEC
+    assert (day.stretches[0].samples["smoothed"].status == Status.GOOD).mean() > 0.99
+
+
+def test_a_step_of_the_clock_is_named_by_the_status(missions, rng):
+    """During a slew a second is a minute of arc and more; trackers and gyro share the clock."""
+    truth = truth_of(lambda t: np.tile([0.0, -2e-3, 0.0], (len(t), 1)), 3600.0)
+    gyro, _ = gyro_of(truth, MODEL, rng)
+    attitudes = attitudes_of(truth, np.arange(0, 3601, 8), SIGMAS, rng)
+    stepped = np.where(truth.time_s >= 1800.0, 10**9, 0)
+    at = np.where(np.arange(0, 3601, 8) >= 1800, 10**9, 0)
+    recorded = recorded_of(
+        gyro.tai_ns + stepped,
+        gyro.rate_rad_s,
+        AttitudeMeasurements(
+            attitudes.tai_ns + at, attitudes.quaternion, attitudes.covariance_rad2
+        ),
+    )
+    day = graded(recorded, mission_with(missions["XTE"], gyro=GYRO))
+    samples = day.stretches[0].samples["smoothed"]
+    ns = samples.tai_ns - NOON_NS
+    moved = ns >= 1801 * 10**9
+    rows = np.rint(ns * 1e-9).astype(int) - moved
+    found = Rotation.from_quat(samples.quaternion)
+    error = np.linalg.norm((found.inv() * truth.attitude[rows]).as_rotvec(), axis=1)
+    good = samples.status == Status.GOOD
+    assert good.mean() > 0.95
+    assert error[good].max() < 120.0 * ARCSEC
+
+
+def test_attitudes_whose_covariance_says_nothing_are_left_out():
+    good = [36.0, 0.0, 0.0, 36.0, 0.0, 1600.0]
+    flat = [1.0, 1.0, 0.0, 1.0, 0.0, 1.0]
+    covariance = np.array([good, flat, [np.nan] * 6, [0.0] * 6, [1e12, 0, 0, 1e12, 0, 1e12], good])
+    q = np.tile([0.0, 0.0, 0.0, 1.0], (6, 1))
+    kept, unusable = usable_attitudes(np.arange(6), q, covariance)
+    assert kept.tai_ns.tolist() == [0, 5]
+    assert unusable == 4
+
+
+def test_measurements_that_cannot_confirm_an_attitude_are_counted(missions, rng):
+    truth = truth_of(slews, 600.0)
+    attitudes = attitudes_of(truth, np.array([0, 300]), SIGMAS, rng)
+    day = graded(recorded_of([], np.zeros((0, 3)), attitudes), missions["XTE"])
+    assert (day.samples, day.measurements["alone"]) == (0, 2)
+
+
+def test_nothing_recorded_gives_nothing(missions):
+    day = graded(recorded_of([], np.zeros((0, 3)), no_attitudes()), missions["XTE"])
+    assert (day.samples, day.stretches, day.nis_per_degree) == (0, [], None)
+
+
+def test_samples_come_back_from_their_bytes(hours):
+    samples = hours[1].stretches[0].samples["filtered"].taken(slice(0, 3600))
+    data = packed(samples)
+    again = unpacked(data, 3600)
+    np.testing.assert_array_equal(again.tai_ns, samples.tai_ns)
+    np.testing.assert_array_equal(again.quaternion, samples.quaternion)
+    np.testing.assert_array_equal(again.status, samples.status)
+    for name in ("covariance_arcsec2", "rate_deg_per_s", "bias_deg_per_h", "bias_sigma_deg_per_h"):
+        np.testing.assert_allclose(
+            getattr(again, name), getattr(samples, name), rtol=1e-7, atol=1e-12
+        )
+    # Of 117 bytes.
+    assert len(data) / 3600 < 75
+    assert packed(again) == data
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda data: b"no", "cannot be decompressed"),
+        (lambda data: data[:-9], "cannot be decompressed"),
+    ],
+)
+def test_damaged_bytes_are_named(hours, damage, said):
+    data = packed(hours[1].stretches[0].samples["filtered"].taken(slice(0, 10)))
+    with pytest.raises(ValueError, match=said):
+        unpacked(damage(data), 10)
+    with pytest.raises(ValueError, match="are not 11 samples"):
+        unpacked(data, 11)
+
+
+def test_settings_of_a_gyro_have_bounds():
+    with pytest.raises(ValueError, match="largest_step_s"):
+        GyroSettings(sigma_v_rad_s0_5=1e-7, sigma_u_rad_s1_5=1e-10, largest_step_s=0.0)
