@@ -1,0 +1,1 @@
+"""Calibrations of a spacecraft's trackers from recorded batches."""

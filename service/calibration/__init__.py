@@ -1,0 +1,1 @@
+"""Calibration of trackers from identified stars of many batches: alignment, distortion, time."""

@@ -1,0 +1,196 @@
+"""Normal equations of a joint fit with every batch's attitude eliminated.
+
+The attitude of a batch meets only its own stars.  Eliminating it block by block (the
+Schur complement) leaves a small system of the unknowns alone, the same as that of a
+least squares over all attitudes and unknowns together.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from service.calibration.linearise import Linearised, Weights
+from service.calibration.stars import Indices
+from service.vectors import Matrix, Vector
+
+ATTITUDE_PRIOR = 1.0
+"""Information (1/rad^2) on every attitude: keeps a batch solvable that lost all stars but one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Normal:
+    """Reduced normal equations: `matrix` (p, p) times the step = `right` (p,).
+
+    `squares` is the weighted sum of squares that remains with the best attitudes and no
+    step; `full` (p,) the diagonal before the attitudes were eliminated.
+    """
+
+    matrix: Matrix
+    right: Vector
+    squares: float
+    full: Vector
+
+    def __add__(self, other: "Normal") -> "Normal":
+        return Normal(
+            self.matrix + other.matrix,
+            self.right + other.right,
+            self.squares + other.squares,
+            self.full + other.full,
+        )
+
+    def __sub__(self, other: "Normal") -> "Normal":
+        return Normal(
+            self.matrix - other.matrix,
+            self.right - other.right,
+            self.squares - other.squares,
+            self.full - other.full,
+        )
+
+    def solution(self, free: Indices) -> Vector:
+        """The step (p,) that is zero but for the unknowns `free`."""
+        step = np.zeros(len(self.right))
+        if len(free):
+            inner = self.matrix[np.ix_(free, free)]
+            scale = 1.0 / np.sqrt(np.diag(inner))
+            scaled = inner * np.outer(scale, scale)
+            step[free] = np.linalg.solve(scaled, self.right[free] * scale) * scale
+        return step
+
+    def squares_after(self, step: Vector) -> float:
+        """The weighted sum of squares with a step (p,) of the unknowns and the best attitudes."""
+        return float(self.squares - 2.0 * self.right @ step + step @ self.matrix @ step)
+
+
+@dataclass(frozen=True, eq=False)
+class Eliminated:
+    """Normal equations in which every attitude is eliminated.
+
+    `blocks` are those of each block of batches.  `whiten` (K, 3, 3) are the inverted
+    Cholesky factors L^-1 of the attitudes' own blocks and `coupling` (3 K, p) is L^-1 times
+    what ties them to the unknowns; both are None where the attitudes are known.
+    """
+
+    parts: Sequence[Linearised]
+    blocks: tuple[Normal, ...]
+    whiten: Matrix | None
+    coupling: Matrix | None
+
+    @property
+    def normal(self) -> Normal:
+        """The equations of all batches."""
+        first, *others = self.blocks
+        return sum(others, start=first)
+
+    def steps(
+        self, normal: Normal, residual: Vector, weight: Weights, free: Indices
+    ) -> tuple[Vector, Vector, float]:
+        """The steps of the unknowns (p,) and turns (K, 3) that weighted residuals (2, n) ask for.
+
+        The matrix stays that of `normal`, whatever its weights were.  The third value is the
+        length of the step in sigmas: of all unknowns, or without any of one attitude, as rms.
+        """
+        pulled = weight * residual
+        right = np.zeros(len(normal.right))
+        for part in self.parts:
+            own = part.flat
+            right[part.stars.columns] = -own @ pulled[:, part.stars.rows].ravel()
+        if self.whiten is None or self.coupling is None:
+            step = replace(normal, right=right).solution(free)
+            return step, np.zeros((0, 3)), _length(normal, step)
+        turning = np.zeros(3 * len(self.whiten))
+        for part in self.parts:
+            sums = part.by_turns.T @ pulled[:, part.stars.rows].ravel()
+            turning[: len(sums)] += sums
+        reduced = (self.whiten @ turning.reshape(-1, 3, 1)).ravel()
+        right += reduced @ self.coupling
+        step = replace(normal, right=right).solution(free)
+        reduced += self.coupling @ step
+        turns = -(np.swapaxes(self.whiten, 1, 2) @ reduced.reshape(-1, 3, 1))[..., 0]
+        of_attitudes = float(np.sqrt(np.mean(reduced**2)))
+        return step, turns, _length(normal, step) if len(free) else of_attitudes
+
+    def change(self, step: Vector, turns: Vector, stars: int) -> Vector:
+        """What such steps add to the residuals (2, n)."""
+        found = np.empty((2, stars))
+        for part in self.parts:
+            by = part.flat
+            moved = step[part.stars.columns] @ by
+            if self.whiten is not None:
+                moved = moved + part.by_turns @ turns.ravel()[: part.by_turns.shape[1]]
+            found[:, part.stars.rows] = moved.reshape(2, -1)
+        return found
+
+
+def _length(normal: Normal, step: Vector) -> float:
+    return math.sqrt(max(float(step @ normal.matrix @ step), 0.0))
+
+
+def eliminate(
+    parts: Sequence[Linearised],
+    residual: Vector,
+    weight: Weights,
+    unknowns: int,
+    edges: Indices,
+    attitudes_known: bool = False,
+) -> Eliminated:
+    """The normal equations of all stars (n); `residual` (2, n) and `weight` (n,) in their order.
+
+    `edges` (f + 1,) are the batches at which blocks begin, and their number at the end.
+    """
+    batches = int(edges[-1])
+    matrix = np.zeros((len(edges) - 1, unknowns + 1, unknowns + 1))
+    # The residuals are one more column, after those of the unknowns.
+    coupling = np.zeros((batches, 3, unknowns + 1))
+    own_blocks = np.zeros((3, 3, batches))
+    for part in parts:
+        stars = part.stars
+        seen = np.concatenate([part.by_unknown, residual[None, :, stars.rows]])
+        own = weight[stars.rows]
+        weighted = seen if (own == 1.0).all() else seen * own
+        columns = np.append(stars.columns, unknowns)
+        rows = np.searchsorted(stars.batch, edges)
+        for block, (first, last) in enumerate(pairwise(rows)):
+            count = 2 * (last - first)
+            right = seen[:, :, first:last].reshape(len(seen), count)
+            left = weighted[:, :, first:last].reshape(len(seen), count)
+            matrix[block][np.ix_(columns, columns)] += left @ right.T
+        if attitudes_known:
+            continue
+        flat = np.ascontiguousarray(weighted.reshape(len(seen), -1).T)
+        sums = (part.by_turns.T @ flat).reshape(-1, 3, len(seen))
+        coupling[: len(sums), :, columns] += sums
+        _add_blocks(own_blocks, part, own)
+    full = matrix[:, :-1, :-1].diagonal(axis1=1, axis2=2).copy()
+    if attitudes_known:
+        return Eliminated(parts, _normals(matrix, full), None, None)
+    chol = np.linalg.cholesky(own_blocks.transpose(2, 0, 1) + ATTITUDE_PRIOR * np.eye(3))
+    whiten = np.linalg.inv(chol)
+    solved = whiten @ coupling
+    for block, (first, last) in enumerate(pairwise(edges)):
+        flat = solved[first:last].reshape(-1, unknowns + 1)
+        matrix[block] -= flat.T @ flat
+    tied = np.ascontiguousarray(solved[:, :, :-1]).reshape(3 * batches, unknowns)
+    return Eliminated(parts, _normals(matrix, full), whiten, tied)
+
+
+def _normals(matrix: Matrix, full: Matrix) -> tuple[Normal, ...]:
+    """Blocks (f, p + 1, p + 1), the residuals their last row, as equations."""
+    return tuple(
+        Normal(block[:-1, :-1], -block[:-1, -1], float(block[-1, -1]), own)
+        for block, own in zip(matrix, full, strict=True)
+    )
+
+
+def _add_blocks(into: Matrix, part: Linearised, weight: Weights) -> None:
+    """Add what a tracker's stars say of each attitude to the blocks (3, 3, K)."""
+    by, batch = part.by_attitude, part.stars.batch
+    for i in range(3):
+        for j in range(i, 3):
+            products = (by[:, 0, i] * by[:, 0, j] + by[:, 1, i] * by[:, 1, j]) * weight
+            sums = np.bincount(batch, products, minlength=into.shape[2])
+            into[i, j] += sums
+            if i != j:
+                into[j, i] += sums

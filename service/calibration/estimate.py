@@ -1,0 +1,271 @@
+"""Joint calibration of trackers from the identified stars of many batches.
+
+A robust least squares of Gauss and Newton over all unknowns and the attitude of every
+batch, which is eliminated (attitude-free estimation: Bierman & Shuster; Shuster, Pitone
+& Bierman 1991).  Stars count by Huber's weights; those far off are left out.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from service.calibration.elimination import Eliminated, eliminate
+from service.calibration.linearise import (
+    TrackerStars,
+    Weights,
+    linearised,
+    prepared,
+    residuals,
+    turned_attitudes,
+)
+from service.calibration.observability import (
+    Marks,
+    NotObservable,
+    inverse,
+    not_observable,
+    observable,
+)
+from service.calibration.robust import covariance_factor, scale_of, weights
+from service.calibration.stars import IdentifiedStars, Indices
+from service.calibration.unknowns import Model, Unknown, unknowns_of
+from service.errors import BadInput, Fault
+from service.vectors import Matrix, Vector
+
+ROUNDS, LINEARISATIONS = 30, 6
+LEAST_FREEDOM = 20
+"""Residuals beyond what determines the unknowns: these give their scale to about a sixth."""
+FAR_RAD = 2e-3
+"""After larger steps than this the derivatives are computed anew."""
+LEAVE_OUT_FROM = 2
+"""The round from which on stars far off are left out: before, the fit itself may be off."""
+RECOUNTED = 0.005
+"""Sigmas are computed anew where more stars than this share were left out: half the change."""
+SETTLED = 0.1
+"""A step so many sigmas long, all unknowns together, is the last: what follows is a tenth of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What the stars of a stretch say of the trackers.
+
+    `value` (p,) and `covariance` (p, p) are of `unknowns`, in the unit of each.  `stars`
+    (n) are those that were used, ordered by tracker and batch; `residual` (n, 2) is
+    observed minus predicted in the stars' sigmas, along h and v, `before` the same with
+    the mission's present settings and attitudes fitted to these.  `weight` (n,) is 0 for
+    stars left out as wrong.  `attitude` (K, 3, 3) are the batches' with the calibration.
+    """
+
+    model: Model
+    stars: IdentifiedStars
+    unknowns: tuple[Unknown, ...]
+    value: Vector
+    covariance: Matrix
+    attitude: Matrix
+    before: Vector
+    residual: Vector
+    weight: Weights
+    freedom: int
+    not_observable: tuple[NotObservable, ...]
+
+    @property
+    def sigma(self) -> Vector:
+        """One standard deviation (p,) of each unknown, in its unit."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def used(self) -> Marks:
+        """The stars (n,) that were not left out."""
+        return self.weight > 0.0
+
+    @property
+    def residual_over_sigma(self) -> float:
+        """Root mean square of the used residuals per degree of freedom, in the stars' sigmas."""
+        return math.sqrt(float(np.sum(self.residual[self.used] ** 2)) / max(self.freedom, 1))
+
+    def value_of(self, name: str) -> tuple[float, float]:
+        """Value and sigma of an unknown, in its unit; raises `BadInput` without such a one."""
+        for at, each in enumerate(self.unknowns):
+            if each.name == name:
+                return float(self.value[at]), float(self.sigma[at])
+        raise BadInput(Fault("name", "is not among the unknowns that were estimated", name))
+
+
+@dataclass(eq=False)
+class Fit:
+    """A fit, on its way and where it has settled.
+
+    `values` (p,) are all unknowns, in radians and seconds, `marks` (p,) those that are
+    free; the others are zero.  `residual` is (2, n) in sigmas, `scale` the sigma that
+    residuals have in these.  `reduced` has unit weights for the stars `counted` and
+    none for others.
+    """
+
+    parts: Sequence[TrackerStars]
+    unknowns: Sequence[Unknown]
+    marks: Marks
+    values: Vector
+    attitude: Matrix
+    residual: Vector
+    weight: Weights
+    counted: Marks
+    reduced: Eliminated
+    scale: float = 1.0
+
+    @property
+    def free(self) -> Indices:
+        """The unknowns that are estimated."""
+        return np.flatnonzero(self.marks)
+
+    @property
+    def used(self) -> Marks:
+        """The stars (n,) that are not left out."""
+        return self.weight > 0.0
+
+
+def calibrate(stars: IdentifiedStars, model: Model) -> Calibration:
+    """The unknowns of a model, by the stars of a stretch.
+
+    Unknowns that the stars do not show are left as the mission has them and named in
+    `not_observable`.  Raises `BadInput` where there are fewer residuals than unknowns.
+    """
+    stars = stars.usable(model.attitudes_known)
+    start = begun(stars, model)
+    before = replace(start, marks=np.zeros_like(start.marks))
+    _settle(before, stars, model, False)
+    return calibration_of(stars, model, _run(start, stars, model), before)
+
+
+def fit(stars: IdentifiedStars, model: Model) -> Fit:
+    """The fit of a model to stars that are in the order of `by_tracker`."""
+    return _run(begun(stars, model), stars, model)
+
+
+def _run(found: Fit, stars: IdentifiedStars, model: Model) -> Fit:
+    """Settle again and again, from where the last time ended, until that moves nothing."""
+    for number in range(LINEARISATIONS):
+        steps, far = _settle(found, stars, model, number > 0)
+        if steps == 1 and not far:
+            break
+        if far:
+            found.counted = found.used
+            found.reduced = _reduced(found, stars, model)
+            # Stars that were left out may have been all that showed an unknown.
+            found.marks = found.marks & observable(found.reduced.normal, found.unknowns)
+            found.values = np.where(found.marks, found.values, 0.0)
+    return found
+
+
+def begun(stars: IdentifiedStars, model: Model) -> Fit:
+    """A fit at the mission's present settings, all stars with full weight."""
+    unknowns = unknowns_of(stars.trackers, model)
+    parts = prepared(stars, unknowns, model.reference_temperature_c)
+    values, every = np.zeros(len(unknowns)), np.ones(len(stars), dtype=np.bool_)
+    residual = _residuals(parts, values, stars.attitude, len(stars))
+    reduced = _eliminated(parts, values, stars.attitude, residual, every, model)
+    marks = observable(reduced.normal, unknowns)
+    if degrees_of_freedom(stars, model, every) < int(marks.sum()) + LEAST_FREEDOM:
+        message = f"are too few for {int(marks.sum())} unknowns and the attitude of every batch"
+        raise BadInput(Fault("stars", message, f"{len(stars)} in {stars.batches} batches"))
+    weight = every.astype(np.float64)
+    return Fit(parts, unknowns, marks, values, stars.attitude, residual, weight, every, reduced)
+
+
+def _settle(found: Fit, stars: IdentifiedStars, model: Model, near: bool) -> tuple[int, bool]:
+    """Move a fit to where linear equations with robust weights settle.
+
+    How many steps that took, and whether they led far.
+    """
+    free, normal = found.free, found.reduced.normal
+    moved, turned = np.zeros(len(found.values)), np.zeros((stars.batches, 3))
+    residual, steps = found.residual, 0
+    for steps in range(1, ROUNDS + 1):
+        step, turns, length = found.reduced.steps(normal, residual, found.weight, free)
+        residual = residual + found.reduced.change(step, turns, len(stars))
+        moved += step
+        if not model.attitudes_known:
+            turned += turns
+        used = found.used
+        freedom = degrees_of_freedom(stars, model, used) - len(free)
+        found.scale = scale_of(residual[:, used], 2 * int(used.sum()), freedom)
+        leave_out = near or steps > LEAVE_OUT_FROM
+        found.weight = weights(residual, found.scale, leave_out)
+        if leave_out and length < SETTLED * found.scale:
+            break
+    found.values = found.values + moved
+    found.attitude = turned_attitudes(found.attitude, turned)
+    found.residual = _residuals(found.parts, found.values, found.attitude, len(stars))
+    angles = [abs(v) for v, each in zip(moved, found.unknowns, strict=True) if each.unit != "s"]
+    return steps, max([float(np.abs(turned).max()), *angles]) > FAR_RAD
+
+
+def _reduced(found: Fit, stars: IdentifiedStars, model: Model) -> Eliminated:
+    """The normal equations where the fit stands."""
+    given = found.values, found.attitude, found.residual, found.counted
+    return _eliminated(found.parts, *given, model)
+
+
+def _eliminated(
+    parts: Sequence[TrackerStars],
+    values: Vector,
+    attitude: Matrix,
+    residual: Vector,
+    counted: Marks,
+    model: Model,
+) -> Eliminated:
+    derivatives = [linearised(part, values, attitude) for part in parts]
+    edges = np.array([0, len(attitude)])
+    given = residual, counted.astype(np.float64), len(values), edges
+    return eliminate(derivatives, *given, model.attitudes_known)
+
+
+def _residuals(
+    parts: Sequence[TrackerStars], values: Vector, attitude: Matrix, stars: int
+) -> Vector:
+    found = np.empty((2, stars))
+    for part in parts:
+        found[:, part.rows] = residuals(part, values, attitude)
+    return found
+
+
+def degrees_of_freedom(stars: IdentifiedStars, model: Model, used: Marks) -> int:
+    """Two a star less three an attitude; the unknowns are not taken off.
+
+    A batch of which fewer than two stars are left determines no attitude, and adds none.
+    """
+    if model.attitudes_known:
+        return 2 * int(used.sum())
+    count = 2 * np.bincount(stars.batch[used], minlength=stars.batches)
+    return int(np.maximum(count - 3, 0).sum())
+
+
+def calibration_of(stars: IdentifiedStars, model: Model, settled: Fit, before: Fit) -> Calibration:
+    """Values and covariance of a fit, in units, with the residuals before it."""
+    free, used = settled.free, settled.used
+    if float(np.mean(used != settled.counted)) > RECOUNTED:
+        settled.counted = used
+        settled.reduced = _reduced(settled, stars, model)
+    freedom = degrees_of_freedom(stars, model, used) - len(free)
+    kept = tuple(settled.unknowns[at] for at in free)
+    per_unit = np.array([each.per_unit for each in kept])
+    covariance = np.zeros((0, 0))
+    if kept:
+        factor = covariance_factor(settled.residual[:, used], settled.scale, freedom)
+        covariance = inverse(settled.reduced.normal.matrix[np.ix_(free, free)]) * factor
+        covariance /= np.outer(per_unit, per_unit)
+    return Calibration(
+        model,
+        stars,
+        kept,
+        settled.values[free] / per_unit,
+        covariance,
+        settled.attitude,
+        before.residual.T,
+        settled.residual.T,
+        settled.weight,
+        freedom,
+        not_observable(
+            stars.trackers, settled.unknowns, settled.marks, model.attitudes_known, model.time_tag
+        ),
+    )

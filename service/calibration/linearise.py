@@ -1,0 +1,275 @@
+"""Residuals of identified stars, and how each depends on the attitudes and the unknowns.
+
+A star's residual is observed minus predicted along two tangents, in sigmas.  Observed
+is the direction of the measured angles through calibration and correction; predicted is
+
+    p = M^T exp(-[e x]) exp(-[w (t + tau) x]) A r,
+
+r the catalog direction, A the batch's attitude, w its body rates, t the star's time from
+the batch's and tau the tracker's time-tag offset, M the mission's alignment and e the
+misalignment.  All derivatives are analytic.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numpy.polynomial.legendre import legvander
+
+from service.calibration.stars import IdentifiedStars, Indices
+from service.calibration.unknowns import SKEW, STRETCH, Unknown
+from service.missions.mission import Tracker
+from service.vectors import Matrix, Vector, rotate_about
+
+Weights = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerStars:
+    """What stays the same of one tracker's stars (n), whatever the unknowns are.
+
+    `rows` are their places among all stars, `columns` (q,) those of the tracker's
+    unknowns among all.  `tangent` (n, 2, 3) are the two directions, in tracker axes,
+    along which residuals are taken.  `bending` are the tracker's unknowns that change the
+    angles, each with its place and the change of h and of v (n,) in radians by one unit of
+    it inside.  `temperature_c` counts from the reference.
+    """
+
+    tracker: Tracker
+    unknowns: tuple[Unknown, ...]
+    columns: Indices
+    rows: slice
+    batch: Indices
+    angles_rad: Vector
+    reference: Vector
+    sigma_rad: Vector
+    time_offset_s: Vector
+    temperature_c: Vector
+    rates_rad_per_s: Vector
+    tangent: Vector
+    bending: tuple[tuple[int, Vector, Vector], ...]
+
+    def places(self, *kinds: str, of_temperature: bool = False) -> list[int]:
+        """Which of the tracker's unknowns are of these kinds."""
+        return [
+            place
+            for place, each in enumerate(self.unknowns)
+            if each.shape in kinds and (each.of is not None) == of_temperature
+        ]
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """The derivatives of one tracker's residuals (2, n), in sigmas.
+
+    `by_unknown` (q, 2, n) is by the tracker's unknowns, in radians and seconds;
+    `by_attitude` (n, 2, 3) by a small rotation d of the batch's attitude about the body
+    axes, A -> exp(-[d x]) A.
+    """
+
+    stars: TrackerStars
+    by_unknown: Vector
+    by_attitude: Vector
+
+    @property
+    def flat(self) -> Vector:
+        """`by_unknown` as a matrix (q, 2 n)."""
+        count, angles, n = self.by_unknown.shape
+        return self.by_unknown.reshape(count, angles * n)
+
+    @cached_property
+    def by_turns(self) -> Any:
+        """`by_attitude` as a sparse matrix (2 n, 3 K), K up to the last batch of the tracker."""
+        from scipy.sparse import csr_array
+
+        n = len(self.stars.batch)
+        columns = 3 * self.stars.batch[:, None] + np.arange(3)
+        data = np.swapaxes(self.by_attitude, 0, 1).ravel()
+        return csr_array(
+            (data, np.tile(columns.ravel(), 2), np.arange(0, 6 * n + 1, 3)),
+            shape=(2 * n, 3 * (int(self.stars.batch[-1]) + 1)),
+        )
+
+
+def prepared(
+    stars: IdentifiedStars, unknowns: Sequence[Unknown], reference_temperature_c: float | None
+) -> list[TrackerStars]:
+    """The stars of each tracker that has some; `stars` are in the order of `usable`."""
+    from_c = 0.0 if reference_temperature_c is None else reference_temperature_c
+    edges = np.searchsorted(stars.tracker, np.arange(len(stars.trackers) + 1))
+    return [
+        _of_tracker(stars, index, slice(int(first), int(last)), unknowns, from_c)
+        for index, (first, last) in enumerate(pairwise(edges))
+        if last > first
+    ]
+
+
+def _of_tracker(
+    stars: IdentifiedStars, index: int, rows: slice, unknowns: Sequence[Unknown], from_c: float
+) -> TrackerStars:
+    tracker = stars.trackers[index]
+    columns = [place for place, each in enumerate(unknowns) if each.tracker == index]
+    own = tuple(unknowns[place] for place in columns)
+    batch = stars.batch[rows]
+    radius_rad = np.radians(tracker.field_of_view_radius_deg)
+    # Where the temperature is not known, the reference is the best guess.
+    temperature_c = np.nan_to_num(stars.temperature_c[rows] - from_c, nan=0.0)
+    x, y = (stars.measured_rad[rows] / radius_rad).T
+    vander = np.moveaxis(
+        legvander(np.stack([x, y]), max((each.degree for each in own), default=0)), 2, 1
+    ).copy()
+    bending = []
+    for place, each in enumerate(own):
+        if each.shape in ("scale", "distortion"):
+            by_h, by_v = _bend(each, x, y, vander, radius_rad)
+            if each.of is not None:
+                by_h, by_v = by_h * temperature_c, by_v * temperature_c
+            bending.append((place, by_h, by_v))
+    angles = stars.angles_rad[rows]
+    return TrackerStars(
+        tracker,
+        own,
+        np.array(columns, dtype=np.int64),
+        rows,
+        batch,
+        angles,
+        stars.reference[rows],
+        stars.sigma_rad[rows],
+        stars.time_offset_s[rows],
+        temperature_c,
+        stars.rates_rad_per_s[batch],
+        _tangents(directions(angles)),
+        tuple(bending),
+    )
+
+
+def _bend(
+    unknown: Unknown, x: Vector, y: Vector, vander: Vector, radius_rad: float
+) -> tuple[Vector, Vector]:
+    """The change of h and of v by one of the unknown; `vander` (2, degree + 1, n) is P of x, y.
+
+    One radian of a distortion is so much at the edge of the field.
+    """
+    kind, i, j = unknown.term
+    if unknown.shape == "scale":
+        return x * radius_rad, y * radius_rad
+    if kind == STRETCH:
+        return x, -y
+    if kind == SKEW:
+        return y, x
+    bent, none = vander[0, i] * vander[1, j], np.zeros_like(x)
+    return (bent, none) if kind == "h" else (none, bent)
+
+
+def directions(angles_rad: Vector) -> Vector:
+    """Unit vectors (n, 3) in tracker axes of true angles h, v (n, 2)."""
+    tangents = np.tan(angles_rad)
+    z = 1.0 / np.sqrt(1.0 + np.sum(tangents**2, axis=1))
+    return np.column_stack([tangents * z[:, None], z])
+
+
+def _tangents(direction: Vector) -> Vector:
+    """Two unit vectors (n, 2, 3) across each direction, right-handed with it; the first along h."""
+    x, y, z = direction.T
+    across = np.hypot(y, z)
+    zero = np.zeros_like(x)
+    first = np.stack([across, -x * y / across, -x * z / across], axis=1)
+    second = np.stack([zero, z / across, -y / across], axis=1)
+    return np.stack([first, second], axis=1)
+
+
+def _corrected_angles(stars: TrackerStars, values: Vector) -> Vector:
+    """The angles h, v (n, 2) with the corrections of `values` (p,)."""
+    own, angles = values[stars.columns], stars.angles_rad.copy()
+    for place, by_h, by_v in stars.bending:
+        if own[place]:
+            angles[:, 0] += own[place] * by_h
+            angles[:, 1] += own[place] * by_v
+    return angles
+
+
+def _predicted(stars: TrackerStars, values: Vector, attitude: Matrix) -> tuple[Vector, Matrix]:
+    """The catalog directions (n, 3) in tracker axes, and body_from_tracker with misalignment."""
+    own = values[stars.columns]
+    aligned = stars.places("alignment")
+    turned = own[aligned] if aligned else np.zeros(3)
+    body_from_tracker = rotate_about(turned, stars.tracker.body_from_tracker.T).T
+    tag = stars.places("time_tag")
+    after_s = stars.time_offset_s + (own[tag[0]] if tag else 0.0)
+    turn = -stars.rates_rad_per_s * after_s[:, None]
+    body = np.einsum("nij,nj->ni", attitude[stars.batch], stars.reference)
+    if turn.any():
+        body = rotate_about(turn, body)
+    drift = stars.places("alignment", of_temperature=True)
+    if drift:
+        body = rotate_about(-own[drift] * stars.temperature_c[:, None], body)
+    return body @ body_from_tracker, body_from_tracker
+
+
+def residuals(stars: TrackerStars, values: Vector, attitude: Matrix) -> Vector:
+    """Observed minus predicted (2, n) in sigmas along the tangents.
+
+    `values` (p,) are all unknowns in radians and seconds, `attitude` (K, 3, 3) those of
+    the batches.
+    """
+    observed = directions(_corrected_angles(stars, values))
+    predicted, _ = _predicted(stars, values, attitude)
+    apart = observed - predicted
+    return np.asarray(np.einsum("nri,ni->rn", stars.tangent, apart) / stars.sigma_rad)
+
+
+def linearised(stars: TrackerStars, values: Vector, attitude: Matrix) -> Linearised:
+    """The derivatives of `residuals`."""
+    own = values[stars.columns]
+    predicted, body_from_tracker = _predicted(stars, values, attitude)
+    angles = _corrected_angles(stars, values)
+    # A small turn d of the body, d in body axes, changes t.(u - p) by d.M(p x t).
+    turning = np.cross(predicted[:, None, :], stars.tangent) @ body_from_tracker.T
+    turning /= stars.sigma_rad[:, None, None]
+    by_unknown = np.empty((len(own), 2, len(predicted)))
+    bent = _by_angles(stars, angles)
+    for place, by_h, by_v in stars.bending:
+        np.multiply(bent[0], by_h, out=by_unknown[place])
+        by_unknown[place] += bent[1] * by_v
+    aligned = stars.places("alignment")
+    if aligned:
+        by_unknown[aligned] = (turning @ _left_jacobian(own[aligned])).transpose(2, 1, 0)
+    drift = stars.places("alignment", of_temperature=True)
+    if drift:
+        by_unknown[drift] = turning.transpose(2, 1, 0) * stars.temperature_c
+        drifted = own[drift] * stars.temperature_c[:, None]
+        turning = rotate_about(drifted[:, None, :], turning)
+    tag = stars.places("time_tag")
+    if tag:
+        by_unknown[tag[0]] = np.einsum("nri,ni->rn", turning, stars.rates_rad_per_s)
+    after_s = stars.time_offset_s + (own[tag[0]] if tag else 0.0)
+    to_epoch = stars.rates_rad_per_s * after_s[:, None]
+    by_attitude = rotate_about(to_epoch[:, None, :], turning) if to_epoch.any() else turning
+    return Linearised(stars, by_unknown, by_attitude)
+
+
+def _by_angles(stars: TrackerStars, angles_rad: Vector) -> Vector:
+    """The derivatives (2, 2, n) of the residuals by h, and by v."""
+    direction = directions(angles_rad)
+    slope = direction[:, 2, None] / np.cos(angles_rad) ** 2
+    along = np.einsum("nri,ni->nr", stars.tangent, direction)
+    # du/d(tan h) = z (e_x - u u_x), u being the direction and z its last part; v likewise.
+    by = stars.tangent[:, :, :2] - along[:, :, None] * direction[:, None, :2]
+    by *= slope[:, None, :] / stars.sigma_rad[:, None, None]
+    return np.ascontiguousarray(by.transpose(2, 1, 0))
+
+
+def _left_jacobian(rotation_rad: Vector) -> Matrix:
+    """The derivative d exp([e x]) / de as a turn from the left, to the first order in e."""
+    x, y, z = rotation_rad
+    return np.eye(3) + 0.5 * np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def turned_attitudes(attitude: Matrix, turn_rad: Vector) -> Matrix:
+    """Attitudes (K, 3, 3) after small turns (K, 3): exp(-[d x]) A."""
+    rows = rotate_about(-turn_rad[:, None, :], np.swapaxes(attitude, 1, 2))
+    return np.swapaxes(rows, 1, 2)

@@ -1,0 +1,167 @@
+"""A calibration as settings of a mission: alignment, scale and distortion of its trackers."""
+
+import math
+import re
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.polynomial.legendre import leg2poly
+
+from service.calibration.estimate import Calibration
+from service.calibration.unknowns import SKEW, STRETCH, Unknown
+from service.errors import BadConfiguration
+from service.missions.mission import Mission, Tracker, parse_mission
+from service.vectors import ARCSEC_PER_RADIAN, Matrix, rotate_about
+
+AXES = ("x_axis_body", "y_axis_body", "z_axis_body")
+Lines = dict[str, str]
+Terms = tuple[tuple[int, int, float], ...]
+
+_HEADER = re.compile(r"^\s*\[")
+_TRACKERS = re.compile(r"^\s*\[\[\s*trackers\s*\]\]")
+_CALIBRATION = re.compile(r"^\s*\[\s*trackers\.calibration\s*\]")
+_KEY = re.compile(r"^\s*([A-Za-z_]+)\s*=")
+
+
+def calibrated_mission_text(text: str, file: str, found: Calibration) -> str:
+    """The text of a mission file with a calibration's alignment, scale and distortion.
+
+    Everything else stays as it is.  Raises `BadConfiguration` for a file whose trackers are
+    not laid out as `[[trackers]]` with each axis in one line.
+    """
+    mission = parse_mission(text, file)
+    lines = text.splitlines()
+    for index in reversed(range(len(mission.trackers))):
+        tracker = mission.trackers[index]
+        changes = tracker_lines(tracker, found)
+        if changes["tracker"] or changes["calibration"]:
+            _edit(lines, index, changes)
+    edited = "\n".join(lines) + "\n"
+    expected = {each.name: tracker_lines(each, found) for each in mission.trackers}
+    if not _holds(parse_mission(edited, file), mission, expected):
+        message = "cannot be edited: write each axis of [[trackers]] in one line of its own"
+        raise BadConfiguration(f"{file}: {message}")
+    return edited
+
+
+def tracker_lines(tracker: Tracker, found: Calibration) -> dict[str, Lines]:
+    """The keys of a tracker, and of its `calibration`, that change, each with its value as TOML."""
+    values = {
+        unknown: float(value)
+        for unknown, value in zip(found.unknowns, found.value, strict=True)
+        if found.stars.trackers[unknown.tracker].name == tracker.name
+    }
+    own: Lines = {}
+    turned = {each.term[0]: value for each, value in values.items() if each.kind == "alignment"}
+    if turned:
+        vector = np.array([turned.get(axis, 0.0) for axis in "xyz"]) / ARCSEC_PER_RADIAN
+        axes = rotate_about(vector, tracker.body_from_tracker.T)
+        own = {name: _vector(axis) for name, axis in zip(AXES, axes, strict=True)}
+    bent = {each: value for each, value in values.items() if each.kind in ("scale", "distortion")}
+    return {"tracker": own, "calibration": _focal_plane(tracker, bent) if bent else {}}
+
+
+def _vector(axis: Matrix) -> str:
+    return "[" + ", ".join(f"{part:.12f}" for part in axis) + "]"
+
+
+def _focal_plane(tracker: Tracker, bent: Mapping[Unknown, float]) -> Lines:
+    """The table `calibration`: the present polynomials with the corrections added to them."""
+    present = tracker.calibration
+    scale = present.scale + sum(value for each, value in bent.items() if each.kind == "scale")
+    added = _polynomials_deg(bent, tracker.field_of_view_radius_deg)
+    lines: Lines = {"scale": repr(scale)}
+    for name, terms, more in (
+        ("h_terms", present.h_terms, added[0]),
+        ("v_terms", present.v_terms, added[1]),
+    ):
+        total = dict(more)
+        for i, j, value in terms:
+            total[i, j] = total.get((i, j), 0.0) + present.scale * value
+        written = [
+            f"[{i}, {j}, {value / scale:.9e}]" for (i, j), value in sorted(total.items()) if value
+        ]
+        if written:
+            lines[name] = "[" + ", ".join(written) + "]"
+    return lines
+
+
+def _polynomials_deg(
+    bent: Mapping[Unknown, float], radius_deg: float
+) -> tuple[dict[tuple[int, int], float], ...]:
+    """What is added to h and to v, in degrees, by powers of the measured h and v in degrees."""
+    size = max((each.degree for each in bent), default=0) + 1
+    series = np.zeros((2, size, size))
+    for each, value in bent.items():
+        kind, i, j = each.term
+        value_deg = value / 3600.0
+        if each.kind == "scale":
+            continue
+        if kind == STRETCH:
+            series[0, 1, 0], series[1, 0, 1] = value_deg, -value_deg
+        elif kind == SKEW:
+            series[0, 0, 1], series[1, 1, 0] = value_deg, value_deg
+        else:
+            series["hv".index(kind), i, j] = value_deg
+    powers = np.zeros((size, size))
+    for degree in range(size):
+        unit = np.zeros(degree + 1)
+        unit[degree] = 1.0
+        powers[degree, : degree + 1] = leg2poly(unit)
+    per_deg = float(radius_deg) ** -np.arange(size)
+    found = np.einsum("aij,ik,jl,k,l->akl", series, powers, powers, per_deg, per_deg)
+    return tuple(
+        {(i, j): float(one[i, j]) for i in range(size) for j in range(size) if one[i, j]}
+        for one in found
+    )
+
+
+def _edit(lines: list[str], index: int, changes: Mapping[str, Lines]) -> None:
+    """Replace the keys of the tracker at `index`, and its table `calibration`, in place."""
+    places = [at for at, line in enumerate(lines) if _TRACKERS.match(line)]
+    if index >= len(places):
+        return
+    begin = places[index] + 1
+    end = next((at for at in range(begin, len(lines)) if _HEADER.match(lines[at])), len(lines))
+    for at in range(begin, end):
+        key = _KEY.match(lines[at])
+        if key and key[1] in changes["tracker"]:
+            lines[at] = f"{key[1]} = {changes['tracker'][key[1]]}"
+    if not changes["calibration"]:
+        return
+    following = next(
+        (at for at in range(begin, len(lines)) if _TRACKERS.match(lines[at])), len(lines)
+    )
+    old = next((at for at in range(end, following) if _CALIBRATION.match(lines[at])), None)
+    if old is not None:
+        last = next(
+            (at for at in range(old + 1, len(lines)) if _HEADER.match(lines[at])), len(lines)
+        )
+        del lines[old:last]
+    else:
+        old = end
+        while old > begin and not lines[old - 1].strip():
+            old -= 1
+        lines.insert(old, "")
+        old += 1
+    written = [f"{key} = {value}" for key, value in changes["calibration"].items()]
+    lines[old:old] = ["[trackers.calibration]", *written, ""]
+
+
+def _holds(edited: Mission, before: Mission, expected: Mapping[str, Mapping[str, Lines]]) -> bool:
+    """Whether the edited mission has every change, and is the same but for these."""
+    for old, new in zip(before.trackers, edited.trackers, strict=True):
+        wanted = expected[old.name]
+        for key, value in wanted["tracker"].items():
+            told = [float(part) for part in value.strip("[]").split(",")]
+            if not np.allclose(getattr(new, key), told, atol=1e-12):
+                return False
+        if wanted["calibration"]:
+            scale = float(wanted["calibration"]["scale"])
+            if not math.isclose(new.calibration.scale, scale, rel_tol=1e-12):
+                return False
+    same = [
+        new.model_copy(update={name: getattr(old, name) for name in (*AXES, "calibration")})
+        for old, new in zip(before.trackers, edited.trackers, strict=True)
+    ]
+    return edited.model_copy(update={"trackers": tuple(same)}) == before

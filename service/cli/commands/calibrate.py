@@ -1,0 +1,133 @@
+"""`acquire calibrate`: alignment, distortion and clocks of trackers from recorded batches."""
+
+from argparse import Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from service.cli.arguments import (
+    MISSION,
+    add_command,
+    add_database,
+    add_json,
+    add_period,
+    count,
+    print_json,
+)
+from service.cli.configuration import period_of, settings_of, settings_of_existing
+from service.errors import BadInput, Fault, shown_value
+
+if TYPE_CHECKING:
+    from service.calibration.estimate import Calibration
+
+
+def add(commands: Any) -> None:
+    """Declare the command."""
+    parser = add_command(
+        commands,
+        "calibrate",
+        "Estimate alignment between trackers, scale and distortion of each, and time tags from "
+        "the identified stars of recorded batches, with sigmas; name what these cannot show; "
+        "write a mission file with the result.  Changes nothing that is recorded or in use.",
+        """
+        acquire calibrate TWOHEADS
+        acquire calibrate TWOHEADS --run commissioning --output twoheads-new.toml
+        acquire calibrate TWOHEADS --start 1999-060T00:00:00Z --degree 3 --time-tag --json
+        """,
+        run,
+    )
+    parser.add_argument("spacecraft", metavar="SPACECRAFT", help=MISSION)
+    add_period(parser, "the run to use; default live")
+    parser.add_argument(
+        "--tracker",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="calibrate this tracker; may be repeated; default all of the mission",
+    )
+    parser.add_argument(
+        "--degree",
+        type=int,
+        metavar="N",
+        help="of the distortion, 0 for none; default: chosen by held-out blocks of time",
+    )
+    parser.add_argument(
+        "--time-tag",
+        action="store_true",
+        help="estimate how much later than sent each tracker but the first measured its stars",
+    )
+    parser.add_argument(
+        "--sample",
+        type=count,
+        default=2000,
+        metavar="N",
+        help="maximum number of batches to use, taken from the whole period; default 2000",
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        metavar="OUT.toml",
+        help="write the mission file with alignment, scale and distortion corrected",
+    )
+    add_json(parser, "the result")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    add_database(parser)
+
+
+def run(parsed: Namespace) -> int:
+    """Estimate, print, and write the mission file if asked to."""
+    from tqdm import tqdm
+
+    from service.app.calibrations.estimates import CalibrationRequest
+    from service.app.factory import open_app
+    from service.cli.calibration_text import calibration_json, calibration_text
+
+    start, end = period_of(parsed)
+    wanted = CalibrationRequest(
+        parsed.spacecraft,
+        run=parsed.run,
+        start=start,
+        end=end,
+        trackers=parsed.tracker,
+        degree=parsed.degree,
+        time_tag=parsed.time_tag,
+        sample=parsed.sample,
+    )
+    app = open_app(settings_of_existing(parsed))
+    try:
+        with tqdm(
+            total=None, unit=" batches", desc="running again", disable=parsed.quiet or None
+        ) as bar:
+            result = app.calibrations.of_spacecraft(wanted, bar.update)
+    finally:
+        app.close()
+    if parsed.json:
+        print_json(calibration_json(result))
+    else:
+        print(calibration_text(result))
+    if parsed.output is not None:
+        _write_mission(parsed, result.found)
+    return 0
+
+
+def _write_mission(parsed: Namespace, found: "Calibration") -> None:
+    """Write the spacecraft's mission file, changed by the calibration, to another file."""
+    from service.calibration.mission_file import calibrated_mission_text
+
+    source = _mission_file(parsed)
+    if parsed.output.exists() and parsed.output.samefile(source):
+        message = "is the mission file in use; name another file, and put it in its place later"
+        raise BadInput(Fault("--output", message, shown_value(str(parsed.output))))
+    text = calibrated_mission_text(source.read_text(encoding="utf-8"), str(source), found)
+    parsed.output.write_text(text, encoding="utf-8")
+    if not parsed.json:
+        print(f"\n{parsed.output}: {source} with alignment, scale and distortion corrected")
+
+
+def _mission_file(parsed: Namespace) -> Path:
+    """The file that the spacecraft's mission is read from: a site's own before the shipped one."""
+    from service.missions.mission import SHIPPED_FOLDER, read_mission
+
+    folders = [each for each in (settings_of(parsed).missions, SHIPPED_FOLDER) if each]
+    files = (path for folder in folders for path in sorted(Path(folder).glob("*.toml")))
+    return next(path for path in files if read_mission(path).name == parsed.spacecraft)
