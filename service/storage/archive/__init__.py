@@ -1,0 +1,1 @@
+"""The archive: old batches in Parquet files beside the database."""

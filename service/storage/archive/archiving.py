@@ -1,0 +1,302 @@
+"""Moves old batches from the database to an archive, and never loses one on the way.
+
+A part is written, read back from its file and named in the manifest.  Then one transaction
+compares the file with the record bit by bit, notes the batches as archived and deletes them.
+Whatever ends the command in between leaves them in the record, and a part that the next one
+discards.
+"""
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from sqlalchemy import ColumnElement, Connection, Table, func, insert, select
+
+from service.errors import BadConfiguration
+from service.storage.archive.folder import (
+    Manifest,
+    Part,
+    Settings,
+    day_folder,
+    locked,
+    manifest_of,
+    path_of,
+    read_partition,
+    whole_content,
+    write_manifest,
+    write_partition,
+    write_settings,
+)
+from service.storage.archive.rows import Rows, differing, from_partition, read_rows, to_partition
+from service.storage.archive.tables import archived_batches, archived_parts, archived_what_ifs
+from service.storage.queries.tracker_splits import is_waiting
+from service.storage.recording.archived_hours import keep_share
+from service.storage.sql.database import Store
+from service.storage.sql.rollup_tables import rollups_daily, rollups_hourly
+from service.storage.sql.statements import insert_all
+from service.storage.sql.tables import catalogs, missions, results
+from service.storage.upkeep.prune import delete_batches
+from service.times import DAY_S, HOUR_S, Utc, bucket_start, utc_now
+
+MOST_BATCHES = 10_000
+"""Of a part: what is held in memory, and deleted in one transaction."""
+
+MAX_ATTEMPTS = 5
+
+
+@dataclass
+class Archived:
+    """How many batches there are to archive, and are archived so far, in how many bytes."""
+
+    total: int
+    batches: int = 0
+    parts: int = 0
+    bytes: int = 0
+
+
+@dataclass(frozen=True)
+class _Day:
+    spacecraft: str
+    run: str
+    number: int
+
+    @property
+    def text(self) -> str:
+        return bucket_start(self.number, DAY_S).text[:10]
+
+
+def archive(
+    store: Store,
+    folder: Path,
+    before: Utc,
+    *,
+    step: Callable[[Archived], object] = lambda archived: None,
+) -> Archived:
+    """Move the batches whose time is before `before` to the archive in `folder`.
+
+    Of each spacecraft and run the hours of the newest batch and of the newest attitude stay, so
+    that its state is known without the archive.  Gyro blocks stay.  Interrupted, it is called
+    again and goes on.  Raises `BadConfiguration` where the folder is missing or in use, where
+    batches are not split by tracker yet, and where a part of the archive contradicts the record.
+    """
+    with locked(folder):
+        with store.reading() as connection:
+            days = _days(connection, before)
+            chosen = {day: _chosen(connection, day, before) for day in days}
+            counted = select(func.count()).select_from(results)
+            total = sum(int(connection.scalar(counted.where(*w)) or 0) for w in chosen.values())
+        archived = Archived(total)
+        step(archived)
+        for day in days:
+            _discard_unfinished(store, folder, day)
+            for ids in _portions(store, chosen[day]):
+                part = _archive(store, folder, day, ids)
+                archived.batches += part.batches
+                archived.parts += 1
+                archived.bytes += part.bytes
+                step(archived)
+    return archived
+
+
+def _days(connection: Connection, before: Utc) -> list[_Day]:
+    daily = rollups_daily.c
+    query = select(daily.spacecraft, daily.run, daily.bucket).where(
+        daily.bucket <= before.bucket(DAY_S)
+    )
+    found = sorted({_Day(*row) for row in connection.execute(query)}, key=_order)
+    for spacecraft, run in sorted({(day.spacecraft, day.run) for day in found}):
+        if is_waiting(connection, spacecraft, run):
+            raise BadConfiguration(
+                f"{spacecraft}, run {run}: batches of an earlier version are not split by tracker "
+                "yet: run `acquire database split-trackers` first"
+            )
+    return found
+
+
+def _order(day: _Day) -> tuple[str, str, int]:
+    return day.spacecraft, day.run, day.number
+
+
+def _chosen(connection: Connection, day: _Day, before: Utc) -> list[ColumnElement[bool]]:
+    """The current results of a day that are to be archived, as SQL."""
+    end_ns = min(bucket_start(day.number + 1, DAY_S).tai_ns, before.tai_ns)
+    chosen: list[ColumnElement[bool]] = [
+        results.c.current,
+        results.c.spacecraft == day.spacecraft,
+        results.c.run == day.run,
+        results.c.time_ns >= bucket_start(day.number, DAY_S).tai_ns,
+        results.c.time_ns < end_ns,
+    ]
+    hourly = rollups_hourly.c
+    for has in (hourly.batches, hourly.solved):
+        newest = select(func.max(hourly.bucket)).where(
+            hourly.spacecraft == day.spacecraft,
+            hourly.run == day.run,
+            # A batch that is dated ahead is not the newest one.
+            hourly.bucket <= utc_now().bucket(HOUR_S),
+            has > 0,
+        )
+        hour = connection.scalar(newest)
+        if hour is not None:
+            begin_ns, end_ns = (bucket_start(hour + k, HOUR_S).tai_ns for k in (0, 1))
+            chosen.append(~results.c.time_ns.between(begin_ns, end_ns - 1))
+    return chosen
+
+
+def _portions(store: Store, chosen: Sequence[ColumnElement[bool]]) -> Iterator[list[str]]:
+    """The ids of the batches of one part after another, in order of time."""
+    query = select(results.c.batch_id).where(*chosen)
+    query = query.order_by(results.c.time_ns, results.c.batch_id).limit(MOST_BATCHES)
+    while True:
+        with store.reading() as connection:
+            ids = list(connection.scalars(query))
+        if not ids:
+            return
+        yield ids
+
+
+def _archive(store: Store, folder: Path, day: _Day, batch_ids: Sequence[str]) -> Part:
+    """Write a part, name it in the manifest, and take its batches out of the database."""
+    for _ in range(MAX_ATTEMPTS):
+        with store.reading() as connection:
+            rows = read_rows(connection, batch_ids)
+            _keep_settings(connection, folder, rows)
+        file = _new_file(day_folder(folder, day.spacecraft, day.text))
+        content = write_partition(file, to_partition(rows))
+        part = _described(file.name, day.run, rows, content)
+        manifest = manifest_of(folder, day.spacecraft, day.text)
+        manifest = msgspec.structs.replace(manifest, parts=[*manifest.parts, part])
+        write_manifest(folder, manifest)
+        path = path_of(folder, manifest, part)
+        written = from_partition(read_partition(content))
+        take_out = partial(_take_out, day=day, part=part, path=path, written=written)
+        if store.writer.change(take_out).result():
+            return part
+        # Changed since it was read, by a what-if for example: written again as it is now.
+        _remove(folder, manifest, part)
+    raise BadConfiguration(f"{path}: the record of these batches changes too often, or is damaged")
+
+
+def _new_file(folder: Path) -> Path:
+    """A name that no file has, whether a manifest names it or not."""
+    names = [each.name for each in folder.glob("part-*.parquet")]
+    numbers = [int(each.removeprefix("part-").partition(".")[0]) for each in names]
+    return folder / f"part-{1 + max(numbers, default=0)}.parquet"
+
+
+def _described(name: str, run: str, rows: Rows, content: bytes) -> Part:
+    found = rows["batches"]
+    first, last = found.slice(0, 1).to_pylist()[0], found.slice(len(found) - 1).to_pylist()[0]
+    made = rows["results"]
+    return Part(
+        file=name,
+        run=run,
+        batches=len(found),
+        results=len(made),
+        first=first["time"],
+        last=last["time"],
+        first_ns=first["time_ns"],
+        last_ns=last["time_ns"],
+        bytes=len(content),
+        sha256=hashlib.sha256(content).hexdigest(),
+        missions=sorted(pc.unique(made["mission_digest"]).to_pylist()),
+        catalogs=sorted(pc.unique(made["catalog_digest"]).to_pylist()),
+    )
+
+
+def _keep_settings(connection: Connection, folder: Path, rows: Rows) -> None:
+    kinds: tuple[tuple[str, Table], ...] = (
+        ("mission_digest", missions),
+        ("catalog_digest", catalogs),
+    )
+    for column, table in kinds:
+        digests = pc.unique(rows["results"][column]).to_pylist()
+        query = select(table).where(table.c.digest.in_(digests))
+        for row in connection.execute(query).mappings():
+            write_settings(folder, Settings(digest=row["digest"], row=dict(row)))
+
+
+def _take_out(connection: Connection, day: _Day, part: Part, path: str, written: Rows) -> bool:
+    """Note the batches of a part as archived and delete them; False: the record is another now."""
+    ids = written["batches"]["id"].to_pylist()
+    if differing(read_rows(connection, ids), written) is not None:
+        return False
+    row = {
+        "path": path,
+        "spacecraft": day.spacecraft,
+        "run": day.run,
+        "first_ns": part.first_ns,
+        "last_ns": part.last_ns,
+        "batches": part.batches,
+        "sha256": part.sha256,
+    }
+    part_id = connection.execute(insert(archived_parts).returning(archived_parts.c.id), row)
+    number = int(part_id.scalar_one())
+    columns = [each.name for each in archived_batches.columns if each.name != "part_id"]
+    noted = (
+        written["batches"]
+        .select(columns)
+        .append_column("part_id", pa.array([number] * len(ids), pa.int32()))
+    )
+    insert_all(connection, archived_batches, noted.to_pylist())
+    made = written["results"]
+    further = made.filter(pc.not_equal(made["id"], made["batch_id"])).select(["id", "batch_id"])
+    insert_all(connection, archived_what_ifs, further.to_pylist())
+    keep_share(connection, number, day.spacecraft, day.run, _by_hour(day, written))
+    delete_batches(connection, ids)
+    return True
+
+
+def _by_hour(day: _Day, rows: Rows) -> dict[int, list[str]]:
+    """The ids of the batches of each hour of a day."""
+    hours = range(24 * day.number, 24 * day.number + 24)
+    starts_ns = np.array([bucket_start(hour, HOUR_S).tai_ns for hour in hours])
+    times_ns = rows["batches"]["time_ns"].to_numpy()
+    # A leap second belongs to the hour that it ends, and begins no other.
+    place = np.searchsorted(starts_ns, times_ns, side="right") - 1
+    found: dict[int, list[str]] = {}
+    for k, id in zip(place.tolist(), rows["batches"]["id"].to_pylist(), strict=True):
+        found.setdefault(hours[k], []).append(id)
+    return found
+
+
+def _discard_unfinished(store: Store, folder: Path, day: _Day) -> None:
+    """Remove the parts of a day that were written and whose batches then stayed in the record.
+
+    Those of other databases, which have none of these batches, stay.
+    """
+    manifest = manifest_of(folder, day.spacecraft, day.text)
+    paths = {path_of(folder, manifest, part): part for part in manifest.parts}
+    with store.reading() as connection:
+        query = select(archived_parts.c.path).where(archived_parts.c.path.in_(paths))
+        known = set(connection.scalars(query))
+    for path, part in paths.items():
+        if path in known or part.run != day.run:
+            continue
+        rows = from_partition(read_partition(whole_content(folder, path, part.sha256)))
+        with store.reading() as connection:
+            there = read_rows(connection, rows["batches"]["id"].to_pylist())
+        if not len(there["results"]):
+            continue
+        own, recorded = (set(each["results"]["id"].to_pylist()) for each in (rows, there))
+        if not own <= recorded:
+            raise BadConfiguration(
+                f"{folder / path}: the database has some of its batches and lacks others: restore "
+                "it with `acquire archive restore`, or move it away"
+            )
+        manifest = _remove(folder, manifest, part)
+
+
+def _remove(folder: Path, manifest: Manifest, part: Part) -> Manifest:
+    """Take a part out of the manifest, then delete its file."""
+    left = [each for each in manifest.parts if each.file != part.file]
+    manifest = msgspec.structs.replace(manifest, parts=left)
+    write_manifest(folder, manifest)
+    (day_folder(folder, manifest.spacecraft, manifest.day) / part.file).unlink()
+    return manifest

@@ -1,0 +1,190 @@
+"""The folder of an archive: partitions of Parquet, and a manifest beside those of a day.
+
+    spacecraft=NAME/day=YYYY-MM-DD/part-N.parquet
+    spacecraft=NAME/day=YYYY-MM-DD/manifest.json
+    settings/DIGEST.json
+
+A partition is whole when the manifest names it with its hash.  Every file appears whole, by a
+rename.
+"""
+
+import fcntl
+import hashlib
+import io
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+from urllib.parse import quote
+
+import msgspec
+import pyarrow as pa
+from msgspec import Struct
+from pyarrow import parquet
+
+from service.errors import BadConfiguration
+from service.storage.upkeep.backup import sync_folder
+
+T = TypeVar("T")
+
+MANIFEST = "manifest.json"
+COMPRESSION_LEVEL = 1
+"""Of zstd: higher levels take longer, and those up to 9 make nothing smaller."""
+ROWS_TOGETHER = 2_048
+"""Of a row group, the least that is read of a text column."""
+
+
+class Part(Struct, frozen=True, kw_only=True):
+    """A partition as the manifest of its day names it."""
+
+    file: str
+    run: str
+    batches: int
+    results: int
+    first: str
+    """UTC of the earliest batch."""
+    last: str
+    first_ns: int
+    last_ns: int
+    bytes: int
+    sha256: str
+    missions: list[str]
+    """Digests of the settings in `settings/`."""
+    catalogs: list[str]
+
+
+class Manifest(Struct, frozen=True, kw_only=True):
+    """The partitions of a spacecraft's day."""
+
+    spacecraft: str
+    day: str
+    parts: list[Part]
+
+
+class Settings(Struct, frozen=True, kw_only=True):
+    """The settings of a mission, or a catalog, that results of the archive name."""
+
+    digest: str
+    row: dict[str, Any]
+    """As the database has it."""
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Have a folder to oneself; raises `BadConfiguration` while another command works on it."""
+    if not folder.is_dir():
+        raise BadConfiguration(f"{folder}: there is no such folder")
+    with (folder / "archive.lock").open("ab") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BadConfiguration(f"{folder}: another command is working on it") from None
+        yield
+
+
+def day_folder(folder: Path, spacecraft: str, day: str) -> Path:
+    """Where the partitions of a spacecraft's day are."""
+    return folder / f"spacecraft={quote(spacecraft, safe='')}" / f"day={day}"
+
+
+def path_of(folder: Path, manifest: Manifest, part: Part) -> str:
+    """The path of a partition below the folder."""
+    file = day_folder(folder, manifest.spacecraft, manifest.day) / part.file
+    return str(file.relative_to(folder))
+
+
+def manifests(folder: Path) -> Iterator[Manifest]:
+    """Every manifest, in order of spacecraft and day."""
+    for file in sorted(folder.glob(f"spacecraft=*/day=*/{MANIFEST}")):
+        yield _decoded(file, Manifest)
+
+
+def manifest_of(folder: Path, spacecraft: str, day: str) -> Manifest:
+    """The manifest of a day; one without partitions where there is none."""
+    file = day_folder(folder, spacecraft, day) / MANIFEST
+    if not file.exists():
+        return Manifest(spacecraft=spacecraft, day=day, parts=[])
+    return _decoded(file, Manifest)
+
+
+def write_manifest(folder: Path, manifest: Manifest) -> None:
+    """Put a manifest in the place of the one before."""
+    file = day_folder(folder, manifest.spacecraft, manifest.day) / MANIFEST
+    write_whole(file, msgspec.json.format(msgspec.json.encode(manifest), indent=1))
+
+
+def write_partition(file: Path, partition: pa.Table) -> bytes:
+    """Write a partition; returns the bytes that then stand in the file."""
+    buffer = io.BytesIO()
+    parquet.write_table(
+        partition,
+        buffer,
+        compression="zstd",
+        compression_level=COMPRESSION_LEVEL,
+        row_group_size=ROWS_TOGETHER,
+        write_page_checksum=True,
+    )
+    write_whole(file, buffer.getvalue())
+    return file.read_bytes()
+
+
+def read_partition(content: bytes) -> pa.Table:
+    """The partition of a file's content."""
+    return parquet.read_table(io.BytesIO(content), page_checksum_verification=True)
+
+
+def whole_content(folder: Path, path: str, sha256: str) -> bytes:
+    """The content of a partition; raises `BadConfiguration` where it is missing or damaged."""
+    try:
+        content = (folder / path).read_bytes()
+    except OSError as error:
+        raise BadConfiguration(f"{folder / path}: cannot be read: {error.strerror}") from None
+    if hashlib.sha256(content).hexdigest() != sha256:
+        raise BadConfiguration(f"{folder / path}: is damaged: its SHA-256 is another")
+    return content
+
+
+def settings_file(folder: Path, digest: str) -> Path:
+    """The file of a mission's settings or of a catalog."""
+    return folder / "settings" / f"{digest.replace(':', '-')}.json"
+
+
+def write_settings(folder: Path, settings: Settings) -> None:
+    """Keep what a digest stands for, unless it is there."""
+    file = settings_file(folder, settings.digest)
+    if not file.exists():
+        write_whole(file, msgspec.json.encode(settings))
+
+
+def read_settings(folder: Path, digest: str) -> Settings:
+    """What a digest stands for."""
+    return _decoded(settings_file(folder, digest), Settings)
+
+
+def write_whole(file: Path, content: bytes) -> None:
+    """Write a file that appears whole and outlasts a power cut."""
+    new = [folder for folder in file.parents if not folder.exists()]
+    file.parent.mkdir(parents=True, exist_ok=True)
+    for folder in new:
+        sync_folder(folder.parent)
+    beside = file.with_name(f"{file.name}.part")
+    try:
+        with beside.open("wb") as part:
+            part.write(content)
+            part.flush()
+            os.fsync(part.fileno())
+        beside.replace(file)
+    except BaseException:
+        beside.unlink(missing_ok=True)
+        raise
+    sync_folder(file.parent)
+
+
+def _decoded(file: Path, kind: type[T]) -> T:
+    try:
+        return msgspec.json.decode(file.read_bytes(), type=kind)
+    except OSError as error:
+        raise BadConfiguration(f"{file}: cannot be read: {error.strerror}") from None
+    except msgspec.MsgspecError as error:
+        raise BadConfiguration(f"{file}: is no file of an archive: {error}") from None

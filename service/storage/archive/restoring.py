@@ -1,0 +1,202 @@
+"""Takes archived batches back into the database, and verifies an archive."""
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain
+from pathlib import Path
+
+import pyarrow.compute as pc
+from sqlalchemy import Connection, delete, select
+from sqlalchemy.exc import IntegrityError
+
+from service.errors import BadConfiguration
+from service.storage.archive.folder import (
+    Manifest,
+    Part,
+    day_folder,
+    locked,
+    manifests,
+    path_of,
+    read_partition,
+    read_settings,
+    whole_content,
+)
+from service.storage.archive.rows import Rows, from_partition, insert_rows
+from service.storage.archive.tables import archived_batches, archived_parts, archived_what_ifs
+from service.storage.recording import rollups
+from service.storage.recording.archived_hours import forget_share
+from service.storage.recording.unsaved_result import Buckets
+from service.storage.sql.database import Store
+from service.storage.sql.statements import insert_missing
+from service.storage.sql.tables import batches, catalogs, missions, runs
+from service.times import DAY_S, HOUR_S, Utc, parse_utc
+
+_AT_ONCE = 1_000
+
+
+@dataclass(frozen=True)
+class PartFilter:
+    """Selects the parts of a spacecraft and a run with a time from `start` to before `end`."""
+
+    spacecraft: str | None = None
+    run: str | None = None
+    start: Utc | None = None
+    end: Utc | None = None
+
+    def takes(self, manifest: Manifest, part: Part) -> bool:
+        """Whether a part is selected."""
+        return (
+            self.spacecraft in (None, manifest.spacecraft)
+            and self.run in (None, part.run)
+            and (self.start is None or part.last_ns >= self.start.tai_ns)
+            and (self.end is None or part.first_ns < self.end.tai_ns)
+        )
+
+
+@dataclass
+class Restored:
+    """How many batches the selected parts have, how many were looked at, how many restored."""
+
+    total: int
+    batches: int = 0
+    restored: int = 0
+
+
+def restore(
+    store: Store,
+    folder: Path,
+    selected: PartFilter,
+    *,
+    step: Callable[[Restored], object] = lambda restored: None,
+) -> Restored:
+    """Record the batches of all selected parts again, each part whole and in one transaction.
+
+    The files stay.  A part whose batches are recorded is passed over, so that an interrupted
+    call is made again.  Raises `BadConfiguration` for a damaged part, and for one whose batches
+    the database has from somebody else.
+    """
+    with locked(folder):
+        parts = [
+            (path_of(folder, manifest, part), part)
+            for manifest in manifests(folder)
+            for part in manifest.parts
+            if selected.takes(manifest, part)
+        ]
+        restored = Restored(sum(part.batches for _, part in parts))
+        step(restored)
+        for path, part in parts:
+            content = whole_content(folder, path, part.sha256)
+            rows = from_partition(read_partition(content))
+            put_back = partial(_put_back, folder=folder, part=part, rows=rows)
+            try:
+                is_new = store.writer.change(put_back).result()
+            except IntegrityError as error:
+                raise BadConfiguration(
+                    f"{folder / path}: the database has other batches of these names: {error.orig}"
+                ) from None
+            restored.batches += part.batches
+            restored.restored += part.batches if is_new else 0
+            step(restored)
+    return restored
+
+
+def _put_back(connection: Connection, folder: Path, part: Part, rows: Rows) -> bool:
+    """Insert the rows of a part; False: they are there."""
+    ids = rows["batches"]["id"].to_pylist()
+    some = select(batches.c.id).where(batches.c.id.in_(ids[:1]))
+    if connection.scalar(some) is not None:
+        return False
+    part_id = connection.scalar(
+        select(archived_batches.c.part_id).where(archived_batches.c.id.in_(ids[:1]))
+    )
+    for digests, table in ((part.missions, missions), (part.catalogs, catalogs)):
+        insert_missing(connection, table, [read_settings(folder, each).row for each in digests])
+    created = pc.min(rows["batches"]["received"]).as_py()
+    insert_missing(connection, runs, [{"name": part.run, "created": created, "alarms": False}])
+    if part_id is not None:
+        spacecraft = rows["batches"]["spacecraft"][0].as_py()
+        forget_share(connection, part_id, spacecraft, part.run)
+        for first in range(0, len(ids), _AT_ONCE):
+            some_ids = ids[first : first + _AT_ONCE]
+            for table, column in ((archived_batches, "id"), (archived_what_ifs, "batch_id")):
+                connection.execute(delete(table).where(table.c[column].in_(some_ids)))
+        connection.execute(delete(archived_parts).where(archived_parts.c.id == part_id))
+    insert_rows(connection, rows)
+    if part_id is None:
+        # The trends have the share of a part that the database knows.
+        _add_to_trends(connection, rows)
+    return True
+
+
+def _add_to_trends(connection: Connection, rows: Rows) -> None:
+    times = zip(*(rows["batches"][name].to_pylist() for name in ("id", "time")), strict=True)
+    moments = {id: parse_utc(time) for id, time in times}
+    current = {row["batch_id"]: row for row in rows["results"].to_pylist() if row["current"]}
+    buckets = {
+        id: Buckets(row["spacecraft"], row["run"], at.bucket(HOUR_S), at.bucket(DAY_S))
+        for id, at in moments.items()
+        for row in [current[id]]
+    }
+    rollups.add(connection, [(buckets[id], row) for id, row in current.items()])
+    of_trackers = rows["tracker_values"].to_pylist()
+    rollups.add_trackers(connection, [(buckets[row["batch_id"]], row) for row in of_trackers])
+
+
+def verify_archive(
+    folder: Path,
+    needed: Mapping[str, str],
+    step: Callable[[int], object] = lambda batches: None,
+) -> Iterator[str]:
+    """The faults of an archive, a sentence each, as they are found; none: every part is whole.
+
+    Every file is read, its hash compared, and its rows with what the manifest and the
+    fingerprints say.  `needed` has the hashes of the parts that a database needs, by path.
+    """
+    done, whole = 0, {}
+    for manifest in manifests(folder):
+        named = set()
+        for part in manifest.parts:
+            path = path_of(folder, manifest, part)
+            named.add(part.file)
+            whole[path] = part.sha256
+            try:
+                content = whole_content(folder, path, part.sha256)
+                yield from _of_a_part(folder, path, manifest, part, content)
+            except BadConfiguration as error:
+                yield str(error)
+            done += part.batches
+            step(done)
+        for file in sorted(day_folder(folder, manifest.spacecraft, manifest.day).glob("part-*")):
+            if file.name not in named:
+                yield f"{file}: the manifest does not name it"
+    for path, sha256 in needed.items():
+        if whole.get(path) != sha256:
+            yield f"{folder / path}: the database has batches in it, and no manifest names it so"
+
+
+def _of_a_part(
+    folder: Path, path: str, manifest: Manifest, part: Part, content: bytes
+) -> Iterator[str]:
+    name = str(folder / path)
+    rows = from_partition(read_partition(content))
+    found, made = rows["batches"].to_pylist(), rows["results"].to_pylist()
+    if (len(found), len(made)) != (part.batches, part.results):
+        yield f"{name}: has other numbers of batches and results than the manifest says"
+    if {(each["spacecraft"], each["run"]) for each in found} != {(manifest.spacecraft, part.run)}:
+        yield f"{name}: has batches of another spacecraft or run"
+    framed = set(rows["frames"]["batch_id"].to_pylist())
+    for each in found:
+        # That of a frame is of more than what is kept.
+        digest = hashlib.sha256(each["input"].encode()).hexdigest()
+        if each["fingerprint"] != digest and each["id"] not in framed:
+            yield f"{name}: batch {each['id']}: its input is not the one that was fingerprinted"
+    current = [each["batch_id"] for each in made if each["current"]]
+    if sorted(current) != sorted(each["id"] for each in found):
+        yield f"{name}: not every batch has one current result"
+    for digest in chain(part.missions, part.catalogs):
+        try:
+            read_settings(folder, digest)
+        except BadConfiguration as error:
+            yield str(error)

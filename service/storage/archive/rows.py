@@ -1,0 +1,209 @@
+"""All that the database keeps of some batches, as Arrow tables in one fixed order.
+
+What is read here, put into a partition and inserted again is the same row by row, byte for
+byte: archiving, verifying, restoring and the pages that read the archive share these functions.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from sqlalchemy import (
+    BigInteger,
+    Boolean,
+    Connection,
+    Double,
+    Integer,
+    LargeBinary,
+    SmallInteger,
+    String,
+    Table,
+    select,
+)
+from sqlalchemy.types import TypeEngine
+
+from service.storage.sql.statements import insert_all
+from service.storage.sql.tables import (
+    batches,
+    frames,
+    idempotency_keys,
+    results,
+    solutions,
+    star_results,
+    tracker_values,
+)
+
+Rows = dict[str, pa.Table]
+"""By the name of the SQL table: batches in order of time, the rest in the order of its batches."""
+
+CHILDREN = {
+    "stars": (star_results, "result_id", ("tracker", "position")),
+    "solution": (solutions, "result_id", ()),
+    "trackers": (tracker_values, "batch_id", ("tracker",)),
+    "frame": (frames, "batch_id", ()),
+    "keys": (idempotency_keys, "result_id", ("token_id", "key")),
+}
+"""Of a partition's list columns: the table, what names its result, and its order within one.
+
+The first result of a batch has the batch's id, and so the rows of a batch are those of a result.
+"""
+OF_BATCHES = ("batch", "time", "received", "fingerprint", "input")
+"""The columns that results do not have."""
+_AT_ONCE = 1_000
+
+# Of two that fit, the narrower stands first; Text is a String.
+_TYPES: Sequence[tuple[type[TypeEngine[Any]], pa.DataType]] = (
+    (BigInteger, pa.int64()),
+    (SmallInteger, pa.int16()),
+    (Integer, pa.int32()),
+    (Boolean, pa.bool_()),
+    (Double, pa.float64()),
+    (LargeBinary, pa.binary()),
+    (String, pa.string()),
+)
+
+
+def schema_of(table: Table) -> pa.Schema:
+    """The Arrow schema of an SQL table."""
+    return pa.schema(
+        [
+            (each.name, next(arrow for kind, arrow in _TYPES if isinstance(each.type, kind)))
+            for each in table.columns
+        ]
+    )
+
+
+def read_rows(connection: Connection, batch_ids: Sequence[str]) -> Rows:
+    """All rows of these batches; ids of no batch are passed over."""
+    found = _ordered(_read(connection, batches, "id", batch_ids), ("time_ns", "id"))
+    made = _read(connection, results, "batch_id", batch_ids)
+    made = _in_order_of(made, "batch_id", found["id"], ("id",))
+    rows = {"batches": found, "results": made}
+    ids = made["id"].to_pylist()
+    for table, owner, within in CHILDREN.values():
+        keys = ids if owner == "result_id" else batch_ids
+        rows[table.name] = _in_order_of(
+            _read(connection, table, owner, keys), owner, made["id"], within
+        )
+    return rows
+
+
+def insert_rows(connection: Connection, rows: Rows) -> None:
+    """Insert all rows, what others refer to first."""
+    made = rows["results"]
+    # A what-if refers to the result that it began with, which has a lower id.
+    made = made.sort_by("id")
+    for table, read in ((batches, rows["batches"]), (results, made)):
+        insert_all(connection, table, read.to_pylist())
+    for table, _, _ in CHILDREN.values():
+        insert_all(connection, table, rows[table.name].to_pylist())
+
+
+def to_partition(rows: Rows) -> pa.Table:
+    """The rows as one table: a row a result with its batch, and lists of what belongs to it."""
+    made = rows["results"]
+    place = pc.index_in(made["batch_id"], value_set=rows["batches"]["id"])
+    columns = {name: made[name] for name in made.column_names}
+    columns |= {name: rows["batches"][name].take(place) for name in OF_BATCHES}
+    for name, (table, owner, _) in CHILDREN.items():
+        read = rows[table.name]
+        at = pc.index_in(read[owner], value_set=made["id"]).to_numpy()
+        offsets = np.searchsorted(at, np.arange(len(made) + 1)).astype(np.int32)
+        parts = read.drop_columns([owner]).combine_chunks()
+        of_each = pa.StructArray.from_arrays(
+            [_whole(parts[each]) for each in parts.column_names], fields=list(parts.schema)
+        )
+        columns[name] = pa.ListArray.from_arrays(pa.array(offsets), of_each)
+    return pa.table(_without_copies(columns))
+
+
+def _without_copies(columns: dict[str, pa.ChunkedArray]) -> dict[str, pa.ChunkedArray]:
+    """The columns with nulls where a value follows from another one: a tenth of the space."""
+    digests = [hashlib.sha256(each.encode()).hexdigest() for each in columns["input"].to_pylist()]
+    copies = {"batch_id": columns["id"], "received": columns["created"]}
+    copies["fingerprint"] = pa.array(digests, pa.string())
+    for name, copy in copies.items():
+        own = columns[name]
+        columns[name] = pc.if_else(pc.equal(own, copy), pa.scalar(None, own.type), own)
+    return columns
+
+
+def _with_copies(partition: pa.Table) -> pa.Table:
+    copies = {"batch_id": partition["id"], "received": partition["created"]}
+    inputs = partition["input"].to_pylist()
+    digests = [hashlib.sha256(each.encode()).hexdigest() for each in inputs]
+    copies["fingerprint"] = pa.chunked_array([pa.array(digests, pa.string())])
+    for name, copy in copies.items():
+        place = partition.column_names.index(name)
+        partition = partition.set_column(place, name, pc.coalesce(partition[name], copy))
+    return partition
+
+
+def from_partition(partition: pa.Table) -> Rows:
+    """The rows that were put into a partition."""
+    partition = _with_copies(partition)
+    is_first = pc.equal(partition["id"], partition["batch_id"])
+    names = [each.name for each in batches.columns]
+    rows = {
+        "batches": partition.filter(is_first).select(names),
+        "results": partition.select([each.name for each in results.columns]),
+    }
+    for name, (table, owner, _) in CHILDREN.items():
+        lists = partition[name]
+        parts = pa.Table.from_struct_array(_whole(pc.list_flatten(lists)))
+        owners = partition["id"].take(pc.list_parent_indices(lists))
+        parts = parts.append_column(owner, owners)
+        rows[table.name] = parts.select([each.name for each in table.columns])
+    return rows
+
+
+def differing(one: Rows, other: Rows) -> str | None:
+    """The name of a table whose rows differ in any bit; None: there is none.
+
+    Zero and minus zero are different numbers here, and any number that is none equals another.
+    """
+    for name in one.keys() | other.keys():
+        if not _as_bits(one[name]).equals(_as_bits(other[name])):
+            return name
+    return None
+
+
+def _as_bits(table: pa.Table) -> pa.Table:
+    columns = {}
+    for field in table.schema:
+        column = _whole(table[field.name])
+        if pa.types.is_floating(field.type):
+            column = pc.if_else(pc.is_nan(column), np.nan, column).view(pa.int64())
+        columns[field.name] = column
+    return pa.table(columns)
+
+
+def _read(connection: Connection, table: Table, owner: str, ids: Sequence[str]) -> pa.Table:
+    rows: list[tuple[object, ...]] = []
+    for first in range(0, len(ids), _AT_ONCE):
+        chosen = table.c[owner].in_(ids[first : first + _AT_ONCE])
+        rows += map(tuple, connection.execute(select(table).where(chosen)))
+    schema = schema_of(table)
+    columns = zip(*rows, strict=True) if rows else ([] for _ in schema)
+    arrays = [pa.array(each, field.type) for each, field in zip(columns, schema, strict=True)]
+    return pa.table(arrays, schema=schema)
+
+
+def _in_order_of(
+    table: pa.Table, owner: str, ids: pa.ChunkedArray, within: Sequence[str]
+) -> pa.Table:
+    """The rows in the order in which their owner's id stands among the ids."""
+    place = pc.index_in(table[owner], value_set=ids)
+    return _ordered(table.append_column("", place), ("", *within)).drop_columns([""])
+
+
+def _ordered(table: pa.Table, names: Sequence[str]) -> pa.Table:
+    return table.sort_by([(name, "ascending") for name in names])
+
+
+def _whole(column: pa.ChunkedArray | pa.Array) -> pa.Array:
+    """A column in one piece."""
+    return column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column

@@ -1,0 +1,285 @@
+"""The archive: every batch is in the record or in the archive, byte for byte, whatever happens."""
+
+import math
+
+import pyarrow as pa
+import pytest
+from sqlalchemy import func, select
+
+from service.errors import BadConfiguration, Busy, Conflict, NotFound
+from service.observations.schema import OptionsIn
+from service.storage.archive import archiving, folder, rows
+from service.storage.archive.restoring import PartFilter, restore, verify_archive
+from service.storage.archive.tables import archived_batches
+from service.storage.sql.columns import metadata
+from service.storage.sql.database import Store
+from service.storage.sql.tables import (
+    batches,
+    frames,
+    idempotency_keys,
+    results,
+    solutions,
+    star_results,
+    tracker_values,
+)
+from service.storage.upkeep.prune import prune
+from service.storage.upkeep.verify import verify
+from service.times import shifted
+from tests.storage import twin
+from tests.storage.recount import assert_equal_to_a_recount
+from tests.storage.samples import START
+
+TIGHT = OptionsIn.model_validate({"tolerances": {"separation_deg": 1e-5}})
+KINDS = ("good", "suspect", "one_star", "spurious")
+OF_BATCHES = (
+    batches,
+    results,
+    star_results,
+    solutions,
+    tracker_values,
+    frames,
+    idempotency_keys,
+)
+DAY_S = 86_400.0
+LATER = shifted(START, 10 * DAY_S)
+
+
+def rows_of(store, tables):
+    with store.reading() as connection:
+        return {
+            table.name: sorted(
+                (dict(row) for row in connection.execute(select(table)).mappings()), key=repr
+            )
+            for table in tables
+        }
+
+
+def trends_of(store):
+    return rows_of(store, [t for name, t in metadata.tables.items() if "rollups" in name])
+
+
+def archived_ids(store):
+    with store.reading() as connection:
+        return set(connection.scalars(select(archived_batches.c.id)))
+
+
+@pytest.fixture
+def place(tmp_path):
+    (tmp_path / "archive").mkdir()
+    return tmp_path / "archive"
+
+
+@pytest.fixture
+def app(opened, place):
+    return opened(archive_folder=place)
+
+
+@pytest.fixture
+def filled(app, make):
+    """Batches of every kind over three days and two runs, what-ifs, keys."""
+    ids = []
+    for k in range(12):
+        for run in ("live", "r"):
+            submission = make(f"b{k}", kind=KINDS[k % 4], run=run, after_s=k * 20_000.0)
+            ids.append(app.submissions.submit(submission, f"key-{run}-{k}").id)
+    app.results.what_if(ids[0], TIGHT, adopt=True)
+    app.results.what_if(ids[1], TIGHT, record=True)
+    return app
+
+
+def test_what_is_archived_and_restored_is_the_same_byte_for_byte(filled, place, database):
+    before, trends = rows_of(filled.store, OF_BATCHES), trends_of(filled.store)
+    steps = []
+    done = archiving.archive(filled.store, place, LATER, step=lambda s: steps.append(s.batches))
+    # The hours of the newest batch, and of the newest attitude, stay.
+    left = rows_of(filled.store, OF_BATCHES)["batches"]
+    assert done.batches == done.total == len(before["batches"]) - len(left) == steps[-1]
+    assert {row["batch"] for row in left} == {"b11"}
+    assert trends_of(filled.store) == trends
+    assert verify(database) == []
+    assert list(verify_archive(place, {})) == []
+    restored = restore(filled.store, place, PartFilter())
+    assert restored.restored == done.batches
+    assert rows_of(filled.store, OF_BATCHES) == before
+    assert archived_ids(filled.store) == set()
+    assert trends_of(filled.store) == trends
+    assert verify(database) == []
+    assert restore(filled.store, place, PartFilter()).restored == 0
+
+
+def test_an_archive_is_restored_into_an_empty_database(filled, place, tmp_path, opened):
+    before, trends = rows_of(filled.store, OF_BATCHES), trends_of(filled.store)
+    archiving.archive(filled.store, place, LATER)
+    kept = {row["id"] for row in rows_of(filled.store, OF_BATCHES)["batches"]}
+    other = Store(f"sqlite:///{tmp_path / 'again.db'}")
+    try:
+        restore(other, place, PartFilter(run="live"))
+        found = rows_of(other, [batches, results])
+        for name, key in (("batches", "id"), ("results", "batch_id")):
+            wanted = [r for r in before[name] if r["run"] == "live" and r[key] not in kept]
+            assert found[name] == wanted
+        with other.reading() as connection:
+            assert_equal_to_a_recount(connection)
+    finally:
+        other.close()
+    assert verify(f"sqlite:///{tmp_path / 'again.db'}") == []
+    assert trends_of(filled.store) == trends
+
+
+def test_a_repeat_of_an_archived_batch_gets_its_answer_and_another_body_is_refused(
+    filled, place, make
+):
+    answers = {row["id"]: row["answer"] for row in rows_of(filled.store, [results])["results"]}
+    archiving.archive(filled.store, place, LATER)
+    again = filled.submissions.submit(make("b1", kind="suspect", after_s=20_000.0))
+    assert again.replayed
+    assert again.body.decode() == answers[again.id]
+    with pytest.raises(NotFound, match="is archived"):
+        filled.results.get(again.id)
+    with_key = make("b2", kind="one_star", after_s=40_000.0)
+    assert filled.submissions.submit(with_key, "another key").replayed
+    with pytest.raises(Conflict):
+        filled.submissions.submit(make("b1", kind="good", after_s=20_000.0))
+    many = [make("b1", kind="suspect", after_s=20_000.0), make("new", after_s=20_000.0)]
+    first, second = filled.submissions.ingest.submit_many(many)
+    assert first.replayed
+    assert not second.replayed
+
+
+def test_without_its_archive_the_service_says_so_and_records_nothing_twice(filled, place, make):
+    archiving.archive(filled.store, place, LATER)
+    place.rename(place.with_name("away"))
+    with pytest.raises(Busy, match="the archive cannot be read"):
+        filled.submissions.submit(make("b1", kind="suspect", after_s=20_000.0))
+
+
+def test_a_batch_that_is_archived_between_look_up_and_insert_is_not_recorded_again(
+    filled, place, make, monkeypatch
+):
+    late = make("b1", kind="suspect", after_s=20_000.0)
+    archiving.archive(filled.store, place, LATER)
+    unsaved = filled.submissions.ingest.solver.solve(late)
+    (outcome,) = filled.store.writer.record([unsaved]).result()
+    assert isinstance(outcome, Busy)
+    with filled.store.reading() as connection:
+        same = batches.c.batch == "b1", batches.c.run == "live"
+        assert connection.scalar(select(func.count()).select_from(batches).where(*same)) == 0
+
+
+def test_late_batches_and_adopted_results_of_archived_hours_keep_the_trends(
+    filled, place, make, database
+):
+    archiving.archive(filled.store, place, LATER)
+    late = filled.submissions.submit(make("late", after_s=20_010.0))
+    filled.results.what_if(late.id, TIGHT, adopt=True)
+    with filled.store.reading() as connection:
+        assert_equal_to_a_recount(connection)
+    assert verify(database) == []
+    archiving.archive(filled.store, place, LATER)
+    assert verify(database) == []
+    names = [part.file for part in folder.manifest_of(place, "XTE", "1996-01-10").parts]
+    assert sorted(names) == ["part-1.parquet", "part-2.parquet", "part-3.parquet"]
+    prune(filled.store, LATER)
+    assert verify(database) == []
+    restore(filled.store, place, PartFilter())
+    assert verify(database) == []
+
+
+@pytest.mark.parametrize("at", ["write_partition", "write_manifest", "differing", "keep_share"])
+def test_an_archiving_that_fails_anywhere_is_called_again(filled, place, monkeypatch, at, database):
+    before = rows_of(filled.store, OF_BATCHES)
+    real, calls = getattr(archiving, at), []
+
+    def fails_later(*arguments, **named):
+        done = real(*arguments, **named)
+        calls.append(done)
+        if len(calls) > 1:
+            raise OSError(28, "no space left on device")
+        return done
+
+    with monkeypatch.context() as patched:
+        patched.setattr(archiving, at, fails_later)
+        with pytest.raises(OSError, match="no space left"):
+            archiving.archive(filled.store, place, LATER)
+    assert verify(database) == []
+    archiving.archive(filled.store, place, LATER)
+    assert verify(database) == []
+    named = [part for m in folder.manifests(place) for part in m.parts]
+    assert sum(part.batches for part in named) == len(archived_ids(filled.store))
+    restore(filled.store, place, PartFilter())
+    assert rows_of(filled.store, OF_BATCHES) == before
+
+
+def test_what_changes_while_a_part_is_written_is_archived_as_it_is_then(filled, place, monkeypatch):
+    real, adopted = archiving.write_manifest, []
+
+    def adopts(*arguments):
+        real(*arguments)
+        if not adopted:
+            with filled.store.reading() as connection:
+                query = select(results.c.id).where(results.c.run == "live", results.c.current)
+                oldest = connection.scalar(query.order_by(results.c.time_ns))
+            adopted.append(filled.results.what_if(oldest, OptionsIn(solver="triad"), adopt=True).id)
+
+    monkeypatch.setattr(archiving, "write_manifest", adopts)
+    archiving.archive(filled.store, place, LATER)
+    restore(filled.store, place, PartFilter())
+    with filled.store.reading() as connection:
+        assert connection.scalar(select(results.c.current).where(results.c.id == adopted[0]))
+
+
+def test_damage_of_a_file_is_found_and_nothing_of_it_is_restored(filled, place):
+    archiving.archive(filled.store, place, LATER)
+    file = min(place.rglob("part-1.parquet"))
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(bytes(content))
+    (problem,) = verify_archive(place, {})
+    assert "is damaged" in problem
+    with pytest.raises(BadConfiguration, match="is damaged"):
+        restore(filled.store, place, PartFilter())
+    min(place.rglob("part-1.parquet")).unlink()
+    assert any("cannot be read" in each for each in verify_archive(place, {}))
+
+
+def test_values_of_trackers_are_archived_and_their_trends_stay(opened, place, sky, missions):
+    mission = twin.twin(missions)
+    app = opened(mission, archive_folder=place)
+    for k in range(3):
+        app.submissions.submit(twin.submission(sky, mission, f"b{k}", after_s=k * 4_000.0))
+    before, trends = rows_of(app.store, OF_BATCHES), trends_of(app.store)
+    assert len(before["tracker_values"]) == 6
+    assert archiving.archive(app.store, place, LATER).batches == 2
+    late = app.submissions.submit(twin.submission(sky, mission, "late", after_s=10.0))
+    app.results.what_if(late.id, OptionsIn(solver="triad"), adopt=True)
+    with app.store.reading() as connection:
+        assert_equal_to_a_recount(connection)
+    restore(app.store, place, PartFilter())
+    found = rows_of(app.store, OF_BATCHES)["tracker_values"]
+    assert [row for row in found if row["batch_id"] != late.id] == before["tracker_values"]
+    assert len(trends_of(app.store)["tracker_rollups_hourly"]) == len(
+        trends["tracker_rollups_hourly"]
+    )
+
+
+def test_a_history_over_archived_time_counts_every_batch(filled, place):
+    span = {"start": START, "end": shifted(START, 12 * 20_000.0)}
+    wanted = filled.spacecraft.history("XTE", size=1_500, **span)
+    archiving.archive(filled.store, place, LATER)
+    found = filled.spacecraft.history("XTE", size=1_500, **span)
+    assert sum(found.batches) == sum(wanted.batches) == 12
+
+
+def test_an_archive_takes_one_command_at_a_time(filled, place):
+    with folder.locked(place), pytest.raises(BadConfiguration, match="another command"):
+        archiving.archive(filled.store, place, LATER)
+
+
+def test_numbers_are_compared_bit_by_bit():
+    def table(*values):
+        return {"t": pa.table({"x": pa.array(values, pa.float64())})}
+
+    assert rows.differing(table(0.0), table(-0.0)) == "t"
+    assert rows.differing(table(math.nan, None), table(math.nan, None)) is None
+    assert rows.differing(table(1.0), table(math.nextafter(1.0, 2.0))) == "t"
+    assert rows.differing(table(None), table(0.0)) == "t"

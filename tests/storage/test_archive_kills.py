@@ -1,0 +1,74 @@
+"""Killed at any moment, archiving loses no batch and doubles none."""
+
+import hashlib
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from sqlalchemy import select
+
+from service.storage.archive import archiving, folder
+from service.storage.archive.restoring import PartFilter, restore, verify_archive
+from service.storage.archive.tables import archived_batches
+from service.storage.sql.tables import batches, results
+from service.storage.upkeep.verify import verify
+from service.times import shifted
+from tests.scale import size
+from tests.storage.bulk import put, result_row
+from tests.storage.samples import START
+
+CHECKOUT = Path(__file__).parents[2]
+BATCHES = 1_000
+LATER = shifted(START, 10 * 86_400.0)
+
+
+def run_and_kill(database, place, output, after_s):
+    """Kill a worker `after_s` after it has begun; False: it had finished."""
+    command = [sys.executable, "-m", "tests.storage.archive_worker", database, place, LATER.text]
+    with output.open("wb") as stdout:
+        worker = subprocess.Popen(command, stdout=stdout, cwd=CHECKOUT)
+        give_up = time.monotonic() + 60
+        while not output.stat().st_size and worker.poll() is None and time.monotonic() < give_up:
+            time.sleep(0.002)
+        time.sleep(after_s)
+        worker.kill()
+        return worker.wait() == -signal.SIGKILL
+
+
+def stored(app, table, *columns):
+    with app.store.reading() as connection:
+        return set(map(tuple, connection.execute(select(*(table.c[name] for name in columns)))))
+
+
+@pytest.mark.torture
+def test_every_batch_is_there_once_after_every_kill(opened, database, tmp_path, rng, figures):
+    place = tmp_path / "archive"
+    place.mkdir()
+    app = opened(archive_folder=place)
+    drawn = [result_row(app, shifted(START, 300.0 * k)) for k in range(BATCHES)]
+    for batch, _ in drawn:
+        batch["fingerprint"] = hashlib.sha256(batch["input"].encode()).hexdigest()
+    put(app, drawn)
+    answers = stored(app, results, "id", "answer")
+    ids = stored(app, batches, "id")
+    killed = 0
+    for _ in range(size(200)):
+        killed += run_and_kill(database, place, tmp_path / "out", float(rng.uniform(0.0, 1.0)))
+        recorded, archived = stored(app, batches, "id"), stored(app, archived_batches, "id")
+        assert recorded | archived == ids
+        assert not recorded & archived
+        if not killed or len(recorded) < BATCHES // 10:
+            restore(app.store, place, PartFilter())
+    archiving.archive(app.store, place, LATER)
+    named = [part.batches for m in folder.manifests(place) for part in m.parts]
+    assert sum(named) == len(stored(app, archived_batches, "id"))
+    # A file that was whole and not yet named is told of, and does not count.
+    assert all("does not name it" in problem for problem in verify_archive(place, {}))
+    restore(app.store, place, PartFilter())
+    assert stored(app, results, "id", "answer") == answers
+    assert [p for p in verify(database) if "batch" not in p and "result" not in p] == []
+    assert killed
+    figures(kills=killed)
