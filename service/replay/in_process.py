@@ -3,8 +3,11 @@
 import time
 from collections.abc import Iterable
 
+import msgspec
+
 from service.app.factory import App
 from service.errors import AcquisitionError, Busy, problem_of
+from service.gyro.block import GyroBlock
 from service.replay.carry_attitude import AttitudeCarrier, reporting_to_carrier
 from service.replay.items import Item, LineOutcome, Pace, Report
 
@@ -49,6 +52,9 @@ def _submit(app: App, chunk: list[Item], report: Report) -> None:
         )
     )
     for item in chunk:
+        if item.gyro is not None:
+            report(_recorded(app, item, item.gyro))
+            continue
         if item.submission is None:
             report(LineOutcome(item, None, problem=item.problem))
             continue
@@ -59,3 +65,13 @@ def _submit(app: App, chunk: list[Item], report: Report) -> None:
             report(LineOutcome(item, None, problem=problem_of(answer)))
         else:
             report(LineOutcome(item, answer.body, answer.replayed))
+
+
+def _recorded(app: App, item: Item, block: GyroBlock) -> LineOutcome:
+    try:
+        recorded = app.gyro.record(block)
+    except Busy:
+        raise
+    except AcquisitionError as error:
+        return LineOutcome(item, None, problem=problem_of(error))
+    return LineOutcome(item, msgspec.json.encode(recorded.row), recorded.replayed)

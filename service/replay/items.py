@@ -8,6 +8,8 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from service.errors import BadInput, Fault, problem_of, problem_of_faults, shown_value
+from service.gyro.block import GyroBlock
+from service.gyro.schema import block_from_line, is_gyro_line
 from service.observations.readers.lines import Line
 from service.observations.readers.telemetry import read_lines
 from service.observations.schema import RunName, Submission, submission_from_json
@@ -19,19 +21,28 @@ Problem = dict[str, Any]
 
 @dataclass(frozen=True)
 class Item:
-    """One line of a file: the batch in it, or the problem with it."""
+    """One line of a file: the batch or the gyro block in it, or the problem with it."""
 
     file: Path
     number: int
     submission: Submission | None
     problem: Problem | None = None
+    gyro: GyroBlock | None = None
+
+    @property
+    def time(self) -> Utc | None:
+        """The time of the batch, or of the last sample of the gyro block."""
+        if self.submission is not None:
+            return self.submission.batch.time
+        return None if self.gyro is None else self.gyro.end
 
 
 @dataclass(frozen=True)
 class LineOutcome:
     """The outcome of a line: the answer's own bytes, or a problem.
 
-    `replayed` tells that the batch was already recorded.
+    Of a gyro block the answer is the recorded block.  `replayed` tells that the batch or the
+    block was already recorded.
     """
 
     item: Item
@@ -44,7 +55,7 @@ Report = Callable[[LineOutcome], None]
 
 
 def items_of(files: Sequence[Path], run: str) -> Iterator[Item]:
-    """Every line of the files, in order, checked as a batch of that run."""
+    """Every line of the files, in order, checked as a batch or a gyro block of that run."""
     for file in files:
         for line in read_lines(file):
             yield _item(file, line, run)
@@ -61,6 +72,8 @@ def _item(file: Path, line: Line, run: str) -> Item:
         assert line.fault is not None
         return Item(file, line.number, None, problem_of_faults([line.fault]))
     try:
+        if is_gyro_line(line.body):
+            return Item(file, line.number, None, gyro=block_from_line(line.body, run))
         return Item(file, line.number, submission_from_json(line.body, run))
     except BadInput as error:
         return Item(file, line.number, None, problem_of(error))
@@ -82,17 +95,17 @@ def run_name(files: Sequence[Path], run: str | None) -> str:
 
 
 class Pace:
-    """When each batch is due: at its own time, sped up by a factor, or at once without one."""
+    """When each item is due: at its own time, sped up by a factor, or at once without one."""
 
     def __init__(self, factor: float | None = None) -> None:
         self.factor = factor
         self._first: tuple[int, float] | None = None
 
     def wait_s(self, item: Item, now_s: float) -> float:
-        """Seconds until the batch is due; the first is due now."""
-        if self.factor is None or item.submission is None:
+        """Seconds until the item is due; the first is due now."""
+        time = item.time
+        if self.factor is None or time is None:
             return 0.0
-        time: Utc = item.submission.batch.time
         if self._first is None:
             self._first = (time.tai_ns, now_s)
         first_ns, start_s = self._first

@@ -5,21 +5,27 @@ identity and records it once.
 """
 
 import asyncio
-import json
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
-import httpx
-
-from service.errors import BadInput, Busy, Fault, Unauthenticated, shown_value
+from service.client import AsyncClient, RecordedAnswer, Repeat
+from service.client import errors as answers
+from service.client.encoding import checked_address, path_of
+from service.errors import (
+    BadInput,
+    Busy,
+    Fault,
+    Forbidden,
+    NotFound,
+    Unauthenticated,
+    problem_of_faults,
+    shown_value,
+)
+from service.gyro.schema import json_of_block
 from service.replay.carry_attitude import AttitudeCarrier, reporting_to_carrier
 from service.replay.items import Item, LineOutcome, Pace, Problem, Report
 
-ROUTE = "/api/v1/batches"
-JSON = {"Content-Type": "application/json"}
-RETRY_STATUSES = frozenset({429, 502, 503, 504})
-TIMEOUT = httpx.Timeout(60.0, connect=5.0)
-FIRST_RETRY_S, LONGEST_RETRY_S = 0.1, 5.0
 GIVE_UP_AFTER_S = 30.0
 
 
@@ -42,53 +48,67 @@ def replay_over_http(
     none any more for `give_up_after_s`.  `watched_run` is a run that limits are to
     be held against.
     """
-    headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+    client = AsyncClient(checked_url(url), token, give_up_after_s=give_up_after_s)
     if carrier is not None:
         report, concurrency = reporting_to_carrier(report, carrier), 1
-    asyncio.run(
-        _replay(
-            checked_url(url),
-            items,
-            report,
-            pace or Pace(),
-            concurrency,
-            give_up_after_s,
-            headers,
-            watched_run,
-            carrier,
+    with translated(url):
+        asyncio.run(
+            _replay(client, url, items, report, pace or Pace(), concurrency, watched_run, carrier)
         )
-    )
 
 
 def checked_url(url: str) -> str:
     """The address without a slash at its end; raises `BadInput` for one that is none."""
     try:
-        parsed = httpx.URL(url)
-        valid = parsed.scheme in ("http", "https") and bool(parsed.host)
-    except httpx.InvalidURL:
-        valid = False
-    if not valid:
+        checked_address(url)
+    except ValueError:
         message = "must be the address of a service, such as http://127.0.0.1:8000"
-        raise BadInput(Fault("--url", message, shown_value(url)))
+        raise BadInput(Fault("--url", message, shown_value(url))) from None
     return url.rstrip("/")
 
 
+@contextmanager
+def translated(url: str) -> Iterator[None]:
+    """Raise what the client raises as this service's own errors, with what a user can do."""
+    try:
+        yield
+    except answers.Unauthenticated as error:
+        raise Unauthenticated(
+            f"{url} asks for a token ({error}): set ACQUIRE_TOKEN to one of its "
+            "`acquire token create`"
+        ) from None
+    except answers.Forbidden as error:
+        raise Forbidden(f"{url}: {error}") from None
+    except answers.NotFound as error:
+        raise NotFound(f"{url}: {error}") from None
+    except (answers.BadInput, answers.Conflict, answers.WrongState) as error:
+        raise BadInput(Fault("replay", str(error))) from None
+    except answers.ClientError as error:
+        raise Busy(
+            f"{url} no longer answers ({error}); run the same command again to go on "
+            "from here: nothing is recorded twice"
+        ) from None
+
+
+def no_service(url: str, error: answers.NoAnswer) -> Busy:
+    """The error where no service answers from the beginning."""
+    return Busy(
+        f"no service answers at {url} ({error}); "
+        "start one with `acquire serve`, or replay with --in-process"
+    )
+
+
 async def _replay(
+    client: AsyncClient,
     url: str,
     items: Iterable[Item],
     report: Report,
     pace: Pace,
     concurrency: int,
-    give_up_after_s: float,
-    headers: dict[str, str],
     watched_run: str | None,
     carrier: AttitudeCarrier | None,
 ) -> None:
-    limits = httpx.Limits(max_connections=concurrency, max_keepalive_connections=concurrency)
-    # The service listens to this machine alone: a proxy of the environment cannot reach it.
-    async with httpx.AsyncClient(
-        base_url=url, timeout=TIMEOUT, limits=limits, trust_env=False, headers=headers
-    ) as client:
+    async with client:
         await _require_service(client, url)
         if watched_run is not None:
             await _watch(client, watched_run)
@@ -104,7 +124,7 @@ async def _replay(
                     report(await window.popleft())
                 if carrier is not None:
                     item = carrier.prepared(item)
-                window.append(asyncio.create_task(_outcome(client, url, item, give_up_after_s)))
+                window.append(asyncio.create_task(_outcome(client, item)))
             while window:
                 report(await window.popleft())
         finally:
@@ -113,76 +133,49 @@ async def _replay(
             await asyncio.gather(*window, return_exceptions=True)
 
 
-async def _require_service(client: httpx.AsyncClient, url: str) -> None:
+async def _require_service(client: AsyncClient, url: str) -> None:
     try:
-        response = await client.get("/livez")
-    except httpx.TransportError as error:
-        raise Busy(
-            f"no service answers at {url} ({shown_error(error)}); "
-            "start one with `acquire serve`, or replay with --in-process"
-        ) from None
-    if response.status_code != 200:
-        raise Busy(f"{url} is not this service: GET /livez gives {response.status_code}")
-    if (await client.get("/api/v1/session")).status_code == 401:
-        raise Unauthenticated(
-            f"{url} asks for a token: set ACQUIRE_TOKEN to one of its `acquire token create`"
-        )
+        await client.ping()
+    except answers.NoAnswer as error:
+        raise no_service(url, error) from None
+    except answers.UnexpectedAnswer as error:
+        raise Busy(str(error)) from None
+    await client.session()
 
 
-async def _watch(client: httpx.AsyncClient, run: str) -> None:
-    answer = await client.put(f"/api/v1/runs/{run}", json={"alarms": True})
-    if answer.status_code != 200:
-        raise BadInput(Fault("--alarms", str(_problem(answer)["detail"]), run))
+async def _watch(client: AsyncClient, run: str) -> None:
+    try:
+        await client.watch_run(run)
+    except answers.Problem as problem:
+        raise BadInput(Fault("--alarms", problem.detail, run)) from None
 
 
-async def _outcome(
-    client: httpx.AsyncClient, url: str, item: Item, give_up_after_s: float
-) -> LineOutcome:
-    if item.submission is None:
+async def _outcome(client: AsyncClient, item: Item) -> LineOutcome:
+    if item.problem is not None:
         return LineOutcome(item, None, problem=item.problem)
-    response = await _post(client, url, item.submission.text, give_up_after_s)
-    if response.status_code in (200, 201):
-        return LineOutcome(item, response.content, response.headers.get("Replayed") == "true")
-    return LineOutcome(item, None, problem=_problem(response))
-
-
-async def _post(
-    client: httpx.AsyncClient, url: str, text: str, give_up_after_s: float
-) -> httpx.Response:
-    clock = asyncio.get_running_loop().time
-    deadline, wait_s = clock() + give_up_after_s, FIRST_RETRY_S
-    while True:
-        asked_s = 0.0
-        try:
-            response = await client.post(ROUTE, content=text, headers=JSON)
-            if response.status_code not in RETRY_STATUSES:
-                return response
-            why = f"HTTP {response.status_code}"
-            asked_s = _seconds(response.headers.get("Retry-After", ""))
-        except httpx.TransportError as error:
-            why = shown_error(error)
-        if clock() >= deadline:
-            raise Busy(
-                f"{url} no longer answers ({why}); run the same command again to go on "
-                "from here: nothing is recorded twice"
-            )
-        await asyncio.sleep(min(max(wait_s, asked_s), LONGEST_RETRY_S))
-        wait_s *= 2
-
-
-def _seconds(text: str) -> float:
-    return float(text) if text.isascii() and text.isdigit() else 0.0
-
-
-def shown_error(error: Exception) -> str:
-    """An error's words, or its name where it has none."""
-    return str(error) or type(error).__name__
-
-
-def _problem(response: httpx.Response) -> Problem:
-    """The part of a problem that does not depend on how the batch was sent."""
     try:
-        content = response.json()
-        return {name: content[name] for name in ("detail", "errors") if name in content}
-    except (json.JSONDecodeError, UnicodeDecodeError, TypeError):
-        return {"detail": f"HTTP {response.status_code}: {response.text[:200]}"}
+        recorded = await _submitted(client, item)
+    except answers.Busy:
+        raise
+    except answers.Problem as problem:
+        return LineOutcome(item, None, problem=_problem(problem))
+    return LineOutcome(item, recorded.body, recorded.replayed)
+
+
+async def _submitted(client: AsyncClient, item: Item) -> RecordedAnswer:
+    if item.submission is not None:
+        return await client.submit_json(item.submission.text)
+    block = item.gyro
+    assert block is not None
+    path = path_of("spacecraft", block.spacecraft, "gyro")
+    body = json_of_block(block)
+    response = await client.request("POST", path, body=body, repeat=Repeat.ALWAYS)
+    return RecordedAnswer(response.content, response.headers.get("Replayed") == "true")
+
+
+def _problem(problem: answers.Problem) -> Problem:
+    """The part of a problem that does not depend on how the batch was sent."""
+    if not problem.errors:
+        return {"detail": problem.detail}
+    faults = [Fault(each.field, each.message, each.value) for each in problem.errors]
+    return {**problem_of_faults(faults), "detail": problem.detail}

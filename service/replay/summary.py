@@ -13,6 +13,7 @@ from typing import IO, Any, Self
 import msgspec
 from tqdm import tqdm
 
+from service.client.models import Replay
 from service.errors import BadFile, Fault
 from service.observations.readers.telemetry import telemetry_format
 from service.replay.items import LineOutcome
@@ -37,6 +38,7 @@ class ReplaySummary:
         title: str | None = None,
     ) -> None:
         self.new = self.replayed = self.refused = self.attitudes = 0
+        self.gyro_new = self.gyro_replayed = 0
         self.stars: Counter[str] = Counter()
         self.seconds = 0.0
         self.packets: dict[str, Any] | None = None
@@ -57,7 +59,7 @@ class ReplaySummary:
 
     @property
     def batches(self) -> int:
-        """Lines that were processed."""
+        """Lines that were processed, gyro blocks aside."""
         return self.new + self.replayed + self.refused
 
     def add(self, outcome: LineOutcome) -> None:
@@ -66,6 +68,10 @@ class ReplaySummary:
             self.refused += 1
             self._print_problem(outcome)
             line = json.dumps(self._refusal(outcome)).encode()
+        elif outcome.item.gyro is not None:
+            self.gyro_replayed += outcome.replayed
+            self.gyro_new += not outcome.replayed
+            line = outcome.answer
         else:
             self.replayed += outcome.replayed
             self.new += not outcome.replayed
@@ -74,17 +80,18 @@ class ReplaySummary:
         self._write(line + b"\n")
         self._bar.update()
 
-    def follow(self, state: dict[str, Any]) -> None:
+    def follow(self, state: Replay) -> None:
         """Take the counts of a replay that the service works through."""
-        counts, lines = state["counts"], state["lines"]
-        self.new, self.replayed = counts["new"], counts["repeated"]
-        self.attitudes = counts["attitudes"]
-        self.packets = state["packets"]
-        self.stars = Counter({each: counts[each] for each in STARS})
-        self._bar.update(lines["done"] - self._bar.n)
-        if state["state"] != "running":
+        counts, lines = state.counts, state.lines
+        self.new, self.replayed = counts.new, counts.repeated
+        self.attitudes = counts.attitudes
+        self.gyro_new, self.gyro_replayed = counts.gyro_new, counts.gyro_repeated
+        self.packets = None if state.packets is None else msgspec.to_builtins(state.packets)
+        self.stars = Counter({each: getattr(counts, each) for each in STARS})
+        self._bar.update(lines.done - self._bar.n)
+        if state.state != "running":
             # Refused lines with a known place are reported one by one.
-            self.refused += lines["refused"] - len(state["errors"])
+            self.refused += lines.refused - len(state.errors)
 
     def _write(self, text: bytes) -> None:
         if self._path is None:
@@ -137,7 +144,14 @@ class ReplaySummary:
             "attitudes": self.attitudes,
             "batches_per_s": self.batches / max(self.seconds, 1e-9),
             **({} if self.packets is None else {"packets": self.packets}),
+            **self._gyro_counts(),
         }
+
+    def _gyro_counts(self) -> dict[str, Any]:
+        """The counts of gyro blocks; empty where the files hold none."""
+        if not (self.gyro_new or self.gyro_replayed):
+            return {}
+        return {"gyro_blocks": {"new": self.gyro_new, "already_recorded": self.gyro_replayed}}
 
     def table(self) -> str:
         """The summary: what was sent, what was found, how fast."""
@@ -150,6 +164,10 @@ class ReplaySummary:
             for word in ("unique", "ambiguous", "unmatched")
         ]
         rows += [("attitudes", str(self.attitudes))]
+        if self._gyro_counts():
+            rows += [("gyro blocks", str(self.gyro_new + self.gyro_replayed))]
+            rows += [("  new", str(self.gyro_new))]
+            rows += [("  already recorded", str(self.gyro_replayed))]
         rows += _packet_rows(self.packets)
         rows += [("speed", f"{self.batches / max(self.seconds, 1e-9):.0f} batches/s")]
         return "\n".join(f"{name:<20}{value}" for name, value in rows)

@@ -23,7 +23,10 @@ class Orekit:
 
     def read(self, kind, file, shift_s=0.0):
         """What Orekit finds in a file; `shift_s` moves each state by its own rate."""
-        asked = {"kind": kind, "file": str(file), "shift_s": shift_s}
+        return self.ask(kind=kind, file=str(file), shift_s=shift_s)
+
+    def ask(self, **asked):
+        """What a function of the worker answers."""
         self._process.stdin.write(json.dumps(asked) + "\n")
         self._process.stdin.flush()
         answer = json.loads(self._process.stdout.readline())

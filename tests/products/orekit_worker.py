@@ -1,4 +1,4 @@
-"""Reads attitude data messages with Orekit: a line of JSON asks, a line of JSON answers.
+"""Reads messages of attitudes and orbits with Orekit: a line of JSON asks, a line of JSON answers.
 
 A process of its own: the Java machine takes signals that the tests' own process needs.
 """
@@ -21,11 +21,20 @@ DATA = Path(__file__).parent / "orekit-data"
 setup_orekit_data(filenames=str(DATA), from_pip_library=False)
 
 from java.io import File  # noqa: E402
+from java.util import ArrayList  # noqa: E402
 from org.hipparchus.geometry.euclidean.threed import Vector3D  # noqa: E402
 from org.orekit.data import DataSource  # noqa: E402
 from org.orekit.files.ccsds.ndm import ParserBuilder  # noqa: E402
+from org.orekit.frames import FramesFactory  # noqa: E402
+from org.orekit.propagation.analytical.tle import TLE, TLEPropagator  # noqa: E402
 from org.orekit.time import AbsoluteDate, TimeScalesFactory  # noqa: E402
+from org.orekit.utils import (  # noqa: E402
+    CartesianDerivativesFilter,
+    TimeStampedPVCoordinates,
+    TimeStampedPVCoordinatesHermiteInterpolator,
+)
 
+MU_M3_PER_S2 = 3.986004418e14
 J2000_TAI = AbsoluteDate(2000, 1, 1, 12, 0, 0.0, TimeScalesFactory.getTAI())
 
 
@@ -45,7 +54,12 @@ def state_of(coordinates):
     }
 
 
-def aem(source, shift_s):
+def source_of(asked):
+    return DataSource(File(asked["file"]))
+
+
+def aem(asked):
+    source, shift_s = source_of(asked), asked["shift_s"]
     message = ParserBuilder().buildAemParser().parseMessage(source)
     return [
         {
@@ -62,7 +76,8 @@ def aem(source, shift_s):
     ]
 
 
-def apm(source, shift_s):
+def apm(asked):
+    source = source_of(asked)
     message = ParserBuilder().buildApmParser().parseMessage(source)
     (segment,) = list(message.getSegments())
     data = segment.getData()
@@ -82,7 +97,8 @@ def apm(source, shift_s):
     }
 
 
-def acm(source, shift_s):
+def acm(asked):
+    source, shift_s = source_of(asked), asked["shift_s"]
     message = ParserBuilder().buildAcmParser().parseMessage(source)
     data = message.getSegments().get(0).getData()
     determination = data.getAttitudeDeterminationBlock()
@@ -116,15 +132,70 @@ def acm(source, shift_s):
     }
 
 
-READERS = {"aem": aem, "apm": apm, "acm": acm}
+def kilometres(vector):
+    return [vector.getX() / 1e3, vector.getY() / 1e3, vector.getZ() / 1e3]
+
+
+def oem(asked):
+    """States at times, interpolated through so many points, and those of the file."""
+    message = ParserBuilder().withMu(MU_M3_PER_S2).buildOemParser().parseMessage(source_of(asked))
+    samples = [
+        each
+        for segment in message.getSegments()
+        for block in [segment.getData().getEphemeridesDataLines()]
+        for each in block
+    ]
+    return {
+        "states": [
+            {
+                "tai_s": each.getDate().durationFrom(J2000_TAI),
+                "state": kilometres(each.getPosition()) + kilometres(each.getVelocity()),
+            }
+            for each in samples
+        ],
+        "at": [
+            interpolated(samples, J2000_TAI.shiftedBy(float(tai_s)), asked)
+            for tai_s in asked["times"]
+        ],
+    }
+
+
+def interpolated(samples, date, asked):
+    """By Hermite's polynomial, or by Lagrange's through positions and velocities apart."""
+    points, method = asked["points"], asked["method"]
+    if method == "HERMITE":
+        through = TimeStampedPVCoordinatesHermiteInterpolator(
+            points, CartesianDerivativesFilter.USE_PV
+        )
+        found = through.interpolate(date, ArrayList(samples))
+        return kilometres(found.getPosition()) + kilometres(found.getVelocity())
+    through = TimeStampedPVCoordinatesHermiteInterpolator(points, CartesianDerivativesFilter.USE_P)
+    velocities = [
+        TimeStampedPVCoordinates(each.getDate(), each.getVelocity(), Vector3D.ZERO)
+        for each in samples
+    ]
+    found = [through.interpolate(date, ArrayList(each)) for each in (samples, velocities)]
+    return [value for each in found for value in kilometres(each.getPosition())]
+
+
+def tle(asked):
+    """States in EME2000 at times."""
+    propagator = TLEPropagator.selectExtrapolator(TLE(*asked["lines"]))
+    found = [
+        propagator.getPVCoordinates(J2000_TAI.shiftedBy(float(tai_s)), FramesFactory.getEME2000())
+        for tai_s in asked["times"]
+    ]
+    return [kilometres(each.getPosition()) + kilometres(each.getVelocity()) for each in found]
+
+
+READERS = {"aem": aem, "apm": apm, "acm": acm, "oem": oem, "tle": tle}
 
 
 def main():
     for line in sys.stdin:
         asked = json.loads(line)
         try:
-            source = DataSource(File(asked["file"]))
-            answer = {"found": READERS[asked["kind"]](source, asked["shift_s"])}
+            answer = {"found": READERS[asked["kind"]](asked)}
         except Exception as error:
             answer = {"error": str(error)}
         print(json.dumps(answer), flush=True)

@@ -8,7 +8,7 @@ from service.products.attitudes import AttitudeRows, SeriesInfo, series_of
 from service.products.formats import write_attitudes
 from service.times import parse_utc, shifted
 
-ABOUT = SeriesInfo("XTE", "live", "2026-01-01T00:00:00.000Z", "0.1.0")
+ABOUT = SeriesInfo("XTE", "live", "2026-01-01T00:00:00.000Z", "0.2.0")
 START = "1996-01-10T12:00:00.000Z"
 GOLDEN = [0.0, 0.0, math.sin(math.radians(15.0)), math.cos(math.radians(15.0))]
 """The axes turned by +30 deg about Z."""
@@ -41,6 +41,10 @@ def rows(quaternions, times=START, *, step_s=1.0, status="good", rates=None):
         residual_rms_arcsec=known[:, 0] * 1.25,
         predicted_rms_arcsec=known[:, 0] * 1.5,
         stars=np.tile([9, 6, 2, 1], (n, 1)),
+        model=texts([None] * n),
+        revision=np.zeros(n, dtype=np.int64),
+        bias_deg_per_h=np.full((n, 3), math.nan),
+        bias_sigma_deg_per_h=np.full((n, 3), math.nan),
     )
 
 

@@ -1,1 +1,1 @@
-"""Attitudes read from files of other programs: AEM and C-kernels."""
+"""Files of other programs: attitudes (AEM and C-kernels), and orbits (OEM and TLE)."""

@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
 from service.errors import BadFile, Fault
 from service.products.attitudes import SAME_MOMENT_NS, Integers
+from service.products.reading.spans import in_order
 from service.products.rotations import rotation_vectors, turned_quaternion
 from service.vectors import Vector
 
@@ -83,19 +83,7 @@ def between(first: Vector, second: Vector, share: Vector) -> Vector:
 
 
 def known_attitudes(file: str, object_name: str, segments: Sequence[Segment]) -> KnownAttitudes:
-    """The attitudes of a file in order of time.
-
-    Raises `BadFile` where there are none, where a segment has no useable attitude, and where
-    two segments overlap.
-    """
+    """The attitudes of a file in order of time; see `in_order`."""
     if not segments:
         raise BadFile(Fault(file, "has no attitude"))
-    for each in segments:
-        if each.first_ns > each.last_ns:
-            raise BadFile(Fault(f"{file}, {each.place}", "the segment has no useable time"))
-    ordered = sorted(segments, key=lambda each: each.first_ns)
-    for one, other in pairwise(ordered):
-        if other.first_ns < one.last_ns:
-            message = f"overlaps the segment at {one.place}: a time belongs to one segment"
-            raise BadFile(Fault(f"{file}, {other.place}", message))
-    return KnownAttitudes(object_name, ordered)
+    return KnownAttitudes(object_name, in_order(file, segments))
