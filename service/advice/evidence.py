@@ -47,12 +47,15 @@ class PairEvidence:
     between the observed and the catalog difference of the angles to the pole
     (GTODIF and GTRDIF).  `cross_product_deg` is the angle between the observed
     and the catalog cross product (CRSSEP), NaN where the votes do not ask for it.
+    `magnitude_difference_mag` is the observed difference of the magnitudes less the
+    catalog's: a pair that differs by more is in its right order by brightness.
     """
 
     batch: npt.NDArray[np.int64]
     separation_deg: Vector
     pole_difference_deg: Vector
     cross_product_deg: Vector
+    magnitude_difference_mag: Vector
 
 
 _Columns = TypeVar("_Columns", StarEvidence, PairEvidence)
@@ -103,6 +106,10 @@ def evidence_of(batch: int, acquisition: Acquisition) -> Evidence:
         presumed = acquisition.prior.attitude
         tracker = names.index(result.corrected.tracker.name)
         row = result.identification.star[used]
+        brightness = (
+            result.corrected.magnitude_mag[used],
+            acquisition.run_catalog.magnitude_mag[row],
+        )
         observed = result.corrected.direction_body[used] @ presumed
         catalog = acquisition.run_catalog.direction[row]
         polar = [np.full(len(row), np.nan)] * 2
@@ -112,12 +119,12 @@ def evidence_of(batch: int, acquisition: Acquisition) -> Evidence:
             StarEvidence(
                 np.full(len(row), batch),
                 np.full(len(row), tracker),
-                result.corrected.magnitude_mag[used],
-                acquisition.run_catalog.magnitude_mag[row],
+                *brightness,
                 polar[0] - polar[1],
             )
         )
-        pairs.append(_pairs(batch, acquisition, observed, catalog, polar))
+        fainter_by = brightness[0] - brightness[1]
+        pairs.append(_pairs(batch, acquisition, observed, catalog, polar, fainter_by))
         solution = _tracker_attitude(acquisition, result, used)
         if solution is not None:
             fits.append(
@@ -157,6 +164,7 @@ def _pairs(
     observed: Vector,
     catalog: Vector,
     polar: Sequence[Vector],
+    fainter_by_mag: Vector,
 ) -> PairEvidence:
     tolerances = acquisition.choices.tolerances
     i, j = np.triu_indices(len(observed), 1)
@@ -176,6 +184,7 @@ def _pairs(
         angle_between_deg(observed[i], observed[j]) - between,
         np.abs(apart[0] - apart[1]),
         crossing,
+        fainter_by_mag[i] - fainter_by_mag[j],
     )
 
 

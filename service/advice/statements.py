@@ -88,17 +88,15 @@ def tolerance_statement(finding: ToleranceFinding, advice: Findings) -> Statemen
     effect = _effect(present, with_it)
     if finding.verdict == "too_tight":
         beyond = _percent_with_bounds(finding.beyond)
-        text = (
-            f"{start} is too tight: {now} loses {beyond} of the true {finding.tolerance.what}; "
-            f"{kept} {needed}. {effect}"
-        )
+        loses = finding.tolerance.loses.format(share=beyond, what=finding.tolerance.what)
+        text = f"{start} is too tight: {now} {loses}; {kept} {needed}. {effect}"
         if name == "magnitude_mag" and any(m.verdict == "off" for m in advice.magnitudes):
             return Statement(
                 "wait",
                 text + " Part of it is the offset of the magnitudes: correct that first, "
                 "then ask again.",
             )
-        if name == "separation_deg" and any(n.before_arcsec for n in advice.noise):
+        if name == "separation_deg" and any(n.before_arcsec or n.worst for n in advice.noise):
             return Statement(
                 "wait",
                 text + " The noise changed meanwhile: correct that first, then ask again for a "
@@ -172,8 +170,9 @@ def noise_statement(finding: NoiseFinding) -> Statement:
             f" in the latest {finding.batches} batches, since {finding.since.text}, and was "
             f"{_with_bounds(finding.before_arcsec, 'arcsec')} before"
         )
+    worst = _worst(finding)
     if finding.verdict == "fits":
-        return Statement("keep", f"{start} is {found}: the mission's {now} fits.")
+        return Statement("keep", f"{start} is {found}: the mission's {now} fits.{worst}")
     ratio = finding.sigma_arcsec.value / finding.now_arcsec
     told = "too small" if finding.verdict == "too_small" else "too large"
     follows = (
@@ -182,6 +181,7 @@ def noise_statement(finding: NoiseFinding) -> Statement:
         else "attitudes are given as worse than they are, and misnamed stars pass unnoticed"
     )
     text = f"{start} is {found}, {ratio:.2f} times the mission's {now}, which is {told}: {follows}."
+    text += worst
     if finding.before_arcsec is not None and finding.since is not None:
         return Statement(
             "correct",
@@ -193,6 +193,19 @@ def noise_statement(finding: NoiseFinding) -> Statement:
         "correct",
         text,
         (FileChange("trackers", finding.tracker, f"{line:<32} # was {finding.now_arcsec:g}"),),
+    )
+
+
+def _worst(finding: NoiseFinding) -> str:
+    """The sentence on a period of more noise, empty without one."""
+    if finding.worst is None:
+        return ""
+    worst = finding.worst
+    ratio = worst.sigma_arcsec.value / finding.now_arcsec
+    return (
+        f" It was {_with_bounds(worst.sigma_arcsec, 'arcsec')}, {ratio:.2f} times the mission's, "
+        f"in {worst.batches} batches from {worst.first.text} to {worst.last.text}: look for what "
+        "happened to the tracker then."
     )
 
 

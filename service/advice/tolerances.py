@@ -47,6 +47,8 @@ class Tolerance:
     most: float
     """The largest value that a mission may give it."""
     differences: Differences
+    loses: str = "loses {share} of the true {what}"
+    """What a value that is too small does."""
 
 
 TOLERANCES: tuple[Tolerance, ...] = (
@@ -71,6 +73,18 @@ TOLERANCES: tuple[Tolerance, ...] = (
         True,
         30.0,
         lambda e: (e.stars.observed_mag - e.stars.catalog_mag, e.stars.batch),
+    ),
+    Tolerance(
+        "magnitude_order_mag",
+        "TMAGMX",
+        "TMAGMX",
+        "mag",
+        "differences of magnitude in pairs",
+        "magnitude",
+        True,
+        30.0,
+        lambda e: (e.pairs.magnitude_difference_mag, e.pairs.batch),
+        "orders stars by brightness though {share} of the {what} are off by more",
     ),
     Tolerance(
         "cross_product_deg",

@@ -26,8 +26,20 @@ CLOSE = 0.2
 """A sigma that is right within a fifth needs no change."""
 CERTAIN = 0.999
 """Of the intervals that tell whether noise changed: several stretches are looked at."""
+SCAN_SIGMAS = 4.5
+"""Of samples of 200 batches of constant noise, about one in five hundred has a stretch above it."""
 
 SizeVerdict = Literal["too_small", "fits", "too_large", "no_verdict"]
+
+
+@dataclass(frozen=True)
+class NoisePeriod:
+    """A tracker's noise over consecutive batches, from the first of them to the last."""
+
+    sigma_arcsec: Interval
+    batches: int
+    first: Utc
+    last: Utc
 
 
 @dataclass(frozen=True)
@@ -35,7 +47,8 @@ class NoiseFinding:
     """A tracker's noise: one standard deviation per tangent axis, beside the mission's.
 
     Where it changed, all this is of the latest batches alone, from `since` on;
-    `before_arcsec` is the noise of those before, else None.
+    `before_arcsec` is the noise of those before, else None.  `worst` is a period
+    in which it was certainly larger, and to which none of the others belong.
     """
 
     tracker: str
@@ -45,6 +58,7 @@ class NoiseFinding:
     verdict: SizeVerdict
     before_arcsec: Interval | None = None
     since: Utc | None = None
+    worst: NoisePeriod | None = None
 
 
 @dataclass(frozen=True)
@@ -90,7 +104,8 @@ def noise_findings(mission: Mission, evidence: Evidence) -> list[NoiseFinding]:
     the noise, in units of the sigmas, for its own median, batch by batch.  The
     median over batches does not mind a few bad ones.  For the same reason it does
     not show a tracker that began to fail: the latest batches are held against
-    those before, and speak for the tracker where they differ.
+    those before, and speak for the tracker where they differ.  A period of more noise that
+    ended before them is found as well: an alarm asks about it.
     """
     return [_noise(tracker, index, evidence) for index, tracker in enumerate(mission.trackers)]
 
@@ -103,16 +118,51 @@ def _noise(tracker: Tracker, index: int, evidence: Evidence) -> NoiseFinding:
     squared = _squared_noise(fits)
     latest = _latest_with_own_noise(squared)
     now, before = squared[-latest:], squared[:-latest]
+    worst = _worst_in_a_row(squared)
+    if worst is not None and len(before) == 0:
+        # The median of both noises would be that of neither.
+        now = np.concatenate([squared[: worst.start], squared[worst.stop :]])
+    elif worst is not None and worst.stop > len(before):
+        worst = None
     sigma = _sigma(now, tracker)
     return NoiseFinding(
         tracker.name,
         tracker.sigma_arcsec,
         sigma,
-        latest,
+        len(now),
         _size_verdict(tracker.sigma_arcsec, sigma),
         _sigma(before, tracker) if len(before) else None,
         fits[-latest].time if len(before) else None,
+        None if worst is None else _noise_period(fits[worst], squared[worst], tracker),
     )
+
+
+def _noise_period(fits: list[TrackerAttitude], squared: Vector, tracker: Tracker) -> NoisePeriod:
+    return NoisePeriod(_sigma(squared, tracker), len(fits), fits[0].time, fits[-1].time)
+
+
+def _worst_in_a_row(squared: Vector) -> slice | None:
+    """The batches in a row that most certainly show more noise than all others; None if none do.
+
+    Of every stretch the sum of its ranks is compared with what chance gives (Mann & Whitney);
+    the search is that of circular binary segmentation (Olshen et al. 2004) in one step.
+    """
+    from scipy.stats import rankdata
+
+    count = len(squared)
+    total = np.concatenate([[0.0], np.cumsum(rankdata(squared) - (count + 1) / 2.0)])
+    best, found = SCAN_SIGMAS, None
+    for length in range(LEAST_BATCHES, count - LEAST_BATCHES + 1):
+        excess = total[length:] - total[:-length]
+        begin = int(np.argmax(excess))
+        sigma = math.sqrt(length * (count - length) * (count + 1) / 12.0)
+        if excess[begin] > best * sigma:
+            best, found = float(excess[begin]) / sigma, slice(begin, begin + length)
+    if found is None:
+        return None
+    others = np.concatenate([squared[: found.start], squared[found.stop :]])
+    more = np.median(squared[found]) > (1.0 + CLOSE) ** 2 * np.median(others)
+    return found if more else None
 
 
 def _sigma(squared: Vector, tracker: Tracker) -> Interval:

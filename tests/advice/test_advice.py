@@ -1,6 +1,7 @@
 """Telemetry with known faults is flown, and the advice finds just these."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
@@ -116,6 +117,37 @@ def test_noise_that_was_large_before_and_fits_now_is_left_alone(sky, missions, s
     said = noise_statement(noise)
     assert (said.action, said.changes) == ("keep", ())
     assert "before" in said.text
+
+
+@pytest.mark.parametrize("end", [90, 140])
+def test_a_period_of_more_noise_is_told_though_the_tracker_has_recovered(sky, missions, seed, end):
+    """What the range of an alarm asks for: how noisy the tracker was, and when."""
+    mission, begin, batches = missions["XTE"], end - 40, 160
+    rng, number = np.random.default_rng(5), itertools.count()
+    sigma_arcsec = mission.trackers[0].sigma_arcsec
+    more = np.sqrt(5.0**2 - 1.0) * sigma_arcsec / ARCSEC_PER_RADIAN
+
+    def change(body):
+        if begin <= next(number) < end:
+            for star in stars_of(body):
+                star["vector"] = unit(np.array(star["vector"]) + rng.normal(0.0, more, 3)).tolist()
+
+    pass_ = flown(mission, sky, batches, seed, change=change, angles_share=0.0)
+    (noise,) = noise_findings(mission, evidence_from(mission, sky, pass_.batches))
+    assert noise.verdict == "fits"
+    assert near(noise.sigma_arcsec, sigma_arcsec)
+    assert near(noise.worst.sigma_arcsec, 5.0 * sigma_arcsec)
+    bounds = [pass_.batches[k].time.tai_ns for k in (begin - 3, begin + 3, end - 4, end + 2)]
+    assert bounds[0] <= noise.worst.first.tai_ns <= bounds[1]
+    assert bounds[2] <= noise.worst.last.tai_ns <= bounds[3]
+    ratio = noise.worst.sigma_arcsec.value / sigma_arcsec
+    assert f"{ratio:.2f} times the mission's" in noise_statement(noise).text
+
+
+def test_constant_noise_has_no_worst_period(sky, missions, seed):
+    pass_ = flown(missions["XTE"], sky, BATCHES, seed, angles_share=0.0)
+    (noise,) = noise_findings(missions["XTE"], evidence_from(missions["XTE"], sky, pass_.batches))
+    assert noise.worst is None
 
 
 def test_an_offset_and_a_scale_of_the_magnitudes_are_found(sky, missions, seed):
@@ -262,6 +294,18 @@ def test_a_magnitude_tolerance_that_is_too_tight_is_found(sky, seed):
     found = finding(mission, evidence, "magnitude_mag")
     assert found.verdict == "too_tight"
     assert near(found.needed, 0.1 * stats.norm.ppf(0.995))
+
+
+@pytest.mark.parametrize(("now", "verdict"), [(0.1, "too_tight"), (0.6, "fits"), (3.0, "too_wide")])
+def test_the_difference_that_orders_by_brightness_is_judged_by_that_of_pairs(
+    sky, seed, now, verdict
+):
+    """A difference of two magnitudes scatters by the root of two times the tracker's sigma."""
+    mission = mission_like(tolerances={"magnitude_order_mag": now})
+    evidence = evidence_from(mission, sky, flown(mission, sky, BATCHES, seed).batches)
+    found = finding(mission, evidence, "magnitude_order_mag")
+    assert found.verdict == verdict
+    assert near(found.needed, math.sqrt(2.0) * 0.1 * stats.norm.ppf(0.995))
 
 
 def test_a_cross_product_tolerance_near_the_attitude_errors_is_too_tight(sky, seed):

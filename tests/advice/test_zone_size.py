@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from service.advice.zone_census import zone_censuses
-from service.advice.zone_size import geometric_k_g, zone_cost, zone_size
+from service.advice.zone_size import ZoneCost, geometric_k_g, zone_cost, zone_size
+from service.advice.zone_statements import zone_statements
 from service.sky.catalog.run_catalog import build_run_catalog
 from service.times import parse_utc
 
@@ -61,3 +62,37 @@ def test_without_errors_only_the_present_size_is_weighed(missions):
     assert (found.errors, found.sizes_deg) == (None, [2.1])
     assert found.setting == "zone.half_width_deg"
     assert np.isclose(found.margin_deg, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("angles", "action", "says"),
+    [
+        ([], "wait", "At least 50 batches"),
+        ([5.0] * 50, "keep", "CCAP (zone.radius_deg) fits: 10.66° leaves room"),
+        (
+            [5.0] * 50 + [7.0],
+            "widen",
+            "in 1 of them it was more than there is room for. Set zone.radius",
+        ),
+        ([5.0] * 50 + [7.0], "widen", "then holds 1,240 pairs (NTOT) instead of 1,066."),
+        ([1.0] * 50, "tighten", "zone.radius_deg = 5.2 covers that and a fifth more"),
+        ([5.0] * 50 + [60.0], "keep", "Larger errors (1, up to 60.00°) are faults of their source"),
+    ],
+)
+def test_the_size_is_told_in_words_with_what_it_costs(missions, angles, action, says):
+    size = zone_size(missions["XTE"], angles)
+    costs = [ZoneCost(each, 10, round(100 * each), 0.4) for each in size.sizes_deg]
+    told, _ = zone_statements(missions["XTE"], size, costs)
+    assert told.action == action
+    assert says in told.text
+
+
+@pytest.mark.parametrize(
+    ("limit_deg", "action"), [(3.9, "widen"), (8.0, "keep"), (8.3, "keep"), (12.0, "tighten")]
+)
+def test_hmax_is_the_width_of_the_field_of_view(missions, limit_deg, action):
+    mission = missions["XTE"]
+    tolerances = mission.tolerances.model_copy(update={"pair_separation_max_deg": limit_deg})
+    mission = mission.model_copy(update={"tolerances": tolerances})
+    *_, told = zone_statements(mission, zone_size(mission, []), [])
+    assert (told.action, "HMAX" in told.text) == (action, True)

@@ -4,12 +4,13 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from service.cli.arguments import MISSION, add_command, count
+from service.cli.arguments import MISSION, add_command, count, positive
 from service.cli.configuration import mission_and_catalog
 from service.errors import BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
     from service.observations.batch import Aberration
+    from service.simulate.gyro import GyroWanted
     from service.simulate.stretches import Pass
 
 _SIZES = {
@@ -33,6 +34,7 @@ def add(group: Any) -> None:
         acquire simulate telemetry --spacecraft SOHO --batches 300 --seed 1 --nominal soho.csv
         acquire simulate telemetry --spacecraft SWAS --batches 500 --seed 2 --serious swas.ndjson
         acquire simulate telemetry --spacecraft XTE --batches 9 --aberration ignore xte.ndjson
+        acquire simulate telemetry --spacecraft XTE --batches 240 --gyro 1 --gyro-gap 90 xte.ndjson
         """,
         run,
     )
@@ -75,6 +77,7 @@ def add(group: Any) -> None:
         metavar="WORD[=SHARE],...",
         help="to_correct, applied_upstream, ignore; default to_correct",
     )
+    _add_gyro(parser)
     serious = parser.add_argument_group(
         "periods with errors",
         "share of the pass with each error, from 0 to 1, and its size",
@@ -97,20 +100,57 @@ def add(group: Any) -> None:
         serious.add_argument(name, type=kind, metavar=unit, help=f"default {size}")
 
 
+def _add_gyro(parser: Any) -> None:
+    gyro = parser.add_argument_group(
+        "gyro", "blocks of gyro samples beside the batches, in NDJSON alone"
+    )
+    gyro.add_argument(
+        "--gyro",
+        type=positive,
+        metavar="S",
+        help="seconds between samples; the noise is that of the mission's table [gyro]",
+    )
+    for flag, unit, text in (
+        ("gyro-quantum", "ARCSEC", "one count of the gyro"),
+        ("gyro-gap", "S", "a gap, which begins after 40 %% of the pass"),
+        ("clock-step", "S", "after 70 %% of the pass the clock of trackers and gyro steps ahead"),
+    ):
+        gyro.add_argument(f"--{flag}", type=float, default=0.0, metavar=unit, help=text)
+
+
 def run(parsed: Namespace) -> int:
     """Draw a pass and write it with its truth."""
     from service.simulate.files import truth_path, write_pass
+    from service.simulate.gyro import with_gyro
     from service.simulate.telemetry import draw_pass
     from service.sky.cache import LruCache
     from service.sky.model import SkyModel
 
     wanted = _pass_of(parsed)
+    gyro = _gyro_of(parsed)
     mission, catalog = mission_and_catalog(parsed.spacecraft)
-    count = write_pass(
-        draw_pass(mission, SkyModel(catalog, LruCache(64 << 20)), wanted), parsed.output
-    )
+    drawn = draw_pass(mission, SkyModel(catalog, LruCache(64 << 20)), wanted)
+    if gyro is not None:
+        duration_s = (wanted.batches - 1) * wanted.cadence_of(mission)
+        drawn = with_gyro(drawn, mission, gyro, duration_s, wanted.seed)
+    count = write_pass(drawn, parsed.output)
     print(f"{parsed.output}: {count} batches of {mission.name}; truth: {truth_path(parsed.output)}")
     return 0
+
+
+def _gyro_of(parsed: Namespace) -> "GyroWanted | None":
+    """The gyro that the arguments describe, if any."""
+    from service.observations.readers.telemetry import telemetry_format
+    from service.simulate.gyro import GyroWanted
+
+    flaws = parsed.gyro_quantum, parsed.gyro_gap, parsed.clock_step
+    if parsed.gyro is None:
+        if any(flaws):
+            raise BadInput(Fault("--gyro", "is missing: without it there is no gyro"))
+        return None
+    if telemetry_format(parsed.output) == "csv":
+        raise BadInput(Fault("--gyro", "needs NDJSON: a CSV file has batches or gyro samples"))
+    return GyroWanted(parsed.gyro, *flaws)
 
 
 def _pass_of(parsed: Namespace) -> "Pass":

@@ -1,0 +1,208 @@
+"""`acquire simulate mission`: rates of a mission's settings under given errors."""
+
+from argparse import ArgumentParser, ArgumentTypeError, Namespace
+from pathlib import Path
+from typing import Any
+
+from service.cli.arguments import add_command, add_json, count, print_json
+from service.errors import BadInput, Fault, shown_value
+from service.missions.identifiers import IDENTIFIERS
+
+IN_ZONES = [name for name, entry in IDENTIFIERS.items() if entry.searches_zone]
+VOTES = "starid"
+DEFAULT_STARS = 10_000
+NOTES = """\
+names of a sweep, with the paper's where it has one:
+  tolerances of the mission file: pair_separation_max_deg (HMAX), separation_deg (SEPTOL),
+    magnitude_mag (XMTOL), magnitude_order_mag (TMAGMX), cross_product_deg (CAPMAX,
+    BANMAX), pole_difference_deg (BANTOL1), pole_angle_deg (BANTOL2), fov_rotation_deg
+  size of the zone: radius_deg (CCAP), half_width_deg (WBAND)
+  errors: phi_deg, theta_deg, psi_deg (LIBROT), off_axis_deg (RCVIEW),
+    position_error_arcsec (per tangent axis; SIGOBS is 1.414 times it),
+    magnitude_error_mag (SIGMAG), magnitude_bound_mag (RCMAG)
+Without a sweep tolerances, zone, position_error_arcsec and magnitude_error_mag are those of
+the mission file, the angles are 0, off_axis_deg is the room that the zone leaves about the
+field of view, and magnitude_bound_mag is six times magnitude_error_mag.
+All settings see the same stars and draws. Nothing is searched outside the zone."""
+
+
+def add(group: Any) -> None:
+    """Declare the command."""
+    parser = add_command(
+        group,
+        "mission",
+        "Simulate the views of a mission's tracker as Fink & Shoup (1994) do, and print which "
+        "shares of the stars are identified rightly, ambiguous, unmatched or wrong, with "
+        "confidence intervals; tolerances, size of the zone and errors may be swept.",
+        """
+        acquire simulate mission XTE
+        acquire simulate mission mine.toml --sweep separation_deg=.01,.02 --sweep magnitude=.3:.9:.2
+        acquire simulate mission XTE --identifier starid --sweep psi_deg=0:100:10 --page psi.html
+        acquire simulate mission SOHO --sweep separation_deg=.0066,.02 --at-most-ambiguous 0.01
+        acquire simulate mission XTE --direction 265.6,-28.9 --within 5 --json
+        """,
+        run,
+        NOTES,
+    )
+    parser.add_argument(
+        "mission", metavar="MISSION", help="the name of a spacecraft, or a mission file (.toml)"
+    )
+    parser.add_argument(
+        "--sweep",
+        action="append",
+        default=[],
+        metavar="NAME=VALUES",
+        help="values such as .01,.02,.05, or a range such as .3:.9:.2; one value sets it; may be "
+        "repeated, for every combination",
+    )
+    parser.add_argument(
+        "--direction",
+        type=_direction,
+        metavar="RA,DEC",
+        help="deg; axes of zones lie about it; default: the whole sky",
+    )
+    parser.add_argument(
+        "--within", type=float, metavar="DEG", help="bound of that angle (RCCAT); default 0"
+    )
+    parser.add_argument("--tracker", metavar="NAME", help="default: the first of the mission")
+    parser.add_argument(
+        "--without",
+        action="append",
+        default=[],
+        choices=("magnitude", "cross_product", "pole"),
+        metavar="TEST",
+        help="switch a test off: magnitude, cross_product or pole; may be repeated",
+    )
+    parser.add_argument(
+        "--identifier",
+        choices=IN_ZONES,
+        metavar="NAME",
+        help=f"{', '.join(IN_ZONES)}; default: {VOTES} where a tolerance is swept that only it "
+        "uses, else the mission's",
+    )
+    _add_draws(parser)
+    _add_outputs(parser)
+
+
+def _add_draws(parser: ArgumentParser) -> None:
+    """Declare how much is drawn."""
+    parser.add_argument(
+        "--stars",
+        type=count,
+        default=DEFAULT_STARS,
+        metavar="N",
+        help=f"stars for each setting, about; default {DEFAULT_STARS}",
+    )
+    parser.add_argument(
+        "--views", type=count, default=10, metavar="N", help="views in each zone; default 10"
+    )
+    parser.add_argument(
+        "--stars-per-view", type=count, default=5, metavar="N", help="at most; default 5"
+    )
+    parser.add_argument("--seed", type=int, default=1, metavar="S", help="default 1")
+
+
+def _add_outputs(parser: ArgumentParser) -> None:
+    """Declare what is printed and written."""
+    parser.add_argument(
+        "--at-most-ambiguous",
+        type=_share,
+        metavar="SHARE",
+        help="name the settings that keep ambiguous stars below this, such as 0.01",
+    )
+    parser.add_argument("--plot", type=Path, metavar="OUT.svg", help="draw the rates as SVG")
+    parser.add_argument(
+        "--page", type=Path, metavar="OUT.html", help="write a page with table and picture"
+    )
+    add_json(parser, "the rates")
+    parser.add_argument("--processes", type=count, metavar="N", help="default: one per core")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def run(parsed: Namespace) -> int:
+    """Simulate and print the rates."""
+    from service.cli.configuration import mission_of_file_or_name
+    from service.settings import Settings
+    from service.studies.mission_rates import page
+    from service.studies.mission_rates.plot import checked, draw
+    from service.studies.mission_rates.report import report_json, report_text
+    from service.studies.mission_rates.simulation import simulate
+
+    plan = _plan(parsed, mission_of_file_or_name(parsed.mission))
+    if parsed.plot is not None:
+        checked(plan, parsed.plot)
+    if parsed.page is not None:
+        page.checked(plan, parsed.page)
+    catalog = Settings.from_environment().catalog
+    rates = simulate(plan, catalog, parsed.processes, parsed.quiet)
+    if parsed.plot is not None:
+        draw(plan, rates, parsed.plot)
+    if parsed.page is not None:
+        page.write_page(plan, rates, parsed.at_most_ambiguous, parsed.page)
+    if parsed.json:
+        print_json(report_json(plan, rates, parsed.at_most_ambiguous))
+    else:
+        print(report_text(plan, rates, parsed.at_most_ambiguous))
+        if parsed.plot is not None:
+            print(f"picture: {parsed.plot}")
+        if parsed.page is not None:
+            print(f"page: {parsed.page}")
+    return 0
+
+
+def _plan(parsed: Namespace, mission: Any) -> Any:
+    from service.studies.mission_rates.settings import (
+        Sweep,
+        one_tracker,
+        only_of_votes,
+        settings_of,
+    )
+    from service.studies.mission_rates.simulation import Plan
+
+    if parsed.seed < 0:
+        raise BadInput(Fault("--seed", "must not be negative", str(parsed.seed)))
+    if parsed.within is not None and not (parsed.direction and 0 <= parsed.within <= 180):
+        message = "must be from 0 to 180, beside a --direction"
+        raise BadInput(Fault("--within", message, shown_value(parsed.within)))
+    sweeps = [Sweep.parsed(text) for text in parsed.sweep]
+    of_votes = only_of_votes(sweeps)
+    identifier = parsed.identifier or (VOTES if of_votes else mission.identifier)
+    if identifier not in IN_ZONES:
+        message = f"{mission.name} identifies by {identifier}, which uses no zone; give one of "
+        raise BadInput(Fault("--identifier", message + ", ".join(IN_ZONES), identifier))
+    if of_votes and identifier != VOTES:
+        message = f"is not used by {identifier}; give --identifier {VOTES}"
+        raise BadInput(Fault("--sweep", message, of_votes[0]))
+    tests = mission.tests.model_copy(update=dict.fromkeys(parsed.without, False))
+    single = one_tracker(mission.model_copy(update={"tests": tests}), parsed.tracker)
+    return Plan(
+        settings=tuple(settings_of(single, sweeps)),
+        identifier=identifier,
+        direction_deg=parsed.direction,
+        within_deg=180.0 if parsed.direction is None else (parsed.within or 0.0),
+        zones=-(-parsed.stars // (parsed.views * parsed.stars_per_view)),
+        views=parsed.views,
+        most_stars=parsed.stars_per_view,
+        seed=parsed.seed,
+    )
+
+
+def _direction(text: str) -> tuple[float, float]:
+    try:
+        ra_deg, dec_deg = map(float, text.split(","))
+    except ValueError:
+        ra_deg, dec_deg = 0.0, 100.0
+    if not (-360.0 <= ra_deg <= 360.0 and -90.0 <= dec_deg <= 90.0):
+        message = f"must be right ascension and declination in degrees, RA,DEC (got {text!r})"
+        raise ArgumentTypeError(message)
+    return ra_deg, dec_deg
+
+
+def _share(text: str) -> float:
+    try:
+        share = float(text)
+    except ValueError:
+        share = -1.0
+    if not 0.0 < share < 1.0:
+        raise ArgumentTypeError(f"must be a share above 0 and below 1 (got {text!r})")
+    return share
