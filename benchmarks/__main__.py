@@ -15,7 +15,9 @@ from collections.abc import Callable, Mapping, Sequence
 from benchmarks.record import SERVICE, record_of
 from benchmarks.report import Report
 from benchmarks.speed import (
+    exports,
     kernels,
+    packets,
     performance,
     pipeline,
     posts,
@@ -30,6 +32,7 @@ from benchmarks.validation import (
     centroids,
     consistency,
     covariance,
+    filtering,
     frames,
     imaging_claims,
     paper_runs,
@@ -57,6 +60,7 @@ BENCHMARKS: dict[str, Callable[[bool, int], Report]] = {
     "two_groups": two_groups.run,
     "whole_sky": whole_sky.run,
     "verified_cost": verified_cost.run,
+    "filtering": filtering.run,
     "frames": frames.run,
     "centroids": centroids.run,
     "imaging_claims": imaging_claims.run,
@@ -65,6 +69,8 @@ BENCHMARKS: dict[str, Callable[[bool, int], Report]] = {
     "posts": posts.run,
     "stored": stored.run,
     "soak": soak.run,
+    "packets": packets.run,
+    "exports": exports.run,
     "lost_in_space": lost_in_space.run,
     "pictures": blind.run,
     "camera_calibrations": calibrations.run,

@@ -1,6 +1,6 @@
 """Every page of the console as a picture: `python -m benchmarks.screenshots`.
 
-A service of its own is filled with a sample pass that is watched for alarms; a
+A service of its own is filled with a day of every mission that is watched for alarms; a
 browser then looks at every page, wide and narrow, light and dark.  The
 pictures go to docs/images, where docs/operators.md shows them; the table of
 all of them at its end is written anew.
@@ -11,8 +11,9 @@ import io
 import json
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import httpx
 from PIL import Image
@@ -21,6 +22,8 @@ from tqdm import tqdm
 from service.app.factory import App, open_app
 from service.missions.mission import load_missions
 from service.settings import Settings
+from service.simulate.frame_files import frame_bytes
+from service.simulate.frames import FrameSettings, draw_frames
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
 from service.web.app import create_app
@@ -31,15 +34,28 @@ FOLDER = Path(__file__).parents[1] / "docs" / "images"
 DOCUMENT = FOLDER.parent / "operators.md"
 HEADING = "## All pages: wide and narrow, light and dark"
 RUN = "sample-pass"
-BATCHES = 240
+BATCHES = 288
 START = "1999-03-01T00:00:00.000Z"
+CADENCE_S = 300.0
+"""288 batches are a day, the period that pages show first."""
+DAY = "start=1999-060T00:00:00Z&end=1999-061T00:00:00Z"
+NOTES = (
+    (
+        "XTE",
+        "1999-060T06:50:00Z",
+        "1999-060T09:10:00Z",
+        "A priori attitude drifts: gyro bias upload",
+    ),
+    ("XTE", "1999-060T15:20:00Z", None, "Particles seen by the tracker since dawn"),
+    (None, "1999-060T21:00:00Z", "1999-060T21:20:00Z", "Ground station changes; a gap is expected"),
+)
 SIZES = {"wide": 1440, "narrow": 400}
 TALLEST = {"wide": 1350, "narrow": 1100}
 """Pixels of a picture's height: what follows on a long page is more of the same."""
 WIDTHS = {"wide": 320, "narrow": 120}
 """Of a picture in the table of all."""
 QUALITY = 50
-PATIENCE_S = 60.0
+PATIENCE_S = 600.0
 
 
 def main() -> int:
@@ -72,29 +88,39 @@ def filled(address: str, app: App) -> Mapping[str, str]:
         while client.get("/readyz").status_code != 200:
             time.sleep(0.2)
         for name, mission in load_missions().items():
-            wanted = Pass(batches=BATCHES, seed=1, start=START, cadence_s=30.0)
+            wanted = Pass(batches=BATCHES, seed=1, start=START, cadence_s=CADENCE_S)
             drawn = draw_pass(mission, app.sky, wanted)
-            lines = b"\n".join(json.dumps(each.batch).encode() for each in drawn)
-            replay(client, lines, name)
+            sent = [each.batch for each in drawn]
+            replay(client, sent, name)
+            if name == "XTE":
+                by_votes = {"options": {"identifier": "starid"}}
+                replay(client, [each | by_votes for each in sent], name, run=f"{RUN}-votes")
         alarms = client.get("/api/v1/alarms", params={"run": RUN, "state": "all"}).json()["items"]
-        signed = {"who": "J. Operator", "comment": "a priori attitude drifts; slew at 00:40"}
+        signed = {"who": "J. Operator", "comment": "a priori attitude drifts; slew at 08:00"}
         xte = [each for each in alarms if each["spacecraft"] == "XTE"]
         client.post(f"/api/v1/alarms/{xte[-1]['id']}/acknowledge", json=signed).raise_for_status()
         shelved = signed | {"comment": "known, until the upload", "minutes": 120}
         client.post(f"/api/v1/alarms/{alarms[0]['id']}/shelve", json=shelved).raise_for_status()
+        for spacecraft, start, end, text in NOTES:
+            note = {"start": start, "end": end, "text": text, "who": "J. Operator"}
+            client.post("/api/v1/annotations", json=note | {"spacecraft": spacecraft})
         batch = looked_into(client)
+        frame = taken(client, app)
         replays = client.get("/api/v1/replays").json()["items"]
     run = f"run={RUN}"
     tried = "identifier=starid&tolerances.separation_deg=0.012"
     return {
         "overview": f"/?{run}",
-        "spacecraft": f"/spacecraft/XTE?{run}&start=1999-060T00:00:00Z&end=1999-060T02:00:00Z",
+        "spacecraft": f"/spacecraft/XTE?{run}&{DAY}",
+        "period": f"/spacecraft/XTE/period?{run}&{DAY}",
         "batch": f"/batches/{batch}",
         "what-if": f"/batches/{batch}?{tried}",
+        "frame": f"/batches/{frame}#frame",
         "batches": f"/batches?{run}&outcome=ambiguous",
-        "compare": f"/compare?{run}&spacecraft=XTE&a.identifier=starid&b.identifier=verified",
+        "compare": f"/compare?{run}",
         "alarms": f"/alarms?{run}&state=all",
         "alarm": f"/alarms/{xte[-1]['id']}",
+        "annotations": f"/annotations?{run}",
         "limits": f"/spacecraft/XTE/limits?{run}",
         "runs": f"/runs?{run}",
         "replay": f"/replays/{replays[0]['id']}?{run}",
@@ -113,12 +139,27 @@ def looked_into(client: httpx.Client) -> str:
     return str(max(found, key=lambda each: (each["counts"]["unique"], each["id"]))["id"])
 
 
-def replay(client: httpx.Client, lines: bytes, name: str) -> None:
+def taken(client: httpx.Client, app: App) -> str:
+    """A batch that was made from a frame."""
+    (drawn,) = draw_frames(load_missions()["IMAGER"], app.sky, FrameSettings(frames=1, seed=5))
+    query = {k: v if isinstance(v, str) else json.dumps(v) for k, v in drawn.known.items()}
+    answer = client.post(
+        "/api/v1/spacecraft/IMAGER/frames",
+        params=query | {"run": "frames"},
+        content=frame_bytes(drawn),
+        headers={"Content-Type": "application/fits"},
+    )
+    return str(answer.raise_for_status().json()["id"])
+
+
+def replay(
+    client: httpx.Client, batches: Sequence[Mapping[str, Any]], name: str, run: str = RUN
+) -> None:
     """Send a file and wait until its last batch is recorded."""
     answer = client.post(
         "/api/v1/replays",
-        params={"run": RUN, "alarms": "true"},
-        content=lines,
+        params={"run": run, "alarms": run == RUN},
+        content=b"\n".join(json.dumps(each).encode() for each in batches),
         headers={"Content-Type": "application/x-ndjson"},
     )
     answer.raise_for_status()
@@ -136,8 +177,9 @@ def look(browser: Browser, address: str, pages: Mapping[str, str], folder: Path)
     for page, size, dark in tqdm(views, desc="pictures", unit="picture"):
         browser.open(address + pages[page], width=SIZES[size], height=900, dark=dark)
         browser.wait(lambda: browser.run(SETTLED))
-        height = min(browser.run("document.documentElement.scrollHeight"), TALLEST[size])
-        picture = browser.picture(SIZES[size], height)
+        top = browser.run(TOP)
+        height = min(browser.run("document.documentElement.scrollHeight") - top, TALLEST[size])
+        picture = browser.picture(SIZES[size], height, top)
         file = folder / f"{page}-{size}-{'dark' if dark else 'light'}.webp"
         with Image.open(io.BytesIO(picture)) as image:
             image.convert("RGB").save(file, "WEBP", quality=QUALITY, method=6)
@@ -163,11 +205,16 @@ def gallery(pages: Mapping[str, str]) -> str:
     return "\n".join([HEADING, "", f"| page | {head} |", "|---|---|---|---|---|", *rows, ""])
 
 
+TOP = """location.hash ? Math.round(
+    document.querySelector(location.hash).closest("section").getBoundingClientRect().top + scrollY
+) : 0"""
+"""A picture begins with the section that the address names."""
 SETTLED = """(() => {
   const charts = document.getElementById("charts");
   const connection = document.getElementById("connection");
   const told = connection === null || connection.dataset.state !== "idle";
-  return told && (charts === null || charts.dataset.drawn !== undefined);
+  const drawn = [...document.images].every((each) => each.complete);
+  return told && drawn && (charts === null || charts.dataset.drawn !== undefined);
 })()"""
 
 

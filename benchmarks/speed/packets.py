@@ -1,4 +1,4 @@
-"""How fast packets are read beside space-packet-parser: `python -m benchmarks.speed.packets`.
+"""How fast packets are read beside space-packet-parser: `python -m benchmarks packets`.
 
 Real packets of JPSS-1, 7,200 in two hours, in turns so that both meet the same load.
 """
@@ -10,6 +10,8 @@ from pathlib import Path
 
 from space_packet_parser import ccsds_generator, load_xtce
 
+from benchmarks.bounds import at_least, equal
+from benchmarks.report import Report
 from service.missions.mission import SHIPPED_FOLDER, parse_mission
 from service.packets.definition import read_definition
 from service.packets.reader import PacketReader
@@ -26,10 +28,11 @@ microsecond = "ADAET2US"
 [packets.prior]
 quaternion = ["ADCFAQ1", "ADCFAQ2", "ADCFAQ3", "ADCFAQ4"]
 """
-ROUNDS = 7
+ROUNDS, QUICK_ROUNDS = 7, 2
+LEAST = 0.6
 
 
-def main() -> None:
+def run(quick: bool, seed: int) -> Report:
     content = PACKETS.read_bytes()
     text = (SHIPPED_FOLDER / "xte.toml").read_text(encoding="utf-8")
     mission = parse_mission(text + TABLE, "xte.toml")
@@ -49,18 +52,24 @@ def main() -> None:
 
     ways = {"space-packet-parser alone": alone, "attitudes": attitudes, "replay": lines}
     best = dict.fromkeys(ways, 0.0)
-    for _ in range(ROUNDS):
+    for _ in range(QUICK_ROUNDS if quick else ROUNDS):
         for name, way in ways.items():
             best[name] = max(best[name], _rate(way))
-    for name, rate in best.items():
-        print(f"{name:<28}{rate:8.0f} packets/s  {rate / best['space-packet-parser alone']:.2f}")
+    theirs_alone = best["space-packet-parser alone"]
+    figures = {f"{name}, packets/s": rate for name, rate in best.items()}
+    bounds = [
+        equal("attitudes of 7,200 packets", attitudes(), 7_200),
+        *(
+            at_least(
+                f"{name} beside space-packet-parser", best[name] / theirs_alone, LEAST, "times"
+            )
+            for name in ("attitudes", "replay")
+        ),
+    ]
+    return Report("packets", figures, bounds)
 
 
 def _rate(way: Callable[[], int]) -> float:
     start = time.perf_counter()
     count = way()
     return count / (time.perf_counter() - start)
-
-
-if __name__ == "__main__":
-    main()

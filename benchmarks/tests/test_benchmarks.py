@@ -160,7 +160,6 @@ def test_a_share_is_held_against_its_probability_on_both_sides(hits, of, holds):
     assert share_as_expected("suspect", hits, of, 0.001).holds is holds
 
 
-@pytest.mark.xfail(strict=True, reason="sections measured before records were kept")
 def test_every_section_of_the_verification_has_its_record_and_its_bounds():
     for name, text in kept(Path(TARGET).read_text(encoding="utf-8")).items():
         state, record = state_of(text)
@@ -170,7 +169,6 @@ def test_every_section_of_the_verification_has_its_record_and_its_bounds():
         assert bounds_shown(text) > 0, name
 
 
-@pytest.mark.xfail(strict=True, reason="benchmarks measured before records were kept")
 def test_every_benchmark_of_speed_has_its_record_and_its_bounds():
     results = json.loads(performance.RESULTS.read_text("utf-8"))["benchmarks"]
     for name in performance.TITLES:

@@ -172,7 +172,8 @@ def main() -> int:
     report = _report(measured(parsed.pictures, parsed.seed, parsed.folder, solvers(), log))
     print(report.text())
     if parsed.write:
-        write_part("blind", report, f"--pictures {parsed.pictures} --seed {parsed.seed}")
+        real = " --folder FOLDER" if parsed.folder else ""
+        write_part("blind", report, f"--pictures {parsed.pictures} --seed {parsed.seed}{real}")
     return 0 if report.passed else 1
 
 

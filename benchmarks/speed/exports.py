@@ -1,0 +1,205 @@
+"""How fast files are written, beside the programs that write the same.
+
+    python -m benchmarks exports           a day at 1 Hz as text; 1,000,000 batches as Parquet
+    python -m benchmarks exports --quick   an hour; 20,000 batches
+
+Text is held against brahe writing an AEM of the same attitudes, and Parquet against pyarrow
+writing the same columns, both from Python's values in memory.  The export of a database runs in a
+process of its own: what it adds to the memory of the program counts.  Most of its time is that of
+reading the rows.
+"""
+
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import brahe.ccsds
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+from pyarrow import parquet
+from scipy.spatial.transform import Rotation
+
+from benchmarks.bounds import Bound, at_least, at_most, equal
+from benchmarks.report import Report
+from benchmarks.speed.fill_database import fill
+from service.app.factory import open_app
+from service.products.attitudes import AttitudeRows, SeriesInfo, series_of
+from service.products.formats import write_attitudes, write_table
+from service.products.tables import Table
+from service.settings import Settings
+from service.storage.queries.tables.result_tables import BATCH_COLUMNS
+from service.storage.queries.tables.result_tables import BATCHES as BATCHES_READ
+from service.times import parse_utc, shifted
+
+DAY, QUICK_DAY = 86_400, 3_600
+BATCHES, QUICK_BATCHES = 1_000_000, 20_000
+PAGE = 2_000
+ROUNDS, QUICK_ROUNDS = 3, 1
+MOST_OF_BRAHE = {"aem": 3.5, "aem-xml": 4.0, "acm": 5.0, "csv": 5.5, "json": 7.0}
+"""brahe writes a time and a quaternion a line; ACM, CSV and JSON have a covariance and more."""
+LEAST_OF_PYARROW, MOST_MB = 0.5, 300.0
+START = parse_utc("1996-01-10T00:00:00Z")
+
+
+def run(quick: bool, seed: int) -> Report:
+    figures: dict[str, Any] = {}
+    bounds = [*_text(quick, figures), *_parquet(quick, seed, figures)]
+    return Report("exports", figures, bounds)
+
+
+def _text(quick: bool, figures: dict[str, Any]) -> Iterator[Bound]:
+    rows = _attitudes(QUICK_DAY if quick else DAY)
+    pages = [rows.taken(slice(first, first + PAGE)) for first in range(0, len(rows), PAGE)]
+    about = SeriesInfo("XTE", "live", START.text, "0")
+
+    def written(name: str) -> bytes:
+        return b"".join(write_attitudes(name, series_of(about, iter(pages))))
+
+    message = brahe.ccsds.AEM.from_str(written("aem").decode())
+    ways: dict[str, Callable[[], object]] = {"brahe": lambda: message.to_string("KVN")}
+    ways |= {name: lambda name=name: written(name) for name in MOST_OF_BRAHE}  # type: ignore[misc]
+    best = dict.fromkeys(ways, np.inf)
+    # In turns, so that all meet the same load.
+    for _ in range(QUICK_ROUNDS if quick else ROUNDS):
+        for name, way in ways.items():
+            best[name] = min(best[name], _seconds(way))
+    figures["attitudes at 1 Hz"] = len(rows)
+    for name, seconds in best.items():
+        figures[f"{name}, s"] = seconds
+    for name, most in MOST_OF_BRAHE.items():
+        yield at_most(f"{name} beside brahe", best[name] / best["brahe"], most, "times")
+
+
+def _parquet(quick: bool, seed: int, figures: dict[str, Any]) -> Iterator[Bound]:
+    count = QUICK_BATCHES if quick else BATCHES
+    with tempfile.TemporaryDirectory() as folder:
+        database, file = Path(folder) / "filled.db", Path(folder) / "batches.parquet"
+        # Half of them are of the spacecraft and run that is exported.
+        fill(database, 2 * count, seed, 0)
+        command = [sys.executable, "-m", "benchmarks.speed.exports", str(database), str(file)]
+        told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        seconds, peak_mb, before_mb = map(float, told.split())
+        table = parquet.read_table(file)
+        ours_s, theirs_s = _written_from_memory(table, Path(folder), quick)
+        differing = _differing(file, table)
+    figures["batches as Parquet"] = table.num_rows
+    figures["export from the database, s"] = seconds
+    figures["the same from memory, s"] = ours_s
+    figures["pyarrow from memory, s"] = theirs_s
+    figures["memory before the export, MB"] = before_mb
+    figures["memory at its peak, MB"] = peak_mb
+    yield equal("batches in the file", table.num_rows, count)
+    yield equal("columns of float64 that DuckDB reads otherwise", differing, 0)
+    yield at_least("rate beside pyarrow, from memory", theirs_s / ours_s, LEAST_OF_PYARROW, "times")
+    yield at_most("memory that the export adds", peak_mb - before_mb, MOST_MB, "MB")
+
+
+def _written_from_memory(table: Any, folder: Path, quick: bool) -> tuple[float, float]:
+    """The seconds that the service and pyarrow take to write the same Python values."""
+    values = [table[name].to_pylist() for name in table.column_names]
+    pages = [
+        [column[first : first + BATCHES_READ] for column in values]
+        for first in range(0, table.num_rows, BATCHES_READ)
+    ]
+
+    def ours() -> None:
+        with (folder / "ours.parquet").open("wb") as file:
+            for piece in write_table("parquet", Table(BATCH_COLUMNS, pages)):
+                file.write(piece)
+
+    def theirs() -> None:
+        arrays = [
+            pa.array(column, field.type) for column, field in zip(values, table.schema, strict=True)
+        ]
+        made = pa.Table.from_arrays(arrays, schema=table.schema)
+        parquet.write_table(made, folder / "theirs.parquet")
+
+    best = [np.inf, np.inf]
+    for _ in range(QUICK_ROUNDS if quick else ROUNDS):
+        best = [min(one, _seconds(way)) for one, way in zip(best, (ours, theirs), strict=True)]
+    return best[0], best[1]
+
+
+def _differing(file: Path, table: Any) -> int:
+    """How many columns of numbers DuckDB reads with other bits."""
+    import duckdb
+
+    names = [each.name for each in table.schema if each.type == pa.float64()]
+    with duckdb.connect() as connection:
+        connection.execute("SET preserve_insertion_order = true")
+        quoted = ", ".join(f'"{name}"' for name in names)
+        theirs = connection.execute(f"SELECT {quoted} FROM '{file}'").fetchnumpy()
+    return sum(
+        _bits(np.ma.filled(theirs[name], np.nan)) != _bits(table[name].to_numpy()) for name in names
+    )
+
+
+def _bits(values: npt.NDArray[Any]) -> bytes:
+    # Nothing is NaN in the file: it stands for null.
+    is_null = np.isnan(values)
+    return bytes(np.where(is_null, 0.0, values).tobytes() + is_null.tobytes())
+
+
+def _attitudes(count: int) -> AttitudeRows:
+    """Attitudes a second apart of a body that turns at 1 deg/s."""
+    turn = Rotation.from_rotvec(np.radians([0.3, -0.5, 0.8]) * np.arange(count)[:, None])
+    times = [shifted(START, float(second)) for second in range(count)]
+
+    def column(values: list[str]) -> npt.NDArray[np.object_]:
+        filled = np.empty(len(values), dtype=object)
+        filled[:] = values
+        return filled
+
+    return AttitudeRows(
+        time_ns=np.array([each.tai_ns for each in times], dtype=np.int64),
+        time=column([each.text for each in times]),
+        id=column([f"{each.tai_ns:026d}" for each in times]),
+        batch=column([f"1996-010-{number:06d}" for number in range(count)]),
+        status=column(["good"] * count),
+        method=column(["quest"] * count),
+        quaternion=turn.as_quat(),
+        covariance_arcsec2=np.tile([1.5, 0.1, 0.2, 2.5, 0.3, 30.0], (count, 1)),
+        rate_deg_per_s=np.full((count, 3), np.nan),
+        residual_rms_arcsec=np.full(count, 1.25),
+        predicted_rms_arcsec=np.full(count, 1.5),
+        stars=np.tile([9, 6, 2, 1], (count, 1)),
+    )
+
+
+def _seconds(way: Callable[[], object]) -> float:
+    started = time.perf_counter()
+    way()
+    return time.perf_counter() - started
+
+
+def main(database: str, output: str) -> None:
+    """Export a database, and print the seconds that it took and the memory in MB.
+
+    The memory is the peak, and what the program held before the export began.
+    """
+    app = open_app(Settings(database=f"sqlite:///{database}", replay_processes=0))
+    try:
+        before_mb = _memory_mb("VmRSS")
+        started = time.perf_counter()
+        with Path(output).open("wb") as file:
+            for piece in write_table("parquet", app.products.table("XTE", "batches", run="live")):
+                file.write(piece)
+        seconds = time.perf_counter() - started
+    finally:
+        app.close()
+    print(seconds, _memory_mb("VmHWM"), before_mb)
+
+
+def _memory_mb(name: str) -> float:
+    (size,) = re.findall(rf"{name}:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    return int(size) / 1024
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
