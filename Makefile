@@ -32,7 +32,7 @@ DEV = $(VENV)/.installed-dev
 # The steps of `make check` run one after another, also under -j.
 .NOTPARALLEL:
 .PHONY: help run test torture check format-check lint types floors migrations-check openapi-check \
-	format lock bench compare stale openapi clean
+	format lock bench compare stale pythons dist openapi clean
 
 help:
 	@echo "make run      set up, serve on http://$(HOST):$(PORT), replay sample telemetry, print a table"
@@ -44,6 +44,8 @@ help:
 	@echo "make bench    measure speed, write docs/performance.md; BENCH_ARGS=--all for all benchmarks"
 	@echo "make compare  send the same inputs to this version and to BASE=commit, show differences"
 	@echo "make stale    name the measured sections of the documents that are older than the code"
+	@echo "make pythons  run the wheel under each supported Python that is here (minutes each)"
+	@echo "make dist     write the wheels, source archive and bill of materials to dist/"
 	@echo "make openapi  write openapi.yaml anew"
 	@echo "make lock     resolve the dependencies anew (needs the package index)"
 	@echo "make clean    remove .venv and everything that was built or cached"
@@ -112,6 +114,19 @@ compare: $(DEV)
 # Before a release; not part of `make check`, because measuring everything again takes hours.
 stale: $(DEV)
 	@$(BIN)/python -m benchmarks.verification --check
+
+pythons: $(DEV)
+	@$(BIN)/python -m tests.pythons
+
+# The bill of materials is made by a tool in an environment of its own, which needs the package index.
+dist: $(DEV)
+	@rm -rf dist
+	@UV_PYTHON=$(BIN)/python $(BIN)/uv build --no-build-isolation --quiet --out-dir dist
+	@UV_PYTHON=$(BIN)/python $(BIN)/uv build --no-build-isolation --quiet --wheel --out-dir dist service/client
+	@$(BIN)/uv tool run --quiet --from cyclonedx-bom==7.5.0 cyclonedx-py requirements \
+		--pyproject pyproject.toml --output-reproducible --output-file dist/bill-of-materials.cdx.json \
+		requirements.lock
+	@cd dist && rm -f .gitignore && sha256sum * > SHA256SUMS && cat SHA256SUMS
 
 # Written beside and then moved: a failure leaves the old file.
 openapi: $(DEV)

@@ -2,7 +2,7 @@
 
 from service.compiled.cache import keep_kernels_apart
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 # Before anything imports numba.
 keep_kernels_apart()

@@ -22,7 +22,7 @@ REPEATS_S = 60.0
 
 _MAX_COUNTED = 1_000
 _MAX_LINE = 300
-_SECRET = re.compile(r"acq_[A-Za-z0-9_-]+")
+_SECRET = re.compile(r"(acq_|whsec_)[A-Za-z0-9_+/=-]+")
 _PARAMETERS = re.compile(r"\[parameters: [^\n]*")
 _PLAIN = re.compile(r"[!#-<>-~]+")
 _NUMBER = re.compile(r"\d+")
@@ -252,7 +252,7 @@ class JsonLines(_Lines):
 
 def _harmless(text: str) -> str:
     """Text without tokens and statements' parameters; each of its lines is cut."""
-    text = _PARAMETERS.sub("[parameters: not shown]", _SECRET.sub("acq_(not shown)", text))
+    text = _PARAMETERS.sub("[parameters: not shown]", _SECRET.sub(r"\1(not shown)", text))
     return "\n".join(
         line if len(line) <= _MAX_LINE else line[: _MAX_LINE - 1] + "…"
         for line in text.splitlines()

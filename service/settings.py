@@ -35,7 +35,9 @@ class Settings:
     `probe_port` is a second port that answers probes alone.  One client address
     may have `connections_per_address` at a time; addresses and networks in
     `trusted_proxies` may have more, and the service believes what they say about
-    the clients behind them (X-Forwarded-For, X-Forwarded-Proto).
+    the clients behind them (X-Forwarded-For, X-Forwarded-Proto).  Webhooks reach
+    public addresses, and the networks in `webhook_networks`, these by http too.
+    `archive_folder` is the folder of `acquire archive`, where archived batches are read.
     """
 
     database: str = "sqlite:///acquire.db"
@@ -55,6 +57,8 @@ class Settings:
     probe_port: int | None = None
     connections_per_address: int = 256
     trusted_proxies: str = "127.0.0.1,::1"
+    webhook_networks: str = ""
+    archive_folder: Path | None = None
 
     def __post_init__(self) -> None:
         if not self.database.strip():
@@ -81,11 +85,12 @@ class Settings:
             raise _refusal(
                 "connections_per_address", "must be from 1 to 65535", self.connections_per_address
             )
-        try:
-            networks(self.trusted_proxies)
-        except ValueError:
-            message = "must be addresses or networks, such as 127.0.0.1,10.0.0.0/8"
-            raise _refusal("trusted_proxies", message, self.trusted_proxies) from None
+        for name in ("trusted_proxies", "webhook_networks"):
+            try:
+                networks(getattr(self, name))
+            except ValueError:
+                message = "must be addresses or networks, such as 127.0.0.1,10.0.0.0/8"
+                raise _refusal(name, message, getattr(self, name)) from None
         if not _HOST.fullmatch(self.host):
             raise _refusal("host", "must be an address or a name, such as 127.0.0.1", self.host)
 
@@ -124,6 +129,7 @@ _READERS: dict[str, Callable[[str], Any]] = {
     "missions": Path,
     "catalog": Path,
     "spool": Path,
+    "archive_folder": Path,
     "shelf_mb": int,
     "frame_mb": int,
     "frame_megapixels": int,

@@ -38,13 +38,17 @@ from service.packets.definition import PacketDefinition
 from service.packets.reader import PacketReader
 from service.packets.upload import PacketLines, archive_of
 from service.products.reading.aem import read_aem
+from service.products.reading.oem import read_oem
+from service.products.reading.tle import read_tle
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import import_csv, import_sky2000, load, load_embedded, save
 from service.sky.model import SkyModel
+from service.times import parse_utc
 from tests.imaging.colour_files import colours, dng, png_of_16_bits, tiff_of_16_bits
 from tests.packets.packing import mission_of_pass, packed, xtce
+from tests.products.orbits import ISS, oem_text, with_checksum
 from tests.products.series import GOLDEN, rows, slew
 from tests.products.series import written as aem_file
 from tests.sky.sky2000_records import SIRIUS, written
@@ -57,6 +61,9 @@ MEMORY = Path("/dev/shm")
 """To write each file to a disk would take most of the time."""
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 
+HERMITE = {"INTERPOLATION": "HERMITE", "INTERPOLATION_DEGREE": 7}
+OEM_ELEMENTS = ("X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
+AMONG_STATES = parse_utc("2022-01-17T12:00:02.5Z")
 TOKENS = (
     b'"', b",", b"{", b"}", b"[", b"]", b"\n", b"\r", b"\0", b"\xff\xfe", b"NaN", b"1e999", b"-",
     b"9" * 400, b"null", b"true", b"\\ud800", b"=", b"#", b"'", b"\xf0\x9f", b"{" * 200, b"[" * 200,
@@ -170,6 +177,20 @@ def read_frame_of(data):
     read_frame(io.BytesIO(data), FRAME_LIMITS)
 
 
+def with_right_sum(line):
+    """A line of elements with its own checksum, so that more of it is read."""
+    return with_checksum(line) if len(line) == 69 and line.isascii() else line
+
+
+def states_of(read):
+    """Reads an ephemeris, and takes a state of it."""
+
+    def read_one(data):
+        read("x", io.BytesIO(data)).at(AMONG_STATES)
+
+    return read_one
+
+
 class Readers:
     """By name: good files, and what reads them."""
 
@@ -227,6 +248,43 @@ class Readers:
     def aem_xml(self):
         good = aem_file("aem-xml", rows(slew(2)), rows([GOLDEN], "1996-01-11T00:00:00Z"))
         return good, lambda data: read_aem("x.aem", io.BytesIO(data))
+
+    def oem(self):
+        covariance = ["COVARIANCE_START", "EPOCH = 2022-01-17T12:00:00", "1e-4", "COVARIANCE_STOP"]
+        good = oem_text(np.arange(0.0, 301.0, 60.0), extra=covariance, **HERMITE).encode()
+        return good, states_of(read_oem)
+
+    def oem_xml(self):
+        states = "".join(
+            "<stateVector>"
+            f"<EPOCH>2022-01-17T12:00:0{second}</EPOCH>"
+            + "".join(f"<{name}>{second + 1}.5</{name}>" for name in OEM_ELEMENTS)
+            + "</stateVector>"
+            for second in range(4)
+        )
+        keys = oem_text([0.0, 3.0], **HERMITE).split("META_START\n")[1].split("META_STOP")[0]
+        pairs = [line.split(" = ") for line in keys.splitlines()]
+        metadata = "".join(f"<{name}>{value}</{name}>" for name, value in pairs)
+        good = (
+            '<oem id="CCSDS_OEM_VERS" version="2.0">'
+            "<header><ORIGINATOR>NASA</ORIGINATOR></header><body><segment>"
+            f"<metadata>{metadata}</metadata><data>{states}</data></segment></body></oem>"
+        )
+        return good.encode(), states_of(read_oem)
+
+    def tle(self):
+        later = [with_checksum(ISS[0].replace("22017", "22018")), ISS[1]]
+        good = "\n".join(["ISS", *ISS, *later]).encode()
+        return good, states_of(lambda name, file: read_tle(name, file, "FILE"))
+
+    def tle_with_right_sums(self):
+        good, read = self.tle()
+
+        def read_with_sums(data):
+            lines = data.decode("latin-1").split("\n")
+            read("\n".join(map(with_right_sum, lines)).encode("latin-1"))
+
+        return good, read_with_sums
 
     def fits(self):
         file = io.BytesIO()

@@ -30,8 +30,10 @@ COMMANDS = [
     "serve",
     "replay",
     "advise",
+    "calibrate",
     "history",
     "reprocess",
+    "smooth",
     "frame",
     "catalog",
     "catalog build",
@@ -46,14 +48,19 @@ COMMANDS = [
     "database upgrade",
     "database check",
     "database backup",
+    "database restore",
     "database verify",
     "database prune",
+    "archive",
+    "archive verify",
+    "archive restore",
     "openapi",
     "demo",
     "version",
     "completion",
     "mission",
     "mission check",
+    "mission estimate",
     "export",
     "export attitude",
     "camera",
@@ -62,6 +69,7 @@ COMMANDS = [
     "token create",
     "token list",
     "simulate imaging",
+    "simulate mission",
 ]
 
 
@@ -143,6 +151,7 @@ def test_the_version_is_the_packages(acquire):
         ("replay a --in-process --url http://x", "--url: not allowed with argument --in-process"),
         ("database backup", "required: FILE (see `acquire database backup --help`)"),
         ("database backup copy.db", "acquire.db: there is no such file"),
+        ("database restore copy.db", "copy.db: cannot be read: No such file or directory"),
         ("database verify", "acquire.db: there is no such file"),
         ("database prune", "required: --before"),
         ("database prune --before noon", "--before: must be UTC as"),
@@ -174,7 +183,7 @@ def test_the_version_is_the_packages(acquire):
         ("openapi --check none.yaml", "none.yaml: No such file or directory"),
         ("serve --host http://here", "must be an address or a name"),
         ("serve --port 70000", "must be from 0 to 65535"),
-        ("serve --database no://where", "ACQUIRE_DATABASE: "),
+        ("serve --port 0 --database no://where", "ACQUIRE_DATABASE: "),
         ("database check --database sqlite:///no/such/folder.db", "ACQUIRE_DATABASE: "),
         ("demo --seed -1 --once", "seed: must not be negative (got -1)"),
         ("demo --port 0 --once", "--port: must be a port that can be named"),
@@ -284,6 +293,8 @@ def test_advice_is_printed_in_sentences_or_as_the_api_answers_it(acquire, tmp_pa
     assert (code, "batches" in complaint) == (0, False)
     assert "30 of 30 batches were examined." in out
     assert "ok  SEPTOL (separation_deg) fits: 99 %" in out
+    assert "?   CCAP (zone.radius_deg): 10.66° leaves room for an a priori error of 6.66°" in out
+    assert "ok  HMAX (pair_separation_max_deg) fits: 8° beside a field of view of 8°." in out
     assert "separation_deg = 0.01, asked for" in out
     code, out, _ = acquire(*asked, "--json")
     assert code == 0
@@ -472,18 +483,48 @@ def test_records_are_copied_verified_and_pruned(acquire, tmp_path):
     assert "its attitude is missing" in out
 
 
+def test_old_batches_are_archived_verified_and_restored(acquire, tmp_path):
+    cadence = ("--nominal", "--cadence", 3600)
+    telemetry(acquire, tmp_path / "pass.ndjson", "XTE", 4, *cadence)
+    replay = ("replay", tmp_path / "pass.ndjson", "--in-process", "--run", "r")
+    assert acquire(*replay)[0] == 0
+    code, _, err = acquire("archive", "--before", "1999-061T00:00:00Z", "--to", "away")
+    assert (code, "away: there is no such folder" in err) == (2, True)
+    (tmp_path / "away").mkdir()
+    code, _, err = acquire("archive", "--before", "2098-001T00:00:00Z", "--to", "away")
+    assert (code, "--before: must not be in the future" in err) == (2, True)
+    assert "--before: must be given" in acquire("archive", "--to", "away")[2]
+    code, out, _ = acquire("archive", "--before", "1999-061T00:00:00Z", "--to", "away")
+    assert code == 0
+    assert out.startswith("3 batches before 1999-03-02T00:00:00.000Z were archived\n1 files, ")
+    assert acquire("database", "verify")[:2] == (0, "nothing is wrong with 1 batches\n")
+    verify = ("archive", "verify", "--archive", "away")
+    assert acquire(*verify)[:2] == (0, "nothing is wrong with 3 batches\n")
+    again = ("archive", "restore", "--archive", "away", "--database", "sqlite:///again.db")
+    code, out, _ = acquire(*again)
+    assert (code, out) == (0, "3 batches were restored; 0 were recorded already\n")
+    needed = ("--database", "sqlite:///acquire.db")
+    assert acquire(*verify, *needed)[0] == 0
+    (part,) = (tmp_path / "away").rglob("part-1.parquet")
+    part.unlink()
+    code, out, _ = acquire(*verify, *needed)
+    assert (code, "cannot be read" in out) == (1, True)
+
+
 @pytest.mark.parametrize(
     "command",
     [
         "advise --spacecraft XTE",
         "advise --spacecraft XTE --json",
         "reprocess",
+        "smooth XTE",
         "token list",
         "token revoke nobody",
         "database verify",
         "database check",
         "database backup copy.db",
         "database prune --before 1999-060T00:00:00Z --dry-run",
+        "archive --before 1999-060T00:00:00Z --to .",
     ],
 )
 def test_no_command_that_reads_makes_a_database(acquire, tmp_path, command):
@@ -512,7 +553,7 @@ def test_no_command_that_reads_makes_tables_in_another_file(acquire, tmp_path, c
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
-def test_reprocess_keeps_off_a_file_that_a_service_is_at_work_on(acquire, tmp_path):
+def test_what_writes_keeps_off_a_file_that_a_service_is_at_work_on(acquire, tmp_path):
     """Killed, the service leaves nothing behind that stands in the way."""
     telemetry(acquire, tmp_path / "pass.ndjson", "XTE", 4, "--nominal")
     assert acquire("replay", tmp_path / "pass.ndjson", "--in-process", "--run", "r")[0] == 0
@@ -521,6 +562,7 @@ def test_reprocess_keeps_off_a_file_that_a_service_is_at_work_on(acquire, tmp_pa
         code, out, err = acquire(*again)
         assert (code, out) == (2, "")
         assert "acquire.db: a service is at work on it: stop it" in err
+        assert acquire("smooth", "XTE", "--run", "r")[2] == err
         # Reading does no harm beside it.
         assert acquire("advise", "--spacecraft", "XTE", "--run", "r")[0] == 0
         process.kill()

@@ -30,6 +30,21 @@ from tests.web.serving import Server
 
 SERIOUS = Troubles(Trouble(0.2), Trouble(0.2, 2), Trouble(0.2, 0.5), Trouble(0.2, 12.0))
 _names = count(1)
+ACCEPTED = {
+    "id": "1",
+    "run": "run",
+    "name": "run",
+    "state": "running",
+    "errors": [],
+    "packets": None,
+    "lines": {"total": None, "done": 0, "refused": 0},
+    "counts": dict.fromkeys(
+        ("new", "repeated", "observed", "unique", "ambiguous", "unmatched", "attitudes"), 0
+    ),
+    "started": "2026-03-01T12:00:00.000Z",
+    "finished": None,
+}
+"""What the service says of a replay that it just accepted."""
 
 
 def opened(folder, name="acquire.db"):
@@ -155,10 +170,10 @@ def test_a_replay_that_a_starting_process_calls_interrupted_is_followed_to_its_e
     app, states = opened(tmp_path), []
 
     def call_interrupted(state):
-        if state["state"] == "running":
+        if state.state == "running":
             # What a process does with the replays that it finds at work when it opens the database.
-            app.context.change(lambda connection: mark_interrupted(connection, state["started"]))
-        states.append(state["state"])
+            app.context.change(lambda connection: mark_interrupted(connection, state.started))
+        states.append(state.state)
 
     with Server(create_app(app)) as url:
         files = [written(tmp_path / "many.ndjson", many)]
@@ -187,7 +202,7 @@ def test_who_may_not_follow_a_replay_is_told_so_at_once(status, kind, run, tmp_p
             while size := int(self.rfile.readline(), 16):
                 self.rfile.read(size + 2)
             self.rfile.readline()
-            self.answer(202, {})
+            self.answer(202, ACCEPTED)
 
         def do_GET(self):
             self.answer(status, {"detail": "in its own words"})

@@ -31,6 +31,8 @@ def test_every_setting_has_its_variable():
             "ACQUIRE_PROBE_PORT": "9001",
             "ACQUIRE_CONNECTIONS_PER_ADDRESS": "32",
             "ACQUIRE_TRUSTED_PROXIES": "10.1.2.3, 2001:db8::/32",
+            "ACQUIRE_WEBHOOK_NETWORKS": "10.20.0.0/16",
+            "ACQUIRE_ARCHIVE_FOLDER": "/archive",
             "HOME": "/root",
         }
     ) == Settings(
@@ -44,6 +46,8 @@ def test_every_setting_has_its_variable():
         probe_port=9001,
         connections_per_address=32,
         trusted_proxies="10.1.2.3, 2001:db8::/32",
+        webhook_networks="10.20.0.0/16",
+        archive_folder=Path("/archive"),
     )
 
 
@@ -61,6 +65,7 @@ def test_an_empty_variable_counts_as_not_set():
         ("ACQUIRE_CONNECTIONS_PER_ADDRESS", "0", "from 1 to"),
         ("ACQUIRE_TRUSTED_PROXIES", "proxy.example", "addresses or networks"),
         ("ACQUIRE_TRUSTED_PROXIES", "10.1.2.3/8", "addresses or networks"),
+        ("ACQUIRE_WEBHOOK_NETWORKS", "10.20", "addresses or networks"),
         ("ACQUIRE_SHELF_MB", "0", "from 1 to"),
         ("ACQUIRE_SHELF_MB", "1.5", "whole number"),
         ("ACQUIRE_DATABASE", "   ", "must be a URL"),

@@ -14,7 +14,7 @@ from service.advice.statements import (
     tolerance_statement,
 )
 from service.advice.tolerances import ToleranceFinding
-from service.advice.trackers import AlignmentFinding, MagnitudeFinding, NoiseFinding
+from service.advice.trackers import AlignmentFinding, MagnitudeFinding, NoiseFinding, NoisePeriod
 from service.advice.trials import VariantOutcome
 from service.storage.models.advice import (
     Advice,
@@ -24,6 +24,7 @@ from service.storage.models.advice import (
     GroupAdvice,
     MagnitudeAdvice,
     NoiseAdvice,
+    NoisePeriodAdvice,
     ToleranceAdvice,
     Trial,
 )
@@ -86,8 +87,20 @@ def _noise(finding: NoiseFinding, statement: Statement) -> NoiseAdvice:
         sigma_arcsec=_estimate(finding.sigma_arcsec),
         batches=finding.batches,
         verdict=finding.verdict,
+        worst=_noise_period(finding.worst),
         action=statement.action,
         text=statement.text,
+    )
+
+
+def _noise_period(found: NoisePeriod | None) -> NoisePeriodAdvice | None:
+    if found is None:
+        return None
+    return NoisePeriodAdvice(
+        sigma_arcsec=_bounded(found.sigma_arcsec),
+        batches=found.batches,
+        first=found.first.text,
+        last=found.last.text,
     )
 
 

@@ -5,11 +5,13 @@ from service.acquire.kernel_build import KernelBuild
 from service.app.advice import AdviceService
 from service.app.alarms import Alarms
 from service.app.annotations import Annotations
+from service.app.calibrations.estimates import CalibrationService
 from service.app.comparisons import Comparisons
 from service.app.context import Context
 from service.app.events import Audit, Events
 from service.app.frames import Frames
 from service.app.limits import Limits
+from service.app.outgoing.webhooks import Webhooks
 from service.app.products import Products
 from service.app.replays import Replays
 from service.app.results import Results
@@ -17,6 +19,8 @@ from service.app.runs import Runs
 from service.app.service import Service
 from service.app.spacecraft import Spacecraft
 from service.app.submissions import Submissions
+from service.app.telemetry.grades import Grades
+from service.app.telemetry.gyro import Gyro
 from service.app.zones import Zones
 from service.missions.mission import Mission, load_missions
 from service.settings import Settings, is_loopback
@@ -26,6 +30,7 @@ from service.sky.model import SkyModel
 from service.storage.queries.replays import mark_interrupted
 from service.storage.recording.results import register
 from service.storage.sql.database import Store
+from service.storage.upkeep.expiries import ExpiryDates
 from service.storage.upkeep.split_trackers import BackgroundSplit, TrackerSplitter
 from service.times import utc_now
 
@@ -51,23 +56,31 @@ class App:
         self.results = Results(context, self.submissions)
         self.spacecraft = Spacecraft(context)
         self.products = Products(context)
+        self.gyro = Gyro(context)
+        self.grades = Grades(context)
         self.limits = Limits(context)
         self.alarms = Alarms(context)
         self.annotations = Annotations(context)
         self.runs = Runs(context)
-        self.replays = Replays(context, self.submissions)
+        self.replays = Replays(context, self.submissions, self.gyro.intake)
         self.advice = AdviceService(context, self.submissions)
+        self.calibrations = CalibrationService(context, self.submissions)
         self.comparisons = Comparisons(context, self.submissions)
         self.zones = Zones(context)
         self.events = Events(context)
         self.audit = Audit(context)
+        self.expiries = ExpiryDates(context.reading)
+        self.webhooks = Webhooks(context, self.access)
         self.tracker_split = BackgroundSplit(
             TrackerSplitter(context.store, context.sky, context.missions)
         )
-        self.service = Service(context, self.submissions, self.replays, kernels, self.tracker_split)
+        self.service = Service(
+            context, self.submissions, self.replays, kernels, self.tracker_split, self.expiries
+        )
 
     def close(self) -> None:
         """Stop the replays, write what is queued, and close the database."""
+        self.webhooks.sender.stop()
         self.replays.stop()
         self.tracker_split.stop()
         self.submissions.close()
@@ -91,7 +104,12 @@ def open_app(
     if mission is not None:
         missions[mission.name] = mission
     sky = SkyModel(open_catalog(settings.catalog), LruCache(settings.shelf_mb << 20))
-    store = Store(settings.database, create=create, serving=serving)
+    store = Store(
+        settings.database,
+        create=create,
+        serving=serving,
+        archive_folder=settings.archive_folder,
+    )
     app = App(Context(settings, missions, sky, store), KernelBuild() if serving else None)
     try:
         _register(app.context)

@@ -1,13 +1,18 @@
 """Products: the attitudes of a spacecraft as a series, for any format."""
 
-from typing import Literal
+from collections.abc import Callable, Iterator
+from typing import Any, Literal, get_args
+
+from sqlalchemy import Connection
 
 from service import __version__
 from service.app.context import Context
 from service.errors import BadBatch, Fault
 from service.missions.mission import mission_named
 from service.products.attitudes import (
+    AttitudeRows,
     AttitudeSeries,
+    ProductGrade,
     SeriesInfo,
     SeriesTracker,
     StatusWanted,
@@ -15,16 +20,21 @@ from service.products.attitudes import (
 )
 from service.products.moment import AtMethod, AttitudeAt, attitude_at
 from service.products.tables import Table
+from service.storage.grades.rows import count_samples_of, graded_pages
+from service.storage.gyro.blocks import BlockFilter
+from service.storage.gyro.samples_table import count_samples, sample_table
 from service.storage.queries.attitude_rows import attitude_pages, count_results
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.tables.result_tables import batch_table, star_table
 from service.times import Utc, shifted, utc_now
 
+Pages = Iterator[AttitudeRows]
 Order = Literal["oldest", "newest"]
 AROUND = 200
 """Batches on either side of a moment among which its attitude is looked for."""
-TableKind = Literal["batches", "stars"]
+TableKind = Literal["batches", "stars", "gyro"]
+TABLE_KINDS: tuple[TableKind, ...] = get_args(TableKind)
 _TABLES = {"batches": batch_table, "stars": star_table}
 
 
@@ -42,6 +52,7 @@ class Products:
         start: Utc | None = None,
         end: Utc | None = None,
         status: StatusWanted = "good",
+        grade: ProductGrade = "raw",
         order: Order = "oldest",
         largest_gap_s: float | None = None,
         object_id: str | None = None,
@@ -50,6 +61,7 @@ class Products:
     ) -> AttitudeSeries:
         """The attitudes of a spacecraft's current results in a run; see `series_of`.
 
+        Of the grades `filtered` and `smoothed` they are those of the latest revision of each day.
         They are read as the series is.  The largest gap and the identifiers are the mission's
         where they are None.  Raises `BadBatch` where a period has more than `most_batches`.
         """
@@ -63,6 +75,7 @@ class Products:
             start=None if start is None else start.text,
             end=None if end is None else end.text,
             status=status,
+            grade=grade,
             newest_first=order == "newest",
             largest_gap_s=own.largest_gap_s if largest_gap_s is None else largest_gap_s,
             object_id=own.object_id if object_id is None else object_id,
@@ -77,13 +90,20 @@ class Products:
             ),
         )
         selected = ResultFilter(about.run, name, start, end)
-        if most_batches is not None:
-            with self._context.reading() as connection:
-                _require_at_most(
-                    most_batches, count_results(connection, selected, most_batches + 1)
-                )
-        pages = attitude_pages(self._context.reading, selected, newest_first=about.newest_first)
+        if grade == "raw":
+            self._require_few_batches(selected, most_batches)
+        else:
+            self._require_few(
+                lambda each: count_samples_of(each, selected, grade), most_batches, "samples"
+            )
+        pages = self._pages(about, selected, newest_first=about.newest_first)
         return series_of(about, pages)
+
+    def _pages(self, about: SeriesInfo, selected: ResultFilter, **wanted: Any) -> Pages:
+        """What is recorded of a period in a grade, page by page."""
+        if about.grade == "raw":
+            return attitude_pages(self._context.reading, selected, **wanted)
+        return graded_pages(self._context.reading, selected, about.grade, **wanted)
 
     def attitude_at(
         self,
@@ -93,17 +113,19 @@ class Products:
         *,
         run: str | None = None,
         status: StatusWanted = "good",
+        grade: ProductGrade = "raw",
         largest_gap_s: float | None = None,
     ) -> AttitudeAt:
         """The attitude of a spacecraft at a moment; see `moment.attitude_at`."""
-        about = self.attitudes(name, run=run, status=status, largest_gap_s=largest_gap_s).about
+        about = self.attitudes(
+            name, run=run, status=status, grade=grade, largest_gap_s=largest_gap_s
+        ).about
         gap_s = about.largest_gap_s
         before = ResultFilter(about.run, name, shifted(moment, -gap_s), moment)
         # The end of a period is excluded.
         after = ResultFilter(about.run, name, moment, shifted(moment, gap_s + 1e-6))
-        reading = self._context.reading
-        earlier = next(attitude_pages(reading, before, newest_first=True, page=AROUND), None)
-        later = next(attitude_pages(reading, after, page=AROUND), None)
+        earlier = next(self._pages(about, before, newest_first=True, page=AROUND), None)
+        later = next(self._pages(about, after, page=AROUND), None)
         pages = [
             *([] if earlier is None else [earlier.taken(slice(None, None, -1))]),
             *([] if later is None else [later]),
@@ -118,22 +140,46 @@ class Products:
         run: str | None = None,
         start: Utc | None = None,
         end: Utc | None = None,
+        most_batches: int | None = None,
     ) -> Table:
-        """A spacecraft's batches or their stars, oldest first; see `result_tables`."""
+        """A spacecraft's batches, their stars or its gyro samples, oldest first.
+
+        They are read as the table is; see `result_tables` and `samples_table`.  Raises `BadBatch`
+        where a period has more than `most_batches`, or so many gyro samples.
+        """
         mission_named(self._context.missions, name)
-        selected = ResultFilter(run or LIVE, name, start, end)
         about = {
             "spacecraft": name,
-            "run": selected.run or LIVE,
+            "run": run or LIVE,
             "start": "" if start is None else start.text,
             "end": "" if end is None else end.text,
             "created": utc_now().text,
             "originator": f"attitude-acquisition {__version__}",
         }
+        if kind == "gyro":
+            blocks = BlockFilter(name, run or LIVE, start, end)
+            self._require_few(
+                lambda each: count_samples(each, blocks), most_batches, "gyro samples"
+            )
+            return sample_table(self._context.reading, blocks, about)
+        selected = ResultFilter(run or LIVE, name, start, end)
+        self._require_few_batches(selected, most_batches)
         return _TABLES[kind](self._context.reading, selected, about)
 
+    def _require_few_batches(self, selected: ResultFilter, most: int | None) -> None:
+        self._require_few(
+            lambda each: count_results(each, selected, (most or 0) + 1), most, "batches"
+        )
 
-def _require_at_most(most: int, count: int) -> None:
-    if count > most:
-        message = f"the period has more than the {most:,} batches that a file of this format takes"
-        raise BadBatch(Fault("start", f"{message}; choose a shorter one"))
+    def _require_few(
+        self, count: Callable[[Connection], int], most: int | None, counted: str
+    ) -> None:
+        if most is None:
+            return
+        with self._context.reading() as connection:
+            found = count(connection)
+        if found > most:
+            message = (
+                f"the period has more than the {most:,} {counted} that a file of this format takes"
+            )
+            raise BadBatch(Fault("start", f"{message}; choose a shorter one"))

@@ -16,6 +16,7 @@ from service.app.context import Context, checked_run_name, known_id
 from service.app.submissions import Submissions
 from service.errors import AcquisitionError, Busy, NotFound, Stopping
 from service.ingest.bulk import Bulk, Check
+from service.ingest.gyro import GyroIntake
 from service.ingest.local_workers import WorkerConfig
 from service.ingest.replays import RunningReplay
 from service.ingest.spool import Spool, SpooledReplay
@@ -74,7 +75,7 @@ class UploadForm:
 class Replays:
     """Starts, cancels and reports replays."""
 
-    def __init__(self, context: Context, submissions: Submissions) -> None:
+    def __init__(self, context: Context, submissions: Submissions, gyro: GyroIntake) -> None:
         self._context = context
         config = WorkerConfig(
             context.missions,
@@ -83,7 +84,11 @@ class Replays:
             context.settings.shelf_mb << 20,
         )
         self.bulk = Bulk(
-            submissions.ingest, context.store, config, context.settings.replay_processes
+            submissions.ingest,
+            gyro,
+            context.store,
+            config,
+            context.settings.replay_processes,
         )
         self._spool = Spool(context.settings.spool_folder)
         self._lock = threading.Lock()

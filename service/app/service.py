@@ -19,6 +19,7 @@ from service.observations.schema import submission_from_json
 from service.storage.models.overview import About, CatalogAbout, MissionAbout
 from service.storage.recording.alarm_evaluation import latest_inputs
 from service.storage.recording.ids import Ulids
+from service.storage.upkeep.expiries import ExpiryDates
 from service.storage.upkeep.split_trackers import BackgroundSplit
 from service.times import utc_now
 
@@ -43,12 +44,14 @@ class Service:
         replays: Replays,
         kernels: KernelBuild | None,
         tracker_split: BackgroundSplit,
+        expiries: ExpiryDates,
     ) -> None:
         self._context = context
         self._submissions = submissions
         self._replays = replays
         self._kernels = kernels
         self._tracker_split = tracker_split
+        self._expiries = expiries
         self._warming = threading.Lock()
         self._is_warm = False
         self._ids = Ulids()
@@ -76,6 +79,7 @@ class Service:
                     # Only the service does this by itself, not a command beside it.
                     self._replays.resume()
                     self._tracker_split.start()
+                    self._expiries.warn()
             finally:
                 gc.enable()
                 self._warming.release()

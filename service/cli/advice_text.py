@@ -3,6 +3,7 @@
 import textwrap
 from collections.abc import Iterable, Sequence
 
+from service.advice.statements import Statement
 from service.app.advice_record import no_changes_text
 from service.storage.models.advice import (
     Advice,
@@ -14,15 +15,18 @@ from service.storage.models.advice import (
     Trial,
 )
 
-Finding = GroupAdvice | ToleranceAdvice | NoiseAdvice | MagnitudeAdvice | AlignmentAdvice
+Finding = (
+    Statement | GroupAdvice | ToleranceAdvice | NoiseAdvice | MagnitudeAdvice | AlignmentAdvice
+)
 WIDTH = 96
 
 
-def advice_text(advice: Advice) -> str:
-    """The advice as lines of text."""
+def advice_text(advice: Advice, zone: Sequence[Statement] = ()) -> str:
+    """The advice as lines of text; `zone` are the statements on the zone."""
     lines = [*_heading(advice), ""]
     sections: tuple[tuple[str, Sequence[Finding]], ...] = (
         ("Groups of stars", advice.groups),
+        ("Zone", zone),
         ("Tolerances", advice.tolerances),
         ("Noise", advice.noise),
         ("Magnitudes", advice.magnitudes),

@@ -2,6 +2,7 @@
 
 import dataclasses
 from argparse import Namespace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from service.errors import BadInput, Fault, shown_value
@@ -54,3 +55,12 @@ def mission_and_catalog(name: str) -> "tuple[Mission, Catalog]":
     settings = Settings.from_environment()
     mission = mission_named(load_missions(settings.missions), name)
     return mission, open_catalog(settings.catalog)
+
+
+def mission_of_file_or_name(text: str) -> "Mission":
+    """The mission of a file whose name ends in `.toml`, else that of a spacecraft's name."""
+    from service.missions.mission import load_missions, mission_named, read_mission
+
+    if text.endswith(".toml"):
+        return read_mission(Path(text))
+    return mission_named(load_missions(Settings.from_environment().missions), text)

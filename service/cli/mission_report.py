@@ -43,11 +43,8 @@ class MissionReport:
 
 def examined(mission: "Mission", catalog: "Catalog", epoch: float | None) -> MissionReport:
     """Check a mission with the run catalog of an epoch in years, by default this year's."""
-    year = utc_now().julian_year if epoch is None else epoch
-    if not FIRST_YEAR <= year <= LAST_YEAR + 1:
-        message = f"must be from {FIRST_YEAR} to {LAST_YEAR + 1}, as the time of a batch"
-        raise BadInput(Fault("--epoch", message, shown_value(epoch)))
-    run_catalog = build_run_catalog(catalog, mission.catalog, mission.catalog.epoch_of(year))
+    year = mission.catalog.epoch_of(epoch_of(epoch))
+    run_catalog = build_run_catalog(catalog, mission.catalog, year)
     wrong = [each for each in axis_findings(mission) if each.level == "wrong"]
     if wrong or len(run_catalog) == 0:
         empty = Finding("wrong", "catalog", "leaves no star in the run catalog")
@@ -57,6 +54,15 @@ def examined(mission: "Mission", catalog: "Catalog", epoch: float | None) -> Mis
     faintest_mag = float(np.percentile(catalog.magnitude_v_mag, FAINTEST_SHARE))
     found = findings(mission, faintest_mag, views, zones)
     return MissionReport(mission, run_catalog, views, zones, found)
+
+
+def epoch_of(epoch: float | None) -> float:
+    """The year of `--epoch`, by default now; raises `BadInput` for one that no batch could have."""
+    year = utc_now().julian_year if epoch is None else epoch
+    if not FIRST_YEAR <= year <= LAST_YEAR + 1:
+        message = f"must be from {FIRST_YEAR} to {LAST_YEAR + 1}, as the time of a batch"
+        raise BadInput(Fault("--epoch", message, shown_value(epoch)))
+    return year
 
 
 def refusals(error: Exception, file: Path) -> list[dict[str, str]]:

@@ -39,7 +39,12 @@ def _run(parsed: Namespace) -> int:
     app = open_app(settings_of_existing(parsed))
     try:
         table = app.products.table(
-            parsed.spacecraft, parsed.kind, run=parsed.run, start=start, end=end
+            parsed.spacecraft,
+            parsed.kind,
+            run=parsed.run,
+            start=start,
+            end=end,
+            most_batches=table_formats()[parsed.format].most_batches,
         )
         written_to(parsed.output, write_table(parsed.format, table))
     finally:

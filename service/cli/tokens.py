@@ -14,6 +14,7 @@ from service.missions.mission import load_missions, mission_named
 from service.settings import Settings
 from service.storage.recording.ids import Ulids
 from service.storage.sql.database import Store
+from service.storage.upkeep.expiries import SOON_DAYS
 from service.times import DAY_S, shifted, utc_now
 
 MAX_DAYS = 3660
@@ -62,11 +63,11 @@ def create(
 
 def show(settings: Settings, as_json: bool = False) -> int:
     """Print every token without its secret."""
-    moment = utc_now().text
+    now = utc_now()
     with _opened(settings, create=False) as store, store.reading() as connection:
         rows = tokens.list_tokens(connection)
     states = [
-        "revoked" if each.revoked else "expired" if each.expires <= moment else "good"
+        "revoked" if each.revoked else "expired" if each.expires <= now.text else "good"
         for each in rows
     ]
     if as_json:
@@ -78,8 +79,11 @@ def show(settings: Settings, as_json: bool = False) -> int:
         print("there are no tokens: access on this machine is open")
         return 0
     print(f"{'name':<24}{'scopes':<22}{'spacecraft':<18}{'until':<12}state")
-    for row, state in zip(rows, states, strict=True):
+    for row, stated in zip(rows, states, strict=True):
+        state = stated
         about = "all" if row.spacecraft is None else ",".join(row.spacecraft)
+        if state == "good" and row.expires <= shifted(now, SOON_DAYS * DAY_S).text:
+            state = "expires soon"
         print(f"{row.name:<24}{','.join(row.scopes):<22}{about:<18}{row.expires[:10]:<12}{state}")
     return 0
 

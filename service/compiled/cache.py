@@ -14,6 +14,7 @@ PACKAGE = Path(__file__).parents[1]
 SOURCES = (
     "attitude",
     "compiled",
+    "filtering",
     "identify",
     "missions",
     "observations/batch.py",

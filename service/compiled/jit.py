@@ -22,6 +22,15 @@ def njit_no_refcount(kernel: Callable[..., Any]) -> Any:
     return _compiled(kernel, error_model="numpy", _nrt=False)
 
 
+def njit_inlined(kernel: Callable[..., Any]) -> Any:
+    """`njit_no_refcount` for a part of a kernel that is copied into each of its callers.
+
+    A named tuple of arrays is passed as tens of numbers, and the compiler does not see
+    which of them the part uses: called for every pair of stars, that took as long as its work.
+    """
+    return _compiled(kernel, error_model="numpy", _nrt=False, forceinline=True)
+
+
 def njit_allocating(kernel: Callable[..., Any]) -> Any:
     """Compile a kernel that makes arrays for itself although its caller counts no references.
 

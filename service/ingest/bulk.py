@@ -9,6 +9,8 @@ from concurrent.futures import Future, wait
 from functools import cached_property
 
 from service.errors import AcquisitionError, Busy
+from service.gyro.block import GyroBlock
+from service.ingest.gyro import GyroIntake
 from service.ingest.local_workers import ChunkEndsWorkers, LocalWorkers, WorkerConfig, WorkerLost
 from service.ingest.solver_pool import Solver
 from service.ingest.submit import Answers, SubmissionService
@@ -21,12 +23,16 @@ from service.ingest.telemetry_lines import (
     line_results,
 )
 from service.observations.schema import Submission, submission_from_json
-from service.storage.recording.identity import Registry, look_up, stored_answers
+from service.storage.gyro.blocks import Recorded
+from service.storage.recording.identity import Registry, look_up
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.sql.database import Store
 
 PENDING_A_WORKER = 2
 """Chunks a worker that it has, or that wait for it."""
+
+LineAnswer = Answered | Recorded | AcquisitionError
+"""To a line: of a batch the answer, of a gyro block its row, or what is wrong with it."""
 
 Check = Callable[[str], None]
 """Raises an `AcquisitionError` where batches of a spacecraft are not to be taken."""
@@ -50,9 +56,15 @@ class Bulk:
     """Takes chunks of lines in, by the submission service and by workers of its own."""
 
     def __init__(
-        self, submissions: SubmissionService, store: Store, config: WorkerConfig, workers: int
+        self,
+        submissions: SubmissionService,
+        gyro: GyroIntake,
+        store: Store,
+        config: WorkerConfig,
+        workers: int,
     ) -> None:
         self._submissions = submissions
+        self.gyro = gyro
         self._store = store
         self.workers: LocalWorkers[TelemetryLines, LineResult] = LocalWorkers(
             config, solve_lines, workers
@@ -96,7 +108,7 @@ class Bulk:
         with self._store.reading() as connection:
             registry = look_up(connection, {each for each in named if each is not None})
             ids = {each.result_id for each in registry.identities.values()}
-            stored = stored_answers(connection, ids)
+            stored = self._store.archive.stored_answers(connection, ids)
         known = frozenset(k for k, each in enumerate(named) if each in registry.identities)
         return BulkChunk(self, TelemetryLines(run, texts, known), check, require, registry, stored)
 
@@ -144,6 +156,8 @@ class BulkChunk:
         self._bulk, self._lines, self._check = bulk, lines, check
         self._require = require
         self._registry, self._stored = registry, stored
+        self._begun: dict[int, Callable[[], LineAnswer]] = {}
+        """The gyro blocks that are queued for the writer, by the places of their lines."""
         self._computed = bulk.compute(lines, require)
 
     def is_computed(self, within_s: float) -> bool:
@@ -152,22 +166,47 @@ class BulkChunk:
 
     def queue_write(self) -> None:
         """Queue what was computed for the writer; raises `Busy` where it must be called again."""
+        for place, each in enumerate(self._decided):
+            if isinstance(each, GyroBlock) and place not in self._begun:
+                self._begun[place] = self._begin_block(each)
         unsaved_results = [each for each in self._decided if isinstance(each, UnsavedResult)]
         self._finish = self._bulk.begin_writing(unsaved_results)
+
+    def _begin_block(self, block: GyroBlock) -> Callable[[], LineAnswer]:
+        try:
+            return self._bulk.gyro.begin(block)
+        except Busy:
+            raise
+        except AcquisitionError as error:
+            refused = error
+            return lambda: refused
 
     def cancel(self) -> None:
         """Let it not be computed, where that has not begun."""
         self._computed.cancel()
 
-    def answers(self) -> Answers:
+    def answers(self) -> list[LineAnswer]:
         """The answer to each line, or what is wrong with it, when all is recorded."""
         written = iter(self._finish())
         return [
-            next(written) if isinstance(each, UnsavedResult) else each for each in self._decided
+            next(written)
+            if isinstance(each, UnsavedResult)
+            else self._recorded(place)
+            if isinstance(each, GyroBlock)
+            else each
+            for place, each in enumerate(self._decided)
         ]
 
+    def _recorded(self, place: int) -> LineAnswer:
+        try:
+            return self._begun[place]()
+        except Busy:
+            raise
+        except AcquisitionError as error:
+            return error
+
     @cached_property
-    def _decided(self) -> list[UnsavedResult | Answered | AcquisitionError]:
+    def _decided(self) -> list[UnsavedResult | GyroBlock | Answered | AcquisitionError]:
         try:
             found = self._computed.result()
         except ChunkEndsWorkers as error:
@@ -183,8 +222,11 @@ class BulkChunk:
 
     def _decision(
         self, text: bytes, found: LineResult
-    ) -> UnsavedResult | Answered | AcquisitionError:
+    ) -> UnsavedResult | GyroBlock | Answered | AcquisitionError:
         try:
+            if isinstance(found, GyroBlock):
+                self._check(found.spacecraft)
+                return found
             if isinstance(found, InvalidLine):
                 if found.spacecraft is not None:
                     self._check(found.spacecraft)

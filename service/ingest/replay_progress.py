@@ -13,6 +13,7 @@ from sqlalchemy import Connection
 
 from service.errors import AcquisitionError, Stopping, problem_of
 from service.packets.reader import PacketTotals
+from service.storage.gyro.blocks import Recorded
 from service.storage.models.problems import FieldFault
 from service.storage.models.runs import (
     LineProblem,
@@ -106,8 +107,11 @@ class ProgressRecorder:
 
         self._store.writer.change(store).result()
 
-    def count(self, answered: Answered) -> None:
+    def count(self, answered: Answered | Recorded) -> None:
         """Count the answer to one line."""
+        if isinstance(answered, Recorded):
+            self._counts["gyro_repeated" if answered.replayed else "gyro_new"] += 1
+            return
         answer = _COUNTED.decode(answered.body)
         self._counts["repeated" if answered.replayed else "new"] += 1
         self._counts["attitudes"] += bytes(answer.attitude) != b"null"

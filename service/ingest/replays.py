@@ -11,10 +11,9 @@ from typing import Any, TypeVar
 from sqlalchemy import Connection
 
 from service.errors import AcquisitionError, BadBatch, BadInput, Busy, Fault, Stopping
-from service.ingest.bulk import Bulk, BulkChunk, Check
+from service.ingest.bulk import Bulk, BulkChunk, Check, LineAnswer
 from service.ingest.replay_lines import LineGroup, line_groups
 from service.ingest.replay_progress import ProgressRecorder
-from service.ingest.submit import Answers
 from service.observations.readers.lines import Line
 from service.packets.upload import PacketLines
 from service.storage.models.runs import Replay, ReplayStateName
@@ -221,7 +220,7 @@ class RunningReplay:
             except Busy:
                 self._pause()
 
-    def _compute_again(self, texts: list[bytes]) -> Answers:
+    def _compute_again(self, texts: list[bytes]) -> list[LineAnswer]:
         while True:
             self._pause()
             chunk = self._retry_while_busy(self._begin, texts)

@@ -34,7 +34,6 @@ from service.storage.recording.identity import (
     identity_of,
     look_up,
     remember_key,
-    stored_answers,
 )
 from service.storage.recording.results import record
 from service.storage.recording.unsaved_result import Answered, UnsavedResult, unsaved_what_if
@@ -150,7 +149,7 @@ class SubmissionService:
                 for each in submissions
             ]
             repeats = {each.result_id for each in holders if isinstance(each, ExistingResult)}
-            stored = stored_answers(connection, repeats)
+            stored = self._store.archive.stored_answers(connection, repeats)
         # The connection is given back: a snapshot of the database that is held for as long as
         # five hundred batches take keeps SQLite from shortening its log.
         found: list[UnsavedResult | ExistingResult | AcquisitionError] = []
@@ -311,7 +310,7 @@ class SubmissionService:
         stored: Mapping[str, bytes] = {}
         if repeats:
             with self._store.reading() as connection:
-                stored = stored_answers(connection, repeats)
+                stored = self._store.archive.stored_answers(connection, repeats)
         return [
             self._repeat(pending, holder, stored, registry)
             if isinstance(holder, ExistingResult)
@@ -331,7 +330,8 @@ class SubmissionService:
             # It was pruned in between: the batch is as new as any other.
             return None
         identity, key = pending.identity, pending.key
-        if key is not None and key not in registry.keys:
+        # The keys of archived batches are in the archive.
+        if key is not None and key not in registry.keys and not first.archived:
             try:
                 self._store.writer.change(
                     lambda connection: remember_key(connection, identity, key, first)

@@ -1,4 +1,7 @@
-"""Lines of telemetry, a batch each: read and solved many at once, in this process or a worker."""
+"""Lines of telemetry, a batch or a gyro block each: read and solved many at once.
+
+In this process or in a worker.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -7,6 +10,8 @@ from typing import Annotated
 import msgspec
 
 from service.errors import AcquisitionError
+from service.gyro.block import GyroBlock
+from service.gyro.schema import block_from_line, is_gyro_line
 from service.observations.schema import Submission, submission_from_json
 from service.storage.recording.identity import Identity, identity_of
 from service.storage.recording.unsaved_result import UnsavedResult
@@ -37,7 +42,7 @@ class InvalidLine:
     error: AcquisitionError
 
 
-LineResult = UnsavedResult | RecordedLine | InvalidLine
+LineResult = UnsavedResult | RecordedLine | InvalidLine | GyroBlock
 ComputeMany = Callable[[Sequence[Submission]], Sequence[UnsavedResult | AcquisitionError]]
 
 
@@ -52,7 +57,7 @@ def line_results(lines: TelemetryLines, compute: ComputeMany) -> list[LineResult
     computed = iter(compute(fresh))
     found: list[LineResult] = []
     for place, each in enumerate(read):
-        if isinstance(each, InvalidLine):
+        if isinstance(each, InvalidLine | GyroBlock):
             found.append(each)
         elif place in lines.known:
             found.append(RecordedLine(identity_of(each.batch), each.fingerprint))
@@ -65,8 +70,10 @@ def line_results(lines: TelemetryLines, compute: ComputeMany) -> list[LineResult
     return found
 
 
-def _read(text: bytes, run: str) -> Submission | InvalidLine:
+def _read(text: bytes, run: str) -> Submission | GyroBlock | InvalidLine:
     try:
+        if is_gyro_line(text):
+            return block_from_line(text, run)
         return submission_from_json(text, run=run)
     except AcquisitionError as error:
         return InvalidLine(None, error)

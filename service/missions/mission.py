@@ -27,6 +27,7 @@ from pydantic import (
 from service.errors import BadConfiguration, BadInput, Fault, NotFound, shown_value
 from service.missions.camera import Camera
 from service.missions.camera_defaults import with_camera_defaults
+from service.missions.gyro import GyroSettings, MotionSettings
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.keys import allowed_keys, dotted_key
 from service.missions.packets import Packets
@@ -256,6 +257,9 @@ class Mission(Strict):
     products: ProductSettings = Field(default=DEFAULT_PRODUCTS, exclude_if=DEFAULT_PRODUCTS.__eq__)
     packets: Packets | None = Field(default=None, exclude_if=_is_missing)
     """Which parameters of space packets fill a batch; missing, it is no part of the digest."""
+    gyro: GyroSettings | None = Field(default=None, exclude_if=_is_missing)
+    motion: MotionSettings | None = Field(default=None, exclude_if=_is_missing)
+    """How the body moves while there is no gyro; missing: as `MotionSettings` has it."""
 
     @field_validator("trackers")
     @classmethod

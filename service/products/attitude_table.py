@@ -1,6 +1,7 @@
 """Attitudes as a table."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -57,40 +58,76 @@ COLUMNS = (
     Column("batch", "text", description="Name of the batch.", width=128),
     Column("id", "text", description="Id of the result.", width=26),
 )
+"""Of raw attitudes."""
+
+_OF_BATCHES = ("rate_origin", "residual_rms_arcsec", "predicted_rms_arcsec", "batch")
+_OF_ESTIMATES: dict[str, dict[str, Any]] = {
+    "time": {"description": "Time of the sample."},
+    "method": {"description": "ekf or filter_smoother.", "width": 16},
+    "id": {"description": "Id of the revision of the day."},
+}
+ESTIMATED_COLUMNS = (
+    *(
+        replace(each, **_OF_ESTIMATES.get(each.name, {}))
+        for each in COLUMNS
+        if each.name not in _OF_BATCHES
+    ),
+    *(
+        Column(f"bias_{axis}", unit="deg/h", frame=_BODY, description="Bias of the gyro.")
+        for axis in "xyz"
+    ),
+    *(
+        Column(
+            f"bias_sigma_{axis}",
+            unit="deg/h",
+            frame=_BODY,
+            description="One sigma of the bias or, at a constant rate, of the rate.",
+        )
+        for axis in "xyz"
+    ),
+    Column("model", "text", description="gyro or constant_rate.", width=16),
+    Column("revision", "integer", description="Of the day, from 1."),
+)
+"""Of filtered and smoothed attitudes."""
 
 
 def attitude_table(series: AttitudeSeries) -> Table:
     """The table of a series, a row an attitude."""
-    return Table(COLUMNS, _pages(series), {"product": "attitude", **series.about.provenance()})
+    columns = COLUMNS if series.about.grade == "raw" else ESTIMATED_COLUMNS
+    about = {"product": "attitude", **series.about.provenance()}
+    return Table(columns, _pages(series, [each.name for each in columns]), about)
 
 
-def _pages(series: AttitudeSeries) -> Iterator[Page]:
+def _pages(series: AttitudeSeries, names: Sequence[str]) -> Iterator[Page]:
     for block in series.blocks:
-        yield page_of(block)
+        values = page_of(block)
+        yield [values[name] for name in names]
 
 
-def page_of(block: AttitudeBlock) -> list[list[Any]]:
-    """The values of every column, as plain values; a rate that is not known is None."""
-    rates: list[list[Any]] = block.rate_deg_per_s.T.tolist()
-    if np.isnan(block.rate_deg_per_s).any():
-        rates = [[None if value != value else value for value in axis] for axis in rates]
-    return [
-        block.time.tolist(),
-        block.time_ns.tolist(),
-        *_columns(block.quaternion),
-        *_columns(block.covariance_arcsec2),
-        *rates,
-        block.rate_origin.tolist(),
-        block.status.tolist(),
-        block.method.tolist(),
-        block.residual_rms_arcsec.tolist(),
-        block.predicted_rms_arcsec.tolist(),
-        block.stretch.tolist(),
-        block.batch.tolist(),
-        block.id.tolist(),
-    ]
+def page_of(block: AttitudeBlock) -> dict[str, list[Any]]:
+    """The values of every column by its name, as plain values; what is not known is None."""
+    parts = {
+        "q": (("1", "2", "3", "c"), block.quaternion),
+        "p": (_COVARIANCE, block.covariance_arcsec2),
+        "rate_": ("xyz", block.rate_deg_per_s),
+        "bias_": ("xyz", block.bias_deg_per_h),
+        "bias_sigma_": ("xyz", block.bias_sigma_deg_per_h),
+    }
+    found: dict[str, list[Any]] = {
+        f"{name}{part}": column
+        for name, (each, values) in parts.items()
+        for part, column in zip(each, _columns(values), strict=True)
+    }
+    plain = (
+        *("time", "rate_origin", "status", "method", "residual_rms_arcsec"),
+        *("predicted_rms_arcsec", "stretch", "batch", "id", "model", "revision"),
+    )
+    found |= {name: getattr(block, name).tolist() for name in plain}
+    return found | {"tai_ns": block.time_ns.tolist()}
 
 
-def _columns(values: Vector) -> list[list[float]]:
-    columns: list[list[float]] = values.T.tolist()
+def _columns(values: Vector) -> list[list[Any]]:
+    columns: list[list[Any]] = values.T.tolist()
+    if np.isnan(values).any():
+        columns = [[None if each != each else each for each in column] for column in columns]
     return columns

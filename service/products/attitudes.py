@@ -30,7 +30,8 @@ Integers = npt.NDArray[np.int64]
 Texts = npt.NDArray[np.object_]
 
 StatusWanted = Literal["good", "suspect", "all"]
-OWN, DERIVED, NONE = "own", "derived", "none"
+ProductGrade = Literal["raw", "filtered", "smoothed"]
+OWN, DERIVED, NONE, ESTIMATED = "own", "derived", "none", "estimated"
 SAME_MOMENT_NS = 1_000
 """Of attitudes that are closer than this the last one counts: clocks of kernels have 1 us."""
 
@@ -48,6 +49,7 @@ class SeriesTracker:
 class SeriesInfo:
     """What a series of attitudes is of: the spacecraft, the filters, and its identifiers.
 
+    Attitudes of the grade `raw` are those of batches; see `service.grades` for the others.
     `start` and `end` are UTC as text, None where the period is open.  `sclk_kernel` is the
     spacecraft's clock; without it kernels have a clock of our own.
     """
@@ -59,6 +61,7 @@ class SeriesInfo:
     start: str | None = None
     end: str | None = None
     status: StatusWanted = "good"
+    grade: ProductGrade = "raw"
     newest_first: bool = False
     largest_gap_s: float = DEFAULT_LARGEST_GAP_S
     object_id: str | None = None
@@ -95,6 +98,8 @@ class SeriesInfo:
     def described(self) -> str:
         """What the series is of, for a message."""
         words = "attitudes" if self.status == "all" else f"{self.status} attitudes"
+        if self.grade != "raw":
+            words = words.replace("attitudes", f"{self.grade} attitudes")
         period = "".join(
             f" {word} {moment}"
             for word, moment in (("from", self.start), ("to before", self.end))
@@ -109,6 +114,7 @@ class SeriesInfo:
             "object_id": self.object_id or self.spacecraft,
             "run": self.run,
             "status": self.status,
+            "grade": self.grade,
             "start": self.start or "",
             "end": self.end or "",
             "largest_gap_s": repr(self.largest_gap_s),
@@ -124,6 +130,11 @@ class AttitudeRows:
 
     `status` is None and the numbers are NaN where a batch has no attitude; `rate_deg_per_s`
     is NaN where the batch came without one.  `time_ns` is `Utc.tai_ns`.
+
+    Of filtered and smoothed attitudes a row is a sample: `id` is that of its day's revision,
+    `batch` and the residuals there are none, and `stars` are zero.  They alone have a `model`,
+    a `revision`, and the bias of the gyro with its sigma, (n, 3); of others these are None, 0 and
+    NaN.
     """
 
     time_ns: Integers
@@ -140,6 +151,10 @@ class AttitudeRows:
     predicted_rms_arcsec: Vector
     stars: Integers
     """Of shape (n, 4): observed, unique, ambiguous, unmatched."""
+    model: Texts
+    revision: Integers
+    bias_deg_per_h: Vector
+    bias_sigma_deg_per_h: Vector
 
     def __len__(self) -> int:
         return len(self.time_ns)
@@ -159,7 +174,8 @@ class AttitudeBlock(AttitudeRows):
     """Attitudes of a series, with the number of their stretch, which counts from 0.
 
     Within a stretch the quaternions have continuous signs.  `rate_origin` says whether a
-    rate is the batch's `own`, `derived` from the attitudes before and after, or `none`.
+    rate is the batch's `own`, `derived` from the attitudes before and after, `estimated` by a
+    filter, or `none`.
     `gaps` counts the batches without a wanted attitude up to each row.
     """
 
@@ -227,7 +243,8 @@ class _Assembler:
         is_wanted = np.isin(page.status.astype(str), self._wanted)
         gaps = self._unwanted + np.cumsum(~is_wanted)
         self._unwanted = int(gaps[-1]) if len(gaps) else self._unwanted
-        new = _unfinished(page.taken(is_wanted), gaps[is_wanted])
+        origin = OWN if self._about.grade == "raw" else ESTIMATED
+        new = _unfinished(page.taken(is_wanted), gaps[is_wanted], origin)
         rows = new if self._held is None else self._held.followed_by(new)
         return self._finished(rows, waiting=2)
 
@@ -260,9 +277,9 @@ class _Assembler:
         return rows.taken(~dropped) if dropped.any() else rows
 
 
-def _unfinished(rows: AttitudeRows, gaps: Integers) -> AttitudeBlock:
+def _unfinished(rows: AttitudeRows, gaps: Integers, known: str) -> AttitudeBlock:
     n = len(rows)
-    origin = np.where(np.isnan(rows.rate_deg_per_s[:, 0]), NONE, OWN).astype(object)
+    origin = np.where(np.isnan(rows.rate_deg_per_s[:, 0]), NONE, known).astype(object)
     own = {f.name: getattr(rows, f.name) for f in fields(AttitudeRows)}
     return AttitudeBlock(**own, stretch=np.zeros(n, np.int64), rate_origin=origin, gaps=gaps)
 
@@ -291,7 +308,7 @@ def _with_rates(rows: AttitudeBlock) -> AttitudeBlock:
     Between the steps before and after a row the rate is interpolated linearly; at the ends of
     a stretch it is that of the one step.  A lone attitude has none.
     """
-    if len(rows) < 2 or not np.any(rows.rate_origin != OWN):
+    if len(rows) < 2 or not np.any(np.isin(rows.rate_origin.astype(str), (NONE, DERIVED))):
         return rows
     step_s = np.diff(rows.time_ns) * 1e-9
     joined = np.diff(rows.stretch) == 0

@@ -5,10 +5,10 @@ media types in the OpenAPI document, the links of the console, `acquire history 
 and `acquire export`.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain, islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from service.errors import BadBatch, Fault, NotFound
 from service.extras import require_extra
@@ -22,6 +22,7 @@ MOST_BATCHES = 5_000_000
 
 TableWriter = Callable[[Table], Iterator[bytes]]
 AttitudeWriter = Callable[["AttitudeSeries"], Iterator[bytes]]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -72,12 +73,10 @@ def write_attitudes(name: str, series: "AttitudeSeries") -> Iterator[bytes]:
     written.require(name)
     if series.about.newest_first and not written.any_order:
         raise BadBatch(Fault("order", f"must be oldest for the format {name}", "'newest'"))
-    blocks = iter(series.blocks)
-    # Errors of the database are raised here, and not when part of a file is sent already.
-    first = list(islice(blocks, 1))
-    if not first and not written.may_be_empty:
+    is_empty, blocks = _read_ahead(series.blocks)
+    if is_empty and not written.may_be_empty:
         raise NotFound(f"{series.about.described()}: none, and {written.title} cannot be empty")
-    series = replace(series, blocks=chain(first, blocks))
+    series = replace(series, blocks=blocks)
     if written.write_attitudes is not None:
         return written.write_attitudes(series)
     from service.products.attitude_table import attitude_table
@@ -91,7 +90,18 @@ def write_table(name: str, table: Table) -> Iterator[bytes]:
     written = OUTPUT_FORMATS[name]
     written.require(name)
     assert written.write_table is not None
-    return written.write_table(table)
+    _, pages = _read_ahead(table.pages)
+    return written.write_table(replace(table, pages=pages))
+
+
+def _read_ahead(pages: Iterable[T]) -> tuple[bool, Iterator[T]]:
+    """Whether there is none, and the pages, of which the first is read at once.
+
+    Errors of the database are raised here, and not when part of a file is sent already.
+    """
+    rest = iter(pages)
+    first = list(islice(rest, 1))
+    return not first, chain(first, rest)
 
 
 # Each writer imports its own libraries when it is called: a command that prints help loads none.

@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 
 from service.products.attitudes import AttitudeBlock, AttitudeSeries
+from service.vectors import Vector
 
 _ENCODER = msgspec.json.Encoder()
 
@@ -23,7 +24,9 @@ def write_json(series: AttitudeSeries) -> Iterator[bytes]:
 
 def items(block: AttitudeBlock) -> list[dict[str, object]]:
     """The attitudes of a block as plain objects."""
-    covariance = block.covariance_arcsec2[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    if len(block) and block.revision[0]:
+        return _estimates(block)
+    covariance = _matrices(block)
     known = ~np.isnan(block.rate_deg_per_s[:, 0])
     names = (
         "time", "quaternion", "covariance_arcsec2", "rate_deg_per_s", "rate_origin", "status",
@@ -46,3 +49,34 @@ def items(block: AttitudeBlock) -> list[dict[str, object]]:
         strict=True,
     )
     return [dict(zip(names, row, strict=True)) for row in values]
+
+
+def _estimates(block: AttitudeBlock) -> list[dict[str, object]]:
+    """The filtered or smoothed attitudes of a block as plain objects."""
+    has_bias = ~np.isnan(block.bias_deg_per_h[:, 0])
+    biases = zip(block.bias_deg_per_h.tolist(), has_bias.tolist(), strict=True)
+    columns: dict[str, list[object]] = {
+        "time": block.time.tolist(),
+        "quaternion": block.quaternion.tolist(),
+        "covariance_arcsec2": _matrices(block).tolist(),
+        "rate_deg_per_s": block.rate_deg_per_s.tolist(),
+        "rate_origin": block.rate_origin.tolist(),
+        "status": block.status.tolist(),
+        "method": block.method.tolist(),
+        "residual_rms_arcsec": [None] * len(block),
+        "predicted_rms_arcsec": [None] * len(block),
+        "stretch": block.stretch.tolist(),
+        "batch": [None] * len(block),
+        "id": block.id.tolist(),
+        "model": block.model.tolist(),
+        "revision": block.revision.tolist(),
+        "bias_deg_per_h": [bias if known else None for bias, known in biases],
+        "bias_sigma_deg_per_h": block.bias_sigma_deg_per_h.tolist(),
+    }
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
+def _matrices(block: AttitudeBlock) -> Vector:
+    """The covariances (n, 3, 3) of a block."""
+    places = [0, 1, 2, 1, 3, 4, 2, 4, 5]
+    return np.asarray(block.covariance_arcsec2[:, places].reshape(-1, 3, 3))

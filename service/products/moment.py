@@ -85,8 +85,10 @@ def _interpolated(rows: AttitudeBlock, after: int, moment: Utc) -> AttitudeAt:
     first_ns, second_ns = rows.time_ns[pair].tolist()
     share = (moment.tai_ns - first_ns) / (second_ns - first_ns)
     q = between(rows.quaternion[[after - 1]], rows.quaternion[[after]], np.array([share]))[0]
-    # The errors of the two attitudes are independent.
     one, other = rows.covariance_arcsec2[pair]
+    # The errors of two batches are independent.  Those of a filter's samples are not: whatever
+    # their correlation, the weighted mean of the covariances is no less than that of the mean.
+    weights = (1.0 - share, share) if rows.revision[after] else ((1.0 - share) ** 2, share**2)
     change = float(np.linalg.norm(np.diff(rows.rate_deg_per_s[pair], axis=0))) * 3600.0
     step_s = (second_ns - first_ns) * 1e-9
     offset_s = min((first_ns, second_ns), key=lambda ns: abs(ns - moment.tai_ns)) - moment.tai_ns
@@ -94,10 +96,10 @@ def _interpolated(rows: AttitudeBlock, after: int, moment: Utc) -> AttitudeAt:
         moment.text,
         "interpolated",
         q.tolist(),
-        _matrix((1.0 - share) ** 2 * one + share**2 * other),
+        _matrix(weights[0] * one + weights[1] * other),
         None if np.isnan(change) else change * step_s / 8.0,
         offset_s * 1e-9,
-        [str(each) for each in rows.id[pair]],
+        list(dict.fromkeys(str(each) for each in rows.id[pair])),
     )
 
 

@@ -1,7 +1,6 @@
 """What every picture for the documentation has in common.
 
-matplotlib is imported when a picture is drawn: it is there where the project
-is developed, not where it only runs.
+matplotlib is imported when a picture is drawn: it comes with the extra `plots`.
 """
 
 from collections.abc import Iterator
@@ -9,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from service.errors import Fault, NotAvailable
+from service.extras import require_extra
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,12 +41,9 @@ def pictures_in(path: Path, salt: str) -> Iterator[Folder]:
     `salt` names the parts of the files.  Raises `NotAvailable` where matplotlib
     is not installed.
     """
-    try:
-        import matplotlib as mpl
-    except ImportError:
-        raise NotAvailable(
-            Fault("plots", "needs matplotlib, one of the development packages")
-        ) from None
+    require_extra("plots", "matplotlib", "pictures", str(path))
+    import matplotlib as mpl
+
     path.mkdir(parents=True, exist_ok=True)
     with mpl.rc_context(
         {"svg.hashsalt": salt, "font.size": 9, "axes.grid": True, "grid.alpha": 0.3}

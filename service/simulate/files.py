@@ -21,26 +21,27 @@ def truth_path(telemetry: Path) -> Path:
 def write_pass(drawn: Iterable[DrawnBatch], telemetry: Path) -> int:
     """Write batches (NDJSON, or CSV by the name) and their truth; how many there were.
 
+    NDJSON also gets the gyro blocks, each after its batch.
     Both files appear when they are whole: a pass cut short leaves the old ones.
     """
     count = 0
 
-    def batches() -> Iterator[dict[str, Any]]:
+    def told() -> Iterator[DrawnBatch]:
         nonlocal count
         for each in drawn:
             truth.write(_line(each.truth))
             count += 1
-            yield each.batch
+            yield each
 
     with ExitStack() as stack:
         truth = stack.enter_context(_appearing(truth_path(telemetry)))
         out = stack.enter_context(_appearing(telemetry))
         if telemetry_format(telemetry) == "csv":
             write_batches_csv(
-                (BatchIn.model_validate_json(json.dumps(each)) for each in batches()), out
+                (BatchIn.model_validate_json(json.dumps(each.batch)) for each in told()), out
             )
         else:
-            out.writelines(_line(each) for each in batches())
+            out.writelines(_line(line) for each in told() for line in (each.batch, *each.gyro))
     return count
 
 

@@ -7,7 +7,7 @@ enters it.
 """
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -47,10 +47,14 @@ BAND_A_PRIORI_DEG = 0.1
 
 @dataclass(frozen=True)
 class DrawnBatch:
-    """One batch as it is sent, and what is true of it; both ready for JSON."""
+    """One batch as it is sent, and what is true of it; both ready for JSON.
+
+    `gyro` are gyro blocks that are sent with it.
+    """
 
     batch: dict[str, Any]
     truth: dict[str, Any]
+    gyro: Sequence[dict[str, Any]] = ()
 
 
 def draw_pass(mission: Mission, sky: SkyModel, wanted: Pass) -> Iterator[DrawnBatch]:

@@ -23,11 +23,13 @@ from service.web.api import (
     compare,
     events,
     frames,
+    gyro,
     overview,
     probes,
     products,
     runs,
     spacecraft,
+    webhooks,
     zones,
 )
 from service.web.api import tokens as access
@@ -54,6 +56,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     frames.router,
     spacecraft.router,
     products.router,
+    gyro.router,
     advice.router,
     compare.router,
     zones.router,
@@ -62,6 +65,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     alarms.router,
     annotations.router,
     events.router,
+    webhooks.router,
     access.router,
     probes.router,
 )
@@ -88,6 +92,7 @@ def create_app(app: App, limits: BodyLimits = DEFAULT_LIMITS) -> FastAPI:
         reporting = asyncio.create_task(report_to_supervisor(app))
         try:
             await web_app.state.live.start()
+            app.webhooks.sender.start()
             yield
         finally:
             reporting.cancel()

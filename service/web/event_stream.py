@@ -137,7 +137,8 @@ class Live:
                 continue
             if found:
                 last = found[-1].id
-                lines = b"".join(_told(e) for e in found if _concerns(e, run, spacecraft))
+                named = None if spacecraft is None else (spacecraft,)
+                lines = b"".join(_told(e) for e in found if e.concerns(run, named))
                 if lines:
                     heard_s = clock()
                     yield lines
@@ -218,19 +219,6 @@ class Live:
 
     async def _read(self, ask: Callable[..., T], *arguments: int) -> T:
         return await run_sync(ask, *arguments, limiter=self._threads)
-
-
-def _concerns(event: Event, run: str | None, spacecraft: str | None) -> bool:
-    """Whether an event passes the filters of a stream.
-
-    An event without a run concerns every run, an annotation without a spacecraft every
-    spacecraft.  A replay names no spacecraft: its lines may be about any, and its id gives
-    access to their errors, so it passes only without a filter.
-    """
-    about_all = event.kind == "annotation" and event.spacecraft is None
-    return (event.run is None or run is None or event.run == run) and (
-        spacecraft is None or event.spacecraft == spacecraft or about_all
-    )
 
 
 def _told(event: Event) -> bytes:

@@ -30,6 +30,17 @@ _FLAGS = (
 )
 
 
+_LEFT = (
+    "Inspected target navigated or closed",
+    "Execution context was destroyed.",
+    "Cannot find default execution context",
+)
+
+
+class PageLeft(Exception):
+    """Another page was loaded while an expression was evaluated in this one."""
+
+
 class Browser:
     """One page in a browser of its own; `complaints` holds what its console says."""
 
@@ -79,6 +90,8 @@ class Browser:
         while True:
             heard = json.loads(self._socket.recv(timeout=30))
             if heard.get("id") == number:
+                if heard.get("error", {}).get("message") in _LEFT:
+                    raise PageLeft(heard["error"]["message"])
                 assert "error" not in heard, heard
                 return heard["result"]
             self._note(heard)
@@ -94,6 +107,14 @@ class Browser:
 
     def open(self, url: str, width: int = 1440, height: int = 900, dark: bool = False) -> None:
         """Load a page in a window of that size."""
+        self.show(width, height, dark)
+        self.call("Page.navigate", url=url)
+        self.wait(
+            lambda: self.run("location.href !== 'about:blank' && document.readyState") == "complete"
+        )
+
+    def show(self, width: int = 1440, height: int = 900, dark: bool = False) -> None:
+        """Give the window that size, and the page that scheme, without loading it again."""
         self.call(
             "Emulation.setDeviceMetricsOverride",
             width=width,
@@ -103,14 +124,10 @@ class Browser:
         )
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", features=[scheme])
-        self.call("Page.navigate", url=url)
-        self.wait(
-            lambda: self.run("location.href !== 'about:blank' && document.readyState") == "complete"
-        )
 
-    def picture(self, width: int, height: int) -> bytes:
-        """The page from its top as PNG."""
-        clip = {"x": 0, "y": 0, "width": width, "height": height, "scale": 1}
+    def picture(self, width: int, height: int, top: int = 0) -> bytes:
+        """The page as PNG, from so many pixels below its top."""
+        clip = {"x": 0, "y": top, "width": width, "height": height, "scale": 1}
         taken = self.call(
             "Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=clip
         )
@@ -147,12 +164,19 @@ class Browser:
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
     def wait(self, condition: Any, seconds: float = 30.0) -> None:
-        """Return once the condition holds."""
+        """Return once the condition holds; it does not while another page is being loaded."""
         end = time.monotonic() + seconds
-        while not condition():
+        while not self._holds(condition):
             if time.monotonic() > end:
                 seen = self.run(
                     "[location.href, document.body.innerText.slice(0, 1000)].join(': ')"
                 )
                 raise AssertionError(f"waited in vain at {seen}")
             time.sleep(0.05)
+
+    @staticmethod
+    def _holds(condition: Any) -> bool:
+        try:
+            return bool(condition())
+        except PageLeft:
+            return False

@@ -104,8 +104,12 @@ def walk(client: httpx.Client, app: App) -> Json:
     _alarm(client, take)
     take("list_attitudes", client.get(f"{API}/spacecraft/SWAS/attitudes"), "one")
     take("get_attitude", client.get(f"{API}/spacecraft/SWAS/attitude"), "one")
+    moment = f"{API}/spacecraft/SWAS/attitude/at?status=all&method=nearest"
+    take("get_attitude_at", client.get(f"{moment}&time=1999-060T00:00:05Z"), "nearest")
+    take("get_attitude_at", client.get(f"{moment}&time=1999-061T00:00:00Z"), "none")
     take("list_rates", client.get(f"{API}/spacecraft/XTE/rates"), "one_hour")
 
+    _gyro(client, take)
     history = f"{API}/spacecraft/XTE/history"
     take("get_history", client.get(f"{history}?quantity=residual_ratio&size=10"), "one_bucket")
     latest = client.get(f"{history}?strategy=latest&quantity=ambiguous_share&size=1")
@@ -134,6 +138,7 @@ def walk(client: httpx.Client, app: App) -> Json:
 
     take("list_audit", client.get(f"{API}/audit"), "two_changes")
     _annotation(client, take)
+    _webhook(client, take)
     take("cancel_replay", client.delete(begun.headers["Location"]), "ended_already")
     # The same batch again and again: it is cancelled long before its end.
     content = gzip.compress(f"{json.dumps(xte)}\n".encode() * 100_000)
@@ -192,6 +197,58 @@ def _annotation(client: httpx.Client, take: Any) -> None:
     note = f"{here}/{written['id']}?who=J.%20Operator"
     take("delete_annotation", client.delete(note), "deleted")
     take("delete_annotation", client.delete(note), "deleted_before")
+
+
+def _gyro(client: httpx.Client, take: Any) -> None:
+    here = f"{API}/spacecraft/XTE/gyro"
+    rates = [[1.1e-3, -2e-5, 0.0], [1.1e-3, -3e-5, 1e-5], [1.2e-3, -2e-5, 0.0]]
+    asked: Json = {"block": "1999-060-g1", "start": "1999-03-01T00:00:00.000Z", "step_s": 0.1}
+    asked["rates_rad_per_s"] = rates
+    first = take("submit_gyro", client.post(here, json=asked), "step", asked)
+    take("submit_gyro", client.post(here, json=asked), "again")
+    take("submit_gyro", client.post(here, json=asked | {"step_s": 0.2}), "another_body")
+    late: Json = {"block": "1999-060-g2", "start": "1999-03-01T00:00:00.300Z"}
+    late |= {"times_s": [0.0, 0.1, 0.25], "rates_rad_per_s": rates}
+    take("submit_gyro", client.post(here, json=late), "times", late)
+    overlapping = late | {"block": "1999-060-g3", "start": "1999-03-01T00:00:00.200Z"}
+    take("submit_gyro", client.post(here, json=overlapping), "sample_of_another_block")
+    degrees = late | {"block": "1999-060-g4", "rates_rad_per_s": [[0.0, 100.0, 0.0]] * 3}
+    take("submit_gyro", client.post(here, json=degrees), "another_unit")
+    take("list_gyro", client.get(here), "two_blocks")
+    take("get_gyro", client.get(f"{here}/{first['id']}"), "three_samples")
+
+
+def _webhook(client: httpx.Client, take: Any) -> None:
+    """A receiver whose name is unknown (RFC 2606), so that a walk sends nothing anywhere."""
+    here = f"{API}/webhooks"
+    asked = {
+        "name": "pager",
+        "url": "https://receiver.invalid/acquire",
+        "kinds": ["alarm"],
+        "severity": "warning",
+    }
+    added = take("add_webhook", client.post(here, json=asked), "alarms", asked)
+    inside = asked | {"url": "https://169.254.169.254/latest/meta-data"}
+    take("add_webhook", client.post(here, json=inside), "not_a_public_address")
+    take("list_webhooks", client.get(here), "one")
+    webhook = f"{here}/{added['id']}"
+    take("test_webhook", client.post(f"{webhook}/test"), "unknown_name")
+    hours = {"previous_hours": 24}
+    rotated = client.post(f"{webhook}/secret", json=hours)
+    take("rotate_webhook_secret", rotated, "new_secret", hours)
+    every = asked | {"kinds": None, "spacecraft": ["XTE"], "run": "*", "enabled": False}
+    take("change_webhook", client.put(webhook, json=every), "paused", every)
+    take("test_webhook", client.post(f"{webhook}/test"), "paused")
+    period = {"since": "1999-03-01T00:00:00.000Z", "until": "1999-03-02T00:00:00.000Z"}
+    replayed = client.post(f"{webhook}/replay", json=period)
+    take("replay_events", replayed, "none_in_the_period", period)
+    every_letter: Json = {"events": None}
+    retried = client.post(f"{webhook}/retry", json=every_letter)
+    take("retry_dead_letters", retried, "none_is_dead", every_letter)
+    take("list_webhook_deliveries", client.get(f"{webhook}/deliveries"), "none_waits")
+    take("get_webhook", client.get(webhook), "paused")
+    take("delete_webhook", client.delete(webhook), "deleted")
+    take("get_webhook", client.get(webhook), "unknown")
 
 
 def _sign_in(client: httpx.Client, app: App, take: Any) -> None:

@@ -29,6 +29,7 @@ PATH_PARAMETERS = {
     "run": "pass-7",
     "quantity": "ambiguous_share",
     "slug": "bad-input",
+    "kind": "batches",
 }
 OPEN_BESIDE_THE_ROUTES = {"/static", "/api/v1/openapi.json"}
 """What `docs/access.md` says is open, of what no policy is asked about."""

@@ -16,7 +16,12 @@ def test_it_tells_what_the_batches_of_a_run_say(client, full_run):
     query = {"run": full_run, "sample": 10, "tolerance": "separation_deg=0.01"}
     advice = client.get(f"{API}/spacecraft/XTE/advice", params=query).json()
     assert (advice["batches_in_range"], advice["batches_sampled"]) == (20, 10)
-    assert [each["symbol"] for each in advice["tolerances"]] == ["SEPTOL", "XMTOL", "CAPMAX"]
+    assert [each["symbol"] for each in advice["tolerances"]] == [
+        "SEPTOL",
+        "XMTOL",
+        "TMAGMX",
+        "CAPMAX",
+    ]
     tried = {(each["name"], each["identifier"]) for each in advice["tried"]}
     assert ("present settings", "verified") in tried
     assert ("separation_deg = 0.01, asked for", "starid") in tried
@@ -25,7 +30,7 @@ def test_it_tells_what_the_batches_of_a_run_say(client, full_run):
 def test_a_band_has_its_own_tolerances(client, full_run):
     advice = client.get(f"{API}/spacecraft/SOHO/advice", params={"run": full_run}).json()
     symbols = [each["symbol"] for each in advice["tolerances"]]
-    assert symbols == ["SEPTOL", "XMTOL", "BANMAX", "BANTOL1", "BANTOL2"]
+    assert symbols == ["SEPTOL", "XMTOL", "TMAGMX", "BANMAX", "BANTOL1", "BANTOL2"]
 
 
 def test_without_batches_nothing_is_advised(client):

@@ -1,11 +1,14 @@
 """Annotations over HTTP: what people write, who may, and what the records keep of it."""
 
+import re
+
 import httpx
 import pytest
 
 from service.app.factory import open_app
 from service.settings import Settings
 from service.web.app import create_app
+from tests.web.markup import Markup
 from tests.web.serving import Server
 from tests.web.test_access import Guarded, shown
 
@@ -141,6 +144,38 @@ def test_a_note_survives_a_restart_and_is_text_on_the_page(chosen_database, draw
     assert "<i>jb" not in page
 
 
+def test_a_page_lists_the_notes_of_every_spacecraft_by_spacecraft_and_period(client):
+    ids = [
+        client.post(HERE, json=NOTE | each).json()["id"]
+        for each in (
+            {"text": "<b>old</b> note", "end": END},
+            {"text": "of SWAS", "spacecraft": "SWAS", "start": END},
+            {"text": "of all", "spacecraft": None, "start": END},
+        )
+    ]
+
+    def listed(**query):
+        page = client.get("/annotations", params=query).raise_for_status().text
+        Markup(page)
+        return re.findall(r'<td class="text" data-name="text">(.*?)</td>', page)
+
+    try:
+        old, swas, every = "&lt;b&gt;old&lt;/b&gt; note", "of SWAS", "of all"
+        assert listed() == [every, swas, old]
+        assert listed(spacecraft="XTE") == [every, old]
+        assert listed(start=END) == [every, swas, old]
+        assert listed(end=END) == [old]
+        assert listed(start="1999-060T00:21:00Z", end="") == []
+        assert client.get("/annotations?start=noon").status_code == 422
+        page = client.get("/annotations").text
+        around = "start=1999-02-28T23%3A30%3A00.000Z&amp;end=1999-03-01T00%3A50%3A00.000Z"
+        assert f'href="/spacecraft/XTE?{around}"' in page
+    finally:
+        for id in ids:
+            client.delete(f"{HERE}/{id}?who=jb").raise_for_status()
+    assert "No annotations yet" in client.get("/annotations").text
+
+
 def test_a_token_signs_with_its_name_and_one_bound_to_spacecraft_writes_about_these(
     chosen_database,
 ):
@@ -163,6 +198,9 @@ def test_a_token_signs_with_its_name_and_one_bound_to_spacecraft_writes_about_th
         assert client.get(HERE, headers=bound).status_code == 403
         listed = client.get(HERE, params={"spacecraft": "SWAS"}, headers=bound).json()["items"]
         assert [each["id"] for each in listed] == [own.json()["id"], of_all["id"]]
+        page = client.get("/annotations", headers=bound).text
+        assert page.count('data-name="text"') == 2
+        assert client.get("/annotations?spacecraft=XTE", headers=bound).status_code == 403
         for note, status in ((written.json(), 404), (of_all, 403), (own.json(), 200)):
             answer = client.delete(f"{HERE}/{note['id']}", headers=bound)
             assert answer.status_code == status

@@ -7,8 +7,8 @@ from service.app.factory import open_app
 from service.settings import Settings
 from service.web.app import create_app
 from tests.web.browser import CHROMIUM, Browser
+from tests.web.fitting import faults
 from tests.web.serving import Server
-from tests.web.test_fleet_in_browser import AXE, FAULTS
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
 
@@ -80,8 +80,7 @@ def test_a_note_by_keyboard_is_marked_on_the_charts_of_every_reader(browser, oth
     assert browser.run(VALUE.format("text")) == ""
     assert "by J. Operator" in browser.run("document.querySelector('[data-annotation]').innerText")
     for each in (browser, other_browser):
-        each.run(AXE + ";0")
-        assert each.run(FAULTS) == []
+        assert faults(each) == []
         assert each.run("document.documentElement.scrollWidth <= innerWidth")
         assert each.complaints == []
 

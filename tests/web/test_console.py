@@ -470,6 +470,8 @@ def test_values_are_written_with_their_units():
     assert formatting.number(-0.5) == "−0.50"
     assert formatting.number(math.nan) == "–"
     assert formatting.age(3725) == f"1{thin}h 2{thin}min"
+    assert formatting.age(3 * 86400 + 7200) == f"3{thin}d 2{thin}h"
+    assert formatting.age(300 * 86400 + 7200) == f"300{thin}d"
     assert formatting.age(None) == "–"
     assert formatting.count(1234567) == f"1{thin}234{thin}567"
     assert formatting.with_day_of_year("1998-12-31T23:59:60.000Z") == "1998-12-31 (365) 23:59:60"

@@ -4,7 +4,6 @@ import json
 import re
 import time
 from itertools import combinations, count
-from pathlib import Path
 
 import httpx
 import pytest
@@ -13,16 +12,11 @@ from service.app.factory import open_app
 from service.settings import Settings
 from service.web.app import create_app
 from tests.web.browser import CHROMIUM, Browser
-from tests.web.console_pages import console_addresses
+from tests.web.fitting import assert_fits, faults
 from tests.web.serving import Server
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
 
-AXE = (Path(__file__).parent / "axe" / "axe.min.js").read_text(encoding="utf-8")
-SERIOUS = """axe.run(document, {resultTypes: ["violations"], runOnly: ["wcag2a", "wcag2aa",
-    "wcag21a", "wcag21aa", "best-practice"]}).then(found => found.violations
-    .filter(each => ["serious", "critical"].includes(each.impact))
-    .map(each => [each.id, each.nodes.map(node => node.html).slice(0, 3)]))"""
 CONNECTED = "document.getElementById('connection')?.dataset.state === 'live'"
 DRAWN = "document.getElementById('charts')?.dataset.drawn !== undefined"
 
@@ -63,7 +57,6 @@ def pages(client, full_run):
         "items"
     ]
     return [
-        *(f"{name}?run={full_run}" for name in console_addresses()),
         "/?run=nobody",
         f"/compare?run={full_run}&spacecraft=XTE&a.identifier=starid&b.identifier=verified",
         "/batches/nothing",
@@ -72,16 +65,10 @@ def pages(client, full_run):
     ]
 
 
-def test_every_page_fits_can_be_read_and_has_no_serious_fault(browser, address, pages):
-    """Wide and narrow, light and dark: no complaint, nothing beyond the edge, axe content."""
+def test_pages_of_a_batch_and_of_what_is_not_there_fit_and_have_no_fault(browser, address, pages):
+    """Pages that need no id are looked at in `test_pages_in_browser`."""
     for page in pages:
-        for width, dark in ((1440, False), (400, True)):
-            browser.open(f"{address}{page}", width=width, dark=dark)
-            if page.startswith("/spacecraft/XTE?"):
-                browser.wait(lambda: browser.run(DRAWN))
-            assert browser.run("document.documentElement.scrollWidth") <= width, page
-            browser.run(AXE + ";0")
-            assert browser.run(SERIOUS) == [], (page, width, dark)
+        assert_fits(browser, f"{address}{page}")
     missing = [each for each in browser.complaints if "404" not in each]
     assert missing == []
     browser.complaints.clear()
@@ -492,8 +479,7 @@ def test_a_shift_from_the_overview_to_the_star_and_the_alarm(browser, address, c
     browser.wait(lambda: browser.run("document.querySelector('[data-act=acknowledge]').disabled"))
     for page in (browser.run("location.pathname"), f"/alarms?run={run}&state=all"):
         browser.open(f"{address}{page}")
-        browser.run(AXE + ";0")
-        assert browser.run(SERIOUS) == []
+        assert faults(browser) == []
     assert browser.complaints == []
 
 

@@ -8,8 +8,8 @@ from service.settings import Settings
 from service.web.app import create_app
 from tests.web import fleet
 from tests.web.browser import CHROMIUM, Browser
+from tests.web.fitting import faults
 from tests.web.serving import Server
-from tests.web.test_fleet_in_browser import AXE, FAULTS
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
 
@@ -58,8 +58,7 @@ def test_a_preview_tells_and_draws_what_a_changed_limit_would_have_done(browser,
         chart = "document.querySelector('#preview-unmatched_share .chart')"
         assert "times out of these limits: 1" in browser.run(f"{chart}.getAttribute('aria-label')")
         assert browser.run("document.documentElement.scrollWidth") <= width
-        browser.run(AXE + ";0")
-        assert browser.run(FAULTS) == [], (width, dark)
+        assert faults(browser) == [], (width, dark)
     here = f"{fleet_address}/api/v1/spacecraft/{name}/limits/unmatched_share"
     assert httpx.get(here).json()["history"] == []
     assert browser.complaints == []

@@ -9,8 +9,8 @@ from service.web.app import create_app
 from tests.web import fleet
 from tests.web.browser import CHROMIUM, Browser
 from tests.web.console_pages import console_addresses
+from tests.web.fitting import assert_fits
 from tests.web.serving import Server
-from tests.web.test_fleet_in_browser import AXE, FAULTS
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
 
@@ -60,9 +60,5 @@ def pages(request, browser, tmp_path, drawn):
 
 def test_every_page_fits_and_axe_finds_nothing(browser, pages):
     for page in pages:
-        for width, dark in ((1440, False), (400, True)):
-            browser.open(page, width=width, dark=dark)
-            assert browser.run("document.documentElement.scrollWidth") <= width, page
-            browser.run(AXE + ";0")
-            assert browser.run(FAULTS) == [], (page, width, dark)
+        assert_fits(browser, page)
     assert browser.complaints == []

@@ -17,7 +17,12 @@ from service.access.tokens import add_token, new_secret
 from service.app.factory import open_app
 from service.cli import main
 from service.products import formats
-from service.products.formats import OUTPUT_FORMATS, OutputFormat, attitude_formats
+from service.products.formats import (
+    OUTPUT_FORMATS,
+    OutputFormat,
+    attitude_formats,
+    table_formats,
+)
 from service.settings import Settings
 from service.storage.recording.ids import unguessable_ulid
 from service.times import utc_now
@@ -26,6 +31,8 @@ from service.web.requests import exports
 from tests.web.serving import Server
 
 ROUTE = "/api/v1/spacecraft/XTE/attitude"
+TABLES = "/api/v1/spacecraft/XTE/tables"
+MOMENT = "1996-01-10T12:00:00Z"
 
 
 def table_of(text):
@@ -211,6 +218,94 @@ def test_the_console_links_the_attitudes_of_the_range_in_every_format(client, fu
     for name in ("json", "aem"):
         assert httpx.URL(shown[name]).params["run"] == full_run
         assert client.get(shown[name]).status_code == 200
+
+
+def test_the_console_links_the_tables_of_the_range(client, full_run):
+    page = client.get("/spacecraft/XTE", params={"run": full_run}).text
+    for kind in ("batches", "stars"):
+        found = re.findall(rf'href="([^"]+/tables/{kind}\?[^"]+)"', page)
+        links = {httpx.URL(html.unescape(each)) for each in found}
+        assert {each.params["format"] for each in links} == set(table_formats())
+        for each in links:
+            assert client.get(each).status_code == 200
+
+
+# ---- tables and the attitude at a moment ---------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["batches", "stars"])
+def test_a_table_is_what_the_command_writes(app, client, full_run, tmp_path, capsysbinary, kind):
+    where = ["--spacecraft", "XTE", "--run", full_run, "--database", app.settings.database]
+    assert main(["export", kind, *where]) == 0
+    answer = client.get(f"{TABLES}/{kind}", params={"run": full_run})
+    assert answer.content == capsysbinary.readouterr().out
+    assert answer.headers["Content-Disposition"] == (
+        f'attachment; filename="XTE-{full_run}-{kind}.csv"'
+    )
+    rows = table_of(answer.text)
+    file = tmp_path / "table.parquet"
+    asked = {"run": full_run, "format": "parquet"}
+    file.write_bytes(client.get(f"{TABLES}/{kind}", params=asked).content)
+    assert pyarrow.parquet.read_table(file)["id"].to_pylist() == [each["id"] for each in rows]
+
+
+def test_a_table_holds_the_batches_of_the_period(client, full_run):
+    of_run = {"run": full_run, "spacecraft": "XTE", "limit": 500}
+    listed = client.get("/api/v1/batches", params=of_run).json()["items"]
+    times = sorted(each["time"] for each in listed)
+    asked = {"run": full_run, "start": times[3], "end": times[-2]}
+    rows = table_of(client.get(f"{TABLES}/batches", params=asked).text)
+    assert [each["time"] for each in rows] == times[3:-2]
+
+
+@pytest.mark.parametrize(
+    ("path", "asked", "field", "value"),
+    [
+        (f"{TABLES}/planets", {}, "kind", "'planets'"),
+        (f"{TABLES}/stars", {"format": "json"}, "format", "'json'"),
+        (f"{TABLES}/stars", {"format": "aem"}, "format", "'aem'"),
+        (f"{TABLES}/stars", {"end": "noon"}, "end", "'noon'"),
+        (f"{TABLES}/stars", {"order": "newest"}, "order", "'newest'"),
+        (f"{ROUTE}/at", {}, "time", None),
+        (f"{ROUTE}/at", {"time": "noon"}, "time", "'noon'"),
+        (f"{ROUTE}/at", {"time": MOMENT, "method": "best"}, "method", "'best'"),
+        (f"{ROUTE}/at", {"time": MOMENT, "largest_gap_s": "-1"}, "largest_gap_s", "'-1'"),
+        (f"{ROUTE}/at", {"time": MOMENT, "end": MOMENT}, "end", f"'{MOMENT}'"),
+    ],
+)
+def test_a_bad_parameter_of_a_table_or_a_moment_is_named(client, path, asked, field, value):
+    answer = client.get(path, params=asked)
+    assert answer.status_code == 422
+    (fault,) = answer.json()["errors"]
+    assert (fault["field"], fault.get("value")) == (field, value)
+
+
+def test_a_table_with_more_batches_than_its_format_takes_is_refused(client, full_run, monkeypatch):
+    few = dataclasses.replace(OUTPUT_FORMATS["fits"], most_batches=5)
+    monkeypatch.setitem(OUTPUT_FORMATS, "fits", few)
+    answer = client.get(f"{TABLES}/stars", params={"run": full_run, "format": "fits"})
+    assert answer.status_code == 422
+    assert "more than the 5 batches" in answer.json()["detail"]
+
+
+def test_tables_and_moments_of_an_unknown_spacecraft_are_not_found(client):
+    for path in ("tables/stars", f"attitude/at?time={MOMENT}"):
+        assert client.get(f"/api/v1/spacecraft/NOPE/{path}").status_code == 404
+
+
+def test_the_attitude_at_a_moment_is_that_of_the_series(client, full_run):
+    items = client.get(ROUTE, params={"run": full_run}).json()["items"]
+    first = items[0]
+    found = client.get(f"{ROUTE}/at", params={"run": full_run, "time": first["time"]}).json()
+    assert found["ids"] == [first["id"]]
+    assert found["quaternion"] == first["quaternion"]
+    assert (found["offset_s"], found["motion_arcsec"]) == (0.0, 0.0)
+
+
+def test_a_moment_outside_every_stretch_is_not_found(client, full_run):
+    answer = client.get(f"{ROUTE}/at", params={"run": full_run, "time": "2090-01-01T00:00:00Z"})
+    assert answer.status_code == 404
+    assert "none is within the largest gap (60 s)" in answer.json()["detail"]
 
 
 # ---- how many at once ----------------------------------------------------------------------------

@@ -20,9 +20,10 @@ def add(commands: Any) -> None:
     parser = add_command(
         commands,
         "advise",
-        "Recommend settings of a mission from recorded batches: tolerances that are too tight "
-        "or too wide, the trackers' noise, magnitudes and alignment, the outcomes with other "
-        "settings, and the lines to change in the mission file.  Changes nothing.",
+        "Recommend settings of a mission from recorded batches: the size of its zone, tolerances "
+        "that are too tight or too wide, the trackers' noise, magnitudes and alignment, the "
+        "outcomes with other settings, and the lines to change in the mission file.  Changes "
+        "nothing.",
         """
         acquire advise --spacecraft XTE
         acquire advise --spacecraft XTE --start 1996-010T00:00:00Z --end 1996-020T00:00:00Z
@@ -57,6 +58,7 @@ def run(parsed: Namespace) -> int:
     import msgspec
     from tqdm import tqdm
 
+    from service.advice.zone_statements import zone_statements
     from service.app.factory import open_app
     from service.cli.advice_text import advice_text
     from service.missions.mission import load_missions, mission_named
@@ -64,7 +66,7 @@ def run(parsed: Namespace) -> int:
 
     start, end = period_of(parsed)
     tolerances = tolerances_from_text(parsed.tolerance, "--try")
-    mission_named(load_missions(settings_of(parsed).missions), parsed.spacecraft)
+    mission = mission_named(load_missions(settings_of(parsed).missions), parsed.spacecraft)
     app = open_app(settings_of_existing(parsed))
     try:
         with tqdm(
@@ -79,10 +81,11 @@ def run(parsed: Namespace) -> int:
                 tolerances=tolerances,
                 step=bar.update,
             )
+        zone = zone_statements(mission, *app.zones.size(parsed.spacecraft, parsed.run))
     finally:
         app.close()
     if parsed.json:
         print_json(msgspec.to_builtins(advice))
     else:
-        print(advice_text(advice))
+        print(advice_text(advice, zone))
     return 0

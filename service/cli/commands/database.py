@@ -1,6 +1,8 @@
 """`acquire database`: the records as a whole."""
 
 from argparse import Namespace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ def add(commands: Any) -> None:
         """
         acquire database upgrade --database postgresql+psycopg://user@host/attitudes
         acquire database backup night.db
+        acquire database restore night.db --database sqlite:///again.db
         acquire database verify
         """,
     )
@@ -60,9 +63,23 @@ def add(commands: Any) -> None:
     add_database(parser)
     parser = add_command(
         group,
+        "restore",
+        "Make a database from a backup: a SQLite file that does not exist yet, or an empty "
+        "PostgreSQL database.  It appears whole or not at all, with the schema that it had.",
+        """
+        acquire database restore night.db --database sqlite:///acquire.db
+        acquire database restore night.dump --database postgresql://user@host/attitudes
+        """,
+        restore,
+    )
+    parser.add_argument("backup", type=Path, metavar="FILE", help="of `acquire database backup`")
+    add_database(parser)
+    parser = add_command(
+        group,
         "verify",
         "Read everything and report faults: the file, the schema, every batch with its results, "
-        "the trends.  Exit code 1 if there is a fault.  Changes nothing.",
+        "the trends, the gyro blocks, the filtered and smoothed attitudes.  Exit code 1 if there "
+        "is a fault.  Changes nothing.",
         """
         acquire database verify
         acquire database verify --database sqlite:///night.db
@@ -92,8 +109,9 @@ def _add_prune(group: Any) -> None:
     parser = add_command(
         group,
         "prune",
-        "Delete the batches before a time, with their results and their part in the trends, "
-        "also while the service is running.  This cannot be undone: make a backup first.",
+        "Delete the batches before a time, with their results and their part in the trends, and "
+        "the gyro blocks and days of filtered attitudes that end before it, also while the service "
+        "is running.  This cannot be undone: make a backup first.",
         """
         acquire database prune --before 1996-01-01T00:00:00Z --dry-run
         acquire database prune --before 1996-001T00:00:00Z --run pass-7
@@ -135,19 +153,39 @@ def check(parsed: Namespace) -> int:
 
 def backup(parsed: Namespace) -> int:
     """Copy the database."""
-    from tqdm import tqdm
-
     from service.storage.upkeep.backup import back_up
 
-    with tqdm(total=None, unit=" pages", desc="copying", disable=None, leave=False) as bar:
+    with _pages("copying") as step:
+        back_up(settings_of(parsed).database, parsed.output, step)
+    print(f"{parsed.output}: {parsed.output.stat().st_size} bytes")
+    return 0
+
+
+def restore(parsed: Namespace) -> int:
+    """Make a database from a backup."""
+    from service.storage.sql.migrations import HEAD
+    from service.storage.upkeep.restore import restore as restore_backup
+
+    with _pages("restoring") as step:
+        revision = restore_backup(settings_of(parsed).database, parsed.backup, step)
+    print(f"{parsed.backup}: restored; its schema is at {revision}")
+    if revision != HEAD:
+        print(f"this version needs {HEAD}: run `acquire database upgrade`")
+    return 0
+
+
+@contextmanager
+def _pages(what: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar of a database's pages."""
+    from tqdm import tqdm
+
+    with tqdm(total=None, unit=" pages", desc=what, disable=None, leave=False) as bar:
 
         def step(left: int, total: int) -> None:
             bar.total = total
             bar.update(total - left - bar.n)
 
-        back_up(settings_of(parsed).database, parsed.output, step)
-    print(f"{parsed.output}: {parsed.output.stat().st_size} bytes")
-    return 0
+        yield step
 
 
 def verify(parsed: Namespace) -> int:
@@ -216,7 +254,16 @@ def prune(parsed: Namespace) -> int:
     finally:
         store.close()
     if parsed.dry_run:
-        print(f"{pruned.total} batches are before {before.text}; nothing was deleted")
+        more = _beside(pruned.total_gyro_blocks, pruned.total_graded_days)
+        print(f"{pruned.total} batches{more} are before {before.text}; nothing was deleted")
     else:
-        print(f"{pruned.batches} batches before {before.text} were deleted")
+        more = _beside(pruned.gyro_blocks, pruned.graded_days)
+        print(f"{pruned.batches} batches{more} before {before.text} were deleted")
     return 0
+
+
+def _beside(gyro_blocks: int, graded_days: int) -> str:
+    """What to say of gyro blocks and graded days beside batches, if there are any."""
+    told = [f"{gyro_blocks} gyro blocks"] if gyro_blocks else []
+    told += [f"{graded_days} days of filtered attitudes"] if graded_days else []
+    return "".join(f" and {each}" for each in told)

@@ -4,6 +4,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
+from service.cli import mission_estimate
 from service.cli.arguments import add_command, add_group, add_json, print_json
 from service.errors import BadConfiguration
 
@@ -17,7 +18,7 @@ def add(commands: Any) -> None:
     group = add_group(
         commands,
         "mission",
-        "Mission files: check one before the service uses it.",
+        "Mission files: check one before the service uses it, and estimate its zones.",
         "acquire mission check missions/mine.toml",
     )
     parser = add_command(
@@ -41,6 +42,7 @@ def add(commands: Any) -> None:
         "--picture", type=Path, metavar="OUT.svg", help="draw the zones and their pairs, as SVG"
     )
     add_json(parser, "findings and counts")
+    mission_estimate.add(group)
 
 
 def check(parsed: Namespace) -> int:

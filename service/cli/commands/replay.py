@@ -18,6 +18,7 @@ from service.errors import BadFile, BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
     from service.packets.reader import PacketReader
+    from service.replay.from_file import FromFile
 
 DEFAULT_CONCURRENCY = 4
 CSV_HELP = """\
@@ -37,8 +38,8 @@ def add(commands: Any) -> None:
     parser = add_command(
         commands,
         "replay",
-        "Send files of batches (NDJSON, or CSV if the name ends in .csv) to the service.  You "
-        "can send a file twice: batches that are already recorded are not recorded again.",
+        "Send files of batches and gyro blocks (NDJSON, or CSV if the name ends in .csv) to the "
+        "service.  You can send a file twice: what is already recorded is not recorded again.",
         """
         acquire replay pass.ndjson
         acquire replay pass.csv --in-process --run trial --results answers.ndjson
@@ -46,6 +47,7 @@ def add(commands: Any) -> None:
         acquire replay pass.ndjson --speed 60          one minute of telemetry per second
         acquire replay pass.ndjson --carry-attitude    use each attitude as the next a priori
         acquire replay pass.ndjson --a-priori xte.aem  use the attitudes of a file as a priori
+        acquire replay pass.ndjson --ephemeris xte.oem  use the velocities of a file
         acquire replay --packets pass.dat --xtce mission.xml     CCSDS space packets
         """,
         run,
@@ -87,6 +89,16 @@ def add(commands: Any) -> None:
         "batch by batch. Without these options the service receives whole files, which is "
         "faster",
     )
+    _add_knowledge(parser)
+    parser.add_argument(
+        "--progress", action="store_true", help="show the progress bar even without a terminal"
+    )
+    add_json(parser, "the counts")
+    add_database(parser)
+
+
+def _add_knowledge(parser: ArgumentParser) -> None:
+    """Declare the arguments that add something to each batch."""
     source = parser.add_mutually_exclusive_group()
     source.add_argument(
         "--a-priori",
@@ -102,10 +114,12 @@ def add(commands: Any) -> None:
         "propagated with the body rates; one batch at a time",
     )
     parser.add_argument(
-        "--progress", action="store_true", help="show the progress bar even without a terminal"
+        "--ephemeris",
+        type=Path,
+        metavar="FILE",
+        help="give each batch without velocity_km_per_s or position_km those of a file for its "
+        "time: an OEM (KVN or XML), or two-line element sets (TLE)",
     )
-    add_json(parser, "the counts")
-    add_database(parser)
 
 
 def _add_packets(parser: ArgumentParser) -> None:
@@ -133,9 +147,7 @@ def run(parsed: Namespace) -> int:
     """Send files through the service and print what became of them."""
     from msgspec import to_builtins
 
-    from service.products.reading.files import read_attitudes
     from service.replay.carry_attitude import AttitudeCarrier
-    from service.replay.file_prior import FilePrior
     from service.replay.items import Pace, items_of, packet_items, run_name
     from service.replay.summary import ReplaySummary
 
@@ -145,10 +157,9 @@ def run(parsed: Namespace) -> int:
     in_bulk = _is_in_bulk(parsed)
     reader = _packet_reader(parsed) if parsed.packets and not in_bulk else None
     items = items_of(files, run) if reader is None else packet_items(reader, files, run)
-    prior = None
-    if parsed.a_priori is not None:
-        prior = FilePrior(read_attitudes(parsed.a_priori, "--a-priori"))
-        items = map(prior.prepared, items)
+    sources = _sources(parsed)
+    for source in sources:
+        items = map(source.prepared, items)
     sized = [] if parsed.packets else files
     progress = True if parsed.progress else None
     carrier = AttitudeCarrier() if parsed.carry_attitude else None
@@ -174,7 +185,6 @@ def run(parsed: Namespace) -> int:
             raise BadInput(Fault("--database", message, shown_value(parsed.database)))
         token = settings_of(parsed).token
         with ReplaySummary(sized, parsed.results, progress) as summary:
-            watched = run if parsed.alarms else None
             if not in_bulk:
                 many = parsed.concurrency or DEFAULT_CONCURRENCY
                 replay_over_http(
@@ -184,7 +194,7 @@ def run(parsed: Namespace) -> int:
                     pace,
                     many,
                     token=token,
-                    watched_run=watched,
+                    watched_run=run if parsed.alarms else None,
                     carrier=carrier,
                 )
             else:
@@ -195,20 +205,35 @@ def run(parsed: Namespace) -> int:
                     summary.add,
                     summary.follow,
                     token=token,
-                    query=_query(parsed),
+                    alarms=parsed.alarms,
+                    spacecraft=parsed.spacecraft,
                     xtce=parsed.xtce,
                 )
     if reader is not None:
         summary.packets = to_builtins(reader.totals())
     if parsed.json:
-        given = {} if prior is None else {"a_priori_from_file": prior.given}
+        given = {source.key: source.given for source in sources}
         print_json({"run": run, **summary.counts(), **given})
     else:
         print(f"{'run':<20}{run}")
         print(summary.table())
-        if prior is not None:
-            print(f"{'a priori of file':<20}{prior.given:,} batches")
+        for source in sources:
+            print(f"{source.title:<20}{source.given:,} batches")
     return 1 if summary.refused else 0
+
+
+def _sources(parsed: Namespace) -> list["FromFile"]:
+    """The files that add something to each batch."""
+    from service.products.reading.ephemerides import read_ephemeris
+    from service.products.reading.files import read_attitudes
+    from service.replay.from_file import FileEphemeris, FilePrior
+
+    sources: list[FromFile] = []
+    if parsed.a_priori is not None:
+        sources.append(FilePrior(read_attitudes(parsed.a_priori, "--a-priori")))
+    if parsed.ephemeris is not None:
+        sources.append(FileEphemeris(read_ephemeris(parsed.ephemeris, "--ephemeris")))
+    return sources
 
 
 def _is_in_bulk(parsed: Namespace) -> bool:
@@ -217,18 +242,11 @@ def _is_in_bulk(parsed: Namespace) -> bool:
         parsed.in_process
         or parsed.carry_attitude
         or parsed.a_priori
+        or parsed.ephemeris
         or parsed.results
         or parsed.speed
         or parsed.concurrency
     )
-
-
-def _query(parsed: Namespace) -> dict[str, str]:
-    """The parameters of an upload beside its run."""
-    query = {"alarms": "true"} if parsed.alarms else {}
-    if parsed.spacecraft is not None:
-        query["spacecraft"] = parsed.spacecraft
-    return query
 
 
 def _checked_files(parsed: Namespace) -> list[Path]:

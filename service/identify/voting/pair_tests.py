@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from service.compiled.jit import njit_no_refcount
+from service.compiled.jit import njit_inlined, njit_no_refcount
 from service.identify.identification import Outcome
 from service.identify.voting.fov_rotation import rotation_rad
 from service.sky.geometry.pairs import separation_rad
@@ -141,7 +141,7 @@ def cast_votes(sighted, zone, polar, bounds, rules, ballots):  # type: ignore[no
     return compared
 
 
-@njit_no_refcount
+@njit_inlined
 def _observed_pair(sighted, i, j, axis, rules):  # type: ignore[no-untyped-def]
     direction, magnitude = sighted.direction, sighted.magnitude
     n0 = direction[i, 1] * direction[j, 2] - direction[i, 2] * direction[j, 1]
@@ -168,7 +168,7 @@ def _observed_pair(sighted, i, j, axis, rules):  # type: ignore[no-untyped-def]
     )
 
 
-@njit_no_refcount
+@njit_inlined
 def _order_of(sighted, zone, polar, bounds, rules, pair, cross_square, a, b):  # type: ignore[no-untyped-def]
     """LORD of a candidate pair: 1 when i goes with a and j with b, -1 the other way round.
 
@@ -217,7 +217,7 @@ def _order_of(sighted, zone, polar, bounds, rules, pair, cross_square, a, b):  #
     return order
 
 
-@njit_no_refcount
+@njit_inlined
 def _order_by_pole(pair, polar_a, polar_b, tolerance, order):  # type: ignore[no-untyped-def]
     """Step 7: greater angle with greater, lesser with lesser, within BANTOL2."""
     greater = max(pair.polar_i, pair.polar_j) - max(polar_a, polar_b)
@@ -230,7 +230,7 @@ def _order_by_pole(pair, polar_a, polar_b, tolerance, order):  # type: ignore[no
     return REJECTED if order != 0 and order != pole_order else pole_order
 
 
-@njit_no_refcount
+@njit_inlined
 def _order_by_cross_product(pair, a, b, cross_square, order):  # type: ignore[no-untyped-def]
     """Steps 4, 5 and 10: CRSSEP, or its supplement CRSSEN for the other order."""
     c0 = a[1] * b[2] - a[2] * b[1]
@@ -253,7 +253,7 @@ def _order_by_cross_product(pair, a, b, cross_square, order):  # type: ignore[no
     return 0 if along == against else 1 if along else -1
 
 
-@njit_no_refcount
+@njit_inlined
 def _order_by_rotation(sighted, bounds, tolerance, pair, star, a, b, order):  # type: ignore[no-untyped-def]
     """Of both orders, where nothing told one, the one that turns the field little."""
     first, second = sighted.direction[pair.i], sighted.direction[pair.j]
@@ -270,7 +270,7 @@ def _order_by_rotation(sighted, bounds, tolerance, pair, star, a, b, order):  # 
     return order if along and against else 1 if along else -1
 
 
-@njit_no_refcount
+@njit_inlined
 def _vote(ballots, kept, i, a, j, b):  # type: ignore[no-untyped-def]
     """A vote that observed star i is a and j is b; how many pairs are kept as edges."""
     _count_up(ballots, i, a)
@@ -283,7 +283,7 @@ def _vote(ballots, kept, i, a, j, b):  # type: ignore[no-untyped-def]
     return kept
 
 
-@njit_no_refcount
+@njit_inlined
 def _count_up(ballots, i, row):  # type: ignore[no-untyped-def]
     if ballots.votes[i, row] == 0:
         ballots.voted[i, ballots.counts[i]] = row

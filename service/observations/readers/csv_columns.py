@@ -81,7 +81,8 @@ def _near(name: str) -> str:
     return f"{close[0]} is meant?" if close else f"there are {', '.join(COLUMNS)}"
 
 
-def _number(row: CsvRow, column: str) -> float:
+def number_cell(row: CsvRow, column: str) -> float:
+    """The finite number in a cell; raises `BadCell`."""
     cell = row[column]
     if not cell:
         raise BadCell(column, "is empty, while the columns that belong to it are not")
@@ -97,7 +98,7 @@ def _group(row: CsvRow, columns: tuple[str, ...]) -> list[float] | None:
     """The numbers of columns that are given together, or None where all are empty."""
     if not any(row.get(column) for column in columns):
         return None
-    return [_number(row, column) for column in columns]
+    return [number_cell(row, column) for column in columns]
 
 
 def batch_fields(row: CsvRow) -> dict[str, Any]:
@@ -134,7 +135,7 @@ def batch_fields(row: CsvRow) -> dict[str, Any]:
 
 def star_of(row: CsvRow) -> dict[str, Any]:
     """The star of a row; raises `BadCell`."""
-    star: dict[str, Any] = {name: _number(row, name) for name in STAR_NUMBERS if row.get(name)}
+    star: dict[str, Any] = {name: number_cell(row, name) for name in STAR_NUMBERS if row.get(name)}
     vector = _group(row, DIRECTION)
     return star if vector is None else {"vector": vector, **star}
 

@@ -27,6 +27,7 @@ from service.observations.readers.csv_columns import (
     number_cells,
     star_of,
 )
+from service.observations.readers.csv_split import split_row
 from service.observations.readers.lines import Line
 from service.observations.schema import BatchIn
 
@@ -112,7 +113,7 @@ def _header(line: Line | None) -> list[str]:
     if line is None or line.body is None:
         raise BadFile(line.fault if line and line.fault else Fault("line 1", "there is no header"))
     where = f"line {line.number}"
-    names = _split(line.body)
+    names = split_row(line.body)
     if names is None:
         raise BadFile(
             Fault(where, "is not a row of comma-separated values", shown_value(line.body))
@@ -122,18 +123,11 @@ def _header(line: Line | None) -> list[str]:
     return names
 
 
-def _split(body: bytes) -> list[str] | None:
-    try:
-        return next(csv.reader([body.decode()], strict=True))
-    except (csv.Error, UnicodeDecodeError, StopIteration):
-        return None
-
-
 def _cells(line: Line, header: list[str]) -> tuple[CsvRow | None, Fault | None]:
     """The cells of a row by column, None where it cannot be told whose they are."""
     if line.body is None:
         return None, line.fault
-    cells = _split(line.body)
+    cells = split_row(line.body)
     if cells is None:
         shown = shown_value(line.body)
         return None, Fault(f"line {line.number}", "is not a row of comma-separated values", shown)

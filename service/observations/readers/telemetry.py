@@ -1,7 +1,7 @@
-"""Telemetry files as numbered lines, each holding one batch as JSON.
+"""Telemetry files as numbered lines, each holding one batch or one gyro block as JSON.
 
-Two forms are read, both in bounded memory: NDJSON, one batch a line, and CSV,
-one star a row (`service.observations.readers.csv_rows`).  A line that cannot be read is
+Two forms are read, both in bounded memory: NDJSON, one of them a line, and CSV, one star or
+one gyro sample a row (`csv_rows`, `gyro_rows`).  A line that cannot be read is
 handed on with its fault, and the next lines follow: what to make of it is the
 caller's choice.  A file that makes no sense as a whole raises `BadFile`.
 """
@@ -9,12 +9,14 @@ caller's choice.  A file that makes no sense as a whole raises `BadFile`.
 import codecs
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import BinaryIO, Literal
 
 from service.errors import BadFile, Fault, shown_value
 from service.observations.readers.csv_columns import COLUMNS
 from service.observations.readers.csv_rows import batches_of_rows
+from service.observations.readers.gyro_rows import blocks_of_rows, is_gyro_header
 from service.observations.readers.lines import Line, physical_lines
 
 TelemetryFormat = Literal["ndjson", "csv"]
@@ -30,7 +32,7 @@ def telemetry_format(path: Path) -> TelemetryFormat:
 
 
 def read_lines(source: Path | BinaryIO, form: TelemetryFormat | None = None) -> Iterator[Line]:
-    """The batches of a file or of a binary stream, in order.
+    """The batches and gyro blocks of a file or of a binary stream, in order.
 
     The form is told by the file's name where it is not given; a stream without
     one is NDJSON.  Raises `BadFile` for a file that cannot be opened and for a
@@ -38,7 +40,10 @@ def read_lines(source: Path | BinaryIO, form: TelemetryFormat | None = None) -> 
     """
     with _opened(source) as stream:
         if (form or (telemetry_format(source) if isinstance(source, Path) else "ndjson")) == "csv":
-            yield from batches_of_rows(physical_lines(stream))
+            lines = physical_lines(stream)
+            first = next(lines, None)
+            every = lines if first is None else chain([first], lines)
+            yield from blocks_of_rows(every) if is_gyro_header(first) else batches_of_rows(every)
         else:
             yield from physical_lines(stream)
 

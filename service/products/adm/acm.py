@@ -49,7 +49,7 @@ def write_acm(series: AttitudeSeries) -> Iterator[bytes]:
                 zero_ns = int(first.time_ns[0])
                 yield _opening(about, first.time[0]).encode()
             has_rates = not np.isnan(first.rate_deg_per_s).any()
-            yield f"\nATT_START\n{kvn(_state_metadata(has_rates))}".encode()
+            yield f"\nATT_START\n{kvn(_state_metadata(about, has_rates))}".encode()
             covariances.write(f"\nCOV_START\n{kvn(_covariance_metadata(about))}".encode())
             for part in chain([first], stretch):
                 seconds = _seconds(part.time_ns - zero_ns)
@@ -62,6 +62,8 @@ def write_acm(series: AttitudeSeries) -> Iterator[bytes]:
             covariances.write(b"COV_STOP\n")
         yield from pieces(covariances)
     yield _determination(about, methods).encode()
+    if about.grade != "raw":
+        return
     counts = zip(COUNTS, stars.tolist(), strict=True)
     told = [(f"USER_DEFINED_STARS_{name}", str(count)) for name, count in counts]
     yield f"\nUSER_START\n{kvn(told)}USER_STOP\n".encode()
@@ -80,7 +82,7 @@ def _opening(about: SeriesInfo, first: str) -> str:
     return f"{opening}\nMETA_START\n{kvn(metadata)}META_STOP\n"
 
 
-def _state_metadata(has_rates: bool) -> Pairs:
+def _state_metadata(about: SeriesInfo, has_rates: bool) -> Pairs:
     told: Pairs = [
         ("REF_FRAME_A", REF_FRAME_A),
         ("REF_FRAME_B", REF_FRAME_B),
@@ -90,6 +92,8 @@ def _state_metadata(has_rates: bool) -> Pairs:
     if not has_rates:
         return told
     comment = "Rates are as the batches gave them, else derived from the attitudes"
+    if about.grade != "raw":
+        comment = "Rates are estimated by the filter"
     return [("COMMENT", comment), *told, ("RATE_TYPE", "ANGVEL")]
 
 

@@ -7,10 +7,16 @@ ORIGINATOR = "ATTITUDE-ACQUISITION"
 REF_FRAME_A, REF_FRAME_B = "EME2000", "SC_BODY_1"
 TIME_SYSTEM = "UTC"
 
+GRADE_WORDS = {
+    "filtered": "Grade filtered: EKF of measured attitudes and gyro rates, from the past alone",
+    "smoothed": "Grade smoothed: FILTER_SMOOTHER of measured attitudes and gyro rates",
+}
+"""How a grade is described; raw attitudes are those of batches."""
 RATE_WORDS = {
     frozenset({"own"}): "as the batches gave it",
     frozenset({"derived"}): "derived from the attitudes",
     frozenset({"own", "derived"}): "of some states as the batches gave it, else derived",
+    frozenset({"estimated"}): "estimated by the filter",
 }
 """How a rate is described, by the origins that occur."""
 
@@ -23,8 +29,11 @@ def header(about: SeriesInfo) -> Pairs:
         if about.status != "all"
         else "Attitudes good or suspect"
     )
+    if about.grade in GRADE_WORDS:
+        told.append(GRADE_WORDS[about.grade])
     if about.start or about.end:
-        told.append(f"Batches from {about.start or 'the first'} to before {about.end or 'the end'}")
+        what = "Batches" if about.grade == "raw" else "Samples"
+        told.append(f"{what} from {about.start or 'the first'} to before {about.end or 'the end'}")
     told.append(f"Largest gap within a segment {about.largest_gap_s!r} s")
     return [
         *(("COMMENT", one_line(each)) for each in told),

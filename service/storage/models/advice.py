@@ -55,6 +55,16 @@ class GroupAdvice(Record, frozen=True, kw_only=True):
     text: Text
 
 
+class NoisePeriodAdvice(Record, frozen=True, kw_only=True):
+    """A tracker's noise over consecutive batches."""
+
+    component: ClassVar[str] = "NoisePeriodAdvice"
+    sigma_arcsec: Estimate
+    batches: Count
+    first: Annotated[Moment, doc("Time of the first batch of the period.")]
+    last: Moment
+
+
 class NoiseAdvice(Record, frozen=True, kw_only=True):
     """A tracker's noise, one standard deviation per tangent axis."""
 
@@ -64,6 +74,10 @@ class NoiseAdvice(Record, frozen=True, kw_only=True):
     sigma_arcsec: Estimate | None
     batches: Count
     verdict: Size
+    worst: Annotated[
+        NoisePeriodAdvice | None,
+        doc("A period in which the noise was certainly larger than `sigma_arcsec`."),
+    ]
     action: Action
     text: Text
 

@@ -1,6 +1,8 @@
-"""Attitudes as a product: with their stretch and their rate."""
+"""Attitudes as products: series with stretches and rates, and the attitude at a moment."""
 
 from typing import Annotated, ClassVar, Literal
+
+from msgspec import UNSET, UnsetType
 
 from service.storage.models.base import (
     Components,
@@ -34,16 +36,57 @@ class ProductAttitude(Record, frozen=True, kw_only=True):
         Components | None, doc("Of the body relative to inertial, in body axes; null: unknown.")
     ]
     rate_origin: Annotated[
-        Literal["own", "derived", "none"],
-        doc("`own`: of the batch. `derived`: from the attitudes before and after."),
+        Literal["own", "derived", "estimated", "none"],
+        doc(
+            "`own`: of the batch. `derived`: from the attitudes before and after. `estimated`: by "
+            "the filter."
+        ),
     ]
     status: Status
-    method: Annotated[str, DescribedAs(Literal["quest", "triad"])]
-    residual_rms_arcsec: float
-    predicted_rms_arcsec: float
+    method: Annotated[
+        str,
+        DescribedAs(Literal["quest", "triad", "ekf", "filter_smoother"]),
+        doc("`ekf` of the grade `filtered`, `filter_smoother` of `smoothed`."),
+    ]
+    residual_rms_arcsec: Annotated[float | None, doc("null unless the grade is `raw`.")]
+    predicted_rms_arcsec: Annotated[float | None, doc("null unless the grade is `raw`.")]
     stretch: Annotated[Count, doc("Number of the unbroken stretch, from 0.")]
-    batch: str
-    id: Id
+    batch: Annotated[str | None, doc("null unless the grade is `raw`.")]
+    id: Annotated[Id, doc("Of the result; unless the grade is `raw`, of the day's revision.")]
+    model: (
+        Annotated[
+            Literal["gyro", "constant_rate"],
+            doc(
+                "What the filter knows of the motion: the rates of a gyro, or that the rate is "
+                "constant but for a random walk. Absent if the grade is `raw`."
+            ),
+        ]
+        | UnsetType
+    ) = UNSET
+    revision: (
+        Annotated[int, doc("Of the day's attitudes, from 1. Absent if the grade is `raw`.")]
+        | UnsetType
+    ) = UNSET
+    bias_deg_per_h: (
+        Annotated[
+            Components | None,
+            doc(
+                "Bias of the gyro, in body axes; null at a constant rate. Absent if the grade is "
+                "`raw`."
+            ),
+        ]
+        | UnsetType
+    ) = UNSET
+    bias_sigma_deg_per_h: (
+        Annotated[
+            Components,
+            doc(
+                "One sigma of the bias or, at a constant rate, of the rate. Absent if the grade "
+                "is `raw`."
+            ),
+        ]
+        | UnsetType
+    ) = UNSET
 
 
 class AttitudeProduct(Record, frozen=True, kw_only=True):
@@ -52,3 +95,29 @@ class AttitudeProduct(Record, frozen=True, kw_only=True):
     component: ClassVar[str] = "AttitudeProduct"
     about: Annotated[dict[str, str], doc("Where the attitudes come from: filters and origin.")]
     items: list[ProductAttitude]
+
+
+class AttitudeAtMoment(Record, frozen=True, kw_only=True):
+    """The attitude at a moment, with its error."""
+
+    component: ClassVar[str] = "AttitudeAtMoment"
+    time: Moment
+    method: Literal["nearest", "interpolated"]
+    quaternion: ContinuousQuaternion
+    covariance_arcsec2: Annotated[
+        Covariance,
+        doc(
+            "Of the attitudes that were used. Between two batches their errors are independent; "
+            "between filtered or smoothed samples it is the weighted mean."
+        ),
+    ]
+    motion_arcsec: Annotated[
+        float | None,
+        doc(
+            "The error that the motion adds. Nearest: the angle that the body turns until the "
+            "moment. Interpolated: an eighth of the step times the change of the rate. Null: no "
+            "rate is known."
+        ),
+    ]
+    offset_s: Annotated[float, doc("From the moment to the nearest attitude that was used.")]
+    ids: Annotated[list[Id], doc("The results that were used.")]

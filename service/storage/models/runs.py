@@ -53,6 +53,8 @@ class ReplayCounts(Record, frozen=True, kw_only=True):
     ambiguous: Count
     unmatched: Count
     attitudes: Annotated[Count, doc("Batches with an attitude.")]
+    gyro_new: Annotated[Count, doc("Gyro blocks that this replay recorded.")] = 0
+    gyro_repeated: Annotated[Count, doc("Gyro blocks that were already recorded.")] = 0
 
 
 class ApidPackets(Record, frozen=True, kw_only=True):

@@ -98,6 +98,10 @@ def _columns(rows: Sequence[Any]) -> AttitudeRows:
         residual_rms_arcsec=values[10],
         predicted_rms_arcsec=values[11],
         stars=_across(values[12:]).astype(np.int64),
+        model=np.full(len(rows), None, dtype=object),
+        revision=np.zeros(len(rows), dtype=np.int64),
+        bias_deg_per_h=np.full((len(rows), 3), np.nan),
+        bias_sigma_deg_per_h=np.full((len(rows), 3), np.nan),
     )
 
 

@@ -18,6 +18,7 @@ from service.storage.queries.time_buckets import (
     BucketFilter,
     Columns,
     batches_about,
+    has_archived,
     read_buckets,
     read_steps,
     totals,
@@ -93,7 +94,10 @@ def sigma_arcsec(covariance_arcsec2: list[list[float]]) -> list[float]:
 
 
 def _read(connection: Connection, span: BucketFilter, width_s: int) -> tuple[int, Columns]:
-    if width_s > HOUR_S and batches_about(connection, span) > MAX_BATCHES_SUMMED:
+    are_many = width_s > HOUR_S and (
+        batches_about(connection, span) > MAX_BATCHES_SUMMED or has_archived(connection, span)
+    )
+    if are_many:
         return HOUR_S, read_buckets(connection, span, "hour", COUNTS)
     return STEPS[width_s], read_steps(connection, span, STEPS[width_s], COUNTS)
 

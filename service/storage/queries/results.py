@@ -5,10 +5,11 @@ from typing import Any, Literal
 
 import msgspec
 from msgspec import UNSET
-from sqlalchemy import ColumnElement, Connection, Select, select
+from sqlalchemy import ColumnElement, Connection, Select, or_, select
 
 from service.alarms.quantities import QUANTITIES, value_names
 from service.errors import NotFound, shown_value
+from service.storage.archive.tables import archived_batches, archived_what_ifs
 from service.storage.models.answers import Answer, Result, StarCounts, Summary
 from service.storage.models.base import Page
 from service.storage.models.frames import FrameWithStars
@@ -73,14 +74,34 @@ def read_result(connection: Connection, id: str) -> Row:
     query = select(results, batches.c.input).join_from(results, batches).where(results.c.id == id)
     row = connection.execute(query).mappings().first()
     if row is None:
+        if is_archived(connection, id):
+            raise NotFound(
+                f"the batch with the id {shown_value(id)} is archived: it can be restored with "
+                "`acquire archive restore`"
+            )
         raise NotFound(f"there is no batch with the id {shown_value(id)}")
     return dict(row)
 
 
+def is_archived(connection: Connection, id: str) -> bool:
+    """Whether a result is in the archive."""
+    return connection.execute(_archived(id)).first() is not None
+
+
+def _archived(id: str) -> Select[tuple[str]]:
+    """The query for the spacecraft of an archived result."""
+    what_if = select(archived_what_ifs.c.batch_id).where(archived_what_ifs.c.id == id)
+    c = archived_batches.c
+    return select(c.spacecraft).where(or_(c.id == id, c.id == what_if.scalar_subquery()))
+
+
 def spacecraft_of(connection: Connection, id: str) -> str | None:
-    """The spacecraft of a result; None where there is none of that id."""
-    found = connection.execute(select(results.c.spacecraft).where(results.c.id == id)).scalar()
-    return None if found is None else str(found)
+    """The spacecraft of a result, recorded or archived; None where there is none of that id."""
+    for query in (select(results.c.spacecraft).where(results.c.id == id), _archived(id)):
+        found = connection.execute(query).scalar()
+        if found is not None:
+            return str(found)
+    return None
 
 
 def read_record(connection: Connection, id: str) -> Result:

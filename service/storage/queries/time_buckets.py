@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from sqlalchemy import BigInteger, Connection, Select, Table, bindparam, case, func, select
 
+from service.storage.archive.tables import archived_parts
 from service.storage.recording.rollup_sql import OF_TRACKERS, SUMMED, SUMMED_OF_TRACKERS
 from service.storage.sql.columns import Row
 from service.storage.sql.rollup_tables import (
@@ -67,6 +68,18 @@ def batches_about(connection: Connection, span: BucketFilter) -> int:
         table.bucket <= span.end.bucket(HOUR_S),
     )
     return int(connection.execute(query).scalar() or 0)
+
+
+def has_archived(connection: Connection, span: BucketFilter) -> bool:
+    """Whether a span has archived batches, which only the rollups count."""
+    c = archived_parts.c
+    query = select(c.id).where(
+        c.spacecraft == span.spacecraft,
+        c.run == span.run,
+        c.last_ns >= span.start.tai_ns,
+        c.first_ns < span.end.tai_ns,
+    )
+    return connection.execute(query.limit(1)).first() is not None
 
 
 def read_buckets(

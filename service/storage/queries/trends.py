@@ -24,6 +24,7 @@ from service.storage.queries.time_buckets import (
     BucketFilter,
     Columns,
     batches_about,
+    has_archived,
     read_buckets,
     read_steps,
 )
@@ -121,7 +122,8 @@ def _resolution(connection: Connection, span: BucketFilter, size: int) -> tuple[
         # Longer than the widest of them: as many months of thirty days as it takes.
         width_s = WIDTHS_S[-1] * (1 + int((end_s - first_s) / (WIDTHS_S[-1] * max(size - 1, 0.5))))
     if width_s < HOUR_S:
-        if end_s - first_s <= HOUR_S or batches_about(connection, span) <= MAX_BATCHES_SUMMED:
+        are_few = end_s - first_s <= HOUR_S or batches_about(connection, span) <= MAX_BATCHES_SUMMED
+        if are_few and not has_archived(connection, span):
             return width_s, "batch"
         width_s = HOUR_S
     if width_s < DAY_S and end_s - first_s > MAX_HOURS_READ * HOUR_S:

@@ -5,19 +5,22 @@ comes from one row whose lock is held until the commit: in no process does an
 event become visible after one with a higher number, and no number is left out.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 import msgspec
-from sqlalchemy import Connection, delete, select
+from sqlalchemy import Connection, delete, func, select
 
 from service.storage.sql.columns import Row
 from service.storage.sql.prepared import execute
 from service.storage.sql.statements import insert_all
 from service.storage.sql.tables import event_counter, events
+from service.times import Utc, utc_now
 
+EventKind = Literal["batches", "adopted", "alarm", "limit", "annotation", "replay", "gyro"]
+EVENT_KINDS: tuple[EventKind, ...] = get_args(EventKind)
 KEPT = 20_000
 """Events that are kept; a client that missed more starts anew."""
 PRUNED_EVERY = 500
@@ -28,18 +31,32 @@ _TAKE = "UPDATE event_counter SET last = last + {0} WHERE id = 1 RETURNING last"
 
 @dataclass(frozen=True)
 class Event:
-    """One event: its number, kind, run, spacecraft, and data as JSON."""
+    """One event: its number, kind, run, spacecraft, data as JSON, and when it was recorded."""
 
     id: int
     kind: str
     run: str | None
     spacecraft: str | None
     data: str
+    at: str | None
+    """None: an earlier version recorded it."""
+
+    def concerns(self, run: str | None, spacecraft: Collection[str] | None) -> bool:
+        """Whether the event passes a filter by run and spacecraft; None: every one passes.
+
+        An event without a run concerns every run, an annotation without a spacecraft every
+        spacecraft.  A replay names no spacecraft: its lines may be about any, and its id gives
+        access to their errors, so it passes only without a filter.
+        """
+        about_all = self.kind == "annotation" and self.spacecraft is None
+        return (self.run is None or run is None or self.run == run) and (
+            spacecraft is None or self.spacecraft in spacecraft or about_all
+        )
 
 
 def add_event(
     connection: Connection,
-    kind: str,
+    kind: EventKind,
     data: object,
     *,
     run: str | None = None,
@@ -64,7 +81,8 @@ def numbered(connection: Connection) -> Iterator[None]:
         return
     ((last,),) = execute(connection, _TAKE.format(len(outbox)))
     first = last - len(outbox) + 1
-    rows = [{"id": first + place} | row for place, row in enumerate(outbox)]
+    now = utc_now().text
+    rows = [{"id": first + place, "at": now} | row for place, row in enumerate(outbox)]
     insert_all(connection, events, rows)
     if first // PRUNED_EVERY != (last + 1) // PRUNED_EVERY:
         connection.execute(delete(events).where(events.c.id <= last - KEPT))
@@ -97,5 +115,18 @@ def events_after(connection: Connection, last: int, limit: int) -> Sequence[Even
     return [] if last_event(connection) == last else None
 
 
+def first_event(connection: Connection) -> int | None:
+    """The number of the oldest event that is kept."""
+    first: int | None = connection.scalar(select(func.min(events.c.id)))
+    return first
+
+
+def events_between(connection: Connection, since: Utc, until: Utc) -> Sequence[Event]:
+    """The kept events that were recorded from `since` to before `until`, oldest first."""
+    recorded = events.c.at >= since.text, events.c.at < until.text
+    query = select(events).where(*recorded).order_by(events.c.id)
+    return [_event(row) for row in connection.execute(query).mappings()]
+
+
 def _event(row: Any) -> Event:
-    return Event(row["id"], row["kind"], row["run"], row["spacecraft"], row["data"])
+    return Event(**row)

@@ -1,6 +1,6 @@
 """Recorded batches and Idempotency-Keys, and the fingerprints of their bodies."""
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,16 +26,25 @@ The id is empty where a key came without a token.
 # changes: compiling a statement for many values takes longer than running it.
 _BY_IDENTITY = {
     "sqlite": """
-        SELECT b.spacecraft, b.run, b.batch, b.id, b.fingerprint
-        FROM json_each(:wanted) AS w CROSS JOIN batches AS b
+        SELECT b.spacecraft, b.run, b.batch, b.id, b.fingerprint, {archived}
+        FROM json_each(:wanted) AS w CROSS JOIN {table} AS b
         WHERE b.spacecraft = json_extract(w.value, '$[0]')
           AND b.run = json_extract(w.value, '$[1]') AND b.batch = json_extract(w.value, '$[2]')
     """,
     "postgresql": """
-        SELECT b.spacecraft, b.run, b.batch, b.id, b.fingerprint
-        FROM json_array_elements(CAST(%(wanted)s AS json)) AS w JOIN batches AS b
+        SELECT b.spacecraft, b.run, b.batch, b.id, b.fingerprint, {archived}
+        FROM json_array_elements(CAST(%(wanted)s AS json)) AS w JOIN {table} AS b
         ON b.spacecraft = w->>0 AND b.run = w->>1 AND b.batch = w->>2
     """,
+}
+_ARCHIVED_BY_IDENTITY = {
+    dialect: sql.format(table="archived_batches", archived=1)
+    for dialect, sql in _BY_IDENTITY.items()
+}
+# One statement sees one moment: a batch that is being archived is found in one of the two.
+_KNOWN_BY_IDENTITY = {
+    dialect: sql.format(table="batches", archived=0) + "UNION ALL" + _ARCHIVED_BY_IDENTITY[dialect]
+    for dialect, sql in _BY_IDENTITY.items()
 }
 _AMONG = {
     "sqlite": "(SELECT value FROM json_each(:wanted))",
@@ -61,6 +70,12 @@ class ExistingResult(Struct, frozen=True):
 
     result_id: str
     fingerprint: str
+    archived: bool = False
+    """Whether its batch is in the archive."""
+
+
+class ArchivedMeanwhile(Exception):
+    """A batch that was to be new is one that another process has just archived."""
 
 
 def identity_of(batch: ObservationBatch) -> Identity:
@@ -110,9 +125,10 @@ def look_up(
     registry = Registry()
     dialect = connection.dialect.name
     if identities:
-        rows = _rows(connection, _BY_IDENTITY[dialect], identities)
-        for spacecraft, run, batch, id, fingerprint in rows:
-            registry.identities[spacecraft, run, batch] = ExistingResult(id, fingerprint)
+        rows = _rows(connection, _KNOWN_BY_IDENTITY[dialect], identities)
+        for spacecraft, run, batch, id, fingerprint, archived in rows:
+            found = ExistingResult(id, fingerprint, bool(archived))
+            registry.identities[spacecraft, run, batch] = found
     if keys:
         rows = _rows(connection, _BY_KEY[dialect], keys)
         registry.keys = {
@@ -122,7 +138,16 @@ def look_up(
     return registry
 
 
-def _rows(connection: Connection, sql: str, wanted: Collection[object]) -> Iterable[Any]:
+def require_not_archived(connection: Connection, identities: Collection[Identity]) -> None:
+    """Raise `ArchivedMeanwhile` if one of the batches that were just inserted is archived.
+
+    The insert waits for a transaction that archives the same batch, and this sees its end.
+    """
+    if identities and _rows(connection, _ARCHIVED_BY_IDENTITY[connection.dialect.name], identities):
+        raise ArchivedMeanwhile
+
+
+def _rows(connection: Connection, sql: str, wanted: Collection[object]) -> Sequence[Any]:
     return execute(connection, sql, {"wanted": msgspec.json.encode(list(wanted)).decode()})
 
 

@@ -1,11 +1,11 @@
 """Writing results: every row of a result, its part in the trends included, in one transaction."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from sqlalchemy import Connection, and_, delete, insert, select, update
 
-from service.errors import AcquisitionError
+from service.errors import AcquisitionError, Busy
 from service.storage.queries.tracker_splits import split_anew
 from service.storage.recording import events, rollups
 from service.storage.recording.alarm_evaluation import evaluate_limits
@@ -14,6 +14,7 @@ from service.storage.recording.identity import (
     Registry,
     key_row,
     look_up,
+    require_not_archived,
     stored_answers,
 )
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
@@ -112,7 +113,7 @@ def record(
         [
             key_row(key, taken)
             for key, taken in sorted(registry.keys.items())
-            if key not in keys_before
+            if key not in keys_before and not taken.archived
         ],
     )
     answers = {unsaved.id: body for unsaved, body in fresh}
@@ -120,11 +121,22 @@ def record(
     if missing:
         answers |= stored_answers(connection, missing)
     return [
-        Answered(holder.result_id, answers[holder.result_id], holder.result_id != unsaved.id)
-        if isinstance(holder, ExistingResult)
-        else holder
+        _outcome(unsaved, holder, answers)
         for unsaved, holder in zip(unsaved_results, holders, strict=True)
     ]
+
+
+def _outcome(
+    unsaved: UnsavedResult,
+    holder: ExistingResult | AcquisitionError,
+    answers: Mapping[str, bytes],
+) -> RecordOutcome:
+    if not isinstance(holder, ExistingResult):
+        return holder
+    if holder.archived:
+        # Between looking it up and recording it.  Sent again, it gets the archived answer.
+        return Busy("the batch was just archived")
+    return Answered(holder.result_id, answers[holder.result_id], holder.result_id != unsaved.id)
 
 
 def _holder(unsaved: UnsavedResult, registry: Registry) -> ExistingResult | AcquisitionError:
@@ -164,6 +176,7 @@ def _insert(
     )
     known.update(missing)
     insert_all(connection, batches, [unsaved.batch for unsaved, _ in firsts if unsaved.batch])
+    require_not_archived(connection, [unsaved.identity for unsaved, _ in firsts])
     insert_all(connection, frames, [unsaved.frame for unsaved, _ in firsts if unsaved.frame])
     _insert_results(connection, firsts)
     rollups.add(connection, ((unsaved.buckets, unsaved.result) for unsaved, _ in firsts))

@@ -13,6 +13,7 @@ from typing import Any, Literal
 from sqlalchemy import ColumnElement, Connection, Select, Table, and_, delete, select, update
 
 from service.errors import BadInput, Fault
+from service.storage.recording.archived_hours import WHOLE, every_share, shares_of_hour
 from service.storage.recording.result_metrics import merge, rolled_up
 from service.storage.recording.rollup_sql import OF_TRACKERS, SUMMED, SUMMED_OF_TRACKERS
 from service.storage.recording.unsaved_result import Buckets
@@ -123,9 +124,11 @@ def _renew_trackers(connection: Connection, changed: Iterable[BucketKey]) -> Non
     for key in changed:
         query = select(tracker, *SUMMED_OF_TRACKERS.values()).select_from(OF_TRACKERS)
         found = connection.execute(_within_hour(query, key).group_by(tracker)).mappings()
-        _replace(
-            connection, tracker_rollups_hourly, key, {row["tracker"]: dict(row) for row in found}
-        )
+        of_hour: Rollups = {row["tracker"]: dict(row) for row in found}
+        for name, share in shares_of_hour(connection, *key).items():
+            if name != WHOLE:
+                _put(of_hour, name, share)
+        _replace(connection, tracker_rollups_hourly, key, of_hour)
     for spacecraft, run, day in sorted({(key[0], key[1], key[2] // 24) for key in changed}):
         hours = _hours_of_day(connection, tracker_rollups_hourly, (spacecraft, run, day))
         of_day: Rollups = {}
@@ -148,10 +151,13 @@ def _replace(
 
 
 def _of_hour(connection: Connection, key: BucketKey) -> Row | None:
-    """The rollup of the current results of an hour."""
+    """The rollup of the current results of an hour, archived ones included."""
     _lock(connection, rollups_hourly, key)
     query = _within_hour(select(*SUMMED.values()), key)
     row = dict(connection.execute(query).mappings().one())
+    archived = shares_of_hour(connection, *key).get(WHOLE)
+    if archived is not None:
+        merge(row, archived)
     return row if row["batches"] else None
 
 
@@ -263,7 +269,10 @@ def stored(connection: Connection, bucket: Bucket, *, of_trackers: bool = False)
 
 
 def recount(connection: Connection, bucket: Bucket, *, of_trackers: bool = False) -> Rollups:
-    """The trends counted anew from the current results: what `stored` must equal."""
+    """The trends counted anew from the current results: what `stored` must equal.
+
+    Of archived batches, from what was kept of them when they were archived.
+    """
     place = results.c.spacecraft, results.c.run, batches.c.time
     query = select(results, batches.c.time).join_from(results, batches)
     if of_trackers:
@@ -276,4 +285,8 @@ def recount(connection: Connection, bucket: Bucket, *, of_trackers: bool = False
         number = parse_utc(row["time"]).bucket(width_s)
         key = row["spacecraft"], row["run"], *tracker, number
         _put(found, key, rolled_up([dict(row)]))
+    for spacecraft, run, name, hour, share in every_share(connection):
+        if (name != WHOLE) == of_trackers:
+            owner = (spacecraft, run, name) if of_trackers else (spacecraft, run)
+            _put(found, (*owner, hour * HOUR_S // width_s), share)
     return found

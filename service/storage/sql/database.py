@@ -4,11 +4,13 @@ import logging
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from sqlalchemy import Connection
 from sqlalchemy.exc import DBAPIError, TimeoutError
 
 from service.errors import Busy
+from service.storage.archive.reading import Archive
 from service.storage.sql.connections import PersistentConnection
 from service.storage.sql.database_file import DatabaseFile
 from service.storage.sql.engines import (
@@ -109,13 +111,16 @@ class Store(Readers):
         *,
         create: bool = True,
         serving: bool = False,
+        archive_folder: Path | None = None,
     ) -> None:
         """Open a database: SQLite is created and migrated, PostgreSQL must be up to date.
 
-        Without `create` SQLite's file must be there.
+        Without `create` SQLite's file must be there.  Batches that left the database are read
+        from the `archive_folder`.
         `serving` bounds the waiting times; see `Readers`.
         Raises `BadConfiguration` with what to do.
         """
+        self.archive = Archive(archive_folder)
         url = database_url(database)
         file = database_file(url)
         if file is not None and not create:

@@ -63,6 +63,9 @@ FREE_S = 10.0
 TURN_S = 2.0
 """The longest wait for the turn of one who looks up or writes."""
 
+SECRETS = ("password", "sslpassword")
+"""Of the query part of a URL of PostgreSQL."""
+
 _DRIVERS = {
     "sqlite": "sqlite",
     "postgres": "postgresql+psycopg",
@@ -87,8 +90,9 @@ def database_url(text: str) -> URL:
 
 
 def shown_url(url: URL) -> str:
-    """The URL for a message, its password hidden."""
-    return url.render_as_string(hide_password=True)
+    """The URL for a message, its password hidden, also where the query part has it."""
+    hidden = {name: "***" for name in SECRETS if name in url.query}
+    return url.update_query_dict(hidden).render_as_string(hide_password=True)
 
 
 def database_file(url: URL) -> DatabaseFile | None:

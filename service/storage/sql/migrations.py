@@ -21,7 +21,7 @@ from service.storage.sql.engines import database_url, reading_engine, shown_url,
 if TYPE_CHECKING:
     from alembic.config import Config
 
-HEAD = "0009"
+HEAD = "0013"
 """The latest revision of `migrations/`."""
 
 
@@ -55,13 +55,18 @@ def require_records(database: str) -> None:
     """
     require_there(database)
     url = database_url(database)
-    if url.drivername != "sqlite":
-        return
+    if url.drivername == "sqlite" and revision_of(database) is None:
+        raise BadConfiguration(
+            f"ACQUIRE_DATABASE: {shown_url(url)}: holds no records of this service"
+        )
+
+
+def revision_of(database: str) -> str | None:
+    """The revision of a database's schema; None where it holds no records of the service."""
+    require_there(database)
+    url = database_url(database)
     with _disposed(reading_engine(url)) as engine, reported(url), engine.begin() as connection:
-        if _revision(connection) is None:
-            raise BadConfiguration(
-                f"ACQUIRE_DATABASE: {shown_url(url)}: holds no records of this service"
-            )
+        return _revision(connection)
 
 
 def check(database: str) -> list[str]:
@@ -80,7 +85,15 @@ def check(database: str) -> list[str]:
         from alembic.runtime.migration import MigrationContext
 
         # Every table must be known to the metadata.
-        from service.storage.sql import access_tables, alarm_tables, tables  # noqa: F401
+        from service.storage.archive import tables as archive_tables  # noqa: F401
+        from service.storage.sql import (  # noqa: F401
+            access_tables,
+            alarm_tables,
+            grade_tables,
+            gyro_tables,
+            tables,
+            webhook_tables,
+        )
 
         context = MigrationContext.configure(connection, opts={"compare_type": True})
         return [_in_words(difference) for difference in compare_metadata(context, metadata)]

@@ -26,8 +26,8 @@ def hold_served(database: str) -> IO[bytes] | None:
     if lock is not None and not _taken(lock, fcntl.LOCK_SH):
         lock.close()
         raise BadConfiguration(
-            f"ACQUIRE_DATABASE: {_file(database)}: `acquire reprocess` is writing to it: wait for "
-            "its end"
+            f"ACQUIRE_DATABASE: {_file(database)}: `acquire reprocess`, `acquire smooth` or "
+            "`acquire archive` is writing to it: wait for its end"
         )
     return lock
 

@@ -10,6 +10,7 @@
     rollups_hourly, rollups_daily                  of current results (rollup_tables.py)
     limits, watches, alarms ── alarm_actions       limits and alarms (alarm_tables.py)
     annotations                                    notes of people (alarm_tables.py)
+    archived_parts, archived_batches, ...          batches that left it (archive/tables.py)
     events, event_counter                          recent events in order of commit
     replays
     access_tokens ── access_sessions, audit        who may ask, who changed what (access_tables.py)
@@ -192,6 +193,9 @@ Index(
     postgresql_where=results.c.parent_id.is_not(None),
 )
 
+# Deleting a batch checks the foreign key of its results, and finds them.
+Index("ix_results_batch_id", results.c.batch_id)
+
 # Deleting a result checks the foreign key of its what-ifs.
 Index(
     "ix_results_parent",
@@ -277,6 +281,8 @@ events = Table(
     Column("run", RunName),
     Column("spacecraft", Name),
     Column("data", Text, nullable=False),
+    # Null: recorded by an earlier version.
+    Column("at", Moment),
 )
 
 event_counter = Table(

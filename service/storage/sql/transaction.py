@@ -18,6 +18,7 @@ from sqlalchemy.exc import (
 )
 
 from service.storage.recording import events
+from service.storage.recording.identity import ArchivedMeanwhile
 from service.storage.recording.results import RecordOutcome, record
 from service.storage.recording.unsaved_result import UnsavedResult
 from service.storage.sql.prepared import execute
@@ -78,7 +79,7 @@ def _record(connection: Connection, unsaved_results: Sequence[UnsavedResult]) ->
         try:
             with _savepoint(connection):
                 return list(record(connection, unsaved_results))
-        except IntegrityError as error:
+        except (IntegrityError, ArchivedMeanwhile) as error:
             failure = error  # perhaps another process was faster: look again
         except Exception as error:
             if is_of_the_database(error):

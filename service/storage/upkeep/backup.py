@@ -8,14 +8,20 @@ does the same with a snapshot.
 import os
 import sqlite3
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
 
 from sqlalchemy import URL
 
 from service.errors import BadConfiguration
-from service.storage.sql.engines import BUSY_TIMEOUT_MS, database_url, shown_url
+from service.storage.sql.engines import (
+    BUSY_TIMEOUT_MS,
+    database_url,
+    reading_engine,
+    shown_url,
+)
+from service.storage.sql.migrations import reported
 
 PAGES_AT_ONCE = 2_000
 """About eight megabytes: often enough to show how far it is."""
@@ -39,6 +45,8 @@ def back_up(database: str, target: Path, step: Step = lambda left, total: None) 
     part = target.with_name(target.name + ".part")
     part.unlink(missing_ok=True)
     try:
+        # It holds what access depends on, such as the secrets of webhooks.
+        part.touch(mode=0o600, exist_ok=False)
         if url.drivername == "sqlite":
             _copy_sqlite(Path(url.database or ""), part, step)
         else:
@@ -46,7 +54,7 @@ def back_up(database: str, target: Path, step: Step = lambda left, total: None) 
         with part.open("rb") as file:
             os.fsync(file.fileno())
         part.replace(target)
-        _sync_folder(target.absolute().parent)
+        sync_folder(target.absolute().parent)
     finally:
         part.unlink(missing_ok=True)
 
@@ -83,32 +91,68 @@ def _opened(source: Path) -> sqlite3.Connection:
 
 
 def _dump_postgresql(url: URL, part: Path) -> None:
-    from service.storage.sql.engines import reading_engine
-
+    to_server, secret = client_options(url)
     engine = reading_engine(url)
-    with engine.connect() as connection:
-        schema = connection.exec_driver_sql("SELECT current_schema()").scalar_one()
-    engine.dispose()
-    options = {"host": url.host, "port": url.port, "username": url.username, "dbname": url.database}
-    command = ["pg_dump", "--format=custom", "--no-owner", "--no-privileges", f"--schema={schema}"]
-    command += [f"--{name}={value}" for name, value in options.items() if value is not None]
-    command += ["--no-password", f"--file={part}"]
-    environment = dict(os.environ)
-    if url.password:
-        # Not on the command line, where every user of the machine could read it.
-        environment["PGPASSWORD"] = str(url.password)
+    try:
+        with reported(url), engine.connect() as connection:
+            schema = connection.exec_driver_sql("SELECT current_schema()").scalar_one()
+    finally:
+        engine.dispose()
+    if schema is None:
+        raise BadConfiguration(f"ACQUIRE_DATABASE: {shown_url(url)}: has no schema of records")
+    # A name without quotes would be a pattern.
+    quoted = '"' + schema.replace('"', '""') + '"'
+    command = ["pg_dump", "--format=custom", "--no-owner", "--no-privileges", f"--schema={quoted}"]
+    run_client([*command, *to_server, f"--file={part}"], shown_url(url), secret)
+
+
+def client_options(url: URL) -> tuple[list[str], dict[str, str]]:
+    """How PostgreSQL's programs reach the database of a URL: arguments, and environment.
+
+    All of the URL counts, its query part too; the password is in the environment, because
+    every user of the machine can read a command line.  Raises `BadConfiguration` for what has no
+    other place.
+    """
+    # First of all: it says what to install where psycopg is missing.
+    dialect = reading_engine(url).dialect
+    from psycopg.conninfo import make_conninfo
+    from psycopg.pq import Conninfo
+
+    given = dialect.create_connect_args(url)[1]
+    password = given.pop("password", None)
+    if "sslpassword" in given:
+        raise BadConfiguration(
+            "ACQUIRE_DATABASE: sslpassword: every user of the machine could read it while "
+            "PostgreSQL's programs run; name a key without a passphrase"
+        )
+    # What else is given is for psycopg alone.
+    known = {option.keyword.decode() for option in Conninfo.get_defaults()}
+    named = make_conninfo(**{name: value for name, value in given.items() if name in known})
+    secret = {} if password is None else {"PGPASSWORD": str(password)}
+    return ["--no-password", f"--dbname={named}"], secret
+
+
+def run_client(command: list[str], about: str, secret: Mapping[str, str] | None = None) -> str:
+    """Run a client program of PostgreSQL; what it printed.
+
+    Raises `BadConfiguration`, which says what it was `about`, where the program is missing or
+    fails.
+    """
+    environment = os.environ | (secret or {})
     try:
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     except FileNotFoundError:
         raise BadConfiguration(
-            "pg_dump was not found: a backup of PostgreSQL needs its client tools"
+            f"{command[0]} was not found: backups of PostgreSQL need its client tools"
         ) from None
     if done.returncode:
         said = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
-        raise BadConfiguration(f"ACQUIRE_DATABASE: {shown_url(url)}: {said}")
+        raise BadConfiguration(f"ACQUIRE_DATABASE: {about}: {said}")
+    return done.stdout
 
 
-def _sync_folder(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
+    """Make the names of a folder's files outlast a power cut."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -1,16 +1,19 @@
-"""Deletes old batches with their results and their part in the trends.
+"""Deletes old batches with their results and their part in the trends, gyro blocks, grades.
 
 One hour of a run at a time, each in one transaction of the writer: other writes
 run between two of them, and the trends always match the stored batches.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
-from sqlalchemy import Connection, delete, func, select
+from sqlalchemy import ColumnElement, Connection, delete, func, select
 
 from service.storage.recording import rollups
 from service.storage.sql.database import Store
+from service.storage.sql.grade_tables import graded_blocks, graded_days
+from service.storage.sql.gyro_tables import gyro_blocks
 from service.storage.sql.rollup_tables import rollups_hourly
 from service.storage.sql.tables import (
     batches,
@@ -26,14 +29,22 @@ from service.times import HOUR_S, Utc, bucket_start
 OF_A_RESULT = (star_results, solutions, idempotency_keys)
 OF_A_BATCH = (frames, tracker_values)
 _AT_ONCE = 1_000
+_BLOCKS_AT_ONCE = 100
+"""Of up to 240 kB each."""
+_DAYS_AT_ONCE = 10
+"""Of about 12 MB each."""
 
 
 @dataclass
 class Pruned:
-    """How many batches there are before the time, and how many of them are gone so far."""
+    """How many batches, gyro blocks and graded days there are before the time, and are gone."""
 
     total: int
     batches: int = 0
+    total_gyro_blocks: int = 0
+    gyro_blocks: int = 0
+    total_graded_days: int = 0
+    graded_days: int = 0
 
 
 def prune(
@@ -46,8 +57,9 @@ def prune(
 ) -> Pruned:
     """Delete the batches whose time is before `before`, of one run or of all.
 
-    Missions, catalogs, alarms and the audit list stay.  Interrupted, it has
-    deleted whole hours; the same call again goes on.
+    Gyro blocks are deleted whose last sample is before it, and days of filtered and smoothed
+    attitudes, with all their revisions, that end by then.  Missions, catalogs, alarms and the
+    audit list stay.  Interrupted, it has deleted whole hours; the same call again goes on.
     """
     with store.reading() as connection:
         # A batch has exactly one current result, and those have the index by time.
@@ -56,6 +68,12 @@ def prune(
             chosen.append(results.c.run == run)
         counted = select(func.count()).select_from(results).where(*chosen)
         pruned = Pruned(int(connection.scalar(counted) or 0))
+        old_blocks = _old_blocks(before, run)
+        blocks = select(func.count()).select_from(gyro_blocks).where(*old_blocks)
+        pruned.total_gyro_blocks = int(connection.scalar(blocks) or 0)
+        old_days = _old_days(before, run)
+        days = select(func.count()).select_from(graded_days).where(*old_days)
+        pruned.total_graded_days = int(connection.scalar(days) or 0)
         hours = select(rollups_hourly.c.bucket, rollups_hourly.c.spacecraft, rollups_hourly.c.run)
         hours = hours.where(rollups_hourly.c.bucket <= before.bucket(HOUR_S))
         if run is not None:
@@ -69,7 +87,41 @@ def prune(
     for hour, spacecraft, name in keys:
         pruned.batches += store.writer.change(_of_an_hour(spacecraft, name, hour, before)).result()
         step(pruned)
+    while deleted := store.writer.change(partial(_delete_blocks, chosen=old_blocks)).result():
+        pruned.gyro_blocks += deleted
+    while deleted := store.writer.change(partial(_delete_days, chosen=old_days)).result():
+        pruned.graded_days += deleted
     return pruned
+
+
+def _old_blocks(before: Utc, run: str | None) -> list[ColumnElement[bool]]:
+    chosen: list[ColumnElement[bool]] = [gyro_blocks.c.end_ns < before.tai_ns]
+    if run is not None:
+        chosen.append(gyro_blocks.c.run == run)
+    return chosen
+
+
+def _old_days(before: Utc, run: str | None) -> list[ColumnElement[bool]]:
+    chosen: list[ColumnElement[bool]] = [graded_days.c.end_ns <= before.tai_ns]
+    if run is not None:
+        chosen.append(graded_days.c.run == run)
+    return chosen
+
+
+def _delete_days(connection: Connection, chosen: Sequence[ColumnElement[bool]]) -> int:
+    """Delete some of the graded days that are chosen, with their samples; how many."""
+    ids = list(connection.scalars(select(graded_days.c.id).where(*chosen).limit(_DAYS_AT_ONCE)))
+    connection.execute(delete(graded_blocks).where(graded_blocks.c.day_id.in_(ids)))
+    connection.execute(delete(graded_days).where(graded_days.c.id.in_(ids)))
+    return len(ids)
+
+
+def _delete_blocks(connection: Connection, chosen: Sequence[ColumnElement[bool]]) -> int:
+    """Delete some of the blocks that are chosen; how many."""
+    some = select(gyro_blocks.c.id).where(*chosen).limit(_BLOCKS_AT_ONCE)
+    ids = list(connection.scalars(some))
+    connection.execute(delete(gyro_blocks).where(gyro_blocks.c.id.in_(ids)))
+    return len(ids)
 
 
 def _of_an_hour(spacecraft: str, run: str, hour: int, before: Utc) -> Callable[[Connection], int]:
@@ -85,20 +137,21 @@ def _of_an_hour(spacecraft: str, run: str, hour: int, before: Utc) -> Callable[[
             results.c.time_ns < end,
         )
         ids = list(connection.scalars(chosen))
-        for first in range(0, len(ids), _AT_ONCE):
-            _delete(connection, ids[first : first + _AT_ONCE])
+        delete_batches(connection, ids)
         rollups.renew(connection, [(spacecraft, run, hour)])
         return len(ids)
 
     return change
 
 
-def _delete(connection: Connection, batch_ids: list[str]) -> None:
+def delete_batches(connection: Connection, batch_ids: Sequence[str]) -> None:
     """Delete batches with all that was made of them, what refers to others first."""
-    made = select(results.c.id).where(results.c.batch_id.in_(batch_ids))
-    for table in OF_A_RESULT:
-        connection.execute(delete(table).where(table.c.result_id.in_(made)))
-    for table in OF_A_BATCH:
-        connection.execute(delete(table).where(table.c.batch_id.in_(batch_ids)))
-    connection.execute(delete(results).where(results.c.batch_id.in_(batch_ids)))
-    connection.execute(delete(batches).where(batches.c.id.in_(batch_ids)))
+    for first in range(0, len(batch_ids), _AT_ONCE):
+        ids = batch_ids[first : first + _AT_ONCE]
+        made = list(connection.scalars(select(results.c.id).where(results.c.batch_id.in_(ids))))
+        for table in OF_A_RESULT:
+            connection.execute(delete(table).where(table.c.result_id.in_(made)))
+        for table in OF_A_BATCH:
+            connection.execute(delete(table).where(table.c.batch_id.in_(ids)))
+        connection.execute(delete(results).where(results.c.batch_id.in_(ids)))
+        connection.execute(delete(batches).where(batches.c.id.in_(ids)))

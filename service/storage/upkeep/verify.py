@@ -31,6 +31,9 @@ from service.storage.sql.tables import (
     star_results,
     tracker_values,
 )
+from service.storage.upkeep.verify_archived import of_the_archived
+from service.storage.upkeep.verify_grades import of_the_grades
+from service.storage.upkeep.verify_gyro import of_the_gyro_blocks
 
 AT_ONCE = 500
 OUTCOMES = ("unique", "ambiguous", "unmatched")
@@ -45,8 +48,8 @@ def verify(database: str, step: Step = lambda done, total: None) -> list[str]:
     """The faults of a database, a sentence each; empty: none.
 
     Looks at the file itself (SQLite), the schema, every batch with all that
-    was made of it, and the trends.  Raises `BadConfiguration` where there is
-    no database.
+    was made of it, the trends, the gyro blocks, the filtered and smoothed attitudes, and
+    which batches are archived.  Raises `BadConfiguration` where there is no database.
     """
     problems = check(database)
     if problems:
@@ -60,6 +63,9 @@ def verify(database: str, step: Step = lambda done, total: None) -> list[str]:
             if not found:
                 found += _of_the_batches(engine, step)
                 found += _of_the_trends(engine)
+                found += of_the_gyro_blocks(engine)
+                found += of_the_archived(engine)
+                found += of_the_grades(engine)
     finally:
         engine.dispose()
     return found

@@ -8,7 +8,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.app.history_table import batch_table, history_table
-from service.products.formats import JSON_FORMAT
+from service.products.formats import JSON_FORMAT, OUTPUT_FORMATS, write_table
 from service.storage.models.answers import Result
 from service.storage.models.spacecraft import (
     AttitudePage,
@@ -20,7 +20,13 @@ from service.storage.models.trends import History, Ranking
 from service.web.openapi.route import CONTENT_LOCATION, LINK, ResponseDoc, route_docs
 from service.web.requests.access import CallerDep
 from service.web.requests.dependencies import AppDep, json_response, page_response
-from service.web.requests.history_files import THINNED, history_file, streamed_file, thinned_header
+from service.web.requests.exports import ExportsDep
+from service.web.requests.history_files import (
+    THINNED,
+    history_file,
+    history_headers,
+    thinned_header,
+)
 from service.web.requests.path_parameters import SpacecraftPath
 from service.web.requests.query_parameters import (
     HistoryQuery,
@@ -103,11 +109,15 @@ def list_rates(
     "/{name}/history",
     **route_docs(
         {200: ResponseDoc("The history, in the requested format.", History, THINNED, tables=True)},
-        problems=(404,),
+        problems=(404, 503),
     ),
 )
 def get_history(
-    name: SpacecraftPath, query: Annotated[HistoryQuery, InQuery()], app: AppDep
+    name: SpacecraftPath,
+    query: Annotated[HistoryQuery, InQuery()],
+    app: AppDep,
+    exports: ExportsDep,
+    caller: CallerDep,
 ) -> Response:
     """Quantities over a period.
 
@@ -119,7 +129,12 @@ def get_history(
         pages = app.spacecraft.every_batch(
             name, quantities=query.quantity, tracker=query.tracker, **where
         )
-        return streamed_file(batch_table(pages), query.format, file)
+        return exports.response(
+            caller,
+            lambda: write_table(query.format, batch_table(pages)),
+            OUTPUT_FORMATS[query.format].media_type,
+            history_headers(file, query.format, is_thinned=False),
+        )
     history = app.spacecraft.history(
         name,
         quantities=query.quantity,

@@ -70,7 +70,7 @@ def utc_short(moment: str) -> Markup:
 
 
 def age(seconds: float | None) -> str:
-    """A length of time in its two largest units."""
+    """A length of time in its two largest units, in days alone from a hundred of them on."""
     if seconds is None:
         return DASH
     whole = max(0, round(seconds))
@@ -81,6 +81,8 @@ def age(seconds: float | None) -> str:
     ):
         if whole >= size:
             large, small = whole // size, whole % size // below
+            if large >= 100:
+                small = 0
             return (
                 f"{large}{THIN}{unit} {small}{THIN}{smaller}" if small else f"{large}{THIN}{unit}"
             )

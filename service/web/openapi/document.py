@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema, models_json_schema
 
 from service import __version__
+from service.gyro.schema import GyroBlockIn
 from service.observations.schema import BatchIn
 from service.storage.models.base import Record, component_name, described
 from service.web.api.alarms import CommentIn, LimitIn, LimitTrialIn, ShelveIn, StatementIn
@@ -21,6 +22,7 @@ from service.web.api.compare import CompareIn
 from service.web.api.events import EVENT_STREAM
 from service.web.api.runs import RunIn
 from service.web.api.tokens import SignIn
+from service.web.api.webhooks import ReplayEventsIn, RetryIn, SecretIn, WebhookIn
 from service.web.api.zones import WarmIn
 from service.web.conditional import API
 from service.web.openapi.route import (
@@ -58,8 +60,10 @@ TAGS = {
     "replayed into them.",
     "access": "The caller, the session of a browser, and the audit list.",
     "alarms": "Limits, alarms, and actions on alarms.",
+    "gyro": "Rates of a spacecraft's gyro, in blocks of samples.",
     "annotations": "Notes that people write on times and periods.",
     "events": "Live events.",
+    "webhooks": "Events that the service sends to receivers (Standard Webhooks).",
     "probes": "Probes and metrics for operation and monitoring.",
 }
 
@@ -125,9 +129,14 @@ REQUESTS: Sequence[type[BaseModel]] = (
     ShelveIn,
     CommentIn,
     AnnotationIn,
+    GyroBlockIn,
     LimitIn,
     LimitTrialIn,
     SignIn,
+    WebhookIn,
+    SecretIn,
+    RetryIn,
+    ReplayEventsIn,
 )
 
 

@@ -72,7 +72,7 @@ _PROBLEMS = {
     403: "The token lacks the scope, or is bound to other spacecraft.",
     404: "Not found.",
     408: "The body did not arrive in time.",
-    409: "The batch is recorded already with another body, or the state does not allow this.",
+    409: "Recorded already with another body, or the state does not allow this.",
     413: "The body is too large.",
     415: "This route does not accept the content type or the content coding of the body.",
     422: "Invalid input; `errors` names every field and value.",

@@ -79,6 +79,11 @@ POLICIES: dict[str, Policy] = {
     "get_latest": Policy("read", "path"),
     "list_attitudes": Policy("read", "path"),
     "get_attitude": Policy("read", "path"),
+    "get_attitude_at": Policy("read", "path"),
+    "get_table": Policy("read", "path"),
+    "submit_gyro": Policy("submit", "path"),
+    "list_gyro": Policy("read", "path"),
+    "get_gyro": Policy("read", "path"),
     "list_rates": Policy("read", "path"),
     "get_history": Policy("read", "path"),
     "list_worst": Policy("read", "path"),
@@ -114,6 +119,17 @@ POLICIES: dict[str, Policy] = {
     "get_overview": Policy("read", "nothing"),
     "events": Policy("read", "query"),
     "list_audit": OPERATE,
+    # What a webhook sends is about every spacecraft, and its URL may be a secret.
+    "list_webhooks": OPERATE,
+    "get_webhook": OPERATE,
+    "add_webhook": OPERATE,
+    "change_webhook": OPERATE,
+    "delete_webhook": OPERATE,
+    "rotate_webhook_secret": OPERATE,
+    "test_webhook": OPERATE,
+    "list_webhook_deliveries": OPERATE,
+    "retry_dead_letters": OPERATE,
+    "replay_events": OPERATE,
 }
 """The policy of every route by its name; the console's pages add theirs."""
 

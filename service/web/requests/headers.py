@@ -40,3 +40,7 @@ NO_KEY_OF_MANY = _no_idempotency_key(
     "belongs to one batch: of an array, each batch is recognised by its own batch id"
 )
 """For a route that takes several batches."""
+NO_KEY_OF_A_BLOCK = _no_idempotency_key(
+    "belongs to batches: a gyro block is recognised by its own name"
+)
+"""For a route that takes gyro blocks."""

@@ -1,6 +1,6 @@
 """Histories as files to keep, in any of the output formats."""
 
-from starlette.responses import Response, StreamingResponse
+from starlette.responses import Response
 
 from service.products.formats import OUTPUT_FORMATS, file_suffix, write_table
 from service.products.tables import Table
@@ -17,14 +17,8 @@ def history_file(table: Table, format: str, name: str, *, is_thinned: bool) -> R
     """A short table as a file of that name."""
     media_type = OUTPUT_FORMATS[format].media_type
     content = b"".join(write_table(format, table))
-    return Response(content, 200, _headers(name, format, is_thinned), media_type=media_type)
-
-
-def streamed_file(table: Table, format: str, name: str) -> Response:
-    """A table of every batch as a file of that name, sent as it is read."""
-    media_type = OUTPUT_FORMATS[format].media_type
-    content = write_table(format, table)
-    return StreamingResponse(content, 200, _headers(name, format, False), media_type)
+    headers = history_headers(name, format, is_thinned=is_thinned)
+    return Response(content, 200, headers, media_type=media_type)
 
 
 def thinned_header(is_thinned: bool) -> dict[str, str]:
@@ -32,7 +26,8 @@ def thinned_header(is_thinned: bool) -> dict[str, str]:
     return {"Thinned": "true" if is_thinned else "false"}
 
 
-def _headers(name: str, format: str, is_thinned: bool) -> dict[str, str]:
+def history_headers(name: str, format: str, *, is_thinned: bool) -> dict[str, str]:
+    """The headers of a history as a file of that name."""
     return attached_as(name, format) | thinned_header(is_thinned)
 
 

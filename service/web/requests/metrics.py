@@ -3,7 +3,7 @@
 import collections
 import logging
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from itertools import product
 from typing import Any
@@ -19,6 +19,9 @@ from service.ingest.submit import Backlog, Recorded
 from service.storage.models.alarms import Alarm
 from service.storage.models.zones import ZoneCache
 from service.storage.queries.future_dated import LIVE
+from service.storage.upkeep.expiries import Expiries
+from service.storage.webhooks.models import Webhook
+from service.times import parse_utc, recorded_utc, unix_seconds, utc_now
 
 log = logging.getLogger(__name__)
 
@@ -75,6 +78,8 @@ class _GaugeCollector(Collector):
             processes=app.replays.processes,
             alarms=app.alarms.active,
             backlog=app.submissions.backlog,
+            expiries=app.expiries.dates,
+            webhooks=app.webhooks.all,
         )
 
     def collect(self) -> Iterator[Metric]:
@@ -91,6 +96,11 @@ class _GaugeCollector(Collector):
             yield _of_alarms(self._app, found["alarms"])
         if "backlog" in found:
             yield from _of_backlog(found["backlog"])
+        if "expiries" in found:
+            yield from _of_expiries(found["expiries"])
+        if "webhooks" in found:
+            yield from _of_webhooks(found["webhooks"])
+        yield _of_attempts(self._app.webhooks.sender.counts)
 
 
 def _of_zones(cache: ZoneCache) -> Iterator[Metric]:
@@ -160,6 +170,71 @@ def _of_backlog(backlog: Backlog) -> Iterator[Metric]:
     age.add_metric(("writes",), writes.oldest_s)
     yield depth
     yield age
+
+
+def _of_expiries(dates: Expiries) -> Iterator[Metric]:
+    """When the leap seconds and the first of the tokens end."""
+    ends = [
+        (
+            "starid_leap_seconds_end_timestamp_seconds",
+            "Until when the table of leap seconds is certain.",
+            dates.leap_seconds,
+        )
+    ]
+    if dates.token_ends is not None:
+        ends.append(
+            (
+                "starid_token_end_timestamp_seconds",
+                "When the first of the tokens in force expires.",
+                dates.token_ends,
+            )
+        )
+    for name, about, moment in ends:
+        unix_s = float(unix_seconds(parse_utc(moment, name).tai_ns))
+        yield GaugeMetricFamily(name, about, value=unix_s)
+
+
+def _of_webhooks(webhooks: Sequence[Webhook]) -> Iterator[Metric]:
+    """What waits for each webhook, and whether anything is sent to it."""
+    labels = ("webhook", "name")
+    active = GaugeMetricFamily(
+        "starid_webhook_active",
+        "1 where events are sent, 0 where not, though nobody paused it.",
+        labels=labels,
+    )
+    waiting = GaugeMetricFamily(
+        "starid_webhook_waiting", "Events that are queued for a webhook.", labels=labels
+    )
+    oldest = GaugeMetricFamily(
+        "starid_webhook_oldest_seconds", "The age of the oldest of them.", labels=labels
+    )
+    dead = GaugeMetricFamily(
+        "starid_webhook_dead_letters", "Events that were not delivered within a day.", labels=labels
+    )
+    now = utc_now()
+    for each in webhooks:
+        names = (each.id, each.name)
+        age_s = (
+            0.0 if each.oldest is None else (now.tai_ns - recorded_utc(each.oldest).tai_ns) / 1e9
+        )
+        if each.enabled:
+            active.add_metric(names, float(each.state == "active"))
+        waiting.add_metric(names, each.waiting)
+        oldest.add_metric(names, max(age_s, 0.0) if each.state == "active" else 0.0)
+        dead.add_metric(names, each.dead)
+    yield from (active, waiting, oldest, dead)
+
+
+def _of_attempts(counts: Mapping[str, int]) -> Metric:
+    """What came of the attempts to deliver."""
+    family = CounterMetricFamily(
+        "starid_webhook_attempts",
+        "Attempts to deliver an event to a webhook; of dead ones it was the last.",
+        labels=("result",),
+    )
+    for result, count in sorted(counts.items()):
+        family.add_metric((result,), count)
+    return family
 
 
 class Metrics:

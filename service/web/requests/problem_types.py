@@ -16,6 +16,7 @@ from service.errors import (
     Unauthenticated,
     WrongState,
 )
+from service.gyro.overlap import SampleTaken
 
 
 @dataclass(frozen=True)
@@ -106,13 +107,22 @@ PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
     ),
     Conflict: ProblemType(
         409,
-        "The batch is already recorded with another body",
+        "Already recorded with another body",
         "conflict",
         "Spacecraft, run and batch id together identify a batch. One with the same three is "
         "recorded, and its body differs from the one that was sent. The recorded batch stays as "
-        "it is.",
+        "it is. The same holds for gyro blocks and their names.",
         "Give the new batch another batch id. To process the recorded one with other options, "
         "use a what-if.",
+    ),
+    SampleTaken: ProblemType(
+        409,
+        "Another gyro block holds a time of this one",
+        "sample-taken",
+        "A sample of the gyro block has the time of a sample that is recorded in another block of "
+        "the spacecraft and the run. Nothing of the block was recorded.",
+        "The detail names both blocks and the time. If the samples are the recorded ones, leave "
+        "them out; if a clock was wrong, correct the times.",
     ),
     WrongState: ProblemType(
         409,

@@ -20,10 +20,8 @@ from starlette.requests import Request
 
 from service.alarms.quantities import QuantityName, RankedName, trend_names
 from service.errors import BadBatch, BadInput, Fault, shown_value
-from service.missions.product_settings import MAX_LARGEST_GAP_S, MIN_NAIF_ID, OBJECT_ID
 from service.observations.schema import Key, RunName
-from service.products.attitudes import StatusWanted
-from service.products.formats import JSON_FORMAT, attitude_formats, table_formats
+from service.products.formats import JSON_FORMAT, table_formats
 from service.storage.queries.alarms import StateFilter
 from service.storage.queries.results import OutcomeName, StatusName
 from service.storage.queries.trends import MAX_SIZE, Strategy
@@ -72,18 +70,6 @@ OfTracker = Annotated[
     ),
 ]
 SpacecraftFilter = Annotated[Key | None, Field(description="Only items of this spacecraft.")]
-
-
-LargestGap = Annotated[
-    float | None,
-    Field(
-        gt=0,
-        le=MAX_LARGEST_GAP_S,
-        allow_inf_nan=False,
-        description="Attitudes farther apart than this, in seconds, belong to two stretches. "
-        "Default: the mission's.",
-    ),
-]
 
 
 class Query(BaseModel):
@@ -260,41 +246,6 @@ class HistoryQuery(PeriodQuery):
             if name not in trend_names():
                 raise ValueError(f"{name} has no history; {', '.join(trend_names())} have")
         return list(dict.fromkeys(names))
-
-
-class AttitudeQuery(PeriodQuery):
-    """Attitudes of a period, in a format."""
-
-    format: Annotated[
-        str,
-        FormatNames(lambda: [*attitude_formats()]),
-        Field(description="`json`: objects; any other: a file."),
-    ] = JSON_FORMAT
-    status: Annotated[
-        StatusWanted,
-        Field(description="Only good attitudes, only suspect ones, or `all`."),
-    ] = "good"
-    order: Annotated[
-        Literal["oldest", "newest"],
-        Field(description="Which come first. `newest` is for JSON and tables alone."),
-    ] = "oldest"
-    largest_gap_s: LargestGap = None
-    object_id: Annotated[
-        str | None,
-        Field(
-            pattern=f"^{OBJECT_ID}$",
-            description="OBJECT_ID of CCSDS messages, such as 1995-074A. Default: the mission's, "
-            "or else the name.",
-        ),
-    ] = None
-    naif_id: Annotated[
-        int | None,
-        Field(
-            ge=MIN_NAIF_ID,
-            le=-1,
-            description="NAIF's id of the spacecraft, for SPICE kernels. Default: the mission's.",
-        ),
-    ] = None
 
 
 class WorstQuery(PeriodQuery):

@@ -19,12 +19,19 @@ def add(commands: Any) -> None:
         """
         acquire export attitude --spacecraft XTE --format aem --output xte.aem
         acquire export attitude --spacecraft XTE --run pass-7 --start 1996-010T00:00:00Z
+        acquire export attitude --spacecraft XTE --grade smoothed --format acm --output xte.acm
         """,
         run,
     )
     parser.add_argument("--spacecraft", required=True, metavar="NAME", help=MISSION)
     add_period(parser, "the run that is read; default live")
     parser.add_argument("--format", choices=tuple(attitude_formats()), default="csv")
+    parser.add_argument(
+        "--grade",
+        choices=("raw", "filtered", "smoothed"),
+        default="raw",
+        help="raw: of batches (default); the others are recorded by `acquire smooth`",
+    )
     parser.add_argument(
         "--status", choices=("good", "suspect", "all"), default="good", help="default good"
     )
@@ -77,6 +84,7 @@ def run(parsed: Namespace) -> int:
             start=start,
             end=end,
             status=parsed.status,
+            grade=parsed.grade,
             order=parsed.order,
             most_batches=attitude_formats()[parsed.format].most_batches,
             **given,

@@ -13,6 +13,7 @@ from starlette.responses import Response
 
 from service.alarms.quantities import QUANTITIES, RankedName, ranked_names, trend_names
 from service.alarms.subjects import limited_trackers
+from service.app.products import TABLE_KINDS
 from service.observations.schema import Key
 from service.products.formats import attitude_formats, table_formats
 from service.storage.models.annotations import Annotation
@@ -184,7 +185,10 @@ def spacecraft_page(
         limits=context.app.limits.all(name, query.tracker if trackers else None),
         formats=table_formats(),
         attitude_formats=attitude_formats(),
-        attitude_file=lambda format: stretch and _attitude_address(name, query, stretch, format),
+        table_kinds=TABLE_KINDS,
+        file=lambda product, format: (
+            stretch and _file_address(name, query, stretch, product, format)
+        ),
         annotations=sorted(notes.items, key=lambda each: recorded_utc(each.start).tai_ns),
         more_annotations=notes.next_cursor is not None,
         may_write="operate" in context.caller.scopes,
@@ -286,12 +290,14 @@ def _history_address(
     return f"/api/v1/spacecraft/{quote(name)}/history?{urlencode(asked)}"
 
 
-def _attitude_address(name: str, query: SpacecraftQuery, stretch: ShownPeriod, format: str) -> str:
-    """The address of the good attitudes of the shown period as a file."""
+def _file_address(
+    name: str, query: SpacecraftQuery, stretch: ShownPeriod, product: str, format: str
+) -> str:
+    """The address of a product of the shown period as a file."""
     asked = {
         "run": query.run,
         "start": stretch.start.text,
         "end": stretch.end.text,
         "format": format,
     }
-    return f"/api/v1/spacecraft/{quote(name)}/attitude?{urlencode(asked)}"
+    return f"/api/v1/spacecraft/{quote(name)}/{product}?{urlencode(asked)}"

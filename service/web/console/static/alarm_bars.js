@@ -17,7 +17,7 @@ export class AlarmBars {
     this.holder.style.width = `${width}px`;
   }
 
-  // A row for each quantity and tracker; the page of alarms has those beyond the last row.
+  // A row for each quantity and tracker, with its name above; the page of alarms has those beyond the last row.
   show(alarms, start, end) {
     const rows = new Map();
     for (const alarm of alarms) {
@@ -28,7 +28,12 @@ export class AlarmBars {
     this.holder.hidden = rows.size === 0;
     const shown = [...rows].slice(0, MOST_ROWS).map(([name, spans]) => {
       const row = document.createElement("div");
-      row.append(...spans.map((each) => this.bar(each, name, start, end)));
+      const label = document.createElement("p");
+      const track = document.createElement("div");
+      label.textContent = name;
+      track.className = "track";
+      track.append(...spans.map((each) => this.bar(each, name, start, end)));
+      row.append(label, track);
       return row;
     });
     this.holder.replaceChildren(...shown);
@@ -45,7 +50,8 @@ export class AlarmBars {
     // A short bar at the end of the chart stays within it.
     bar.style.left = `min(${100 * left}%, 100% - 6px)`;
     bar.style.width = `${100 * (right - left)}%`;
-    bar.textContent = `${SHAPES[severity]} ${name}`;
+    // A shape for which the bar is too narrow breaks to a line that is not seen.
+    bar.textContent = `\u200b${SHAPES[severity]}`;
     bar.title = `${severity}: ${name}, from ${clock(from)} ${until === null ? "until now" : `to ${clock(until)}`} UTC`;
     bar.setAttribute("aria-label", bar.title);
     return bar;

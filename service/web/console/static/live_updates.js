@@ -71,7 +71,7 @@ function ageText(seconds) {
   const units = [[86400, "d", 3600, "h"], [3600, "h", 60, "min"], [60, "min", 1, "s"]];
   for (const [size, unit, below, smaller] of units) {
     if (whole < size) continue;
-    const small = Math.floor((whole % size) / below);
+    const small = whole >= 100 * size ? 0 : Math.floor((whole % size) / below);
     return `${Math.floor(whole / size)}\u202f${unit}${small ? ` ${small}\u202f${smaller}` : ""}`;
   }
   return `${whole}\u202fs`;

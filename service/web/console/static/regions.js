@@ -47,10 +47,23 @@ export function swapRegions(fresh, selector = "[data-region]") {
       const same = next.querySelector(`#${CSS.escape(open.id)}`);
       if (same) same.open = true;
     }
+    keepTyped(region, next);
     if (next.isEqualNode(region)) continue;
     const focused = region.contains(document.activeElement) && placeOf(document.activeElement, region);
     region.replaceWith(document.adoptNode(next));
     if (focused) focused(next)?.focus({ preventScroll: true });
+  }
+}
+
+// What was typed into a form that asks for another page, and not sent yet, stays in its field.
+function keepTyped(region, next) {
+  const forms = (part) => [...part.querySelectorAll('form[method="get"]')];
+  const fresh = forms(next);
+  for (const [index, form] of forms(region).entries()) {
+    for (const field of form.querySelectorAll("input:not([type=hidden])[name]")) {
+      const same = fresh[index]?.querySelector(`[name="${CSS.escape(field.name)}"]`);
+      if (same && field.value !== field.defaultValue) same.value = field.value;
+    }
   }
 }
 

@@ -1,0 +1,90 @@
+"""The wheel holds the service and all that it needs at run time, and nothing else."""
+
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import service
+from service import client as acquire_client
+
+CHECKOUT = Path(__file__).parents[1]
+UV = Path(sys.executable).parent / "uv"
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [UV, "build", "--wheel", "--no-build-isolation", "--offline", "--quiet"]
+    # Without UV_PYTHON it would look for an interpreter of its own.
+    named = os.environ | {"UV_PYTHON": sys.executable}
+    subprocess.run([*command, f"--out-dir={folder}", CHECKOUT], check=True, env=named)
+    (made,) = folder.glob("*.whl")
+    return made
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory):
+    """Runs the wheel in an empty folder, with the dependencies of this environment."""
+    site = tmp_path_factory.mktemp("site")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(site)
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+
+    def run(*arguments):
+        # The wheel comes before the checkout, whose path this environment has as well.
+        return subprocess.run(
+            [sys.executable, *arguments],
+            cwd=elsewhere,
+            env=os.environ | {"PYTHONPATH": str(site)},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+
+    assert str(site) in run("-c", "import service; print(service.__file__)")
+    return run
+
+
+def test_the_wheel_holds_every_file_of_the_package_and_the_shipped_data(wheel):
+    listed = subprocess.run(
+        ["git", "ls-files", "service", "migrations", "catalogs"],
+        cwd=CHECKOUT,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.split()
+    shipped = {"catalogs/README.md", "catalogs/stars.npz"}
+    wanted = {
+        name if name.startswith("service/") else f"service/_shipped/{name}"
+        for name in listed
+        if not name.startswith("catalogs/") or name in shipped
+    }
+    with zipfile.ZipFile(wheel) as archive:
+        held = {name for name in archive.namelist() if ".dist-info/" not in name}
+    assert {
+        name for name in wanted if (CHECKOUT / name).exists() or "_shipped" in name
+    } - held == set()
+    assert {name for name in held if not name.startswith("service/")} == set()
+    assert {name for name in held if name.endswith((".db", ".nbi", ".nbc", ".pyc"))} == set()
+
+
+def test_the_wheel_the_service_and_the_client_have_one_version(wheel):
+    assert service.__version__ == acquire_client.__version__ == wheel.name.split("-")[1]
+
+
+def test_its_commands_find_migrations_and_star_catalog_in_the_wheel(installed):
+    version = installed("-m", "service.cli", "--version")
+    assert (
+        version.split()[-1] == installed("-c", "import service; print(service.__version__)").strip()
+    )
+    assert "the schema is that of the code" in installed(
+        "-m", "service.cli", "database", "check", "--fresh"
+    )
+    export = ("catalog", "export", "--spacecraft", "XTE", "--epoch", "2000", "run.csv")
+    installed("-m", "service.cli", *export)
+    rows = installed("-c", "print(sum(1 for line in open('run.csv')))")
+    assert int(rows) > 1_000
