@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -151,7 +151,7 @@ def _attitudes(count: int) -> AttitudeRows:
     turn = Rotation.from_rotvec(np.radians([0.3, -0.5, 0.8]) * np.arange(count)[:, None])
     times = [shifted(START, float(second)) for second in range(count)]
 
-    def column(values: list[str]) -> npt.NDArray[np.object_]:
+    def column(values: Sequence[str | None]) -> npt.NDArray[np.object_]:
         filled = np.empty(len(values), dtype=object)
         filled[:] = values
         return filled
@@ -169,6 +169,10 @@ def _attitudes(count: int) -> AttitudeRows:
         residual_rms_arcsec=np.full(count, 1.25),
         predicted_rms_arcsec=np.full(count, 1.5),
         stars=np.tile([9, 6, 2, 1], (count, 1)),
+        model=column([None] * count),
+        revision=np.zeros(count, dtype=np.int64),
+        bias_deg_per_h=np.full((count, 3), np.nan),
+        bias_sigma_deg_per_h=np.full((count, 3), np.nan),
     )
 
 
