@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 NOTES = """\
 NCAP is counted, NTOT predicted: NTOT = k_g (NCAP^2 - NCAP) / 2 with the k_g of the place and
-the shape of the zone. Beside it stand NTOT as counted for the richest zone, and the bound of
+the shape of the zone. The table also has NTOT as counted for the richest zone, and the bound of
 Fink & Shoup (1994): k_g of the areas (equation 2) in equation 1, with the most stars of the sky.
 Memory is that of the largest zone as the service caches it, grown by the zone's grid."""
 

@@ -26,8 +26,9 @@ def add(commands: Any) -> None:
         commands,
         "calibrate",
         "Estimate alignment between trackers, scale and distortion of each, and time tags from "
-        "the identified stars of recorded batches, with sigmas; name what these cannot show; "
-        "write a mission file with the result.  Changes nothing that is recorded or in use.",
+        "the identified stars of recorded batches, with sigmas; name the unknowns that these "
+        "cannot show; write a mission file with the result.  Changes nothing that is recorded or in "
+        "use.",
         """
         acquire calibrate TWOHEADS
         acquire calibrate TWOHEADS --run commissioning --output twoheads-new.toml
@@ -48,12 +49,13 @@ def add(commands: Any) -> None:
         "--degree",
         type=int,
         metavar="N",
-        help="of the distortion, 0 for none; default: chosen by held-out blocks of time",
+        help="degree of the distortion, 0 for none; default: chosen by held-out blocks of time",
     )
     parser.add_argument(
         "--time-tag",
         action="store_true",
-        help="estimate how much later than sent each tracker but the first measured its stars",
+        help="estimate by how much each tracker but the first measured its stars later than the "
+        "batch says",
     )
     parser.add_argument(
         "--sample",

@@ -30,7 +30,7 @@ def add(commands: Any) -> None:
         "calibrate",
         "Fit focal length, optical centre and radial distortion to pictures of the sky, measure "
         "star images, noise and zero point, and write the mission file of the camera.  A few "
-        "pictures of different fields are enough; nothing needs to be known of them.  Residual "
+        "pictures of different fields are enough; no information about them is needed.  Residual "
         "maps before and after are written beside the mission file.",
         """
         acquire camera calibrate pictures/*.jpg -o missions/mycam.toml

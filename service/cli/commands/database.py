@@ -65,7 +65,7 @@ def add(commands: Any) -> None:
         group,
         "restore",
         "Make a database from a backup: a SQLite file that does not exist yet, or an empty "
-        "PostgreSQL database.  It appears whole or not at all, with the schema that it had.",
+        "PostgreSQL database.  It appears whole or not at all, with the schema of the backup.",
         """
         acquire database restore night.db --database sqlite:///acquire.db
         acquire database restore night.dump --database postgresql://user@host/attitudes

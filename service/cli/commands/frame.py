@@ -22,7 +22,7 @@ from service.errors import BadInput, Fault, shown_value
 SIDECAR = """\
 The metadata of a frame are in a JSON file of its name beside it, FILE.json for
 FILE.fits, as `acquire simulate frames` writes it: the fields of a batch but its stars
-(time, a_priori, body_rates_deg_per_s, ...).  Options of the command come first."""
+(time, a_priori, body_rates_deg_per_s, ...).  Options of the command override them."""
 
 
 def add(commands: Any) -> None:
@@ -90,7 +90,8 @@ def add(commands: Any) -> None:
 def _add_lens(parser: ArgumentParser) -> None:
     """Options for the lens of a picture without a spacecraft."""
     lens = parser.add_argument_group(
-        "without a spacecraft", "what is known of the camera; of its lens within a quarter"
+        "without a spacecraft",
+        "known data of the camera; values of its lens may be wrong by a quarter",
     )
     lens.add_argument("--fov", type=degrees, metavar="DEG", help="field of view, the longer side")
     lens.add_argument("--focal-px", type=positive, metavar="PX", help="focal length in pixels")

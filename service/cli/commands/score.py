@@ -23,7 +23,7 @@ def add(commands: Any) -> None:
     parser = add_command(
         commands,
         "score",
-        "Hold recorded attitudes against true ones: an AEM (KVN or XML) or a C-kernel. Prints "
+        "Compare recorded attitudes with true ones: an AEM (KVN or XML) or a C-kernel. Prints "
         "the errors about each body axis, and whether the covariances fit them.",
         """
         acquire score truth.aem --spacecraft XTE --run pass-7

@@ -21,7 +21,11 @@ def add(commands: Any) -> None:
         """,
         run,
     )
-    parser.add_argument("--host", help="loopback address; default: ACQUIRE_HOST, else 127.0.0.1")
+    parser.add_argument(
+        "--host",
+        help="address to listen on; one that is not loopback requires a token; default: "
+        "ACQUIRE_HOST, else 127.0.0.1",
+    )
     parser.add_argument("--port", type=int, help="default: ACQUIRE_PORT, else 8000")
     add_database(parser)
 

@@ -47,7 +47,7 @@ PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
         400,
         "The body is not JSON",
         "not-json",
-        "The body was cut off, is empty, is no JSON, or is not in UTF-8. Nothing of it was used.",
+        "The body is truncated, empty, not JSON, or not in UTF-8. The service used no part of it.",
         "Check that the client sends the whole body. The detail names the place of the first "
         "fault.",
     ),
@@ -91,8 +91,8 @@ PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
         429,
         "Too many requests",
         "too-often",
-        "The rate of the token is used up, or its ten event streams. An array of batches counts "
-        "as many requests as it has batches.",
+        "The rate of the token is used up, or all of its ten event streams are in use. An array of "
+        "batches counts as many requests as it has batches.",
         "Wait for as many seconds as the header Retry-After says, then send the same request "
         "again.",
     ),
@@ -100,18 +100,18 @@ PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
         404,
         "Not found",
         "not-found",
-        "There is no spacecraft, batch, alarm, run or replay of the name or id in the address, or "
+        "No spacecraft, batch, alarm, run or replay has the name or id in the address, or "
         "the token may not see it.",
-        "Check the name in the address. GET /api/v1/spacecraft and GET /api/v1/batches list what "
-        "there is.",
+        "Check the name in the address. GET /api/v1/spacecraft and GET /api/v1/batches list the "
+        "existing ones.",
     ),
     Conflict: ProblemType(
         409,
         "Already recorded with another body",
         "conflict",
-        "Spacecraft, run and batch id together identify a batch. One with the same three is "
-        "recorded, and its body differs from the one that was sent. The recorded batch stays as "
-        "it is. The same holds for gyro blocks and their names.",
+        "Spacecraft, run and batch id together identify a batch. A batch with the same three is "
+        "already recorded, and its body differs from the one that was sent. The recorded batch "
+        "does not change. The same holds for gyro blocks and their names.",
         "Give the new batch another batch id. To process the recorded one with other options, "
         "use a what-if.",
     ),
@@ -120,7 +120,7 @@ PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
         "Another gyro block holds a time of this one",
         "sample-taken",
         "A sample of the gyro block has the time of a sample that is recorded in another block of "
-        "the spacecraft and the run. Nothing of the block was recorded.",
+        "the spacecraft and the run. The service recorded no part of the block.",
         "The detail names both blocks and the time. If the samples are the recorded ones, leave "
         "them out; if a clock was wrong, correct the times.",
     ),

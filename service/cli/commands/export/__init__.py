@@ -12,7 +12,7 @@ def add(commands: Any) -> None:
     group = add_group(
         commands,
         "export",
-        "Write what is recorded to files that other programs read.",
+        "Write recorded data to files that other programs read.",
         "acquire export attitude --spacecraft XTE --format aem --output xte.aem",
     )
     for module in pkgutil.iter_modules(__path__):

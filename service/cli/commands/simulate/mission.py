@@ -59,10 +59,10 @@ def add(group: Any) -> None:
         "--direction",
         type=_direction,
         metavar="RA,DEC",
-        help="deg; axes of zones lie about it; default: the whole sky",
+        help="deg; draw the axes of zones about this direction; default: over the whole sky",
     )
     parser.add_argument(
-        "--within", type=float, metavar="DEG", help="bound of that angle (RCCAT); default 0"
+        "--within", type=float, metavar="DEG", help="largest angle from it (RCCAT); default 0"
     )
     parser.add_argument("--tracker", metavar="NAME", help="default: the first of the mission")
     parser.add_argument(
