@@ -56,7 +56,7 @@ def create(
         store.writer.change(change).result()
     print(secret)
     print(f"\n{name} may {', '.join(scopes)}{_about(spacecraft)} until {expires.text[:10]}.")
-    print("It is shown this once. Programs send it as `Authorization: Bearer acq_...`; commands")
+    print("It is shown only now. Programs send it as `Authorization: Bearer acq_...`; commands")
     print("that talk to the service read it from ACQUIRE_TOKEN.")
     return 0
 

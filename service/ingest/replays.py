@@ -125,7 +125,7 @@ class RunningReplay:
     def require_going_on(self) -> None:
         """Raise `Busy` if the replay is to stop, `BadBatch` if its time is over."""
         if self._stopping.is_set():
-            raise Busy("the replay is to stop", round(BUSY_PAUSE_S) or 1)
+            raise Busy("the replay is stopping", round(BUSY_PAUSE_S) or 1)
         if time.monotonic() > self._until_s:
             message = (
                 f"took longer than {self._longest_s:g} s (ACQUIRE_REPLAY_SECONDS); send it again "

@@ -27,8 +27,8 @@ def add(commands: Any) -> None:
         "calibrate",
         "Estimate alignment between trackers, scale and distortion of each, and time tags from "
         "the identified stars of recorded batches, with sigmas; name the unknowns that these "
-        "cannot show; write a mission file with the result.  Changes nothing that is recorded or in "
-        "use.",
+        "cannot show; write a mission file with the result.  Changes nothing that is recorded or "
+        "in use.",
         """
         acquire calibrate TWOHEADS
         acquire calibrate TWOHEADS --run commissioning --output twoheads-new.toml

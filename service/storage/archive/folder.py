@@ -141,7 +141,7 @@ def whole_content(folder: Path, path: str, sha256: str) -> bytes:
     except OSError as error:
         raise BadConfiguration(f"{folder / path}: cannot be read: {error.strerror}") from None
     if hashlib.sha256(content).hexdigest() != sha256:
-        raise BadConfiguration(f"{folder / path}: is damaged: its SHA-256 is another")
+        raise BadConfiguration(f"{folder / path}: is damaged: its SHA-256 differs")
     return content
 
 

@@ -45,7 +45,7 @@ class Archive:
         from pyarrow import parquet
 
         if self.folder is None:
-            raise Busy("the batch is archived, and this service knows no folder of an archive")
+            raise Busy("the batch is archived, and this service has no archive folder")
         try:
             return parquet.read_table(
                 self.folder / path,

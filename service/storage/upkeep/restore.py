@@ -116,7 +116,7 @@ def _restore_postgresql(source: Path, url: URL) -> str:
     if schema is not None and held and not held[0].startswith(f"TABLE {schema} "):
         raise BadConfiguration(
             f"{source}: holds the tables of schema {held[0].split()[1]}; those of "
-            f"{shown_url(url)} would stand in schema {schema}"
+            f"{shown_url(url)} belong in schema {schema}"
         )
     wanted = [line for line in contents if schema is None or not _makes_schema(line, schema)]
     with tempfile.NamedTemporaryFile("w", encoding="utf-8") as listed:
