@@ -91,7 +91,8 @@ def test_every_command_that_prints_a_table_prints_it_as_json(acquire, tmp_path):
 def test_commands_that_print_tables_are_known_to_have_json():
     with_json = {"advise", "database check", "database verify", "demo", "frame", "history"}
     with_json |= {"mission check", "replay", "reprocess", "simulate imaging", "simulate paper"}
-    with_json |= {"mission estimate", "simulate mission", "token list"}
+    with_json |= {"mission estimate", "simulate mission", "token list", "calibrate", "smooth"}
+    with_json |= {"archive", "archive verify", "archive restore"}
     found = {name for name in {*COMMANDS, "demo"} if "--json" in _options(name)}
     assert found == with_json
 
