@@ -87,7 +87,7 @@ def moved(text, folder, port):
 @pytest.mark.usefixtures("server")
 def test_the_lines_of_the_readme_print_the_attitude_that_it_shows(folder, port):
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    shown = json.loads(re.search(r"with more digits\n`(\[.*\])`", text).group(1))
+    shown = json.loads(re.search(r"with more digits than here:\n`(\[.*\])`", text).group(1))
     for language, program in (("sh", ["bash", "-c"]), ("python", [".venv/bin/python", "-c"])):
         (lines,) = re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
         command = [*program, "set -e\n" * (language == "sh") + moved(lines, folder, port)]
