@@ -88,6 +88,9 @@ def require_reachable(
     With `only_allowed` it must be in an allowed network.  An address that stands for
     another one, as IPv4-mapped and 6to4 ones do, is refused where either is.
     """
+    if isinstance(address, ipaddress.IPv6Address):
+        # Without the name of an interface (%eth0): with one it equals no other address.
+        address = ipaddress.IPv6Address(int(address))
     for each in (address, *_embedded(address)):
         if each in METADATA:
             raise Refused(f"{address} tells a machine its own secrets, and is never allowed")

@@ -108,6 +108,14 @@ def test_a_setting_allows_networks_but_never_metadata():
         require_reachable(ip_address("::ffff:10.1.2.3"), allowed)
 
 
+def test_an_interface_beside_the_address_makes_no_other_address_of_it():
+    allowed = networks("fd00::/8")
+    require_url("https://[fd00::1]/", allowed)
+    for refused in ("fd00:ec2::254", "fd00:ec2::254%25lo", "fd00:ec2::254%lo"):
+        with pytest.raises(BadInput, match="never allowed"):
+            require_url(f"https://[{refused}]/", allowed)
+
+
 @pytest.fixture
 def names(monkeypatch):
     """A name server of ours: a list of answers for each name, and what was looked up."""
