@@ -55,6 +55,8 @@ def require_url(url: str, allowed: Sequence[Network]) -> None:
         raise BadInput(Fault("url", f"may have at most {MAX_URL} characters"))
     try:
         parsed = httpx.URL(url)
+        # Decoded: raises for a name that no name server can have.
+        host = parsed.host
     except (httpx.InvalidURL, ValueError) as error:
         raise fault(f"is no URL: {error}") from None
     schemes = ("https", "http") if allowed else ("https",)
@@ -64,7 +66,7 @@ def require_url(url: str, allowed: Sequence[Network]) -> None:
             if parsed.scheme != "http"
             else "must begin with https://; http is for networks in ACQUIRE_WEBHOOK_NETWORKS"
         )
-    if not parsed.host:
+    if not host:
         raise fault("must name a host")
     if parsed.userinfo:
         raise BadInput(Fault("url", "must not hold a user name or a password"))
@@ -73,7 +75,7 @@ def require_url(url: str, allowed: Sequence[Network]) -> None:
     port = parsed.port
     if port is not None and port not in (80, 443) and not _is_web_port(port):
         raise fault("must have port 80, 443, or one from 1024 on that is for the web")
-    if (address := _literal(parsed.host)) is not None:
+    if (address := _literal(host)) is not None:
         try:
             require_reachable(address, allowed, only_allowed=parsed.scheme == "http")
         except Refused as error:

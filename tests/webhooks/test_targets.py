@@ -62,6 +62,8 @@ FORMS = [
     ("https://receiver.example:99999/", "port"),
     ("https://[::1/", "URL"),
     ("https://0177.0.0.1/", "URL"),
+    ("https://xn--a.example/", "URL"),
+    ("https://xn--/", "URL"),
 ]
 
 NAMES = [
