@@ -59,14 +59,17 @@ class CheckedTransport(httpx.AsyncBaseTransport):
         Raises `Refused` where an address must not be reached.
         """
         url = request.url
+        # As it is sent: decoded and encoded again by the rules of 2003, xn--fa-hia.example would
+        # be fass.example, which is somebody else's.
+        host = url.raw_host.decode("ascii")
         addresses = await reachable_addresses(
-            url.host,
+            host,
             url.port or PORTS[url.scheme],
             self._allowed,
             only_allowed=url.scheme == "http",
         )
         # The header `Host` was made of the name before.
-        request.extensions = {**request.extensions, "sni_hostname": url.host}
+        request.extensions = {**request.extensions, "sni_hostname": host}
         limits = dict(request.extensions["timeout"])
         for address in addresses[:-1]:
             request.url = url.copy_with(host=address)

@@ -128,6 +128,7 @@ def names(monkeypatch):
         "mixed.example": [["127.0.0.2", "127.0.0.1"]],
         "rebind.example": [["127.0.0.2"], ["127.0.0.1"]],
         "good.example": [["127.0.0.2"]],
+        "xn--fa-hia.example": [["127.0.0.2"]],
     }
 
     def getaddrinfo(host, port, *given, **named):
@@ -169,6 +170,15 @@ def test_names_are_refused_on_the_address_that_they_resolve_to(guarded, names):
         assert inside.requests == []
         assert len(world.requests) == 1
         assert world.requests[0].headers["Host"] == f"rebind.example:{world.port}"
+
+
+def test_a_name_is_looked_up_as_it_stands_in_the_url(guarded, names):
+    # The name of 2008's faß; by the rules of 2003 that is fass, another owner's name.
+    with receiving("127.0.0.2") as world:
+        hook = guarded.hook(f"http://xn--fa-hia.example:{world.port}/")
+        assert guarded.ask(hook, "test").json()["delivered"] is True
+        assert names == ["xn--fa-hia.example"]
+        assert world.requests[0].headers["Host"] == f"xn--fa-hia.example:{world.port}"
 
 
 def test_redirects_are_not_followed_and_proxies_not_asked(guarded, names, monkeypatch):
