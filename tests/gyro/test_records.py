@@ -39,6 +39,19 @@ def names(app, run="live"):
     return [each.block for each in app.gyro.page("XTE", run=run).items]
 
 
+@pytest.mark.parametrize("year", [1972, 1999, 2032, 2098])
+def test_pages_of_blocks_go_on_in_any_year(app, year):
+    starts = [f"{year}-03-01T00:00:{k:02d}.000Z" for k in range(3)]
+    for start in starts:
+        app.gyro.record(block(start, start=start))
+    found, cursor = [], None
+    while not found or cursor is not None:
+        page = app.gyro.page("XTE", limit=1, cursor=cursor)
+        found += [each.start for each in page.items]
+        cursor = page.next_cursor
+    assert found == starts
+
+
 def test_of_sound_blocks_nothing_is_wrong(filled, database):
     assert verify(database) == []
 

@@ -194,6 +194,7 @@ def shown(row: Any) -> GyroBlockRow:
 
 
 def _read_cursor(cursor: str) -> int:
-    if not re.fullmatch(r"-?\d{1,18}", cursor, re.ASCII):
+    # From 2031-09 on a time has 19 digits.
+    if not re.fullmatch(r"-?\d{1,19}", cursor, re.ASCII) or abs(int(cursor)) >= 1 << 63:
         raise BadBatch(Fault("cursor", "is not a cursor of this list", shown_value(cursor)))
     return int(cursor)
