@@ -1,6 +1,7 @@
 """The archive: every batch is in the record or in the archive, byte for byte, whatever happens."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor, wait
 
 import pyarrow as pa
 import pytest
@@ -11,6 +12,7 @@ from service.observations.schema import OptionsIn
 from service.storage.archive import archiving, folder, rows
 from service.storage.archive.restoring import PartFilter, restore, verify_archive
 from service.storage.archive.tables import archived_batches
+from service.storage.queries.results import is_archived
 from service.storage.sql.columns import metadata
 from service.storage.sql.database import Store
 from service.storage.sql.tables import (
@@ -226,6 +228,46 @@ def test_what_changes_while_a_part_is_written_is_archived_as_it_is_then(filled, 
     restore(filled.store, place, PartFilter())
     with filled.store.reading() as connection:
         assert connection.scalar(select(results.c.current).where(results.c.id == adopted[0]))
+
+
+@pytest.fixture
+def meanwhile(opened, place, database):
+    """Lets another service on the database do something, once.
+
+    Waits for the end of it, a second at most: it may have to wait for the caller.
+    """
+    if database.startswith("sqlite"):
+        pytest.skip("with SQLite the service is stopped first")
+    other, begun = opened(archive_folder=place), []
+    with ThreadPoolExecutor() as pool:
+
+        def does(work):
+            if not begun:
+                begun.append(pool.submit(work, other))
+                wait(begun, timeout=1.0)
+            return begun[0]
+
+        yield does
+
+
+def test_a_what_if_that_a_service_records_meanwhile_is_not_lost(
+    filled, place, meanwhile, monkeypatch
+):
+    with filled.store.reading() as connection:
+        query = select(results.c.id).where(results.c.run == "live", results.c.current)
+        oldest = connection.scalar(query.order_by(results.c.time_ns))
+    real, told = archiving.keep_share, []
+
+    def keeps(*arguments):
+        told.append(meanwhile(lambda other: other.results.what_if(oldest, TIGHT, record=True)))
+        real(*arguments)
+
+    monkeypatch.setattr(archiving, "keep_share", keeps)
+    archiving.archive(filled.store, place, LATER)
+    # It may be refused.  If not, it is kept.
+    if told[0].exception() is None:
+        with filled.store.reading() as connection:
+            assert is_archived(connection, told[0].result().id)
 
 
 def test_damage_of_a_file_is_found_and_nothing_of_it_is_restored(filled, place):

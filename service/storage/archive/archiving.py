@@ -33,7 +33,14 @@ from service.storage.archive.folder import (
     write_partition,
     write_settings,
 )
-from service.storage.archive.rows import Rows, differing, from_partition, read_rows, to_partition
+from service.storage.archive.rows import (
+    Rows,
+    differing,
+    from_partition,
+    lock_rows,
+    read_rows,
+    to_partition,
+)
 from service.storage.archive.tables import archived_batches, archived_parts, archived_what_ifs
 from service.storage.queries.tracker_splits import is_waiting
 from service.storage.recording.archived_hours import keep_share
@@ -225,6 +232,7 @@ def _keep_settings(connection: Connection, folder: Path, rows: Rows) -> None:
 def _take_out(connection: Connection, day: _Day, part: Part, path: str, written: Rows) -> bool:
     """Note the batches of a part as archived and delete them; False: the record is another now."""
     ids = written["batches"]["id"].to_pylist()
+    lock_rows(connection, ids)
     if differing(read_rows(connection, ids), written) is not None:
         return False
     row = {

@@ -91,6 +91,19 @@ def read_rows(connection: Connection, batch_ids: Sequence[str]) -> Rows:
     return rows
 
 
+def lock_rows(connection: Connection, batch_ids: Sequence[str]) -> None:
+    """Let no other process add anything to these batches, or change it, before the commit.
+
+    What others write refers to a result or to a batch.  Results come first, as where one is
+    adopted.
+    """
+    for table, owner in ((results, results.c.batch_id), (batches, batches.c.id)):
+        for first in range(0, len(batch_ids), _AT_ONCE):
+            chosen = owner.in_(batch_ids[first : first + _AT_ONCE])
+            query = select(table.c.id).where(chosen).order_by(table.c.id)
+            connection.execute(query.with_for_update())
+
+
 def insert_rows(connection: Connection, rows: Rows) -> None:
     """Insert all rows, what others refer to first."""
     made = rows["results"]
