@@ -13,6 +13,7 @@ from service.storage.archive import archiving, folder, rows
 from service.storage.archive.restoring import PartFilter, restore, verify_archive
 from service.storage.archive.tables import archived_batches
 from service.storage.queries.results import is_archived
+from service.storage.recording import rollups
 from service.storage.sql.columns import metadata
 from service.storage.sql.database import Store
 from service.storage.sql.tables import (
@@ -251,7 +252,7 @@ def meanwhile(opened, place, database):
 
 
 def test_a_what_if_that_a_service_records_meanwhile_is_not_lost(
-    filled, place, meanwhile, monkeypatch
+    meanwhile, filled, place, monkeypatch
 ):
     with filled.store.reading() as connection:
         query = select(results.c.id).where(results.c.run == "live", results.c.current)
@@ -268,6 +269,31 @@ def test_a_what_if_that_a_service_records_meanwhile_is_not_lost(
     if told[0].exception() is None:
         with filled.store.reading() as connection:
             assert is_archived(connection, told[0].result().id)
+
+
+@pytest.mark.parametrize("work", ["archive", "restore"])
+def test_trends_that_a_service_counts_meanwhile_have_each_batch_once(
+    meanwhile, filled, place, make, monkeypatch, work
+):
+    monkeypatch.setattr(archiving, "MOST_BATCHES", 1)
+    if work == "restore":
+        archiving.archive(filled.store, place, LATER)
+    late = filled.submissions.submit(make("late", after_s=20_010.0))
+    works = {
+        "archive": lambda other: archiving.archive(other.store, place, LATER),
+        "restore": lambda other: restore(other.store, place, PartFilter()),
+    }
+    real, told = rollups.shares_of_hour, []
+
+    def shares_of_hour(*arguments):
+        told.append(meanwhile(works[work]))
+        return real(*arguments)
+
+    monkeypatch.setattr(rollups, "shares_of_hour", shares_of_hour)
+    filled.results.what_if(late.id, TIGHT, adopt=True)
+    told[0].result()
+    with filled.store.reading() as connection:
+        assert_equal_to_a_recount(connection)
 
 
 def test_damage_of_a_file_is_found_and_nothing_of_it_is_restored(filled, place):

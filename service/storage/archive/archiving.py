@@ -43,6 +43,7 @@ from service.storage.archive.rows import (
 )
 from service.storage.archive.tables import archived_batches, archived_parts, archived_what_ifs
 from service.storage.queries.tracker_splits import is_waiting
+from service.storage.recording import rollups
 from service.storage.recording.archived_hours import keep_share
 from service.storage.sql.database import Store
 from service.storage.sql.rollup_tables import rollups_daily, rollups_hourly
@@ -256,7 +257,10 @@ def _take_out(connection: Connection, day: _Day, part: Part, path: str, written:
     made = written["results"]
     further = made.filter(pc.not_equal(made["id"], made["batch_id"])).select(["id", "batch_id"])
     insert_all(connection, archived_what_ifs, further.to_pylist())
-    keep_share(connection, number, day.spacecraft, day.run, _by_hour(day, written))
+    of_hour = _by_hour(day, written)
+    # Who counts an hour anew reads its results, then its shares: all of it before, or after.
+    rollups.lock(connection, ((day.spacecraft, day.run, hour) for hour in of_hour))
+    keep_share(connection, number, day.spacecraft, day.run, of_hour)
     delete_batches(connection, ids)
     return True
 

@@ -117,6 +117,9 @@ def _put_back(connection: Connection, folder: Path, part: Part, rows: Rows) -> b
     insert_missing(connection, runs, [{"name": part.run, "created": created, "alarms": False}])
     if part_id is not None:
         spacecraft = rows["batches"]["spacecraft"][0].as_py()
+        # As where they are archived.
+        hours = {parse_utc(time).bucket(HOUR_S) for time in rows["batches"]["time"].to_pylist()}
+        rollups.lock(connection, ((spacecraft, part.run, hour) for hour in hours))
         forget_share(connection, part_id, spacecraft, part.run)
         for first in range(0, len(ids), _AT_ONCE):
             some_ids = ids[first : first + _AT_ONCE]
