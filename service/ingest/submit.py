@@ -307,10 +307,10 @@ class SubmissionService:
             )
         holders = [_holder(registry, e.identity, e.key, e.fingerprint) for e in group]
         repeats = {each.result_id for each in holders if isinstance(each, ExistingResult)}
-        stored: Mapping[str, bytes] = {}
+        stored: Mapping[str, bytes | AcquisitionError] = {}
         if repeats:
             with self._store.reading() as connection:
-                stored = self._store.archive.stored_answers(connection, repeats)
+                stored = self._store.archive.answers_or_faults(connection, repeats)
         return [
             self._repeat(pending, holder, stored, registry)
             if isinstance(holder, ExistingResult)
@@ -322,13 +322,16 @@ class SubmissionService:
         self,
         pending: PendingBatch,
         first: ExistingResult,
-        stored: Mapping[str, bytes],
+        stored: Mapping[str, bytes | AcquisitionError],
         registry: Registry,
     ) -> Answered | AcquisitionError | None:
         """The stored answer; a key that came with it belongs to its body from now on."""
-        if first.result_id not in stored:
+        answer = stored.get(first.result_id)
+        if answer is None:
             # It was pruned in between: the batch is as new as any other.
             return None
+        if isinstance(answer, AcquisitionError):
+            return answer
         identity, key = pending.identity, pending.key
         # The keys of archived batches are in the archive.
         if key is not None and key not in registry.keys and not first.archived:
@@ -338,7 +341,7 @@ class SubmissionService:
                 ).result()
             except AcquisitionError as error:
                 return error
-        return Answered(first.result_id, stored[first.result_id], replayed=True)
+        return Answered(first.result_id, answer, replayed=True)
 
     @contextmanager
     def _noted_failure(self, count: int) -> Iterator[None]:

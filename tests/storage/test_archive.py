@@ -1,13 +1,15 @@
 """The archive: every batch is in the record or in the archive, byte for byte, whatever happens."""
 
 import math
-from concurrent.futures import ThreadPoolExecutor, wait
+import threading
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 import pyarrow as pa
 import pytest
 from sqlalchemy import func, select
 
 from service.errors import BadConfiguration, Busy, Conflict, NotFound
+from service.ingest import submit
 from service.observations.schema import OptionsIn
 from service.storage.archive import archiving, folder, rows
 from service.storage.archive.restoring import PartFilter, restore, verify_archive
@@ -154,6 +156,29 @@ def test_without_its_archive_the_service_says_so_and_records_nothing_twice(fille
     place.rename(place.with_name("away"))
     with pytest.raises(Busy, match="the archive cannot be read"):
         filled.submissions.submit(make("b1", kind="suspect", after_s=20_000.0))
+
+
+def test_without_its_archive_the_service_takes_what_came_with_a_repeat(
+    filled, place, make, monkeypatch
+):
+    archiving.archive(filled.store, place, LATER)
+    place.rename(place.with_name("away"))
+    real, may_go_on = submit.look_up, threading.Event()
+
+    def look_up(*arguments):
+        may_go_on.wait(60)
+        return real(*arguments)
+
+    # While the first is looked up the others come, and are then looked up together.
+    monkeypatch.setattr(submit, "look_up", look_up)
+    sent = [make("n1"), make("b1", kind="suspect", after_s=20_000.0), make("n2")]
+    first, repeat, new = (
+        filled.submissions.ingest.submit(each, None, None, Future()) for each in sent
+    )
+    may_go_on.set()
+    assert not first.result(60).replayed
+    assert not new.result(60).replayed
+    assert isinstance(repeat.exception(60), Busy)
 
 
 def test_a_batch_that_is_archived_between_look_up_and_insert_is_not_recorded_again(

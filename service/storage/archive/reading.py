@@ -1,13 +1,13 @@
 """Reads archived batches for the service: the one place that knows where a batch is."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import Connection, select
 
-from service.errors import Busy
+from service.errors import AcquisitionError, Busy
 from service.extras import require_extra
 from service.storage.archive.tables import archived_batches, archived_parts, archived_what_ifs
 from service.storage.recording.identity import stored_answers
@@ -32,6 +32,18 @@ class Archive:
             read = self.read(path, ["id", "answer"], wanted)
             rows = zip(read["id"].to_pylist(), read["answer"].to_pylist(), strict=True)
             found |= {id: answer.encode() for id, answer in rows}
+        return found
+
+    def answers_or_faults(
+        self, connection: Connection, ids: Set[str]
+    ) -> dict[str, bytes | AcquisitionError]:
+        """`stored_answers`, or for archived results what keeps them from being read."""
+        found: dict[str, bytes | AcquisitionError] = {**stored_answers(connection, ids)}
+        if archived := ids - found.keys():
+            try:
+                found |= self.stored_answers(connection, archived)
+            except AcquisitionError as error:
+                found |= dict.fromkeys(archived, error)
         return found
 
     def read(self, path: str, columns: Sequence[str] | None, ids: Sequence[str]) -> "pa.Table":
