@@ -4,7 +4,7 @@ Worker processes compute where there are any; otherwise this process does, a lin
 time while no single post waits.  Only this process uses the database.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, wait
 from functools import cached_property
 
@@ -108,7 +108,7 @@ class Bulk:
         with self._store.reading() as connection:
             registry = look_up(connection, {each for each in named if each is not None})
             ids = {each.result_id for each in registry.identities.values()}
-            stored = self._store.archive.stored_answers(connection, ids)
+            stored = self._store.archive.answers_or_faults(connection, ids)
         known = frozenset(k for k, each in enumerate(named) if each in registry.identities)
         return BulkChunk(self, TelemetryLines(run, texts, known), check, require, registry, stored)
 
@@ -151,7 +151,7 @@ class BulkChunk:
         check: Check,
         require: Require,
         registry: Registry,
-        stored: dict[str, bytes],
+        stored: Mapping[str, bytes | AcquisitionError],
     ) -> None:
         self._bulk, self._lines, self._check = bulk, lines, check
         self._require = require
@@ -249,4 +249,8 @@ class BulkChunk:
         if first is None:
             # It is not called what it seemed to be called.
             return self._bulk.solve_here(submission_from_json(text, run=self._lines.run))
-        return Answered(first.result_id, self._stored[first.result_id], replayed=True)
+        answer = self._stored[first.result_id]
+        if isinstance(answer, AcquisitionError):
+            # The archive may be out of reach for long: the other lines do not wait for it.
+            return answer
+        return Answered(first.result_id, answer, replayed=True)

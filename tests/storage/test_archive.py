@@ -2,6 +2,7 @@
 
 import math
 import threading
+import time
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 import pyarrow as pa
@@ -179,6 +180,19 @@ def test_without_its_archive_the_service_takes_what_came_with_a_repeat(
     assert not first.result(60).replayed
     assert not new.result(60).replayed
     assert isinstance(repeat.exception(60), Busy)
+
+
+def test_without_its_archive_a_replay_refuses_the_line_and_goes_on(filled, place, make):
+    archiving.archive(filled.store, place, LATER)
+    place.rename(place.with_name("away"))
+    sent = [make("b1", kind="suspect", after_s=20_000.0, run="r"), make("new", run="r")]
+    id = filled.replays.start([each.text.encode() + b"\n" for each in sent], "r")
+    give_up = time.monotonic() + 60
+    while (replay := filled.replays.get(id)).finished is None and time.monotonic() < give_up:
+        time.sleep(0.01)
+    assert (replay.state, replay.counts.new) == ("done", 1)
+    assert [each.line for each in replay.errors] == [1]
+    assert "archive" in replay.errors[0].problem.detail
 
 
 def test_a_batch_that_is_archived_between_look_up_and_insert_is_not_recorded_again(
