@@ -73,6 +73,15 @@ def test_between_the_states_it_is_the_orbit(extra, rng):
     within(at(read(oem_text(STEPS, **extra)), seconds), orbit(seconds), 1e-9)
 
 
+@pytest.mark.parametrize("method", ["HERMITE", "LAGRANGE"])
+@pytest.mark.parametrize("degree", [1, 2, 19])
+def test_between_the_states_it_is_near_the_orbit_at_any_degree(method, degree, rng):
+    seconds = np.sort(rng.uniform(0.0, 1_800.0, 50)).round(6)
+    known = read(oem_text(STEPS, INTERPOLATION=method, INTERPOLATION_DEGREE=degree))
+    # Along a chord: an eighth of the square of the angle of a step.
+    within(at(known, seconds), orbit(seconds), 7e-4)
+
+
 def test_states_that_name_no_interpolation_are_near_enough_for_a_kilometre(rng):
     period_s = 5_580.0
     steps = np.arange(0.0, 2 * period_s, period_s / 12.1).round(3)

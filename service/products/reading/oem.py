@@ -217,8 +217,9 @@ class _Reader:
     def _points(self, form: _Form, count: int) -> int:
         """Through how many states the polynomial goes."""
         degree = DEFAULT_DEGREE if form.degree is None else form.degree
-        # A state gives Hermite's polynomial two conditions, its position and its velocity.
-        points = degree + 1 if form.method == "LAGRANGE" else degree // 2 + 1
+        # A state gives Hermite's polynomial two conditions, its position and its velocity; through
+        # one alone would be a line that ends at the next.
+        points = degree + 1 if form.method == "LAGRANGE" else max(degree // 2 + 1, 2)
         if form.degree is None:
             return min(points, count)
         if points > count:
