@@ -327,6 +327,13 @@ def test_the_client_waits_as_long_as_it_is_asked_to(status, asked):
         assert 1.0 <= second - first < 4.0
 
 
+def test_a_wait_that_is_no_time_is_none():
+    asked = {"Retry-After": "Wed, 01 Jan 99999999999999999999 00:00:00 GMT"}
+    with answering(503, asked) as (client, times):
+        assert client.runs() == []
+        assert len(times) == 2
+
+
 def test_a_wait_beyond_the_patience_is_not_begun():
     with answering(503, {"Retry-After": "3600"}) as (client, times):
         with pytest.raises(Busy) as refusal:

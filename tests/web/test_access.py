@@ -20,6 +20,7 @@ from service.times import shifted, utc_now
 from service.web import event_stream as live
 from service.web.app import bare_app, create_app
 from service.web.requests.access import COOKIE, POLICIES, authorize
+from tests.web.console_pages import console_addresses
 from tests.web.serving import Server
 from tests.web.test_bodies import raw
 
@@ -218,6 +219,12 @@ def test_a_token_of_another_spacecraft_is_refused_by_every_route_about_one(guard
         assert response.status_code == wanted, name
         if policy.spacecraft_in == "query":
             assert asked(anybody, method, path, headers=shown(guarded.swas)).status_code == 403
+
+
+def test_every_page_answers_the_token_of_a_spacecraft_without_a_mission_file(guarded, anybody):
+    gone = shown(guarded.token("gone", "read", "submit", "operate", spacecraft=["GONE"]))
+    for path in console_addresses():
+        assert anybody.get(path, headers=gone).status_code < 500, path
 
 
 def test_a_bound_token_submits_reads_and_replays_its_own_spacecraft_alone(guarded, anybody, drawn):

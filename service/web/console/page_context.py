@@ -145,15 +145,23 @@ class PageContext:
 
     @property
     def spacecraft(self) -> list[str]:
-        """The spacecraft that the reader may see."""
+        """The spacecraft with a mission that the reader may see."""
         return [name for name in sorted(self.app.missions) if self.caller.may_see(name)]
+
+    @property
+    def first_spacecraft(self) -> str:
+        """The first spacecraft that the reader may see, with a mission if there is one.
+
+        A token may be bound to spacecraft alone that have no mission file any more.
+        """
+        return (self.spacecraft or sorted(self.caller.spacecraft or ()))[0]
 
     def filled_spacecraft(self, run: str) -> str:
         """The first spacecraft with batches in a run; without any, the first one."""
         found = {
             name for each in self.app.runs.all() if each.run == run for name in each.spacecraft
         }
-        return next((name for name in self.spacecraft if name in found), self.spacecraft[0])
+        return next((name for name in self.spacecraft if name in found), self.first_spacecraft)
 
 
 def _page_context(request: Request, app: AppDep, caller: CallerDep) -> PageContext:

@@ -58,7 +58,7 @@ def alarms_page(query: Annotated[AlarmsQuery, InQuery()], context: ContextDep) -
     if query.spacecraft:
         context.caller.require(query.spacecraft)
     elif context.caller.spacecraft is not None:
-        query = query.model_copy(update={"spacecraft": context.spacecraft[0]})
+        query = query.model_copy(update={"spacecraft": context.first_spacecraft})
     page = context.app.alarms.page(
         run=query.run,
         spacecraft=query.spacecraft or None,

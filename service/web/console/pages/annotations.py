@@ -42,7 +42,7 @@ def annotations_page(
     if query.spacecraft:
         context.caller.require(query.spacecraft)
     elif context.caller.spacecraft is not None:
-        query = query.model_copy(update={"spacecraft": context.spacecraft[0]})
+        query = query.model_copy(update={"spacecraft": context.first_spacecraft})
     page = context.app.annotations.page(
         spacecraft=query.spacecraft or None,
         start=parse_utc(query.start, "start") if query.start else None,

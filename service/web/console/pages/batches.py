@@ -43,7 +43,7 @@ def batches_page(query: Annotated[BatchesQuery, InQuery()], context: ContextDep)
     if query.spacecraft:
         context.caller.require(query.spacecraft)
     elif context.caller.spacecraft is not None:
-        query = query.model_copy(update={"spacecraft": context.spacecraft[0]})
+        query = query.model_copy(update={"spacecraft": context.first_spacecraft})
     page = context.app.results.page(
         spacecraft=query.spacecraft or None,
         run=query.run,
