@@ -18,6 +18,7 @@ from service.sky.cache import LruCache
 from service.sky.model import SkyModel
 from service.sky.zones import Zone
 from service.times import Utc, parse_utc
+from service.tracks.linking import compile_linking
 from service.vectors import quaternion_from_matrix
 
 ORION = 84.0, -1.0
@@ -96,6 +97,7 @@ def prewarm_kernels(sky: SkyModel, missions: Mapping[str, Mission]) -> None:
             batch = submission_from_json(json.dumps(body | {"options": options})).batch
             brightest = _of_bright_stars(given, BRIGHTEST_MAG)
             acquire(batch, mission if identifier.uses_prior else brightest, apart)
+    compile_linking()
 
 
 def _of_bright_stars(mission: Mission, to_mag: float) -> Mission:

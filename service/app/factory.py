@@ -21,6 +21,7 @@ from service.app.spacecraft import Spacecraft
 from service.app.submissions import Submissions
 from service.app.telemetry.grades import Grades
 from service.app.telemetry.gyro import Gyro
+from service.app.telemetry.tracks import Tracks
 from service.app.zones import Zones
 from service.missions.mission import Mission, load_missions
 from service.settings import Settings, is_loopback
@@ -58,6 +59,7 @@ class App:
         self.products = Products(context)
         self.gyro = Gyro(context)
         self.grades = Grades(context)
+        self.tracks = Tracks(context)
         self.limits = Limits(context)
         self.alarms = Alarms(context)
         self.annotations = Annotations(context)

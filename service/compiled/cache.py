@@ -22,6 +22,7 @@ SOURCES = (
     "simulate/scenes.py",
     "sky",
     "studies/ptp_2015/rivals",
+    "tracks/extending.py",
     "errors.py",
     "resources.py",
     "times.py",

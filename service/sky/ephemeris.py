@@ -14,15 +14,15 @@ import numpy.typing as npt
 from erfa import ufunc
 
 from service.times import Utc
-from service.vectors import Vector, unit_of
+from service.vectors import Vector, unit, unit_of
 
 Triple = tuple[float, float, float]
 
 KM_PER_AU = erfa.DAU / 1000.0
 LIGHT_AU_PER_DAY = erfa.DAYSEC / erfa.AULT
 LIGHT_KM_PER_S = erfa.CMPS / 1000.0
-
-
+_ROUNDS_OF_ABERRATION = 3
+"""Each leaves 1e-4 of what was off before."""
 _STEPS_PER_DAY = 32
 """Between so close places a cubic follows epv00 within 0.03 m and 1e-8 m/s."""
 
@@ -85,6 +85,15 @@ def apparent(directions: npt.ArrayLike, velocity_c: Vector, time: Utc) -> Vector
     """Apparent unit vectors of geometric ones (..., 3), aberration applied by `erfa.ab`."""
     inverse_lorentz = float(np.sqrt(1.0 - velocity_c @ velocity_c))
     return np.asarray(ufunc.ab(directions, velocity_c, sun_distance_au(time), inverse_lorentz))
+
+
+def natural(directions: npt.ArrayLike, velocity_c: Vector, time: Utc) -> Vector:
+    """Geometric unit vectors of apparent ones (..., 3): `apparent` undone, within 1e-12 rad."""
+    seen = np.asarray(directions, dtype=np.float64)
+    found = seen
+    for _ in range(_ROUNDS_OF_ABERRATION):
+        found = unit(found + seen - apparent(found, velocity_c, time))
+    return found
 
 
 def sun_direction(time: Utc, position_km: npt.ArrayLike | None) -> Vector:

@@ -29,6 +29,7 @@ from service.web.api import (
     products,
     runs,
     spacecraft,
+    tracks,
     webhooks,
     zones,
 )
@@ -57,6 +58,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     spacecraft.router,
     products.router,
     gyro.router,
+    tracks.router,
     advice.router,
     compare.router,
     zones.router,

@@ -12,6 +12,7 @@ from service.products.formats import JSON_FORMAT, attitude_formats, table_format
 from service.products.moment import AtMethod
 from service.web.requests.query_parameters import FormatNames, PeriodQuery, RunQuery, Time
 
+TDM_MEDIA_TYPE = "text/plain"
 LargestGap = Annotated[
     float | None,
     Field(
@@ -72,6 +73,15 @@ class AttitudeQuery(PeriodQuery):
             description="NAIF's id of the spacecraft, for SPICE kernels. Default: the mission's.",
         ),
     ] = None
+
+
+class TracksQuery(PeriodQuery):
+    """Tracks of a period, in a format."""
+
+    format: Annotated[
+        Literal["json", "tdm"],
+        Field(description="`json`: every track; `tdm`: the moving ones as a file, a CCSDS TDM."),
+    ] = "json"
 
 
 class AttitudeAtQuery(RunQuery):

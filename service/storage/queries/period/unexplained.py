@@ -1,0 +1,109 @@
+"""Recorded batches with their answers, and the points of them that no catalog star explains."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection, Select, select
+
+from service.errors import BadBatch, Fault
+from service.missions.mission import Mission, Tracker
+from service.observations.calibrate import correct
+from service.observations.decode import batch_from_canonical
+from service.storage.models.answers import Answer
+from service.storage.queries.pages import PLACE, ResultFilter
+from service.storage.queries.recorded_batch import recorded_mission
+from service.storage.queries.results import answer_from_json, read_result
+from service.storage.sql.columns import Row
+from service.storage.sql.tables import batches, results
+from service.tracks.gathering import Gathering
+from service.vectors import matrix_from_quaternion
+
+_ROWS: Select[Any] = select(
+    results.c.id,
+    results.c.answer,
+    results.c.mission_digest,
+    results.c.time_ns,
+    results.c.batch_id,
+    batches.c.input,
+).join_from(results, batches, results.c.batch_id == batches.c.id)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedBatches:
+    """Rows of consecutive batches in order of time, with their missions by digest."""
+
+    rows: tuple[Row, ...]
+    missions: dict[str, Mission]
+
+
+def batches_of_period(connection: Connection, selected: ResultFilter, most: int) -> RecordedBatches:
+    """Every current result that is selected.
+
+    Raises `BadBatch` where there are more than `most`.
+    """
+    query = _ROWS.where(*selected.conditions()).order_by(*PLACE).limit(most + 1)
+    rows = [dict(row) for row in connection.execute(query).mappings()]
+    if len(rows) > most:
+        message = f"the period has more than {most:,} batches; choose a shorter one"
+        raise BadBatch(Fault("start", message))
+    return _with_missions(connection, rows)
+
+
+def batches_around(connection: Connection, id: str, each_side: int) -> RecordedBatches:
+    """A result, and the current ones of its spacecraft and run that are next to it in time.
+
+    Raises `NotFound` where there is no such result.
+    """
+    here = read_result(connection, id)
+    same = ResultFilter(here["run"], here["spacecraft"]).conditions()
+    own = (results.c.batch_id, here["batch_id"])
+    descending = [column.desc() for column in PLACE]
+    earlier = _ROWS.where(*same, own[0] != own[1], results.c.time_ns <= here["time_ns"])
+    later = _ROWS.where(*same, own[0] != own[1], results.c.time_ns > here["time_ns"])
+    found = [
+        *connection.execute(earlier.order_by(*descending).limit(each_side)).mappings(),
+        *connection.execute(_ROWS.where(results.c.id == id)).mappings(),
+        *connection.execute(later.order_by(*PLACE).limit(each_side)).mappings(),
+    ]
+    rows = sorted(map(dict, found), key=lambda row: (row["time_ns"], row["batch_id"]))
+    return _with_missions(connection, rows)
+
+
+def _with_missions(connection: Connection, rows: Sequence[Row]) -> RecordedBatches:
+    digests = {row["mission_digest"] for row in rows}
+    missions = {digest: recorded_mission(connection, digest) for digest in digests}
+    return RecordedBatches(tuple(rows), missions)
+
+
+def unexplained_points(recorded: RecordedBatches) -> Gathering:
+    """The unmatched stars of the batches that have an attitude, carried to inertial directions.
+
+    What was sent is calibrated with the settings of the mission as they were for each result.
+    """
+    trackers: dict[str, Tracker] = {}
+    for mission in recorded.missions.values():
+        trackers.update({each.name: each for each in mission.trackers})
+    gathered = Gathering(list(trackers.values()))
+    for row in recorded.rows:
+        answer = answer_from_json(row["answer"])
+        if answer.attitude is None:
+            continue
+        batch = batch_from_canonical(row["input"])
+        gathered.add(
+            batch,
+            correct(batch, recorded.missions[row["mission_digest"]]),
+            _unmatched(answer),
+            matrix_from_quaternion(answer.attitude.quaternion),
+            np.array(answer.attitude.covariance_arcsec2),
+            row["id"],
+        )
+    return gathered
+
+
+def _unmatched(answer: Answer) -> list[Any]:
+    return [
+        np.array([k for k, star in enumerate(each.stars) if star.outcome == "unmatched"], np.int64)
+        for each in answer.observations
+    ]

@@ -1,0 +1,186 @@
+"""Points linked into motions: the one that most points are on first, until none is left.
+
+Whether a motion is real is decided a contrario (Desolneux, Moisan and Morel 2000): how many
+motions with so many points as near would be expected of points that lie anywhere, among
+all pairs that a motion could begin with.  It is taken if that is below `MOST_EXPECTED`.
+"""
+
+import heapq
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import gammaln
+
+from service.errors import BadInput, Fault
+from service.tracks.extending import GATE, MOST_CHANCE, count_seeds, extend, try_seeds
+from service.tracks.motion import Motion, fit_motion, offsets
+from service.tracks.points import Indices, Points
+from service.vectors import ARCSEC_PER_RADIAN, Vector
+
+LEAST_POINTS = 4
+REACH = 3
+"""Batches from the first point of a seed to its second."""
+MOST_EXPECTED = 1e-4
+MOST_SEEDS = 3_000_000
+MOST_RATE_RAD_PER_S = 120.0 / ARCSEC_PER_RADIAN
+_ROUNDS = 8
+
+Marks = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """A motion, the places of its points among all points, and the false ones expected of it."""
+
+    motion: Motion
+    own: Indices
+    log10_expected: float
+
+
+def link(points: Points, batches: int, *, rests: bool = False) -> Iterator[Link]:
+    """The motions on which points lie, those of most points first; each point is on one at most.
+
+    With `rests` only points that keep their place are linked, in whatever axes the directions
+    of the points are.  Raises `BadInput` where there are too many points to try all pairs.
+    """
+    if len(points) < LEAST_POINTS:
+        return
+    first = np.searchsorted(points.batch, np.arange(batches + 1))
+    pairs = int(count_seeds(first, REACH))
+    if pairs > MOST_SEEDS:
+        message = f"has too many unexplained points: {len(points):,}; choose a shorter one"
+        raise BadInput(Fault("start", f"the period {message}"))
+    density = points.per_steradian()
+    used = np.zeros(len(points), np.bool_)
+    chosen = np.full(batches, -1)
+    given = (
+        *(first, points.batch, points.time_s, points.direction),
+        *(_worse_variance(points), density, used, chosen),
+    )
+    seeds = np.empty((max(pairs, 1), 3), np.int64)
+    room = 0.0 if rests else math.pi
+    found = int(try_seeds(REACH, MOST_RATE_RAD_PER_S, LEAST_POINTS, room, *given, seeds))
+    heap = [(-count, i, j) for i, j, count in seeds[:found].tolist()]
+    heapq.heapify(heap)
+    while heap:
+        count, i, j = heapq.heappop(heap)
+        if used[i] or used[j]:
+            continue
+        now = int(extend(i, j, *given))
+        if now < LEAST_POINTS:
+            continue
+        if now < -count:
+            # Some of its points are on another motion by now.
+            heapq.heappush(heap, (-now, i, j))
+            continue
+        own = chosen[points.batch[i] : _end(points, i, chosen, now)]
+        made = _settled(points, own[own >= 0], used, density, moves=True)
+        if made is not None and rests:
+            if made[0].rate_chi_square >= GATE:
+                continue
+            made = _settled(points, made[1], used, density, moves=False)
+        if made is None:
+            continue
+        motion, own = made
+        expected = _log10_expected(points, motion, own, density, pairs)
+        if expected < math.log10(MOST_EXPECTED):
+            used[own] = True
+            yield Link(motion, own, expected)
+
+
+def compile_linking() -> None:
+    """Compile the kernels by linking a few points."""
+    count = LEAST_POINTS + 1
+    number = np.arange(count, dtype=np.int64)
+    places = np.stack([np.cos(number * 1e-4), np.sin(number * 1e-4), np.zeros(count)], axis=1)
+    points = Points(
+        trackers=("any",),
+        field_sr=np.ones(1),
+        batch=number,
+        tracker=np.zeros(count, np.int64),
+        number=number,
+        time_s=number * 10.0,
+        direction=places,
+        covariance=np.tile(np.eye(3) * 1e-10, (count, 1, 1)),
+        place=places,
+        sigma_rad=np.full(count, 1e-5),
+        magnitude_mag=np.full(count, np.nan),
+    )
+    assert len(list(link(points, count))) == 1
+
+
+def _end(points: Points, i: int, chosen: Indices, count: int) -> int:
+    """The batch after the last that was followed: beyond it `chosen` is of another motion."""
+    taken = np.flatnonzero(chosen[points.batch[i] :] >= 0)
+    return int(points.batch[i] + taken[count - 1] + 1)
+
+
+def _worse_variance(points: Points) -> Vector:
+    """The variance (n,) of each direction along its worse axis, rad^2."""
+    return np.ascontiguousarray(np.linalg.eigvalsh(points.covariance)[:, 2])
+
+
+def _settled(
+    points: Points,
+    own: Indices,
+    used: Marks,
+    density: Vector,
+    *,
+    moves: bool,
+) -> tuple[Motion, Indices] | None:
+    """The motion with all points on it, fitted and gathered in turn; None: it dissolves."""
+    motion = None
+    for _ in range(_ROUNDS):
+        if len(own) < LEAST_POINTS:
+            return None
+        motion = fit_motion(
+            *(points.time_s[own], points.direction[own], points.covariance[own]), moves=moves
+        )
+        gathered = _gathered(points, motion, used, density, moves=moves)
+        if np.array_equal(gathered, own):
+            return motion, own
+        own = gathered
+    return None if motion is None or len(own) < LEAST_POINTS else (motion, own)
+
+
+def _gathered(
+    points: Points,
+    motion: Motion,
+    used: Marks,
+    density: Vector,
+    *,
+    moves: bool,
+) -> Indices:
+    """The points on a motion: of each batch and tracker the nearest within the gate."""
+    off, variance = offsets(motion, (points.time_s, points.direction, points.covariance))
+    place, _ = motion.at(points.time_s)
+    whole = variance + motion.spread(points.time_s)
+    distance = np.einsum("ni,nij,nj->n", off, np.linalg.inv(whole), off)
+    chance = math.pi * GATE * np.sqrt(np.linalg.det(whole)) * density
+    near = ~used & (distance < GATE) & (chance < MOST_CHANCE)
+    near &= np.sum(place * points.direction, axis=1) > 0.5
+    candidates = np.flatnonzero(near)
+    order = candidates[np.argsort(distance[candidates], kind="stable")]
+    view = points.batch[order] * len(points.trackers) + points.tracker[order]
+    _, nearest = np.unique(view, return_index=True)
+    return np.sort(order[nearest])
+
+
+def _log10_expected(
+    points: Points, motion: Motion, own: Indices, density: Vector, pairs: int
+) -> float:
+    """How many such motions points anywhere would make: pairs, choices, and the chance of each."""
+    time_s = points.time_s[own]
+    _, variance = offsets(motion, (time_s, points.direction[own], points.covariance[own]))
+    whole = variance + motion.spread(time_s)
+    area = math.pi * GATE * np.sqrt(np.linalg.det(whole))
+    chance = np.minimum(area * density[own], 1.0)
+    # The two points that made the motion tell nothing: those that tell the most are left out.
+    log = np.sort(np.log(chance))[2:].sum()
+    spanned = int(points.batch[own[-1]] - points.batch[own[0]]) + 1
+    free, taken = max(spanned - 2, len(own) - 2), len(own) - 2
+    choices = gammaln(free + 1) - gammaln(taken + 1) - gammaln(free - taken + 1)
+    return float((log + choices) / math.log(10.0) + math.log10(max(pairs, 1)))
