@@ -6,8 +6,12 @@ is taken.
 """
 
 import math
+from typing import NamedTuple
 
-from service.compiled.jit import njit_no_refcount
+import numpy as np
+import numpy.typing as npt
+
+from service.compiled.jit import njit_inlined, njit_no_refcount
 
 GATE = 16.0
 """Chi-square with two degrees of freedom that a point of the motion exceeds once in 3,000."""
@@ -17,101 +21,112 @@ MOST_CHANCE = 0.2
 """Where so many random points are expected within the gate, the next would be a guess."""
 
 
-@njit_no_refcount
-def _solved(s0, s1, s2, y0, y1):  # type: ignore[no-untyped-def]
-    """Value and slope of a weighted line, and their variances and covariance."""
-    determinant = s0 * s2 - s1 * s1
-    if determinant <= 0.0:
-        return y0 / s0, 0.0, 1.0 / s0, math.inf, 0.0
-    value = (s2 * y0 - s1 * y1) / determinant
-    slope = (s0 * y1 - s1 * y0) / determinant
-    return value, slope, s2 / determinant, s0 / determinant, -s1 / determinant
+class Sightings(NamedTuple):
+    """The points (n) of batches (b), as the kernel takes them.
 
-
-@njit_no_refcount
-def extend(  # type: ignore[no-untyped-def]
-    i,
-    j,
-    first,  # (b + 1,) where the points of each batch begin
-    batch,  # (n,)
-    time_s,  # (n,)
-    direction,  # (n, 3)
-    variance,  # (n,) rad^2, along the worse axis
-    density,  # (n,) points per steradian
-    used,  # (n,) points of other tracks
-    chosen,  # (b,) the points that are taken, written
-):
-    """The number of points that lie on the motion of points `i` and `j`, with these two.
-
-    Of each later batch the nearest one is taken, as `chosen` from the batch of `i` on tells;
-    -1 is no point.
+    The points of each batch begin at `first` (b + 1,).  `variance` (n,) is rad^2 along the worse
+    axis, `density` (n,) points per steradian.  `used` (n,) marks points of other motions.
+    `chosen` (b,) is written: the point that is taken of each batch, -1 for none.
     """
+
+    first: npt.NDArray[np.int64]
+    batch: npt.NDArray[np.int64]
+    time_s: npt.NDArray[np.float64]
+    direction: npt.NDArray[np.float64]
+    variance: npt.NDArray[np.float64]
+    density: npt.NDArray[np.float64]
+    used: npt.NDArray[np.bool_]
+    chosen: npt.NDArray[np.int64]
+
+
+@njit_no_refcount
+def _circle(direction, i, j):  # type: ignore[no-untyped-def]
+    """The axes of the circle through two points, (6,): along it at the first one, and its pole."""
     ax, ay, az = direction[i, 0], direction[i, 1], direction[i, 2]
     bx, by, bz = direction[j, 0], direction[j, 1], direction[j, 2]
     nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
     norm = math.sqrt(nx * nx + ny * ny + nz * nz)
     if norm < 1e-12:
         # At one place: any circle through it.
-        if abs(az) < 0.9:
-            nx, ny, nz = ay, -ax, 0.0
-        else:
-            nx, ny, nz = 0.0, az, -ay
+        nx, ny, nz = (ay, -ax, 0.0) if abs(az) < 0.9 else (0.0, az, -ay)
         norm = math.sqrt(nx * nx + ny * ny + nz * nz)
     nx, ny, nz = nx / norm, ny / norm, nz / norm
-    ux, uy, uz = ny * az - nz * ay, nz * ax - nx * az, nx * ay - ny * ax
-    begin = time_s[i]
+    return ny * az - nz * ay, nz * ax - nx * az, nx * ay - ny * ax, nx, ny, nz
+
+
+@njit_inlined
+def _angles(direction, point, i, circle):  # type: ignore[no-untyped-def]
+    """The angles of a point along the circle from point `i`, and across it."""
+    x, y, z = direction[point, 0], direction[point, 1], direction[point, 2]
+    cosine = x * direction[i, 0] + y * direction[i, 1] + z * direction[i, 2]
+    along = math.atan2(x * circle[0] + y * circle[1] + z * circle[2], cosine)
+    return along, x * circle[3] + y * circle[4] + z * circle[5]
+
+
+@njit_inlined
+def _nearest(seen, at, i, circle, sums):  # type: ignore[no-untyped-def]
+    """The point of batch `at` that is nearest to the lines, within the gate; -1: none is."""
+    s0, s1, s2, along0, along1, across0, across1 = sums
+    determinant = s0 * s2 - s1 * s1
+    if determinant <= 0.0:
+        return -1
+    along, rate_along = (s2 * along0 - s1 * along1), (s0 * along1 - s1 * along0)
+    across, rate_across = (s2 * across0 - s1 * across1), (s0 * across1 - s1 * across0)
+    nearest, point = GATE, -1
+    for k in range(seen.first[at], seen.first[at + 1]):
+        if seen.used[k]:
+            continue
+        elapsed = seen.time_s[k] - seen.time_s[i]
+        spread = (s2 + elapsed * (elapsed * s0 - 2.0 * s1)) / determinant
+        allowed = spread + seen.variance[k]
+        if math.pi * GATE * allowed * seen.density[k] > MOST_CHANCE:
+            continue
+        angle, aside = _angles(seen.direction, k, i, circle)
+        off = angle - (along + rate_along * elapsed) / determinant
+        aside -= (across + rate_across * elapsed) / determinant
+        distance = (off * off + aside * aside) / allowed
+        if distance < nearest:
+            nearest, point = distance, k
+    return point
+
+
+@njit_no_refcount
+def extend(i, j, seen):  # type: ignore[no-untyped-def]
+    """The number of points that lie on the motion of points `i` and `j`, with these two.
+
+    Of each later batch the nearest one is taken, as `chosen` tells from the batch of `i` on.
+    """
+    circle = _circle(seen.direction, i, j)
     s0 = s1 = s2 = along0 = along1 = across0 = across1 = 0.0
-    count, missed, last = 0, 0, len(first) - 1
-    at = batch[i]
-    point = i
-    while True:
-        if point >= 0:
-            x, y, z = direction[point, 0], direction[point, 1], direction[point, 2]
-            elapsed = time_s[point] - begin
-            weight = 1.0 / variance[point]
-            angle = math.atan2(x * ux + y * uy + z * uz, x * ax + y * ay + z * az)
-            aside = x * nx + y * ny + z * nz
-            s0 += weight
-            s1 += weight * elapsed
-            s2 += weight * elapsed * elapsed
-            along0 += weight * angle
-            along1 += weight * elapsed * angle
-            across0 += weight * aside
-            across1 += weight * elapsed * aside
-            count += 1
-            missed = 0
-        else:
-            missed += at > batch[j]
+    count, missed = 0, 0
+    second, point = seen.batch[j], i
+    for at in range(seen.batch[i], len(seen.first) - 1):
+        if at == second:
+            point = j
+        elif at > second:
+            sums = s0, s1, s2, along0, along1, across0, across1
+            point = _nearest(seen, at, i, circle, sums)
+        elif count == 1:
+            point = -1
+        seen.chosen[at] = point
+        if point < 0:
+            missed += at > second
             # Two points alone do not tell where the third is to be looked for much later.
             if missed > (MOST_MISSED if count > 2 else 2):
-                return count
-        chosen[at] = point
-        at += 1
-        if at == last:
-            return count
-        if at <= batch[j]:
-            point = j if at == batch[j] else -1
+                break
             continue
-        point = -1
-        if first[at] == first[at + 1]:
-            continue
-        value, rate, v00, v11, v01 = _solved(s0, s1, s2, along0, along1)
-        value_across, rate_across, _, _, _ = _solved(s0, s1, s2, across0, across1)
-        nearest = GATE
-        for k in range(first[at], first[at + 1]):
-            if used[k]:
-                continue
-            elapsed = time_s[k] - begin
-            allowed = v00 + elapsed * (2.0 * v01 + elapsed * v11) + variance[k]
-            if math.pi * GATE * allowed * density[k] > MOST_CHANCE:
-                continue
-            x, y, z = direction[k, 0], direction[k, 1], direction[k, 2]
-            angle = math.atan2(x * ux + y * uy + z * uz, x * ax + y * ay + z * az)
-            off = angle - value - rate * elapsed
-            aside = x * nx + y * ny + z * nz - value_across - rate_across * elapsed
-            distance = (off * off + aside * aside) / allowed
-            if distance < nearest:
-                nearest, point = distance, k
+        angle, aside = _angles(seen.direction, point, i, circle)
+        elapsed, weight = seen.time_s[point] - seen.time_s[i], 1.0 / seen.variance[point]
+        s0 += weight
+        s1 += weight * elapsed
+        s2 += weight * elapsed * elapsed
+        along0 += weight * angle
+        along1 += weight * elapsed * angle
+        across0 += weight * aside
+        across1 += weight * elapsed * aside
+        count += 1
+        missed = 0
+    return count
 
 
 @njit_no_refcount
@@ -126,44 +141,29 @@ def count_seeds(first, reach):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def try_seeds(  # type: ignore[no-untyped-def]
-    reach,
+    reach,  # batches from the first point of a seed to its second
     most_rate,  # rad/s
-    least,  # points of a track
-    room,  # further apart, in rad, is no seed; for points at rest
-    first,
-    batch,
-    time_s,
-    direction,
-    variance,
-    density,
-    used,
-    chosen,
+    room,  # rad; points farther apart are no seed
+    least,  # points of a motion
+    seen,
     seeds,  # (m, 3): points i and j, and the count, written
 ):
-    """The number of seeds that have at least `least` points; they are written to `seeds`."""
+    """The number of seeds whose motion has at least `least` points; they are written to `seeds`."""
     found = 0
-    for a in range(len(first) - 1):
-        for i in range(first[a], first[a + 1]):
-            if used[i]:
+    for i in range(len(seen.batch)):
+        a = seen.batch[i]
+        last = min(a + reach, len(seen.first) - 2)
+        for j in range(seen.first[a + 1], seen.first[last + 1] if last > a else 0):
+            x = seen.direction[j, 0] - seen.direction[i, 0]
+            y = seen.direction[j, 1] - seen.direction[i, 1]
+            z = seen.direction[j, 2] - seen.direction[i, 2]
+            apart = math.sqrt(x * x + y * y + z * z)
+            elapsed = seen.time_s[j] - seen.time_s[i]
+            slack = 4.0 * math.sqrt(seen.variance[i] + seen.variance[j])
+            if elapsed <= 0.0 or apart > min(most_rate * elapsed, room) + slack:
                 continue
-            for b in range(a + 1, min(a + reach, len(first) - 2) + 1):
-                for j in range(first[b], first[b + 1]):
-                    if used[j]:
-                        continue
-                    x = direction[j, 0] - direction[i, 0]
-                    y = direction[j, 1] - direction[i, 1]
-                    z = direction[j, 2] - direction[i, 2]
-                    apart = math.sqrt(x * x + y * y + z * z)
-                    elapsed = time_s[j] - time_s[i]
-                    slack = 4.0 * math.sqrt(variance[i] + variance[j])
-                    if elapsed <= 0.0 or apart > min(most_rate * elapsed, room) + slack:
-                        continue
-                    count = extend(
-                        i, j, first, batch, time_s, direction, variance, density, used, chosen
-                    )
-                    if count >= least and found < len(seeds):
-                        seeds[found, 0] = i
-                        seeds[found, 1] = j
-                        seeds[found, 2] = count
-                        found += 1
+            count = extend(i, j, seen)
+            if count >= least and found < len(seeds):
+                seeds[found, 0], seeds[found, 1], seeds[found, 2] = i, j, count
+                found += 1
     return found

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.special import gammaln
 
 from service.errors import BadInput, Fault
-from service.tracks.extending import GATE, MOST_CHANCE, count_seeds, extend, try_seeds
+from service.tracks.extending import GATE, MOST_CHANCE, Sightings, count_seeds, extend, try_seeds
 from service.tracks.motion import Motion, fit_motion, offsets
 from service.tracks.points import Indices, Points
 from service.vectors import ARCSEC_PER_RADIAN, Vector
@@ -56,20 +56,20 @@ def link(points: Points, batches: int, *, rests: bool = False) -> Iterator[Link]
     density = points.per_steradian()
     used = np.zeros(len(points), np.bool_)
     chosen = np.full(batches, -1)
-    given = (
+    seen = Sightings(
         *(first, points.batch, points.time_s, points.direction),
         *(_worse_variance(points), density, used, chosen),
     )
     seeds = np.empty((max(pairs, 1), 3), np.int64)
     room = 0.0 if rests else math.pi
-    found = int(try_seeds(REACH, MOST_RATE_RAD_PER_S, LEAST_POINTS, room, *given, seeds))
+    found = int(try_seeds(REACH, MOST_RATE_RAD_PER_S, room, LEAST_POINTS, seen, seeds))
     heap = [(-count, i, j) for i, j, count in seeds[:found].tolist()]
     heapq.heapify(heap)
     while heap:
         count, i, j = heapq.heappop(heap)
         if used[i] or used[j]:
             continue
-        now = int(extend(i, j, *given))
+        now = int(extend(i, j, seen))
         if now < LEAST_POINTS:
             continue
         if now < -count:
@@ -102,7 +102,7 @@ def compile_linking() -> None:
         batch=number,
         tracker=np.zeros(count, np.int64),
         number=number,
-        time_s=number * 10.0,
+        time_s=np.arange(0.0, count),
         direction=places,
         covariance=np.tile(np.eye(3) * 1e-10, (count, 1, 1)),
         place=places,

@@ -188,7 +188,33 @@ def tle(asked):
     return [kilometres(each.getPosition()) + kilometres(each.getVelocity()) for each in found]
 
 
-READERS = {"aem": aem, "apm": apm, "acm": acm, "oem": oem, "tle": tle}
+def tdm(asked):
+    message = ParserBuilder().buildTdmParser().parseMessage(source_of(asked))
+    found = []
+    for segment in message.getSegments():
+        metadata = segment.getMetadata()
+        found.append(
+            {
+                "participants": [
+                    str(each.getValue()) for each in metadata.getParticipants().entrySet()
+                ],
+                "path": [int(each) for each in metadata.getPath()],
+                "angle_type": str(metadata.getAngleType()),
+                "frame": str(metadata.getReferenceFrame().getName()),
+                "observations": [
+                    {
+                        "type": str(each.getType()),
+                        "tai_s": each.getEpoch().durationFrom(J2000_TAI),
+                        "value": float(each.getMeasurement()),
+                    }
+                    for each in segment.getData().getObservations()
+                ],
+            }
+        )
+    return found
+
+
+READERS = {"tdm": tdm, "aem": aem, "apm": apm, "acm": acm, "oem": oem, "tle": tle}
 
 
 def main():

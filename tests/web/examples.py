@@ -110,6 +110,7 @@ def walk(client: httpx.Client, app: App) -> Json:
     take("list_rates", client.get(f"{API}/spacecraft/XTE/rates"), "one_hour")
 
     _gyro(client, take)
+    _tracks(client, take)
     history = f"{API}/spacecraft/XTE/history"
     take("get_history", client.get(f"{history}?quantity=residual_ratio&size=10"), "one_bucket")
     latest = client.get(f"{history}?strategy=latest&quantity=ambiguous_share&size=1")
@@ -216,6 +217,20 @@ def _gyro(client: httpx.Client, take: Any) -> None:
     take("submit_gyro", client.post(here, json=degrees), "another_unit")
     take("list_gyro", client.get(here), "two_blocks")
     take("get_gyro", client.get(f"{here}/{first['id']}"), "three_samples")
+
+
+def _tracks(client: httpx.Client, take: Any) -> None:
+    """Four batches a second apart, in which one point moves among three stars."""
+    batch = _drawn("XTE", stars=3) | {"run": "pass-9"}
+    (seen,) = batch["observations"]
+    for k in range(4):
+        point = {"vector": [0.01 + 1e-4 * k, 0.02, 0.99975], "magnitude": 5.0}
+        own = {"batch": f"1999-060-t{k}", "time": f"1999-03-01T00:00:{10 + k}.000Z"}
+        own["observations"] = [seen | {"stars": [*seen["stars"], point]}]
+        client.post(f"{API}/batches", json=batch | own).raise_for_status()
+    here = f"{API}/spacecraft/XTE/tracks"
+    take("list_tracks", client.get(f"{here}?run=pass-9"), "one_moves")
+    take("list_tracks", client.get(f"{here}?run=none&format=aem"), "format")
 
 
 def _webhook(client: httpx.Client, take: Any) -> None:

@@ -9,10 +9,10 @@ from service.app.context import Context, known_id
 from service.errors import NotFound
 from service.missions.mission import mission_named
 from service.products.tdm import TrackedObject, write_tdm
-from service.storage.models.tracks import Track, TrackList, TrackPoint
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
-from service.storage.queries.period.unexplained import (
+from service.storage.tracks.models import Track, TrackList, TrackPoint
+from service.storage.tracks.unexplained import (
     RecordedBatches,
     batches_around,
     batches_of_period,

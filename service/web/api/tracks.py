@@ -6,11 +6,9 @@ from fastapi import APIRouter
 from fastapi import Query as InQuery
 from starlette.responses import Response
 
-from service.storage.models.tracks import TrackList
+from service.storage.tracks.models import TrackList
 from service.web.openapi.route import ResponseDoc, route_docs
-from service.web.requests.access import CallerDep
 from service.web.requests.dependencies import AppDep, json_response
-from service.web.requests.exports import ExportsDep
 from service.web.requests.path_parameters import SpacecraftPath
 from service.web.requests.product_parameters import TDM_MEDIA_TYPE, TracksQuery
 
@@ -27,8 +25,6 @@ def list_tracks(
     name: SpacecraftPath,
     query: Annotated[TracksQuery, InQuery()],
     app: AppDep,
-    exports: ExportsDep,
-    caller: CallerDep,
 ) -> Response:
     """Tracks of a period: points that no catalog star explains and that move together.
 
@@ -40,4 +36,4 @@ def list_tracks(
     if query.format == "json":
         return json_response(found)
     attached = {"Content-Disposition": f'attachment; filename="{name}-{query.run}-tracks.tdm"'}
-    return exports.response(caller, lambda: app.tracks.tdm(found), TDM_MEDIA_TYPE, attached)
+    return Response(b"".join(app.tracks.tdm(found)), 200, attached, TDM_MEDIA_TYPE)

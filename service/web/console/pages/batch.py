@@ -16,6 +16,7 @@ from service.storage.models.answers import Answer
 from service.storage.models.answers import Star as FoundStar
 from service.storage.models.star_field import ObservedStarPlace, StarField
 from service.storage.queries.results import answer_from_json
+from service.storage.tracks.models import TrackList
 from service.vectors import matrix_from_quaternion, to_ra_dec
 from service.web.console.charts.sky_chart import sky_chart
 from service.web.console.options import (
@@ -96,6 +97,7 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
         toml=toml_of(fields),
         pointing=_pointing(shown),
         timings_us=structs.asdict(shown.timings_us),
+        tracks=_tracks(context, id, answer),
         around=context.app.results.neighbours(id),
         other_settings=context.app.missions[answer.spacecraft].digest != answer.provenance.mission,
     )
@@ -139,6 +141,13 @@ def _trackers(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         row | {"ratio": ratio, "width": (ratio or 0.0) / scale, "mark": 1.0 / scale}
         for row, ratio in zip(rows, ratios, strict=True)
     ]
+
+
+def _tracks(context: ContextDep, id: str, answer: Answer) -> TrackList | None:
+    """The tracks of the result's unmatched stars, if it has any and their directions are known."""
+    if answer.attitude is None or not answer.counts.unmatched:
+        return None
+    return context.app.tracks.through_batch(id, answer.spacecraft, answer.run)
 
 
 def _pointing(shown: Answer) -> list[dict[str, Any]]:

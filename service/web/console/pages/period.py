@@ -20,6 +20,9 @@ from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
 
+MOST_LINKED = 600
+"""Batches whose tracks are looked for: reading and linking them takes about a second."""
+
 
 @dataclass(frozen=True)
 class TrackerCharts:
@@ -44,9 +47,13 @@ def period_page(
         mission.tracker(query.tracker, "tracker")
     latest = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
     shown = shown_period(context, name, query, latest)
-    found, trackers = None, list[TrackerStarsOfPeriod]()
+    found, tracks, trackers = None, None, list[TrackerStarsOfPeriod]()
     if shown is not None:
         found = context.app.results.period(name, run=query.run, start=shown.start, end=shown.end)
+        if found.total <= MOST_LINKED:
+            tracks = context.app.tracks.of_period(
+                name, run=query.run, start=shown.start, end=shown.end
+            )
         trackers = [each for each in found.trackers if query.tracker in (None, each.tracker)]
     is_any = found is not None and found.read > 0
     return rendered(
@@ -58,6 +65,8 @@ def period_page(
         stretch=shown,
         ranges=list(RANGES_S),
         found=found,
+        tracks=tracks,
+        most_linked=MOST_LINKED,
         sky=all_sky_chart(found, trackers) if is_any and found else None,
         trackers=[_tracker_charts(each) for each in trackers],
         attitude=attitude_charts(found.attitudes, shown.start, shown.end)

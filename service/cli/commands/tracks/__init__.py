@@ -2,14 +2,11 @@
 
 from argparse import Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from service.cli.arguments import MISSION, add_command, add_database, add_period, print_json
 from service.cli.configuration import period_of, settings_of_existing
 from service.errors import BadInput, Fault
-
-if TYPE_CHECKING:
-    from service.storage.models.tracks import Track, TrackList
 
 
 def add(commands: Any) -> None:
@@ -42,6 +39,7 @@ def add(commands: Any) -> None:
 def run(parsed: Namespace) -> int:
     """Link, and print or write."""
     from service.app.factory import open_app
+    from service.cli.commands.tracks.table import tracks_text
     from service.cli.output import written_to
 
     if parsed.output is not None and parsed.format != "tdm":
@@ -55,34 +53,7 @@ def run(parsed: Namespace) -> int:
         elif parsed.format == "json":
             print_json(found)
         else:
-            print(_text(found))
+            print(tracks_text(found))
     finally:
         app.close()
     return 0
-
-
-_HEADING = (
-    f"{'track':<24}{'middle':<26}{'points':>6}  {'RA, Dec':<24}"
-    f"{'rate, arcsec/s':>20}  {'magnitude':>13}"
-)
-
-
-def _text(found: "TrackList") -> str:
-    """The tracks as a table."""
-    counts = (
-        f"{found.batches:,} batches, {found.without_attitude:,} without attitude; "
-        f"{found.unexplained:,} unmatched stars, {found.linked:,} of them on tracks"
-    )
-    return "\n".join([counts, _HEADING, *map(_line, found.items)] if found.items else [counts])
-
-
-def _line(track: "Track") -> str:
-    name = track.planet or track.kind.replace("_", " ")
-    rate = f"{track.rate_arcsec_per_s:.4f} ± {track.sigma_rate_arcsec_per_s:.4f}"
-    magnitude = "–" if track.magnitude is None else f"{track.magnitude:.2f}"
-    if track.sigma_magnitude is not None:
-        magnitude += f" ± {track.sigma_magnitude:.2f}"
-    place = f"{track.ra_deg:.5f}° {track.dec_deg:+.5f}°"
-    return (
-        f"{name:<24}{track.time:<26}{len(track.points):>6}  {place:<24}{rate:>20}  {magnitude:>13}"
-    )

@@ -1,0 +1,1 @@
+"""Tracks of points that no catalog star explains: what is read for them, and their records."""
