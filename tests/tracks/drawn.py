@@ -48,10 +48,14 @@ class Stretched:
 
 
 def conjunctions(rng, count):
-    """Moments at which two planets are within a field of view, away from the Sun, and who."""
+    """Moments at which two planets are within a field of view, away from the Sun, and who.
+
+    Of two years: each has a run catalog, and an index of the whole sky, of its own.
+    """
     found = []
+    first = parse_utc(f"{rng.choice((1994, 2000, 2012, 2020))}-07-01T00:00:00Z")
     while len(found) < count:
-        time = shifted(parse_utc("1993-01-01T00:00:00Z"), int(rng.integers(0, 11_000 * 86400)))
+        time = shifted(first, int(rng.integers(0, 730 * 86400)))
         seen = np.array([planet_place(each, time, None).direction for each in PLANETS])
         sun = -unit(np.asarray(erfa.epv00(*time.tt)[0]["p"]))
         one, other = np.triu_indices(len(PLANETS), 1)
