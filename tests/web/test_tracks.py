@@ -9,6 +9,8 @@ import pytest
 from service.cli import main
 from service.vectors import from_ra_dec, unit
 from tests.tracks.drawn import conjunctions, draw
+from tests.web.browser import CHROMIUM, Browser
+from tests.web.fitting import assert_fits
 
 ROUTE = "/api/v1/spacecraft/XTE/tracks"
 RUN = "tracks"
@@ -134,3 +136,12 @@ def test_the_command_says_the_same(app, found, capsys, tmp_path):
     assert len(told) == 2 + len(found["items"])
     assert main([*asked, "--format", "tdm", "-o", str(tmp_path / "x.tdm")]) == 0
     assert (tmp_path / "x.tdm").read_text().startswith("CCSDS_TDM_VERS = 2.0")
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
+def test_the_tables_fit_and_axe_finds_no_fault(address, posted, tmp_path):
+    with Browser(tmp_path) as browser:
+        for path in ("/spacecraft/XTE/period", f"/batches/{posted[15]}"):
+            assert_fits(browser, f"{address}{path}?run={RUN}")
+            assert browser.run("document.querySelector('[aria-labelledby=tracks] td') !== null")
+        browser.call("Page.navigate", url="about:blank")
