@@ -8,6 +8,7 @@ in again, one chunk at a time, so that a chunk that ends its process is known by
 import gc
 import logging
 import multiprocessing
+import multiprocessing.connection
 import os
 import pickle
 import signal
@@ -168,6 +169,7 @@ class LocalWorkers(Generic[Input, Output]):
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         for each in ready:
             each.add_done_callback(partial(self._note_ready, executor))
+        self._end_all_with_the_first(executor, self._stop)
         self._check_idle_after(IDLE_S)
         return executor
 
@@ -178,7 +180,29 @@ class LocalWorkers(Generic[Input, Output]):
         if self._stop is not None:
             # The processes see that the pipe is closed.
             self._stop.close()
+            self._stop = None
         return executor
+
+    def _end_all_with_the_first(self, executor: ProcessPoolExecutor, stop: Connection) -> None:
+        """See to it that the executor notices a process that dies while it sends a result.
+
+        The executor would wait for the rest of the result for as long as any process can write
+        to the pipe of results.  So this process gives up its own writing end, and the other
+        workers end with the one that died: the executor is broken anyhow.
+        """
+        executor._result_queue._writer.close()  # type: ignore[attr-defined]
+        ends = [os.dup(each.sentinel) for each in executor._processes.values()]
+
+        def wait_for_an_end() -> None:
+            multiprocessing.connection.wait(ends)
+            for end in ends:
+                os.close(end)
+            with self._lock:
+                if self._stop is stop:
+                    stop.close()
+                    self._stop = None
+
+        threading.Thread(target=wait_for_an_end, name="worker-ends", daemon=True).start()
 
     def _hand_in(self, chunk: _QueuedTask[Input, Output]) -> None:
         executor = self._executor or self._open()

@@ -1,6 +1,7 @@
 """Replays computed by processes of their own: the same answers, whatever becomes of a process."""
 
 import json
+import multiprocessing.connection
 import os
 import pickle
 import signal
@@ -203,6 +204,35 @@ def test_a_chunk_that_ends_its_processes_is_named_and_costs_no_other(missions, s
         assert workers.submit(6).result(GIVE_UP_S) == [12]
     finally:
         workers.close()
+
+
+def half_sent(solver, number):
+    """A result of a megabyte; of 13 the process dies when it has sent a half of it."""
+    if number == 13:
+
+        def send_half(connection, content):
+            os.write(connection.fileno(), bytes(content[: len(content) // 2]))
+            os.kill(os.getpid(), signal.SIGKILL)
+
+        multiprocessing.connection.Connection._send = send_half
+    return [bytes(1 << 20)]
+
+
+def test_a_process_that_dies_while_it_sends_a_result_costs_no_other_chunk(missions, sky):
+    config = WorkerConfig(missions, None, sky.catalog.digest, 1 << 20)
+    workers = LocalWorkers(config, half_sent, 2)
+    futures = {number: workers.submit(number) for number in (1, 13, 2, 3)}
+    try:
+        for number, future in futures.items():
+            if number == 13:
+                assert isinstance(future.exception(GIVE_UP_S), ChunkEndsWorkers)
+            else:
+                assert future.result(GIVE_UP_S) == [bytes(1 << 20)]
+    finally:
+        closing = threading.Thread(target=workers.close, daemon=True)
+        closing.start()
+        closing.join(GIVE_UP_S)
+    assert not closing.is_alive()
 
 
 class Served:
