@@ -222,6 +222,7 @@ class Summary(Model, frozen=True, kw_only=True):
     measures: dict[str, float | None]
     parent: str | None
     current: bool
+    archived: bool = False
 
 
 class Result(Model, frozen=True, kw_only=True):
@@ -233,5 +234,6 @@ class Result(Model, frozen=True, kw_only=True):
     measures: dict[str, float | None]
     current: bool
     parent: str | None
+    archived: bool = False
     what_ifs: Sequence[Summary]
     frame: FrameWithStars | None = None
