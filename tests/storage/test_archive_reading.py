@@ -1,17 +1,24 @@
 """Archived batches are seen as recorded ones are: the same lists, pages, products and what-ifs."""
 
+from itertools import chain
+
 import pytest
 from msgspec import structs
 
 from service.errors import Busy, WrongState
 from service.observations.schema import OptionsIn
 from service.storage.archive import archiving, folder
+from service.storage.archive.restoring import PartFilter, restore
+from service.storage.queries import both_runs
 from service.storage.queries.merged import count
 from service.storage.queries.pages import ResultFilter
 from service.times import shifted
 from tests.storage.samples import START
 
 TIGHT = OptionsIn.model_validate({"tolerances": {"separation_deg": 1e-5}})
+VOTES = OptionsIn.model_validate(
+    {"identifier": "starid", "tolerances": {"separation_deg": 1e-5, "magnitude": 0.01}}
+)
 KINDS = ("good", "suspect", "one_star", "spurious", "two_trackers")
 DAY_S = 86_400.0
 BATCHES, STEP_S = 6, 40_000.0
@@ -81,7 +88,7 @@ def table_of(app, kind, **period):
 
 
 def joined(pages):
-    return [sum(columns, []) for columns in zip(*pages, strict=True)]
+    return [list(chain.from_iterable(columns)) for columns in zip(*pages, strict=True)]
 
 
 def without_mark(items):
@@ -96,13 +103,21 @@ def test_lists_are_the_same_before_and_after_archiving(filled, place, monkeypatc
         assert [without_mark(each) for each in after] == before
     marked = {each.batch: each.archived for each in after[0]}
     assert marked == {f"b{k}": k < BATCHES - 1 for k in range(BATCHES)}
+    # Few row groups are held in memory.
+    cache = filled.store.archive.cache
+    cache.drop()
+    monkeypatch.setattr(cache, "max_bytes", 200_000)
+    assert pages_of(filled, 2, **FILTERS[2]) == after[2]
+    state = cache.state()
+    assert state.nbytes <= 200_000
+    assert state.evictions > 0
     # A page that looks into few row groups is short, and goes on at its cursor.
     monkeypatch.setattr("service.storage.queries.results.MOST_OPENED", 1)
     after = [pages_of(filled, 3, **selected) for selected in FILTERS]
     assert [without_mark(each) for each in after] == before
 
 
-def test_records_and_what_they_show_are_the_same(filled, place):
+def test_records_what_they_show_and_what_ifs_are_the_same(filled, place):
     ids = [each.id for each in pages_of(filled, 100, run="*")]
 
     def seen():
@@ -122,30 +137,24 @@ def test_records_and_what_they_show_are_the_same(filled, place):
         sides = [(each.earlier, each.later) for each in found]
         return [[side and side.id for side in each] for each in sides], [f.current for f in found]
 
+    def tried():
+        return filled.results.what_if(ids[-3], TIGHT).body.split(b'"timings_us"')[0]
+
     before, none = seen()
-    near = around()
+    near, answer = around(), tried()
     archiving.archive(filled.store, place, LATER)
     after, archived = seen()
     assert repr(after) == repr(before)
     assert around() == near
+    assert tried() == answer
+    for asked in ({"record": True}, {"adopt": True}):
+        with pytest.raises(WrongState, match="acquire archive restore"):
+            filled.results.what_if(ids[-3], TIGHT, **asked)
     assert not any(none)
     assert archived.count(False) == 2
 
 
-def test_a_what_if_of_an_archived_batch_is_answered_and_not_recorded(filled, place):
-    (id,) = [each.id for each in pages_of(filled, 100, batch="b1", spacecraft="XTE")]
-    before = filled.results.what_if(id, TIGHT).body
-    archiving.archive(filled.store, place, LATER)
-    after = filled.results.what_if(id, TIGHT).body
-    assert [each.split(b'"timings_us"')[0] for each in (after,)] == [
-        before.split(b'"timings_us"')[0]
-    ]
-    for asked in ({"record": True}, {"adopt": True}):
-        with pytest.raises(WrongState, match="acquire archive restore"):
-            filled.results.what_if(id, TIGHT, **asked)
-
-
-def test_products_are_the_same(filled, place):
+def test_products_and_their_numbers_are_the_same(filled, place):
     period = {"start": shifted(START, 30_000.0), "end": shifted(START, 200_000.0)}
 
     def seen():
@@ -162,12 +171,6 @@ def test_products_are_the_same(filled, place):
             )
         )
 
-    before = seen()
-    archiving.archive(filled.store, place, LATER)
-    assert seen() == before
-
-
-def test_batches_are_counted_in_the_archive_too(filled, place):
     selections = [
         ResultFilter("live", "XTE"),
         ResultFilter(None, None, None, shifted(START, 100_000.0)),
@@ -178,11 +181,34 @@ def test_batches_are_counted_in_the_archive_too(filled, place):
         with filled.store.reading() as connection:
             return [count(connection, filled.store.archive, each, most) for each in selections]
 
-    before = counted(1000)
-    assert min(before) > 0
+    before, numbers = seen(), counted(1000)
+    assert min(numbers) > 0
     archiving.archive(filled.store, place, LATER)
-    assert counted(1000) == before
-    assert counted(2) == [min(each, 2) for each in before]
+    assert seen() == before
+    assert counted(1000) == numbers
+    assert counted(2) == [min(each, 2) for each in numbers]
+
+
+def compared_of(app):
+    """Comparisons of runs and of options, without times of computing."""
+    found = app.comparisons.of_options("XTE", OptionsIn(), VOTES, run="r")
+    sides = [structs.replace(each, us_per_batch=None) for each in (found.a, found.b)]
+    return (
+        structs.replace(found, a=sides[0], b=sides[1]),
+        app.runs.compare("live", "r"),
+        app.runs.compare("live", "r", "XTE", shifted(START, 30_000.0), shifted(START, 99_000.0)),
+        *(app.runs.compare_latest(*runs, "XTE") for runs in (("live", "r"), ("r", "live"))),
+    )
+
+
+def test_comparisons_are_the_same_wherever_the_batches_are(filled, place, monkeypatch):
+    before = compared_of(filled)
+    assert before[0].changed_batches > 0
+    archiving.archive(filled.store, place, LATER)
+    assert compared_of(filled) == before
+    restore(filled.store, place, PartFilter(run="r"))
+    monkeypatch.setattr(both_runs, "GROUP", 2)
+    assert compared_of(filled) == before
 
 
 def test_a_page_of_recorded_batches_needs_no_archive(filled, place):
@@ -202,16 +228,3 @@ def test_a_page_of_recorded_batches_needs_no_archive(filled, place):
     ):
         with pytest.raises(Busy, match="ACQUIRE_ARCHIVE_FOLDER"):
             read()
-
-
-def test_the_memory_of_opened_row_groups_is_bounded(filled, place, monkeypatch):
-    archiving.archive(filled.store, place, LATER)
-    cache = filled.store.archive.cache
-    monkeypatch.setattr(cache, "max_bytes", 200_000)
-    before = pages_of(filled, 2, run="*")
-    assert pages_of(filled, 2, run="*") == before
-    state = cache.state()
-    assert state.nbytes <= 200_000
-    assert state.evictions > 0
-
-

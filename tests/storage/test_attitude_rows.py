@@ -49,7 +49,9 @@ def test_every_result_is_read_once_in_order_in_pages_of_any_size(app):
             check(each, listed)
     with app.context.reading() as connection:
         for most, counted in ((100, 12), (7, 7)):
-            assert count(connection, app.store.archive, ResultFilter("live", "XTE"), most) == counted
+            assert (
+                count(connection, app.store.archive, ResultFilter("live", "XTE"), most) == counted
+            )
 
 
 def check(page, listed):

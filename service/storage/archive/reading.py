@@ -153,6 +153,15 @@ class Archive:
         key = (block.part.path, block.part.sha256, block.group, *sorted(needs))
         return self.cache.get(key, build)[0]
 
+    def current_ids(
+        self, part: PlacedPart, start_ns: int | None, end_ns: int | None
+    ) -> "pa.ChunkedArray":
+        """The ids of the current results of a part from a time to before another, in order."""
+        filters: list[tuple[str, str, object]] = [("current", "=", True)]
+        filters += [("time_ns", ">=", start_ns)] if start_ns is not None else []
+        filters += [("time_ns", "<", end_ns)] if end_ns is not None else []
+        return self.read(part.path, ["id"], filters)["id"]
+
     @contextmanager
     def _readable(self, path: str) -> Iterator[Path]:
         """The file of a part; whatever is wrong with it is told as what to do."""

@@ -86,7 +86,7 @@ def first_rows(
     found = [Found(row, False) for row in connection.execute(query)]
     sign = -1 if newest_first else 1
     last_ns = found[limit - 1].place[0] if len(found) >= limit else None
-    waiting = _Waiting(_parts(connection, use, selected, newest_first, beyond, last_ns), sign)
+    waiting = _Waiting(parts_of(connection, use, selected, newest_first, beyond, last_ns), sign)
     opened = 0
     while waiting.some:
         begins = waiting.begins
@@ -194,7 +194,7 @@ def count(connection: Connection, archive: Archive, selected: ResultFilter, most
     some = select(results.c.batch_id).where(*selected.conditions()).limit(most).subquery()
     query = select(func.count()).select_from(some)
     found = int(connection.scalar(query) or 0)
-    for part in _parts(connection, ArchiveUse(archive), selected):
+    for part in parts_of(connection, ArchiveUse(archive), selected):
         if found >= most:
             return most
         found += count_of_part(archive, part, selected)
@@ -203,18 +203,20 @@ def count(connection: Connection, archive: Archive, selected: ResultFilter, most
 
 def count_of_part(archive: Archive, part: PlacedPart, selected: ResultFilter) -> int:
     """How many batches of a part are selected."""
-    start, end = selected.start, selected.end
-    if (start is None or part.first_ns >= start.tai_ns) and (
-        end is None or part.last_ns < end.tai_ns
+    start_ns, end_ns = bounds_of(selected)
+    if (start_ns is None or part.first_ns >= start_ns) and (
+        end_ns is None or part.last_ns < end_ns
     ):
         return part.batches
-    query = select(func.count()).select_from(results).where(*selected.conditions())
-    found = 0
-    for block in archive.blocks(part):
-        if _reaches(block, selected, False, None):
-            with archive.open(block, ()).reading() as connection:
-                found += int(connection.scalar(query) or 0)
-    return found
+    return len(archive.current_ids(part, start_ns, end_ns))
+
+
+def bounds_of(selected: ResultFilter) -> tuple[int | None, int | None]:
+    """Start and end of a filter in nanoseconds; None where it is open."""
+    return (
+        None if selected.start is None else selected.start.tai_ns,
+        None if selected.end is None else selected.end.tai_ns,
+    )
 
 
 class _Waiting:
@@ -245,7 +247,7 @@ class _Waiting:
         return heapq.heappop(self._heap)[2]
 
 
-def _parts(
+def parts_of(
     connection: Connection,
     use: ArchiveUse,
     selected: ResultFilter,
@@ -256,8 +258,7 @@ def _parts(
     """The parts that may have selected rows beyond a place and not after `last_ns`."""
     if use.parts is not None and not use.parts:
         return []
-    first_ns = None if selected.start is None else selected.start.tai_ns
-    end_ns = None if selected.end is None else selected.end.tai_ns
+    first_ns, end_ns = bounds_of(selected)
     if last_ns is not None and newest_first:
         first_ns = last_ns if first_ns is None else max(first_ns, last_ns)
     elif last_ns is not None:
