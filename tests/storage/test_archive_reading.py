@@ -16,9 +16,7 @@ from service.times import shifted
 from tests.storage.samples import START
 
 TIGHT = OptionsIn.model_validate({"tolerances": {"separation_deg": 1e-5}})
-VOTES = OptionsIn.model_validate(
-    {"identifier": "starid", "tolerances": {"separation_deg": 1e-5, "magnitude": 0.01}}
-)
+VOTES = OptionsIn.model_validate({"identifier": "starid", "tolerances": {"separation_deg": 1e-5}})
 KINDS = ("good", "suspect", "one_star", "spurious", "two_trackers")
 DAY_S = 86_400.0
 BATCHES, STEP_S = 6, 40_000.0
