@@ -25,9 +25,9 @@ from service.storage.gyro.blocks import BlockFilter
 from service.storage.gyro.samples_table import count_samples, sample_table
 from service.storage.queries.attitude_rows import attitude_pages
 from service.storage.queries.future_dated import LIVE
-from service.storage.queries.merged import count
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.tables.result_tables import batch_table, star_table
+from service.storage.queries.with_archive.rows import count
 from service.times import Utc, shifted, utc_now
 
 Pages = Iterator[AttitudeRows]

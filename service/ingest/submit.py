@@ -16,7 +16,7 @@ from sqlalchemy import Connection
 from service.access.audit import Entry
 from service.access.tokens import Caller, own_key
 from service.acquire import Acquisition
-from service.errors import AcquisitionError, BadBatch, Busy, Fault, WrongState, shown_value
+from service.errors import AcquisitionError, BadBatch, Busy, Fault, shown_value
 from service.ingest.queue import IngestQueue, PendingBatch, QueueState
 from service.ingest.solver_pool import WAIT_S, Solver, SolverPool, may_take_long
 from service.missions.mission import Mission
@@ -24,7 +24,7 @@ from service.observations.batch import ObservationBatch
 from service.observations.schema import OptionsIn, Submission
 from service.sky.model import SkyModel
 from service.storage.queries.recorded_batch import batch_with_options
-from service.storage.queries.results import read_result
+from service.storage.queries.results import read_parent
 from service.storage.recording.answer import answer_of
 from service.storage.recording.identity import (
     ExistingResult,
@@ -181,12 +181,7 @@ class SubmissionService:
         `entry` is stored in the audit list together with a result that is recorded.
         """
         with self._store.reading_batch(id) as (connection, archived):
-            parent = read_result(connection, id)
-        if archived and (record or adopt):
-            raise WrongState(
-                f"the batch with the id {shown_value(id)} is archived: bring its period back with "
-                "`acquire archive restore` before you record a what-if of it"
-            )
+            parent = read_parent(connection, id, archived=archived, kept=record or adopt)
         batch = batch_with_options(parent["input"], parent["options"], options)
         acquisition = self.run_again(batch)
         if not (record or adopt):

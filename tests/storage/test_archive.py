@@ -15,7 +15,6 @@ from service.observations.schema import OptionsIn
 from service.storage.archive import archiving, folder, rows
 from service.storage.archive.restoring import PartFilter, restore, verify_archive
 from service.storage.archive.tables import archived_batches
-from service.storage.queries.results import is_archived
 from service.storage.recording import rollups
 from service.storage.sql.columns import metadata
 from service.storage.sql.database import Store
@@ -305,8 +304,7 @@ def test_a_what_if_that_a_service_records_meanwhile_is_not_lost(
     archiving.archive(filled.store, place, LATER)
     # It may be refused.  If not, it is kept.
     if told[0].exception() is None:
-        with filled.store.reading() as connection:
-            assert is_archived(connection, told[0].result().id)
+        assert filled.results.get(told[0].result().id).archived
 
 
 @pytest.mark.parametrize("work", ["archive", "restore"])

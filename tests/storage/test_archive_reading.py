@@ -9,9 +9,9 @@ from service.errors import Busy, WrongState
 from service.observations.schema import OptionsIn
 from service.storage.archive import archiving, folder
 from service.storage.archive.restoring import PartFilter, restore
-from service.storage.queries import both_runs
-from service.storage.queries.merged import count
 from service.storage.queries.pages import ResultFilter
+from service.storage.queries.with_archive import both_runs
+from service.storage.queries.with_archive.rows import count
 from service.times import shifted
 from tests.storage.samples import START
 

@@ -9,8 +9,8 @@ from sqlalchemy import Select, select
 
 from service.products.attitudes import AttitudeRows
 from service.storage.archive.reading import Archive
-from service.storage.queries.merged import ArchiveUse, Reading, row_pages
 from service.storage.queries.pages import PLACE, ResultFilter
+from service.storage.queries.with_archive.rows import ArchiveUse, Reading, row_pages
 from service.storage.sql.tables import COUNTED, batches, results, solutions
 from service.vectors import Vector
 

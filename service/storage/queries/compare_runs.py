@@ -19,8 +19,8 @@ from service.storage.models.compare import (
     RunTransition,
     StatusCounts,
 )
-from service.storage.queries.both_runs import both_runs, is_archived_in_part
 from service.storage.queries.pages import ResultFilter
+from service.storage.queries.with_archive.both_runs import both_runs, is_archived_in_part
 from service.storage.sql.tables import COUNTED, batches, results, solutions, star_results
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 

@@ -7,9 +7,9 @@ from sqlalchemy import Connection, select
 from service.errors import Busy
 from service.storage.archive.reading import Archive
 from service.storage.models.answers import Neighbours, Summary
-from service.storage.queries.merged import FIRST_ID, LAST_ID, ArchiveUse, first_rows
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.results import summary_of, summary_query
+from service.storage.queries.with_archive.rows import FIRST_ID, LAST_ID, ArchiveUse, first_rows
 from service.storage.sql.tables import results
 
 

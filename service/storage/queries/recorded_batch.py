@@ -12,9 +12,9 @@ from service.observations.batch import ObservationBatch
 from service.observations.schema import OptionsIn, submission_from_json
 from service.storage.archive.reading import Archive, PlacedPart
 from service.storage.models.answers import Answer
-from service.storage.queries.merged import ArchiveUse, bounds_of, count_of_part, parts_of
 from service.storage.queries.pages import PLACE, ResultFilter
 from service.storage.queries.results import answer_from_json, read_result
+from service.storage.queries.with_archive.rows import ArchiveUse, bounds_of, count_of_part, parts_of
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, missions, results
 

@@ -8,14 +8,14 @@ from msgspec import UNSET
 from sqlalchemy import ColumnElement, Connection, Select, or_, select
 
 from service.alarms.quantities import QUANTITIES, value_names
-from service.errors import NotFound, shown_value
+from service.errors import NotFound, WrongState, shown_value
 from service.storage.archive.reading import Archive, parts_with
 from service.storage.archive.tables import archived_batches, archived_what_ifs
 from service.storage.models.answers import Answer, Result, StarCounts, Summary
 from service.storage.models.base import Page
 from service.storage.models.frames import FrameWithStars
-from service.storage.queries.merged import MOST_OPENED, ArchiveUse, page_of
 from service.storage.queries.pages import ResultFilter, newest
+from service.storage.queries.with_archive.rows import MOST_OPENED, ArchiveUse, page_of
 from service.storage.recording.unsaved_result import STARS
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, frames, missions, results, runs
@@ -90,6 +90,21 @@ def read_result(connection: Connection, id: str) -> Row:
     if row is None:
         raise NotFound(f"there is no batch with the id {shown_value(id)}")
     return dict(row)
+
+
+def read_parent(connection: Connection, id: str, *, archived: bool, kept: bool) -> Row:
+    """The result that a what-if starts from, as `read_result`.
+
+    `archived` says that the connection is to a batch of the archive; `kept`, that the what-if is
+    to be recorded.  Raises `WrongState` for both at once.
+    """
+    row = read_result(connection, id)
+    if archived and kept:
+        raise WrongState(
+            f"the batch with the id {shown_value(id)} is archived: bring its period back with "
+            "`acquire archive restore` before you record a what-if of it"
+        )
+    return row
 
 
 def _archived(id: str) -> Select[tuple[str]]:

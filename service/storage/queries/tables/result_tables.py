@@ -8,8 +8,8 @@ from sqlalchemy import select
 from service.alarms.quantities import QUANTITIES
 from service.products.tables import Column, Page, Table
 from service.storage.archive.reading import Archive
-from service.storage.queries.merged import ArchiveUse, Reading, all_rows, row_pages
 from service.storage.queries.pages import PLACE, ResultFilter
+from service.storage.queries.with_archive.rows import ArchiveUse, Reading, all_rows, row_pages
 from service.storage.sql.tables import COUNTED, MEASURED, batches, results, star_results
 
 BATCHES, BATCHES_OF_STARS = 5_000, 500
