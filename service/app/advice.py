@@ -58,7 +58,10 @@ class AdviceService:
         try:
             with self._context.reading() as connection:
                 drawn = sample_batches(
-                    connection, ResultFilter(run or LIVE, name, start, end), sample
+                    connection,
+                    self._context.store.archive,
+                    ResultFilter(run or LIVE, name, start, end),
+                    sample,
                 )
             began = time.monotonic()
             pace = WorkLimit(lambda share: time.monotonic() - began < share * limit_s, step)

@@ -50,7 +50,10 @@ class Comparisons:
         try:
             with self._context.reading() as connection:
                 drawn = sample_batches(
-                    connection, ResultFilter(run or LIVE, name, start, end), sample
+                    connection,
+                    self._context.store.archive,
+                    ResultFilter(run or LIVE, name, start, end),
+                    sample,
                 )
             pairs = [
                 Pair(

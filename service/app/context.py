@@ -38,6 +38,10 @@ class Context:
         """A connection that sees one moment of the database; see `Readers.reading`."""
         return self.store.reading()
 
+    def reading_batch(self, id: str) -> AbstractContextManager[tuple[Connection, bool]]:
+        """A connection that has the batch of a result; see `Store.reading_batch`."""
+        return self.store.reading_batch(id)
+
     def change(self, change: Callable[[Connection], T]) -> T:
         """Change the database in one transaction, and wait until it is committed."""
         return self.store.writer.change(change).result()

@@ -68,8 +68,8 @@ class Frames:
 
     def overlay(self, id: str) -> bytes:
         """A PNG of the frame that a result was made of, with its stars, names and residuals."""
-        with self._context.reading() as connection:
-            row = frame_of_result(connection, known_id(id, "batch"))
+        with self._context.reading_batch(known_id(id, "batch")) as (connection, _):
+            row = frame_of_result(connection, id)
         # The mission of that result, which may differ from the present file.
         mission = Mission.model_validate_json(row["settings"])
         answer, batch = answer_from_json(row["answer"]), submission_from_json(row["input"]).batch

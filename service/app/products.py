@@ -23,10 +23,11 @@ from service.products.tables import Table
 from service.storage.grades.rows import count_samples_of, graded_pages
 from service.storage.gyro.blocks import BlockFilter
 from service.storage.gyro.samples_table import count_samples, sample_table
-from service.storage.queries.attitude_rows import attitude_pages, count_results
+from service.storage.queries.attitude_rows import attitude_pages
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.tables.result_tables import batch_table, star_table
+from service.storage.queries.with_archive.rows import count
 from service.times import Utc, shifted, utc_now
 
 Pages = Iterator[AttitudeRows]
@@ -102,7 +103,9 @@ class Products:
     def _pages(self, about: SeriesInfo, selected: ResultFilter, **wanted: Any) -> Pages:
         """What is recorded of a period in a grade, page by page."""
         if about.grade == "raw":
-            return attitude_pages(self._context.reading, selected, **wanted)
+            return attitude_pages(
+                self._context.reading, self._context.store.archive, selected, **wanted
+            )
         return graded_pages(self._context.reading, selected, about.grade, **wanted)
 
     def attitude_at(
@@ -164,20 +167,22 @@ class Products:
             return sample_table(self._context.reading, blocks, about)
         selected = ResultFilter(run or LIVE, name, start, end)
         self._require_few_batches(selected, most_batches)
-        return _TABLES[kind](self._context.reading, selected, about)
+        return _TABLES[kind](self._context.reading, self._context.store.archive, selected, about)
 
     def _require_few_batches(self, selected: ResultFilter, most: int | None) -> None:
         self._require_few(
-            lambda each: count_results(each, selected, (most or 0) + 1), most, "batches"
+            lambda each: count(each, self._context.store.archive, selected, (most or 0) + 1),
+            most,
+            "batches",
         )
 
     def _require_few(
-        self, count: Callable[[Connection], int], most: int | None, counted: str
+        self, counting: Callable[[Connection], int], most: int | None, counted: str
     ) -> None:
         if most is None:
             return
         with self._context.reading() as connection:
-            found = count(connection)
+            found = counting(connection)
         if found > most:
             message = (
                 f"the period has more than the {most:,} {counted} that a file of this format takes"

@@ -14,7 +14,7 @@ from service.storage.models.period import PeriodStars
 from service.storage.models.star_field import StarField
 from service.storage.queries import results
 from service.storage.queries.future_dated import LIVE
-from service.storage.queries.neighbours import neighbours
+from service.storage.queries.neighbours import here_of, neighbours
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.period.sample import sample_period
 from service.storage.queries.period.stars import period_stars
@@ -38,8 +38,8 @@ class Results:
 
     def get(self, id: str) -> Result:
         """One result: `answer`, `input`, `current`, `parent`, and the `what_ifs` of its batch."""
-        with self._context.reading() as connection:
-            return results.read_record(connection, known_id(id, "batch"))
+        with self._context.reading_batch(known_id(id, "batch")) as (connection, archived):
+            return results.read_record(connection, id, archived=archived)
 
     def latest(self, spacecraft: str, run: str | None = None) -> Result:
         """The newest current result of a spacecraft in a run, by batch time; as `get`.
@@ -78,6 +78,7 @@ class Results:
         with self._context.reading() as connection:
             page = results.list_batches(
                 connection,
+                self._context.store.archive,
                 stretch,
                 outcome=outcome,
                 status=status,
@@ -85,15 +86,17 @@ class Results:
                 limit=limit,
                 cursor=cursor,
             )
-        if spacecraft is not None and not page.items:
+        if spacecraft is not None and not page.items and page.next_cursor is None:
             # A misspelt name must not look like a spacecraft without data.
             mission_in_input(self._context.missions, spacecraft)
         return page
 
     def neighbours(self, id: str) -> Neighbours:
         """The results before and after one in time: `earlier` and `later`, or None."""
+        with self._context.reading_batch(known_id(id, "batch")) as (connection, _):
+            here = here_of(connection, id)
         with self._context.reading() as connection:
-            return neighbours(connection, known_id(id, "batch"))
+            return neighbours(connection, self._context.store.archive, here)
 
     def star_field(self, id: str, answer: Answer | None = None) -> StarField:
         """The data of the chart of a result's stars; see `star_field.star_field_of`.
@@ -101,8 +104,8 @@ class Results:
         An `answer` in place of the recorded one, such as that of a what-if, is
         drawn over the same batch.
         """
-        with self._context.reading() as connection:
-            batch, recorded = recorded_batch(connection, known_id(id, "batch"))
+        with self._context.reading_batch(known_id(id, "batch")) as (connection, _):
+            batch, recorded = recorded_batch(connection, id)
             answer = answer or recorded
             mission = recorded_mission(connection, answer.provenance.mission)
         return star_field_of(batch, mission, self._context.sky, answer)
@@ -113,8 +116,8 @@ class Results:
         Empty for a result of one tracker.  An `answer` in place of the recorded one, such
         as that of a what-if, is compared over the same batch.
         """
-        with self._context.reading() as connection:
-            batch, recorded = recorded_batch(connection, known_id(id, "batch"))
+        with self._context.reading_batch(known_id(id, "batch")) as (connection, _):
+            batch, recorded = recorded_batch(connection, id)
             answer = answer or recorded
             if len(answer.observations) == 1:
                 return []
@@ -136,8 +139,8 @@ class Results:
 
     def settings_for(self, id: str) -> Choices:
         """The settings that a what-if of a result changes."""
-        with self._context.reading() as connection:
-            batch, _ = recorded_batch(connection, known_id(id, "batch"))
+        with self._context.reading_batch(known_id(id, "batch")) as (connection, _):
+            batch, _ = recorded_batch(connection, id)
         return choices_of(batch, mission_named(self._context.missions, batch.spacecraft))
 
     def spacecraft_of(self, id: str) -> str | None:

@@ -58,17 +58,24 @@ class Runs:
     ) -> RunComparison:
         """The outcomes of the same stars in two runs, and the angles between their attitudes."""
         with self._context.reading() as connection:
-            return compare_runs(connection, ResultFilter(run, spacecraft, start, end), other)
+            return compare_runs(
+                connection,
+                self._context.store.archive,
+                ResultFilter(run, spacecraft, start, end),
+                other,
+            )
 
     def compare_latest(
         self, run: str, other: str, spacecraft: str
     ) -> tuple[RunComparison, list[RunChange]]:
         """The same of the latest batches of a spacecraft alone, and those that differ."""
         mission_named(self._context.missions, spacecraft)
-        place = ResultFilter(run, spacecraft)
+        place, archive = ResultFilter(run, spacecraft), self._context.store.archive
         with self._context.reading() as connection:
-            found = compare_runs(connection, place, other, MOST_COMPARED)
-            changed = changed_batches(connection, place, other, MOST_COMPARED, MOST_CHANGED)
+            found = compare_runs(connection, archive, place, other, MOST_COMPARED)
+            changed = changed_batches(
+                connection, archive, place, other, MOST_COMPARED, MOST_CHANGED
+            )
         return found, changed
 
     def comparable(

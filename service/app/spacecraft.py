@@ -83,7 +83,9 @@ class Spacecraft:
         mission_named(self._context.missions, name)
         stretch = ResultFilter(run or LIVE, name, start, end)
         with self._context.reading() as connection:
-            return histories.list_attitudes(connection, stretch, limit=limit, cursor=cursor)
+            return histories.list_attitudes(
+                connection, self._context.store.archive, stretch, limit=limit, cursor=cursor
+            )
 
     def rates(
         self,

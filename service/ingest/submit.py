@@ -24,7 +24,7 @@ from service.observations.batch import ObservationBatch
 from service.observations.schema import OptionsIn, Submission
 from service.sky.model import SkyModel
 from service.storage.queries.recorded_batch import batch_with_options
-from service.storage.queries.results import read_result
+from service.storage.queries.results import read_parent
 from service.storage.recording.answer import answer_of
 from service.storage.recording.identity import (
     ExistingResult,
@@ -180,8 +180,8 @@ class SubmissionService:
 
         `entry` is stored in the audit list together with a result that is recorded.
         """
-        with self._store.reading() as connection:
-            parent = read_result(connection, id)
+        with self._store.reading_batch(id) as (connection, archived):
+            parent = read_parent(connection, id, archived=archived, kept=record or adopt)
         batch = batch_with_options(parent["input"], parent["options"], options)
         acquisition = self.run_again(batch)
         if not (record or adopt):

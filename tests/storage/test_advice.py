@@ -14,6 +14,7 @@ from service.errors import BadBatch, Busy, NotFound
 from service.observations.schema import OptionsIn, submission_from_json, tolerances_from_text
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
+from service.storage.archive.reading import Archive
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.recorded_batch import sample_batches
 from service.storage.sql.tables import results, star_results
@@ -34,7 +35,9 @@ def recorded(app, missions, sky, seed):
 
 def drawn_from(app, size, seed=0, **stretch):
     with app.store.reading() as connection:
-        return sample_batches(connection, ResultFilter("night", "XTE", **stretch), size, seed)
+        return sample_batches(
+            connection, Archive(None), ResultFilter("night", "XTE", **stretch), size, seed
+        )
 
 
 def rows(app):
@@ -95,7 +98,7 @@ def test_the_advice_is_that_of_the_batches_themselves_and_changes_nothing(
     batches = [submission_from_json(json.dumps(body)).batch for body in recorded]
     mission = missions["XTE"]
     with app.store.reading() as connection:
-        sample = sample_batches(connection, ResultFilter("night", "XTE"), 1000)
+        sample = sample_batches(connection, Archive(None), ResultFilter("night", "XTE"), 1000)
     plain = advise(
         mission, batches, lambda b: acquire(b, mission.within_zones, sky), {"separation_deg": 0.01}
     )

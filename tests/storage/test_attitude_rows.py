@@ -9,8 +9,9 @@ import pytest
 from service.app.factory import open_app
 from service.observations.schema import submission_from_json
 from service.settings import Settings
-from service.storage.queries.attitude_rows import attitude_pages, count_results
+from service.storage.queries.attitude_rows import attitude_pages
 from service.storage.queries.pages import ResultFilter
+from service.storage.queries.with_archive.rows import count
 from tests.storage.samples import KINDS, batch
 
 
@@ -34,6 +35,7 @@ def test_every_result_is_read_once_in_order_in_pages_of_any_size(app):
         pages = list(
             attitude_pages(
                 app.context.reading,
+                app.store.archive,
                 ResultFilter("live", "XTE"),
                 newest_first=newest_first,
                 page=page,
@@ -47,7 +49,9 @@ def test_every_result_is_read_once_in_order_in_pages_of_any_size(app):
             check(each, listed)
     with app.context.reading() as connection:
         for most, counted in ((100, 12), (7, 7)):
-            assert count_results(connection, ResultFilter("live", "XTE"), most) == counted
+            assert (
+                count(connection, app.store.archive, ResultFilter("live", "XTE"), most) == counted
+            )
 
 
 def check(page, listed):

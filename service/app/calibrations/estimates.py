@@ -82,7 +82,7 @@ class CalibrationService:
         names = set(wanted.trackers or (each.name for each in mission.trackers))
         selected = ResultFilter(wanted.run or LIVE, wanted.spacecraft, wanted.start, wanted.end)
         with self._context.reading() as connection:
-            drawn = sample_batches(connection, selected, wanted.sample)
+            drawn = sample_batches(connection, self._context.store.archive, selected, wanted.sample)
         run_again = partial(self._submissions.ingest.run_again, mission=mission.within_zones)
         parts: list[IdentifiedStars] = []
         refused = 0

@@ -222,6 +222,7 @@ class Summary(Model, frozen=True, kw_only=True):
     measures: dict[str, float | None]
     parent: str | None
     current: bool
+    archived: bool
 
 
 class Result(Model, frozen=True, kw_only=True):
@@ -233,5 +234,6 @@ class Result(Model, frozen=True, kw_only=True):
     measures: dict[str, float | None]
     current: bool
     parent: str | None
+    archived: bool
     what_ifs: Sequence[Summary]
     frame: FrameWithStars | None = None

@@ -1,35 +1,74 @@
 """Reads archived batches for the service: the one place that knows where a batch is."""
 
-from collections.abc import Collection, Sequence, Set
+import logging
+from collections.abc import Collection, Iterator, Sequence, Set
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import Connection, select
+from sqlalchemy import ColumnElement, Connection, select
 
 from service.errors import AcquisitionError, Busy
 from service.extras import require_extra
+from service.sky.cache import LruCache
 from service.storage.archive.tables import archived_batches, archived_parts, archived_what_ifs
 from service.storage.recording.identity import stored_answers
+from service.storage.sql.tables import results, runs
 from service.times import Utc
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from service.storage.archive.opened import Opened
+
+log = logging.getLogger(__name__)
+
+
+CACHE_BYTES = 64 << 20
+"""Of opened results, which are those of a few row groups."""
+
 
 @dataclass(frozen=True)
-class Archive:
-    """The folder with the parts of a database; None: none is set."""
+class PlacedPart:
+    """A part that has batches of the database, with the times of its first and last batch."""
 
-    folder: Path | None
+    id: int
+    path: str
+    sha256: str
+    first_ns: int
+    last_ns: int
+    batches: int
+
+
+@dataclass(frozen=True)
+class Block:
+    """A row group of a part: the least that is opened."""
+
+    part: PlacedPart
+    group: int
+    first_ns: int
+    last_ns: int
+
+
+class Archive:
+    """The folder with the parts of a database; None: none is set.
+
+    Every method raises `Busy` where a file cannot be read, and `NotAvailable` without the
+    package that reads it.
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        self.folder = folder
+        self.cache = LruCache(CACHE_BYTES)
 
     def stored_answers(self, connection: Connection, ids: Collection[str]) -> dict[str, bytes]:
         """The answers of recorded or archived results, byte for byte; of others there is none."""
         found = stored_answers(connection, ids)
         if len(found) == len(ids):
             return found
-        for path, wanted in _places(connection, set(ids) - found.keys()).items():
-            read = self.read(path, ["id", "answer"], wanted)
+        for path, wanted in places(connection, set(ids) - found.keys()).items():
+            read = self.read(path, ["id", "answer"], [("id", "in", list(wanted))])
             rows = zip(read["id"].to_pylist(), read["answer"].to_pylist(), strict=True)
             found |= {id: answer.encode() for id, answer in rows}
         return found
@@ -46,31 +85,146 @@ class Archive:
                 found |= dict.fromkeys(archived, error)
         return found
 
-    def read(self, path: str, columns: Sequence[str] | None, ids: Sequence[str]) -> "pa.Table":
-        """Some columns, or all, of the results of a part that have these ids.
+    def read(self, path: str, columns: Sequence[str] | None, filters: Any) -> "pa.Table":
+        """Some columns, or all, of those results of a part that pass pyarrow's `filters`."""
+        with self._readable(path) as file:
+            from pyarrow import parquet
 
-        Raises `Busy` where the file cannot be read, and `NotAvailable` without the package that
-        reads it.
-        """
-        require_extra("tables", "pyarrow", "archive", path)
-        import pyarrow as pa
-        from pyarrow import parquet
-
-        if self.folder is None:
-            raise Busy("the batch is archived, and this service has no archive folder")
-        try:
             return parquet.read_table(
-                self.folder / path,
+                file,
                 columns=None if columns is None else list(columns),
-                filters=[("id", "in", list(ids))],
+                filters=filters,
                 partitioning=None,
                 page_checksum_verification=True,
             )
+
+    def batch(self, connection: Connection, id: str) -> "Opened | None":
+        """The batch of an archived result with all its results; None: it is not archived."""
+        if connection.scalar(select(results.c.id).where(results.c.id == id)) is not None:
+            return None
+        found = places(connection, [id])
+        if not found:
+            return None
+        ((path, _),) = found.items()
+        batch_id = batch_of(connection, id)
+
+        def build() -> "Opened":
+            from service.storage.archive.folder import read_settings
+            from service.storage.archive.opened import WHOLE, Opened, columns_of
+
+            own = [[("id", "=", batch_id)], [("batch_id", "=", batch_id)]]
+            read = self.read(path, columns_of(WHOLE), own)
+            opened = Opened()
+            opened.add_partition(read)
+            digests = sorted({*read["mission_digest"].to_pylist()})
+            assert self.folder is not None
+            opened.add_settings(read_settings(self.folder, digest) for digest in digests)
+            return opened
+
+        return self.cache.get((path, batch_id), build)[0]
+
+    def blocks(self, part: PlacedPart) -> list[Block]:
+        """The row groups of a part, in order of time."""
+        with self._readable(part.path) as file:
+            from pyarrow import parquet
+
+            about = parquet.read_metadata(file)
+            place = about.schema.to_arrow_schema().names.index("time_ns")
+            times = [
+                about.row_group(k).column(place).statistics for k in range(about.num_row_groups)
+            ]
+        return [Block(part, k, each.min, each.max) for k, each in enumerate(times)]
+
+    def open(self, block: Block, needs: Collection[str]) -> "Opened":
+        """The results of a row group, with what is needed of them; see `opened.columns_of`."""
+
+        def build() -> "Opened":
+            from service.storage.archive.opened import Opened, columns_of
+
+            with self._readable(block.part.path) as file:
+                from pyarrow import parquet
+
+                whole = parquet.ParquetFile(file, page_checksum_verification=True)
+                read = whole.read_row_group(block.group, columns_of(needs))
+            opened = Opened()
+            opened.add_partition(read)
+            return opened
+
+        key = (block.part.path, block.part.sha256, block.group, *sorted(needs))
+        return self.cache.get(key, build)[0]
+
+    def current_ids(
+        self, part: PlacedPart, start_ns: int | None, end_ns: int | None
+    ) -> "pa.ChunkedArray":
+        """The ids of the current results of a part from a time to before another, in order."""
+        filters: list[tuple[str, str, object]] = [("current", "=", True)]
+        filters += [("time_ns", ">=", start_ns)] if start_ns is not None else []
+        filters += [("time_ns", "<", end_ns)] if end_ns is not None else []
+        return self.read(part.path, ["id"], filters)["id"]
+
+    @contextmanager
+    def _readable(self, path: str) -> Iterator[Path]:
+        """The file of a part; whatever is wrong with it is told as what to do."""
+        require_extra("tables", "pyarrow", "archive", path)
+        import pyarrow as pa
+
+        if self.folder is None:
+            raise Busy(
+                "the batches are archived, and this service knows no folder of an archive: set "
+                "ACQUIRE_ARCHIVE_FOLDER to it and start again"
+            )
+        try:
+            yield self.folder / path
         except (OSError, pa.ArrowException) as error:
-            raise Busy("the batch is archived, and the archive cannot be read now") from error
+            log.error("%s: cannot be read: %s", self.folder / path, error)
+            raise Busy(
+                "the batches are archived, and the archive cannot be read now: have the folder "
+                "of ACQUIRE_ARCHIVE_FOLDER mounted, or restored from its backup"
+            ) from error
 
 
-def _places(connection: Connection, ids: Collection[str]) -> dict[str, list[str]]:
+def parts_between(
+    connection: Connection,
+    spacecraft: str | None,
+    run: str | None,
+    first_ns: int | None,
+    end_ns: int | None,
+) -> list[PlacedPart]:
+    """The parts that reach into a period, of every spacecraft or run where none is named."""
+    c = archived_parts.c
+    chosen: list[ColumnElement[bool]] = []
+    if spacecraft is not None:
+        chosen.append(c.spacecraft == spacecraft)
+    if run is not None:
+        chosen.append(c.run == run)
+    if first_ns is not None:
+        chosen.append(c.last_ns >= first_ns)
+    if end_ns is not None:
+        chosen.append(c.first_ns < end_ns)
+    columns = (c.id, c.path, c.sha256, c.first_ns, c.last_ns, c.batches)
+    return [PlacedPart(*row) for row in connection.execute(select(*columns).where(*chosen))]
+
+
+def parts_with(
+    connection: Connection, spacecraft: str | None, run: str | None, batch: str
+) -> set[int]:
+    """The ids of the parts that have a batch of this name."""
+    c = archived_batches.c
+    # The unique index begins with spacecraft and run: neither is left open.
+    in_runs = select(runs.c.name) if run is None else [run]
+    query = select(c.part_id).where(
+        c.spacecraft == spacecraft, c.run.in_(in_runs), c.batch == batch
+    )
+    return set(connection.scalars(query))
+
+
+def batch_of(connection: Connection, id: str) -> str:
+    """The id of the batch of an archived result."""
+    of_what_if = select(archived_what_ifs.c.batch_id).where(archived_what_ifs.c.id == id)
+    return connection.scalar(of_what_if) or id
+
+
+def places(connection: Connection, ids: Collection[str]) -> dict[str, list[str]]:
     """The ids of archived results by the path of their part."""
     found: dict[str, list[str]] = {}
     wanted = list(ids)

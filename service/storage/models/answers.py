@@ -283,6 +283,7 @@ class Summary(Record, frozen=True, kw_only=True):
     measures: Measures
     parent: Annotated[Id | None, doc("For a what-if: the result that it started from.")]
     current: Annotated[bool, doc("Whether this is the current result of its batch.")]
+    archived: Annotated[bool, doc("Whether it is read from the archive, which takes longer.")]
 
 
 class BatchPage(Record, frozen=True, kw_only=True):
@@ -313,6 +314,7 @@ class Result(Record, frozen=True, kw_only=True):
     measures: Measures
     current: bool
     parent: Id | None
+    archived: Annotated[bool, doc("Whether it is read from the archive, which takes longer.")]
     what_ifs: list[Summary]
     frame: (
         Annotated[

@@ -1,15 +1,16 @@
 """Current results of a spacecraft with their attitudes, in order of time, page by page."""
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import msgspec
 import numpy as np
-from sqlalchemy import Connection, Select, func, select, tuple_
+from sqlalchemy import Select, select
 
 from service.products.attitudes import AttitudeRows
+from service.storage.archive.reading import Archive
 from service.storage.queries.pages import PLACE, ResultFilter
+from service.storage.queries.with_archive.rows import ArchiveUse, Reading, row_pages
 from service.storage.sql.tables import COUNTED, batches, results, solutions
 from service.vectors import Vector
 
@@ -46,7 +47,8 @@ _UNKNOWN = (np.nan, np.nan, np.nan)
 
 
 def attitude_pages(
-    reading: Callable[[], AbstractContextManager[Connection]],
+    reading: Reading,
+    archive: Archive,
     selected: ResultFilter,
     *,
     newest_first: bool = False,
@@ -54,30 +56,20 @@ def attitude_pages(
 ) -> Iterator[AttitudeRows]:
     """Every current result that is selected, with its attitude, page by page.
 
+    Those of the archive are read with the recorded ones.
+
     Between two pages no connection is held, so that a slow reader keeps none from others.
     """
-    order = [column.desc() if newest_first else column for column in PLACE]
-    query = _QUERY.where(*selected.conditions()).order_by(*order).limit(page)
-    last: tuple[int, str] | None = None
-    while True:
-        beyond = query
-        if last is not None:
-            place = tuple_(*PLACE)
-            before = tuple_(*last)
-            beyond = query.where(place < before if newest_first else place > before)
-        with reading() as connection:
-            rows = connection.execute(beyond).all()
-        if rows:
-            yield _columns(rows)
-        if len(rows) < page:
-            return
-        last = rows[-1][0], rows[-1][1]
-
-
-def count_results(connection: Connection, selected: ResultFilter, most: int) -> int:
-    """How many current results are selected; no more than `most` are counted."""
-    some = select(results.c.batch_id).where(*selected.conditions()).limit(most).subquery()
-    return int(connection.scalar(select(func.count()).select_from(some)) or 0)
+    use = ArchiveUse(archive, ("input", "solution"))
+    pages = row_pages(
+        reading,
+        use,
+        _QUERY.where(*selected.conditions()),
+        selected,
+        page,
+        newest_first=newest_first,
+    )
+    return map(_columns, pages)
 
 
 def _columns(rows: Sequence[Any]) -> AttitudeRows:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection, Subquery, and_, case, func, or_, select
 
+from service.storage.archive.reading import Archive
 from service.storage.models.compare import (
     AngleStatistics,
     OutcomeCounts,
@@ -19,6 +20,7 @@ from service.storage.models.compare import (
     StatusCounts,
 )
 from service.storage.queries.pages import ResultFilter
+from service.storage.queries.with_archive.both_runs import both_runs, is_archived_in_part
 from service.storage.sql.tables import COUNTED, batches, results, solutions, star_results
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
@@ -27,7 +29,11 @@ _QUATERNION = ("q1", "q2", "q3", "qc")
 
 
 def compare_runs(
-    connection: Connection, selected: ResultFilter, other: str, latest: int | None = None
+    connection: Connection,
+    archive: Archive,
+    selected: ResultFilter,
+    other: str,
+    latest: int | None = None,
 ) -> RunComparison:
     """The current results of a period beside those of the same batches in another run.
 
@@ -35,30 +41,40 @@ def compare_runs(
     (`after`); `same_star` tells whether both name it, and alike.  `attitudes`
     compares what both have.  With `latest`, of the period's latest batches alone.
     """
-    pairs = _pairs(selected, other, latest)
-    transitions = _transitions(connection, pairs)
-    return RunComparison(
-        run=selected.run,
-        other=other,
-        batches=int(connection.scalar(select(func.count()).select_from(pairs)) or 0),
-        stars=RunStars(
-            observed=sum(each.stars for each in transitions),
-            before=_sums((each.before, each.stars) for each in transitions),
-            after=_sums((each.after, each.stars) for each in transitions),
-            transitions=transitions,
-        ),
-        attitudes=_attitudes(connection, pairs),
-    )
+    tally = _Tally()
+    if not is_archived_in_part(connection, selected, other):
+        tally.add(connection, _pairs(selected, other, latest))
+    else:
+        for group in both_runs(connection, archive, selected, other, latest):
+            with group.reading() as of_group:
+                tally.add(of_group, _pairs(selected, other))
+    return tally.comparison(selected.run, other)
 
 
 def changed_batches(
-    connection: Connection, selected: ResultFilter, other: str, latest: int, limit: int
+    connection: Connection,
+    archive: Archive,
+    selected: ResultFilter,
+    other: str,
+    latest: int,
+    limit: int,
 ) -> list[RunChange]:
     """The batches whose counts of stars or whose status differ in the other run, latest first.
 
     At most `limit` of the period's `latest` batches.
     """
-    pairs = _pairs(selected, other, latest)
+    if not is_archived_in_part(connection, selected, other):
+        return _changed(connection, _pairs(selected, other, latest), limit)
+    found: list[RunChange] = []
+    for group in both_runs(connection, archive, selected, other, latest):
+        with group.reading() as of_group:
+            found += _changed(of_group, _pairs(selected, other), limit)
+        if len(found) >= limit:
+            break
+    return found[:limit]
+
+
+def _changed(connection: Connection, pairs: Subquery, limit: int) -> list[RunChange]:
     old, new = results.alias("old"), results.alias("changed")
     differ = or_(
         *(old.c[name] != new.c[name] for name in (*COUNTED, "status")),
@@ -129,8 +145,61 @@ def _pairs(selected: ResultFilter, other: str, latest: int | None = None) -> Sub
     )
 
 
-def _transitions(connection: Connection, pairs: Subquery) -> list[RunTransition]:
-    """How many stars went from which outcome to which, the most first."""
+class _Tally:
+    """Both runs so far, over the groups of batches that were compared."""
+
+    def __init__(self) -> None:
+        self.batches = 0
+        self.stars: Counter[tuple[str, str, bool]] = Counter()
+        self.before: Counter[str] = Counter()
+        self.after: Counter[str] = Counter()
+        self.angles_arcsec: list[Vector] = []
+
+    def add(self, connection: Connection, pairs: Subquery) -> None:
+        """Take the pairs of a group."""
+        self.batches += int(connection.scalar(select(func.count()).select_from(pairs)) or 0)
+        self.stars.update(_transitions(connection, pairs))
+        states = select(pairs.c.status_before, pairs.c.status_after, func.count()).group_by(
+            pairs.c.status_before, pairs.c.status_after
+        )
+        for old, new, count in connection.execute(states):
+            self.before[old or "none"] += int(count)
+            self.after[new or "none"] += int(count)
+        self.angles_arcsec += _angles_arcsec(connection, pairs)
+
+    def comparison(self, run: str | None, other: str) -> RunComparison:
+        """The whole; of the transitions the most frequent first."""
+        transitions = [
+            RunTransition(before=before, after=after, same_star=alike, stars=stars)
+            for (before, after, alike), stars in self.stars.items()
+        ]
+        transitions.sort(key=lambda each: (-each.stars, each.before, each.after))
+        angles = np.concatenate([np.empty(0), *self.angles_arcsec])
+        statistics = None
+        if len(angles):
+            median, p95 = np.quantile(angles, (0.5, 0.95)).tolist()
+            statistics = AngleStatistics(median=median, p95=p95, max=float(angles.max()))
+        return RunComparison(
+            run=run,
+            other=other,
+            batches=self.batches,
+            stars=RunStars(
+                observed=sum(each.stars for each in transitions),
+                before=_sums((each.before, each.stars) for each in transitions),
+                after=_sums((each.after, each.stars) for each in transitions),
+                transitions=transitions,
+            ),
+            attitudes=RunAttitudes(
+                before=StatusCounts(**self.before),
+                after=StatusCounts(**self.after),
+                in_both=len(angles),
+                angle_arcsec=statistics,
+            ),
+        )
+
+
+def _transitions(connection: Connection, pairs: Subquery) -> dict[tuple[str, str, bool], int]:
+    """How many stars went from which outcome to which, and whether they name the same star."""
     old, new = star_results.alias("old_star"), star_results.alias("new_star")
     same = case((old.c.star_id == new.c.star_id, 1), else_=0)
     query = (
@@ -147,11 +216,10 @@ def _transitions(connection: Connection, pairs: Subquery) -> list[RunTransition]
         )
         .group_by(old.c.outcome, new.c.outcome, same)
     )
-    found = [
-        RunTransition(before=before, after=after, same_star=bool(alike), stars=int(stars))
+    return {
+        (before, after, bool(alike)): int(stars)
         for before, after, alike, stars in connection.execute(query)
-    ]
-    return sorted(found, key=lambda each: (-each.stars, each.before, each.after))
+    }
 
 
 def _sums(stars: Iterable[tuple[str, int]]) -> OutcomeCounts:
@@ -161,30 +229,8 @@ def _sums(stars: Iterable[tuple[str, int]]) -> OutcomeCounts:
     return OutcomeCounts(**{name: counts[name] for name in OutcomeCounts.__struct_fields__})
 
 
-def _attitudes(connection: Connection, pairs: Subquery) -> RunAttitudes:
-    """How many attitudes each has, and the angle between those that both have."""
-    states = select(pairs.c.status_before, pairs.c.status_after, func.count()).group_by(
-        pairs.c.status_before, pairs.c.status_after
-    )
-    before: Counter[str] = Counter()
-    after: Counter[str] = Counter()
-    for old, new, count in connection.execute(states):
-        before[old or "none"] += int(count)
-        after[new or "none"] += int(count)
-    angles = _angles_arcsec(connection, pairs)
-    statistics = None
-    if len(angles):
-        median, p95 = np.quantile(angles, (0.5, 0.95)).tolist()
-        statistics = AngleStatistics(median=median, p95=p95, max=float(angles.max()))
-    return RunAttitudes(
-        before=StatusCounts(**before),
-        after=StatusCounts(**after),
-        in_both=len(angles),
-        angle_arcsec=statistics,
-    )
-
-
-def _angles_arcsec(connection: Connection, pairs: Subquery) -> Vector:
+def _angles_arcsec(connection: Connection, pairs: Subquery) -> list[Vector]:
+    """The angles between the attitudes that both have, in arrays."""
     old, new = solutions.alias("old_solution"), solutions.alias("new_solution")
     query = (
         select(*(each.c[name] for each in (old, new) for name in _QUATERNION))
@@ -193,8 +239,7 @@ def _angles_arcsec(connection: Connection, pairs: Subquery) -> Vector:
         .join(new, new.c.result_id == pairs.c.after)
     )
     read: Any = connection.execution_options(yield_per=_READ_AT_ONCE).execute(query)
-    parts = [_between(np.array(rows, dtype=float)) for rows in read.partitions(_READ_AT_ONCE)]
-    return np.concatenate(parts) if parts else np.empty(0)
+    return [_between(np.array(rows, dtype=float)) for rows in read.partitions(_READ_AT_ONCE)]
 
 
 def _between(rows: Vector) -> Vector:

@@ -7,24 +7,37 @@ from typing import Any
 from sqlalchemy import Connection, Select, func, select
 
 from service.missions.mission import Mission
+from service.storage.archive.reading import Archive
 from service.storage.models.base import Page
 from service.storage.models.runs import Run
 from service.storage.models.spacecraft import AttitudeRow, MissionThen, SpacecraftRow
 from service.storage.queries.future_dated import LIVE
-from service.storage.queries.pages import PLACE, ResultFilter, newest, oldest_first, page_of
+from service.storage.queries.pages import PLACE, ResultFilter, newest
 from service.storage.queries.results import summary_of, summary_query
+from service.storage.queries.with_archive.rows import MOST_OPENED, ArchiveUse, page_of
 from service.storage.sql.rollup_tables import rollups_daily
 from service.storage.sql.tables import batches, mission_uses, missions, results, runs, solutions
 from service.times import DAY_S, Utc, bucket_start
 
 
 def list_attitudes(
-    connection: Connection, selected: ResultFilter, *, limit: int, cursor: str | None
+    connection: Connection,
+    archive: Archive,
+    selected: ResultFilter,
+    *,
+    limit: int,
+    cursor: str | None,
 ) -> Page[AttitudeRow]:
-    """The attitudes of current results, oldest batch time first."""
+    """The attitudes of current results, recorded and archived, oldest batch time first."""
     chosen = [*selected.conditions(), results.c.status.is_not(None)]
     return page_of(
-        connection, oldest_first(attitudes().where(*chosen), cursor), limit, attitude_row
+        connection,
+        ArchiveUse(archive, ("solution",), most_opened=MOST_OPENED),
+        attitudes().where(*chosen),
+        selected,
+        limit,
+        attitude_row,
+        cursor=cursor,
     )
 
 

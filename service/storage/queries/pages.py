@@ -16,6 +16,9 @@ from service.times import Utc
 
 T = TypeVar("T")
 
+Place = tuple[int, str]
+"""The time of a batch, and its id."""
+
 PLACE = (results.c.time_ns, results.c.batch_id)
 """The order of a list.  Columns of the batch, not of the result: adopting changes no order."""
 
@@ -67,14 +70,14 @@ def newest(
 def newest_first(query: Select[Any], cursor: str | None = None) -> Select[Any]:
     """The query in descending order of time, from beyond the cursor."""
     if cursor is not None:
-        query = query.where(tuple_(*PLACE) < tuple_(*_read_cursor(cursor)))
+        query = query.where(tuple_(*PLACE) < tuple_(*read_cursor(cursor)))
     return query.order_by(*(column.desc() for column in PLACE))
 
 
 def oldest_first(query: Select[Any], cursor: str | None = None) -> Select[Any]:
     """The query in ascending order of time, from beyond the cursor."""
     if cursor is not None:
-        query = query.where(tuple_(*PLACE) > tuple_(*_read_cursor(cursor)))
+        query = query.where(tuple_(*PLACE) > tuple_(*read_cursor(cursor)))
     return query.order_by(*PLACE)
 
 
@@ -86,15 +89,23 @@ def page_of(
     rows = list(connection.execute(query.limit(limit + 1)).mappings())
     more = len(rows) > limit
     rows = rows[:limit]
-    return Page([shown(row) for row in rows], _cursor(rows[-1]) if more and rows else None)
+    return Page(
+        [shown(row) for row in rows], cursor_of(_place_of(rows[-1])) if more and rows else None
+    )
 
 
-def _cursor(row: Any) -> str:
-    text = f"{row['time_ns']}.{row['batch_id']}"
+def _place_of(row: Any) -> Place:
+    return row["time_ns"], row["batch_id"]
+
+
+def cursor_of(place: Place) -> str:
+    """The cursor of a list that goes on beyond a place."""
+    text = f"{place[0]}.{place[1]}"
     return base64.urlsafe_b64encode(text.encode()).decode().rstrip("=")
 
 
-def _read_cursor(cursor: str) -> tuple[int, str]:
+def read_cursor(cursor: str) -> Place:
+    """The place of a cursor; raises `BadBatch` for a text that is none."""
     try:
         padded = cursor.encode("ascii") + b"=" * (-len(cursor) % 4)
         time_ns, _, batch_id = base64.urlsafe_b64decode(padded).decode("ascii").partition(".")

@@ -10,9 +10,11 @@ from sqlalchemy import Connection, bindparam, func, select
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
 from service.observations.schema import OptionsIn, submission_from_json
+from service.storage.archive.reading import Archive, PlacedPart
 from service.storage.models.answers import Answer
 from service.storage.queries.pages import PLACE, ResultFilter
 from service.storage.queries.results import answer_from_json, read_result
+from service.storage.queries.with_archive.rows import ArchiveUse, bounds_of, count_of_part, parts_of
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, missions, results
 
@@ -70,25 +72,33 @@ def merged_options(own: Row, options: OptionsIn) -> OptionsIn:
 
 
 def sample_batches(
-    connection: Connection, selected: ResultFilter, size: int, seed: int = 0
+    connection: Connection, archive: Archive, selected: ResultFilter, size: int, seed: int = 0
 ) -> BatchSample:
     """At most `size` batches of a period: all, or one drawn from each of as many equal parts.
 
     Drawn and not every n-th, so that nothing periodic in the telemetry is met
-    always or never; the same seed draws the same.
+    always or never; the same seed draws the same.  The archived ones count as the earlier.
     """
     conditions = selected.conditions()
-    total = int(connection.scalar(select(func.count()).where(*conditions)) or 0)
+    parts = sorted(
+        parts_of(connection, ArchiveUse(archive), selected), key=lambda each: each.first_ns
+    )
+    ends = np.cumsum([0, *(count_of_part(archive, part, selected) for part in parts)])
+    recorded = int(connection.scalar(select(func.count()).where(*conditions)) or 0)
+    total = int(ends[-1]) + recorded
     rng = np.random.default_rng(seed)
     count = min(size, total)
     ranks = np.arange(1, count + 1)
     if count < total:
         ranks = 1 + np.floor((np.arange(count) + rng.random(count)) * total / count).astype(int)
-    rows = [
-        row
-        for start in range(0, count, _READ_AT_ONCE)
-        for row in _at_ranks(connection, selected, ranks[start : start + _READ_AT_ONCE].tolist())
-    ]
+    rows: list[Row] = []
+    for part, begin, end in zip(parts, ends, ends[1:], strict=False):
+        within = ranks[(ranks > begin) & (ranks <= end)] - begin - 1
+        if len(within):
+            rows += _of_part(archive, part, selected, within.tolist())
+    left = ranks[ranks > ends[-1]] - ends[-1]
+    for start in range(0, len(left), _READ_AT_ONCE):
+        rows += _at_ranks(connection, selected, left[start : start + _READ_AT_ONCE].tolist())
     times = [(row["time_ns"], row["time"]) for row in rows]
     drawn = tuple(rows[k] for k in rng.permutation(len(rows)))
     return BatchSample(
@@ -98,6 +108,15 @@ def sample_batches(
         max(times)[1] if times else None,
         drawn,
     )
+
+
+def _of_part(
+    archive: Archive, part: PlacedPart, selected: ResultFilter, at: list[int]
+) -> list[Row]:
+    """The batches of a part at these places, from 0, among those that are selected."""
+    ids = archive.current_ids(part, *bounds_of(selected)).take(at).to_pylist()
+    read = archive.read(part.path, ["id", "options", *_SENT], [("id", "in", ids)])
+    return [dict(row) for row in read.to_pylist()]
 
 
 def _at_ranks(connection: Connection, selected: ResultFilter, ranks: list[int]) -> list[Row]:

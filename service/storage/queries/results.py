@@ -8,12 +8,14 @@ from msgspec import UNSET
 from sqlalchemy import ColumnElement, Connection, Select, or_, select
 
 from service.alarms.quantities import QUANTITIES, value_names
-from service.errors import NotFound, shown_value
+from service.errors import NotFound, WrongState, shown_value
+from service.storage.archive.reading import Archive, parts_with
 from service.storage.archive.tables import archived_batches, archived_what_ifs
 from service.storage.models.answers import Answer, Result, StarCounts, Summary
 from service.storage.models.base import Page
 from service.storage.models.frames import FrameWithStars
-from service.storage.queries.pages import ResultFilter, newest, newest_first, page_of
+from service.storage.queries.pages import ResultFilter, newest
+from service.storage.queries.with_archive.rows import MOST_OPENED, ArchiveUse, page_of
 from service.storage.recording.unsaved_result import STARS
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, frames, missions, results, runs
@@ -25,6 +27,7 @@ StatusName = Literal["good", "suspect", "none"]
 
 def list_batches(
     connection: Connection,
+    archive: Archive,
     selected: ResultFilter,
     *,
     outcome: OutcomeName | None,
@@ -33,7 +36,7 @@ def list_batches(
     limit: int,
     cursor: str | None,
 ) -> Page[Summary]:
-    """Current results, newest batch time first.
+    """Current results, recorded and archived, newest batch time first.
 
     `outcome` keeps batches with at least one star of it; `status` those whose
     attitude is good or suspect, or that have none; `batch` the one with this batch id in each
@@ -44,8 +47,19 @@ def list_batches(
         chosen.append(results.c[outcome] > 0)
     if status is not None:
         chosen.append(results.c.status == (None if status == "none" else status))
-    query = newest_first(summary_query().where(*chosen), cursor)
-    return page_of(connection, query, limit, summary_of)
+    parts = None
+    if batch is not None:
+        parts = parts_with(connection, selected.spacecraft, selected.run, batch)
+    return page_of(
+        connection,
+        ArchiveUse(archive, most_opened=MOST_OPENED, parts=parts),
+        summary_query().where(*chosen),
+        selected,
+        limit,
+        summary_of,
+        newest_first=True,
+        cursor=cursor,
+    )
 
 
 def newest_id(connection: Connection, selected: ResultFilter, now: Utc) -> str | None:
@@ -74,18 +88,23 @@ def read_result(connection: Connection, id: str) -> Row:
     query = select(results, batches.c.input).join_from(results, batches).where(results.c.id == id)
     row = connection.execute(query).mappings().first()
     if row is None:
-        if is_archived(connection, id):
-            raise NotFound(
-                f"the batch with the id {shown_value(id)} is archived: it can be restored with "
-                "`acquire archive restore`"
-            )
         raise NotFound(f"there is no batch with the id {shown_value(id)}")
     return dict(row)
 
 
-def is_archived(connection: Connection, id: str) -> bool:
-    """Whether a result is in the archive."""
-    return connection.execute(_archived(id)).first() is not None
+def read_parent(connection: Connection, id: str, *, archived: bool, kept: bool) -> Row:
+    """The result that a what-if starts from, as `read_result`.
+
+    `archived` says that the connection is to a batch of the archive; `kept`, that the what-if is
+    to be recorded.  Raises `WrongState` for both at once.
+    """
+    row = read_result(connection, id)
+    if archived and kept:
+        raise WrongState(
+            f"the batch with the id {shown_value(id)} is archived: bring its period back with "
+            "`acquire archive restore` before you record a what-if of it"
+        )
+    return row
 
 
 def _archived(id: str) -> Select[tuple[str]]:
@@ -104,8 +123,11 @@ def spacecraft_of(connection: Connection, id: str) -> str | None:
     return None
 
 
-def read_record(connection: Connection, id: str) -> Result:
-    """A result with its input and the what-ifs of its batch; raises `NotFound`."""
+def read_record(connection: Connection, id: str, *, archived: bool = False) -> Result:
+    """A result with its input and the what-ifs of its batch; raises `NotFound`.
+
+    `archived` says that the connection is to a batch of the archive.
+    """
     row = read_result(connection, id)
     what_ifs = (
         summary_query()
@@ -123,7 +145,11 @@ def read_record(connection: Connection, id: str) -> Result:
         measures=measured(row),
         current=row["current"],
         parent=row["parent_id"],
-        what_ifs=[summary_of(each) for each in connection.execute(what_ifs).mappings()],
+        what_ifs=[
+            summary_of({**each, "archived": archived})
+            for each in connection.execute(what_ifs).mappings()
+        ],
+        archived=archived,
         frame=UNSET if frame is None else _frame_of(frame),
     )
 
@@ -194,6 +220,7 @@ def summary_fields(row: Any) -> Row:
         "measures": measured(row),
         "parent": row["parent_id"],
         "current": row["current"],
+        "archived": row.get("archived", False),
     }
 
 

@@ -138,6 +138,20 @@ class Store(Readers):
         super().__init__(database, serving=serving, file=file)
         self.writer = Writer(self._writing, file=file, wait_s=TURN_S if serving else None)
 
+    @contextmanager
+    def reading_batch(self, id: str) -> Iterator[tuple[Connection, bool]]:
+        """A connection that has the batch of a result, and whether that is archived.
+
+        Where there is no such result the connection is that of the database.
+        """
+        with self.reading() as connection:
+            opened = self.archive.batch(connection, id)
+            if opened is None:
+                yield connection, False
+                return
+        with opened.reading() as connection:
+            yield connection, True
+
     def close(self) -> None:
         """Write what is queued, then let go of the database."""
         self.writer.close()

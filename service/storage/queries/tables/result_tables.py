@@ -1,19 +1,19 @@
 """Current results as tables, in order of time: a row a batch, or a row a star."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import Connection, Select, select, tuple_
+from sqlalchemy import select
 
 from service.alarms.quantities import QUANTITIES
 from service.products.tables import Column, Page, Table
+from service.storage.archive.reading import Archive
 from service.storage.queries.pages import PLACE, ResultFilter
+from service.storage.queries.with_archive.rows import ArchiveUse, Reading, all_rows, row_pages
 from service.storage.sql.tables import COUNTED, MEASURED, batches, results, star_results
 
 BATCHES, BATCHES_OF_STARS = 5_000, 500
 """Results that are read together."""
-Reading = Callable[[], AbstractContextManager[Connection]]
 
 _NAMES = (
     Column("time", "text", "UTC", description="Time of the batch.", width=30),
@@ -50,63 +50,50 @@ STAR_COLUMNS = (
 )
 
 
-def batch_table(reading: Reading, selected: ResultFilter, about: Mapping[str, str]) -> Table:
+def batch_table(
+    reading: Reading, archive: Archive, selected: ResultFilter, about: Mapping[str, str]
+) -> Table:
     """The batches that are selected with their quantities; read as the table is."""
     read = [
         _PLACES[each.name] if each.name in _PLACES else results.c[each.name]
         for each in BATCH_COLUMNS
     ]
     query = select(*PLACE, *read).join_from(results, batches, results.c.batch_id == batches.c.id)
+    chosen = selected.conditions()
     pages = (
         _columns([row[len(PLACE) :] for row in rows])
-        for rows in _pages(reading, query, selected, BATCHES)
+        for rows in row_pages(reading, ArchiveUse(archive), query.where(*chosen), selected, BATCHES)
     )
     return Table(BATCH_COLUMNS, pages, {"product": "batches", **about})
 
 
-def star_table(reading: Reading, selected: ResultFilter, about: Mapping[str, str]) -> Table:
+def star_table(
+    reading: Reading, archive: Archive, selected: ResultFilter, about: Mapping[str, str]
+) -> Table:
     """The stars of the batches that are selected with their outcomes; read as the table is."""
-    return Table(STAR_COLUMNS, _stars(reading, selected), {"product": "stars", **about})
+    return Table(STAR_COLUMNS, _stars(reading, archive, selected), {"product": "stars", **about})
 
 
-def _stars(reading: Reading, selected: ResultFilter) -> Iterator[Page]:
-    ids = select(*PLACE, results.c.id)
+def _stars(reading: Reading, archive: Archive, selected: ResultFilter) -> Iterator[Page]:
+    ids = select(*PLACE, results.c.id).where(*selected.conditions())
     places = {**_PLACES, "id": results.c.id}
     read = [
         places[each.name] if each.name in places else star_results.c[each.name]
         for each in STAR_COLUMNS
     ]
     query = (
-        select(*read)
+        select(*PLACE, *read)
         .join_from(star_results, results, star_results.c.result_id == results.c.id)
         .join(batches, results.c.batch_id == batches.c.id)
         .order_by(*PLACE, star_results.c.tracker, star_results.c.position)
     )
-    for rows in _pages(reading, ids, selected, BATCHES_OF_STARS):
+    use = ArchiveUse(archive, ("stars",))
+    for rows in row_pages(reading, use, ids, selected, BATCHES_OF_STARS):
         chosen = query.where(star_results.c.result_id.in_([row[-1] for row in rows]))
         with reading() as connection:
-            stars = connection.execute(chosen).all()
+            stars = all_rows(connection, use, chosen, [row[: len(PLACE)] for row in rows])
         if stars:
-            yield _columns(stars)
-
-
-def _pages(
-    reading: Reading, query: Select[Any], selected: ResultFilter, page: int
-) -> Iterator[Sequence[Any]]:
-    """The rows of a query over current results, oldest first, that begin with their place.
-
-    Between two pages no connection is held.
-    """
-    query = query.where(*selected.conditions()).order_by(*PLACE).limit(page)
-    beyond = query
-    while True:
-        with reading() as connection:
-            rows = connection.execute(beyond).all()
-        if rows:
-            yield rows
-        if len(rows) < page:
-            return
-        beyond = query.where(tuple_(*PLACE) > tuple_(*rows[-1][: len(PLACE)]))
+            yield _columns([row[len(PLACE) :] for row in stars])
 
 
 def _columns(rows: Sequence[Any]) -> Page:

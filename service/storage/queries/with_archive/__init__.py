@@ -1,0 +1,1 @@
+"""Queries over recorded and archived batches together."""
