@@ -81,22 +81,28 @@ class SampledPsf:
         u = np.arange(-(columns // 2), columns // 2 + 1) / self.samples_per_px
         return RectBivariateSpline(v, u, share, kx=3, ky=3)
 
+    @cached_property
+    def _slopes(self) -> tuple[Any, Any]:
+        """The derivatives along u and v, once: for each call they would be made anew."""
+        return self._spline.partial_derivative(0, 1), self._spline.partial_derivative(1, 0)
+
     def pixel(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> Array:
         """See `psf.Psf`."""
-        return self._at(du_px, dv_px, 0, 0)
+        return self._at(self._spline, du_px, dv_px)
 
     def slopes(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> tuple[Array, Array]:
         """See `psf.Psf`."""
-        return self._at(du_px, dv_px, 1, 0), self._at(du_px, dv_px, 0, 1)
+        along_u, along_v = self._slopes
+        return self._at(along_u, du_px, dv_px), self._at(along_v, du_px, dv_px)
 
-    def _at(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike, in_u: int, in_v: int) -> Array:
+    def _at(self, spline: Any, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> Array:
         u, v = np.asarray(du_px, dtype=np.float64), np.asarray(dv_px, dtype=np.float64)
         known = (np.abs(u) <= self.reach_px[0]) & (np.abs(v) <= self.reach_px[1])
         if _is_raster(u, v):
             # Twenty times as quick as point by point.
-            found = self._spline(v[:, 0], u[0], dx=in_v, dy=in_u, grid=True)
+            found = spline(v[:, 0], u[0], grid=True)
         else:
-            found = self._spline.ev(*np.broadcast_arrays(v, u), dx=in_v, dy=in_u)
+            found = spline.ev(*np.broadcast_arrays(v, u))
         return np.where(known, found, 0.0)
 
 

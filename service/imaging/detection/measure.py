@@ -50,7 +50,9 @@ def measure(
     """
     exposure_s = frame.exposure_s or camera.exposure_s
     detector = detector_of(frame, found.background_counts, found.noise_counts, camera)
-    wanted = FAINT_SHARE * core_share(camera) * camera.flux_counts(np.array(faintest_mag), exposure_s)
+    wanted = (
+        FAINT_SHARE * core_share(camera) * camera.flux_counts(np.array(faintest_mag), exposure_s)
+    )
     # Without a zero point no candidate is known to be too faint.
     bright = np.count_nonzero(~(found.flux_counts < wanted))
     count = min(int(bright), 2 * camera.most_stars)

@@ -14,8 +14,9 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from service.imaging.centroids.centroid import centroid
 from service.imaging.centroids.psf import Psf
+from service.imaging.centroids.record import BREAKDOWN_RATIO
+from service.imaging.centroids.shape_fit import fit
 from service.imaging.centroids.window import Array, Detector, Mask, Window, cutout
 from service.imaging.detection.shapes import is_sharp
 from service.imaging.detection.star_image import PsfAt, reach_px, still_psf
@@ -40,9 +41,7 @@ MARGIN_PX = 2
 FAINTEST_DRAWN = 0.01
 """Light of a pixel, in sigmas of noise, at which an image may end."""
 
-Extract = Callable[
-    [CountArray, CountArray, "Mask | None", Camera], npt.NDArray[np.void]
-]
+Extract = Callable[[CountArray, CountArray, "Mask | None", Camera], npt.NDArray[np.void]]
 """SEP's search of light (rows, columns), with the noise of each of its pixels."""
 
 
@@ -89,7 +88,9 @@ def put_into(whole: Array, part: Array, row: int, column: int) -> None:
     top, left = max(row, 0), max(column, 0)
     bottom, right = min(row + part.shape[0], rows), min(column + part.shape[1], columns)
     if top < bottom and left < right:
-        whole[top:bottom, left:right] += part[top - row : bottom - row, left - column : right - column]
+        whole[top:bottom, left:right] += part[
+            top - row : bottom - row, left - column : right - column
+        ]
 
 
 @dataclass(frozen=True)
@@ -143,11 +144,11 @@ class ImageSearch:
             if self._core(images, *at) < LEAST_SHARE * _core_of(left, *at):
                 continue
             window = images.behind(self._cutout(*at), None)
-            record = centroid(window, "matched", psfs[k], at, self._half)
-            if record.usable and record.flux_counts > max(limit, SEEN_SHARE * seen):
-                place = record.u_px, record.v_px
-                if not _near(images, *place):
-                    self._put(images, self._drawn(*place, record.flux_counts, psfs[k]))
+            star = self._placed(window, at, psfs[k])
+            if star is None or star.flux_counts <= max(limit, SEEN_SHARE * seen):
+                continue
+            if not _near(images, star.u_px, star.v_px):
+                self._put(images, star)
         return len(images.stars) - before
 
     def _refit(self, images: StarImages, number: int) -> None:
@@ -155,14 +156,21 @@ class ImageSearch:
         star = images.stars[number]
         at = star.u_px, star.v_px
         window = images.behind(self._cutout(*at), number)
-        record = centroid(window, "matched", star.psf, at, self._half)
-        if not record.usable or math.hypot(record.u_px - at[0], record.v_px - at[1]) > SAME_PX:
+        placed = self._placed(window, at, star.psf)
+        if placed is None or math.hypot(placed.u_px - at[0], placed.v_px - at[1]) > SAME_PX:
             return
         images.light[star.where] -= star.counts.astype(images.light.dtype)
-        images.stars[number] = drawn = self._drawn(
-            record.u_px, record.v_px, record.flux_counts, star.psf
-        )
-        images.light[drawn.where] += drawn.counts.astype(images.light.dtype)
+        images.light[placed.where] += placed.counts.astype(images.light.dtype)
+        images.stars[number] = placed
+
+    def _placed(self, window: Window, at: tuple[float, float], psf: Psf) -> StarImage | None:
+        """The star of a window where it fits best; None where there is no light to fit."""
+        start = at[0] - window.corner_u_px, at[1] - window.corner_v_px
+        found = fit(window, psf, start, self._half)
+        if found is None or not found.signal_ratio >= BREAKDOWN_RATIO:
+            return None
+        u, v = found.u_px + window.corner_u_px, found.v_px + window.corner_v_px
+        return self._drawn(u, v, found.flux_counts, psf)
 
     def _cutout(self, u_px: float, v_px: float) -> Window:
         half = self._half + MARGIN_PX
