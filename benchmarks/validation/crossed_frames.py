@@ -96,7 +96,7 @@ def measured_report(frames: int, seed: int, processes: int) -> Report:
     found: list[CrossedFrame] = []
     with (
         ProcessPoolExecutor(min(processes, len(tasks)), get_context("spawn")) as pool,
-        tqdm(total=frames, desc="crossed frames", unit="frame", disable=None) as bar,
+        tqdm(total=frames, desc="crossed frames", unit="frame") as bar,
     ):
         for chunk in pool.map(_chunk, tasks):
             found += chunk
@@ -243,9 +243,9 @@ its figures are not edited by hand. {verdict}
 
 The frames are those of [frames.md](frames.md) with one difference: two wires each way, a tenth of
 the aperture wide, stand before the lens, and every star is a cross whose arms reach 90 pixels far.
-The mission's camera has `psf = "cross"` ([missions.md](missions.md#the-image-of-a-star)); its stars are
-taken off the frame one behind the other before the next ones are looked for, and each is placed by
-the shape of the cross, with the arms of all others as its background.
+The mission's camera has `psf = "cross"` ([missions.md](missions.md#the-image-of-a-star)); its stars
+are taken off the frame one behind the other before the next ones are looked for, and each is placed
+by the shape of the cross, with the arms of all others as its background.
 
 A star counts as found, and an attitude as right, as in frames.md: within {FOUND_PX:g} pixels, and
 within {RIGHT_ARCSEC[0]:g} arcsec across the boresight and {RIGHT_ARCSEC[2]:g} about it.
