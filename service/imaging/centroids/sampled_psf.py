@@ -102,7 +102,7 @@ class SampledPsf:
             # Twenty times as quick as point by point.
             found = spline(v[:, 0], u[0], grid=True)
         else:
-            found = spline.ev(*np.broadcast_arrays(v, u))
+            found = spline(*np.broadcast_arrays(v, u), grid=False)
         return np.where(known, found, 0.0)
 
 
