@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from benchmarks.validation.crossed_frames import mission_with
 from service.imaging.centroids.centroid import METHODS
 from service.imaging.centroids.sampled_psf import airy_psf, cross_psf, wired_psf
 from service.imaging.detection.detect import detect
@@ -19,9 +18,18 @@ from service.simulate.frames import FrameSettings, draw_frames
 FOUND_PX = 2.0
 
 
+def with_image(mission, psf):
+    """The mission with another image of a star."""
+    (tracker,) = mission.trackers
+    camera = tracker.camera.model_copy(update={"psf": psf})
+    other = tracker.model_copy(update={"camera": camera})
+    return mission.model_copy(update={"trackers": (other,)})
+
+
 @pytest.fixture(scope="module")
-def crossed():
-    return mission_with("cross")
+def crossed(missions):
+    """The shipped mission behind two wires each way."""
+    return with_image(missions["IMAGER"], "cross")
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +84,21 @@ def test_places_scatter_as_they_say(method, frames, crossed):
     # Four standard deviations of the mean of so many squares.
     slack = 4.0 * np.sqrt(2.0 / len(errors))
     assert np.mean(np.square(errors)) == pytest.approx(1.0, abs=slack)
+
+
+def test_rings_of_an_aperture_are_no_stars(sky, missions):
+    """A frame with a star of V 1.4, whose rings stand out of the noise for 50 pixels."""
+    mission = with_image(missions["IMAGER"], "airy")
+    camera = mission.trackers[0].camera
+    (drawn,) = draw_frames(mission, sky, FrameSettings(frames=1, seed=8))
+    u, v, magnitude = truth_of(drawn)
+    assert magnitude.min() < 2.0
+    found = detect(Frame(drawn.counts.astype(np.float32), "FITS", "sha256:0", 65535.0), camera)
+    away = np.hypot(found.u_px - u[:, None], found.v_px - v[:, None])
+    bright = found.flux_counts > 0.5 * camera.flux_counts(np.array(6.5), 0.1)
+    assert (away.min(axis=0)[bright] < FOUND_PX).all()
+    inside = (u > 0) & (u < 1023) & (v > 0) & (v < 1023) & (magnitude <= 6.5)
+    assert (away.min(axis=1)[inside] < FOUND_PX).mean() > 0.9
 
 
 def test_wires_along_the_axes_make_the_cross_of_the_report():

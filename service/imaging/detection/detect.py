@@ -6,7 +6,7 @@ threshold in the noise behind that filter, and deblending.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -51,9 +51,9 @@ class Detections:
     sharp_u_px: Vector
     sharp_v_px: Vector
     """Hot pixels and cosmic rays: what was found and is no star."""
-    images: StarImages | None = None
+    images: StarImages | None
     """Of a camera whose images of stars reach far: those of the brighter candidates."""
-    image_of: npt.NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    image_of: npt.NDArray[np.intp]
     """Which of the images is a candidate's (n,); -1 where none is."""
 
     @property

@@ -147,8 +147,7 @@ def draw_figure_6(figure: Any, found: Projections) -> None:
     ends = np.array([index.projection.value[0], index.projection.value[-1]])
     line = index.mean + ends[:, None] * index.axis
     left.plot(*line.T, color=COLORS[1], lw=2)
-    left.set(xlabel="side 1", ylabel="side 2", zlabel="side 3")
-    left.set_title("Figure 6: sides and the axis")
+    left.set(xlabel="side 1", ylabel="side 2", title="Figure 6: the three sides, the axis")
     right = figure.add_subplot(1, 2, 2)
     right.hist(index.projection.value, 80, color=COLORS[0])
     right.set(xlabel="projection", ylabel="triangles")
