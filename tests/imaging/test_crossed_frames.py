@@ -5,12 +5,14 @@ import math
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from scipy.ndimage import gaussian_filter
 
 from service.imaging.centroids.centroid import METHODS
 from service.imaging.centroids.sampled_psf import airy_psf, cross_psf, wired_psf
 from service.imaging.detection.detect import detect
 from service.imaging.detection.measure import measure
 from service.imaging.detection.star_image import psf_of, still_psf
+from service.imaging.detection.star_images import MOST_IMAGES
 from service.imaging.frames.frame import Frame
 from service.missions.camera import Camera
 from service.simulate.frames import FrameSettings, draw_frames
@@ -99,6 +101,19 @@ def test_rings_of_an_aperture_are_no_stars(sky, missions):
     assert (away.min(axis=0)[bright] < FOUND_PX).all()
     inside = (u > 0) & (u < 1023) & (v > 0) & (v < 1023) & (magnitude <= 6.5)
     assert (away.min(axis=1)[inside] < FOUND_PX).mean() > 0.9
+
+
+def test_a_frame_full_of_points_is_bounded_work(crossed, rng):
+    """More points than stars are taken off: the rest are candidates as they are."""
+    camera = crossed.trackers[0].camera
+    light = np.zeros((360, 360))
+    v, u = (axis.ravel() for axis in np.mgrid[8:352:13, 8:352:13])
+    light[v, u] = rng.uniform(3e4, 9e4, len(u))
+    counts = rng.poisson(gaussian_filter(light, 0.9) + 200.0).astype(np.float32)
+    found = detect(Frame(counts, "FITS", "sha256:0", 65535.0), camera)
+    assert len(u) > MOST_IMAGES
+    assert len(found.images.stars) == MOST_IMAGES
+    assert found.count >= MOST_IMAGES
 
 
 def test_wires_along_the_axes_make_the_cross_of_the_report():

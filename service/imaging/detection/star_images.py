@@ -37,6 +37,8 @@ LEAST_SHARE = 0.5
 A star that stands on a brighter tail shows in the next round."""
 SEEN_SHARE = 0.3
 """Of a star's light, at least seen as that of its candidate."""
+MOST_IMAGES, MOST_TRIED = 400, 800
+"""Stars taken off, and candidates tried in a round: the work is bounded on any frame."""
 MARGIN_PX = 2
 FAINTEST_DRAWN = 0.01
 """Light of a pixel, in sigmas of noise, at which an image may end."""
@@ -45,7 +47,7 @@ Extract = Callable[[CountArray, CountArray, "Mask | None", Camera], npt.NDArray[
 """SEP's search of light (rows, columns), with the noise of each of its pixels."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class StarImage:
     """One star as it was taken off: place, all of its light, and its image on the frame."""
 
@@ -137,7 +139,9 @@ class ImageSearch:
         sharp = is_sharp(left, u, v, self.camera.psf_sigma_px)
         psfs = self.psf_at(u, v)
         before = len(images.stars)
-        for k in np.argsort(-found["flux"], kind="stable").tolist():
+        for k in np.argsort(-found["flux"], kind="stable")[:MOST_TRIED].tolist():
+            if len(images.stars) == MOST_IMAGES:
+                break
             seen, at = float(found["flux"][k]), (float(u[k]), float(v[k]))
             if sharp[k] or seen < SEEN_SHARE * limit or _near(images, *at):
                 continue
