@@ -201,9 +201,6 @@ def _report(found: Sequence[CrossedFrame]) -> Report:
         bounds.append(at_least(f"prior {prior}: right", right, len(solved)))
         wrong = sum(each.attitude and not each.suspect and not each.right for each in solved)
         bounds.append(at_most(f"prior {prior}: good, and wrong", wrong, 0))
-    for step in ("detect", "centroid"):
-        times = [each.steps_us[step] for each in whole]
-        figures[f"{step}, median ms"] = float(np.median(times)) / 1000.0
     return Report("crossed_frames", figures | _naive(found), bounds)
 
 
