@@ -140,12 +140,12 @@ def _chunk(task: tuple[int, int, list[int]]) -> list[Measured]:
     settings = FrameSettings(frames=frames, seed=seed)
     drawn = draw_frames(mission, sky, settings, numbers)
     return [
-        _measured(each, mission, sky, number % TIMED_EVERY == 0)
+        measured_frame(each, mission, sky, number % TIMED_EVERY == 0)
         for number, each in zip(numbers, drawn, strict=True)
     ]
 
 
-def _measured(drawn: DrawnFrame, mission: Mission, sky: SkyModel, timed: bool) -> Measured:
+def measured_frame(drawn: DrawnFrame, mission: Mission, sky: SkyModel, timed: bool) -> Measured:
     _, camera = mission.camera_tracker(None, "tracker")
     file = io.BytesIO(frame_bytes(drawn))
     frame = read_frame(file, FrameLimits(camera.width_px * camera.height_px))

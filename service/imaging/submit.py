@@ -111,8 +111,11 @@ def submission_of_frame(
     # What these import takes a third of the service's start, which no frame may follow.
     from service.imaging.detection.detect import detect
     from service.imaging.detection.measure import measure
+    from service.imaging.detection.star_image import psf_of
 
-    found = detect(frame, camera)
+    rates_deg_per_s = np.array(known.body_rates_deg_per_s)
+    exposure_s = frame.exposure_s or camera.exposure_s
+    found = detect(frame, camera, psf_of(camera, tracker, rates_deg_per_s, exposure_s))
     clock.append(clock_ns())
     faintest_mag = camera.faintest_mag
     stars = measure(
@@ -120,7 +123,7 @@ def submission_of_frame(
         found,
         tracker,
         camera,
-        np.array(known.body_rates_deg_per_s),
+        rates_deg_per_s,
         known.centroid or camera.centroid,
         mission.catalog.magnitude_limit_mag if faintest_mag is None else faintest_mag,
     )

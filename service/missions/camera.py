@@ -11,8 +11,23 @@ from service.missions.strict import Strict
 from service.vectors import ARCSEC_PER_RADIAN, Vector, unit
 
 CentroidMethod = Literal["window", "scan", "matched", "recursive"]
+PsfKind = Literal["gaussian", "airy", "cross"]
 Power = Annotated[int, Field(ge=0, le=12)]
 Terms = tuple[tuple[Power, Power, float], ...]
+Wire = tuple[
+    Annotated[float, Field(ge=-180, le=180)],
+    Annotated[float, Field(gt=-0.5, lt=0.5)],
+    Annotated[float, Field(gt=0, le=0.5)],
+]
+"""A wire before the aperture: the direction that it runs in, deg from u towards v; how far its
+middle is from the aperture's, across it; its width.  Both in diameters of the aperture."""
+
+TWO_EACH_WAY: tuple[Wire, ...] = (
+    (0.0, -0.25, 0.1), (0.0, 0.25, 0.1), (90.0, -0.25, 0.1), (90.0, 0.25, 0.1),
+)  # fmt: skip
+MOST_COVERED = 0.6
+"""Of the aperture: the wires may cover no more, counted one by one."""
+MOST_SAMPLED_SIGMA_PX = 5.0
 
 MAX_SIDE_PX = 20_000
 MOST_STARS = 250
@@ -52,7 +67,17 @@ class Camera(Strict):
     exposure_s: float = Field(gt=0, le=3600)
     """Of a frame that does not say otherwise."""
     psf_sigma_px: float = Field(ge=0.3, le=20)
-    """Of a star's image along each axis, before the pixel integrates it."""
+    """Of a star's image along each axis, before the pixel integrates it.
+
+    Of the images of an aperture: of the Gaussian that is as wide at half of its height as the
+    image of the aperture without its wires."""
+    psf: PsfKind = Field(default="gaussian", exclude_if="gaussian".__eq__)
+    """A star's image: a Gaussian, the Airy disc of a round aperture, or the cross of wires before
+    it.  The default is no part of the digest."""
+    wires: tuple[Wire, ...] = Field(
+        default=TWO_EACH_WAY, max_length=32, exclude_if=TWO_EACH_WAY.__eq__
+    )
+    """Of the cross."""
     zero_point_mag: float | None = Field(default=None, ge=-10, le=40)
     """Instrument magnitude of a star that gives one count a second; without it stars have none."""
     sigma_floor_px: float = Field(default=0.0, ge=0, le=10)
@@ -70,6 +95,22 @@ class Camera(Strict):
     def _bias_lies_below_saturation(self) -> Self:
         if self.bias_counts >= self.saturation_counts:
             raise ValueError("bias_counts must be below saturation_counts")
+        return self
+
+    @model_validator(mode="after")
+    def _wires_make_a_cross(self) -> Self:
+        if self.psf != "gaussian" and self.psf_sigma_px > MOST_SAMPLED_SIGMA_PX:
+            message = f"of the psf {self.psf} must be at most {MOST_SAMPLED_SIGMA_PX:g}"
+            raise ValueError(f"psf_sigma_px {message}")
+        if self.psf != "cross" and "wires" in self.model_fields_set:
+            raise ValueError(f'wires belong to the psf "cross", not to "{self.psf}"')
+        if self.psf == "cross" and not self.wires:
+            raise ValueError('wires: the psf "cross" needs at least one')
+        covered = sum(w * math.sqrt(1.0 - 4.0 * at**2) for _, at, w in self.wires) * 4.0 / math.pi
+        if covered > MOST_COVERED:
+            raise ValueError(
+                f"wires cover {covered:.0%} of the aperture; at most {MOST_COVERED:.0%} may be"
+            )
         return self
 
     @property

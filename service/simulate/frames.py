@@ -8,18 +8,17 @@ cosmic rays; the noise of reading; full pixels; whole counts.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from service.errors import BadInput, Fault, shown_value
-from service.imaging.centroids.psf import GaussianPsf, Psf
-from service.imaging.centroids.sampled_psf import airy_psf, cross_psf
+from service.imaging.detection.star_image import reach_px, still_psf
 from service.imaging.detection.trail import TrailPsf, trails_px
 from service.imaging.frames.frame import CountArray
-from service.missions.camera import Camera
+from service.missions.camera import Camera, PsfKind
 from service.missions.mission import Mission, RunCatalogSettings, Tracker
 from service.simulate.motion import pointed, random_axis, turned_by
 from service.simulate.orbits import orbit_of
@@ -30,20 +29,17 @@ from service.sky.model import SkyModel
 from service.times import Utc, parse_utc, shifted
 from service.vectors import Matrix, Vector, quaternion_from_matrix
 
-PsfKind = Literal["gaussian", "airy", "cross"]
-
 DEFAULT_START = "2026-03-01T00:00:00.000Z"
 CADENCE_S = 60.0
 FAINTEST_RENDERED_MAG = 9.0
 """As deep as the embedded catalog is."""
 FAINTEST_TOLD_MAG = 8.0
-STAMP_HALF_PX = {"gaussian": 8, "airy": 24, "cross": 48}
+MARGIN_PX = 10
+"""Beyond the frame's edge, where stars shine in; more where their images reach farther."""
+FAINT_REACHES = ((2e3, 16), (3e4, 48))
+"""Below so many electrons, the image of an aperture is drawn no farther than so many pixels: a
+pixel beyond holds a tenth of an electron."""
 FULL_SCALE = 65535
-LIGHT_M = 600e-9
-AIRY_OVER_SIGMA = 2.29
-"""lambda f / D over the sigma of the Gaussian that is as wide at half of its height."""
-WIRE_SHARE = 0.1
-"""Of a wire of the cross, in the aperture's diameter."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +50,8 @@ class FrameSettings:
     seed: int = 1
     tracker: str | None = None
     start: str = DEFAULT_START
-    psf: PsfKind = "gaussian"
+    psf: PsfKind | None = None
+    """The image of a star, where it is not the one that the mission's camera has."""
     a_priori_error_deg: float | None = 1.0
     """The largest error of the a priori attitude; None: there is none, lost in space."""
     rates_deg_per_s: float = 0.02
@@ -68,7 +65,8 @@ class FrameSettings:
     def __post_init__(self) -> None:
         _require(self.frames >= 1, "frames", "must be at least 1", self.frames)
         _require(self.seed >= 0, "seed", "must not be negative", self.seed)
-        _require(self.psf in get_args(PsfKind), "psf", "must be gaussian, airy or cross", self.psf)
+        sane = self.psf is None or self.psf in get_args(PsfKind)
+        _require(sane, "psf", "must be gaussian, airy or cross", self.psf)
         error_deg = self.a_priori_error_deg
         sane = error_deg is None or 0.0 <= error_deg <= 180.0
         _require(sane, "prior-error", "must be from 0 to 180 deg", error_deg)
@@ -125,7 +123,7 @@ def draw_frames(
     start = parse_utc(wanted.start, "start")
     root = (wanted.seed, *mission.name.encode(), *tracker.name.encode())
     chip = _chip(camera, wanted, np.random.default_rng([*root, 0]))
-    psf = PSFS[wanted.psf](camera)
+    lens = camera if wanted.psf is None else camera.model_copy(update={"psf": wanted.psf})
     digits = max(4, len(str(wanted.frames)))
     for k in range(wanted.frames) if numbers is None else numbers:
         rng = np.random.default_rng([*root, 1, k])
@@ -138,9 +136,9 @@ def draw_frames(
         )
         everything = whole_sky(sky, mission, time)
         stars = _stars(
-            everything, tracker, camera, attitude, rates, time, position_km, velocity_km_per_s
+            everything, tracker, lens, attitude, rates, time, position_km, velocity_km_per_s
         )
-        counts, hits = _exposed(camera, psf, stars, chip, wanted, rng)
+        counts, hits = _exposed(lens, stars, chip, wanted, rng)
         known: dict[str, Any] = {
             "batch": f"{time.text[:10]}-{k + 1:0{digits}d}",
             "time": time.text,
@@ -198,7 +196,9 @@ def _stars(
 ) -> _FrameStars:
     run = everything.run
     boresight = attitude.T @ tracker.body_from_tracker[:, 2]
-    near = math.cos(math.radians(min(camera.corner_radius_deg + 0.5, 89.0)))
+    margin = float(max(MARGIN_PX, reach_px(camera)))
+    beyond_deg = max(0.5, math.degrees(1.5 * margin / camera.focal_length_px))
+    near = math.cos(math.radians(min(camera.corner_radius_deg + beyond_deg, 89.0)))
     row = np.flatnonzero(run.direction @ boresight >= near)
     # The light of these is that of another row already.
     row = row[~everything.catalog.light_elsewhere[run.catalog_row[row]]]
@@ -206,7 +206,6 @@ def _stars(
     direction = apparent(direction, observer_velocity(time, velocity_km_per_s), time)
     u, v = camera.places(direction @ attitude.T @ tracker.body_from_tracker)
     rows, columns = camera.shape
-    margin = 10.0
     inside = (u > -margin) & (u < columns + margin) & (v > -margin) & (v < rows + margin)
     row, u, v = row[inside], u[inside], v[inside]
     trails = trails_px(camera, tracker.body_from_tracker, rates_deg_per_s, u, v, camera.exposure_s)
@@ -215,7 +214,6 @@ def _stars(
 
 def _exposed(
     camera: Camera,
-    psf: Psf,
     stars: _FrameStars,
     chip: _Chip,
     wanted: FrameSettings,
@@ -224,11 +222,12 @@ def _exposed(
     """The counts of one exposure, and how many cosmic rays hit."""
     light_e = np.full(camera.shape, wanted.sky_e_per_s * camera.exposure_s)
     flux_e = camera.flux_counts(stars.magnitude_mag, camera.exposure_s) * camera.gain_e_per_count
-    half = STAMP_HALF_PX[wanted.psf]
+    psf, half = still_psf(camera), reach_px(camera)
     for u, v, along_u, along_v, flux in zip(
         stars.u_px, stars.v_px, stars.trail_u_px, stars.trail_v_px, flux_e, strict=True
     ):
-        add_star(light_e, TrailPsf(psf, along_u, along_v), u, v, flux, half)
+        near = [reach for most_e, reach in FAINT_REACHES if flux < most_e]
+        add_star(light_e, TrailPsf(psf, along_u, along_v), u, v, flux, min([half, *near]))
     light_e *= chip.response
     light_e += camera.dark_e_per_s * camera.exposure_s
     light_e.reshape(-1)[chip.hot] += chip.hot_e_per_s * camera.exposure_s
@@ -283,30 +282,6 @@ def _a_priori(
     error = random_axis(rng) * math.radians(rng.uniform(0.0, error_deg))
     quaternion = np.round(quaternion_from_matrix(turned_by(attitude, error)), 10)
     return {"quaternion": quaternion.tolist(), "frame": "EME2000"}
-
-
-def _gaussian(camera: Camera) -> Psf:
-    return GaussianPsf(camera.psf_sigma_px)
-
-
-def _airy(camera: Camera) -> Psf:
-    return airy_psf(AIRY_OVER_SIGMA * camera.psf_sigma_px, reach_px=STAMP_HALF_PX["airy"])
-
-
-def _cross(camera: Camera) -> Psf:
-    # An aperture as wide as the camera's images say, with two wires each way before it.
-    pixel_rad = 1.0 / camera.focal_length_px
-    diameter_m = LIGHT_M / (AIRY_OVER_SIGMA * camera.psf_sigma_px * pixel_rad)
-    wires = [(place * diameter_m, WIRE_SHARE * diameter_m) for place in (-0.25, 0.25)]
-    return cross_psf(diameter_m, wires, wires, pixel_rad, LIGHT_M, reach_px=STAMP_HALF_PX["cross"])
-
-
-PSFS: Mapping[PsfKind, Callable[[Camera], Psf]] = {
-    "gaussian": _gaussian,
-    "airy": _airy,
-    "cross": _cross,
-}
-"""How each kind is made to measure for a camera."""
 
 
 def _require(holds: bool, name: str, message: str, value: object) -> None:

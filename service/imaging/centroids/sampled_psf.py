@@ -14,7 +14,7 @@ from scipy.special import j1
 
 from service.errors import BadInput, Fault
 from service.imaging.centroids.psf import Array
-from service.imaging.optics.pupil import between_wires, disc
+from service.imaging.optics.pupil import behind_wires, between_wires, disc
 from service.imaging.optics.spectrum import Spectrum, monochromatic
 from service.imaging.optics.transfer import image_of
 
@@ -81,21 +81,36 @@ class SampledPsf:
         u = np.arange(-(columns // 2), columns // 2 + 1) / self.samples_per_px
         return RectBivariateSpline(v, u, share, kx=3, ky=3)
 
+    @cached_property
+    def _slopes(self) -> tuple[Any, Any]:
+        """The derivatives along u and v, once: for each call they would be made anew."""
+        return self._spline.partial_derivative(0, 1), self._spline.partial_derivative(1, 0)
+
     def pixel(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> Array:
         """See `psf.Psf`."""
-        return self._at(du_px, dv_px, 0, 0)
+        return self._at(self._spline, du_px, dv_px)
 
     def slopes(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> tuple[Array, Array]:
         """See `psf.Psf`."""
-        return self._at(du_px, dv_px, 1, 0), self._at(du_px, dv_px, 0, 1)
+        along_u, along_v = self._slopes
+        return self._at(along_u, du_px, dv_px), self._at(along_v, du_px, dv_px)
 
-    def _at(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike, in_u: int, in_v: int) -> Array:
-        u, v = np.broadcast_arrays(
-            np.asarray(du_px, dtype=np.float64), np.asarray(dv_px, dtype=np.float64)
-        )
+    def _at(self, spline: Any, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> Array:
+        u, v = np.asarray(du_px, dtype=np.float64), np.asarray(dv_px, dtype=np.float64)
         known = (np.abs(u) <= self.reach_px[0]) & (np.abs(v) <= self.reach_px[1])
-        found = self._spline.ev(v, u, dx=in_v, dy=in_u)
+        if _is_raster(u, v):
+            # Twenty times as quick as point by point.
+            found = spline(v[:, 0], u[0], grid=True)
+        else:
+            found = spline(*np.broadcast_arrays(v, u), grid=False)
         return np.where(known, found, 0.0)
+
+
+def _is_raster(u: Array, v: Array) -> bool:
+    """Whether places are rising columns (1, n) and rising rows (m, 1)."""
+    if u.ndim != 2 or v.ndim != 2 or u.shape[0] != 1 or v.shape[1] != 1:
+        return False
+    return bool(np.all(np.diff(u[0]) > 0.0) and np.all(np.diff(v[:, 0]) > 0.0))
 
 
 def airy_psf(
@@ -153,3 +168,23 @@ def cross_psf(
     image = image_of(pupil, light, pixel_rad / samples, reach_px * samples, photons=True)
     total = pupil.open_area_m2 / image.step_rad**2
     return SampledPsf(image.intensity, samples, total, jitter_px)
+
+
+def wired_psf(
+    lambda_over_d_px: float,
+    wires: Sequence[tuple[float, float, float]],
+    reach_px: int = 48,
+    cells_across: int = 512,
+) -> SampledPsf:
+    """The image, in light of one colour, of a round aperture behind wires in any directions.
+
+    `lambda_over_d_px` is that of the aperture without them; each wire is (direction that it runs
+    in, deg from u towards v; offset and width in diameters of the aperture), as in a `Camera`.
+    """
+    clear = disc(cells_across, 1.0 / cells_across, 0.5)
+    pupil = behind_wires(clear, [(math.radians(d), offset, width) for d, offset, width in wires])
+    samples = max(LEAST_SAMPLES_PER_PX + 1, math.ceil(6.0 / lambda_over_d_px))
+    # A diameter of one metre, so that a wavelength of one metre is an angle of one.
+    light = monochromatic(1.0)
+    image = image_of(pupil, light, 1.0 / (lambda_over_d_px * samples), reach_px * samples)
+    return SampledPsf(image.intensity, samples, pupil.open_area_m2 / image.step_rad**2)

@@ -5,6 +5,7 @@ clipped medians for the background, a filter of the shape of a star's image, a
 threshold in the noise behind that filter, and deblending.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +13,11 @@ import numpy.typing as npt
 import sep
 
 from service.imaging.centroids.psf import GaussianPsf
+from service.imaging.centroids.window import Detector
 from service.imaging.detection.cosmic_rays import stars_behind
 from service.imaging.detection.shapes import is_sharp
+from service.imaging.detection.star_image import PsfAt, psf_of
+from service.imaging.detection.star_images import ImageSearch, StarImages
 from service.imaging.frames.frame import CountArray, Frame, bad_frame
 from service.missions.camera import Camera
 from service.vectors import Vector, read_only
@@ -47,6 +51,10 @@ class Detections:
     sharp_u_px: Vector
     sharp_v_px: Vector
     """Hot pixels and cosmic rays: what was found and is no star."""
+    images: StarImages | None
+    """Of a camera whose images of stars reach far: those of the brighter candidates."""
+    image_of: npt.NDArray[np.intp]
+    """Which of the images is a candidate's (n,); -1 where none is."""
 
     @property
     def count(self) -> int:
@@ -54,8 +62,12 @@ class Detections:
         return len(self.u_px)
 
 
-def detect(frame: Frame, camera: Camera) -> Detections:
-    """The candidates on a frame; raises `BadFile` for one that is bright nearly everywhere."""
+def detect(frame: Frame, camera: Camera, psf_at: PsfAt | None = None) -> Detections:
+    """The candidates on a frame; raises `BadFile` for one that is bright nearly everywhere.
+
+    `psf_at` tells the images of stars that move; without it they stand still.  Only a camera
+    whose images reach far needs it.
+    """
     light = frame.counts - np.asarray(camera.bias_counts, dtype=frame.counts.dtype)
     known = np.isfinite(light)
     # SEP takes a mask of what to pass by; without one it is quicker.
@@ -69,22 +81,33 @@ def detect(frame: Frame, camera: Camera) -> Detections:
         noise = 1.0
     level = background.back(dtype=light.dtype)
     light -= level
-    found = _extracted(light, noise, mask, camera)
+    if camera.psf == "gaussian":
+        images, left = None, light
+        found = _extracted(light, noise, mask, camera)
+    else:
+        detector = detector_of(frame, level, noise, camera)
+        search = ImageSearch(
+            light, level, noise, mask, detector, camera, psf_at or psf_of(camera), _extracted
+        )
+        images, found, left = search.taken_off()
     u, v = found["x"].astype(np.float64), found["y"].astype(np.float64)
-    sharp = is_sharp(light, u, v, camera.psf_sigma_px)
-    good = _good(light, known, noise, found[~sharp], found[sharp])
+    sharp = is_sharp(left, u, v, camera.psf_sigma_px)
+    good = _good(left, known, noise, found[~sharp], found[sharp])
     # Light beside the brightest pixel: without it no star can be behind.
     dense = sharp & (found["flux"] - found["peak"] > BEHIND_SIGMAS * noise)
-    behind = stars_behind(light, u[dense], v[dense], camera.psf_sigma_px, noise)
+    behind = stars_behind(left, u[dense], v[dense], camera.psf_sigma_px, noise)
     good[behind.hot_v_px, behind.hot_u_px] = False
     stars = np.concatenate(
         [
             np.stack([found[name][~sharp] for name in ("x", "y", "flux")]),
             np.stack([behind.u_px, behind.v_px, behind.flux_counts]),
+            np.empty((3, 0)) if images is None else images.places_and_light(),
         ],
         axis=1,
     )
-    u_px, v_px, flux = stars[:, np.argsort(-stars[2], kind="stable")]
+    order = np.argsort(-stars[2], kind="stable")
+    u_px, v_px, flux = stars[:, order]
+    without_image = stars.shape[1] - (0 if images is None else len(images.stars))
     return Detections(
         light=light,
         background_counts=level,
@@ -95,7 +118,18 @@ def detect(frame: Frame, camera: Camera) -> Detections:
         flux_counts=read_only(flux),
         sharp_u_px=read_only(u[sharp]),
         sharp_v_px=read_only(v[sharp]),
+        images=images,
+        image_of=read_only(np.maximum(order - without_image, -1)),
     )
+
+
+def detector_of(frame: Frame, level: CountArray, noise_counts: float, camera: Camera) -> Detector:
+    """The detector with the noise that the frame itself shows beyond that of its light."""
+    gain = camera.gain_e_per_count
+    light = max(float(np.median(level)), 0.0)
+    variance_e = (noise_counts * gain) ** 2 - light * gain
+    full = min(camera.saturation_counts, frame.full_scale) - camera.bias_counts
+    return Detector(gain, math.sqrt(max(variance_e, 0.0)), full)
 
 
 def detection_kernel(camera: Camera) -> npt.NDArray[np.float32]:
@@ -110,7 +144,10 @@ def detection_kernel(camera: Camera) -> npt.NDArray[np.float32]:
 
 
 def _extracted(
-    light: CountArray, noise: float, mask: npt.NDArray[np.bool_] | None, camera: Camera
+    light: CountArray,
+    noise: float | CountArray,
+    mask: npt.NDArray[np.bool_] | None,
+    camera: Camera,
 ) -> npt.NDArray[np.void]:
     try:
         found: npt.NDArray[np.void] = sep.extract(

@@ -8,18 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.imaging.centroids.centroid import centroid
-from service.imaging.centroids.psf import GaussianPsf, Psf
+from service.imaging.centroids.psf import Psf
 from service.imaging.centroids.record import CentroidRecord
-from service.imaging.centroids.window import Detector, Window, cutout
+from service.imaging.centroids.window import Window, cutout
 from service.imaging.detection.cosmic_rays import hits_under
-from service.imaging.detection.detect import MESH_PX, Detections
-from service.imaging.detection.trail import TrailPsf, trails_px
+from service.imaging.detection.detect import MESH_PX, Detections, detector_of
+from service.imaging.detection.star_image import core_share, psf_of
 from service.imaging.frames.frame import Frame
 from service.missions.camera import Camera, CentroidMethod
 from service.missions.mission import Tracker
 from service.vectors import Vector
 
-SHORT_TRAIL_PX = 0.1
 MARGIN_PX = 2
 """Of a window beyond the square that a centroid sums, so that the square may follow the star."""
 FAINT_SHARE = 0.4
@@ -50,12 +49,16 @@ def measure(
     with the light of the others taken away, and those on pixels that were hit without these.
     """
     exposure_s = frame.exposure_s or camera.exposure_s
-    detector = detector_of(frame, found, camera)
-    wanted = FAINT_SHARE * camera.flux_counts(np.array(faintest_mag), exposure_s)
+    detector = detector_of(frame, found.background_counts, found.noise_counts, camera)
+    wanted = (
+        FAINT_SHARE * core_share(camera) * camera.flux_counts(np.array(faintest_mag), exposure_s)
+    )
     # Without a zero point no candidate is known to be too faint.
     bright = np.count_nonzero(~(found.flux_counts < wanted))
     count = min(int(bright), 2 * camera.most_stars)
-    psfs = _psfs(found, count, tracker, camera, rates_deg_per_s, exposure_s)
+    psfs = psf_of(camera, tracker, rates_deg_per_s, exposure_s)(
+        found.u_px[:count], found.v_px[:count]
+    )
     half = camera.centroid_half_width_px
     windows = [
         cutout(
@@ -71,6 +74,11 @@ def measure(
         for k in range(count)
     ]
     windows = [dataclasses.replace(w, counts=w.counts - camera.bias_counts) for w in windows]
+    if found.images is not None:
+        windows = [
+            found.images.behind(window, int(own) if own >= 0 else None)
+            for window, own in zip(windows, found.image_of[:count], strict=True)
+        ]
     starts = list(zip(found.u_px.tolist(), found.v_px.tolist(), strict=True))
     records = [centroid(windows[k], method, psfs[k], starts[k], half) for k in range(count)]
     for k, near in enumerate(_neighbours(found, count, half + MARGIN_PX + 2)):
@@ -85,45 +93,19 @@ def measure(
     return _chosen(records, magnitudes.tolist(), faintest_mag, camera.most_stars)
 
 
-def detector_of(frame: Frame, found: Detections, camera: Camera) -> Detector:
-    """The detector with the noise that the frame itself shows beyond that of its light."""
-    gain = camera.gain_e_per_count
-    level = max(float(np.median(found.background_counts)), 0.0)
-    variance_e = (found.noise_counts * gain) ** 2 - level * gain
-    full = min(camera.saturation_counts, frame.full_scale) - camera.bias_counts
-    return Detector(gain, math.sqrt(max(variance_e, 0.0)), full)
-
-
-def _psfs(
-    found: Detections,
-    count: int,
-    tracker: Tracker,
-    camera: Camera,
-    rates_deg_per_s: Vector,
-    exposure_s: float,
-) -> list[Psf]:
-    still = GaussianPsf(camera.psf_sigma_px)
-    along_u, along_v = trails_px(
-        camera,
-        tracker.body_from_tracker,
-        rates_deg_per_s,
-        found.u_px[:count],
-        found.v_px[:count],
-        exposure_s,
-    )
-    return [
-        TrailPsf(still, u, v) if math.hypot(u, v) > SHORT_TRAIL_PX else still
-        for u, v in zip(along_u.tolist(), along_v.tolist(), strict=True)
-    ]
-
-
 def _neighbours(found: Detections, count: int, reach_px: float) -> list[list[int]]:
-    """For each of the first `count` candidates, the others whose light falls into its window."""
+    """For each of the first `count` candidates, the others whose light falls into its window.
+
+    Without those whose images are part of its background.
+    """
     u, v = found.u_px, found.v_px
+    whole = found.image_of < 0
     return [
         [
             int(other)
-            for other in np.flatnonzero(np.maximum(abs(u - u[k]), abs(v - v[k])) < reach_px)
+            for other in np.flatnonzero(
+                whole & (np.maximum(abs(u - u[k]), abs(v - v[k])) < reach_px)
+            )
             if other != k
         ]
         for k in range(count)

@@ -81,3 +81,19 @@ def between_wires(places_m: Array, cell_m: float, wires: Sequence[tuple[float, f
         high = np.minimum(places_m + cell_m / 2.0, middle + diameter / 2.0)
         covered += np.maximum(high - low, 0.0) / cell_m
     return np.asarray(np.maximum(1.0 - covered, 0.0))
+
+
+def behind_wires(pupil: Pupil, wires: Sequence[tuple[float, float, float]]) -> Pupil:
+    """The pupil behind straight wires in any directions.
+
+    Each is (direction that it runs in, rad from x towards y; how far its middle is from that of
+    the pupil, along the direction turned by a right angle, m; diameter, m).
+    """
+    x, y = pupil.places_m[None, :], pupil.places_m[:, None]
+    found = pupil
+    for direction, offset, diameter in wires:
+        across = y * math.cos(direction) - x * math.sin(direction) - offset
+        low = np.maximum(across - pupil.cell_m / 2.0, -diameter / 2.0)
+        high = np.minimum(across + pupil.cell_m / 2.0, diameter / 2.0)
+        found = found.behind(1.0 - np.maximum(high - low, 0.0) / pupil.cell_m)
+    return found

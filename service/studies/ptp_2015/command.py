@@ -11,6 +11,7 @@ from service.studies.ptp_2015.case import Case
 from service.studies.ptp_2015.comparison import (
     COMPARED,
     OF_THE_PAPER,
+    all_projections,
     compare,
     databases,
     stars_in_fields,
@@ -18,7 +19,7 @@ from service.studies.ptp_2015.comparison import (
 from service.studies.ptp_2015.document import document
 from service.studies.ptp_2015.found import Measurements
 from service.studies.ptp_2015.plots import draw
-from service.studies.ptp_2015.tables import TITLES, section
+from service.studies.ptp_2015.tables import OF_PROJECTIONS, TITLES, section
 
 DEFAULT_SCENES = 10_000
 SLAVES = ("PTP, 3 slaves", "PTP", "PTP, 5 slaves", "PTP, 6 slaves")
@@ -26,6 +27,9 @@ ALL = "ptp"
 """Names every table and figure together."""
 
 CASES: Mapping[str, Sequence[Case]] = {
+    "ptp-2": [],
+    "figure-6": [],
+    "figure-7": [],
     "ptp-5": [Case("ptp-5", SLAVES, 0.0)],
     "ptp-6": [Case("ptp-6", COMPARED, 1.0, 0.5, adds=adds) for adds in (False, True)],
     "figure-10": [],
@@ -94,12 +98,15 @@ def measured(
         {name: [tally for tally in tallies if tally.case.name == name] for name in wanted},
         stars_in_fields(scenes, seed) if "figure-10" in wanted else None,
         databases(list(names)),
+        all_projections() if any(name in OF_PROJECTIONS for name in wanted) else None,
     )
 
 
 def rows_of(found: Measurements) -> list[dict[str, Any]]:
-    """One row per condition and algorithm, and one of Figure 10."""
-    rows = [tally.row() for tallies in found.tallies.values() for tally in tallies]
+    """One row per condition and algorithm, one of Figure 10, and those of Table 2."""
+    rows: list[dict[str, Any]] = [
+        tally.row() for tallies in found.tallies.values() for tally in tallies
+    ]
     if found.stars is not None:
         rows.append(
             {
@@ -111,6 +118,8 @@ def rows_of(found: Measurements) -> list[dict[str, Any]]:
                 "more_than_8": int((found.stars > 8).sum()),
             }
         )
+    if found.projections is not None and "ptp-2" in found.tallies:
+        rows += found.projections.rows()
     return rows
 
 

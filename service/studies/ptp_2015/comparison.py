@@ -21,6 +21,7 @@ from service.simulate.scenes import Conditions, Scene, SceneSky, draw_scenes
 from service.sky.geometry.triangles import REACH_DEG
 from service.sky.whole_sky.guide import Guide, build_guide
 from service.studies.ptp_2015.case import LIMIT_MAG, Case
+from service.studies.ptp_2015.projections import Projections, projections_of
 from service.studies.ptp_2015.rivals.liebe import build_liebe
 from service.studies.ptp_2015.rivals.p_vector import build_p_vector
 from service.studies.ptp_2015.rivals.planar_triangle import build_planar_triangle
@@ -149,6 +150,11 @@ def stars_in_fields(scenes: int, seed: int) -> npt.NDArray[np.int64]:
     case = Case("figure-10", (), 0.0, fewest=0)
     drawn = draw_scenes(_sky(0.0), case.conditions, scenes, seed)
     return np.array([len(s.star) for s in tqdm(drawn, total=scenes, unit="scene", disable=None)])
+
+
+def all_projections() -> Projections:
+    """Of the guide triangles of the sky to the limit: Table 2, Figures 6 and 7."""
+    return projections_of(_sky(0.0).run_catalog)
 
 
 @cache

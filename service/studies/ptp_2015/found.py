@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from service.studies.ptp_2015.comparison import Database
 from service.studies.ptp_2015.plots import PlottedSeries
+from service.studies.ptp_2015.projections import Projections
 from service.studies.ptp_2015.tally import Tally
 
 
@@ -20,9 +21,16 @@ class Measurements:
     tallies: Mapping[str, Sequence[Tally]]
     stars: npt.NDArray[np.int64] | None = None
     databases: Sequence[Database] = field(default_factory=tuple)
+    projections: Projections | None = None
+    """Of the sky's triangles, for Table 2 and Figures 6 and 7."""
 
     @property
     def drawn(self) -> PlottedSeries:
         """The figures, for the plots."""
         figures: PlottedSeries = {} if self.stars is None else {"figure-10": self.stars}
+        if self.projections is not None:
+            wanted = [name for name in self.tallies if name.startswith("figure")]
+            figures |= {
+                name: self.projections for name in wanted if name in ("figure-6", "figure-7")
+            }
         return figures | {name: tallies for name, tallies in self.tallies.items() if tallies}

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from service.simulate.drawing import pictures_in
 from service.studies.ptp_2015.printed import Ends, the_ptp_paper
+from service.studies.ptp_2015.projections import Projections, draw_figure_6, draw_figure_7
 from service.studies.ptp_2015.tally import FieldShare, Tally
 
 COLORS = {
@@ -18,7 +19,7 @@ COLORS = {
     "Liebe's triangles": "#741b47",
     "pyramid": "#444444",
 }
-PlottedSeries = dict[str, Sequence[Tally] | npt.NDArray[np.int64]]
+PlottedSeries = dict[str, Sequence[Tally] | npt.NDArray[np.int64] | Projections]
 
 
 def draw(found: PlottedSeries, folder: Path) -> list[Path]:
@@ -32,7 +33,9 @@ def draw(found: PlottedSeries, folder: Path) -> list[Path]:
             if not name.startswith("figure"):
                 continue
             figure = pictures.figure(7.4, 3.4)
-            if isinstance(shown, np.ndarray):
+            if isinstance(shown, Projections):
+                (draw_figure_6 if name == "figure-6" else draw_figure_7)(figure, shown)
+            elif isinstance(shown, np.ndarray):
                 _histogram(figure.subplots(), shown)
             else:
                 left, right = figure.subplots(1, 2, sharey=True)

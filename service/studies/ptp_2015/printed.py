@@ -51,6 +51,10 @@ class Printed:
 
     axis: tuple[float, ...]
     mean_projection: float
+    table_1: tuple[tuple[int, float], ...]
+    """Index and projection of the nine rows that are printed."""
+    table_2: tuple[tuple[int, int], ...]
+    """Limit index and k-vector."""
     catalog_stars: int
     table_5: tuple[Slaves, ...]
     table_6: tuple[Compared, ...]
@@ -68,6 +72,8 @@ def the_ptp_paper() -> Printed:
     return Printed(
         axis=tuple(data["table_1"]["axis"]),
         mean_projection=data["table_1"]["mean_projection"],
+        table_1=tuple((index, value) for index, value in data["table_1"]["rows"]),
+        table_2=tuple((index, count) for index, count in data["table_2"]),
         catalog_stars=data["catalog_stars"],
         table_5=tuple(Slaves(**row) for row in data["table_5"]),
         table_6=tuple(Compared(**row) for row in data["table_6"]),

@@ -1,18 +1,22 @@
 """The paper's tables and figures as Markdown, its numbers beside ours."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from service.studies.paper_1994.tables import markdown
-from service.studies.ptp_2015 import claims
+from service.studies.ptp_2015 import claims, projections
 from service.studies.ptp_2015.comparison import Database
 from service.studies.ptp_2015.found import Measurements
 from service.studies.ptp_2015.printed import Ends, the_ptp_paper
+from service.studies.ptp_2015.projections import Projections
 from service.studies.ptp_2015.tally import Tally
 
 TITLES: Mapping[str, str] = {
+    "ptp-2": "Table 2. The k-vector",
+    "figure-6": "Figure 6. Triangles on the projection axis",
+    "figure-7": "Figure 7. Projection and index of the triangles",
     "ptp-5": "Table 5. The number of slave stars, no noise",
     "ptp-6": "Table 6. The algorithms compared, 1 px and 0.5 mag of noise",
     "figure-10": "Figure 10. Stars in the field of view",
@@ -20,6 +24,13 @@ TITLES: Mapping[str, str] = {
     "figure-12": "Figure 12. Rate against the noise of position",
     "figure-13": "Figure 13. Rate against the noise of magnitude, stars lost and added",
 }
+
+OF_PROJECTIONS: Mapping[str, Callable[[Projections], str]] = {
+    "ptp-2": projections.table_2,
+    "figure-6": projections.figure_6,
+    "figure-7": projections.figure_7,
+}
+"""Of all triangles of the sky: no field is drawn for these."""
 
 MB = 1e6
 STARS_IN_FIELD = ((3, 3), (4, 4), (5, 5), (6, 6), (7, 7), (8, 8), (9, 10), (11, 15), (16, 99))
@@ -37,7 +48,12 @@ RATES = (
 def section(found: Measurements, name: str) -> str:
     """A table or figure with its heading, and what the paper claims of it that cannot be."""
     tallies, paper = found.tallies[name], the_ptp_paper()
-    if name == "ptp-5":
+    note = claims.NOT_REPRODUCED.get(name)
+    if name in OF_PROJECTIONS:
+        assert found.projections is not None
+        shown = OF_PROJECTIONS[name](found.projections)
+        note = projections.note_on_table_2(found.projections) if name == "ptp-2" else None
+    elif name == "ptp-5":
         shown = table_5(tallies, found.databases)
     elif name == "ptp-6":
         shown = table_6(tallies, found.databases)
@@ -50,7 +66,6 @@ def section(found: Measurements, name: str) -> str:
         shown = line_table(tallies, "position_px", "px", paper.figure_12)
     else:
         shown = line_table(tallies, "magnitude_sigma_mag", "mag", paper.figure_13)
-    note = claims.NOT_REPRODUCED.get(name)
     parts = [f"### {TITLES[name]}", shown, *([note] if note else [])]
     return "\n\n".join(parts)
 

@@ -7,6 +7,7 @@ import numpy as np
 from service.imaging.centroids.sequential import StateEstimate, batch, diffuse, least_norm
 from service.imaging.centroids.window import Array
 from service.studies.star_image_report.claims import Claim, Picture, Row, Study
+from service.studies.star_image_report.further import measurements
 from service.studies.star_image_report.quadratic_peak import Hump, StopRule, hump_of, recentred
 
 ROUND = Hump(peak=1.0, M=-1.0, L=-1.3, J=0.2)
@@ -43,6 +44,7 @@ def sequential(study: Study) -> Row:
             _one_point(),
             *_differenced(rng),
             *_limits(rng),
+            *measurements.claims(study),
         ),
         {
             "imaging-convergence": Picture(
@@ -56,7 +58,8 @@ def sequential(study: Study) -> Row:
                 (5.2, 3.0),
                 _draw_limits,
             ),
-        },
+        }
+        | measurements.pictures(),
     )
 
 

@@ -18,6 +18,7 @@ from service.studies.star_image_report.correlate import (
     overlap,
     search_by_axes,
 )
+from service.studies.star_image_report.further import rotation, sun_acquisition
 from service.studies.star_image_report.mesh import THICK_M, THIN_M
 from service.studies.star_image_report.optics import DIAMETER_M, LASER_M
 from service.studies.star_image_report.sun_tracker import SunTracker
@@ -92,6 +93,7 @@ def correlation(study: Study) -> Row:
                 abs(scatter / bound - 1.0) < study.slack(study.trials(2000), 0.15),
                 {"scatter (px)": scatter, "bound (px)": bound, "bias (px)": bias},
             ),
+            *rotation.claims(study),
         ),
         {
             "imaging-search": Picture(
@@ -100,7 +102,8 @@ def correlation(study: Study) -> Row:
                 (5.6, 3.0),
                 _draw_search,
             )
-        },
+        }
+        | rotation.pictures(),
     )
 
 
@@ -143,7 +146,6 @@ def _draw_search(figure: Any) -> None:
 
 def sun(study: Study) -> Row:
     """IM-5."""
-    del study  # nothing is random
     tracker = SunTracker()
     slope = tracker.slope_per_arcmin()
     both = tracker.errors(8.0, 8.0)
@@ -190,8 +192,10 @@ def sun(study: Study) -> Row:
                 abs(width - 27.0) < 0.5,
                 {"tail width (arcmin)": width},
             ),
+            *sun_acquisition.claims(study),
         ),
-        {"imaging-sun": Picture("Signals of the sun tracker.", (5.6, 3.2), draw)},
+        {"imaging-sun": Picture("Signals of the sun tracker.", (5.6, 3.2), draw)}
+        | sun_acquisition.pictures(),
     )
 
 

@@ -9,6 +9,7 @@ from service.imaging.optics.pupil import Pupil, between_wires, centres
 from service.imaging.optics.spectrum import thermal
 from service.imaging.optics.transfer import image_at, image_by_fft
 from service.studies.star_image_report.claims import Claim, Picture, Row, Study
+from service.studies.star_image_report.further import wires_and_lines
 from service.studies.star_image_report.optics import DIAMETER_M, LASER_M
 from service.studies.star_image_report.wires import (
     INCH_M,
@@ -55,8 +56,9 @@ def mesh(study: Study) -> Row:
             *_trade_off(counted),
             *_apodisation(depths, lone, fine),
             *_observations(screen),
+            *wires_and_lines.claims(study),
         ),
-        _pictures(screen, counted, fine),
+        _pictures(screen, counted, fine) | wires_and_lines.pictures(),
     )
 
 

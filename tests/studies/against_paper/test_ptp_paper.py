@@ -13,9 +13,16 @@ from service.simulate.scenes import Conditions, SceneSky, draw_scenes
 from service.studies.ptp_2015 import claims, tables
 from service.studies.ptp_2015.case import Case
 from service.studies.ptp_2015.command import CASES, run_ptp
-from service.studies.ptp_2015.comparison import ALGORITHMS, COMPARED, compare, databases
+from service.studies.ptp_2015.comparison import (
+    ALGORITHMS,
+    COMPARED,
+    all_projections,
+    compare,
+    databases,
+)
 from service.studies.ptp_2015.plots import draw
 from service.studies.ptp_2015.printed import the_ptp_paper
+from service.studies.ptp_2015.projections import printed_slope
 from service.studies.ptp_2015.rivals.liebe import features
 from service.studies.ptp_2015.rivals.planar_triangle import area_and_moment, area_and_moment_sigma
 from service.studies.ptp_2015.tables import TITLES
@@ -181,6 +188,15 @@ class TestCommand:
         ]  # fmt: skip
         assert all(row["scenes"] == 6 and row["table"] == "ptp-5" for row in written)
 
+    def test_table_2_is_printed_beside_ours(self, tmp_path):
+        out, rows = io.StringIO(), tmp_path / "rows.json"
+        run_ptp("ptp-2", json_path=rows, out=out)
+        written = json.loads(rows.read_text())
+        assert [(row["paper"], row["paper"] / row["three_slaves"]) for row in written] == [
+            (paper, pytest.approx(1.0, abs=0.06)) for _, paper in the_ptp_paper().table_2
+        ]
+        assert all(f"| {row['index']:,} " in out.getvalue() for row in written)
+
     def test_the_page_shows_everything_with_its_claims_and_pictures(self, tmp_path):
         page = tmp_path / "ptp.md"
         run_ptp("ptp", 3, 2, None, 1, tmp_path / "plots", page, out=io.StringIO())
@@ -189,7 +205,7 @@ class TestCommand:
             assert f"### {title}" in text
         for note in claims.NOT_REPRODUCED.values():
             assert note in text
-        for name in ("figure-10", "figure-11", "figure-12", "figure-13"):
+        for name in (name for name in TITLES if name.startswith("figure")):
             assert f"plots/ptp-{name}.svg" in text
             assert "<svg" in (tmp_path / "plots" / f"ptp-{name}.svg").read_text()
         assert "713.21" in text
@@ -231,3 +247,33 @@ class TestClaims:
     def test_the_p_vector_s_ends_are_printed_twice(self):
         paper = the_ptp_paper()
         assert paper.figure_12["P-vector"] == paper.figure_13["P-vector"]
+
+
+class TestProjections:
+    """Table 2, Figures 6 and 7: all triangles of the sky on their axis."""
+
+    def test_k_is_how_many_projections_the_line_has_passed(self):
+        found = all_projections()
+        for column in (found.triangles.projection, found.three):
+            for index, *_ in found.table_2():
+                line = column.slope * index + column.intercept
+                assert column.below[index - 1] == np.count_nonzero(column.value <= line)
+
+    def test_each_set_of_three_stars_is_there_once(self):
+        found = all_projections()
+        sets = {tuple(sorted(row)) for row in found.triangles.star.tolist()}
+        assert len(found.once.value) == len(sets) < found.triangles.count
+        assert np.isin(found.once.value, found.triangles.projection.value).all()
+
+    def test_the_rows_of_table_1_stand_where_they_do_once_each_triangle_is(self):
+        """Within 6 % of the printed index; with all masters they stand at twice of it."""
+        found = all_projections()
+        for index, projection in the_ptp_paper().table_1:
+            at = np.searchsorted(found.once.value, projection)
+            assert at == pytest.approx(index, rel=0.06)
+            assert np.searchsorted(found.triangles.projection.value, projection) > 2 * index
+
+    def test_table_2_is_of_three_slaves(self):
+        found = all_projections()
+        assert printed_slope(found) == pytest.approx(found.three.slope, rel=0.03)
+        assert printed_slope(found) > 2.0 * found.triangles.projection.slope

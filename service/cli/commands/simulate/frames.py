@@ -40,8 +40,7 @@ def add(group: Any) -> None:
     parser.add_argument(
         "--psf",
         choices=("gaussian", "airy", "cross"),
-        default="gaussian",
-        help="the image of a star; default gaussian",
+        help="the image of a star; default: that of the mission's camera",
     )
     prior = parser.add_mutually_exclusive_group()
     prior.add_argument(

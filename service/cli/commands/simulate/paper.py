@@ -21,6 +21,9 @@ IN_ZONES = [name for name, entry in IDENTIFIERS.items() if entry.searches_zone]
 
 PTP_HELP = """\
 tables by name, each algorithm on the same fields (10 deg square, stars to V 6):
+  ptp-2       the k-vector of the projections
+  figure-6    triangles on the projection axis
+  figure-7    projection and index of the triangles
   ptp-5       slave stars of the guide database: memory, rate, time
   ptp-6       PTP, P-vector, planar triangle, Liebe's triangles, pyramid at 1 px, 0.5 mag
   figure-10   stars in the field of view; the paper's figure cannot be reproduced

@@ -1,0 +1,246 @@
+"""Stars whose images reach far, as those of an aperture do: found one behind the other.
+
+The tails of a bright star are broken into pieces that look like faint stars, and hide those
+that stand there.  So stars are taken off the frame, the brightest first, each at its best
+place; what is still seen then is searched again.  A piece of a tail is gone by the time that
+its turn comes.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from service.imaging.centroids.psf import Psf
+from service.imaging.centroids.record import BREAKDOWN_RATIO
+from service.imaging.centroids.shape_fit import fit
+from service.imaging.centroids.window import Array, Detector, Mask, Window, cutout
+from service.imaging.detection.shapes import is_sharp
+from service.imaging.detection.star_image import PsfAt, reach_px, still_psf
+from service.imaging.frames.frame import CountArray
+from service.missions.camera import Camera
+
+ROUNDS = 4
+FAR_FWHMS = 1.2
+"""Beyond this distance light is that of the tails."""
+TAIL_NOISES = 0.5
+"""A star is taken off where the brightest pixel of its tails has so many sigmas of noise."""
+DOUBT = 0.03
+"""Of the light taken off: what an image that is not quite the one presumed may leave."""
+SAME_PX = 2.5
+LEAST_SHARE = 0.5
+"""Of a candidate's light, left where brighter stars are taken off: less may be a piece of a tail.
+
+A star that stands on a brighter tail shows in the next round."""
+SEEN_SHARE = 0.3
+"""Of a star's light, at least seen as that of its candidate."""
+MOST_IMAGES, MOST_TRIED = 400, 800
+"""Stars taken off, and candidates tried in a round: the work is bounded on any frame."""
+MARGIN_PX = 2
+FAINTEST_DRAWN = 0.01
+"""Light of a pixel, in sigmas of noise, at which an image may end."""
+
+Extract = Callable[[CountArray, CountArray, "Mask | None", Camera], npt.NDArray[np.void]]
+"""SEP's search of light (rows, columns), with the noise of each of its pixels."""
+
+
+@dataclass(frozen=True)
+class StarImage:
+    """One star as it was taken off: place, all of its light, and its image on the frame."""
+
+    u_px: float
+    v_px: float
+    flux_counts: float
+    psf: Psf
+    where: tuple[slice, slice]
+    counts: Array
+
+
+@dataclass(frozen=True)
+class StarImages:
+    """The stars that were taken off, and the sum of their light on the frame."""
+
+    stars: list[StarImage]
+    light: CountArray
+
+    def places_and_light(self) -> Array:
+        """U, v and counts of the stars (3, n)."""
+        told = [(star.u_px, star.v_px, star.flux_counts) for star in self.stars]
+        return np.array(told, dtype=np.float64).reshape(-1, 3).T
+
+    def behind(self, window: Window, number: int | None) -> Window:
+        """The window with the light of all stars but one as part of its background."""
+        rows, columns = window.counts.shape
+        v, u = window.corner_v_px, window.corner_u_px
+        light = self.light[v : v + rows, u : u + columns].astype(np.float64)
+        if number is not None:
+            star = self.stars[number]
+            own = np.zeros_like(light)
+            put_into(own, star.counts, star.where[0].start - v, star.where[1].start - u)
+            light -= own
+        return replace(window, background_counts=window.background_counts + light)
+
+
+def put_into(whole: Array, part: Array, row: int, column: int) -> None:
+    """Add a part to the whole, its corner at (row, column), as far as it lies within."""
+    rows, columns = whole.shape
+    top, left = max(row, 0), max(column, 0)
+    bottom, right = min(row + part.shape[0], rows), min(column + part.shape[1], columns)
+    if top < bottom and left < right:
+        whole[top:bottom, left:right] += part[
+            top - row : bottom - row, left - column : right - column
+        ]
+
+
+@dataclass(frozen=True)
+class ImageSearch:
+    """The search of one frame.
+
+    `light` is above the background `level`, `noise` one sigma of a pixel of it.
+    """
+
+    light: CountArray
+    level: CountArray
+    noise: float
+    mask: Mask | None
+    detector: Detector
+    camera: Camera
+    psf_at: PsfAt
+    extract: Extract
+
+    def taken_off(self) -> tuple[StarImages, npt.NDArray[np.void], CountArray]:
+        """The stars taken off, what SEP finds behind them, and the light that is left."""
+        images = StarImages([], np.zeros_like(self.light))
+        limit = TAIL_NOISES * self.noise / max(_tail_share(still_psf(self.camera)), 1e-9)
+        for round_ in range(ROUNDS + 1):
+            left = self.light - images.light
+            found = self.extract(left, self._noise_behind(images), self.mask, self.camera)
+            if round_ == ROUNDS or not self._taken(images, found, left, limit):
+                break
+            for number in range(len(images.stars)):
+                self._refit(images, number)
+        return images, _without_residue(images, found), left
+
+    def _noise_behind(self, images: StarImages) -> CountArray:
+        """One sigma of each pixel where the images were: of their photons, and of their shape."""
+        light = np.maximum(images.light, 0.0)
+        gain = self.detector.gain_e_per_count
+        variance = self.noise**2 + light / gain + (DOUBT * light) ** 2
+        return np.asarray(np.sqrt(variance), dtype=self.light.dtype)
+
+    def _taken(
+        self, images: StarImages, found: npt.NDArray[np.void], left: CountArray, limit: float
+    ) -> int:
+        """Take off the stars among the candidates, the brightest first; how many."""
+        u, v = found["x"].astype(np.float64), found["y"].astype(np.float64)
+        sharp = is_sharp(left, u, v, self.camera.psf_sigma_px)
+        psfs = self.psf_at(u, v)
+        before = len(images.stars)
+        for k in np.argsort(-found["flux"], kind="stable")[:MOST_TRIED].tolist():
+            if len(images.stars) == MOST_IMAGES:
+                break
+            seen, at = float(found["flux"][k]), (float(u[k]), float(v[k]))
+            if sharp[k] or seen < SEEN_SHARE * limit or _near(images, *at):
+                continue
+            if self._core(images, *at) < LEAST_SHARE * _core_of(left, *at):
+                continue
+            window = images.behind(self._cutout(*at), None)
+            star = self._placed(window, at, psfs[k])
+            if star is None or star.flux_counts <= max(limit, SEEN_SHARE * seen):
+                continue
+            if not _near(images, star.u_px, star.v_px):
+                self._put(images, star)
+        return len(images.stars) - before
+
+    def _refit(self, images: StarImages, number: int) -> None:
+        """Place a star once more, with all others taken off."""
+        star = images.stars[number]
+        at = star.u_px, star.v_px
+        window = images.behind(self._cutout(*at), number)
+        placed = self._placed(window, at, star.psf)
+        if placed is None or math.hypot(placed.u_px - at[0], placed.v_px - at[1]) > SAME_PX:
+            return
+        images.light[star.where] -= star.counts.astype(images.light.dtype)
+        images.light[placed.where] += placed.counts.astype(images.light.dtype)
+        images.stars[number] = placed
+
+    def _placed(self, window: Window, at: tuple[float, float], psf: Psf) -> StarImage | None:
+        """The star of a window where it fits best; None where there is no light to fit."""
+        start = at[0] - window.corner_u_px, at[1] - window.corner_v_px
+        found = fit(window, psf, start, self._half)
+        if found is None or not found.signal_ratio >= BREAKDOWN_RATIO:
+            return None
+        u, v = found.u_px + window.corner_u_px, found.v_px + window.corner_v_px
+        return self._drawn(u, v, found.flux_counts, psf)
+
+    def _cutout(self, u_px: float, v_px: float) -> Window:
+        half = self._half + MARGIN_PX
+        good = None if self.mask is None else ~self.mask
+        # The level is part of the counts, so that full pixels are known as such.
+        window = cutout(self.light, u_px, v_px, half, self.detector, self.level, good=good)
+        return replace(window, counts=window.counts + window.background_counts)
+
+    def _core(self, images: StarImages, u: float, v: float) -> float:
+        """The light about a place that is left now."""
+        return _core_of(self.light, u, v) - _core_of(images.light, u, v)
+
+    def _put(self, images: StarImages, star: StarImage) -> None:
+        images.stars.append(star)
+        images.light[star.where] += star.counts.astype(images.light.dtype)
+
+    def _drawn(self, u: float, v: float, flux: float, psf: Psf) -> StarImage:
+        rows, columns = self.light.shape
+        enough = [half for half, rim in self._rims if flux * rim < FAINTEST_DRAWN * self.noise]
+        half = enough[-1] if enough else reach_px(self.camera)
+        left, top = max(round(u) - half, 0), max(round(v) - half, 0)
+        right, bottom = min(round(u) + half + 1, columns), min(round(v) + half + 1, rows)
+        du = np.arange(left, right, dtype=np.float64)[None, :] - u
+        dv = np.arange(top, bottom, dtype=np.float64)[:, None] - v
+        where = slice(top, bottom), slice(left, right)
+        return StarImage(u, v, flux, psf, where, flux * psf.pixel(du, dv))
+
+    @property
+    def _half(self) -> int:
+        return self.camera.centroid_half_width_px
+
+    @cached_property
+    def _rims(self) -> list[tuple[int, float]]:
+        """Half widths of an image, from the widest, and the share of light on the square's rim."""
+        still, halves = still_psf(self.camera), [reach_px(self.camera)]
+        while halves[-1] > 4 * self._half:
+            halves.append(halves[-1] // 2)
+        return [(half, _rim(still, half)) for half in halves]
+
+
+def _tail_share(psf: Psf) -> float:
+    """The share of the light on the brightest pixel of the tails."""
+    far = FAR_FWHMS * psf.fwhm_px
+    steps = np.arange(-32.0, 33.0)
+    image = psf.pixel(steps[None, :], steps[:, None])
+    return float(np.max(image, where=np.hypot(steps[None, :], steps[:, None]) > far, initial=0.0))
+
+
+def _rim(psf: Psf, half: int) -> float:
+    """The share of the light on the brightest pixel of a square's rim."""
+    along = np.arange(-half, half + 1, dtype=np.float64)
+    end = np.full_like(along, float(half))
+    return float(max(psf.pixel(along, end).max(), psf.pixel(end, along).max()))
+
+
+def _near(images: StarImages, u: float, v: float) -> bool:
+    return any(math.hypot(star.u_px - u, star.v_px - v) < SAME_PX for star in images.stars)
+
+
+def _core_of(light: CountArray, u: float, v: float) -> float:
+    """The light of the nearest 3 x 3 pixels."""
+    column, row = max(round(u), 1), max(round(v), 1)
+    return float(light[row - 1 : row + 2, column - 1 : column + 2].sum())
+
+
+def _without_residue(images: StarImages, found: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
+    """The candidates that are not what is left of a star that was taken off."""
+    places = zip(found["x"].tolist(), found["y"].tolist(), strict=True)
+    return found[np.array([not _near(images, u, v) for u, v in places], dtype=np.bool_)]
