@@ -21,7 +21,7 @@ from service.storage.sql.engines import database_url, reading_engine, shown_url,
 if TYPE_CHECKING:
     from alembic.config import Config
 
-HEAD = "0013"
+HEAD = "0014"
 """The latest revision of `migrations/`."""
 
 
@@ -89,6 +89,7 @@ def check(database: str) -> list[str]:
         from service.storage.sql import (  # noqa: F401
             access_tables,
             alarm_tables,
+            calibration_tables,
             grade_tables,
             gyro_tables,
             tables,
