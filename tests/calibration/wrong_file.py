@@ -1,10 +1,13 @@
 """A mission of two trackers whose file is wrong, and telemetry of what is true of it."""
 
+import json
 import math
 from itertools import islice
 from pathlib import Path
 
+from service.acquire import acquire
 from service.missions.mission import SHIPPED_FOLDER, parse_mission
+from service.observations.schema import submission_from_json
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
 
@@ -47,6 +50,16 @@ def write_mission_files(folder: Path) -> None:
     for name, text in mission_texts().items():
         (folder / name).mkdir()
         (folder / name / "two.toml").write_text(text, "utf-8")
+
+
+def with_true_file(sky, batches):
+    """Of batches acquired with the true file: those without a good attitude, ambiguous stars."""
+    mission = parse_mission(mission_texts()["true"], "true")
+    found = [
+        acquire(submission_from_json(json.dumps(each)).batch, mission, sky) for each in batches
+    ]
+    poor = sum(each.solution is None or each.solution.suspect for each in found)
+    return poor, sum(each.counts["ambiguous"] for each in found)
 
 
 def true_batches(sky, batches, seed=3):

@@ -7,17 +7,21 @@ import pytest
 
 from service.app.factory import open_app
 from service.settings import Settings
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.model import SkyModel
 from service.web.app import create_app
 from tests.calibration.wrong_file import (
     CALIBRATION,
     TURNED_ARCSEC,
     true_batches,
+    with_true_file,
     write_mission_files,
 )
 from tests.web.conformance import check
 from tests.web.serving import Server
 
-BEFORE, AFTER = 60, 20
+BEFORE, AFTER = 40, 20
 API = "/api/v1"
 
 
@@ -34,12 +38,13 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def batches(folder):
-    app = serve(folder)
-    try:
-        return true_batches(app.sky, BEFORE + AFTER)
-    finally:
-        app.close()
+def sky():
+    return SkyModel(load_embedded(), LruCache(64 << 20))
+
+
+@pytest.fixture(scope="module")
+def batches(sky):
+    return true_batches(sky, BEFORE + AFTER)
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +96,7 @@ def test_a_calibration_is_a_versioned_record_of_all_that_was_found(client, calib
     assert {each["name"] for each in found["trackers"]} == {"STARTRACKER_1", "SECOND"}
     assert '[[trackers]]\nname = "SECOND"\nx_axis_body = [' in found["mission_file"]
     for each in found["maps"]:
-        assert sum(cell["stars"] for cell in each["cells"]) > 200
+        assert sum(cell["stars"] for cell in each["cells"]) > 150
         rms = [
             sum(part**2 for cell in each["cells"] for part in cell[side]) ** 0.5
             for side in ("before_arcsec", "after_arcsec")
@@ -102,20 +107,13 @@ def test_a_calibration_is_a_versioned_record_of_all_that_was_found(client, calib
     assert listed["unknowns"] == found["unknowns"]
 
 
-def shares(client, ids):
-    """The shares of batches without a good attitude, and of stars that are ambiguous."""
-    results = [client.get(f"{API}/batches/{id}").json()["answer"] for id in ids]
-    poor = sum(each["attitude"] is None or each["attitude"]["suspect"] for each in results)
-    counts = [each["counts"] for each in results]
-    observed = sum(each["observed"] for each in counts)
-    return poor / len(results), sum(each["ambiguous"] for each in counts) / observed
-
-
 def test_a_trial_tells_what_an_adoption_would_do_and_changes_nothing(client, calibrated):
     before = client.get(f"{API}/spacecraft/TWO/calibration").json()
-    tried = client.post(f"{API}/calibrations/{calibrated['id']}/trial", json={"sample": 30}).json()
-    assert tried["compared"] == 30
-    assert tried["a"]["suspect"] > 20
+    tried = client.post(
+        f"{API}/calibrations/{calibrated['id']}/trial", json={"sample": BEFORE}
+    ).json()
+    assert tried["compared"] == BEFORE
+    assert tried["a"]["suspect"] > 0.8 * BEFORE
     assert tried["b"]["suspect"] <= 1
     assert tried["b"]["residual_ratio_mean"] < 1.5 < tried["a"]["residual_ratio_mean"]
     assert client.get(f"{API}/spacecraft/TWO/calibration").json() == before
@@ -124,7 +122,7 @@ def test_a_trial_tells_what_an_adoption_would_do_and_changes_nothing(client, cal
 
 
 def test_new_batches_are_as_good_as_with_the_true_file_until_it_is_taken_back(
-    client, calibrated, batches, folder
+    client, calibrated, batches, sky
 ):
     here = f"{API}/calibrations/{calibrated['id']}/adopt"
     signed = {"who": "J. Operator", "note": "after the first pass"}
@@ -138,13 +136,10 @@ def test_new_batches_are_as_good_as_with_the_true_file_until_it_is_taken_back(
 
     sent = [client.post(f"{API}/batches", json=each).json() for each in batches[BEFORE:]]
     assert {each["provenance"]["mission"] for each in sent} == {adopted["mission"]}
-    with_true = open_app(Settings(database=f"sqlite:///{folder}/true.db", missions=folder / "true"))
-    with Server(create_app(with_true)) as address, httpx.Client(base_url=address) as other:
-        ids = [other.post(f"{API}/batches", json=each).json()["id"] for each in batches[BEFORE:]]
-        true = shares(other, ids)
-    now = shares(client, [each["id"] for each in sent])
-    assert now[0] <= true[0] + 1 / AFTER
-    assert now[1] <= true[1] + 0.02
+    poor, ambiguous = with_true_file(sky, batches[BEFORE:])
+    attitudes = [each["attitude"] for each in sent]
+    assert sum(each is None or each["status"] == "suspect" for each in attitudes) <= poor + 1
+    assert sum(each["counts"]["ambiguous"] for each in sent) <= ambiguous + 1
 
     back = {"who": "J. Operator", "to": None}
     reverted = client.post(f"{API}/spacecraft/TWO/calibration/revert", json=back).json()

@@ -71,7 +71,7 @@ class CalibrationAdoptions:
         overridden = (
             latest is not None
             and latest.trackers is not None
-            and latest.file != geometry_digest(self._file(spacecraft))
+            and latest.file != geometry_digest(self.file_of(spacecraft))
         )
         return CalibrationInForce(
             spacecraft=spacecraft,
@@ -94,7 +94,7 @@ class CalibrationAdoptions:
         if found.result is None:
             raise WrongState(f"the calibration is {found.state}")
         names = [each.name for each in found.result.trackers]
-        file = self._file(found.spacecraft)
+        file = self.file_of(found.spacecraft)
         if names != [each.name for each in file.trackers]:
             raise WrongState("the mission has other trackers by now: calibrate anew")
         return self._change(file, found.result.trackers, found.id, who, note, entry)
@@ -106,7 +106,7 @@ class CalibrationAdoptions:
 
         Raises `NotFound` for another spacecraft's, `WrongState` where that is in force.
         """
-        file = self._file(spacecraft)
+        file = self.file_of(spacecraft)
         if to is None:
             return self._change(file, None, None, who, note, entry)
         with self._context.reading() as connection:
@@ -116,7 +116,8 @@ class CalibrationAdoptions:
                 return self._change(file, each.trackers, each.calibration, who, note, entry)
         raise NotFound(f"{spacecraft} has no adoption with the id {shown_value(to)}")
 
-    def _file(self, spacecraft: str) -> Mission:
+    def file_of(self, spacecraft: str) -> Mission:
+        """The settings as the mission file has them, whatever was adopted."""
         return mission_named(self._files, spacecraft)
 
     def _change(
