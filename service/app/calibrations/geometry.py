@@ -23,7 +23,9 @@ def geometry_of(tracker: Tracker) -> TrackerGeometry:
         y_axis_body=list(tracker.y_axis_body),
         z_axis_body=list(tracker.z_axis_body),
         calibration=FocalPlane(
-            scale=plane.scale, h_terms=list(plane.h_terms), v_terms=list(plane.v_terms)
+            scale=plane.scale,
+            h_terms=[list(each) for each in plane.h_terms],
+            v_terms=[list(each) for each in plane.v_terms],
         ),
     )
 

@@ -19,7 +19,7 @@ from service.storage.models.base import (
 CalibrationStateName = Literal["queued", "running", "done", "failed", "interrupted"]
 UnknownKind = Literal["alignment", "scale", "distortion", "temperature", "time_tag"]
 Terms = Annotated[
-    list[tuple[int, int, float]],
+    list[Components],
     doc("Powers of the measured h and v in degrees, and the coefficient, as in mission files."),
 ]
 

@@ -86,10 +86,10 @@ def check(database: str) -> list[str]:
 
         # Every table must be known to the metadata.
         from service.storage.archive import tables as archive_tables  # noqa: F401
+        from service.storage.calibrations import tables as calibration_tables  # noqa: F401
         from service.storage.sql import (  # noqa: F401
             access_tables,
             alarm_tables,
-            calibration_tables,
             grade_tables,
             gyro_tables,
             tables,
