@@ -30,7 +30,7 @@ Array = npt.NDArray[np.float64]
 
 BATCHES, QUICK_BATCHES = 10_000, 300
 STARS, SIGMA_ARCSEC, RADIUS_DEG = 5, 6.0, 4.0
-DEGREE, ROUNDS = 3, 3
+DEGREE, ROUNDS = 3, 9
 MISALIGNED_ARCSEC = np.array([35.0, -22.0, 80.0])
 MOST_TIMES = 2.0
 MOST_APART_SIGMAS = 1.0
@@ -80,7 +80,7 @@ def drawn(batches: int, seed: int) -> IdentifiedStars:
         sigma_rad=np.full(len(batch), SIGMA_ARCSEC / ARCSEC_PER_RADIAN),
         time_offset_s=np.zeros(len(batch)),
         temperature_c=np.full(len(batch), np.nan),
-        time_s=60.0 * np.arange(batches),
+        time_s=np.arange(batches, dtype=np.float64),
         attitude=attitude,
         rates_rad_per_s=np.zeros((batches, 3)),
     )
@@ -98,7 +98,7 @@ def dense_rows(stars: IdentifiedStars, model: Model) -> tuple[Array, Array]:
     turned = np.zeros((len(stars), 2, 3))
     for part in fit.parts:
         derivatives = linearised(part, fit.values, fit.attitude)
-        matrix[part.rows, :, part.columns] = np.moveaxis(derivatives.by_unknown, 0, 0)
+        matrix[part.rows, :, part.columns] = derivatives.by_unknown.transpose(2, 1, 0)
         turned[part.rows] = derivatives.by_attitude
     order = np.argsort(stars.batch, kind="stable")
     rows = 2 * len(order) // stars.batches
