@@ -120,7 +120,9 @@ def open_app(
         # A mission that is given takes the place of what was adopted, too.
         app.adoptions.load(leave=mission.name if mission is not None else None)
         _register(app.context)
-        app.calibrations.interrupt()
+        if serving:
+            # A command may run beside the service that computes one.
+            app.calibrations.interrupt()
     except BaseException:
         app.close()
         raise

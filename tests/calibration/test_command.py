@@ -43,6 +43,10 @@ def test_the_written_file_has_what_was_wrong(acquire, replayed):
     assert off > 79.0
     assert left < 8.0
 
+    code, out, _ = acquire(*asked, "--degree", "2", "--record")
+    assert code == 0
+    assert "Recorded as version 1, " in out
+
     code, out, _ = acquire(*asked, "--degree", "2", "--tracker", "SECOND", "--json")
     told = json.loads(out)
     assert code == 0

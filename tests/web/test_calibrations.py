@@ -5,6 +5,7 @@ import time
 import httpx
 import pytest
 
+from service.app.calibrations.estimates import CalibrationRequest
 from service.app.factory import open_app
 from service.settings import Settings
 from service.sky.cache import LruCache
@@ -212,3 +213,16 @@ def test_too_few_stars_end_it_as_failed_and_it_cannot_be_adopted(client):
     assert "have no identified stars" in failed["fault"]
     assert client.post(f"{location}/adopt", json={"who": "J. Operator"}).status_code == 409
     assert client.post(f"{location}/trial", json={}).status_code == 409
+
+
+def test_a_stopping_service_leaves_none_that_looks_unfinished(client, folder):
+    app = serve(folder)
+    begun = app.calibrations.start(CalibrationRequest("TWO"), "J. Operator")
+    app.close()
+    app = serve(folder)
+    app.calibrations.interrupt()
+    left = app.calibrations.get(begun.id)
+    app.close()
+    assert left.state == "interrupted"
+    assert left.ended is not None
+    assert left.result is None
