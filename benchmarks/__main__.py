@@ -23,6 +23,7 @@ from benchmarks.speed import (
     posts,
     soak,
     stored,
+    tracker_calibration,
     verified_cost,
 )
 from benchmarks.validation import (
@@ -76,6 +77,7 @@ BENCHMARKS: dict[str, Callable[[bool, int], Report]] = {
     "lost_in_space": lost_in_space.run,
     "pictures": blind.run,
     "camera_calibrations": calibrations.run,
+    "tracker_calibration": tracker_calibration.run,
 }
 OF_SPEED = tuple(performance.TITLES)
 BY_NAME_ALONE = ("soak",)

@@ -9,7 +9,7 @@ from benchmarks.__main__ import main
 from benchmarks.bounds import equal, share_as_expected
 from benchmarks.record import digest_of, read_record
 from benchmarks.sections import Section, Written, bounds_shown, kept, stale, state_of
-from benchmarks.speed import performance
+from benchmarks.speed import performance, tracker_calibration
 from benchmarks.validation import aberration, centroids, consistency, covariance
 from benchmarks.validation.lost_in_space.__main__ import main as lost_in_space
 from benchmarks.validation.lost_in_space.conditions import CONDITIONS
@@ -18,7 +18,7 @@ from benchmarks.verification import SECTIONS, TARGET, remake
 from benchmarks.verification import main as verification
 
 
-@pytest.mark.parametrize("benchmark", [aberration, consistency, covariance])
+@pytest.mark.parametrize("benchmark", [aberration, consistency, covariance, tracker_calibration])
 def test_a_benchmark_s_small_sample_is_within_its_bounds(benchmark, seed):
     report = benchmark.run(quick=True, seed=seed)
     assert report.passed, report.text()

@@ -2,24 +2,40 @@
 
 import math
 import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 
+from service.advice.advice import RunAgain
 from service.app.context import Context
 from service.app.submissions import Submissions
 from service.errors import Busy
 from service.ingest.compare_options import ComparedSample, Pair, compare
-from service.missions.mission import mission_named
+from service.missions.mission import Mission, mission_named
 from service.observations.schema import OptionsIn
 from service.storage.models.compare import Comparison
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.recorded_batch import batch_with_options, sample_batches
+from service.storage.sql.columns import Row
 from service.times import Utc
 
 COMPARE_SAMPLE, COMPARE_RETRY_S = 100, 10
 
 
+@dataclass(frozen=True)
+class Stretch:
+    """The batches to compare with: at most `sample` of a period."""
+
+    spacecraft: str
+    run: str | None = None
+    start: Utc | None = None
+    end: Utc | None = None
+    sample: int = COMPARE_SAMPLE
+
+
 class Comparisons:
-    """Compares sets of options, for one caller at a time."""
+    """Compares sets of options, or settings, for one caller at a time."""
 
     def __init__(self, context: Context, submissions: Submissions) -> None:
         self._context = context
@@ -45,27 +61,51 @@ class Comparisons:
         `Busy` while the service is computing another comparison.
         """
         mission_named(self._context.missions, name)
+        again = self._submissions.ingest.run_again
+
+        def pair_of(row: Row) -> Pair:
+            options = (batch_with_options(row["input"], row["options"], each) for each in (a, b))
+            return Pair(row["id"], *options)
+
+        stretch = Stretch(name, run, start, end, sample)
+        told = tuple(each.model_dump(mode="json", exclude_none=True) for each in (a, b))
+        return self._compared(stretch, pair_of, (again, again), (told[0], told[1]), limit_s)
+
+    def of_missions(
+        self, stretch: Stretch, a: Mission, b: Mission, limit_s: float = math.inf
+    ) -> Comparison:
+        """The same with two settings of the mission, and every batch's own options."""
+
+        def pair_of(row: Row) -> Pair:
+            batch = batch_with_options(row["input"], row["options"])
+            return Pair(row["id"], batch, batch)
+
+        again = self._submissions.ingest.run_again
+        sides = partial(again, mission=a), partial(again, mission=b)
+        return self._compared(stretch, pair_of, sides, ({}, {}), limit_s)
+
+    def _compared(
+        self,
+        stretch: Stretch,
+        pair_of: Callable[[Row], Pair],
+        sides: tuple[RunAgain, RunAgain],
+        options: tuple[Row, Row],
+        limit_s: float,
+    ) -> Comparison:
         if not self._lock.acquire(blocking=False):
             raise Busy("the service is computing another comparison", COMPARE_RETRY_S)
+        name, run = stretch.spacecraft, stretch.run or LIVE
         try:
             with self._context.reading() as connection:
                 drawn = sample_batches(
                     connection,
                     self._context.store.archive,
-                    ResultFilter(run or LIVE, name, start, end),
-                    sample,
+                    ResultFilter(run, name, stretch.start, stretch.end),
+                    stretch.sample,
                 )
-            pairs = [
-                Pair(
-                    row["id"],
-                    *(batch_with_options(row["input"], row["options"], o) for o in (a, b)),
-                )
-                for row in drawn.rows
-            ]
-            found, cut_short = compare(pairs, self._submissions.ingest.run_again, limit_s)
+            pairs = [pair_of(row) for row in drawn.rows]
+            found, cut_short = compare(pairs, sides, limit_s)
         finally:
             self._lock.release()
-        run_name = run or LIVE
-        sample_of = ComparedSample(name, run_name, drawn.first, drawn.last, drawn.total, len(pairs))
-        options = tuple(each.model_dump(mode="json", exclude_none=True) for each in (a, b))
-        return found.record(sample_of, (options[0], options[1]), cut_short=cut_short)
+        sample = ComparedSample(name, run, drawn.first, drawn.last, drawn.total, len(pairs))
+        return found.record(sample, options, cut_short=cut_short)

@@ -5,7 +5,8 @@ from service.acquire.kernel_build import KernelBuild
 from service.app.advice import AdviceService
 from service.app.alarms import Alarms
 from service.app.annotations import Annotations
-from service.app.calibrations.estimates import CalibrationService
+from service.app.calibrations.adoptions import CalibrationAdoptions
+from service.app.calibrations.service import CalibrationService
 from service.app.comparisons import Comparisons
 from service.app.context import Context
 from service.app.events import Audit, Events
@@ -66,8 +67,9 @@ class App:
         self.runs = Runs(context)
         self.replays = Replays(context, self.submissions, self.gyro.intake)
         self.advice = AdviceService(context, self.submissions)
-        self.calibrations = CalibrationService(context, self.submissions)
         self.comparisons = Comparisons(context, self.submissions)
+        self.calibrations = CalibrationService(context, self.submissions, self.comparisons)
+        self.adoptions = CalibrationAdoptions(context, self.replays.bulk.workers.restart)
         self.zones = Zones(context)
         self.events = Events(context)
         self.audit = Audit(context)
@@ -84,6 +86,7 @@ class App:
         """Stop the replays, write what is queued, and close the database."""
         self.webhooks.sender.stop()
         self.replays.stop()
+        self.calibrations.close()
         self.tracker_split.stop()
         self.submissions.close()
         self.store.close()
@@ -114,7 +117,12 @@ def open_app(
     )
     app = App(Context(settings, missions, sky, store), KernelBuild() if serving else None)
     try:
+        # A mission that is given takes the place of what was adopted, too.
+        app.adoptions.load(leave=mission.name if mission is not None else None)
         _register(app.context)
+        if serving:
+            # A command may run beside the service that computes one.
+            app.calibrations.interrupt()
     except BaseException:
         app.close()
         raise

@@ -23,29 +23,56 @@ _CALIBRATION = re.compile(r"^\s*\[\s*trackers\.calibration\s*\]")
 _KEY = re.compile(r"^\s*([A-Za-z_]+)\s*=")
 
 
-def calibrated_mission_text(text: str, file: str, found: Calibration) -> str:
+def calibrated_mission_text(
+    text: str, file: str, found: Calibration, in_force: Mission | None = None
+) -> str:
     """The text of a mission file with a calibration's alignment, scale and distortion.
 
-    Everything else stays as it is.  Raises `BadConfiguration` for a file whose trackers are
-    not laid out as `[[trackers]]` with each axis in one line.
+    `in_force` are the settings that the calibration started from, where these are not the
+    file's: what differs is written, too.  Everything else stays as it is.  Raises
+    `BadConfiguration` for a file whose trackers are not laid out as `[[trackers]]` with each
+    axis in one line.
     """
     mission = parse_mission(text, file)
     lines = text.splitlines()
+    based = {each.name: each for each in (in_force or mission).trackers}
+    expected = {
+        each.name: tracker_lines(based.get(each.name, each), found, each)
+        for each in mission.trackers
+    }
     for index in reversed(range(len(mission.trackers))):
-        tracker = mission.trackers[index]
-        changes = tracker_lines(tracker, found)
+        changes = expected[mission.trackers[index].name]
         if changes["tracker"] or changes["calibration"]:
             _edit(lines, index, changes)
     edited = "\n".join(lines) + "\n"
-    expected = {each.name: tracker_lines(each, found) for each in mission.trackers}
     if not _holds(parse_mission(edited, file), mission, expected):
         message = "cannot be edited: write each axis of [[trackers]] in one line of its own"
         raise BadConfiguration(f"{file}: {message}")
     return edited
 
 
-def tracker_lines(tracker: Tracker, found: Calibration) -> dict[str, Lines]:
-    """The keys of a tracker, and of its `calibration`, that change, each with its value as TOML."""
+def tracker_lines(
+    tracker: Tracker, found: Calibration, own: Tracker | None = None
+) -> dict[str, Lines]:
+    """The keys of a tracker, and of its `calibration`, that change, each with its value as TOML.
+
+    `own` is the tracker as the mission file has it, where the calibration did not start from
+    that.
+    """
+    lines = _corrected(tracker, found)
+    if own is None:
+        return lines
+    if not lines["tracker"] and not np.array_equal(
+        own.body_from_tracker, tracker.body_from_tracker
+    ):
+        axes = tracker.body_from_tracker.T
+        lines["tracker"] = {name: _vector(axis) for name, axis in zip(AXES, axes, strict=True)}
+    if not lines["calibration"] and own.calibration != tracker.calibration:
+        lines["calibration"] = _focal_plane(tracker, {})
+    return lines
+
+
+def _corrected(tracker: Tracker, found: Calibration) -> dict[str, Lines]:
     values = {
         unknown: float(value)
         for unknown, value in zip(found.unknowns, found.value, strict=True)

@@ -1,22 +1,17 @@
 """A calibration as text for people, and as JSON."""
 
-import math
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 
-from service.vectors import ARCSEC_PER_RADIAN, Vector
+from service.app.calibrations.findings import notes, residuals_by_tracker, result_of
 
 if TYPE_CHECKING:
     from service.app.calibrations.estimates import CalibrationRun
     from service.calibration.estimate import Calibration
 
 CERTAIN_SIGMAS = 3.0
-VECTORS = (
-    "scale and distortion in a mission file correct stars sent as angles (h_deg, v_deg) only, "
-    "not those sent as vectors"
-)
-TIME_TAGS = "mission files hold no time tag: add it to time_offset_s where telemetry is made"
 
 
 def calibration_text(result: "CalibrationRun") -> str:
@@ -49,9 +44,9 @@ def _residual_lines(found: "Calibration") -> list[str]:
     lines = ["Residuals per axis, rms (with the present mission file -> calibrated):"]
     lines += [
         (
-            f"  {each['tracker']}: {each['before_arcsec']:.2f} -> {each['after_arcsec']:.2f} "
-            f"arcsec, {each['before_over_sigma']:.2f} -> {each['after_over_sigma']:.2f} sigmas, "
-            f"{each['stars']} stars"
+            f"  {each.tracker}: {each.before_arcsec:.2f} -> {each.after_arcsec:.2f} "
+            f"arcsec, {each.before_over_sigma:.2f} -> {each.after_over_sigma:.2f} sigmas, "
+            f"{each.stars} stars"
         )
         for each in residuals_by_tracker(found)
     ]
@@ -59,76 +54,7 @@ def _residual_lines(found: "Calibration") -> list[str]:
     return lines
 
 
-def residuals_by_tracker(found: "Calibration") -> list[dict[str, Any]]:
-    """Of each tracker the rms of the residuals of used stars, before and after."""
-    sigma_arcsec = found.stars.sigma_rad[:, None] * ARCSEC_PER_RADIAN
-    rows = []
-    for index, tracker in enumerate(found.stars.trackers):
-        own = found.used & (found.stars.tracker == index)
-        if own.any():
-            rows.append(
-                {
-                    "tracker": tracker.name,
-                    "stars": int(own.sum()),
-                    "before_arcsec": _rms((found.before * sigma_arcsec)[own]),
-                    "after_arcsec": _rms((found.residual * sigma_arcsec)[own]),
-                    "before_over_sigma": _rms(found.before[own]),
-                    "after_over_sigma": _rms(found.residual[own]),
-                }
-            )
-    return rows
-
-
-def _rms(values: Vector) -> float:
-    return math.sqrt(float(np.mean(values**2)))
-
-
-def notes(found: "Calibration") -> list[str]:
-    """What a mission file cannot hold of this calibration."""
-    kinds = {each.kind for each in found.unknowns}
-    told = [VECTORS] if kinds & {"scale", "distortion"} else []
-    return told + ([TIME_TAGS] if "time_tag" in kinds else [])
-
-
 def calibration_json(result: "CalibrationRun") -> dict[str, Any]:
-    """The result with its covariance, in the units of the unknowns."""
-    found = result.found
-    return {
-        "batches": {
-            "total": result.total,
-            "sampled": result.sampled,
-            "used": result.used,
-            "refused": result.refused,
-            "first": result.first,
-            "last": result.last,
-        },
-        "stars": len(found.stars),
-        "stars_left_out": int(np.sum(~found.used)),
-        "degree": found.model.degree,
-        "held_out": [
-            {
-                "degree": each.degree,
-                "residual_over_sigma": each.residual_over_sigma,
-                "chosen": each.chosen,
-            }
-            for each in result.tried
-        ],
-        "residual_over_sigma": found.residual_over_sigma,
-        "residuals": residuals_by_tracker(found),
-        "unknowns": [
-            {
-                "name": unknown.name,
-                "tracker": found.stars.trackers[unknown.tracker].name,
-                "kind": unknown.kind,
-                "value": float(value),
-                "sigma": float(sigma),
-                "unit": unknown.unit,
-            }
-            for unknown, value, sigma in zip(found.unknowns, found.value, found.sigma, strict=True)
-        ],
-        "covariance": found.covariance.tolist(),
-        "not_observable": [
-            {"name": each.name, "reason": each.reason} for each in found.not_observable
-        ],
-        "notes": notes(found),
-    }
+    """The result as `GET /api/v1/calibrations/{id}` has it, with its covariance."""
+    found: dict[str, Any] = msgspec.to_builtins(result_of(result))
+    return found | {"covariance": result.found.covariance.tolist()}

@@ -161,14 +161,14 @@ _WHICH = {
 
 
 def compare(
-    pairs: Sequence[Pair], run_again: RunAgain, limit_s: float
+    pairs: Sequence[Pair], run_again: tuple[RunAgain, RunAgain], limit_s: float
 ) -> tuple[ComparisonTally, bool]:
-    """Run both sides of each batch; whether `limit_s` seconds cut it short."""
+    """Run each side of each batch with its function; whether `limit_s` seconds cut it short."""
     found, end_s = ComparisonTally(), time.monotonic() + limit_s
     for pair in pairs:
         if time.monotonic() > end_s:
             return found, True
-        found.add(pair, run_again(pair.a), run_again(pair.b))
+        found.add(pair, run_again[0](pair.a), run_again[1](pair.b))
     return found, False
 
 

@@ -137,6 +137,17 @@ class LocalWorkers(Generic[Input, Output]):
                 self._hand_in(chunk)
         return chunk.done
 
+    def restart(self) -> None:
+        """End the processes; the next ones have the settings as they are then.
+
+        Tasks that they were at work on are computed anew.
+        """
+        with self._lock:
+            executor = self._end_processes()
+        if executor is not None:
+            # Without the lock, which the executor's threads may wait for.
+            executor.shutdown(wait=False)
+
     def close(self) -> None:
         """End the processes at once, whatever they compute."""
         with self._lock:

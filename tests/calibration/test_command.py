@@ -1,48 +1,20 @@
 """A mission whose file is wrong is flown, and `acquire calibrate` writes the file that is right."""
 
 import json
-import math
 
 import numpy as np
 import pytest
 
-from service.missions.mission import SHIPPED_FOLDER, read_mission
+from service.missions.mission import read_mission
+from tests.calibration.wrong_file import write_mission_files
 
 BATCHES = 60
-SECOND = """
-[[trackers]]
-name = "SECOND"
-x_axis_body = [0.0, 0.0, 1.0]
-y_axis_body = [1.0, 0.0, 0.0]
-z_axis_body = [0.0, 1.0, 0.0]
-field_of_view_radius_deg = 4.0
-sigma_arcsec = 2.0
-magnitude_sigma_mag = 0.1
-"""
-CALIBRATION = """
-[trackers.calibration]
-h_terms = [[2, 0, 2e-4]]
-v_terms = [[0, 2, -2e-4]]
-"""
-TURNED_ARCSEC = 80.0
 
 
 @pytest.fixture
 def replayed(acquire, tmp_path, monkeypatch):
     """A pass with bent fields and a tracker that is off, replayed with a file of neither."""
-    xte = (SHIPPED_FOLDER / "xte.toml").read_text(encoding="utf-8")
-    assumed = xte.replace('name = "XTE"', 'name = "TWO"') + SECOND
-    turn = math.radians(TURNED_ARCSEC / 3600.0)
-    # About body Z: x of the tracker stays, y (body X) and z (body Y) turn.
-    true = assumed.replace(
-        "y_axis_body = [1.0, 0.0, 0.0]\nz_axis_body = [0.0, 1.0, 0.0]",
-        f"y_axis_body = [{math.cos(turn)}, {math.sin(turn)}, 0.0]\n"
-        f"z_axis_body = [{-math.sin(turn)}, {math.cos(turn)}, 0.0]",
-    )
-    assert true != assumed
-    for folder, text in (("true", true + CALIBRATION), ("assumed", assumed)):
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / "two.toml").write_text(text, "utf-8")
+    write_mission_files(tmp_path)
     monkeypatch.setenv("ACQUIRE_MISSIONS", str(tmp_path / "true"))
     wanted = ("--batches", BATCHES, "--seed", 3, "--angles", 1, "--nominal")
     simulated = acquire(
@@ -70,6 +42,10 @@ def test_the_written_file_has_what_was_wrong(acquire, replayed):
     )
     assert off > 79.0
     assert left < 8.0
+
+    code, out, _ = acquire(*asked, "--degree", "2", "--record")
+    assert code == 0
+    assert "Recorded as version 1, " in out
 
     code, out, _ = acquire(*asked, "--degree", "2", "--tracker", "SECOND", "--json")
     told = json.loads(out)

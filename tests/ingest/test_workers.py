@@ -235,6 +235,29 @@ def test_a_process_that_dies_while_it_sends_a_result_costs_no_other_chunk(missio
     assert not closing.is_alive()
 
 
+def settings_after(solver, seconds):
+    """The settings of XTE that a worker has, told after a while."""
+    time.sleep(seconds)
+    return [solver.missions["XTE"].digest]
+
+
+def test_restarted_workers_have_the_settings_of_now_and_lose_no_chunk(missions, sky):
+    used = dict(missions)
+    config = WorkerConfig(used, None, sky.catalog.digest, 1 << 20)
+    workers = LocalWorkers(config, settings_after, 1)
+    try:
+        assert workers.submit(0.0).result(GIVE_UP_S) == [missions["XTE"].digest]
+        pending = [workers.submit(0.2) for _ in range(4)]
+        used["XTE"] = missions["XTE"].within_zones
+        workers.restart()
+        told = [each.result(GIVE_UP_S)[0] for each in pending]
+        assert set(told) <= {missions["XTE"].digest, used["XTE"].digest}
+        assert told[-1] == used["XTE"].digest
+        assert workers.submit(0.0).result(GIVE_UP_S) == [used["XTE"].digest]
+    finally:
+        workers.close()
+
+
 class Served:
     """`acquire serve` in a process group of its own, with one worker at work on a replay."""
 

@@ -256,6 +256,7 @@ def names_of(earlier):
         "tables/{kind}": ["batches", "stars", "gyro"],
         # Earlier versions took none.
         "gyro/{id}": [],
+        "calibrations/{id}": [],
         "problems/{slug}": list(types_with_pages()),
         "limits/{quantity}": [
             each["quantity"] for each in earlier.get(f"{API}/spacecraft/XTE/limits").json()["items"]

@@ -148,6 +148,7 @@ def walk(client: httpx.Client, app: App) -> Json:
     while not client.get(begun.headers["Location"]).json()["counts"]["repeated"]:
         time.sleep(0.05)
     take("cancel_replay", client.delete(begun.headers["Location"]), "cancelled")
+    _calibration(client, take)
     take("session", client.get(f"{API}/session"), "open_access")
     _sign_in(client, app, take)
     return found
@@ -180,6 +181,38 @@ def _alarm(client: httpx.Client, take: Any) -> None:
     take("acknowledge_alarm", client.post(acknowledge, json=said), "seen_before")
     take("get_alarm", client.get(alarm), "with_what_was_done")
     take("reset_limit", client.delete(f"{limit}?who=J.%20Operator"), "shipped_again")
+
+
+def _calibration(client: httpx.Client, take: Any) -> None:
+    """The scale of one tracker, from a run of its own."""
+    mission = load_missions()["XTE"]
+    wanted = Pass(batches=20, troubles=NO_TROUBLES, angles_share=1.0)
+    for drawn in draw_pass(mission, _sky(), wanted):
+        client.post(f"{API}/batches", json=drawn.batch | {"run": "commissioning"})
+    here, signed = f"{API}/calibrations", {"who": "J. Operator"}
+    asked: Json = {"spacecraft": "XTE", "run": "commissioning", "degree": 0, **signed}
+    begun = client.post(here, json=asked)
+    take("start_calibration", begun, "scale", asked)
+    other = client.post(here, json=asked | {"trackers": ["STARTRACKER_2"]})
+    take("start_calibration", other, "no_such_tracker")
+    one = begun.headers["Location"]
+    while (found := client.get(one)).json()["state"] in ("queued", "running"):
+        time.sleep(0.05)
+    # A map has a hundred cells.
+    shown: Json = found.json()
+    shown["result"]["maps"][0]["cells"] = shown["result"]["maps"][0]["cells"][:2]
+    take("get_calibration", httpx.Response(200, json=shown), "scale")
+    take("list_calibrations", client.get(here), "one")
+    tried: Json = {"sample": 5}
+    take("try_calibration", client.post(f"{one}/trial", json=tried), "five_batches", tried)
+    reason = {**signed, "note": "scale after the first pass"}
+    take("adopt_calibration", client.post(f"{one}/adopt", json=reason), "first", reason)
+    take("adopt_calibration", client.post(f"{one}/adopt", json=reason), "in_force_already")
+    mission_file: Json = {**signed, "to": None}
+    held = f"{API}/spacecraft/XTE/calibration"
+    back = client.post(f"{held}/revert", json=mission_file)
+    take("revert_calibration", back, "to_the_mission_file", mission_file)
+    take("get_calibration_in_force", client.get(held), "the_mission_file")
 
 
 def _annotation(client: httpx.Client, take: Any) -> None:

@@ -1,20 +1,22 @@
 """Trackers calibrated from the recorded batches of a spacecraft; see `service.calibration`."""
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 from msgspec import structs
 
+from service.acquire import Acquisition
 from service.app.context import Context
 from service.app.submissions import Submissions
 from service.calibration.estimate import Calibration, calibrate
 from service.calibration.evidence import identified_stars
 from service.calibration.held_out import HeldOut, calibrate_with_chosen_degree
 from service.calibration.stars import IdentifiedStars, joined
-from service.calibration.unknowns import Model
-from service.errors import BadInput, Fault
-from service.missions.mission import mission_named
+from service.calibration.unknowns import LARGEST_DEGREE, Model
+from service.errors import BadInput, Busy, Fault, Stopping, shown_value
+from service.missions.mission import Mission
+from service.observations.batch import ObservationBatch
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.recorded_batch import sample_batches
@@ -22,6 +24,11 @@ from service.times import Utc
 
 CALIBRATION_SAMPLE = 2_000
 LARGEST_CHOSEN_DEGREE = 5
+LONGEST_WAIT_S = 120.0
+"""For a thread of the solver, while others keep them all at work."""
+
+Step = Callable[[int, int], object]
+"""Told after each batch: how many are done, and of how many."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +45,24 @@ class CalibrationRequest:
     end: Utc | None = None
     trackers: Sequence[str] = ()
     degree: int | None = None
+    alignment: bool = True
+    scale: bool = True
     time_tag: bool = False
     sample: int = CALIBRATION_SAMPLE
+
+    def require(self, mission: Mission, trackers_field: str = "trackers") -> None:
+        """Raise `BadInput` for trackers that the mission has not, and for a useless model."""
+        for name in self.trackers:
+            mission.tracker(name, trackers_field)
+        if self.degree is not None and not 0 <= self.degree <= LARGEST_DEGREE:
+            message = f"must be from 0 to {LARGEST_DEGREE}"
+            raise BadInput(Fault("degree", message, shown_value(self.degree)))
+        if self.degree == 0 and not (self.alignment or self.scale or self.time_tag):
+            raise BadInput(Fault("degree", "leaves nothing to estimate", "0"))
+
+    def model(self, degree: int) -> Model:
+        """The unknowns, with a distortion of this degree."""
+        return Model(self.alignment, self.scale, degree, time_tag=self.time_tag)
 
 
 @dataclass(frozen=True)
@@ -50,6 +73,7 @@ class CalibrationRun:
     stars; `refused` no longer fit the mission.  `tried` is empty where the degree was given.
     """
 
+    mission: Mission
     found: Calibration
     tried: tuple[HeldOut, ...]
     total: int
@@ -60,47 +84,58 @@ class CalibrationRun:
     last: str | None
 
 
-class CalibrationService:
+class Estimator:
     """Estimates calibrations; nothing is recorded and no setting is changed."""
 
     def __init__(self, context: Context, submissions: Submissions) -> None:
         self._context = context
         self._submissions = submissions
 
-    def of_spacecraft(
-        self, wanted: CalibrationRequest, step: Callable[[], object] = lambda: None
+    def estimate(
+        self,
+        wanted: CalibrationRequest,
+        mission: Mission,
+        step: Step = lambda done, total: None,
     ) -> CalibrationRun:
-        """The calibration that the batches of a run give; `step` is called after each batch.
+        """The calibration that the batches of a run give.
 
         Batches are identified anew by verified identification, which does not look at the
-        tolerances.  Raises `BadInput` for a tracker that the mission has not, and where
-        there are too few identified stars.
+        tolerances.  Raises `BadInput` where there are too few identified stars.
         """
-        mission = mission_named(self._context.missions, wanted.spacecraft)
-        for name in wanted.trackers:
-            mission.tracker(name, "--tracker")
         names = set(wanted.trackers or (each.name for each in mission.trackers))
         selected = ResultFilter(wanted.run or LIVE, wanted.spacecraft, wanted.start, wanted.end)
         with self._context.reading() as connection:
             drawn = sample_batches(connection, self._context.store.archive, selected, wanted.sample)
-        run_again = partial(self._submissions.ingest.run_again, mission=mission.within_zones)
         parts: list[IdentifiedStars] = []
         refused = 0
-        for batch in drawn.batches:
+        for number, batch in enumerate(drawn.batches, 1):
             options = structs.replace(batch.options, identifier="verified", solver="quest")
             try:
-                stars = identified_stars(run_again(structs.replace(batch, options=options)), names)
+                again = self._run_again(structs.replace(batch, options=options), mission)
+                stars = identified_stars(again, names)
             except BadInput:
                 refused += 1
             else:
                 parts += [] if stars is None else [stars]
-            step()
+            step(number, len(drawn.batches))
         if not parts:
             message = "have no identified stars: there is nothing to calibrate with"
             raise BadInput(Fault("batches", message, f"{len(drawn.batches)} batches"))
         found, tried = _calibrated(joined(parts), wanted)
         counts = drawn.total, len(drawn.batches), len(parts), refused
-        return CalibrationRun(found, tried, *counts, drawn.first, drawn.last)
+        return CalibrationRun(mission, found, tried, *counts, drawn.first, drawn.last)
+
+    def _run_again(self, batch: ObservationBatch, mission: Mission) -> Acquisition:
+        """The acquisition of a batch; while the threads are at work on others it waits."""
+        until_s = time.monotonic() + LONGEST_WAIT_S
+        while True:
+            try:
+                return self._submissions.ingest.run_again(batch, mission.within_zones)
+            except Stopping:
+                raise
+            except Busy:
+                if time.monotonic() > until_s:
+                    raise
 
 
 def _calibrated(
@@ -108,12 +143,10 @@ def _calibrated(
 ) -> tuple[Calibration, tuple[HeldOut, ...]]:
     """With the degree that is wanted, or the best of those that so many stars allow."""
     if wanted.degree is not None:
-        return calibrate(stars, Model(degree=wanted.degree, time_tag=wanted.time_tag)), ()
+        return calibrate(stars, wanted.model(wanted.degree)), ()
     for degree in range(LARGEST_CHOSEN_DEGREE, 0, -1):
         try:
-            return calibrate_with_chosen_degree(
-                stars, Model(degree=degree, time_tag=wanted.time_tag)
-            )
+            return calibrate_with_chosen_degree(stars, wanted.model(degree))
         except BadInput:
             continue
-    return calibrate_with_chosen_degree(stars, Model(degree=0, time_tag=wanted.time_tag))
+    return calibrate_with_chosen_degree(stars, wanted.model(0))

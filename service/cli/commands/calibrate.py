@@ -17,7 +17,10 @@ from service.cli.configuration import period_of, settings_of, settings_of_existi
 from service.errors import BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
-    from service.calibration.estimate import Calibration
+    from service.app.calibrations.estimates import CalibrationRun
+
+RECORDED_BY = "acquire calibrate"
+"""The author of a calibration that the command records."""
 
 
 def add(commands: Any) -> None:
@@ -27,11 +30,12 @@ def add(commands: Any) -> None:
         "calibrate",
         "Estimate alignment between trackers, scale and distortion of each, and time tags from "
         "the identified stars of recorded batches, with sigmas; name the unknowns that these "
-        "cannot show; write a mission file with the result.  Changes nothing that is recorded or "
-        "in use.",
+        "cannot show; write a mission file with the result, or record it for the console, where "
+        "an operator may adopt it.  Changes nothing that is in use.",
         """
         acquire calibrate TWOHEADS
         acquire calibrate TWOHEADS --run commissioning --output twoheads-new.toml
+        acquire calibrate TWOHEADS --record
         acquire calibrate TWOHEADS --start 1999-060T00:00:00Z --degree 3 --time-tag --json
         """,
         run,
@@ -71,6 +75,11 @@ def add(commands: Any) -> None:
         metavar="OUT.toml",
         help="write the mission file with alignment, scale and distortion corrected",
     )
+    parser.add_argument(
+        "--record",
+        action="store_true",
+        help="record the result as the spacecraft's next version, to be tried and adopted",
+    )
     add_json(parser, "the result")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     add_database(parser)
@@ -83,6 +92,7 @@ def run(parsed: Namespace) -> int:
     from service.app.calibrations.estimates import CalibrationRequest
     from service.app.factory import open_app
     from service.cli.calibration_text import calibration_json, calibration_text
+    from service.missions.mission import mission_named
 
     start, end = period_of(parsed)
     wanted = CalibrationRequest(
@@ -96,23 +106,35 @@ def run(parsed: Namespace) -> int:
         sample=parsed.sample,
     )
     app = open_app(settings_of_existing(parsed))
+    recorded = None
     try:
+        mission = mission_named(app.missions, parsed.spacecraft)
+        wanted.require(mission, "--tracker")
         with tqdm(
             total=None, unit=" batches", desc="running again", disable=parsed.quiet or None
         ) as bar:
-            result = app.calibrations.of_spacecraft(wanted, bar.update)
+
+            def step(done: int, total: int) -> None:
+                bar.total = total
+                bar.update(1)
+
+            result = app.calibrations.of_spacecraft(wanted, step)
+        if parsed.record:
+            recorded = app.calibrations.record(wanted, result, RECORDED_BY)
     finally:
         app.close()
     if parsed.json:
         print_json(calibration_json(result))
     else:
         print(calibration_text(result))
+        if recorded is not None:
+            print(f"\nRecorded as version {recorded.version}, {recorded.id}")
     if parsed.output is not None:
-        _write_mission(parsed, result.found)
+        _write_mission(parsed, result)
     return 0
 
 
-def _write_mission(parsed: Namespace, found: "Calibration") -> None:
+def _write_mission(parsed: Namespace, result: "CalibrationRun") -> None:
     """Write the spacecraft's mission file, changed by the calibration, to another file."""
     from service.calibration.mission_file import calibrated_mission_text
 
@@ -120,7 +142,8 @@ def _write_mission(parsed: Namespace, found: "Calibration") -> None:
     if parsed.output.exists() and parsed.output.samefile(source):
         message = "is the mission file in use; name another file, and put it in its place later"
         raise BadInput(Fault("--output", message, shown_value(str(parsed.output))))
-    text = calibrated_mission_text(source.read_text(encoding="utf-8"), str(source), found)
+    before = source.read_text(encoding="utf-8")
+    text = calibrated_mission_text(before, str(source), result.found, result.mission)
     parsed.output.write_text(text, encoding="utf-8")
     if not parsed.json:
         print(f"\n{parsed.output}: {source} with alignment, scale and distortion corrected")

@@ -4,13 +4,16 @@ from ..encoding import path_of
 from ..models import Session
 from .alarms import AsyncAlarms
 from .batches import AsyncBatches
+from .calibrations import AsyncCalibrations
 from .events import AsyncEvents
 from .gyro import AsyncGyro
 from .replays import AsyncReplays
 from .spacecraft import AsyncSpacecraft
 
 
-class AsyncClient(AsyncBatches, AsyncSpacecraft, AsyncAlarms, AsyncReplays, AsyncGyro):
+class AsyncClient(
+    AsyncBatches, AsyncSpacecraft, AsyncAlarms, AsyncReplays, AsyncGyro, AsyncCalibrations
+):
     """A client of the service at an address; a context manager that closes its connections.
 
     `token` is sent with each request.  A request that may be sent twice is sent again after a

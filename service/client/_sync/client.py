@@ -4,13 +4,14 @@ from ..encoding import path_of
 from ..models import Session
 from .alarms import Alarms
 from .batches import Batches
+from .calibrations import Calibrations
 from .events import Events
 from .gyro import Gyro
 from .replays import Replays
 from .spacecraft import Spacecraft
 
 
-class Client(Batches, Spacecraft, Alarms, Replays, Gyro):
+class Client(Batches, Spacecraft, Alarms, Replays, Gyro, Calibrations):
     """A client of the service at an address; a context manager that closes its connections.
 
     `token` is sent with each request.  A request that may be sent twice is sent again after a

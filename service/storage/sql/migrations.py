@@ -21,7 +21,7 @@ from service.storage.sql.engines import database_url, reading_engine, shown_url,
 if TYPE_CHECKING:
     from alembic.config import Config
 
-HEAD = "0013"
+HEAD = "0014"
 """The latest revision of `migrations/`."""
 
 
@@ -86,6 +86,7 @@ def check(database: str) -> list[str]:
 
         # Every table must be known to the metadata.
         from service.storage.archive import tables as archive_tables  # noqa: F401
+        from service.storage.calibrations import tables as calibration_tables  # noqa: F401
         from service.storage.sql import (  # noqa: F401
             access_tables,
             alarm_tables,

@@ -18,6 +18,12 @@ from service.storage.models.base import Record, component_name, described
 from service.web.api.alarms import CommentIn, LimitIn, LimitTrialIn, ShelveIn, StatementIn
 from service.web.api.annotations import AnnotationIn
 from service.web.api.batches import WhatIfIn
+from service.web.api.calibrations import (
+    CalibrationAdoptIn,
+    CalibrationIn,
+    CalibrationRevertIn,
+    CalibrationTrialIn,
+)
 from service.web.api.compare import CompareIn
 from service.web.api.events import EVENT_STREAM
 from service.web.api.runs import RunIn
@@ -62,6 +68,7 @@ TAGS = {
     "alarms": "Limits, alarms, and actions on alarms.",
     "gyro": "Rates of a spacecraft's gyro, in blocks of samples.",
     "annotations": "Notes that people write on times and periods.",
+    "calibrations": "Trackers calibrated from recorded batches, and what was adopted when.",
     "events": "Live events.",
     "webhooks": "Events that the service sends to receivers (Standard Webhooks).",
     "probes": "Probes and metrics for operation and monitoring.",
@@ -137,6 +144,10 @@ REQUESTS: Sequence[type[BaseModel]] = (
     SecretIn,
     RetryIn,
     ReplayEventsIn,
+    CalibrationIn,
+    CalibrationTrialIn,
+    CalibrationAdoptIn,
+    CalibrationRevertIn,
 )
 
 

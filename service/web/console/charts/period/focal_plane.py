@@ -79,7 +79,7 @@ def focal_plane_map(tracker: TrackerStarsOfPeriod) -> FocalPlaneMap | None:
         _drawn(int(k), each, radius_deg, px_per_arcsec)
         for k, each in zip(np.unique(cell), found, strict=True)
     ]
-    key_arcsec = _round_below(longest)
+    key_arcsec = round_below(longest)
     return FocalPlaneMap(
         tracker=tracker.tracker,
         cells=tuple(cells),
@@ -145,7 +145,8 @@ def arrow(x: float, y: float, along: float, down: float) -> str:
     )
 
 
-def _round_below(longest: float) -> float:
+def round_below(longest: float) -> float:
+    """The largest of 1, 2 and 5 times a power of ten that is not longer; 0 for nothing."""
     if longest <= 0.0:
         return 0.0
     power = 10.0 ** math.floor(math.log10(longest))

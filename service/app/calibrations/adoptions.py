@@ -1,0 +1,166 @@
+"""The calibration in force of each spacecraft: adopted and taken back by an operator.
+
+An adopted calibration lies over the mission file: alignment and focal plane of every
+tracker are those that were adopted, and all other settings the file's.  Where the file's
+own alignments or focal planes have changed since, the file holds.
+"""
+
+import logging
+import threading
+from collections.abc import Callable, Sequence
+
+import msgspec
+from sqlalchemy import Connection
+
+from service.access.audit import Entry
+from service.app.calibrations.geometry import geometry_digest, with_geometry
+from service.app.context import Context, known_id
+from service.errors import NotFound, WrongState, shown_value
+from service.missions.mission import Mission, mission_named
+from service.storage.calibrations import stored
+from service.storage.calibrations.models import (
+    CalibrationAdoption,
+    CalibrationInForce,
+    TrackerGeometry,
+)
+from service.storage.recording.ids import Ulids
+from service.storage.recording.results import register
+from service.times import utc_now
+
+log = logging.getLogger(__name__)
+
+
+class CalibrationAdoptions:
+    """Adopts calibrations, and says what held when.
+
+    `context.missions` have what is in force; the settings of the files are kept here.
+    """
+
+    def __init__(self, context: Context, missions_changed: Callable[[], None]) -> None:
+        """`missions_changed` is called after a mission of the context was replaced."""
+        self._context = context
+        self._files = dict(context.missions)
+        self._missions_changed = missions_changed
+        self._ids = Ulids()
+        self._lock = threading.Lock()
+
+    def load(self, leave: str | None = None) -> None:
+        """Put what was adopted over the mission files, but for the spacecraft `leave`."""
+        with self._context.reading() as connection:
+            latest = stored.latest_adoptions(connection)
+        for each in latest:
+            file = self._files.get(each.spacecraft)
+            if file is None or each.spacecraft == leave or each.trackers is None:
+                continue
+            if each.file != geometry_digest(file):
+                log.warning(
+                    "%s: the mission file was changed after calibration version %s was adopted; "
+                    "the file holds",
+                    each.spacecraft,
+                    each.version,
+                )
+                continue
+            self._context.missions[each.spacecraft] = with_geometry(file, each.trackers)
+
+    def in_force(self, spacecraft: str) -> CalibrationInForce:
+        """The calibration that new batches use, and every change of it, newest first."""
+        mission = mission_named(self._context.missions, spacecraft)
+        with self._context.reading() as connection:
+            history = stored.list_adoptions(connection, spacecraft)
+        latest = history[0] if history else None
+        overridden = (
+            latest is not None
+            and latest.trackers is not None
+            and latest.file != geometry_digest(self.file_of(spacecraft))
+        )
+        return CalibrationInForce(
+            spacecraft=spacecraft,
+            mission=mission.digest,
+            calibration=None if latest is None or overridden else latest.calibration,
+            overridden=overridden,
+            history=history,
+        )
+
+    def adopt(
+        self, id: str, who: str, note: str = "", entry: Entry | None = None
+    ) -> CalibrationAdoption:
+        """Let new batches be processed with a calibration.
+
+        Raises `WrongState` for one that is not done, is in force already, or knows other
+        trackers than the mission.
+        """
+        with self._context.reading() as connection:
+            found = stored.read_calibration(connection, known_id(id, "calibration"))
+        if found.result is None:
+            raise WrongState(f"the calibration is {found.state}")
+        names = [each.name for each in found.result.trackers]
+        file = self.file_of(found.spacecraft)
+        if names != [each.name for each in file.trackers]:
+            raise WrongState("the mission has other trackers by now: calibrate anew")
+        return self._change(file, found.result.trackers, found.id, who, note, entry)
+
+    def revert(
+        self, spacecraft: str, to: str | None, who: str, note: str = "", entry: Entry | None = None
+    ) -> CalibrationAdoption:
+        """Go back to an earlier adoption of this id, or with None to the mission file.
+
+        Raises `NotFound` for another spacecraft's, `WrongState` where that is in force.
+        """
+        file = self.file_of(spacecraft)
+        if to is None:
+            return self._change(file, None, None, who, note, entry)
+        with self._context.reading() as connection:
+            history = stored.list_adoptions(connection, spacecraft)
+        for each in history:
+            if each.id == to:
+                return self._change(file, each.trackers, each.calibration, who, note, entry)
+        raise NotFound(f"{spacecraft} has no adoption with the id {shown_value(to)}")
+
+    def file_of(self, spacecraft: str) -> Mission:
+        """The settings as the mission file has them, whatever was adopted."""
+        return mission_named(self._files, spacecraft)
+
+    def _change(
+        self,
+        file: Mission,
+        trackers: Sequence[TrackerGeometry] | None,
+        calibration: str | None,
+        who: str,
+        note: str,
+        entry: Entry | None,
+    ) -> CalibrationAdoption:
+        name, id, moment = file.name, self._ids.new(), utc_now().text
+        mission = file if trackers is None else with_geometry(file, trackers)
+        row = {
+            "id": id,
+            "spacecraft": name,
+            "adopted": moment,
+            "who": who,
+            "note": note,
+            "calibration_id": calibration,
+            "file_digest": geometry_digest(file),
+            "mission_digest": mission.digest,
+            "trackers": None if trackers is None else msgspec.json.encode(trackers).decode(),
+        }
+        settings = {
+            "digest": mission.digest,
+            "spacecraft": name,
+            "settings": mission.model_dump_json(),
+            "first_used": moment,
+        }
+        catalog = self._context.sky.catalog
+        used = {"digest": catalog.digest, "name": catalog.name, "first_used": moment}
+
+        def change(connection: Connection) -> CalibrationAdoption:
+            register(connection, [settings], used)
+            stored.add_adoption(connection, row)
+            return stored.list_adoptions(connection, name)[0]
+
+        with self._lock:
+            if self._context.missions[name].digest == mission.digest:
+                raise WrongState("these settings are in force already")
+            # Results name the settings by their digest, which is recorded before the first.
+            adopted = self._context.change_audited(change, entry)
+            self._context.missions[name] = mission
+            self._missions_changed()
+        return adopted

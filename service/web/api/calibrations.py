@@ -1,0 +1,260 @@
+"""Trackers calibrated from recorded batches: estimated, tried, adopted and taken back."""
+
+from typing import Annotated, ClassVar, Self
+
+from fastapi import APIRouter, Path
+from fastapi import Query as InQuery
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
+from starlette.requests import Request
+from starlette.responses import Response
+
+from service.access.tokens import Caller
+from service.app.calibrations.estimates import CALIBRATION_SAMPLE, CalibrationRequest
+from service.app.comparisons import COMPARE_SAMPLE
+from service.calibration.unknowns import LARGEST_DEGREE
+from service.errors import NotFound, shown_value
+from service.observations.schema import Key, RunName, Wire
+from service.storage.calibrations.models import (
+    Calibration,
+    CalibrationAdoption,
+    CalibrationInForce,
+    CalibrationPage,
+)
+from service.storage.models.compare import Comparison
+from service.web.api.compare import WORK_S
+from service.web.openapi.route import LINK, LOCATION, ResponseDoc, route_docs
+from service.web.requests.access import AuditDep, CallerDep, author
+from service.web.requests.dependencies import AppDep, json_response, page_response
+from service.web.requests.path_parameters import SpacecraftPath
+from service.web.requests.query_parameters import (
+    NO_QUERY,
+    Cursor,
+    PageLimit,
+    Query,
+    SpacecraftFilter,
+    Time,
+)
+from service.web.requests.request_body import JsonBody, read_model
+from service.web.requests.statements import Who, without_nul
+
+router = APIRouter(prefix="/api/v1", tags=["calibrations"])
+
+CalibrationId = Annotated[str, Path(description="The `id` of a calibration.")]
+Start = Annotated[Time | None, Field(description="Start of the period, included.")]
+End = Annotated[Time | None, Field(description="End of the period, excluded.")]
+
+
+class _Period(Wire):
+    """The batches that are used."""
+
+    start: Start = None
+    end: End = None
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if self.start and self.end and self.start.tai_ns > self.end.tai_ns:
+            raise ValueError(f"start {self.start} must not be after end {self.end}")
+        return self
+
+
+class CalibrationIn(_Period):
+    """What is calibrated, and with which batches."""
+
+    component: ClassVar[str] = "CalibrationIn"
+    model_config = ConfigDict(title=component)
+
+    spacecraft: Key
+    run: RunName = "live"
+    trackers: Annotated[
+        tuple[Key, ...],
+        Field(max_length=16, description="The first is the reference; empty: all of the mission."),
+    ] = ()
+    degree: Annotated[
+        int | None,
+        Field(
+            ge=0,
+            le=LARGEST_DEGREE,
+            strict=True,
+            description="Of the distortion, 0: none; null: chosen by held-out blocks of time.",
+        ),
+    ] = None
+    alignment: Annotated[bool, Field(description="Estimate alignment between trackers.")] = True
+    scale: Annotated[bool, Field(description="Estimate the scale of measured angles.")] = True
+    time_tag: Annotated[
+        bool, Field(description="Estimate how much later than sent stars were measured.")
+    ] = False
+    sample: Annotated[
+        int, Field(ge=1, le=10_000, strict=True, description="Maximum number of batches.")
+    ] = CALIBRATION_SAMPLE
+    who: Who = None
+
+    def request(self) -> CalibrationRequest:
+        """What is asked, without the author."""
+        return CalibrationRequest(**{name: getattr(self, name) for name in _ASKED})
+
+
+_ASKED = tuple(name for name in CalibrationIn.model_fields if name != "who")
+
+
+class CalibrationTrialIn(_Period):
+    """The batches that a calibration is tried over; without a run those of the calibration's."""
+
+    component: ClassVar[str] = "CalibrationTrialIn"
+    model_config = ConfigDict(title=component)
+
+    run: RunName | None = None
+    sample: Annotated[
+        int,
+        Field(ge=1, le=500, description="Maximum number of batches, taken evenly from the period."),
+    ] = COMPARE_SAMPLE
+
+
+class _Signed(Wire):
+    """Who changes the calibration in force, and why."""
+
+    who: Who = None
+    note: Annotated[
+        str,
+        Field(max_length=2_000, description="The reason, in plain text."),
+        AfterValidator(without_nul),
+    ] = ""
+
+
+class CalibrationAdoptIn(_Signed):
+    """The author of an adoption, and the reason."""
+
+    component: ClassVar[str] = "CalibrationAdoptIn"
+    model_config = ConfigDict(title=component)
+
+
+class CalibrationRevertIn(_Signed):
+    """What the spacecraft goes back to."""
+
+    component: ClassVar[str] = "CalibrationRevertIn"
+    model_config = ConfigDict(title=component)
+
+    to: Annotated[
+        Key | None, Field(description="The `id` of an earlier adoption; null: the mission file.")
+    ] = None
+
+
+class CalibrationQuery(Query):
+    """Which calibrations."""
+
+    spacecraft: SpacecraftFilter = None
+    limit: PageLimit = 100
+    cursor: Cursor = None
+
+
+@router.get(
+    "/calibrations",
+    **route_docs({200: ResponseDoc("A page of calibrations.", CalibrationPage, LINK)}),
+)
+def list_calibrations(
+    request: Request, query: Annotated[CalibrationQuery, InQuery()], app: AppDep
+) -> Response:
+    """Calibrations without covariances and residual maps, newest first."""
+    return page_response(request, app.calibrations.page(**query.asked()))
+
+
+@router.post(
+    "/calibrations",
+    dependencies=[NO_QUERY],
+    **route_docs(
+        {202: ResponseDoc("The calibration, which is computed now.", Calibration, LOCATION)},
+        body=CalibrationIn,
+        problems=(404, 503),
+    ),
+)
+def start_calibration(
+    body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
+) -> Response:
+    """Estimate alignment, scale and distortion of trackers; no setting is changed."""
+    asked = read_model(CalibrationIn, body)
+    caller.require(asked.spacecraft)
+    who = author(caller, asked.who)
+    begun = app.calibrations.start(asked.request(), who, audited.entry(202))
+    return json_response(begun, 202, {"Location": f"/api/v1/calibrations/{begun.id}"})
+
+
+@router.get(
+    "/calibrations/{id}",
+    dependencies=[NO_QUERY],
+    **route_docs({200: ResponseDoc("The calibration.", Calibration)}, problems=(404,)),
+)
+def get_calibration(id: CalibrationId, app: AppDep, caller: CallerDep) -> Response:
+    """One calibration with covariance and residual maps."""
+    return json_response(_visible(app, id, caller))
+
+
+@router.post(
+    "/calibrations/{id}/trial",
+    dependencies=[NO_QUERY],
+    **route_docs(
+        {200: ResponseDoc("In force (a), and with the calibration (b).", Comparison)},
+        body=CalibrationTrialIn,
+        problems=(404, 409, 503),
+    ),
+)
+def try_calibration(id: CalibrationId, body: JsonBody, app: AppDep, caller: CallerDep) -> Response:
+    """Process recorded batches again with and without a calibration; nothing is recorded."""
+    asked = read_model(CalibrationTrialIn, body)
+    _visible(app, id, caller)
+    return json_response(app.calibrations.trial(id, **vars(asked), limit_s=WORK_S))
+
+
+@router.post(
+    "/calibrations/{id}/adopt",
+    dependencies=[NO_QUERY],
+    **route_docs(
+        {200: ResponseDoc("The adoption.", CalibrationAdoption)},
+        body=CalibrationAdoptIn,
+        problems=(404, 409, 503),
+    ),
+)
+def adopt_calibration(
+    id: CalibrationId, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
+) -> Response:
+    """Let new batches of the spacecraft be processed with a calibration."""
+    asked = read_model(CalibrationAdoptIn, body)
+    _visible(app, id, caller)
+    who = author(caller, asked.who)
+    return json_response(app.adoptions.adopt(id, who, asked.note, audited.entry()))
+
+
+@router.get(
+    "/spacecraft/{name}/calibration",
+    dependencies=[NO_QUERY],
+    **route_docs(
+        {200: ResponseDoc("The calibration in force.", CalibrationInForce)}, problems=(404,)
+    ),
+)
+def get_calibration_in_force(name: SpacecraftPath, app: AppDep) -> Response:
+    """The calibration that new batches use, and what held when."""
+    return json_response(app.adoptions.in_force(name))
+
+
+@router.post(
+    "/spacecraft/{name}/calibration/revert",
+    dependencies=[NO_QUERY],
+    **route_docs(
+        {200: ResponseDoc("The change.", CalibrationAdoption)},
+        body=CalibrationRevertIn,
+        problems=(404, 409, 503),
+    ),
+)
+def revert_calibration(
+    name: SpacecraftPath, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
+) -> Response:
+    """Go back to an earlier adoption, or to the mission file."""
+    asked = read_model(CalibrationRevertIn, body)
+    who = author(caller, asked.who)
+    return json_response(app.adoptions.revert(name, asked.to, who, asked.note, audited.entry()))
+
+
+def _visible(app: AppDep, id: str, caller: Caller) -> Calibration:
+    """A calibration of the caller's spacecraft; raises `NotFound` for those of others."""
+    found = app.calibrations.get(id)
+    if not caller.may_see(found.spacecraft):
+        raise NotFound(f"there is no calibration with the id {shown_value(id)}")
+    return found

@@ -1,0 +1,119 @@
+"""Parameters of trackers over the versions of a calibration, with their sigmas."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from service.missions.mission import Mission
+from service.storage.calibrations.models import CalibrationSummary, TrackerGeometry
+from service.times import parse_utc
+from service.vectors import ARCSEC_PER_RADIAN
+
+WIDTH, HEIGHT, PAD = 420.0, 96.0, 10.0
+SIGMAS = 1.0
+
+
+@dataclass(frozen=True)
+class Point:
+    """One version's value; `low` and `high` are the ends of its error bar."""
+
+    version: int
+    time: str
+    value: float
+    sigma: float
+    x: float = 0.0
+    y: float = 0.0
+    low: float = 0.0
+    high: float = 0.0
+
+
+@dataclass(frozen=True)
+class ParameterHistory:
+    """A parameter by the time of its batches; `top` and `bottom` are the ends of the chart."""
+
+    name: str
+    unit: str
+    points: tuple[Point, ...]
+    top: float
+    bottom: float
+    width: float = WIDTH
+    height: float = HEIGHT
+
+    @property
+    def line(self) -> str:
+        """The path through all points."""
+        places = (f"{each.x:.1f} {each.y:.1f}" for each in self.points)
+        return "M" + "L".join(places)
+
+
+def parameter_histories(
+    versions: Sequence[CalibrationSummary], file: Mission
+) -> list[ParameterHistory]:
+    """Alignment and scale by the mission file's, and time tags, of the versions that are done.
+
+    All are counted from the same settings, whatever was in force when they were estimated.
+    """
+    found: dict[tuple[str, str], list[Point]] = {}
+    for each in versions:
+        if each.state == "done" and each.first is not None:
+            for name, unit, point in _points(each, file):
+                found.setdefault((name, unit), []).append(point)
+    return [_drawn(name, unit, points) for (name, unit), points in sorted(found.items())]
+
+
+def _points(found: CalibrationSummary, file: Mission) -> Iterator[tuple[str, str, Point]]:
+    own = {each.name: each for each in found.trackers}
+    files = {each.name: each for each in file.trackers}
+    for each in found.unknowns:
+        if each.tracker not in own or each.tracker not in files:
+            continue
+        if each.kind == "alignment":
+            turned = _turned_arcsec(own[each.tracker], files[each.tracker].body_from_tracker)
+            value = turned["xyz".index(each.name[-1])]
+        elif each.kind == "scale":
+            value = own[each.tracker].calibration.scale - files[each.tracker].calibration.scale
+        elif each.kind == "time_tag":
+            value = each.value
+        else:
+            continue
+        point = Point(found.version, found.first or "", value, each.sigma)
+        yield each.name, "" if each.unit == "1" else each.unit, point
+
+
+def _turned_arcsec(tracker: TrackerGeometry, before: np.ndarray) -> list[float]:
+    """The rotation about the body axes from one alignment to another; small angles."""
+    axes = [tracker.x_axis_body, tracker.y_axis_body, tracker.z_axis_body]
+    turn = np.column_stack(axes) @ before.T
+    vector = [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+    return [float(part) / 2.0 * ARCSEC_PER_RADIAN for part in vector]
+
+
+def _drawn(name: str, unit: str, points: Sequence[Point]) -> ParameterHistory:
+    ordered = sorted(points, key=lambda each: (each.time, each.version))
+    top = max(each.value + SIGMAS * each.sigma for each in ordered)
+    bottom = min(each.value - SIGMAS * each.sigma for each in ordered)
+    times = np.array([parse_utc(each.time).tai_ns for each in ordered], dtype=float)
+    # Versions of one stretch would lie upon each other.
+    places = times if len(set(times)) == len(times) else np.arange(float(len(times)))
+    spread = places[-1] - places[0]
+    xs = (places - places[0]) / spread if spread else np.full(len(places), 0.5)
+
+    def y_of(value: float) -> float:
+        part = (value - bottom) / (top - bottom) if top > bottom else 0.5
+        return HEIGHT - PAD - part * (HEIGHT - 2.0 * PAD)
+
+    drawn = tuple(
+        Point(
+            each.version,
+            each.time,
+            each.value,
+            each.sigma,
+            PAD + float(x) * (WIDTH - 2.0 * PAD),
+            y_of(each.value),
+            y_of(each.value - SIGMAS * each.sigma),
+            y_of(each.value + SIGMAS * each.sigma),
+        )
+        for each, x in zip(ordered, xs, strict=True)
+    )
+    return ParameterHistory(name, unit, drawn, top, bottom)

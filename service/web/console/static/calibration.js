@@ -1,0 +1,119 @@
+// Calibrates, tries a calibration over recorded batches, adopts it, and takes it back.
+import { attempt, rememberWho, send } from "./actions.js";
+import { refreshSoon } from "./live_updates.js";
+
+const POLL_MS = 500;
+const message = document.getElementById("message");
+const signed = document.getElementById("signed");
+const form = document.getElementById("calibrate");
+const trial = document.getElementById("trial");
+
+if (signed) {
+  rememberWho(signed.elements.who);
+  signed.addEventListener("submit", (event) => event.preventDefault());
+}
+
+function author() {
+  return signed.elements.who.value.trim();
+}
+
+function pause(milliseconds) {
+  return new Promise((resolve) => setTimeout(resolve, milliseconds));
+}
+
+// Waits for a calibration, and draws the page anew as it goes on.
+async function finished(id) {
+  for (;;) {
+    const found = await send("GET", `/api/v1/calibrations/${id}`);
+    if (found.state !== "queued" && found.state !== "running") return found;
+    message.textContent = `Version ${found.version}: ${found.done} of ${found.total} batches.`;
+    await pause(POLL_MS);
+  }
+}
+
+form?.addEventListener("submit", (event) => {
+  event.preventDefault();
+  if (!signed.reportValidity()) return;
+  const { start, end, degree, sample, alignment, scale, time_tag: timeTag } = form.elements;
+  attempt(event.submitter, message, async () => {
+    const begun = await send("POST", "/api/v1/calibrations", JSON.stringify({
+      spacecraft: form.dataset.spacecraft,
+      run: document.body.dataset.run,
+      start: start.value.trim() || null,
+      end: end.value.trim() || null,
+      degree: degree.value === "" ? null : Number(degree.value),
+      sample: Number(sample.value),
+      alignment: alignment.checked,
+      scale: scale.checked,
+      time_tag: timeTag.checked,
+      who: author(),
+    }));
+    const found = await finished(begun.id);
+    if (found.state !== "done") throw new Error(found.fault ?? found.state);
+    const here = new URL(location.href);
+    here.searchParams.set("version", found.version);
+    location.assign(here);
+    return `Version ${found.version} is done.`;
+  });
+});
+
+const SHOWN = [
+  ["batches with a suspect attitude", (side, found) => share(side.suspect, found.compared)],
+  ["stars unique", (side) => share(side.unique, side.observed)],
+  ["stars ambiguous", (side) => share(side.ambiguous, side.observed)],
+  ["stars unmatched", (side) => share(side.unmatched, side.observed)],
+  ["residual over predicted, mean", (side) => side.residual_ratio_mean?.toFixed(2) ?? "–"],
+];
+
+function share(part, whole) {
+  return whole ? `${part} of ${whole} (${((100 * part) / whole).toFixed(1)} %)` : "–";
+}
+
+function cell(kind, text, className = "") {
+  const made = document.createElement(kind);
+  made.textContent = text;
+  made.className = className;
+  if (kind === "th") made.scope = className ? "col" : "row";
+  return made;
+}
+
+function showTrial(found) {
+  const table = document.createElement("table");
+  table.createCaption().textContent = `${found.compared} of ${found.batches_in_stretch} batches${found.cut_short ? ", stopped after ten seconds" : ""}`;
+  const head = table.createTHead().insertRow();
+  head.append(document.createElement("td"), cell("th", "in force", "number"), cell("th", "with this calibration", "number"));
+  const body = table.createTBody();
+  for (const [name, text] of SHOWN) {
+    body.insertRow().append(cell("th", name), cell("td", text(found.a, found), "number"), cell("td", text(found.b, found), "number"));
+  }
+  trial.replaceChildren(table);
+  trial.hidden = false;
+}
+
+document.getElementById("try")?.addEventListener("submit", (event) => {
+  event.preventDefault();
+  const { sample } = event.target.elements;
+  const address = `/api/v1/calibrations/${event.target.dataset.calibration}/trial`;
+  attempt(event.submitter, document.getElementById("trial-message"), async () => {
+    showTrial(await send("POST", address, JSON.stringify({ run: document.body.dataset.run, sample: Number(sample.value) })));
+    return "Nothing is recorded.";
+  });
+});
+
+document.addEventListener("click", (event) => {
+  const button = event.target.closest("[data-adopt], [data-revert]");
+  if (!button || !signed.reportValidity()) return;
+  const { adopt, revert } = button.dataset;
+  const said = { who: author(), note: signed.elements.note.value.trim() };
+  attempt(button, message, async () => {
+    if (adopt !== undefined) {
+      const adopted = await send("POST", `/api/v1/calibrations/${adopt}/adopt`, JSON.stringify(said));
+      refreshSoon();
+      return `In force: version ${adopted.version}.`;
+    }
+    const address = `/api/v1/spacecraft/${encodeURIComponent(form.dataset.spacecraft)}/calibration/revert`;
+    const back = await send("POST", address, JSON.stringify({ ...said, to: revert || null }));
+    refreshSoon();
+    return back.version === null ? "In force: the mission file." : `In force: version ${back.version}.`;
+  });
+});
