@@ -14,7 +14,7 @@ from service.missions.mission import (
     Tolerances,
     rules_of,
 )
-from service.observations.batch import BoresightPrior, ObservationBatch
+from service.observations.batch import BoresightPrior, ObservationBatch, PredictedPrior
 from service.sky.ephemeris import observer_velocity
 from service.vectors import Vector
 
@@ -41,8 +41,9 @@ class Choices(Struct, frozen=True, eq=False, gc=False):
 def choices_of(batch: ObservationBatch, mission: Mission) -> Choices:
     """The settings that hold for a batch.
 
-    A test that cannot be made is off: the pole test in a cap, and tests that
-    compare with the presumed roll where an a priori boresight leaves it open.
+    A test that cannot be made is off: the pole test in a cap, which a predicted attitude
+    has in bands too, and tests that compare with the presumed roll where an a priori
+    boresight leaves it open.
     """
     options = batch.options
     grid_deg = options.zone_grid_deg
@@ -56,7 +57,8 @@ def choices_of(batch: ObservationBatch, mission: Mission) -> Choices:
 
 def _rules(batch: ObservationBatch, mission: Mission) -> Rules:
     options, roll_open = batch.options, isinstance(batch.a_priori, BoresightPrior)
-    if not (options.tests or options.tolerances):
+    in_cap = isinstance(batch.a_priori, PredictedPrior) and mission.tests.pole
+    if not (options.tests or options.tolerances or in_cap):
         return mission.rules_without_roll if roll_open else mission.rules
     tests = {**options.tests, **dict.fromkeys(impossible_tests(batch, mission), False)}
     return rules_of(
@@ -67,7 +69,8 @@ def _rules(batch: ObservationBatch, mission: Mission) -> Rules:
 
 def impossible_tests(batch: ObservationBatch, mission: Mission) -> tuple[str, ...]:
     """The tests that a batch's a priori knowledge, or its mission's zone, does not allow."""
-    pole = () if isinstance(mission.zone, Band) else ("pole",)
+    in_band = isinstance(mission.zone, Band) and not isinstance(batch.a_priori, PredictedPrior)
+    pole = () if in_band else ("pole",)
     return pole + (TESTS_OF_ROLL if isinstance(batch.a_priori, BoresightPrior) else ())
 
 
