@@ -36,6 +36,8 @@ from service.vectors import ARCSEC_PER_RADIAN
 
 MARGIN_SIGMAS = 3.0
 """A zone reaches beyond the field of view by so many sigmas of the prediction."""
+LARGEST_SIGMAS = 5.0
+"""Two attitudes tell no rate that is more than so many sigmas of the mission's."""
 SAMPLES_BEFORE_S = 60.0
 """Gyro samples are read from so long before the attitude: one of them begins the first step."""
 
@@ -131,7 +133,10 @@ def _rate(
         sigma = math.radians(settings.body_rate_sigma_deg_per_s)
         return given_rate(given, sigma, passed_s), "body_rates"
     if before is not None and before.known.tai_ns < last.known.tai_ns:
-        return derived_rate(before.known, last.known, passed_s), "attitudes"
+        derived = derived_rate(before.known, last.known, passed_s)
+        # Between them there may have been a manoeuvre, such as a flip of the roll.
+        if np.abs(derived.rad_s).max() <= LARGEST_SIGMAS * motion.rate_sigma_rad_s:
+            return derived, "attitudes"
     return unknown_rate(motion.rate_sigma_rad_s, passed_s), "unknown"
 
 

@@ -81,7 +81,7 @@ def fly(mission, sky, batches, seed, *, flips=(), gaps=None, most=5, cadence_s=3
             position_km=position_km,
             velocity_c=observer_velocity(time, velocity),
             aberration="to_correct",
-            rates_deg_per_s=np.degrees(rate),
+            rates_deg_per_s=np.zeros(3),
             stretch=Stretch(),
             rng=rng,
         )
@@ -98,8 +98,10 @@ def fly(mission, sky, batches, seed, *, flips=(), gaps=None, most=5, cadence_s=3
             "observations": [
                 {
                     "tracker": each.tracker.name,
-                    # The stars are at the batch's own time, for the rates are not told.
-                    "stars": [star | {"time_offset_s": 0.0} for star in scene.measured(each, False)],
+                    # All stars are at the batch's own time, for the rates are not told.
+                    "stars": [
+                        star | {"time_offset_s": 0.0} for star in scene.measured(each, False)
+                    ],
                 }
                 for each in seen
             ],
