@@ -1,5 +1,6 @@
 """How a mission predicts the attitude of a batch from the last good one."""
 
+from functools import cached_property
 from typing import Self
 
 from pydantic import Field, field_validator, model_validator
@@ -31,13 +32,19 @@ class Flip(Strict):
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
-        if parse_utc(self.end) <= parse_utc(self.start):
+        start_ns, end_ns = self._span_ns
+        if end_ns <= start_ns:
             raise ValueError("end: must come after start")
         return self
 
     def lies_between(self, first: Utc, last: Utc) -> bool:
         """Whether it is under way at some time from `first` to `last`."""
-        return first < parse_utc(self.end) and parse_utc(self.start) < last
+        start_ns, end_ns = self._span_ns
+        return first.tai_ns < end_ns and start_ns < last.tai_ns
+
+    @cached_property
+    def _span_ns(self) -> tuple[int, int]:
+        return parse_utc(self.start).tai_ns, parse_utc(self.end).tai_ns
 
 
 class TrackingSettings(Strict):

@@ -16,7 +16,8 @@ from service.sky.ephemeris import observer_velocity, sun_direction
 from service.times import parse_utc, shifted
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion
 
-START = parse_utc("1999-03-01T00:00:00.000Z")
+START = parse_utc("1997-01-15T00:00:00.000Z")
+"""SOHO's band crosses Carina then, where stars stand closest."""
 WALK_RAD_S1_5 = 2e-6
 STAY = 0.98
 """Of the rate, from one batch to the next: it stays bounded."""
@@ -31,11 +32,12 @@ def tracked(mission, **settings):
 
 @dataclass(frozen=True)
 class Flown:
-    """A batch as it is sent, its true attitude, and the true stars of each tracker."""
+    """A batch as it is sent, its true attitude, the stars of each tracker, and the rate from then."""
 
     body: dict
     attitude: np.ndarray
     stars: list
+    rate_rad_s: np.ndarray
 
     def wrong(self, answer):
         """What is wrong in an answer that is sure of itself."""
@@ -110,7 +112,7 @@ def fly(mission, sky, batches, seed, *, flips=(), gaps=None, most=5, cadence_s=3
             body["body_rates_deg_per_s"] = np.degrees(rate).tolist()
         ids = run_sky.run.star_id
         stars = [[None if row < 0 else ids[row] for row in each.star] for each in seen]
-        yield Flown(body, attitude, stars)
+        yield Flown(body, attitude, stars, rate)
         rate = STAY * rate + rng.normal(0.0, WALK_RAD_S1_5 * np.sqrt(cadence_s), 3)
 
 

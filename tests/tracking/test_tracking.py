@@ -3,16 +3,17 @@
 import json
 import time
 from concurrent.futures import Future
+from itertools import pairwise
 
 import numpy as np
 import pytest
-from msgspec.structs import replace
 
 from service.acquire import acquire
 from service.app.factory import open_app
 from service.errors import BadBatch
+from service.gyro.schema import block_from_json
+from service.missions.gyro import GyroSettings
 from service.missions.mission import load_missions
-from service.observations.batch import QuaternionPrior
 from service.observations.readers.csv_columns import batch_cells, batch_fields
 from service.observations.schema import (
     BatchIn,
@@ -20,13 +21,11 @@ from service.observations.schema import (
     submission_from_json,
 )
 from service.settings import Settings
-from service.storage.queries.recorded_batch import recorded_batch
 from service.storage.queries.results import read_result
 from service.storage.upkeep.verify import verify
 from service.vectors import (
     attitude_error_arcsec,
     matrix_from_quaternion,
-    quaternion_from_matrix,
 )
 from tests.tracking.conftest import send
 from tests.tracking.passes import fly, tracked
@@ -45,42 +44,10 @@ def kept(answer):
     }
 
 
-@pytest.mark.parametrize(("name", "share"), [("SOHO", 20), ("XTE", 6)])
-def test_a_pass_with_flips_and_gaps_has_no_wrong_attitude_and_small_zones(
-    name, share, sky, tmp_path, seed
-):
-    mission = tracked(load_missions()[name])
-    app = open_app(Settings(database=f"sqlite:///{tmp_path / 'a.db'}"), mission)
-    gaps = {9: 5000.0, 20: 1560.0, 27: 600.0}
-    pairs, default, states = 0, 0, []
-    try:
-        for flown in fly(mission, sky, 32, seed, flips=(13, 20), gaps=gaps):
-            answer = send(app, flown.body)
-            assert flown.wrong(answer) == []
-            states.append(answer["tracking"]["state"])
-            if states[-1] == "tracking":
-                pairs += answer["observations"][0]["zone"]["pairs"]
-                prior = QuaternionPrior(quaternion_from_matrix(flown.attitude))
-                default += _pairs_about(app, answer["id"], prior, mission, sky)
-    finally:
-        app.close()
-    assert states[0] == states[9] == states[13] == states[20] == "acquiring"
-    assert states.count("tracking") >= 24
-    assert pairs * share <= default
-
-
-def _pairs_about(app, id, prior, mission, sky):
-    """The pairs of the zone that the batch has with another a priori attitude."""
-    with app.store.reading() as connection:
-        batch, _ = recorded_batch(connection, id)
-    given = acquire(replace(batch, a_priori=prior, tracking=None), mission, sky)
-    return given.trackers[0].pairs
-
-
 def test_the_prediction_is_recorded_and_gives_the_same_again(app, flown):
     answers = [send(app, each.body) for each in flown[:4]]
     assert [each["tracking"]["state"] for each in answers] == ["acquiring", *["tracking"] * 3]
-    for before, answer in zip(answers, answers[1:], strict=False):
+    for before, answer in pairwise(answers):
         assert answer["tracking"]["prediction"]["result"] == before["id"]
         assert answer["tracking"]["prediction"]["age_s"] == pytest.approx(30.0)
     assert [each["tracking"]["prediction"]["rate"] for each in answers[1:]] == [
@@ -215,8 +182,8 @@ def test_predictions_are_checked_where_they_are_sent(app, flown):
     for prior in ({"from": "first"}, {"from": "last", "quaternion": [0, 0, 0, 1]}):
         with pytest.raises(BadBatch):
             submission_from_json(json.dumps(flown[0].body | {"a_priori": prior}))
+    batch = submission_from_json(json.dumps(flown[0].body)).batch
     with pytest.raises(BadBatch, match="needs the record"):
-        batch = submission_from_json(json.dumps(flown[0].body)).batch
         acquire(batch, load_missions()["XTE"], app.context.sky)
 
 
@@ -252,3 +219,30 @@ def test_the_covariance_of_the_prediction_is_right(app, sky):
     assert len(weighted) > 15
     assert max(weighted) < 30.0
     assert 0.0 < np.mean(weighted) < 3.0
+
+
+def test_the_recorded_gyro_predicts_where_it_reaches(database, sky):
+    mission = tracked(load_missions()["XTE"])
+    gyro = GyroSettings(sigma_v_rad_s0_5=1e-6, sigma_u_rad_s1_5=1e-9, bias_sigma_rad_s=1e-6)
+    app = open_app(
+        Settings(database=database, replay_processes=0), mission.model_copy(update={"gyro": gyro})
+    )
+    flown = list(fly(load_missions()["XTE"], sky, 4, 3))
+    try:
+        send(app, flown[0].body)
+        # The gyro's samples of the first two intervals are there before the batches at their ends.
+        rates = [each.rate_rad_s.tolist() for each in flown[:2] for _ in range(30)]
+        block = {"block": "g1", "start": flown[0].body["time"], "step_s": 1.0}
+        block["rates_rad_per_s"] = [rates[0], *rates]
+        app.gyro.record(block_from_json(json.dumps(block), "XTE"))
+        answers = [send(app, each.body) for each in flown[1:]]
+    finally:
+        app.close()
+    predictions = [each["tracking"]["prediction"] for each in answers]
+    assert [each["rate"] for each in predictions] == ["gyro", "gyro", "attitudes"]
+    for flight, prediction in zip(flown[1:3], predictions, strict=False):
+        error = attitude_error_arcsec(
+            matrix_from_quaternion(prediction["quaternion"]), flight.attitude
+        )
+        # That of the attitude before, for the gyro of this test measures without errors.
+        assert np.linalg.norm(error) < 150.0

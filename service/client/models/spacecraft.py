@@ -41,7 +41,7 @@ class SpacecraftRow(Model, frozen=True, kw_only=True):
     latest_batch: Summary | None
     attitude: AttitudeRow | None
     last_attitude: AttitudeRow | None
-    tracking: str | None = None
+    tracking: str | None
 
 
 class MissionNow(Model, frozen=True):

@@ -340,7 +340,10 @@ class Result(Record, frozen=True, kw_only=True):
     input: Annotated[
         dict[str, Any],
         DescribedAs(BatchIn),
-        doc("The batch as it was sent, without default values."),
+        doc(
+            "The batch as it was sent, without default values. The service adds the prediction "
+            "to one that asks for the last attitude."
+        ),
     ]
     options: Annotated[
         MissionSettings,
