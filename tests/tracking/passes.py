@@ -32,7 +32,7 @@ def tracked(mission, **settings):
 
 @dataclass(frozen=True)
 class Flown:
-    """A batch as it is sent, its true attitude, the stars of each tracker, and the rate from then."""
+    """A batch as it is sent, its true attitude, its stars, and the rate after it."""
 
     body: dict
     attitude: np.ndarray

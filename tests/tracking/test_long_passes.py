@@ -17,20 +17,21 @@ from tests import scale
 from tests.tracking.conftest import send
 from tests.tracking.passes import fly, tracked
 
-CASES = [("SOHO", "verified", 20), ("SOHO", "starid", 20), ("XTE", "verified", 6), ("XTE", "starid", 6)]
+CASES = [
+    ("SOHO", "verified", 20),
+    ("SOHO", "starid", 20),
+    ("XTE", "verified", 6),
+    ("XTE", "starid", 6),
+]
 COMPARED_EVERY = 3
 
 
 @pytest.mark.torture
 @pytest.mark.parametrize(("name", "identifier", "share"), CASES)
-def test_flips_and_gaps_leave_nothing_wrong(
-    name, identifier, share, sky, tmp_path, seed, figures
-):
+def test_flips_and_gaps_leave_nothing_wrong(name, identifier, share, sky, tmp_path, seed, figures):
     batches = scale.size(10_000) // len(CASES)
     mission = tracked(load_missions()[name]).model_copy(update={"identifier": identifier})
-    app = open_app(
-        Settings(database=f"sqlite:///{tmp_path / 'a.db'}", replay_processes=0), mission
-    )
+    app = open_app(Settings(database=f"sqlite:///{tmp_path / 'a.db'}", replay_processes=0), mission)
     flips = {batches // 3, batches * 2 // 3}
     # The second flip takes its time; after the longest gap nothing is left to predict from.
     gaps = {batches // 6: 5000.0, batches // 2: 600.0, batches * 5 // 6: 120.0}
