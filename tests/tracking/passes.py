@@ -59,7 +59,7 @@ class Flown:
         return faults
 
 
-def fly(mission, sky, batches, seed, *, flips=(), gaps=None, most=5, cadence_s=30.0, rates=False):
+def fly(mission, sky, batches, seed, *, flips=(), gaps=None, most=5, cadence_s=30.0, dense=False):
     """Batches of a pass: before those of `flips` the body has rolled by half a turn.
 
     `gaps` are seconds of silence before batches by their numbers.
@@ -67,8 +67,8 @@ def fly(mission, sky, batches, seed, *, flips=(), gaps=None, most=5, cadence_s=3
     rng = np.random.default_rng(seed)
     orbit, time = orbit_of(mission), START
     rate = rng.normal(0.0, WALK_RAD_S1_5 * np.sqrt(cadence_s / (1 - STAY**2)), 3)
-    attitude = _first(mission, rng)
     run_sky = real_sky(sky.catalog, mission.catalog, sky.run_catalog(mission, START))
+    attitude = _first(mission, run_sky.run.direction if dense else None, rng)
     for k in range(batches):
         passed_s = (gaps or {}).get(k, cadence_s) if k else 0.0
         time = shifted(time, passed_s)
@@ -108,17 +108,24 @@ def fly(mission, sky, batches, seed, *, flips=(), gaps=None, most=5, cadence_s=3
                 for each in seen
             ],
         }
-        if rates:
-            body["body_rates_deg_per_s"] = np.degrees(rate).tolist()
         ids = run_sky.run.star_id
         stars = [[None if row < 0 else ids[row] for row in each.star] for each in seen]
         yield Flown(body, attitude, stars, rate)
         rate = STAY * rate + rng.normal(0.0, WALK_RAD_S1_5 * np.sqrt(cadence_s), 3)
 
 
-def _first(mission, rng):
+def _first(mission, stars, rng):
+    """Anywhere, in a band with its pole on the Sun; if given, where it has most of `stars`."""
     if isinstance(mission.zone, Band):
-        # Beside the Sun, as a real one: nothing is told of its roll.
         pole = sun_direction(START, None)
-        return pointed(mission.axis_body, pole, rng.uniform(0.0, 2 * np.pi))
+        if stars is None:
+            return pointed(mission.axis_body, pole, rng.uniform(0.0, 2 * np.pi))
+        rolls = np.arange(0.0, 2 * np.pi, np.radians(1.0))
+        attitudes = [pointed(mission.axis_body, pole, roll) for roll in rolls]
+        tracker = mission.trackers[0]
+        seen = [
+            (stars @ (tracker.boresight_body @ each) > tracker.least_cosine).sum()
+            for each in attitudes
+        ]
+        return attitudes[int(np.argmax(seen))]
     return pointed(mission.axis_body, random_axis(rng), rng.uniform(0.0, 2 * np.pi))

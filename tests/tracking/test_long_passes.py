@@ -2,15 +2,17 @@
 
 import json
 
+import numpy as np
 import pytest
 from msgspec.structs import replace
 
 from service.acquire import acquire
 from service.app.factory import open_app
-from service.missions.mission import load_missions
+from service.missions.mission import Band, load_missions
 from service.observations.batch import QuaternionPrior
 from service.observations.schema import OptionsIn
 from service.settings import Settings
+from service.simulate.motion import turned_by
 from service.storage.queries.recorded_batch import recorded_batch
 from service.vectors import quaternion_from_matrix
 from tests import scale
@@ -18,17 +20,20 @@ from tests.tracking.conftest import send
 from tests.tracking.passes import fly, tracked
 
 CASES = [
-    ("SOHO", "verified", 20),
-    ("SOHO", "starid", 20),
-    ("XTE", "verified", 6),
-    ("XTE", "starid", 6),
+    ("SOHO", "verified", False, 20),
+    # The pairs of one dense field are many beside those of the whole band.
+    ("SOHO", "starid", True, 15),
+    ("XTE", "verified", False, 6),
+    ("XTE", "starid", False, 6),
 ]
 COMPARED_EVERY = 3
 
 
 @pytest.mark.torture
-@pytest.mark.parametrize(("name", "identifier", "share"), CASES)
-def test_flips_and_gaps_leave_nothing_wrong(name, identifier, share, sky, tmp_path, seed, figures):
+@pytest.mark.parametrize(("name", "identifier", "dense", "share"), CASES)
+def test_flips_and_gaps_leave_nothing_wrong(
+    name, identifier, dense, share, sky, tmp_path, seed, rng, figures
+):
     batches = scale.size(10_000) // len(CASES)
     mission = tracked(load_missions()[name]).model_copy(update={"identifier": identifier})
     app = open_app(Settings(database=f"sqlite:///{tmp_path / 'a.db'}", replay_processes=0), mission)
@@ -40,14 +45,25 @@ def test_flips_and_gaps_leave_nothing_wrong(name, identifier, share, sky, tmp_pa
     ambiguous = [0, 0]
     states = []
     try:
-        for k, flown in enumerate(fly(mission, sky, batches, seed, flips=flips, gaps=gaps)):
+        for k, flown in enumerate(
+            fly(
+                mission,
+                sky,
+                batches,
+                seed,
+                flips=flips,
+                gaps=gaps,
+                dense=dense,
+                most=3 if dense else 5,
+            )
+        ):
             answer = send(app, flown.body)
             assert flown.wrong(answer) == []
             states.append(answer["tracking"]["state"])
             if k in flips:
                 assert states[-1] != "tracking"
             if states[-1] == "tracking" and k % COMPARED_EVERY == 0:
-                given = _by_default(app, answer["id"], flown, mission, sky)
+                given = _by_default(app, answer["id"], flown, mission, sky, rng)
                 pairs += answer["observations"][0]["zone"]["pairs"]
                 default += given.trackers[0].pairs
                 ambiguous[0] += answer["counts"]["ambiguous"]
@@ -70,14 +86,18 @@ def test_flips_and_gaps_leave_nothing_wrong(name, identifier, share, sky, tmp_pa
         ambiguous_by_default=ambiguous[1],
     )
     assert pairs * share <= default
-    assert 2 * ambiguous[0] <= ambiguous[1]
+    # Of few batches there may be one by chance.
+    assert 2 * ambiguous[0] <= ambiguous[1] + 2
     # Beside the beginning, the flips and the gaps.
     assert states.count("tracking") >= 0.97 * (batches - 8)
 
 
-def _by_default(app, id, flown, mission, sky):
-    """The acquisition of a batch in the mission's own zone about the true attitude."""
+def _by_default(app, id, flown, mission, sky, rng):
+    """The acquisition of a batch in the mission's own zone; in a band with any other roll."""
     with app.store.reading() as connection:
         batch, _ = recorded_batch(connection, id)
-    prior = QuaternionPrior(quaternion_from_matrix(flown.attitude))
+    attitude = flown.attitude
+    if isinstance(mission.zone, Band):
+        attitude = turned_by(attitude, rng.uniform(0.0, 2 * np.pi) * mission.axis_body)
+    prior = QuaternionPrior(quaternion_from_matrix(attitude))
     return acquire(replace(batch, a_priori=prior, tracking=None), mission, sky)
