@@ -14,9 +14,14 @@ from service.missions.mission import (
     Tolerances,
     rules_of,
 )
-from service.observations.batch import BoresightPrior, ObservationBatch
+from service.observations.batch import BoresightPrior, ObservationBatch, PredictedPrior
 from service.sky.ephemeris import observer_velocity
 from service.vectors import Vector
+
+TURNED_BY_NOISE_DEG = 3.0
+"""How far noise turns the direction of a close pair."""
+TURNED_IN_MARGINS = 2.0
+"""An attitude that is farther from its prediction is not used (`search.contradicts`)."""
 
 
 class Choices(Struct, frozen=True, eq=False, gc=False):
@@ -41,8 +46,9 @@ class Choices(Struct, frozen=True, eq=False, gc=False):
 def choices_of(batch: ObservationBatch, mission: Mission) -> Choices:
     """The settings that hold for a batch.
 
-    A test that cannot be made is off: the pole test in a cap, and tests that
-    compare with the presumed roll where an a priori boresight leaves it open.
+    A test that cannot be made is off: the pole test in a cap, which a predicted attitude
+    has in bands too, and tests that compare with the presumed roll where an a priori
+    boresight leaves it open.  About a prediction the cross product test is stricter.
     """
     options = batch.options
     grid_deg = options.zone_grid_deg
@@ -56,18 +62,26 @@ def choices_of(batch: ObservationBatch, mission: Mission) -> Choices:
 
 def _rules(batch: ObservationBatch, mission: Mission) -> Rules:
     options, roll_open = batch.options, isinstance(batch.a_priori, BoresightPrior)
-    if not (options.tests or options.tolerances):
+    predicted = batch.a_priori if isinstance(batch.a_priori, PredictedPrior) else None
+    if not (options.tests or options.tolerances or predicted):
         return mission.rules_without_roll if roll_open else mission.rules
     tests = {**options.tests, **dict.fromkeys(impossible_tests(batch, mission), False)}
+    tolerances = options.tolerances
+    if predicted is not None:
+        # The roll is known as well as the rest: a pair can have turned by little.
+        most_deg = TURNED_BY_NOISE_DEG + TURNED_IN_MARGINS * predicted.margin_deg
+        own_deg = min(most_deg, mission.tolerances.cross_product_deg)
+        tolerances = {"cross_product_deg": own_deg} | tolerances
     return rules_of(
-        mission.tolerances.model_copy(update=options.tolerances),
+        mission.tolerances.model_copy(update=tolerances),
         mission.tests.model_copy(update=tests),
     )
 
 
 def impossible_tests(batch: ObservationBatch, mission: Mission) -> tuple[str, ...]:
     """The tests that a batch's a priori knowledge, or its mission's zone, does not allow."""
-    pole = () if isinstance(mission.zone, Band) else ("pole",)
+    in_band = isinstance(mission.zone, Band) and not isinstance(batch.a_priori, PredictedPrior)
+    pole = () if in_band else ("pole",)
     return pole + (TESTS_OF_ROLL if isinstance(batch.a_priori, BoresightPrior) else ())
 
 

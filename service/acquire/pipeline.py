@@ -9,6 +9,7 @@ from service import __version__
 from service.acquire.choices import aberration_velocity, choices_of
 from service.acquire.result import (
     Acquisition,
+    Path,
     Provenance,
     outcome_counts,
     tracker_results,
@@ -22,8 +23,10 @@ from service.acquire.warnings import (
     warnings_of_attitude,
     warnings_of_batch,
     warnings_of_trackers,
+    warnings_of_tracking,
 )
 from service.attitude.solution import AttitudeSolution, NoAttitude
+from service.errors import BadBatch, Fault, shown_value
 from service.identify.budget import WorkBudget
 from service.identify.prior_attitude import prior_attitude
 from service.missions.mission import Mission
@@ -41,6 +44,9 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: SkyModel) -> Acquisi
     the mission: a tracker that it has not, a kind of a priori knowledge that its
     zone cannot use.
     """
+    if batch.tracking is not None and not batch.tracking.resolved:
+        told = "last needs the record of a service, which predicts the attitude from it"
+        raise BadBatch(Fault("a_priori.from", told, shown_value("last")))
     choices = choices_of(batch, mission)
     corrected = correct(batch, mission)
     given = batch.a_priori
@@ -60,6 +66,7 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: SkyModel) -> Acquisi
     solved = found.refusal if in_zones is None else in_zones.solved
     solution = solved if isinstance(solved, AttitudeSolution) else None
     warnings = found.warnings + warnings_of_batch(batch, mission)
+    warnings += warnings_of_tracking(batch, mission, solution, prior, found.path is Path.ZONE)
     if in_zones is None:
         trackers = unmatched_results(corrected)
     else:

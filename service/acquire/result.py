@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
+from typing import Literal
 
 from msgspec import Struct
 
@@ -22,6 +23,8 @@ from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.zones import SearchRegion, Zone, counts_within
 from service.vectors import Vector
 
+TrackingState = Literal["acquiring", "tracking", "lost"]
+"""Of a batch: found in the whole sky, found about a prediction, or no good attitude."""
 _COUNTED = [
     (int(each), each.word) for each in (Outcome.UNIQUE, Outcome.AMBIGUOUS, Outcome.UNMATCHED)
 ]
@@ -104,6 +107,15 @@ class Acquisition(Struct, frozen=True, eq=False, gc=False):
     warnings: tuple[str, ...]
     timings_us: Mapping[str, int]
     provenance: Provenance
+
+    @property
+    def tracking_state(self) -> TrackingState | None:
+        """The state that a batch that asks for the last attitude leaves its spacecraft in."""
+        if self.batch.tracking is None:
+            return None
+        if self.solution is None or self.solution.suspect:
+            return "lost"
+        return "tracking" if self.path is Path.ZONE else "acquiring"
 
 
 def tracker_results(

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from service.acquire.choices import Choices
 from service.acquire.result import Path
-from service.acquire.warnings import WORK_BOUND_HIT
+from service.acquire.warnings import PREDICTION_CONTRADICTED, WORK_BOUND_HIT
 from service.attitude.solution import AttitudeSolution, NoAttitude
 from service.identify.attitude_from_matches import attitude_of
 from service.identify.budget import WorkBudget
@@ -27,7 +27,16 @@ from service.observations.calibrate import CorrectedObservations
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.model import SkyModel
 from service.sky.zones import SearchRegion, Zone
-from service.vectors import Vector, quaternion_from_matrix, read_only
+from service.vectors import (
+    Matrix,
+    Vector,
+    attitude_error_arcsec,
+    quaternion_from_matrix,
+    read_only,
+)
+
+CONTRADICTED_CHI_SQUARE = 30.0
+"""Of chi-square with three degrees of freedom: a right prediction passes it in 1e-6."""
 
 
 class ZoneResult(Struct, frozen=True, eq=False, gc=False):
@@ -119,7 +128,14 @@ class Search:
             budget = self.budget.share(3, 4)
             path, in_zones = Path.ZONE, self.find_about(corrected, prior, budget)
             warnings += prior.warnings
-            if self._falls_back(corrected, in_zones):
+            falls_back = self._falls_back(corrected, in_zones)
+            if contradicts(in_zones, prior):
+                # The stars that were named stand or fall with the attitude.
+                in_zones, refusal = None, NoAttitude.FEWER_THAN_THREE_STARS
+                falls_back = _whole_sky_can_tell(corrected)
+                explained = tuple(np.zeros(len(each.sigma_rad), bool) for each in corrected)
+                warnings.append(PREDICTION_CONTRADICTED)
+            if falls_back:
                 path = Path.ZONE_THEN_LOST_IN_SPACE
         if path is not Path.ZONE:
             found = find_attitude(
@@ -133,13 +149,8 @@ class Search:
             self.timer.end("identify")
             refusal, explained = found.refusal, found.explained
             if found.attitude is not None:
-                quaternion = QuaternionPrior(read_only(quaternion_from_matrix(found.attitude)))
                 again = self.find_about(
-                    found.corrected,
-                    prior_attitude(
-                        quaternion, self.batch.time, self.mission, self.batch.position_km
-                    ),
-                    self.budget,
+                    found.corrected, self._presumed(found.attitude), self.budget
                 )
                 warnings_found = found.warnings
                 if not isinstance(again.solved, AttitudeSolution):
@@ -152,7 +163,8 @@ class Search:
                 # The zone's result stands unless the whole sky gives a better one.
                 if in_zones is None or again.good:
                     in_zones = again
-                    warnings = [*again.prior.warnings, *warnings_found]
+                    contradicted = [each for each in warnings if each == PREDICTION_CONTRADICTED]
+                    warnings = [*again.prior.warnings, *contradicted, *warnings_found]
             elif in_zones is not None:
                 warnings.append(f"lost_in_space_refused: {refusal}")
             if found.bounded:
@@ -161,6 +173,14 @@ class Search:
             explained = tuple(each.explained for each in in_zones.identifications)
         assert explained is not None
         return SearchResult(path, in_zones, refusal, warnings, explained)
+
+    def _presumed(self, attitude: Matrix) -> PriorAttitude:
+        """The attitude that the whole sky gave, to search about as about the a priori one."""
+        prior = QuaternionPrior(read_only(quaternion_from_matrix(attitude)))
+        if self.prior is not None and self.prior.predicted is not None:
+            # The tests of the batch are those of a cap.
+            prior = replace(self.prior.predicted, quaternion=prior.quaternion)
+        return prior_attitude(prior, self.batch.time, self.mission, self.batch.position_km)
 
     def _with_found_stars(self, found: FoundAttitude, in_zones: ZoneResult) -> ZoneResult:
         """The result in zones with the stars of the whole sky in place of those of the zones."""
@@ -271,10 +291,27 @@ class Search:
         )
 
     def _falls_back(self, corrected: Sequence[CorrectedObservations], in_zones: ZoneResult) -> bool:
-        """Whether the result about the a priori attitude is so poor that the sky is searched."""
-        return (
-            not in_zones.good
-            and IDENTIFIERS[self.choices.identifier].falls_back
-            and self.mission.lost_in_space_fallback
-            and any(len(each.magnitude_mag) >= FEWEST_POINTS for each in corrected)
-        )
+        """Whether the result about the a priori attitude is so poor that the sky is searched.
+
+        A prediction may fail at any time: its batch is without other knowledge then.
+        """
+        identifier = IDENTIFIERS[self.choices.identifier]
+        is_allowed = identifier.falls_back and self.mission.lost_in_space_fallback
+        if in_zones.prior.predicted is not None:
+            is_allowed = identifier.searches_zone
+        return not in_zones.good and is_allowed and _whole_sky_can_tell(corrected)
+
+
+def contradicts(in_zones: ZoneResult, prior: PriorAttitude) -> bool:
+    """Whether an attitude that was found about a prediction cannot be the predicted one."""
+    predicted, solved = prior.predicted, in_zones.solved
+    if predicted is None or not isinstance(solved, AttitudeSolution):
+        return False
+    apart_arcsec = attitude_error_arcsec(solved.matrix, prior.attitude)
+    covariance_arcsec2 = predicted.covariance_arcsec2 + solved.covariance_arcsec2
+    weighted = float(apart_arcsec @ np.linalg.solve(covariance_arcsec2, apart_arcsec))
+    return weighted > CONTRADICTED_CHI_SQUARE
+
+
+def _whole_sky_can_tell(corrected: Sequence[CorrectedObservations]) -> bool:
+    return any(len(each.magnitude_mag) >= FEWEST_POINTS for each in corrected)

@@ -12,10 +12,23 @@ from service.identify.prior_attitude import PriorAttitude
 from service.identify.voting.starid import MAX_RIVALS
 from service.missions.mission import Band, Mission
 from service.observations.batch import ObservationBatch
-from service.vectors import Matrix, separation_deg
+from service.vectors import Matrix, attitude_error_arcsec, separation_deg, unit_of
 
 WORK_BOUND_HIT = "work_bound_hit"
 """The code of the warning that a search ended at its bound on the work."""
+
+PREDICTION_CONTRADICTED = (
+    "prediction_contradicted: the attitude found about the predicted one lies too far from it "
+    "and is not used"
+)
+NO_PREDICTION = {
+    "no_good_attitude": "no good attitude was recorded in the time before",
+    "too_uncertain": "the attitude may have changed too much since the last good one",
+    "flip": "the mission declares a flip since the last good attitude",
+}
+NEAR_AXIS_COS = 0.9998
+FLIP_DEG = 5.0
+"""A turn by more about the zone's axis is called one of the roll."""
 
 
 def warnings_of_batch(batch: ObservationBatch, mission: Mission) -> list[str]:
@@ -56,6 +69,34 @@ def warnings_of_attitude(
             f"{off_deg:.1f} deg from where the a priori knowledge has it"
         )
     return warnings
+
+
+def warnings_of_tracking(
+    batch: ObservationBatch,
+    mission: Mission,
+    solution: AttitudeSolution | None,
+    prior: PriorAttitude | None,
+    is_in_zone: bool,
+) -> list[str]:
+    """Warnings that nothing was predicted, or that the prediction did not hold."""
+    tracking = batch.tracking
+    if tracking is not None and tracking.reason is not None:
+        return [f"not_tracked: {NO_PREDICTION[tracking.reason]}"]
+    if prior is None or prior.predicted is None or is_in_zone:
+        return []
+    if solution is None or solution.suspect:
+        return ["prediction_failed: no good attitude was found about the predicted one"]
+    apart = attitude_error_arcsec(solution.matrix, prior.attitude) / 3600.0
+    angle_deg = float(np.linalg.norm(apart))
+    axis = unit_of(apart) if angle_deg > 0.0 else apart
+    is_roll = abs(float(axis @ mission.axis_body)) > NEAR_AXIS_COS and angle_deg > FLIP_DEG
+    x, y, z = axis.tolist()
+    how = "rolled" if is_roll else "turned"
+    warning = (
+        f"prediction_failed: the attitude is {how} by {angle_deg:.3f} deg from the predicted one, "
+        f"about ({x:.3f}, {y:.3f}, {z:.3f})"
+    )
+    return [warning]
 
 
 def warning_of_rival(rival: RivalAttitude) -> str:

@@ -12,12 +12,20 @@ from service.imaging.overlay import draw_overlay
 from service.imaging.overlay_marks import marks_of
 from service.imaging.submit import FrameIn
 from service.missions.mission import Mission, mission_named
-from service.observations.schema import Submission, submission_from_json
+from service.observations.schema import FromLastIn, Submission, submission_from_json
 from service.storage.queries.results import answer_from_json, frame_of_result
 from service.storage.recording.unsaved_result import Answered
+from service.times import utc_now
 
 FRAME_WAIT_S = 30.0
 """The longest time that a frame waits for a thread: other frames may take seconds."""
+
+
+def _asks_for_last(known: FrameIn, mission: Mission) -> bool:
+    """Whether the batch of a frame may ask for the last attitude."""
+    prior, settings = known.a_priori, mission.tracking
+    is_default = settings is not None and settings.default
+    return isinstance(prior, FromLastIn) or (prior is None and is_default)
 
 
 class Frames:
@@ -64,6 +72,7 @@ class Frames:
                 Future(),
                 is_long=True,
                 wait_s=FRAME_WAIT_S,
+                tracked_ns=utc_now().tai_ns if _asks_for_last(known, mission) else None,
             ).result()
 
     def overlay(self, id: str) -> bytes:

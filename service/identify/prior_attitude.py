@@ -11,7 +11,13 @@ from msgspec import Struct
 from service.attitude.quaternions import to_matrix
 from service.errors import BadBatch, Fault, shown_value
 from service.missions.mission import Band, Cap, Mission, Tracker
-from service.observations.batch import APriori, BoresightPrior, QuaternionPrior, SunPointedPrior
+from service.observations.batch import (
+    APriori,
+    BoresightPrior,
+    PredictedPrior,
+    QuaternionPrior,
+    SunPointedPrior,
+)
 from service.sky.ephemeris import ecliptic_north, sun_direction
 from service.sky.zones import SearchRegion
 from service.times import Utc
@@ -39,6 +45,8 @@ class PriorAttitude(Struct, frozen=True, eq=False, gc=False):
     known_axis: Vector | None
     growth_deg: float = 0.0
     warnings: tuple[str, ...] = ()
+    predicted: PredictedPrior | None = None
+    """What the attitude was predicted with, if it was: its zones are caps about each boresight."""
 
 
 def prior_attitude(
@@ -52,6 +60,8 @@ def prior_attitude(
         attitude = np.empty((3, 3))
         to_matrix(prior.quaternion, attitude)
         axis = np.dot(mission.axis_body, attitude)
+        if isinstance(prior, PredictedPrior):
+            return PriorAttitude(attitude, axis, True, None, predicted=prior)
         if not isinstance(mission.zone, Band):
             return PriorAttitude(attitude, axis, True, None)
         warnings = _pole_warnings(axis, time, position_km)
@@ -135,10 +145,15 @@ def search_region(
     """The region in which the stars of a tracker are searched for.
 
     In a cap, about the tracker's own presumed boresight; in a band, at the
-    boresight's coelevation from the pole.  Raises `BadBatch` for a tracker
+    boresight's coelevation from the pole.  About a predicted attitude it is the field of
+    view with a margin, in bands too.  Raises `BadBatch` for a tracker
     whose boresight an a priori direction with unknown roll does not tell.
     """
     zone = mission.zone
+    if presumed.predicted is not None:
+        axis = np.dot(tracker.boresight_body, presumed.attitude)
+        most_deg = tracker.field_of_view_radius_deg + presumed.predicted.margin_deg
+        return SearchRegion("cap", axis, 0.0, min(180.0, most_deg))
     if isinstance(zone, Band):
         coelevation_deg = tracker.coelevation_deg or zone.coelevation_deg
         half_width_deg = zone.half_width_deg + presumed.growth_deg

@@ -12,13 +12,15 @@ from service.errors import AcquisitionError, Busy
 from service.gyro.block import GyroBlock
 from service.ingest.gyro import GyroIntake
 from service.ingest.local_workers import ChunkEndsWorkers, LocalWorkers, WorkerConfig, WorkerLost
+from service.ingest.outcomes import Answers
 from service.ingest.solver_pool import Solver
-from service.ingest.submit import Answers, SubmissionService
+from service.ingest.submit import SubmissionService
 from service.ingest.telemetry_lines import (
     InvalidLine,
     LineResult,
     RecordedLine,
     TelemetryLines,
+    TrackedLine,
     identity_in,
     line_results,
 )
@@ -34,6 +36,9 @@ PENDING_A_WORKER = 2
 LineAnswer = Answered | Recorded | AcquisitionError
 """To a line: of a batch the answer, of a gyro block its row, or what is wrong with it."""
 
+Decided = UnsavedResult | GyroBlock | TrackedLine | Answered | AcquisitionError
+"""Of a line before it is recorded."""
+
 Check = Callable[[str], None]
 """Raises an `AcquisitionError` where batches of a spacecraft are not to be taken."""
 
@@ -43,7 +48,9 @@ Require = Callable[[], object]
 
 def solve_lines(solver: Solver, lines: TelemetryLines) -> list[LineResult]:
     """The results of some lines, computed in a worker."""
-    return line_results(lines, lambda fresh: [solver.solve_one_of_many(each) for each in fresh])
+    return line_results(
+        lines, lambda fresh: [solver.solve_one_of_many(each) for each in fresh], solver.tracks
+    )
 
 
 INTERACTIVE_WINDOW_S = 0.5
@@ -130,7 +137,17 @@ class Bulk:
                 made.append(self.solve_here(each))
             return made
 
-        return line_results(lines, unsaved_results)
+        tracks = self._submissions.solver.tracks
+        return line_results(lines, unsaved_results, tracks)
+
+    def submit_tracked(self, line: TrackedLine) -> Answered | AcquisitionError:
+        """Record a line that asks for the last attitude, when all before it are recorded."""
+        self._submissions.yield_to_interactive()
+        return self._submissions.submit_tracked(submission_from_json(line.text))
+
+    def tracks(self, submission: Submission) -> bool:
+        """Whether a line asks for the last attitude."""
+        return self._submissions.solver.tracks(submission.batch)
 
     def solve_here(self, submission: Submission) -> UnsavedResult | AcquisitionError:
         """The result of one line, computed when no single post waits."""
@@ -193,9 +210,15 @@ class BulkChunk:
             if isinstance(each, UnsavedResult)
             else self._recorded(place)
             if isinstance(each, GyroBlock)
+            else self._tracked(each)
+            if isinstance(each, TrackedLine)
             else each
             for place, each in enumerate(self._decided)
         ]
+
+    def _tracked(self, line: TrackedLine) -> LineAnswer:
+        self._require()
+        return self._bulk.submit_tracked(line)
 
     def _recorded(self, place: int) -> LineAnswer:
         try:
@@ -206,7 +229,7 @@ class BulkChunk:
             return error
 
     @cached_property
-    def _decided(self) -> list[UnsavedResult | GyroBlock | Answered | AcquisitionError]:
+    def _decided(self) -> list[Decided]:
         try:
             found = self._computed.result()
         except ChunkEndsWorkers as error:
@@ -220,9 +243,7 @@ class BulkChunk:
             self._decision(text, each) for text, each in zip(self._lines.texts, found, strict=True)
         ]
 
-    def _decision(
-        self, text: bytes, found: LineResult
-    ) -> UnsavedResult | GyroBlock | Answered | AcquisitionError:
+    def _decision(self, text: bytes, found: LineResult) -> Decided:
         try:
             if isinstance(found, GyroBlock):
                 self._check(found.spacecraft)
@@ -231,7 +252,7 @@ class BulkChunk:
                 if found.spacecraft is not None:
                     self._check(found.spacecraft)
                 return found.error
-            if isinstance(found, UnsavedResult):
+            if isinstance(found, UnsavedResult | TrackedLine):
                 self._check(found.identity[0])
                 return found
             self._check(found.identity[0])
@@ -244,11 +265,14 @@ class BulkChunk:
 
     def _repeat(
         self, text: bytes, seen: RecordedLine
-    ) -> UnsavedResult | Answered | AcquisitionError:
+    ) -> UnsavedResult | TrackedLine | Answered | AcquisitionError:
         first = self._registry.first(seen.identity, None, seen.fingerprint)
         if first is None:
             # It is not called what it seemed to be called.
-            return self._bulk.solve_here(submission_from_json(text, run=self._lines.run))
+            submission = submission_from_json(text, run=self._lines.run)
+            if self._bulk.tracks(submission):
+                return TrackedLine(seen.identity, submission.text)
+            return self._bulk.solve_here(submission)
         answer = self._stored[first.result_id]
         if isinstance(answer, AcquisitionError):
             # The archive may be out of reach for long: the other lines do not wait for it.

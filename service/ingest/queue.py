@@ -22,6 +22,7 @@ from queue import Empty, SimpleQueue
 
 from service.errors import Busy, Stopping
 from service.ingest.solver_pool import WAIT_S, SolverPool, SolverTask
+from service.ingest.turns import Turns
 from service.observations.schema import Submission
 from service.storage.recording.identity import Identity, OwnKey
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
@@ -58,6 +59,10 @@ class PendingBatch:
     is_long: bool
     future: "asyncio.Future[Answered] | Future[Answered]" = field(default_factory=Future)
     wait_s: float = WAIT_S
+    track: Hashable | None = None
+    """Batches of one track are computed one after another, each when the last is recorded."""
+    time_ns: int = 0
+    """The order of those of a track that wait together."""
     received: Utc = field(default_factory=utc_now)
     since_s: float = field(default_factory=time.monotonic)
 
@@ -88,6 +93,7 @@ class IngestQueue:
         self._lock = threading.Lock()
         self._in_flight: dict[Identity, list[PendingBatch]] = {}
         """Those that are being computed or recorded, each with its repeats."""
+        self._turns: Turns[PendingBatch] = Turns()
         self._unsettled: dict[PendingBatch, None] = {}
         self._written: list[tuple[PendingBatch, WriteOutcome]] = []
         self._closing = False
@@ -192,6 +198,15 @@ class IngestQueue:
                 repeats.append(pending)
                 return
             self._in_flight[pending.identity] = []
+            track = pending.track
+            if track is not None and not self._turns.enter(track, pending.time_ns, pending):
+                return
+        error = self._start(pending)
+        if error is not None:
+            self._finish([(pending, error)])
+
+    def _start(self, pending: PendingBatch) -> Stopping | None:
+        """Queue a batch for the pool; the error where that takes no more."""
         task = SolverTask(
             partial(self._solve_and_record, pending),
             lambda error: self._finish([(pending, error)]),
@@ -200,7 +215,8 @@ class IngestQueue:
         try:
             self._pool.put(task, pending.turn, is_long=pending.is_long)
         except Stopping as error:
-            self._finish([(pending, error)])
+            return error
+        return None
 
     # ---- a thread of the pool ----------------------------------------------------------------
 
@@ -229,11 +245,20 @@ class IngestQueue:
 
     def _finish(self, outcomes: Sequence[tuple[PendingBatch, WriteOutcome]]) -> None:
         """Answer what was computed; its repeats are looked up, for it may have failed."""
+        done = list(outcomes)
+        # The next of a track may fail to start: then it is done as well.
+        for pending, _ in done:
+            if pending.track is not None:
+                with self._lock:
+                    following = self._turns.leave(pending.track)
+                error = None if following is None else self._start(following)
+                if following is not None and error is not None:
+                    done.append((following, error))
         with self._lock:
-            repeats = [each for p, _ in outcomes for each in self._in_flight.pop(p.identity, ())]
+            repeats = [each for p, _ in done for each in self._in_flight.pop(p.identity, ())]
         for each in repeats:
             self._inbox.put(each)
-        self._settle(outcomes)
+        self._settle(done)
 
     def _settle(self, outcomes: Sequence[tuple[PendingBatch, WriteOutcome]]) -> None:
         by_loop: dict[asyncio.AbstractEventLoop, list[tuple[PendingBatch, WriteOutcome]]] = {}

@@ -19,6 +19,7 @@ from service.errors import (
     Stopping,
     shown_value,
 )
+from service.ingest.tracking import asks_for_last
 from service.missions.mission import Mission, mission_named
 from service.observations.batch import ObservationBatch
 from service.observations.schema import Submission
@@ -51,6 +52,13 @@ class Solver:
         """The acquisition of a batch, with other settings than its mission's where given."""
         mission = mission or mission_in_input(self.missions, batch.spacecraft)
         return acquire(batch, mission, self.sky)
+
+    def tracks(self, batch: ObservationBatch) -> bool:
+        """Whether the attitude of a batch is to be predicted from the record first.
+
+        False for an unknown spacecraft, whose batch is refused.
+        """
+        return asks_for_last(batch, self.missions.get(batch.spacecraft))
 
     def solve(
         self, submission: Submission, received: Utc | None = None, key: OwnKey | None = None

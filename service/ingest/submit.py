@@ -10,15 +10,25 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import msgspec
-from msgspec import Struct
 from sqlalchemy import Connection
 
 from service.access.audit import Entry
 from service.access.tokens import Caller, own_key
 from service.acquire import Acquisition
-from service.errors import AcquisitionError, BadBatch, Busy, Fault, shown_value
+from service.errors import AcquisitionError, Busy
+from service.ingest.outcomes import (
+    Answers,
+    Observer,
+    Recorded,
+    check_key,
+    decided,
+    holder_of,
+    note_handed_over,
+    outcome_of,
+)
 from service.ingest.queue import IngestQueue, PendingBatch, QueueState
 from service.ingest.solver_pool import WAIT_S, Solver, SolverPool, may_take_long
+from service.ingest.tracking import with_prediction
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
 from service.observations.schema import OptionsIn, Submission
@@ -38,33 +48,15 @@ from service.storage.recording.identity import (
 from service.storage.recording.results import record
 from service.storage.recording.unsaved_result import Answered, UnsavedResult, unsaved_what_if
 from service.storage.sql.database import Store
-from service.storage.sql.transaction import WriteOutcomes
 from service.storage.sql.writer import WriterState
 from service.times import utc_now
-
-MAX_KEY_LENGTH = 255
 
 YIELD_S = 0.002
 """The longest wait of each bulk batch for single posts."""
 
 log = logging.getLogger(__name__)
 
-Answers = list[Answered | AcquisitionError]
 AnswerFuture = TypeVar("AnswerFuture", "asyncio.Future[Answered]", "Future[Answered]")
-
-
-class Recorded(Struct, frozen=True, eq=False):
-    """A newly recorded batch, as observers receive it."""
-
-    spacecraft: str
-    run: str
-    batch: str
-    counts: Mapping[str, int]
-    """Its stars: observed, and of them unique, ambiguous and unmatched."""
-    has_attitude: bool
-
-
-Observer = Callable[[Recorded], None]
 
 
 @dataclass(frozen=True)
@@ -106,7 +98,8 @@ class SubmissionService:
         `BadBatch` for a key that cannot be one, and `Busy` where too much is waiting.
         The future raises what else keeps the batch from being recorded.
         """
-        identity = identity_of(submission.batch)
+        batch = submission.batch
+        identity = identity_of(batch)
         if caller is not None:
             caller.require(identity[0])
         return self.submit_made(
@@ -116,7 +109,10 @@ class SubmissionService:
             own_key(caller, idempotency_key),
             caller,
             future,
-            is_long=may_take_long(submission.batch),
+            is_long=may_take_long(batch),
+            tracked_ns=submission.batch.time.tai_ns
+            if self.solver.tracks(submission.batch)
+            else None,
         )
 
     def submit_made(
@@ -130,22 +126,55 @@ class SubmissionService:
         *,
         is_long: bool,
         wait_s: float = WAIT_S,
+        tracked_ns: int | None = None,
     ) -> AnswerFuture:
-        """`submit` of a batch that `make` makes, in the pool, unless it is recorded already."""
+        """`submit` of a batch that `make` makes, in the pool, unless it is recorded already.
+
+        `tracked_ns` is the time of one that asks for the last attitude.
+        """
         if key is not None:
-            _check_key(key)
+            check_key(key)
         turn = (None if caller is None else caller.token_id, identity[0])
         pending = PendingBatch(identity, fingerprint, key, make, turn, is_long, future, wait_s)
+        if tracked_ns is not None:
+            pending.track, pending.time_ns = identity[:2], tracked_ns
         self._single_s = pending.since_s
         self._queue.put(pending)
         return future
 
     def submit_many(self, submissions: Sequence[Submission]) -> Answers:
-        """Record many in one transaction; a refused one has its error in the list."""
+        """Record many in one transaction; a refused one has its error in the list.
+
+        Those that ask for the last attitude follow one by one.
+        """
+        places = [k for k, each in enumerate(submissions) if self.solver.tracks(each.batch)]
+        others = [each for k, each in enumerate(submissions) if k not in places]
+        answers = iter(self._submit_together(others) if others else ())
+        tracked = {k: self.submit_tracked(submissions[k]) for k in places}
+        return [tracked[k] if k in tracked else next(answers) for k in range(len(submissions))]
+
+    def submit_tracked(self, submission: Submission) -> Answered | AcquisitionError:
+        """Record one of many that asks for the last attitude; raises `Busy`."""
+        batch = submission.batch
+        pending = PendingBatch(
+            identity := identity_of(batch),
+            submission.fingerprint,
+            None,
+            lambda: submission,
+            "bulk",
+            is_long=True,
+            track=identity[:2],
+            time_ns=batch.time.tai_ns,
+        )
+        self._queue.put(pending)
+        (outcome,) = decided([outcome_of(pending.future)])
+        return outcome
+
+    def _submit_together(self, submissions: Sequence[Submission]) -> Answers:
         with self._store.reading() as connection:
             registry = look_up(connection, {identity_of(each.batch) for each in submissions})
             holders = [
-                _holder(registry, identity_of(each.batch), None, each.fingerprint)
+                holder_of(registry, identity_of(each.batch), None, each.fingerprint)
                 for each in submissions
             ]
             repeats = {each.result_id for each in holders if isinstance(each, ExistingResult)}
@@ -197,8 +226,8 @@ class SubmissionService:
         )
         if entry is not None:
             unsaved.audit = entry.row()
-        _note_handed_over([unsaved])
-        (outcome,) = _decided(self._store.writer.record([unsaved]).result())
+        note_handed_over([unsaved])
+        (outcome,) = decided(self._store.writer.record([unsaved]).result())
         if isinstance(outcome, AcquisitionError):
             raise outcome
         return outcome
@@ -251,14 +280,14 @@ class SubmissionService:
         """Queue many results for a transaction; to call what it gives waits for the answers."""
         if not unsaved_results:
             return list
-        _note_handed_over(unsaved_results)
+        note_handed_over(unsaved_results)
         future = self._store.writer.record(unsaved_results, low_priority=True)
 
         def finish() -> Answers:
             outcomes = future.result()
             for unsaved, outcome in zip(unsaved_results, outcomes, strict=True):
                 self._tell(unsaved, outcome)
-            return _decided(outcomes)
+            return decided(outcomes)
 
         return finish
 
@@ -289,8 +318,13 @@ class SubmissionService:
     # ---- steps of the queue ------------------------------------------------------------------
 
     def _solve(self, pending: PendingBatch) -> UnsavedResult:
-        unsaved = self.solver.solve(pending.make(), pending.received, pending.key)
-        _note_handed_over([unsaved])
+        submission = pending.make()
+        if self.solver.tracks(submission.batch):
+            mission = self.solver.missions[submission.batch.spacecraft]
+            with self._store.reading() as connection:
+                submission = with_prediction(connection, submission, mission)
+        unsaved = self.solver.solve(submission, pending.received, pending.key)
+        note_handed_over([unsaved])
         return unsaved
 
     def _recorded_before(
@@ -305,7 +339,7 @@ class SubmissionService:
                 {each.identity for each in group},
                 {each.key for each in group if each.key is not None},
             )
-        holders = [_holder(registry, e.identity, e.key, e.fingerprint) for e in group]
+        holders = [holder_of(registry, e.identity, e.key, e.fingerprint) for e in group]
         repeats = {each.result_id for each in holders if isinstance(each, ExistingResult)}
         stored: Mapping[str, bytes | AcquisitionError] = {}
         if repeats:
@@ -366,35 +400,3 @@ class SubmissionService:
             except Exception:
                 # The batch is recorded and its answer due, whatever an observer does.
                 log.exception("an observer failed")
-
-
-def _note_handed_over(unsaved_results: Sequence[UnsavedResult]) -> None:
-    moment_ns = time.perf_counter_ns()
-    for unsaved in unsaved_results:
-        unsaved.handed_over_ns = moment_ns
-
-
-def _decided(outcomes: WriteOutcomes) -> Answers:
-    answers: Answers = []
-    for outcome in outcomes:
-        # Neither is an answer to the batch: both say that nothing was decided about it.
-        if isinstance(outcome, Busy) or not isinstance(outcome, Answered | AcquisitionError):
-            raise outcome
-        answers.append(outcome)
-    return answers
-
-
-def _holder(
-    registry: Registry, identity: Identity, key: OwnKey | None, fingerprint: str
-) -> ExistingResult | AcquisitionError | None:
-    try:
-        return registry.first(identity, key, fingerprint)
-    except AcquisitionError as error:
-        return error
-
-
-def _check_key(own: OwnKey) -> None:
-    _, key = own
-    if not (0 < len(key) <= MAX_KEY_LENGTH and key.isascii() and key.isprintable()):
-        message = f"must be 1 to {MAX_KEY_LENGTH} printable ASCII characters"
-        raise BadBatch(Fault("Idempotency-Key", message, shown_value(key)))

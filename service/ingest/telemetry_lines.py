@@ -12,6 +12,7 @@ import msgspec
 from service.errors import AcquisitionError
 from service.gyro.block import GyroBlock
 from service.gyro.schema import block_from_line, is_gyro_line
+from service.observations.batch import ObservationBatch
 from service.observations.schema import Submission, submission_from_json
 from service.storage.recording.identity import Identity, identity_of
 from service.storage.recording.unsaved_result import UnsavedResult
@@ -42,17 +43,35 @@ class InvalidLine:
     error: AcquisitionError
 
 
-LineResult = UnsavedResult | RecordedLine | InvalidLine | GyroBlock
+@dataclass(frozen=True)
+class TrackedLine:
+    """A batch that asks for the last attitude, as JSON: only the record has it."""
+
+    identity: Identity
+    text: str
+
+
+LineResult = UnsavedResult | RecordedLine | InvalidLine | GyroBlock | TrackedLine
 ComputeMany = Callable[[Sequence[Submission]], Sequence[UnsavedResult | AcquisitionError]]
 
 
-def line_results(lines: TelemetryLines, compute: ComputeMany) -> list[LineResult]:
-    """The result of each line, in order; `compute` is given all new submissions."""
+def line_results(
+    lines: TelemetryLines, compute: ComputeMany, tracks: Callable[[ObservationBatch], bool]
+) -> list[LineResult]:
+    """The result of each line, in order; `compute` is given all new submissions.
+
+    Except those that `tracks` says ask for the last attitude.
+    """
     read = [_read(text, lines.run) for text in lines.texts]
+    tracked = {
+        place
+        for place, each in enumerate(read)
+        if isinstance(each, Submission) and place not in lines.known and tracks(each.batch)
+    }
     fresh = [
         each
         for place, each in enumerate(read)
-        if isinstance(each, Submission) and place not in lines.known
+        if isinstance(each, Submission) and place not in lines.known | tracked
     ]
     computed = iter(compute(fresh))
     found: list[LineResult] = []
@@ -61,6 +80,8 @@ def line_results(lines: TelemetryLines, compute: ComputeMany) -> list[LineResult
             found.append(each)
         elif place in lines.known:
             found.append(RecordedLine(identity_of(each.batch), each.fingerprint))
+        elif place in tracked:
+            found.append(TrackedLine(identity_of(each.batch), each.text))
         else:
             match next(computed):
                 case AcquisitionError() as error:

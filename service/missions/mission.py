@@ -32,7 +32,8 @@ from service.missions.identifiers import IDENTIFIERS
 from service.missions.keys import allowed_keys, dotted_key
 from service.missions.packets import Packets
 from service.missions.product_settings import DEFAULT_PRODUCTS, ProductSettings, beside
-from service.missions.strict import Strict
+from service.missions.strict import Strict, is_missing
+from service.missions.tracking import TrackingSettings
 from service.vectors import Matrix, Vector, read_only, unit
 
 SHIPPED_FOLDER = Path(__file__).parent
@@ -236,10 +237,6 @@ class Tracker(Strict):
         return read_only(self.body_from_tracker[:, 2].copy())
 
 
-def _is_missing(table: object) -> bool:
-    return table is None
-
-
 class Mission(Strict):
     """All that is fixed for a mission."""
 
@@ -255,11 +252,12 @@ class Mission(Strict):
     catalog: RunCatalogSettings
     trackers: tuple[Tracker, ...] = Field(min_length=1, max_length=16)
     products: ProductSettings = Field(default=DEFAULT_PRODUCTS, exclude_if=DEFAULT_PRODUCTS.__eq__)
-    packets: Packets | None = Field(default=None, exclude_if=_is_missing)
+    packets: Packets | None = Field(default=None, exclude_if=is_missing)
     """Which parameters of space packets fill a batch; missing, it is no part of the digest."""
-    gyro: GyroSettings | None = Field(default=None, exclude_if=_is_missing)
-    motion: MotionSettings | None = Field(default=None, exclude_if=_is_missing)
+    gyro: GyroSettings | None = Field(default=None, exclude_if=is_missing)
+    motion: MotionSettings | None = Field(default=None, exclude_if=is_missing)
     """How the body moves while there is no gyro; missing: as `MotionSettings` has it."""
+    tracking: TrackingSettings | None = Field(default=None, exclude_if=is_missing)
 
     @field_validator("trackers")
     @classmethod

@@ -17,3 +17,8 @@ class Strict(BaseModel):
         for name in vars(copied).keys() - type(self).model_fields.keys():
             del vars(copied)[name]
         return copied
+
+
+def is_missing(table: object) -> bool:
+    """Whether a table was left out of the file: then it is no part of the mission's digest."""
+    return table is None

@@ -6,7 +6,7 @@ from msgspec import Struct
 
 from service.missions.mission import Identifier, SolverName
 from service.times import Utc
-from service.vectors import Vector
+from service.vectors import Matrix, Vector
 
 MAX_STARS_PER_TRACKER = 250
 MAX_TRACKERS = 16
@@ -18,6 +18,31 @@ class QuaternionPrior(Struct, frozen=True, eq=False):
     """An a priori attitude: inertial to body, scalar last, of norm one."""
 
     quaternion: Vector
+
+
+class PredictedPrior(QuaternionPrior, frozen=True, eq=False):
+    """An attitude that was predicted, with its covariance (3, 3) about the body axes.
+
+    `margin_deg` is how far its zones reach beyond the fields of view.
+    """
+
+    covariance_arcsec2: Matrix
+    margin_deg: float
+
+
+class Tracking(Struct, frozen=True, eq=False):
+    """Of a batch that asks for the last attitude: what was predicted from, or why nothing was.
+
+    Without `result` and `reason` nothing was looked up yet.  The prediction itself is
+    the batch's `a_priori`.
+    """
+
+    by_default: bool
+    result: str | None = None
+    age_s: float | None = None
+    rate: str | None = None
+    reason: str | None = None
+    resolved: bool = False
 
 
 class BoresightPrior(Struct, frozen=True):
@@ -75,7 +100,8 @@ class TrackerStars(Struct, frozen=True, eq=False):
 class ObservationBatch(Struct, frozen=True, eq=False):
     """One batch: who, when, the a priori attitude, and the stars of each tracker.
 
-    Without `a_priori` it is lost in space.
+    Without `a_priori` it is lost in space.  `tracking` is there where it asks for the last
+    attitude.
     Body rates are of the body relative to inertial, in body axes.  Velocity and
     position are geocentric, EME2000, None where they were not given.
     """
@@ -91,3 +117,4 @@ class ObservationBatch(Struct, frozen=True, eq=False):
     observations: tuple[TrackerStars, ...]
     options: Options
     position_km: Vector | None = None
+    tracking: Tracking | None = None

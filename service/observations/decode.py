@@ -18,9 +18,11 @@ from service.observations.batch import (
     BoresightPrior,
     ObservationBatch,
     Options,
+    PredictedPrior,
     QuaternionPrior,
     SunPointedPrior,
     TrackerStars,
+    Tracking,
 )
 from service.times import parse_utc
 from service.vectors import Vector, read_only, unit_of
@@ -60,6 +62,18 @@ class SentDirection(_SentPart):
     dec_deg: float
 
 
+class SentPrediction(_SentPart):
+    """The prediction that a batch was recorded with."""
+
+    quaternion: tuple[float, float, float, float] | None = None
+    covariance_arcsec2: tuple[Triple, Triple, Triple] | None = None
+    margin_deg: float = _ABSENT
+    result: str | None = None
+    age_s: float | None = None
+    rate: str | None = None
+    reason: str | None = None
+
+
 class SentPrior(_SentPart):
     """A priori knowledge of one kind, the others left out."""
 
@@ -69,6 +83,9 @@ class SentPrior(_SentPart):
     sun_vector: Triple | None = None
     position_km: Triple | None = None
     frame: str = "EME2000"
+    from_: str | None = msgspec.field(default=None, name="from")
+    by_default: bool = False
+    prediction: SentPrediction | None = None
 
 
 class SentOptions(_SentPart):
@@ -124,27 +141,53 @@ def batch_from_canonical(text: str) -> ObservationBatch:
             zone_grid_deg=chosen.zone_grid_deg,
         ),
         position_km=_optional_array(told.position_km),
+        tracking=None if prior is None or prior.from_ is None else _tracking_of(prior),
     )
 
 
-def prior_from_canonical(text: str) -> APriori:
+def prior_from_canonical(text: str) -> APriori | None:
     """A priori knowledge by itself, from a text that `wire` made."""
     return _prior_of(_PRIOR.decode(text), None, None)
 
 
-def _prior_of(prior: SentPrior, sun_vector: Triple | None, position_km: Triple | None) -> APriori:
-    """The a priori knowledge as the core takes it; the Sun's direction may stand beside it too."""
+def _prior_of(
+    prior: SentPrior, sun_vector: Triple | None, position_km: Triple | None
+) -> APriori | None:
+    """The a priori knowledge as the core takes it; the Sun's direction may stand beside it too.
+
+    None where nothing could be predicted from the last attitude.
+    """
+    if prior.from_ is not None:
+        told = prior.prediction
+        if told is None or told.quaternion is None:
+            return None
+        return PredictedPrior(
+            _quaternion(told.quaternion), _array(told.covariance_arcsec2), told.margin_deg
+        )
     if prior.quaternion is not None:
-        # By plain numbers: numpy takes as long for four as for a thousand.
-        q1, q2, q3, qc = prior.quaternion
-        norm = math.sqrt(q1 * q1 + q2 * q2 + q3 * q3 + qc * qc)
-        return QuaternionPrior(_array((q1 / norm, q2 / norm, q3 / norm, qc / norm)))
+        return QuaternionPrior(_quaternion(prior.quaternion))
     if prior.boresight is not None:
         return BoresightPrior(prior.boresight.ra_deg, prior.boresight.dec_deg)
     sun = prior.sun_vector or sun_vector
     return SunPointedPrior(
         None if sun is None else read_only(unit_of(np.array(sun))),
         _optional_array(prior.position_km or position_km),
+    )
+
+
+def _quaternion(components: tuple[float, float, float, float]) -> Vector:
+    # By plain numbers: numpy takes as long for four as for a thousand.
+    q1, q2, q3, qc = components
+    norm = math.sqrt(q1 * q1 + q2 * q2 + q3 * q3 + qc * qc)
+    return _array((q1 / norm, q2 / norm, q3 / norm, qc / norm))
+
+
+def _tracking_of(prior: SentPrior) -> Tracking:
+    told = prior.prediction
+    if told is None:
+        return Tracking(prior.by_default)
+    return Tracking(
+        prior.by_default, told.result, told.age_s, told.rate, told.reason, resolved=True
     )
 
 

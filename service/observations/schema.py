@@ -33,6 +33,7 @@ from service.observations.batch import (
 )
 from service.observations.decode import batch_from_canonical, prior_from_canonical
 from service.observations.frame_record import FrameRecord
+from service.observations.prediction import PredictionIn
 from service.times import parse_utc
 
 NORM_TOLERANCE = 1e-3
@@ -137,6 +138,16 @@ class SunPointedIn(Wire):
     frame: ReferenceFrame = "EME2000"
 
 
+class FromLastIn(Wire):
+    """The attitude predicted from the last good one of the spacecraft and the run."""
+
+    model_config = ConfigDict(serialize_by_alias=True)
+    from_: Annotated[Literal["last"], Field(alias="from")]
+    by_default: bool = False
+    """The mission asks for it; the batch was sent with null.  The service adds this."""
+    prediction: PredictionIn | None = None
+
+
 class TestsIn(Wire):
     """Tests switched on or off."""
 
@@ -186,19 +197,26 @@ def _named(model: Wire) -> dict[str, Any]:
     return {name: value for name, value in values if value is not None}
 
 
+_KINDS = {each: each for each in ("quaternion", "boresight", "sun_pointed")} | {"from_last": "from"}
+"""The kinds of a priori knowledge, and the field that tells each."""
+
+
 def _kind_of_prior(value: Any) -> str | None:
+    if isinstance(value, FromLastIn):
+        return "from_last"
     keys = value if isinstance(value, dict) else getattr(value, "model_fields_set", ())
-    return next((kind for kind in ("quaternion", "boresight", "sun_pointed") if kind in keys), None)
+    return next((kind for kind, key in _KINDS.items() if key in keys), None)
 
 
 APrioriIn = Annotated[
     Annotated[QuaternionIn, Tag("quaternion")]
     | Annotated[BoresightIn, Tag("boresight")]
-    | Annotated[SunPointedIn, Tag("sun_pointed")],
+    | Annotated[SunPointedIn, Tag("sun_pointed")]
+    | Annotated[FromLastIn, Tag("from_last")],
     Discriminator(
         _kind_of_prior,
         custom_error_type="a_priori_kind",
-        custom_error_message="must hold one of quaternion, boresight, sun_pointed, or be null",
+        custom_error_message="must hold quaternion, boresight, sun_pointed or from, or be null",
     ),
 ]
 
@@ -234,16 +252,19 @@ class BatchIn(Wire):
 
 
 def prior_of(prior: APrioriIn) -> APriori:
-    """The a priori knowledge as the core takes it."""
-    return prior_from_canonical(prior.model_dump_json(exclude_defaults=True))
+    """A priori knowledge without a batch, as the core takes it; raises `BadBatch`."""
+    known = prior_from_canonical(prior.model_dump_json(exclude_defaults=True))
+    if known is None:
+        raise BadBatch(Fault("a_priori.from", "is for batches alone", shown_value("last")))
+    return known
 
 
 class Checked(Struct, frozen=True):
     """A batch that passed every check of its form.
 
     `text` is its canonical JSON, defaults left out: what is recorded and run
-    again.  `fingerprint` is the digest of that text, so that white space and
-    the order of keys do not make another body.
+    again.  `fingerprint` is the digest of that text as it was sent, without what the
+    service added, so that white space and the order of keys do not make another body.
     """
 
     text: str
@@ -277,8 +298,23 @@ def checked_from_json(body: bytes | str, run: str | None = None) -> Checked:
 
 def checked_from_model(model: BatchIn) -> Checked:
     """What a model stands for that is already checked."""
-    text = model.model_dump_json(exclude_defaults=True)
-    return Checked(text, hashlib.sha256(text.encode()).hexdigest())
+    text, prior = model.model_dump_json(exclude_defaults=True), model.a_priori
+    sent = text
+    if isinstance(prior, FromLastIn) and (prior.prediction or prior.by_default):
+        as_sent = None if prior.by_default else FromLastIn.model_validate({"from": "last"})
+        sent_model = model.model_copy(update={"a_priori": as_sent})
+        sent = sent_model.model_dump_json(exclude_defaults=True)
+    return Checked(text, hashlib.sha256(sent.encode()).hexdigest())
+
+
+def fingerprint_of(input: str) -> str:
+    """The fingerprint of a recorded batch that was not made of a frame."""
+    if _PREDICTED in input:
+        return checked_from_json(input).fingerprint
+    return hashlib.sha256(input.encode()).hexdigest()
+
+
+_PREDICTED = '"from":"last"'
 
 
 def submission_from_json(body: bytes | str, run: str | None = None) -> Submission:
@@ -324,7 +360,7 @@ def faults_of(error: ValidationError, prefix: tuple[str, ...] = ()) -> list[Faul
 
 
 def _field(location: tuple[str | int, ...]) -> str:
-    tags = ("quaternion", "boresight", "sun_pointed")
+    tags = tuple(_KINDS)
     parts = [
         # A client's own key may be of any length.
         str(part)[:MAX_NAME_SHOWN]

@@ -120,7 +120,8 @@ async def _replay(
                     while window and window[0].done():
                         report(await window.popleft())
                     await asyncio.sleep(min(wait_s, 0.5))
-                if len(window) >= concurrency:
+                # What asks for the last attitude waits for the answers before it.
+                while len(window) >= (1 if _is_tracked(item) else concurrency):
                     report(await window.popleft())
                 if carrier is not None:
                     item = carrier.prepared(item)
@@ -131,6 +132,10 @@ async def _replay(
             for task in window:
                 task.cancel()
             await asyncio.gather(*window, return_exceptions=True)
+
+
+def _is_tracked(item: Item) -> bool:
+    return item.submission is not None and item.submission.batch.tracking is not None
 
 
 async def _require_service(client: AsyncClient, url: str) -> None:

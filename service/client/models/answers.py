@@ -174,6 +174,26 @@ class FrameWithStars(FrameSummary, frozen=True, kw_only=True):
     hot_or_cosmic_px: Sequence[Sequence[float]]
 
 
+class Prediction(Model, frozen=True, kw_only=True):
+    """The attitude that was predicted for a batch, and the result that it came from."""
+
+    quaternion: Sequence[float]
+    covariance_arcsec2: Sequence[Sequence[float]]
+    margin_deg: float
+    result: str | None
+    age_s: float | None
+    rate: str | None
+
+
+class Tracking(Model, frozen=True, kw_only=True):
+    """What came of asking for the last attitude: `state` is acquiring, tracking or lost."""
+
+    state: str
+    by_default: bool
+    prediction: Prediction | None
+    reason: str | None
+
+
 class Answer(Model, frozen=True, kw_only=True):
     """The answer to a batch.  Without an attitude, `reason` says why there is none.
 
@@ -198,6 +218,7 @@ class Answer(Model, frozen=True, kw_only=True):
     parent: str | None = None
     recorded: bool = True
     frame: FrameSummary | None = None
+    tracking: Tracking | None = None
 
 
 class Summary(Model, frozen=True, kw_only=True):

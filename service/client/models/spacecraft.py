@@ -31,7 +31,8 @@ class AttitudeRow(Model, frozen=True):
 class SpacecraftRow(Model, frozen=True, kw_only=True):
     """The state of a spacecraft in a run.
 
-    `attitude` is that of the latest batch, or None; `last_attitude` may be older.
+    `attitude` is that of the latest batch, or None; `last_attitude` may be older.  `tracking` is
+    acquiring, tracking or lost, None where the latest batch does not ask for the last attitude.
     """
 
     name: str
@@ -40,6 +41,7 @@ class SpacecraftRow(Model, frozen=True, kw_only=True):
     latest_batch: Summary | None
     attitude: AttitudeRow | None
     last_attitude: AttitudeRow | None
+    tracking: str | None
 
 
 class MissionNow(Model, frozen=True):

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from service.errors import BadFile, Fault, shown_value
-from service.observations.schema import BatchIn, BoresightIn, QuaternionIn, SunPointedIn
+from service.observations.schema import BatchIn, BoresightIn, FromLastIn, QuaternionIn, SunPointedIn
 
 KEY = ("spacecraft", "run", "batch")
 REQUIRED = ("spacecraft", "batch", "time", "tracker")
@@ -28,7 +28,7 @@ VECTORS = {
 DIRECTION = ("x", "y", "z")
 STAR_NUMBERS = ("h_deg", "v_deg", "magnitude", "time_offset_s", "sigma_arcsec")
 STAR_COLUMNS = ("tracker", *DIRECTION, *STAR_NUMBERS)
-BATCH_COLUMNS = (*TEXTS, *sum(VECTORS.values(), ()), "sun_pointed", "options")
+BATCH_COLUMNS = (*TEXTS, *sum(VECTORS.values(), ()), "sun_pointed", "a_priori_from", "options")
 COLUMNS = (*BATCH_COLUMNS, *STAR_COLUMNS)
 VERBATIM = (*TEXTS, "tracker")
 """Columns whose cells are taken with their spaces; around other cells spaces do no harm."""
@@ -118,11 +118,15 @@ def batch_fields(row: CsvRow) -> dict[str, Any]:
             raise BadCell("sun_pointed", "must be true, false or empty", sun_pointed)
         if sun_pointed.lower() in ("true", "1"):
             priors.append({"sun_pointed": True})
+    if told := row.get("a_priori_from", ""):
+        if told != "last":
+            raise BadCell("a_priori_from", "must be last or empty", told)
+        priors.append({"from": told})
     if len(priors) > 1:
         kinds = " and ".join(next(iter(prior)) for prior in priors)
         raise BadCell("batch", f"has more than one a priori attitude: {kinds}", row["batch"])
     prior = priors[0] if priors else None
-    if prior is not None and frame is not None:
+    if prior is not None and frame is not None and "from" not in prior:
         prior["frame"] = frame
     fields["a_priori"] = prior
     if options := row.get("options"):
@@ -154,7 +158,10 @@ def batch_cells(batch: BatchIn) -> CsvRow:
     vectors: dict[str, tuple[float, ...] | None] = {
         name: getattr(batch, name, None) for name in VECTORS
     }
-    if prior is not None:
+    if isinstance(prior, FromLastIn):
+        if not prior.by_default:
+            cells["a_priori_from"] = prior.from_
+    elif prior is not None:
         cells["frame"] = prior.frame
     if isinstance(prior, QuaternionIn):
         vectors["quaternion"] = prior.quaternion

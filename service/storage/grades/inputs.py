@@ -53,11 +53,11 @@ def recorded_in(
     attitudes, unusable = usable_attitudes(
         rows[:, 0].astype(np.int64), numbers[:, :4], numbers[:, 4:]
     )
-    gyro_ns, rates = _gyro_in(connection, BlockFilter(spacecraft, run, start, end))
+    gyro_ns, rates = gyro_in(connection, BlockFilter(spacecraft, run, start, end))
     return Recorded(gyro_ns, rates, attitudes, no_directions(), unusable)
 
 
-def _gyro_in(connection: Connection, selected: BlockFilter) -> tuple[Nanoseconds, Vector]:
+def gyro_in(connection: Connection, selected: BlockFilter) -> tuple[Nanoseconds, Vector]:
     """The samples of a period in order of time; those of blocks that interleave are merged."""
     times, rates = [np.zeros(0, np.int64)], [np.zeros((0, 3))]
     query = select(gyro_blocks).where(*selected.conditions()).order_by(gyro_blocks.c.start_ns)

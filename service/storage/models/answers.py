@@ -7,8 +7,10 @@ from msgspec import UNSET, Struct, UnsetType
 from pydantic import BaseModel, Field, GetCoreSchemaHandler, create_model
 from pydantic_core import CoreSchema
 
+from service.acquire.result import TrackingState
 from service.alarms.quantities import QUANTITIES, value_names
 from service.missions.mission import Identifier
+from service.observations.prediction import NoPrediction, RateSource
 from service.observations.schema import BatchIn
 from service.storage.models.base import (
     Count,
@@ -202,6 +204,39 @@ class Provenance(Record, frozen=True, kw_only=True):
     version: str
 
 
+_Rate = Annotated[str, DescribedAs(RateSource)]
+_NoPrediction = Annotated[str, DescribedAs(NoPrediction)]
+
+
+class Prediction(Record, frozen=True, kw_only=True):
+    """The attitude that was predicted for a batch."""
+
+    component: ClassVar[str] = "PredictionOut"
+    quaternion: Quaternion
+    covariance_arcsec2: Annotated[Covariance, doc("Of the rotation about the body axes.")]
+    margin_deg: Annotated[float, doc("How far the zones reach beyond the fields of view.")]
+    result: Annotated[str | None, doc("The result whose attitude it came from.")]
+    age_s: Annotated[float | None, doc("Time since that attitude.")]
+    rate: Annotated[_Rate | None, doc("What told how the body turned since then.")]
+
+
+class Tracking(Record, frozen=True, kw_only=True):
+    """What came of asking for the last attitude."""
+
+    component: ClassVar[str] = "TrackingOut"
+    state: Annotated[
+        str,
+        DescribedAs(TrackingState),
+        doc(
+            "`tracking`: a good attitude was found about the prediction. `acquiring`: one was "
+            "found in the whole sky. `lost`: none was found."
+        ),
+    ]
+    by_default: Annotated[bool, doc("The mission asks for it, not the batch.")]
+    prediction: Prediction | None
+    reason: Annotated[_NoPrediction | None, doc("Why nothing was predicted.")]
+
+
 class Answer(Record, frozen=True, kw_only=True):
     """The answer to a batch, as it is recorded."""
 
@@ -239,6 +274,10 @@ class Answer(Record, frozen=True, kw_only=True):
     recorded: Annotated[bool, doc("For a what-if: whether it was recorded.")] | UnsetType = UNSET
     frame: (
         Annotated[FrameSummary | None, doc("Only for a batch that was made from a frame.")]
+        | UnsetType
+    ) = UNSET
+    tracking: (
+        Annotated[Tracking | None, doc("Only for a batch that asks for the last attitude.")]
         | UnsetType
     ) = UNSET
 
@@ -302,7 +341,10 @@ class Result(Record, frozen=True, kw_only=True):
     input: Annotated[
         dict[str, Any],
         DescribedAs(BatchIn),
-        doc("The batch as it was sent, without default values."),
+        doc(
+            "The batch as it was sent, without default values. The service adds the prediction "
+            "to one that asks for the last attitude."
+        ),
     ]
     options: Annotated[
         MissionSettings,

@@ -2,6 +2,7 @@
 
 from typing import Annotated, ClassVar, Literal
 
+from service.acquire.result import TrackingState
 from service.storage.models.answers import Summary
 from service.storage.models.base import (
     Count,
@@ -62,6 +63,10 @@ class SpacecraftRow(Record, frozen=True, kw_only=True):
     last_attitude: Annotated[
         AttitudeRow | None,
         doc("The latest attitude. It can be older than the latest batch; see its time."),
+    ]
+    tracking: Annotated[
+        Annotated[str, DescribedAs(TrackingState)] | None,
+        doc("State of the latest batch; null if that does not ask for the last attitude."),
     ]
 
 

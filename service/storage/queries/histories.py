@@ -15,6 +15,7 @@ from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import PLACE, ResultFilter, newest
 from service.storage.queries.results import summary_of, summary_query
 from service.storage.queries.with_archive.rows import MOST_OPENED, ArchiveUse, page_of
+from service.storage.recording.tracking import state_in
 from service.storage.sql.rollup_tables import rollups_daily
 from service.storage.sql.tables import batches, mission_uses, missions, results, runs, solutions
 from service.times import DAY_S, Utc, bucket_start
@@ -61,7 +62,13 @@ def live_state(connection: Connection, mission: Mission, run: str, now: Utc) -> 
         latest_batch=None if batch is None else summary_of(batch),
         attitude=last if is_latest else None,
         last_attitude=last,
+        tracking=None if batch is None else _tracking(connection, batch["id"]),
     )
+
+
+def _tracking(connection: Connection, id: str) -> str | None:
+    answer = connection.execute(select(results.c.answer).where(results.c.id == id)).scalar_one()
+    return state_in(answer)
 
 
 def mission_history(connection: Connection, spacecraft: str) -> list[MissionThen]:

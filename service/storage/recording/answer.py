@@ -10,11 +10,13 @@ from msgspec import UNSET, UnsetType
 from service.acquire import Acquisition
 from service.acquire.result import RivalAttitude, TrackerResult
 from service.identify.identification import Outcome
+from service.observations.batch import PredictedPrior
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.zones import SearchRegion
 from service.storage.models.answers import (
     Answer,
     Attitude,
+    Prediction,
     Provenance,
     Rival,
     SearchedZone,
@@ -24,6 +26,7 @@ from service.storage.models.answers import (
     Timings,
     TrackerFit,
     TrackerStars,
+    Tracking,
 )
 from service.storage.models.frames import FrameSummary
 from service.vectors import ra_dec_of
@@ -87,6 +90,7 @@ def answer_of(
         parent=parent,
         recorded=recorded,
         frame=frame,
+        tracking=_tracking(acquisition),
     )
 
 
@@ -219,6 +223,26 @@ def _attitude(acquisition: Acquisition) -> Attitude | None:
         else UNSET,
         outlier=next((fit.tracker for fit in several if fit.outlier), None) if several else UNSET,
         rival=UNSET if rival is None else _rival(rival, acquisition.run_catalog),
+    )
+
+
+def _tracking(acquisition: Acquisition) -> Tracking | UnsetType:
+    asked, state = acquisition.batch.tracking, acquisition.tracking_state
+    if asked is None or state is None:
+        return UNSET
+    predicted = acquisition.batch.a_priori
+    prediction = None
+    if isinstance(predicted, PredictedPrior):
+        prediction = Prediction(
+            quaternion=predicted.quaternion.tolist(),
+            covariance_arcsec2=predicted.covariance_arcsec2.tolist(),
+            margin_deg=predicted.margin_deg,
+            result=asked.result,
+            age_s=asked.age_s,
+            rate=asked.rate,
+        )
+    return Tracking(
+        state=state, by_default=asked.by_default, prediction=prediction, reason=asked.reason
     )
 
 

@@ -19,7 +19,9 @@ from service.storage.sql.statements import insert_all
 from service.storage.sql.tables import event_counter, events
 from service.times import Utc, utc_now
 
-EventKind = Literal["batches", "adopted", "alarm", "limit", "annotation", "replay", "gyro"]
+EventKind = Literal[
+    "batches", "adopted", "alarm", "limit", "annotation", "replay", "gyro", "tracking"
+]
 EVENT_KINDS: tuple[EventKind, ...] = get_args(EventKind)
 KEPT = 20_000
 """Events that are kept; a client that missed more starts anew."""

@@ -17,6 +17,7 @@ from service.storage.recording.identity import (
     require_not_archived,
     stored_answers,
 )
+from service.storage.recording.tracking import note_states
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.sql.access_tables import audit
 from service.storage.sql.columns import Row
@@ -220,6 +221,7 @@ def _note_events(connection: Connection, fresh: Sequence[UnsavedResult]) -> None
         note: Row = {"spacecraft": spacecraft, "run": run, "batches": len(unsaved_results)}
         note["latest"] = newest
         events.add_event(connection, "batches", note, run=run, spacecraft=spacecraft)
+        note_states(connection, spacecraft, run, unsaved_results)
 
 
 def _insert_results(

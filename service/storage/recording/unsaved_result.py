@@ -83,6 +83,9 @@ class UnsavedResult(Struct, eq=False):
     audit: Row | None = None
     """The entry of the audit list that is stored with a recorded what-if."""
 
+    tracking: str | None = None
+    """The state that the batch leaves its spacecraft in; None: it asks for no last attitude."""
+
     def __reduce__(self) -> tuple[type["UnsavedResult"], tuple[Any, ...]]:
         # To another process without what stands first, the settings of its mission: they are many.
         return UnsavedResult, (None, *structs.astuple(self)[1:])
@@ -147,7 +150,7 @@ def unsaved_submission(
         acquisition, answer, batch_id=id, parent=None, current=True, created=received
     )
     unsaved = _unsaved_result(acquisition, answer, row, result, key, received)
-    unsaved.is_ahead = is_ahead
+    unsaved.is_ahead, unsaved.tracking = is_ahead, acquisition.tracking_state
     if submission.frame is not None:
         unsaved.frame = _frame_row(submission.frame, id)
     return unsaved

@@ -4,7 +4,6 @@ Batches are read a few at a time, each time as of one moment, so that it can be
 done while the database is being served.
 """
 
-import hashlib
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,7 +16,7 @@ from sqlalchemy.exc import DatabaseError
 
 from service.errors import BadInput
 from service.observations.batch import ObservationBatch
-from service.observations.schema import submission_from_json
+from service.observations.schema import fingerprint_of, submission_from_json
 from service.storage.queries.tracker_splits import is_waiting
 from service.storage.recording import rollups
 from service.storage.sql.columns import Row
@@ -186,10 +185,9 @@ def _of_a_batch(batch: Row, made: Sequence[Row], frame: Row | None) -> Iterator[
     if current != 1:
         yield f"{name}: {current} of its results are current, not one"
     # The fingerprint of a batch made of a frame is that of the frame and of what was told with it.
-    is_own = hashlib.sha256(batch["input"].encode()).hexdigest() == batch["fingerprint"]
-    if frame is None and not is_own:
-        yield f"{name}: its input is not the one that was fingerprinted"
     try:
+        if frame is None and fingerprint_of(batch["input"]) != batch["fingerprint"]:
+            yield f"{name}: its input is not the one that was fingerprinted"
         read = submission_from_json(batch["input"]).batch
     except BadInput as error:
         yield f"{name}: its input cannot be read: {error}"

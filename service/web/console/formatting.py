@@ -36,6 +36,9 @@ STATES: Mapping[str, tuple[str, str]] = {
     "interrupted": ("‖", "interrupted"),
     "cancelled": ("‖", "cancelled"),
     "failed": ("✕", "failed"),
+    "acquiring": ("▲", "acquiring"),
+    "tracking": ("●", "tracking"),
+    "lost": ("✕", "lost"),
 }
 """Shape and word of every state there is."""
 

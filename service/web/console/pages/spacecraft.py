@@ -158,7 +158,7 @@ def spacecraft_page(
     name: Annotated[str, Path()], query: Annotated[SpacecraftQuery, InQuery()], context: ContextDep
 ) -> Response:
     """Trends of one spacecraft in a run, its worst batches, and its latest ones."""
-    state = context.app.spacecraft.state(name)
+    state = context.app.spacecraft.state(name, query.run)
     latest = context.app.results.page(spacecraft=name, run=query.run, limit=LATEST).items
     stretch = shown_period(context, name, query, latest)
     trackers = limited_trackers(context.app.missions[name])
@@ -171,6 +171,7 @@ def spacecraft_page(
         name=name,
         description=state.description,
         latest=latest,
+        tracking=state.tracking,
         attitude=_attitude(context, latest),
         stretch=stretch,
         ranges=list(RANGES_S),

@@ -1,0 +1,164 @@
+"""The prediction of a batch that asks for the last attitude, from what is recorded.
+
+It becomes a part of the recorded batch: whatever is recorded later, the batch explains its answer.
+"""
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+from msgspec import structs
+from sqlalchemy import Connection
+
+from service.errors import BadInput
+from service.filtering.prediction import (
+    Known,
+    Rate,
+    derived_rate,
+    given_rate,
+    predict_at_rate,
+    predict_by_gyro,
+    unknown_rate,
+)
+from service.grades.models import believed, gyro_samples
+from service.missions.gyro import MotionSettings
+from service.missions.mission import Mission
+from service.missions.tracking import TrackingSettings
+from service.observations.batch import ObservationBatch
+from service.observations.prediction import NoPrediction, RateSource
+from service.observations.schema import Submission, submission_from_json
+from service.storage.grades.inputs import gyro_in
+from service.storage.grades.last_attitudes import RecordedAttitude, last_attitudes
+from service.storage.gyro.blocks import BlockFilter
+from service.times import shifted
+from service.vectors import ARCSEC_PER_RADIAN
+
+MARGIN_SIGMAS = 3.0
+"""A zone reaches beyond the field of view by so many sigmas of the prediction."""
+LARGEST_SIGMAS = 5.0
+"""Two attitudes tell no rate that is more than so many sigmas of the mission's."""
+SAMPLES_BEFORE_S = 60.0
+"""Gyro samples are read from so long before the attitude: one of them begins the first step."""
+
+
+def asks_for_last(batch: ObservationBatch, mission: Mission | None) -> bool:
+    """Whether the attitude of a batch is to be predicted from the record."""
+    if batch.tracking is not None:
+        return not batch.tracking.resolved
+    is_default = mission is not None and mission.tracking is not None and mission.tracking.default
+    return is_default and batch.a_priori is None
+
+
+def with_prediction(connection: Connection, submission: Submission, mission: Mission) -> Submission:
+    """The submission with the prediction in its batch, or the reason why there is none.
+
+    The fingerprint stays that of what was sent.
+    """
+    batch = submission.batch
+    told: dict[str, Any] = {"from": "last"}
+    if batch.tracking is None:
+        told["by_default"] = True
+    told["prediction"] = _prediction(connection, batch, mission)
+    body = json.loads(submission.text) | {"a_priori": told}
+    made = submission_from_json(json.dumps(body))
+    return structs.replace(submission, batch=made.batch, text=made.text)
+
+
+def _prediction(
+    connection: Connection, batch: ObservationBatch, mission: Mission
+) -> dict[str, Any]:
+    settings = mission.tracking or TrackingSettings()
+    attitudes = last_attitudes(
+        connection, batch.spacecraft, batch.run, batch.time, settings.max_age_s
+    )
+    if not attitudes:
+        return _nothing("no_good_attitude")
+    last = attitudes[0]
+    if any(flip.lies_between(last.time, batch.time) for flip in settings.flips):
+        return _nothing("flip")
+    before = attitudes[1] if len(attitudes) > 1 else None
+    if before and any(flip.lies_between(before.time, last.time) for flip in settings.flips):
+        before = None
+    predicted, source = _predicted(connection, batch, mission, last, before)
+    floor_rad = math.radians(settings.floor_deg) / MARGIN_SIGMAS
+    covariance_rad2 = predicted.covariance_rad2 + np.eye(3) * floor_rad**2
+    sigma_deg = math.degrees(math.sqrt(float(np.linalg.eigvalsh(covariance_rad2)[-1])))
+    if sigma_deg > settings.ceiling_deg:
+        return _nothing("too_uncertain")
+    return {
+        "quaternion": predicted.quaternion.tolist(),
+        "covariance_arcsec2": (covariance_rad2 * ARCSEC_PER_RADIAN**2).tolist(),
+        "margin_deg": min(MARGIN_SIGMAS * sigma_deg, settings.ceiling_deg),
+        "result": last.result,
+        "age_s": (batch.time.tai_ns - last.known.tai_ns) * 1e-9,
+        "rate": source,
+    }
+
+
+def _nothing(reason: NoPrediction) -> dict[str, Any]:
+    return {"reason": reason}
+
+
+def _predicted(
+    connection: Connection,
+    batch: ObservationBatch,
+    mission: Mission,
+    last: RecordedAttitude,
+    before: RecordedAttitude | None,
+) -> tuple[Known, RateSource]:
+    """The attitude at the batch's time: by the gyro where it is recorded, else at a rate."""
+    now_ns = batch.time.tai_ns
+    motion = mission.motion or MotionSettings()
+    by_gyro = _by_gyro(connection, batch, mission, last, motion)
+    if by_gyro is not None:
+        return by_gyro, "gyro"
+    rate, source = _rate(batch, mission, last, before, motion)
+    return predict_at_rate(last.known, now_ns, rate, motion.rate_walk_rad_s1_5), source
+
+
+def _rate(
+    batch: ObservationBatch,
+    mission: Mission,
+    last: RecordedAttitude,
+    before: RecordedAttitude | None,
+    motion: MotionSettings,
+) -> tuple[Rate, RateSource]:
+    passed_s = (batch.time.tai_ns - last.known.tai_ns) * 1e-9
+    both = (last.body_rates_deg_per_s, batch.body_rates_deg_per_s)
+    # Zero is what a batch has that tells nothing of its rates.
+    given = [np.radians(each) for each in both if each.any()]
+    if given:
+        settings = mission.tracking or TrackingSettings()
+        sigma = math.radians(settings.body_rate_sigma_deg_per_s)
+        return given_rate(given, sigma, passed_s), "body_rates"
+    if before is not None and before.known.tai_ns < last.known.tai_ns:
+        derived = derived_rate(before.known, last.known, passed_s)
+        # Between them there may have been a manoeuvre, such as a flip of the roll.
+        if np.abs(derived.rad_s).max() <= LARGEST_SIGMAS * motion.rate_sigma_rad_s:
+            return derived, "attitudes"
+    return unknown_rate(motion.rate_sigma_rad_s, passed_s), "unknown"
+
+
+def _by_gyro(
+    connection: Connection,
+    batch: ObservationBatch,
+    mission: Mission,
+    last: RecordedAttitude,
+    motion: MotionSettings,
+) -> Known | None:
+    if mission.gyro is None:
+        return None
+    start = shifted(last.time, -SAMPLES_BEFORE_S)
+    # The end of a filter is excluded.
+    end = shifted(batch.time, 1e-6)
+    selected = BlockFilter(batch.spacecraft, batch.run, start, end)
+    tai_ns, rates = gyro_in(connection, selected)
+    if len(tai_ns) < 2 or not believed(mission.gyro, rates).all():
+        return None
+    try:
+        model, samples = gyro_samples(mission.gyro, tai_ns, rates)
+    except BadInput:
+        return None
+    walk = motion.rate_walk_rad_s1_5
+    return predict_by_gyro(last.known, batch.time.tai_ns, model, samples, walk)
