@@ -23,7 +23,7 @@ from service.missions.product_settings import (
     MIN_NAIF_ID,
     OBJECT_ID,
 )
-from service.products.rotations import rotation_vectors
+from service.attitude.rotations import rotation_vectors
 from service.vectors import Vector
 
 Integers = npt.NDArray[np.int64]

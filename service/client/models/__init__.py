@@ -36,6 +36,7 @@ from .replays import (
 from .spacecraft import (
     AttitudeRow,
     History,
+    Innovation,
     MissionNow,
     MissionThen,
     RankedBatch,
@@ -64,6 +65,7 @@ __all__ = [
     "GyroBlock",
     "GyroSamples",
     "History",
+    "Innovation",
     "LineProblem",
     "MissionNow",
     "MissionThen",

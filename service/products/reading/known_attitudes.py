@@ -8,7 +8,7 @@ import numpy as np
 from service.errors import BadFile, Fault
 from service.products.attitudes import SAME_MOMENT_NS, Integers
 from service.products.reading.spans import in_order
-from service.products.rotations import rotation_vectors, turned_quaternion
+from service.attitude.rotations import rotation_vectors, turned_quaternion
 from service.vectors import Vector
 
 MOST_RECORDS = 5_000_000
