@@ -18,7 +18,6 @@ from service.filtering.result import AttitudeHistory, FilterResult, Integers
 from service.filtering.samples import AttitudeMeasurements
 from service.filtering.state import Outcome
 from service.filtering.updates import ATTITUDE
-from service.attitude.rotations import rotation_vectors
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
 UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])

@@ -25,6 +25,8 @@ from service.web.console.formatting import level
 
 BOUND = 3.0
 """Sigmas to either side."""
+WIDEST = 2.0
+"""Usual bounds, that a chart of bounds reaches to."""
 
 
 def grade_charts(found: GradesOfPeriod, axis: TimeAxis) -> list[GradeChart]:
@@ -146,8 +148,8 @@ def bounded_chart(
 ) -> GradeChart:
     """Values (m, 3) of measurements as dots, with three sigmas to either side as a band.
 
-    The scale is that of the band and of the values that were used: others, which may be far
-    beyond, are marked at the edge.
+    The scale is that of the usual band and of the values that were used: others, which may be
+    far beyond, are marked at the edge, and after a gap the band reaches beyond it.
     """
     used = met.is_used
     joins = joined_moments(met.tai_ns, axis, PARTS, np.arange(len(used)) > 0)
@@ -155,7 +157,8 @@ def bounded_chart(
     for k, name in enumerate(AXES):
         value, bound = value_arcsec[:, k], BOUND * sigma_arcsec[:, k]
         known = used & np.isfinite(value) & np.isfinite(bound)
-        largest = float(np.max(np.append(np.abs(value[known]), bound[known]), initial=0.0)) or 1.0
+        most = WIDEST * _median(bound[known])
+        largest = min(most, _largest(np.append(np.abs(value[known]), bound[known]))) or 1.0
         scale = Scale(-largest, largest)
         dots = Values(met.tai_ns[used], value[used]).trace("raw", axis, scale)
         beyond = int(np.count_nonzero(np.abs(value[known]) > bound[known]))
@@ -233,6 +236,10 @@ def _lines(
         rows.append((name, low, high))
         panels.append(GradePanel(name, tuple(traces), "", "", (), f"{low} to {high}"))
     return GradeChart(id, title, tuple(panels), ("axis", "least", "greatest"), tuple(rows))
+
+
+def _largest(values: Vector) -> float:
+    return float(np.max(values, initial=0.0))
 
 
 def _median(values: Vector) -> float:
