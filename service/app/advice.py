@@ -7,12 +7,15 @@ from collections.abc import Callable
 from functools import partial
 
 from service.advice.advice import WorkLimit, advise
+from service.advice.innovation_statements import innovation_findings
+from service.advice.innovations import innovation_noise
 from service.app.advice_record import advice_record
 from service.app.context import Context
 from service.app.submissions import Submissions
 from service.errors import Busy
 from service.missions.mission import mission_named
 from service.observations.schema import TolerancesIn
+from service.storage.grades.period import gyro_innovations
 from service.storage.models.advice import Advice
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
@@ -57,9 +60,9 @@ class AdviceService:
             raise Busy("the service is computing other advice", ADVICE_RETRY_S)
         try:
             with self._context.reading() as connection:
-                drawn = sample_batches(
-                    connection, ResultFilter(run or LIVE, name, start, end), sample
-                )
+                selected = ResultFilter(run or LIVE, name, start, end)
+                drawn = sample_batches(connection, selected, sample)
+                met = gyro_innovations(connection, selected)
             began = time.monotonic()
             pace = WorkLimit(lambda share: time.monotonic() - began < share * limit_s, step)
             # Without the search of the whole sky, which would hide faults of the settings.
@@ -67,4 +70,5 @@ class AdviceService:
             findings = advise(mission, drawn.batches, run_again, own, pace)
         finally:
             self._lock.release()
-        return advice_record(name, run or LIVE, drawn, findings)
+        noise = innovation_findings(innovation_noise(met), mission, findings.noise)
+        return advice_record(name, run or LIVE, drawn, findings, noise)

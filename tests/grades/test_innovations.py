@@ -9,8 +9,11 @@ from service.filtering.samples import AttitudeMeasurements
 from service.filtering.state import Outcome
 from service.grades.innovations import MeasuredInnovations
 from service.grades.packing import packed, unpacked_innovations
+from service.storage.grades.period import gyro_innovations
+from service.storage.queries.pages import ResultFilter
+from service.times import shifted
 from tests.filtering.simulated import ARCSEC, attitudes_of, gyro_of, slews, truth_of
-from tests.grades.passes import GYRO, MODEL, NOON_NS, graded, mission_with, recorded_of
+from tests.grades.passes import GYRO, MODEL, NOON, NOON_NS, graded, mission_with, recorded_of
 from tests.grades.records import put_pass
 
 SIGMAS = (6.0, 6.0, 40.0)
@@ -107,9 +110,6 @@ def test_pages_of_innovations_give_each_once_in_order_of_time(app, half_hour):
 
 
 def half_start(minutes):
-    from service.times import shifted
-    from tests.grades.passes import NOON
-
     return shifted(NOON, 60.0 * minutes)
 
 
@@ -125,3 +125,17 @@ def test_no_measurement_makes_no_innovation():
         np.zeros((0, 3)),
     )
     assert len(unpacked_innovations(packed(empty), 0)) == 0
+
+
+def test_the_innovations_of_a_period_come_from_the_record(app, half_hour):
+    put_pass(app, half_hour[1])
+    app.grades.smooth("XTE")
+    with app.context.reading() as connection:
+        whole = gyro_innovations(connection, ResultFilter("live", "XTE"))
+        part = gyro_innovations(
+            connection, ResultFilter("live", "XTE", half_start(10), half_start(20))
+        )
+        none = gyro_innovations(connection, ResultFilter("none", "XTE"))
+    assert [len(each) for each in whole] == [226]
+    assert [len(each) for each in part] == [75]
+    assert none == []

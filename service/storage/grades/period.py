@@ -89,6 +89,14 @@ def grades_of_period(
     )
 
 
+def gyro_innovations(connection: Connection, selected: ResultFilter) -> list[MeasuredInnovations]:
+    """The innovations of stretches with a gyro, the latest blocks of a period, in order of time."""
+    blocks = [each for each in _blocks(connection, selected, INNOVATIONS) if each.model == "gyro"]
+    rows = _packed(connection, INNOVATIONS, blocks[-MOST_BLOCKS:])
+    found = [unpacked_innovations(row.packed, row.samples) for row in rows]
+    return [each.taken(inside(each, selected)) for each in found]
+
+
 def _blocks(connection: Connection, selected: ResultFilter, kind: str) -> list[_Block]:
     """The blocks of a period without their samples, in order of time."""
     c = graded_blocks.c
