@@ -15,7 +15,7 @@ from service.app.submissions import Submissions
 from service.errors import Busy
 from service.missions.mission import mission_named
 from service.observations.schema import TolerancesIn
-from service.storage.grades.period import gyro_innovations
+from service.storage.grades.period import latest_innovations
 from service.storage.models.advice import Advice
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
@@ -62,7 +62,7 @@ class AdviceService:
             with self._context.reading() as connection:
                 selected = ResultFilter(run or LIVE, name, start, end)
                 drawn = sample_batches(connection, selected, sample)
-                met = gyro_innovations(connection, selected)
+                met = latest_innovations(connection, selected, of_gyro=True)
             began = time.monotonic()
             pace = WorkLimit(lambda share: time.monotonic() - began < share * limit_s, step)
             # Without the search of the whole sky, which would hide faults of the settings.

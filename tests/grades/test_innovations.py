@@ -9,7 +9,7 @@ from service.filtering.samples import AttitudeMeasurements
 from service.filtering.state import Outcome
 from service.grades.innovations import MeasuredInnovations
 from service.grades.packing import packed, unpacked_innovations
-from service.storage.grades.period import gyro_innovations
+from service.storage.grades.period import latest_innovations
 from service.storage.queries.pages import ResultFilter
 from service.times import shifted
 from tests.filtering.simulated import ARCSEC, attitudes_of, gyro_of, slews, truth_of
@@ -131,11 +131,11 @@ def test_the_innovations_of_a_period_come_from_the_record(app, half_hour):
     put_pass(app, half_hour[1])
     app.grades.smooth("XTE")
     with app.context.reading() as connection:
-        whole = gyro_innovations(connection, ResultFilter("live", "XTE"))
-        part = gyro_innovations(
+        whole = latest_innovations(connection, ResultFilter("live", "XTE"), of_gyro=True)
+        part = latest_innovations(
             connection, ResultFilter("live", "XTE", half_start(10), half_start(20))
         )
-        none = gyro_innovations(connection, ResultFilter("none", "XTE"))
+        none = latest_innovations(connection, ResultFilter("none", "XTE"))
     assert [len(each) for each in whole] == [226]
     assert [len(each) for each in part] == [75]
     assert none == []

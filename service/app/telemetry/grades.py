@@ -3,11 +3,14 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from sqlalchemy import Connection
+
 from service.app.context import Context, checked_run_name
 from service.errors import NotFound
 from service.grades.day import grade_day, window_of
 from service.missions.mission import Mission, mission_named
 from service.storage.archive.reading import holds_any
+from service.storage.grades.alarms import evaluate_day
 from service.storage.grades.days import DayKey, current_day, record_day, rows_of
 from service.storage.grades.innovations import list_innovations
 from service.storage.grades.inputs import days_with_batches, inputs_digest, recorded_in
@@ -117,7 +120,15 @@ class Grades:
             progress.empty += 1
             return
         rows = rows_of(key, graded, inputs, self._ids.new(), utc_now())
-        row = self._context.change(lambda connection: record_day(connection, key, rows))
+
+        def change(connection: Connection) -> GradedDayRow:
+            recorded_day = record_day(connection, key, rows)
+            # Another process may have recorded the same meanwhile.
+            if recorded_day.id == rows[0]["id"]:
+                evaluate_day(connection, mission, key, recorded_day)
+            return recorded_day
+
+        row = self._context.change(change)
         progress.days.append(row)
         if row.id == rows[0]["id"]:
             progress.new.add(row.id)

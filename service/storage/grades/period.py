@@ -89,9 +89,12 @@ def grades_of_period(
     )
 
 
-def gyro_innovations(connection: Connection, selected: ResultFilter) -> list[MeasuredInnovations]:
-    """The innovations of stretches with a gyro, the latest blocks of a period, in order of time."""
-    blocks = [each for each in _blocks(connection, selected, INNOVATIONS) if each.model == "gyro"]
+def latest_innovations(
+    connection: Connection, selected: ResultFilter, *, of_gyro: bool = False
+) -> list[MeasuredInnovations]:
+    """The innovations of a period, its latest blocks, in order of time; perhaps with a gyro alone."""
+    blocks = _blocks(connection, selected, INNOVATIONS)
+    blocks = [each for each in blocks if each.model == "gyro" or not of_gyro]
     rows = _packed(connection, INNOVATIONS, blocks[-MOST_BLOCKS:])
     found = [unpacked_innovations(row.packed, row.samples) for row in rows]
     return [each.taken(inside(each, selected)) for each in found]
