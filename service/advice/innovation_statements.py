@@ -37,7 +37,7 @@ def innovation_findings(
         return []
     if noise is None:
         text = (
-            f"Gyro: too few innovations to judge its noise; {LEAST} in a row are needed. "
+            f"Gyro: too few innovations to judge its noise: {LEAST} are needed, without gaps. "
             f"`acquire smooth {mission.name}` makes them."
         )
         return [InnovationFinding("gyro", None, 0, Statement("wait", text))]
