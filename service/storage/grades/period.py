@@ -92,7 +92,7 @@ def grades_of_period(
 def latest_innovations(
     connection: Connection, selected: ResultFilter, *, of_gyro: bool = False
 ) -> list[MeasuredInnovations]:
-    """The innovations of the latest blocks of a period, in order of time; perhaps of a gyro alone."""
+    """The innovations of a period's latest blocks, in order of time; perhaps of a gyro alone."""
     blocks = _blocks(connection, selected, INNOVATIONS)
     blocks = [each for each in blocks if each.model == "gyro" or not of_gyro]
     rows = _packed(connection, INNOVATIONS, blocks[-MOST_BLOCKS:])
