@@ -21,7 +21,7 @@ _APRIORI = ("cross_product_deg", "pole_difference_deg", "pole_angle_deg")
 class FileChange:
     """A line for the mission file: its table, of a tracker where `tracker` names one, and why."""
 
-    table: Literal["tolerances", "catalog", "trackers"]
+    table: Literal["tolerances", "catalog", "trackers", "gyro"]
     tracker: str | None
     line: str
 

@@ -55,6 +55,12 @@ CAUSES: Mapping[str, Cause] = {
         "Check where the a priori attitude comes from. Until it is corrected, send the batches as "
         "lost in space, or widen the zone.",
     ),
+    "innovation_rejected_share": Cause(
+        "The filter rejects good attitudes: a star that is taken for another one lastingly, a step "
+        "of the clock, or a fault of the gyro.",
+        "Open the innovations of that time. If the attitudes agree with each other, look at the "
+        "gyro and the clock; if its noise is larger than the mission says, the advice tells.",
+    ),
     "silence_s": Cause(
         "Telemetry, not the sky: the link, or the program that sends the batches.",
         "Check that the sender runs and reaches the service, and whether its batches are refused.",

@@ -73,6 +73,14 @@ class Gap:
 
 
 @dataclass(frozen=True)
+class SmoothedShare:
+    """A share of the attitudes that the filter met, of days that are smoothed; it has no history.
+
+    Batches have no value of it as they are recorded: `acquire smooth` has.
+    """
+
+
+@dataclass(frozen=True)
 class Quantity:
     """One quantity with all that derives from it."""
 
@@ -80,7 +88,7 @@ class Quantity:
     unit: str
     label: str
     """As pages show it."""
-    source: StarShare | BatchShare | Measured | Ratio | Rate | Gap
+    source: StarShare | BatchShare | Measured | Ratio | Rate | Gap | SmoothedShare
     limits: Callable[[Mission], LimitSettings] | None = None
     """The limits of a mission until others are set; None: limits do not apply."""
     worse: Literal["high", "size"] = "high"
@@ -153,6 +161,7 @@ def _over(part: float | None, whole: float | None) -> float | None:
 
 
 SILENCE = "silence_s"
+REJECTED = "innovation_rejected_share"
 QUANTITIES: dict[str, Quantity] = {
     each.name: each
     for each in (
@@ -246,6 +255,14 @@ QUANTITIES: dict[str, Quantity] = {
             Gap(),
             lambda mission: above(None, 3600.0, 6 * 3600.0, minimum_count=1, duration_s=0.0),
         ),
+        Quantity(
+            REJECTED,
+            "1",
+            "attitudes that the filter rejects",
+            SmoothedShare(),
+            # Of good ones one in ten thousand is rejected.
+            lambda mission: above(0.02, 0.05, 0.2, hysteresis=0.005, minimum_count=100),
+        ),
     )
 }
 
@@ -262,7 +279,7 @@ def names() -> tuple[str, ...]:
 
 def trend_names() -> tuple[str, ...]:
     """The quantities that have a history."""
-    return _names(lambda each: not isinstance(each.source, Gap))
+    return _names(lambda each: not isinstance(each.source, Gap | SmoothedShare))
 
 
 def tracker_names() -> tuple[str, ...]:

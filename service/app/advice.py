@@ -7,12 +7,15 @@ from collections.abc import Callable
 from functools import partial
 
 from service.advice.advice import WorkLimit, advise
+from service.advice.innovation_statements import innovation_findings
+from service.advice.innovations import innovation_noise
 from service.app.advice_record import advice_record
 from service.app.context import Context
 from service.app.submissions import Submissions
 from service.errors import Busy
 from service.missions.mission import mission_named
 from service.observations.schema import TolerancesIn
+from service.storage.grades.period import latest_innovations
 from service.storage.models.advice import Advice
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
@@ -57,12 +60,10 @@ class AdviceService:
             raise Busy("the service is computing other advice", ADVICE_RETRY_S)
         try:
             with self._context.reading() as connection:
-                drawn = sample_batches(
-                    connection,
-                    self._context.store.archive,
-                    ResultFilter(run or LIVE, name, start, end),
-                    sample,
-                )
+                selected = ResultFilter(run or LIVE, name, start, end)
+                archive = self._context.store.archive
+                drawn = sample_batches(connection, archive, selected, sample)
+                met = latest_innovations(connection, selected, of_gyro=True)
             began = time.monotonic()
             pace = WorkLimit(lambda share: time.monotonic() - began < share * limit_s, step)
             # Without the search of the whole sky, which would hide faults of the settings.
@@ -70,4 +71,5 @@ class AdviceService:
             findings = advise(mission, drawn.batches, run_again, own, pace)
         finally:
             self._lock.release()
-        return advice_record(name, run or LIVE, drawn, findings)
+        noise = innovation_findings(innovation_noise(met), mission, findings.noise)
+        return advice_record(name, run or LIVE, drawn, findings, noise)

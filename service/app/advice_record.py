@@ -1,9 +1,10 @@
 """Findings on a mission's settings as the record that the API and the command show."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from service.advice.advice import Findings
+from service.advice.innovation_statements import InnovationFinding
 from service.advice.intervals import Interval
 from service.advice.statements import (
     Statement,
@@ -22,6 +23,7 @@ from service.storage.models.advice import (
     Change,
     Estimate,
     GroupAdvice,
+    InnovationAdvice,
     MagnitudeAdvice,
     NoiseAdvice,
     NoisePeriodAdvice,
@@ -31,13 +33,20 @@ from service.storage.models.advice import (
 from service.storage.queries.recorded_batch import BatchSample
 
 
-def advice_record(spacecraft: str, run: str, sample: BatchSample, findings: Findings) -> Advice:
+def advice_record(
+    spacecraft: str,
+    run: str,
+    sample: BatchSample,
+    findings: Findings,
+    innovations: Sequence[InnovationFinding] = (),
+) -> Advice:
     """The findings with their figures and sentences, the trials, and the lines to change."""
     tolerances = [(each, tolerance_statement(each, findings)) for each in findings.tolerances]
     noise = [(each, noise_statement(each)) for each in findings.noise]
     magnitudes = [(each, magnitude_statement(each, findings)) for each in findings.magnitudes]
     alignment = [(each, alignment_statement(each)) for each in findings.alignment]
     statements = [each for pairs in (tolerances, noise, magnitudes, alignment) for _, each in pairs]
+    statements += [each.statement for each in innovations]
     return Advice(
         spacecraft=spacecraft,
         run=run,
@@ -57,6 +66,7 @@ def advice_record(spacecraft: str, run: str, sample: BatchSample, findings: Find
         noise=[_noise(*each) for each in noise],
         magnitudes=[_magnitude(*each) for each in magnitudes],
         alignment=[_alignment(*each) for each in alignment],
+        innovations=[_innovation(each) for each in innovations],
         tried=[_trial(each) for each in findings.trials],
         changes=_changes(statements),
     )
@@ -134,6 +144,16 @@ def _alignment(finding: AlignmentFinding, statement: Statement) -> AlignmentAdvi
     )
 
 
+def _innovation(finding: InnovationFinding) -> InnovationAdvice:
+    return InnovationAdvice(
+        subject=finding.subject,
+        ratio=_estimate(finding.ratio),
+        measurements=finding.measurements,
+        action=finding.statement.action,
+        text=finding.statement.text,
+    )
+
+
 def _trial(outcome: VariantOutcome) -> Trial:
     return Trial(
         name=outcome.variant.name,
@@ -170,7 +190,13 @@ def _bounded(found: Interval) -> Estimate:
 
 def no_changes_text(advice: Advice) -> str:
     """The text shown when no line of the mission file should change."""
-    findings = (advice.tolerances, advice.noise, advice.magnitudes, advice.alignment)
+    findings = (
+        advice.tolerances,
+        advice.noise,
+        advice.magnitudes,
+        advice.alignment,
+        advice.innovations,
+    )
     actions = {each.action for found in findings for each in found}
     if actions - {"keep", "wait"}:
         return "No line of the mission file corrects these findings: each sentence says what to do."

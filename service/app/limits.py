@@ -6,12 +6,13 @@ from typing import cast
 from service.access.audit import Entry
 from service.alarms.limits import LimitSettings
 from service.alarms.preview import Preview, preview_of, preview_of_gaps
-from service.alarms.quantities import SILENCE, QuantityName, tracker_names
+from service.alarms.quantities import REJECTED, SILENCE, QuantityName, tracker_names
 from service.alarms.subjects import limited_trackers, subject_of
 from service.alarms.window import Sample
 from service.app.context import Context
 from service.errors import BadBatch, Fault, shown_value
 from service.missions.mission import Mission, mission_named
+from service.storage.grades.alarms import rejected_samples
 from service.storage.models.alarms import (
     Limit,
     LimitExcursion,
@@ -109,9 +110,13 @@ class Limits:
                 # The latest batch belongs to the period.
                 start, end = shifted(last, -DAY_S * days), shifted(last, 0.001)
                 period = ResultFilter(run or LIVE, name, start, end)
-                time_ns, samples = limits.latest_samples(
-                    connection, period, subject, MOST_PREVIEWED
-                )
+                if quantity == REJECTED:
+                    samples = rejected_samples(connection, period)[-MOST_PREVIEWED:]
+                    time_ns = [at_ns for at_ns, _, _ in samples]
+                else:
+                    time_ns, samples = limits.latest_samples(
+                        connection, period, subject, MOST_PREVIEWED
+                    )
 
         def moment(at_ns: int) -> str:
             assert last is not None

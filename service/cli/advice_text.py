@@ -9,6 +9,7 @@ from service.storage.models.advice import (
     Advice,
     AlignmentAdvice,
     GroupAdvice,
+    InnovationAdvice,
     MagnitudeAdvice,
     NoiseAdvice,
     ToleranceAdvice,
@@ -16,7 +17,13 @@ from service.storage.models.advice import (
 )
 
 Finding = (
-    Statement | GroupAdvice | ToleranceAdvice | NoiseAdvice | MagnitudeAdvice | AlignmentAdvice
+    Statement
+    | GroupAdvice
+    | ToleranceAdvice
+    | NoiseAdvice
+    | MagnitudeAdvice
+    | AlignmentAdvice
+    | InnovationAdvice
 )
 WIDTH = 96
 
@@ -31,6 +38,7 @@ def advice_text(advice: Advice, zone: Sequence[Statement] = ()) -> str:
         ("Noise", advice.noise),
         ("Magnitudes", advice.magnitudes),
         ("Alignment", advice.alignment),
+        ("Innovations", advice.innovations),
     )
     for title, findings in sections:
         if findings:

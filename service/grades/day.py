@@ -5,6 +5,7 @@ else: not on the period that is asked for, nor on what was computed of the days 
 can be computed again, alone, and gives the same bytes; a late batch concerns one day or two.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
@@ -16,6 +17,7 @@ from service.filtering.gyro import ConstantRateModel
 from service.filtering.result import AttitudeHistory, FilterResult, Integers
 from service.filtering.smoother import smooth
 from service.filtering.state import Outcome, Status
+from service.grades.innovations import UPPER, MeasuredInnovations, innovations_of
 from service.grades.measured import Mask, Recorded
 from service.grades.stretches import Stretch, cut
 from service.missions.mission import Mission
@@ -26,7 +28,7 @@ Grade = Literal["filtered", "smoothed"]
 Model = Literal["gyro", "constant_rate"]
 GRADES: tuple[Grade, ...] = ("filtered", "smoothed")
 
-METHOD = 1
+METHOD = 2
 """Counted up with every change of what is computed: then days are computed anew."""
 WARM_UP_S = 6 * 3600.0
 """For the bias to settle (two hours), after a tracker that is wrong at the beginning was found
@@ -67,13 +69,24 @@ class GradedSamples:
         """The samples at some places."""
         return GradedSamples(**{f.name: getattr(self, f.name)[places] for f in fields(self)})
 
+    @staticmethod
+    def joined(parts: Sequence["GradedSamples"]) -> "GradedSamples":
+        """The samples of parts, one after the other."""
+        return GradedSamples(
+            **{
+                f.name: np.concatenate([getattr(part, f.name) for part in parts])
+                for f in fields(GradedSamples)
+            }
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class GradedStretch:
-    """A stretch of a day in both grades, which have the same times."""
+    """A stretch of a day in both grades, which have the same times, and its measurements."""
 
     model: Model
     samples: dict[Grade, GradedSamples]
+    innovations: MeasuredInnovations
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +178,7 @@ def _graded(
             "filtered": _samples(result.history, kept, is_constant),
             "smoothed": _samples(smoothed, kept, is_constant),
         },
+        innovations_of(stretch.attitudes, result, smoothed, start, end),
     )
 
 
@@ -185,7 +199,7 @@ def _samples(history: AttitudeHistory, kept: Mask, is_constant: bool) -> GradedS
     attitude = covariance[:, :3, :3].copy()
     # A doubt is one more sigma about each axis.
     attitude[:, axes, axes] += history.doubt_rad[kept, None] ** 2
-    upper = attitude[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]] * ARCSEC_PER_RADIAN**2
+    upper = attitude[:, *UPPER] * ARCSEC_PER_RADIAN**2
     bias = np.degrees(history.bias_rad_s[kept]) * 3600.0
     sigma = np.sqrt(covariance[:, axes + 3, axes + 3])
     return GradedSamples(

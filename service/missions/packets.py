@@ -173,6 +173,51 @@ class PacketGyro(Strict):
         return self
 
 
+class PacketGyroBlocks(Strict):
+    """Samples about the axes of the mission's gyro, which are recorded as gyro blocks."""
+
+    samples: int = Field(default=1, ge=1, le=MOST_SLOTS)
+    """In one packet, numbered from `first_sample`."""
+    first_sample: int = Field(default=1, ge=0, le=1000)
+    values: tuple[SlotNames, SlotNames, SlotNames]
+    """About each axis a parameter for each sample: arrays, patterns or lists."""
+    kind: Literal["rate", "angle"] = "rate"
+    """`angle`: a counter that accumulates; a rate is its change from the sample before."""
+    scale_rad: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Radians per second, or of `angle` radians, of one unit about each axis."""
+    counter_bits: int = Field(default=16, ge=2, le=64)
+    """An accumulated angle starts again after 2^counter_bits counts."""
+    max_gap_s: float = Field(default=10.0, gt=0, le=3600)
+    """Angles farther apart give no rate."""
+    time: PacketTime | None = None
+    """Of the first sample; by default the time of the packet."""
+    step_s: float | None = Field(default=None, gt=0, le=3600)
+    """From each sample of a packet to the next."""
+    time_offset_s: SlotNames | None = None
+    """In place of a step: of each sample, seconds after the time."""
+    count: ParameterName | None = None
+    """So many samples, from the first, are in the packet."""
+    block_s: float = Field(default=600.0, ge=1, le=86400)
+    """A block ends where so many seconds of TAI begin, so that the same samples make the same
+    blocks, whichever file they are read from."""
+
+    @model_validator(mode="after")
+    def _samples_have_times(self) -> Self:
+        if any(scale == 0.0 or not math.isfinite(scale) for scale in self.scale_rad):
+            raise ValueError("scale_rad must hold three numbers other than 0")
+        both = self.step_s is not None and self.time_offset_s is not None
+        neither = self.step_s is None and self.time_offset_s is None
+        if both or (neither and self.samples > 1):
+            raise ValueError("needs either step_s or time_offset_s")
+        columns = {f"values.{i}": names for i, names in enumerate(self.values)}
+        if self.time_offset_s is not None:
+            columns["time_offset_s"] = self.time_offset_s
+        for name, names in columns.items():
+            if isinstance(names, tuple) and len(names) != self.samples:
+                raise ValueError(f"{name} names {len(names)} parameters for {self.samples} samples")
+        return self
+
+
 class PacketVelocity(Strict):
     """The geocentric velocity of the spacecraft, EME2000."""
 
@@ -201,7 +246,7 @@ class Packets(Strict):
     """Only packets of these APIDs are read, others are counted; empty: all that XTCE describes."""
     time: PacketTime
     trackers: tuple[PacketTracker, ...] = Field(default=(), max_length=16)
-    """Without trackers the packets give a priori attitudes alone."""
+    """Without trackers the packets give a priori attitudes and gyro blocks alone."""
     join_within_s: float = Field(default=0.0, ge=0, le=60)
     """Packets of different trackers make one batch if their times differ by at most this."""
     batch: ParameterName | None = None
@@ -209,6 +254,10 @@ class Packets(Strict):
     prior: PacketPrior | None = None
     rates: PacketRates | None = None
     gyro: PacketGyro | None = None
+    gyro_blocks: PacketGyroBlocks | None = Field(
+        default=None, exclude_if=lambda blocks: blocks is None
+    )
+    """Missing, it is no part of the mission's digest."""
     velocity: PacketVelocity | None = None
     position: PacketPosition | None = None
     aberration: Literal["to_correct", "applied_upstream", "ignore"] = "to_correct"
@@ -217,8 +266,9 @@ class Packets(Strict):
     def _say_each_thing_once(self) -> Self:
         if self.rates is not None and self.gyro is not None:
             raise ValueError("takes either rates or gyro, not both")
-        if not self.trackers and (self.prior is None or self.prior.quaternion is None):
-            raise ValueError("needs trackers, or a prior with a quaternion")
+        has_quaternion = self.prior is not None and self.prior.quaternion is not None
+        if not (self.trackers or has_quaternion or self.gyro_blocks):
+            raise ValueError("needs trackers, gyro_blocks, or a prior with a quaternion")
         names = [each.tracker for each in self.trackers]
         if len(set(names)) != len(names):
             raise ValueError(f"a tracker occurs twice: {', '.join(names)}")

@@ -43,6 +43,12 @@ def quaternion_in(
     return x, y, z, scalar
 
 
+def counted_change(counts: int, turn: int) -> int:
+    """The change nearest to zero of a counter that starts again after `turn` counts."""
+    half = turn // 2
+    return (counts + half) % turn - half
+
+
 class GyroRates:
     """Body rates from the counts of a gyro."""
 
@@ -66,14 +72,9 @@ class GyroRates:
         if not 0.0 < passed_s <= gyro.max_gap_s:
             return None
         return [
-            self._change(now - then) * scale / passed_s
+            counted_change(now - then, self._turn) * scale / passed_s
             for now, then, scale in zip(angles, before[1], gyro.scale_deg, strict=True)
         ]
-
-    def _change(self, counts: int) -> int:
-        """The change that is nearest to zero: the counter starts again after its last value."""
-        half = self._turn // 2
-        return (counts + half) % self._turn - half
 
 
 class Held:

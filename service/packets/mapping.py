@@ -4,10 +4,11 @@ import difflib
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 from service.errors import BadInput, Fault, shown_value
 from service.missions.mission import Mission
-from service.missions.packets import Packets, PacketTracker, element_names
+from service.missions.packets import PacketGyroBlocks, Packets, PacketTracker, element_names
 from service.packets.clock import names_of
 from service.packets.definition import PacketDefinition
 
@@ -45,6 +46,9 @@ class PacketMap:
     quaternion: tuple[str, ...]
     rates: tuple[str, ...]
     gyro: tuple[str, ...]
+    gyro_values: tuple[tuple[str, ...], ...]
+    """Of each axis a name for each sample of a gyro block."""
+    gyro_offsets: tuple[str, ...]
     velocity: tuple[str, ...]
     position: tuple[str, ...]
 
@@ -61,6 +65,8 @@ def packet_map(table: Packets, definition: PacketDefinition) -> PacketMap:
         quaternion=_triple(prior.quaternion, 4) if prior and prior.quaternion else (),
         rates=_triple(table.rates.components, 3) if table.rates else (),
         gyro=_triple(table.gyro.counts, 3) if table.gyro else (),
+        gyro_values=_gyro_columns(table.gyro_blocks, "values"),
+        gyro_offsets=next(iter(_gyro_columns(table.gyro_blocks, "time_offset_s")), ()),
         velocity=_triple(table.velocity.components, 3) if table.velocity else (),
         position=_triple(table.position.components, 3) if table.position else (),
     )
@@ -96,6 +102,19 @@ def packet_mission(missions: Mapping[str, Mission], name: str | None) -> Mission
 
 def _triple(names: str | tuple[str, ...], count: int) -> tuple[str, ...]:
     return element_names(names, count)
+
+
+def _gyro_columns(
+    table: PacketGyroBlocks | None, key: Literal["values", "time_offset_s"]
+) -> tuple[tuple[str, ...], ...]:
+    if table is None:
+        return ()
+    named = table.values if key == "values" else (table.time_offset_s,)
+    return tuple(
+        element_names(names, table.samples, table.first_sample)
+        for names in named
+        if names is not None
+    )
 
 
 def _columns(table: PacketTracker) -> TrackerColumns:
@@ -138,6 +157,12 @@ def _keys(found: PacketMap) -> Iterable[tuple[str, Iterable[str]]]:
     yield "prior.quaternion", found.quaternion
     yield "rates.components", found.rates
     yield "gyro.counts", found.gyro
+    if (blocks := table.gyro_blocks) is not None:
+        for axis, names in enumerate(found.gyro_values):
+            yield f"gyro_blocks.values.{axis}", names
+        yield "gyro_blocks.time_offset_s", found.gyro_offsets
+        yield "gyro_blocks.time", names_of(blocks.time) if blocks.time else ()
+        yield "gyro_blocks.count", (blocks.count,) if blocks.count else ()
     yield "velocity.components", found.velocity
     yield "position.components", found.position
 

@@ -1,4 +1,4 @@
-"""Files of space packets as lines of telemetry, one batch each, with counts of the packets."""
+"""Files of space packets as lines of telemetry, a batch or a gyro block each, with counts."""
 
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -13,6 +13,7 @@ from service.observations.readers.lines import Line
 from service.packets.batches import BatchMaker, StarBatch
 from service.packets.carried import PacketAttitude
 from service.packets.definition import PacketDefinition, PacketFault, UnknownPacket
+from service.packets.gyro_blocks import GyroBlockMaker, PacketBlock
 from service.packets.mapping import packet_map
 from service.packets.stream import (
     IDLE_APID,
@@ -32,6 +33,8 @@ class PacketTotals(Struct, kw_only=True):
     batches: int = 0
     without_stars: int = 0
     """Packets of a tracker that held no star."""
+    gyro_blocks: int = 0
+    gyro_samples: int = 0
     unknown: int = 0
     """Packets that the XTCE file does not describe."""
     not_asked: int = 0
@@ -53,7 +56,9 @@ class PacketReader:
             raise BadInput(Fault("packets", f"the mission file of {mission.name} has no [packets]"))
         self._table = mission.packets
         self._definition = definition
-        self._maker = BatchMaker(mission.name, packet_map(mission.packets, definition))
+        mapped = packet_map(mission.packets, definition)
+        self._maker = BatchMaker(mission.name, mapped)
+        self._gyro = GyroBlockMaker(mission, mapped) if mission.packets.gyro_blocks else None
         self._asked = frozenset(mission.packets.apids)
         self._sequence = SequenceCounter()
         self._totals = PacketTotals()
@@ -68,7 +73,7 @@ class PacketReader:
         return totals
 
     def lines(self, stream: IO[bytes], name: str) -> Iterator[Line]:
-        """The batches of a file, and a fault in place of each packet that cannot be read.
+        """The batches and gyro blocks of a file, and a fault for each packet that cannot be read.
 
         A line has the number of its packet in the file.  A fault names the file, the packet, its
         first byte and the parameter.  After the end of a file that is damaged nothing follows.
@@ -83,6 +88,8 @@ class PacketReader:
             self._totals.refused += 1
             yield Line(fault.number, None, _fault_at(fault.number, fault.offset, fault, name))
         yield from self._lines_of(self._maker.end(), name)
+        if self._gyro is not None:
+            yield from self._lines_of_blocks(self._gyro, self._gyro.end())
 
     def attitudes(self, stream: IO[bytes]) -> Iterator[PacketAttitude]:
         """The a priori attitudes in a file; raises `BadFile` at the first damaged packet."""
@@ -118,6 +125,8 @@ class PacketReader:
             totals.unknown += 1
             return
         yield from self._lines_of(self._maker.add(packet, values), name)
+        if self._gyro is not None:
+            yield from self._lines_of_blocks(self._gyro, self._gyro.add(packet, values))
 
     def _lines_of(self, batches: Iterable[StarBatch], name: str) -> Iterator[Line]:
         for batch in batches:
@@ -125,6 +134,14 @@ class PacketReader:
                 yield self._line(batch, name)
             else:
                 self._totals.without_stars += 1
+
+    def _lines_of_blocks(
+        self, maker: GyroBlockMaker, blocks: Iterable[PacketBlock]
+    ) -> Iterator[Line]:
+        for block in blocks:
+            self._totals.gyro_blocks += 1
+            self._totals.gyro_samples += len(block.tai_ns)
+            yield Line(block.packet.number, maker.json_of(block, block.packet.apid))
 
     def _line(self, batch: StarBatch, name: str) -> Line:
         try:

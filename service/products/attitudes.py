@@ -15,6 +15,7 @@ from typing import Any, Literal, Self
 import numpy as np
 import numpy.typing as npt
 
+from service.attitude.rotations import rotation_vectors
 from service.errors import BadBatch, Fault, shown_value
 from service.missions.product_settings import (
     DEFAULT_LARGEST_GAP_S,
@@ -23,7 +24,6 @@ from service.missions.product_settings import (
     MIN_NAIF_ID,
     OBJECT_ID,
 )
-from service.products.rotations import rotation_vectors
 from service.vectors import Vector
 
 Integers = npt.NDArray[np.int64]

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from service.attitude.rotations import rotation_vectors
 from service.products.attitudes import AttitudeBlock, Integers
 from service.products.reading.known_attitudes import KnownAttitudes
-from service.products.rotations import rotation_vectors
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
 AXES = ("x", "y", "z")

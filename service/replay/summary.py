@@ -187,6 +187,9 @@ def _packet_rows(packets: dict[str, Any] | None) -> list[tuple[str, str]]:
     rows += [(f"  {name}", str(packets[word])) for word, name in words.items()]
     gaps = f"{packets['gaps']}  ({packets['missing']} packets missing)"
     rows += [("  sequence gaps", gaps), ("  steps backward", str(packets["backward"]))]
+    if packets["gyro_blocks"]:
+        blocks = f"{packets['gyro_blocks']}  ({packets['gyro_samples']} samples)"
+        rows += [("  gyro blocks", blocks)]
     unknown = [str(each["apid"]) for each in packets["apids"] if not each["described"]]
     if unknown:
         rows += [("  unknown APIDs", ", ".join(unknown[:20]))]

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from service.attitude.rotations import rotation_vectors
 from service.errors import BadInput, Fault, shown_value
 from service.missions.gyro import GyroSettings
 from service.missions.mission import Mission
-from service.products.rotations import rotation_vectors
 from service.simulate.telemetry import DrawnBatch
 from service.times import Utc, parse_utc, shifted
 from service.vectors import ARCSEC_PER_RADIAN, Vector

@@ -58,7 +58,7 @@ def test_a_second_run_over_the_same_record_changes_nothing(filled, opened, datab
     assert (day.day, day.revision, first.new) == ("1999-03-01", 1, {day.id})
     assert day.summary.measurements["accepted"] == 215
     kept = blocks_of(filled, day.id)
-    assert {each["grade"] for each in kept} == {"filtered", "smoothed"}
+    assert {each["grade"] for each in kept} == {"filtered", "smoothed", "innovations"}
     # Another process, another period.
     again = opened().grades.smooth("XTE", start=parse_utc("1999-03-01T12:20:00Z"))
     assert (again.days, again.new) == ([day], set())

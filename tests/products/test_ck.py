@@ -10,7 +10,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from service.products.rotations import matrices
+from service.attitude.rotations import matrices
 from service.times import parse_utc
 from tests import scale
 from tests.products.series import ABOUT, GOLDEN, random_quaternions, rows, slew, whole, written

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from service.attitude.rotations import matrices
 from service.errors import BadFile
 from service.products.reading.aem import read_aem
 from service.products.reading.files import read_attitudes
-from service.products.rotations import matrices
 from service.times import parse_utc
 from tests import scale
 from tests.products.series import GOLDEN, START, random_quaternions, rows, slew, whole, written

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from service.attitude.rotations import turned_quaternion
 from service.cli.score_picture import picture
 from service.products.reading.aem import read_aem
-from service.products.rotations import turned_quaternion
 from service.products.scoring import errors_of, histogram, statistics
 from service.vectors import ARCSEC_PER_RADIAN
 from tests.products.series import rows, series, slew, written

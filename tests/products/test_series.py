@@ -6,9 +6,9 @@ import itertools
 import numpy as np
 import pytest
 
+from service.attitude.rotations import matrices, rotation_vectors, turned_quaternion
 from service.errors import BadInput
 from service.products.attitudes import SeriesInfo
-from service.products.rotations import matrices, rotation_vectors, turned_quaternion
 from service.times import parse_utc, shifted
 from service.vectors import matrix_from_quaternion, rotate_about
 from tests.products.series import ABOUT, GOLDEN, START, random_quaternions, rows, slew, whole

@@ -6,10 +6,10 @@ import json
 import numpy as np
 import pytest
 
+from service.attitude.rotations import rotation_vectors, turned_quaternion
 from service.cli import main
 from service.errors import BadInput
 from service.gyro.schema import block_from_line
-from service.products.rotations import rotation_vectors, turned_quaternion
 from service.simulate.files import read_objects, write_pass
 from service.simulate.gyro import GyroWanted, with_gyro
 from service.simulate.stretches import NO_TROUBLES, Pass

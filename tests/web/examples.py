@@ -249,6 +249,7 @@ def _gyro(client: httpx.Client, take: Any) -> None:
     degrees = late | {"block": "1999-060-g4", "rates_rad_per_s": [[0.0, 100.0, 0.0]] * 3}
     take("submit_gyro", client.post(here, json=degrees), "another_unit")
     take("list_gyro", client.get(here), "two_blocks")
+    take("list_innovations", client.get(f"{API}/spacecraft/XTE/innovations"), "none_smoothed")
     take("get_gyro", client.get(f"{here}/{first['id']}"), "three_samples")
 
 

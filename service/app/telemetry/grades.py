@@ -3,15 +3,22 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from sqlalchemy import Connection
+
 from service.app.context import Context, checked_run_name
 from service.errors import NotFound
 from service.grades.day import grade_day, window_of
 from service.missions.mission import Mission, mission_named
 from service.storage.archive.reading import holds_any
+from service.storage.grades.alarms import evaluate_day
 from service.storage.grades.days import DayKey, current_day, record_day, rows_of
+from service.storage.grades.innovations import list_innovations
 from service.storage.grades.inputs import days_with_batches, inputs_digest, recorded_in
-from service.storage.grades.models import GradedDayRow
+from service.storage.grades.models import GradedDayRow, Innovation
+from service.storage.grades.period import GradesOfPeriod, grades_of_period
+from service.storage.models.base import Page
 from service.storage.queries.future_dated import LIVE
+from service.storage.queries.pages import ResultFilter
 from service.storage.recording.ids import Ulids
 from service.times import Utc, utc_now
 
@@ -74,6 +81,28 @@ class Grades:
             step(progress)
         return progress
 
+    def innovations(
+        self,
+        name: str,
+        *,
+        run: str | None = None,
+        start: Utc | None = None,
+        end: Utc | None = None,
+        limit: int = 100,
+        cursor: str | None = None,
+    ) -> Page[Innovation]:
+        """How the measured attitudes of a period met the filter, the earliest first."""
+        mission_named(self._context.missions, name)
+        selected = ResultFilter(run or LIVE, name, start, end)
+        with self._context.reading() as connection:
+            return list_innovations(connection, selected, limit=limit, cursor=cursor)
+
+    def of_period(self, name: str, run: str, start: Utc, end: Utc) -> GradesOfPeriod | None:
+        """A bounded number of samples and innovations of a period; None where none are recorded."""
+        mission_named(self._context.missions, name)
+        with self._context.reading() as connection:
+            return grades_of_period(connection, name, run, start, end)
+
     def _smooth_day(self, mission: Mission, key: DayKey, progress: SmoothProgress) -> None:
         window = window_of(key.day)
         with self._context.reading() as connection:
@@ -91,7 +120,15 @@ class Grades:
             progress.empty += 1
             return
         rows = rows_of(key, graded, inputs, self._ids.new(), utc_now())
-        row = self._context.change(lambda connection: record_day(connection, key, rows))
+
+        def change(connection: Connection) -> GradedDayRow:
+            recorded_day = record_day(connection, key, rows)
+            # Another process may have recorded the same meanwhile.
+            if recorded_day.id == rows[0]["id"]:
+                evaluate_day(connection, mission, key, recorded_day)
+            return recorded_day
+
+        row = self._context.change(change)
         progress.days.append(row)
         if row.id == rows[0]["id"]:
             progress.new.add(row.id)

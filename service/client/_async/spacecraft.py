@@ -7,6 +7,7 @@ from ..encoding import Time, path_of
 from ..models import (
     AttitudeRow,
     History,
+    Innovation,
     Ranking,
     Rates,
     SpacecraftRow,
@@ -50,6 +51,24 @@ class AsyncSpacecraft(AsyncConnection):
         """
         query = {"run": run, "start": start, "end": end}
         return AsyncItems(self, AttitudeRow, path_of("spacecraft", spacecraft, "attitudes"), query)
+
+    def innovations(
+        self,
+        spacecraft: str,
+        *,
+        run: str = "live",
+        start: Time | None = None,
+        end: Time | None = None,
+    ) -> AsyncItems[Innovation]:
+        """How the attitudes of a period met the filter, the earliest first.
+
+        There are some of the days that `acquire smooth` recorded.
+
+        >>> [row.chi_square async for row in client.innovations("XTE")]
+        []
+        """
+        query = {"run": run, "start": start, "end": end}
+        return AsyncItems(self, Innovation, path_of("spacecraft", spacecraft, "innovations"), query)
 
     async def history(
         self,

@@ -52,6 +52,7 @@ from .replays import (
 from .spacecraft import (
     AttitudeRow,
     History,
+    Innovation,
     MissionNow,
     MissionThen,
     RankedBatch,
@@ -91,6 +92,7 @@ __all__ = [
     "GyroBlock",
     "GyroSamples",
     "History",
+    "Innovation",
     "LineProblem",
     "MissionNow",
     "MissionThen",

@@ -82,6 +82,8 @@ class ReplayPackets(Model, frozen=True):
     bytes: int
     batches: int
     without_stars: int
+    gyro_blocks: int
+    gyro_samples: int
     unknown: int
     not_asked: int
     idle: int

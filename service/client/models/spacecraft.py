@@ -28,6 +28,23 @@ class AttitudeRow(Model, frozen=True):
     status: str
 
 
+class Innovation(Model, frozen=True, kw_only=True):
+    """How a measured attitude met the filter, and how far it is from the smoothed attitude.
+
+    Vectors are about the body axes.  The innovation is None where nothing was predicted.
+    """
+
+    time: str
+    outcome: str
+    innovation_arcsec: Sequence[float] | None
+    innovation_sigma_arcsec: Sequence[float] | None
+    chi_square: float | None
+    difference_arcsec: Sequence[float]
+    difference_sigma_arcsec: Sequence[float]
+    model: str
+    revision: int
+
+
 class SpacecraftRow(Model, frozen=True, kw_only=True):
     """The state of a spacecraft in a run.
 

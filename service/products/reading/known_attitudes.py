@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from service.attitude.rotations import rotation_vectors, turned_quaternion
 from service.errors import BadFile, Fault
 from service.products.attitudes import SAME_MOMENT_NS, Integers
 from service.products.reading.spans import in_order
-from service.products.rotations import rotation_vectors, turned_quaternion
 from service.vectors import Vector
 
 MOST_RECORDS = 5_000_000

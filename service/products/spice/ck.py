@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+from service.attitude.rotations import matrices
 from service.errors import AcquisitionError, BadConfiguration
 from service.products.attitudes import AttitudeBlock, AttitudeSeries, SeriesInfo, stretches
-from service.products.rotations import matrices
 from service.products.spice import kernels
 from service.products.spool import folder, pieces
 from service.vectors import Vector

@@ -12,11 +12,12 @@ from sqlalchemy import Connection, delete, func, insert, select, update
 
 from service.filtering.state import Status
 from service.grades.day import GRADES, GradedDay, GradedSamples, GradedStretch, day_bounds
+from service.grades.innovations import MeasuredInnovations
 from service.grades.packing import MOST_SAMPLES, packed
 from service.gyro.block import texts_of
 from service.storage.grades.models import DaySummary, GradedDayRow, GradedStretchInfo
 from service.storage.sql.columns import Row
-from service.storage.sql.grade_tables import graded_blocks, graded_days
+from service.storage.sql.grade_tables import INNOVATIONS, graded_blocks, graded_days
 from service.storage.sql.tables import runs
 from service.times import Utc
 
@@ -103,13 +104,17 @@ def shown(row: Any) -> GradedDayRow:
 
 
 def _blocks(day_id: str, graded: GradedDay) -> Iterator[Row]:
-    for grade in GRADES:
+    by_kind: dict[str, list[GradedSamples | MeasuredInnovations]] = {
+        **{grade: [each.samples[grade] for each in graded.stretches] for grade in GRADES},
+        INNOVATIONS: [each.innovations for each in graded.stretches],
+    }
+    for kind, wholes in by_kind.items():
         position = 0
-        for stretch in graded.stretches:
-            for part in _parts(stretch.samples[grade]):
+        for stretch, whole in zip(graded.stretches, wholes, strict=True):
+            for part in _parts(whole):
                 yield {
                     "day_id": day_id,
-                    "grade": grade,
+                    "grade": kind,
                     "position": position,
                     "model": stretch.model,
                     "start_ns": int(part.tai_ns[0]),
@@ -120,7 +125,9 @@ def _blocks(day_id: str, graded: GradedDay) -> Iterator[Row]:
                 position += 1
 
 
-def _parts(samples: GradedSamples) -> Iterator[GradedSamples]:
+def _parts(
+    samples: GradedSamples | MeasuredInnovations,
+) -> Iterator[GradedSamples | MeasuredInnovations]:
     edges = [*range(0, len(samples), MOST_SAMPLES), len(samples)]
     for first, end in pairwise(edges):
         yield samples.taken(slice(first, end))

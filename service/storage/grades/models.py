@@ -1,10 +1,20 @@
 """Days of filtered and smoothed attitudes as they are recorded."""
 
-from typing import Annotated
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from service.storage.models.base import Count, Digest, Id, Moment, Record, Stamp, doc
+from service.storage.models.base import (
+    Components,
+    Count,
+    DescribedAs,
+    Digest,
+    Id,
+    Moment,
+    Record,
+    Stamp,
+    doc,
+)
 
 
 class GradedStretchInfo(Record, frozen=True, kw_only=True):
@@ -50,3 +60,44 @@ class GradedDayRow(Record, frozen=True, kw_only=True):
     inputs: Annotated[Digest, doc("Of all that the day was computed from.")]
     digest: Annotated[Digest, doc("Of what was computed.")]
     summary: DaySummary
+
+
+class Innovation(Record, frozen=True, kw_only=True):
+    """How a measured attitude met the filter, and how it differs from the smoothed attitude."""
+
+    component: ClassVar[str] = "Innovation"
+    time: Moment
+    outcome: Annotated[
+        str,
+        DescribedAs(Literal["accepted", "rejected", "started", "undecided", "unused"]),
+        doc(
+            "`accepted` and `started` measurements are used; `started`: with it the filter began. "
+            "`undecided`: it agrees with two attitudes that contradict each other."
+        ),
+    ]
+    innovation_arcsec: Annotated[
+        Components | None,
+        doc("From prediction to measurement, about the body axes; null: nothing was predicted."),
+    ]
+    innovation_sigma_arcsec: Annotated[
+        Components | None, doc("One sigma of prediction and measurement together.")
+    ]
+    chi_square: Annotated[
+        float | None, doc("Of the innovation, with three degrees of freedom: 3 on average.")
+    ]
+    difference_arcsec: Annotated[
+        Components, doc("From the smoothed attitude to the measured one, about the body axes.")
+    ]
+    difference_sigma_arcsec: Annotated[
+        Components, doc("One sigma; the smoothed attitude is partly made of the measured one.")
+    ]
+    model: Annotated[str, DescribedAs(Literal["gyro", "constant_rate"])]
+    revision: Annotated[int, Field(ge=1), doc("Of the day.")]
+
+
+class InnovationPage(Record, frozen=True, kw_only=True):
+    """A page of innovations."""
+
+    component: ClassVar[str] = "InnovationPage"
+    items: list[Innovation]
+    next_cursor: str | None

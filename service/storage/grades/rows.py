@@ -43,7 +43,7 @@ def graded_pages(
     Of each block no more than the first `page`.  Between two blocks no connection is held.
     """
     order = [column.desc() if newest_first else column for column in _PLACE]
-    query = _BLOCKS.where(*_conditions(selected, grade)).order_by(*order).limit(1)
+    query = _BLOCKS.where(*block_conditions(selected, grade)).order_by(*order).limit(1)
     beyond: Select[Any] = query
     while True:
         with reading() as connection:
@@ -64,16 +64,17 @@ def count_samples_of(connection: Connection, selected: ResultFilter, grade: Grad
     total = select(func.sum(graded_blocks.c.samples)).join_from(
         graded_days, graded_blocks, graded_blocks.c.day_id == graded_days.c.id
     )
-    return int(connection.scalar(total.where(*_conditions(selected, grade))) or 0)
+    return int(connection.scalar(total.where(*block_conditions(selected, grade))) or 0)
 
 
-def _conditions(selected: ResultFilter, grade: Grade) -> list[ColumnElement[bool]]:
+def block_conditions(selected: ResultFilter, kind: str) -> list[ColumnElement[bool]]:
+    """The blocks of a grade, or of innovations, that touch a period, as SQL; latest revisions."""
     days, blocks = graded_days.c, graded_blocks.c
     chosen: list[ColumnElement[bool]] = [
         days.current,
         days.spacecraft == selected.spacecraft,
         days.run == selected.run,
-        blocks.grade == grade,
+        blocks.grade == kind,
     ]
     if selected.start is not None:
         chosen += [days.day >= selected.start.bucket(DAY_S)]

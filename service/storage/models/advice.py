@@ -121,6 +121,22 @@ class AlignmentAdvice(Record, frozen=True, kw_only=True):
     text: Text
 
 
+class InnovationAdvice(Record, frozen=True, kw_only=True):
+    """Noise by the innovations of the filter and how they follow each other."""
+
+    component: ClassVar[str] = "InnovationAdvice"
+    subject: Annotated[
+        Literal["gyro", "attitudes"],
+        doc("`gyro`: sigma_v of the mission. `attitudes`: what the covariances of batches say."),
+    ]
+    ratio: Annotated[
+        Estimate | None, doc("True over assumed standard deviation; null: too little data.")
+    ]
+    measurements: Annotated[Count, doc("Innovations that were used.")]
+    action: Action
+    text: Text
+
+
 class Trial(Record, frozen=True, kw_only=True):
     """Outcomes of the sample's stars with other settings."""
 
@@ -150,7 +166,7 @@ class Change(Record, frozen=True, kw_only=True):
     """A line for the mission's file."""
 
     component: ClassVar[str] = "Change"
-    table: Literal["tolerances", "catalog", "trackers"]
+    table: Literal["tolerances", "catalog", "trackers", "gyro"]
     tracker: str | None
     line: str
 
@@ -181,5 +197,9 @@ class Advice(Record, frozen=True, kw_only=True):
     noise: list[NoiseAdvice]
     magnitudes: list[MagnitudeAdvice]
     alignment: list[AlignmentAdvice]
+    innovations: Annotated[
+        list[InnovationAdvice],
+        doc("Of the period's days that `acquire smooth` recorded; empty without `[gyro]`."),
+    ]
     tried: list[Trial]
     changes: list[Change]

@@ -80,6 +80,8 @@ class ReplayPackets(Record, frozen=True, kw_only=True):
     bytes: Count
     batches: Annotated[Count, doc("Batches that the packets hold.")]
     without_stars: Annotated[Count, doc("Batches without a star, which are left out.")]
+    gyro_blocks: Annotated[Count, doc("Gyro blocks that the packets hold.")]
+    gyro_samples: Annotated[Count, doc("Samples of these blocks.")]
     unknown: Annotated[Count, doc("Packets that the XTCE file does not describe.")]
     not_asked: Annotated[Count, doc("Packets of APIDs that the mission's table leaves out.")]
     idle: Annotated[Count, doc("Idle packets (APID 2047).")]

@@ -21,6 +21,8 @@ from service.storage.sql.tables import replays
 
 MAX_LISTED = 100
 CANCELLED: ReplayStateName = "cancelled"
+_NO_GYRO = {"gyro_blocks": 0, "gyro_samples": 0}
+"""Of packets that an earlier version counted."""
 _NO_COUNTS = dict.fromkeys(ReplayCounts.__struct_fields__, 0)
 
 
@@ -57,7 +59,7 @@ def _replay(row: Any) -> Replay:
             total=row["lines_total"], done=row["lines_done"], refused=row["lines_refused"]
         ),
         counts=msgspec.convert(counts, ReplayCounts),
-        packets=None if packets is None else msgspec.convert(packets, ReplayPackets),
+        packets=None if packets is None else msgspec.convert(_NO_GYRO | packets, ReplayPackets),
         errors=msgspec.json.decode(row["errors"], type=list[RefusedLine]),
         started=row["started"],
         finished=row["finished"],

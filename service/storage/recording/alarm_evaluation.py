@@ -48,7 +48,7 @@ def evaluate_limits(connection: Connection, new: Sequence[UnsavedResult]) -> Non
         spacecraft, run, _ = unsaved.identity
         if unsaved.batch is not None and not unsaved.is_ahead:
             groups.setdefault((run, spacecraft), []).append(unsaved)
-    evaluated = _runs_with_alarms(connection, {run for run, _ in groups})
+    evaluated = runs_with_alarms(connection, {run for run, _ in groups})
     for run, spacecraft in sorted(groups):
         if run in evaluated:
             unsaved_results = sorted(
@@ -57,7 +57,8 @@ def evaluate_limits(connection: Connection, new: Sequence[UnsavedResult]) -> Non
             LimitEvaluator(connection, spacecraft, run, unsaved_results).evaluate()
 
 
-def _runs_with_alarms(connection: Connection, names: set[str]) -> set[str]:
+def runs_with_alarms(connection: Connection, names: set[str]) -> set[str]:
+    """Those of some runs whose limits are evaluated: the live one, and others that ask for it."""
     others = names - {LIVE}
     if not others:
         return names

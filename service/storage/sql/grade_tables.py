@@ -23,6 +23,9 @@ from sqlalchemy import (
 from service.storage.sql.columns import Digest, Id, Moment, Name, RunName, metadata
 from service.storage.sql.tables import runs
 
+INNOVATIONS = "innovations"
+"""In the place of a grade: the block has measurements, as they met the filter."""
+
 graded_days = Table(
     "graded_days",
     metadata,
@@ -60,6 +63,7 @@ graded_blocks = Table(
     "graded_blocks",
     metadata,
     Column("day_id", Id, ForeignKey(graded_days.c.id), primary_key=True),
+    # filtered, smoothed, or innovations.
     Column("grade", String(16), primary_key=True),
     Column("position", SmallInteger, primary_key=True),
     # gyro or constant_rate.

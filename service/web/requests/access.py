@@ -85,6 +85,7 @@ POLICIES: dict[str, Policy] = {
     "submit_gyro": Policy("submit", "path"),
     "list_gyro": Policy("read", "path"),
     "get_gyro": Policy("read", "path"),
+    "list_innovations": Policy("read", "path"),
     "list_rates": Policy("read", "path"),
     "get_history": Policy("read", "path"),
     "list_worst": Policy("read", "path"),

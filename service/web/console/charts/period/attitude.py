@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from service.products.rotations import rotation_vectors
+from service.attitude.rotations import rotation_vectors
 from service.storage.models.period import PeriodAttitudes
 from service.times import Utc
 from service.vectors import ARCSEC_PER_RADIAN, Vector
@@ -178,9 +178,9 @@ def _panel(
     at = y(value)
     return Panel(
         axis=AXES[axis],
-        line="".join(_line(x[part], at[part]) for part in parts if len(part) > 1),
-        band=_band(x, y(value + sigma), y(value - sigma), parts) if is_wide else "",
-        dots="".join(_line(x[part], at[part]) + "h0" for part in parts if len(part) == 1),
+        line="".join(line_path(x[part], at[part]) for part in parts if len(part) > 1),
+        band=band_path(x, y(value + sigma), y(value - sigma), parts) if is_wide else "",
+        dots="".join(line_path(x[part], at[part]) + "h0" for part in parts if len(part) == 1),
         suspect="".join(
             f"M{a} {b - 9}l8 15h-16z"
             for a, b in zip(
@@ -193,13 +193,13 @@ def _panel(
     )
 
 
-def _line(x: npt.NDArray[np.int64], y: npt.NDArray[np.int64]) -> str:
+def line_path(x: npt.NDArray[np.int64], y: npt.NDArray[np.int64]) -> str:
     """A path in whole units, each step from the point before."""
     steps = zip(np.diff(x).tolist(), np.diff(y).tolist(), strict=True)
     return f"M{x[0]} {y[0]}" + "".join(f"l{a} {b}" for a, b in steps)
 
 
-def _band(
+def band_path(
     x: npt.NDArray[np.int64],
     upper: npt.NDArray[np.int64],
     lower: npt.NDArray[np.int64],
@@ -212,7 +212,7 @@ def _band(
             k = int(part[0])
             text.append(f"M{x[k] - 1} {upper[k]}h2V{lower[k]}h-2z")
             continue
-        there = _line(x[part], upper[part])
-        back = _line(x[part][::-1], lower[part][::-1])
+        there = line_path(x[part], upper[part])
+        back = line_path(x[part][::-1], lower[part][::-1])
         text.append(f"{there}L{back[1:]}z")
     return "".join(text)

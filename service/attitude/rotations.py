@@ -1,4 +1,4 @@
-"""Rotations between attitudes, of whole arrays of quaternions."""
+"""Rotations between attitudes, of whole arrays of quaternions: scalar last, inertial to body."""
 
 import numpy as np
 

@@ -1,0 +1,194 @@
+"""The noise of gyro and trackers from innovations and how they follow each other.
+
+The mean square of innovations alone cannot tell the gyro's noise: a filter that believes its gyro
+four times too good has errors nearly three times as large, and innovations that are as large as
+it expects.  But then each innovation resembles the one before.  (Mehra, 1970: the covariances of
+innovations at zero and other lags give both noises.)
+
+About each axis the filter predicts an error of variance P = S - R and corrects it by the gain
+K = P / S.  If the true noise is r R of a measurement and q Q of a step, the true variance of
+the prediction is r A + q B, where
+
+    A' = (1 - K)^2 A + K^2 R        B' = (1 - K)^2 B + Q        Q = P' - (1 - K) P
+
+from one measurement to the next, so that
+
+    E z^2 = r (A + R) + q B         E z' z = (1 - K) (r A + q B) - K r R
+
+and (1 - K) times that at each further lag.  Both sides are summed, and r and q are what remains.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from service.advice.intervals import Interval
+from service.filtering.state import Outcome
+from service.grades.innovations import MeasuredInnovations
+from service.vectors import Vector
+
+MOST = 20_000
+"""Measurements, the latest ones: of more the estimate needs too long."""
+LEAST = 300
+SEGMENTS = 20
+"""Consecutive parts, each of which is left out once for the interval."""
+STUDENT = 2.093
+"""The 97.5 % point of Student's t with 19 degrees of freedom."""
+LONGEST_STEPS = 3.0
+"""Of the median step: across a longer one nothing is said of the gyro's noise."""
+SETTLING = 4.0
+"""Of 1 / K: so many measurements after a break only settle A and B."""
+
+Full = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class InnovationNoise:
+    """Ratios of true sigmas to those assumed: of the gyro over a step, and of the attitudes."""
+
+    gyro: Interval
+    attitudes: Interval
+    measurements: int
+
+
+def innovation_noise(parts: Sequence[MeasuredInnovations]) -> InnovationNoise | None:
+    """The noise that innovations of stretches with a gyro show; None where they are too few.
+
+    Each part is of one stretch, in order of time.  What the gyro's bias adds to its noise is
+    counted as noise of its steps.
+    """
+    sums = _segment_sums(_latest(parts))
+    if sums is None:
+        return None
+    matrix, right, measurements = sums
+    whole = _ratios(matrix.sum(axis=0), right.sum(axis=0))
+    left_out = [
+        _ratios(matrix.sum(axis=0) - matrix[k], right.sum(axis=0) - right[k])
+        for k in range(SEGMENTS)
+    ]
+    if whole is None or any(each is None for each in left_out):
+        return None
+    spread = np.array([each for each in left_out if each is not None])
+    sigma = np.sqrt((SEGMENTS - 1) / SEGMENTS * np.sum((spread - spread.mean(axis=0)) ** 2, axis=0))
+    attitudes, gyro = (
+        _of_sigmas(float(value), STUDENT * float(width))
+        for value, width in zip(whole, sigma, strict=True)
+    )
+    return InnovationNoise(gyro, attitudes, measurements)
+
+
+def _of_sigmas(ratio: float, half: float) -> Interval:
+    """A ratio of variances with its interval as one of sigmas."""
+    low, value, high = (math.sqrt(max(each, 0.0)) for each in (ratio - half, ratio, ratio + half))
+    return Interval(value, low, high)
+
+
+def _ratios(matrix: Full, right: Full) -> Vector | None:
+    if abs(np.linalg.det(matrix)) < 1e-12 * np.abs(matrix).max() ** 2:
+        return None
+    return np.asarray(np.linalg.solve(matrix, right))
+
+
+def _latest(parts: Sequence[MeasuredInnovations]) -> list[MeasuredInnovations]:
+    kept: list[MeasuredInnovations] = []
+    room = MOST
+    for part in reversed(parts):
+        if room <= 0:
+            break
+        kept.append(part.taken(slice(max(0, len(part) - room), None)))
+        room -= len(kept[-1])
+    return kept[::-1]
+
+
+def _segment_sums(
+    parts: Sequence[MeasuredInnovations],
+) -> tuple[Full, Full, int] | None:
+    """Both equations summed over each segment: (segments, 2, 2), (segments, 2)."""
+    used = [part for whole in parts for part in _unbroken(whole)]
+    if not used:
+        return None
+    axes = _principal_axes(used)
+    rows = [row for part in used for row in _rows(part, axes)]
+    if len(rows) < LEAST:
+        return None
+    every = np.array(rows).reshape(len(rows), 2, 3)
+    segments = np.array([each.sum(axis=0) for each in np.array_split(every, SEGMENTS)])
+    return segments[:, :, :2], segments[:, :, 2], len(rows)
+
+
+def _unbroken(whole: MeasuredInnovations) -> Iterator[MeasuredInnovations]:
+    """The parts of consecutive accepted measurements without a gap."""
+    if len(whole) < 2:
+        return
+    step = np.diff(whole.tai_ns)
+    accepted = whole.outcome == Outcome.ACCEPTED
+    breaks = (step > LONGEST_STEPS * np.median(step)) | (step <= 0)
+    breaks |= ~accepted[1:] | ~accepted[:-1]
+    edges = [0, *(np.flatnonzero(breaks) + 1).tolist(), len(whole)]
+    for first, end in pairwise(edges):
+        if end - first > 1 and accepted[first]:
+            yield whole.taken(slice(first, end))
+
+
+def _full(upper: Vector) -> Full:
+    return upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+
+
+def _principal_axes(parts: Sequence[MeasuredInnovations]) -> Full:
+    """Axes, as columns, about which the errors of an attitude are independent on average."""
+    mean = np.mean(np.concatenate([_full(each.measured_arcsec2) for each in parts]), axis=0)
+    return np.asarray(np.linalg.eigh(mean)[1])
+
+
+def _rows(part: MeasuredInnovations, axes: Full) -> Iterator[list[float]]:
+    """Of each measurement the two equations, summed over the axes: left sides and right side."""
+    z = part.innovation_arcsec @ axes
+    predicted, measured = (
+        np.einsum("ji,njk,ki->ni", axes, _full(each), axes)
+        for each in (part.predicted_arcsec2, part.measured_arcsec2)
+    )
+    by_axis = [
+        list(_axis_rows(z[:, k].tolist(), predicted[:, k].tolist(), measured[:, k].tolist()))
+        for k in range(3)
+    ]
+    for of_axes in zip(*by_axis, strict=True):
+        settled = [each for each in of_axes if each is not None]
+        if len(settled) == 3:
+            yield [sum(terms) for terms in zip(*settled, strict=True)]
+
+
+def _axis_rows(
+    z: Sequence[float], s: Sequence[float], r: Sequence[float]
+) -> Iterator[tuple[float, ...] | None]:
+    """The two equations of each measurement about one axis; None until A and B have settled."""
+    usual = sorted(1.0 - b / a for a, b in zip(s, r, strict=True))[len(s) // 2]
+    settling = SETTLING / max(usual, 1e-6)
+    a = b = 0.5 * (s[0] - r[0])
+    past = lag_a = lag_b = 0.0
+    for k in range(len(z)):
+        gain = max(1.0 - r[k] / s[k], 0.0)
+        left = 1.0 - gain
+        if k < settling:
+            yield None
+        else:
+            # Weighed by what each tells: a small gain has a long memory, which adds noise.
+            weight = gain / s[k]
+            yield (
+                (a + r[k]) / s[k],
+                b / s[k],
+                z[k] * z[k] / s[k],
+                weight * lag_a,
+                weight * lag_b,
+                weight * z[k] * past,
+            )
+        past = z[k] + left * past
+        lag_a = left * a - gain * r[k] + left * left * lag_a
+        lag_b = left * b + left * left * lag_b
+        if k + 1 < len(z):
+            step = max((s[k + 1] - r[k + 1]) - left * (s[k] - r[k]), 0.0)
+            a = left * left * a + gain * gain * r[k]
+            b = left * left * b + step

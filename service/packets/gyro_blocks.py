@@ -1,0 +1,184 @@
+"""Packets to gyro blocks: the samples of packets, gathered in blocks of a fixed time."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import msgspec
+
+from service.errors import shown_value
+from service.missions.gyro import largest_rate_deg_per_s
+from service.missions.mission import Mission
+from service.packets.carried import counted_change
+from service.packets.clock import NS, Moment, moment_of
+from service.packets.definition import PacketFault
+from service.packets.mapping import PacketMap
+from service.packets.stream import SpacePacket
+from service.packets.values import finite, whole
+from service.times import parse_utc, shifted
+
+MOST_SAMPLES = 10_000
+"""Of a block, as a request may have."""
+
+Values = Mapping[str, Any]
+Axes = tuple[float, float, float]
+
+
+@dataclass
+class PacketBlock:
+    """A gyro block in the making, with the packet that it began with."""
+
+    packet: SpacePacket
+    start_ns: int
+    start: str
+    tai_ns: list[int] = field(default_factory=list)
+    rates: list[Axes] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class _Sample:
+    tai_ns: int
+    values: tuple[float, ...] | tuple[int, ...]
+
+
+class GyroBlockMaker:
+    """Makes gyro blocks of one spacecraft from the values of packets, in order.
+
+    A block ends where the next one of `block_s` begins, and where time goes back.  Its name is
+    made of the APID and the time of its first sample.
+    """
+
+    def __init__(self, mission: Mission, mapped: PacketMap) -> None:
+        assert mapped.table.gyro_blocks is not None
+        self._spacecraft = mission.name
+        self._mapped = mapped
+        self._table = mapped.table.gyro_blocks
+        self._largest = math.radians(largest_rate_deg_per_s(mission.gyro))
+        self._turn = 1 << self._table.counter_bits
+        self._block_ns = round(self._table.block_s * NS)
+        self._before: _Sample | None = None
+        self._pending: PacketBlock | None = None
+
+    def add(self, packet: SpacePacket, values: Values) -> Iterator[PacketBlock]:
+        """Take a packet; gives the blocks that are complete with it.
+
+        Raises `PacketFault` for a packet of which no sample is taken.
+        """
+        if self._mapped.gyro_values[0][0] not in values:
+            return
+        moment = moment_of(self._table.time or self._mapped.table.time, values)
+        found = [self._sample(values, moment, row) for row in range(self._used(values))]
+        for before, after in pairwise(found):
+            if after.tai_ns <= before.tai_ns:
+                name = ", ".join(self._mapped.gyro_offsets)
+                raise PacketFault(name, "must rise from sample to sample")
+        rates = self._rates(found)
+        self._before = found[-1] if found else self._before
+        for sample, rate in rates:
+            if (done := self._taken(packet, moment, sample, rate)) is not None:
+                yield done
+
+    def end(self) -> Iterator[PacketBlock]:
+        """The block that waits for further samples."""
+        pending, self._pending = self._pending, None
+        if pending is not None:
+            yield pending
+
+    def json_of(self, block: PacketBlock, apid: int) -> bytes:
+        """A block as a line of a telemetry file."""
+        return msgspec.json.encode(
+            {
+                "spacecraft": self._spacecraft,
+                "block": f"{apid}-{block.start}",
+                "start": block.start,
+                "times_s": [(each - block.start_ns) / NS for each in block.tai_ns],
+                "rates_rad_per_s": block.rates,
+            }
+        )
+
+    def _used(self, values: Values) -> int:
+        table = self._table
+        if table.count is None:
+            return table.samples
+        used = whole(values, table.count)
+        if not 0 <= used <= table.samples:
+            message = f"must be from 0 to {table.samples}, the number of samples"
+            raise PacketFault(table.count, message, used)
+        return used
+
+    def _sample(self, values: Values, moment: Moment, row: int) -> _Sample:
+        names = tuple(column[row] for column in self._mapped.gyro_values)
+        later_s = 0.0
+        if self._mapped.gyro_offsets:
+            later_s = finite(values, self._mapped.gyro_offsets[row])
+        elif self._table.step_s is not None:
+            later_s = row * self._table.step_s
+        tai_ns = moment.tai_ns + round(later_s * NS)
+        if self._table.kind == "angle":
+            return _Sample(tai_ns, tuple(whole(values, name) for name in names))
+        return _Sample(tai_ns, tuple(finite(values, name) for name in names))
+
+    def _rates(self, found: list[_Sample]) -> list[tuple[_Sample, Axes]]:
+        """The samples with their rates; of an angle without one before there is none."""
+        rates = []
+        before = self._before
+        for sample in found:
+            if self._table.kind == "rate":
+                units: tuple[float, ...] | None = sample.values
+            else:
+                units = self._changes(before, sample)
+            before = sample
+            if units is not None:
+                x, y, z = (
+                    unit * scale for unit, scale in zip(units, self._table.scale_rad, strict=True)
+                )
+                self._require_believed((x, y, z))
+                rates.append((sample, (x, y, z)))
+        return rates
+
+    def _changes(self, before: _Sample | None, sample: _Sample) -> tuple[float, ...] | None:
+        """Counts per second since the sample before."""
+        if before is None:
+            return None
+        passed_s = (sample.tai_ns - before.tai_ns) / NS
+        if not 0.0 < passed_s <= self._table.max_gap_s:
+            return None
+        return tuple(
+            counted_change(int(now) - int(then), self._turn) / passed_s
+            for now, then in zip(sample.values, before.values, strict=True)
+        )
+
+    def _require_believed(self, rates: Axes) -> None:
+        """Raise `PacketFault` for a rate beyond the mission's largest.
+
+        Here and not with the block, of which the other samples are kept.
+        """
+        for axis, rate in enumerate(rates):
+            if abs(rate) > self._largest:
+                raise PacketFault(
+                    f"{self._mapped.gyro_values[axis][0]}",
+                    f"gives a rate about axis {axis + 1} beyond the largest of "
+                    f"{self._spacecraft}, {self._largest:.6g} rad/s",
+                    shown_value(rate),
+                )
+
+    def _taken(
+        self, packet: SpacePacket, moment: Moment, sample: _Sample, rate: Axes
+    ) -> PacketBlock | None:
+        """Put a sample into its block; the block before, where it begins another one."""
+        pending, done = self._pending, None
+        if pending is not None and (
+            sample.tai_ns // self._block_ns != pending.start_ns // self._block_ns
+            or sample.tai_ns <= pending.tai_ns[-1]
+            or len(pending.tai_ns) == MOST_SAMPLES
+        ):
+            done, pending = pending, None
+        if pending is None:
+            later_s = (sample.tai_ns - moment.tai_ns) / NS
+            start = shifted(parse_utc(moment.text), later_s)
+            pending = self._pending = PacketBlock(packet, sample.tai_ns, start.text)
+        pending.tai_ns.append(sample.tai_ns)
+        pending.rates.append(rate)
+        return done

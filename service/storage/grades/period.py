@@ -1,0 +1,200 @@
+"""The grades of a period for its charts: a bounded number of samples and innovations."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from sqlalchemy import Connection, select, tuple_
+
+from service.filtering.result import Integers
+from service.filtering.state import Status
+from service.grades.day import GRADES, Grade, GradedSamples
+from service.grades.innovations import MeasuredInnovations
+from service.grades.packing import unpacked, unpacked_innovations
+from service.storage.grades.days import shown
+from service.storage.grades.innovations import inside
+from service.storage.grades.models import GradedDayRow
+from service.storage.grades.rows import block_conditions
+from service.storage.queries.pages import ResultFilter
+from service.storage.sql.grade_tables import INNOVATIONS, graded_blocks, graded_days
+from service.times import DAY_S, Utc
+
+PARTS = 600
+"""Of a period, of each of which one sample is kept: as many as a chart shows."""
+MOST_BLOCKS = 48
+"""That are read of each grade: two days at 1 Hz.  Of a longer period they are spread evenly."""
+MOST_DAYS = 40
+_SEVERITY = {Status.NONE: 3, Status.LOST: 3, Status.DOUBTFUL: 2, Status.STARTING: 1}
+
+
+@dataclass(frozen=True, eq=False)
+class GradesOfPeriod:
+    """What was recorded of a period.
+
+    Of each of `PARTS` equal parts of it `samples` have one, that with the worst status in
+    it; both grades have the same times.  `is_gyro` (n,) says which model they have.
+    `innovations` have of each part one measurement that was accepted, and one, with the largest
+    chi-square, that was not.  `is_whole` says whether every block was read.
+    `stretches` are the model, first and last moment (TAI nanoseconds) of every block of up to
+    an hour; `days` the latest of `total_days`.
+    """
+
+    samples: dict[Grade, GradedSamples]
+    is_gyro: npt.NDArray[np.bool_]
+    innovations: MeasuredInnovations | None
+    is_whole: bool
+    stretches: list[tuple[str, int, int]]
+    days: list[GradedDayRow]
+    total_days: int
+
+
+@dataclass(frozen=True)
+class _Block:
+    day_id: str
+    position: int
+    model: str
+    start_ns: int
+    end_ns: int
+
+
+def grades_of_period(
+    connection: Connection, spacecraft: str, run: str, start: Utc, end: Utc
+) -> GradesOfPeriod | None:
+    """The grades of a period, None where none are recorded."""
+    selected = ResultFilter(run, spacecraft, start, end)
+    blocks = _blocks(connection, selected, "smoothed")
+    if not blocks:
+        return None
+    measured = _blocks(connection, selected, INNOVATIONS)
+    days, total = _days(connection, spacecraft, run, start, end)
+    read = _spread(blocks)
+    whole = {grade: _samples(connection, grade, read) for grade in GRADES}
+    places = _of_each_part(
+        whole["smoothed"].tai_ns,
+        np.maximum(*(_severity(whole[grade].status) for grade in GRADES)),
+        start,
+        end,
+    )
+    is_gyro = _repeated_models(read, whole["smoothed"].tai_ns)
+    return GradesOfPeriod(
+        samples={grade: each.taken(places) for grade, each in whole.items()},
+        is_gyro=is_gyro[places],
+        innovations=_innovations(connection, _spread(measured), selected, start, end),
+        is_whole=len(blocks) <= MOST_BLOCKS and len(measured) <= MOST_BLOCKS,
+        stretches=[(each.model, each.start_ns, each.end_ns) for each in blocks],
+        days=days,
+        total_days=total,
+    )
+
+
+def latest_innovations(
+    connection: Connection, selected: ResultFilter, *, of_gyro: bool = False
+) -> list[MeasuredInnovations]:
+    """The innovations of a period's latest blocks, in order of time; perhaps of a gyro alone."""
+    blocks = _blocks(connection, selected, INNOVATIONS)
+    blocks = [each for each in blocks if each.model == "gyro" or not of_gyro]
+    rows = _packed(connection, INNOVATIONS, blocks[-MOST_BLOCKS:])
+    found = [unpacked_innovations(row.packed, row.samples) for row in rows]
+    return [each.taken(inside(each, selected)) for each in found]
+
+
+def _blocks(connection: Connection, selected: ResultFilter, kind: str) -> list[_Block]:
+    """The blocks of a period without their samples, in order of time."""
+    c = graded_blocks.c
+    query = (
+        select(c.day_id, c.position, c.model, c.start_ns, c.end_ns)
+        .join_from(graded_days, graded_blocks, c.day_id == graded_days.c.id)
+        .where(*block_conditions(selected, kind))
+        .order_by(graded_days.c.day, c.position)
+    )
+    return [_Block(*row) for row in connection.execute(query)]
+
+
+def _days(
+    connection: Connection, spacecraft: str, run: str, start: Utc, end: Utc
+) -> tuple[list[GradedDayRow], int]:
+    c = graded_days.c
+    query = select(graded_days).where(
+        c.current,
+        c.spacecraft == spacecraft,
+        c.run == run,
+        c.day >= start.bucket(DAY_S),
+        c.start_ns < end.tai_ns,
+    )
+    rows = connection.execute(query.order_by(c.day)).mappings().all()
+    return [shown(row) for row in rows[-MOST_DAYS:]], len(rows)
+
+
+def _spread(blocks: Sequence[_Block]) -> list[_Block]:
+    if len(blocks) <= MOST_BLOCKS:
+        return list(blocks)
+    chosen = np.unique(np.rint(np.linspace(0, len(blocks) - 1, MOST_BLOCKS)).astype(int))
+    return [blocks[place] for place in chosen.tolist()]
+
+
+def _packed(connection: Connection, kind: str, read: Sequence[_Block]) -> list[Any]:
+    """The packed samples of some blocks, in their order."""
+    c = graded_blocks.c
+    place = tuple_(c.day_id, c.position)
+    query = select(c.day_id, c.position, c.samples, c.packed).where(
+        c.grade == kind, place.in_([(each.day_id, each.position) for each in read])
+    )
+    rows = {(row.day_id, row.position): row for row in connection.execute(query)}
+    return [rows[each.day_id, each.position] for each in read]
+
+
+def _samples(connection: Connection, grade: Grade, read: Sequence[_Block]) -> GradedSamples:
+    found = [unpacked(row.packed, row.samples) for row in _packed(connection, grade, read)]
+    return GradedSamples.joined(found)
+
+
+def _severity(status: Integers) -> Integers:
+    severity = np.zeros(len(status), dtype=np.int64)
+    for code, value in _SEVERITY.items():
+        severity[status == code] = value
+    return severity
+
+
+def _of_each_part(time_ns: Integers, rank: npt.ArrayLike, start: Utc, end: Utc) -> Integers:
+    """The places, one in each part of the period, with the greatest rank in it; the first such."""
+    inside_ = np.flatnonzero((time_ns >= start.tai_ns) & (time_ns < end.tai_ns))
+    length_ns = max(end.tai_ns - start.tai_ns, 1)
+    part = ((time_ns[inside_] - start.tai_ns) / length_ns * PARTS).astype(np.int64)
+    order = np.lexsort((time_ns[inside_], -np.asarray(rank)[inside_], part))
+    _, first = np.unique(part[order], return_index=True)
+    return np.asarray(inside_[order[first]])
+
+
+def _repeated_models(read: Sequence[_Block], time_ns: Integers) -> npt.NDArray[np.bool_]:
+    is_gyro = np.array([each.model == "gyro" for each in read])
+    begins = np.array([each.start_ns for each in read])
+    return np.asarray(is_gyro[np.searchsorted(begins, time_ns, side="right") - 1])
+
+
+def _innovations(
+    connection: Connection,
+    read: Sequence[_Block],
+    selected: ResultFilter,
+    start: Utc,
+    end: Utc,
+) -> MeasuredInnovations | None:
+    """The innovations to show; None where none were recorded, as of an older revision."""
+    if not read:
+        return None
+    parts = []
+    for row in _packed(connection, INNOVATIONS, read):
+        found = unpacked_innovations(row.packed, row.samples)
+        parts.append(found.taken(inside(found, selected)))
+    whole = MeasuredInnovations.joined(parts)
+    is_used = whole.is_used
+    nis = np.where(np.isfinite(whole.nis), whole.nis, np.inf)
+    places = []
+    for chosen, rank in (
+        (np.flatnonzero(is_used), np.zeros(len(whole))),
+        (np.flatnonzero(~is_used), nis),
+    ):
+        kept = _of_each_part(whole.tai_ns[chosen], rank[chosen], start, end)
+        places.append(chosen[kept])
+    return whole.taken(np.sort(np.concatenate(places)))

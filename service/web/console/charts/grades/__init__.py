@@ -1,0 +1,1 @@
+"""Charts of filtered and smoothed attitudes: traces by grade, innovations, time line."""

@@ -1,0 +1,159 @@
+"""Panels of one axis: traces of several grades, a band, marks, on a linear or logarithmic scale."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from service.filtering.result import Integers
+from service.times import Utc
+from service.vectors import Vector
+from service.web.console.charts.period.attitude import HEIGHT, PAD, WIDTH, band_path, line_path
+
+Mask = npt.NDArray[np.bool_]
+ROOM = 0.04
+"""Above the greatest and below the least value, of the height."""
+
+
+@dataclass(frozen=True)
+class Trace:
+    """A path of one kind, such as a grade: `line` for joined values, `dots` for lone ones."""
+
+    kind: str
+    line: str
+    dots: str
+
+
+@dataclass(frozen=True)
+class GradePanel:
+    """One axis.  `marks` are of rejected values; those beyond an edge stand at it."""
+
+    axis: str
+    traces: tuple[Trace, ...]
+    band: str
+    marks: str
+    bounds: tuple[int, ...]
+    """Heights of horizontal lines."""
+    note: str
+    """The range of the values, and what else there is to say."""
+
+
+@dataclass(frozen=True)
+class GradeChart:
+    """Panels of one unit; `rows` are the same as a table: the axis, then a cell a column."""
+
+    id: str
+    title: str
+    panels: tuple[GradePanel, ...]
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    width: int = WIDTH
+    height: int = HEIGHT
+
+
+@dataclass(frozen=True)
+class TimeAxis:
+    """The period that a chart shows."""
+
+    start: Utc
+    end: Utc
+
+    def x(self, time_ns: Integers) -> Integers:
+        """Units from the left edge (n,)."""
+        length = max(self.end.tai_ns - self.start.tai_ns, 1)
+        along = np.clip((time_ns - self.start.tai_ns) / length, 0.0, 1.0)
+        return np.asarray(np.rint(PAD + along * (WIDTH - 2 * PAD)).astype(np.int64))
+
+
+@dataclass(frozen=True)
+class Scale:
+    """From values to heights; logarithmic or linear, between `low` and `high`."""
+
+    low: float
+    high: float
+    is_log: bool = False
+
+    def y(self, value: Vector) -> Integers:
+        """Units from the top (n,); values beyond an edge are at it."""
+        low, high = self.low, self.high
+        if self.is_log:
+            value, low, high = np.log(np.maximum(value, low)), np.log(low), np.log(high)
+        room = ROOM * (high - low) or 1.0
+        part = (value - low + room) / (high - low + 2.0 * room)
+        return np.asarray(np.rint(HEIGHT * (1.0 - np.clip(part, 0.0, 1.0))).astype(np.int64))
+
+
+@dataclass(frozen=True, eq=False)
+class Values:
+    """Values of one axis at moments; `joins` (n,): whether each is joined with the one before."""
+
+    time_ns: Integers
+    value: Vector
+    joins: Mask = field(default_factory=lambda: np.zeros(0, dtype=bool))
+
+    def trace(self, kind: str, axis: TimeAxis, scale: Scale) -> Trace:
+        """The path of the values; of those that are unknown there is none."""
+        known = np.isfinite(self.value)
+        joins = self.joins if len(self.joins) else np.zeros(len(known), dtype=bool)
+        # One that follows an unknown one begins a part.
+        joins = (joins & np.append(False, known[:-1])[: len(known)])[known]
+        x, y = axis.x(self.time_ns[known]), scale.y(self.value[known])
+        parts = parts_of(joins)
+        return Trace(
+            kind,
+            "".join(line_path(x[part], y[part]) for part in parts if len(part) > 1),
+            "".join(line_path(x[part], y[part]) + "h0" for part in parts if len(part) == 1),
+        )
+
+
+def parts_of(joins: Mask) -> list[npt.NDArray[np.int64]]:
+    """The places of each joined part."""
+    if not len(joins):
+        return []
+    return np.split(np.arange(len(joins)), np.flatnonzero(~joins[1:]) + 1)
+
+
+def band_of(
+    time_ns: Integers, low: Vector, high: Vector, joins: Mask, axis: TimeAxis, scale: Scale
+) -> str:
+    """The area between two lines, where both are known."""
+    known = np.isfinite(low) & np.isfinite(high)
+    joins = (joins & np.append(False, known[:-1])[: len(known)])[known]
+    if not len(joins):
+        return ""
+    x = axis.x(time_ns[known])
+    return band_path(x, scale.y(high[known]), scale.y(low[known]), parts_of(joins))
+
+
+def marks_of(time_ns: Integers, value: Vector, axis: TimeAxis, scale: Scale) -> str:
+    """A cross at each value."""
+    known = np.isfinite(value)
+    x, y = axis.x(time_ns[known]), np.clip(scale.y(value[known]), 8, HEIGHT - 8)
+    places = zip(x.tolist(), y.tolist(), strict=True)
+    return "".join(f"M{a - 7} {b - 7}l14 14m0 -14l-14 14" for a, b in places)
+
+
+def joined_moments(time_ns: Integers, axis: TimeAxis, parts: int, same: Mask) -> Mask:
+    """Which moments (n,) belong together with the one before.
+
+    They do unless they are farther apart than three parts of the period and three times what
+    is usual, or `same` (n,) says that they are not of the same stretch.
+    """
+    step = np.diff(time_ns, prepend=time_ns[:1])
+    part = (axis.end.tai_ns - axis.start.tai_ns) / parts
+    usual = float(np.median(step[1:])) if len(step) > 1 else 0.0
+    return np.asarray((step <= 3.0 * max(part, usual)) & same)
+
+
+def scale_of(values: Mapping[str, Vector], *, is_log: bool = False) -> Scale | None:
+    """A scale that holds all known values; None where none is known."""
+    found = np.concatenate([each[np.isfinite(each)] for each in values.values()])
+    if is_log:
+        found = found[found > 0.0]
+    if not len(found):
+        return None
+    low, high = float(found.min()), float(found.max())
+    if is_log and high < 1.2 * low:
+        low, high = low / 1.2, high * 1.2
+    return Scale(low, high, is_log)

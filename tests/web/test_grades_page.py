@@ -1,0 +1,175 @@
+"""The page of grades and its route: what the record says of attitude over time, and of nothing."""
+
+import html
+import re
+from dataclasses import replace
+
+import httpx
+import numpy as np
+import pytest
+
+from service.app.factory import open_app
+from service.settings import Settings
+from service.web.app import create_app
+from tests.filtering.simulated import ARCSEC, attitudes_of, gyro_of, slews, truth_of
+from tests.grades.passes import GYRO, MODEL, mission_with, recorded_of
+from tests.grades.records import put_pass
+from tests.web.browser import CHROMIUM, Browser
+from tests.web.fitting import assert_fits
+from tests.web.markup import Markup
+from tests.web.serving import Server
+
+PAGE = "/spacecraft/XTE/grades"
+ROUTE = "/api/v1/spacecraft/XTE/innovations"
+SMOOTHED = {"run": "pass"}
+WRONG = 120
+"""This attitude of 226 is 300 arcsec off."""
+in_browser = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
+
+
+def one_turned(attitudes, row, arcsec):
+    q = attitudes.quaternion.copy()
+    s, c = np.sin(0.5 * arcsec * ARCSEC), np.cos(0.5 * arcsec * ARCSEC)
+    x, y, z, w = q[row]
+    q[row] = [c * x + s * w, c * y + s * z, c * z - s * y, c * w - s * x]
+    return replace(attitudes, quaternion=q)
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory, missions):
+    """A service with half an hour at 1 Hz in two runs, of which one is smoothed."""
+    rng = np.random.default_rng(11)
+    truth = truth_of(slews, 1800.0)
+    gyro, _ = gyro_of(truth, MODEL, rng)
+    attitudes = attitudes_of(truth, np.arange(0, 1801, 8), (6.0, 6.0, 40.0), rng)
+    attitudes = one_turned(attitudes, WRONG, 300.0)
+    kept = (truth.time_s < 600.0) | (truth.time_s > 660.0)
+    recorded = recorded_of(gyro.tai_ns[kept], gyro.rate_rad_s[kept], attitudes)
+    database = f"sqlite:///{tmp_path_factory.mktemp('grades') / 'acquire.db'}"
+    mission = mission_with(missions["XTE"], gyro=GYRO)
+    app = open_app(Settings(database=database, replay_processes=0), mission)
+    for run in ("pass", "bare"):
+        put_pass(app, recorded, run=run)
+    app.grades.smooth("XTE", run="pass")
+    with Server(create_app(app)) as address:
+        yield address
+
+
+def text_of(page):
+    return re.sub(r"\s+", " ", html.unescape(re.sub(r"<[^>]+>", " ", page)))
+
+
+def figure(page, id):
+    return page.partition(f'id="chart-{id}"')[2].partition("</figure>")[0]
+
+
+def cells(page, id):
+    """The rows of a chart's table of figures."""
+    rows = re.findall(r"<tr><th scope=\"row\">.*?</tr>", figure(page, id))
+    return [re.findall(r"<t[hd][^>]*>([^<]*)</t[hd]>", row) for row in rows]
+
+
+def arcsec(text):
+    return float(text.rstrip("″").replace("−", "-"))
+
+
+def test_sigmas_of_the_grades_are_those_of_the_record_raw_the_worst_smoothed_the_best(address):
+    page = httpx.get(address + PAGE, params=SMOOTHED).raise_for_status().text
+    Markup(page)
+    for axis, raw, filtered, smoothed in cells(page, "sigma"):
+        assert arcsec(raw) == pytest.approx(40.0 if axis == "z" else 6.0, rel=1e-3)
+        assert arcsec(smoothed) < 0.9 * arcsec(filtered) < 0.5 * arcsec(raw)
+
+
+def test_innovations_and_differences_scatter_about_as_their_bounds_say(address):
+    page = httpx.get(address + PAGE, params=SMOOTHED).text
+    for id in ("innovation", "difference"):
+        for row in cells(page, id):
+            assert float(row[3]) == pytest.approx(1.0, abs=0.2), (id, row)
+    ((_, mean, inside, _),) = cells(page, "chi-square")
+    assert float(mean) == pytest.approx(1.0, abs=0.2)
+    assert float(inside.rstrip(" %")) > 90.0
+
+
+def test_the_rejected_attitude_is_marked_and_counted(address):
+    page = httpx.get(address + PAGE, params=SMOOTHED).text
+    for id, panels in (("innovation", 3), ("difference", 3), ("chi-square", 1)):
+        drawn = figure(page, id)
+        assert drawn.count('class="rejected-at"') == panels
+        assert [row[-1] for row in cells(page, id)] == ["1"] * panels
+    assert "accepted" in text_of(page)
+    assert 'data-name="rejected">1<' in page
+
+
+def test_the_time_line_names_model_and_status_and_the_days_count_gaps(address):
+    page = httpx.get(address + PAGE, params=SMOOTHED).text
+    strips = page.partition('class="period-figure strips"')[2].partition("</figure>")[0]
+    assert 'class="bar-gyro"' in strips
+    assert 'class="bar-good"' in strips
+    # The filtered grade begins as suspect.
+    assert 'class="bar-suspect"' in strips
+    assert 'data-name="gaps of the gyro">1<' in page
+
+
+def test_what_is_drawn_is_bounded_however_long_the_period(address):
+    page = httpx.get(address + PAGE, params=SMOOTHED | {"range": "60min"}).text
+    steps = max(path.count("l") for path in re.findall(r' d="([^"]*)"', page))
+    assert 200 < steps < 1300
+    assert len(page) < 300_000
+    year = httpx.get(address + PAGE, params=SMOOTHED | {"range": "year"}).raise_for_status()
+    assert 'class="bar-gyro"' in year.text
+
+
+def test_where_nothing_is_smoothed_the_page_names_the_command(address):
+    page = httpx.get(address + PAGE, params={"run": "bare"}).raise_for_status().text
+    assert "acquire smooth XTE --run bare --start" in text_of(page)
+    assert "<svg" not in page.partition('id="grades"')[2].partition("</main>")[0]
+    none = httpx.get(address + PAGE, params={"run": "nothing"}).raise_for_status()
+    assert "No batches of XTE in run nothing" in text_of(none.text)
+    assert httpx.get(f"{address}/spacecraft/NONE/grades").status_code == 404
+
+
+def test_the_page_of_the_spacecraft_leads_to_it(address):
+    # A run without batches: those of the others are of attitudes alone.
+    page = httpx.get(f"{address}/spacecraft/XTE", params={"run": "nothing"}).text
+    assert re.search(r'href="/spacecraft/XTE/grades\?[^"]*run=nothing', page)
+
+
+def test_the_route_gives_every_innovation_once_by_its_pages(address):
+    found, url = [], f"{address}{ROUTE}?run=pass&limit=100"
+    while url:
+        answer = httpx.get(url).raise_for_status()
+        found += answer.json()["items"]
+        following = re.match(r'<([^>]*)>; rel="next"', answer.headers.get("Link", ""))
+        url = address + following[1] if following else None
+    assert len(found) == 226
+    assert [k for k, each in enumerate(found) if each["outcome"] == "rejected"] == [WRONG]
+    assert found[WRONG]["chi_square"] > 21.1
+    assert found[WRONG]["innovation_arcsec"][0] == pytest.approx(300.0, abs=30.0)
+    assert found[0]["innovation_arcsec"] is None
+
+
+@pytest.mark.parametrize(
+    ("asked", "status", "named"),
+    [
+        ({"cursor": "1.x"}, 422, "cursor"),
+        ({"cursor": "9" * 100}, 422, "cursor"),
+        ({"limit": 0}, 422, "limit"),
+        ({"start": "yesterday"}, 422, "start"),
+        ({"grade": "raw"}, 422, "grade"),
+    ],
+)
+def test_the_route_names_what_is_wrong(address, asked, status, named):
+    answer = httpx.get(address + ROUTE, params=asked)
+    assert answer.status_code == status
+    assert named in answer.text
+    assert httpx.get(f"{address}/api/v1/spacecraft/NONE/innovations").status_code == 404
+
+
+@in_browser
+@pytest.mark.parametrize("run", ["pass", "bare"])
+def test_it_fits_and_axe_finds_no_fault(address, run, tmp_path):
+    with Browser(tmp_path) as browser:
+        assert_fits(browser, f"{address}{PAGE}?run={run}")
+        assert browser.complaints == []
+        browser.call("Page.navigate", url="about:blank")
