@@ -13,7 +13,8 @@ from service.acquire.kernel_build import KernelBuild
 from service.app.context import Context
 from service.errors import AcquisitionError, BadBatch
 from service.ingest.outcomes import Observer
-from service.ingest.submit import Backlog, SubmissionService
+from service.ingest.queue import Backlog
+from service.ingest.submit import SubmissionService
 from service.observations.schema import Submission, faults_of, submission_from_json
 from service.storage.recording.unsaved_result import Answered
 

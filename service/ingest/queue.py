@@ -27,7 +27,7 @@ from service.observations.schema import Submission
 from service.storage.recording.identity import Identity, OwnKey
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.sql.transaction import WriteOutcome, WriteOutcomes
-from service.storage.sql.writer import RETRY_AFTER_S, Writer
+from service.storage.sql.writer import RETRY_AFTER_S, Writer, WriterState
 from service.times import Utc, utc_now
 
 MAX_WAITING = 2_000
@@ -73,6 +73,14 @@ class QueueState:
 
     queued: int
     oldest_s: float
+
+
+@dataclass(frozen=True)
+class Backlog:
+    """The queue of submitted batches, and that of the writer."""
+
+    posts: QueueState
+    writes: WriterState
 
 
 class IngestQueue:

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from typing import TypeVar
 
 import msgspec
@@ -26,7 +25,7 @@ from service.ingest.outcomes import (
     note_handed_over,
     outcome_of,
 )
-from service.ingest.queue import IngestQueue, PendingBatch, QueueState
+from service.ingest.queue import Backlog, IngestQueue, PendingBatch
 from service.ingest.solver_pool import WAIT_S, Solver, SolverPool, may_take_long
 from service.ingest.tracking import with_prediction
 from service.missions.mission import Mission
@@ -48,7 +47,6 @@ from service.storage.recording.identity import (
 from service.storage.recording.results import record
 from service.storage.recording.unsaved_result import Answered, UnsavedResult, unsaved_what_if
 from service.storage.sql.database import Store
-from service.storage.sql.writer import WriterState
 from service.times import utc_now
 
 YIELD_S = 0.002
@@ -57,14 +55,6 @@ YIELD_S = 0.002
 log = logging.getLogger(__name__)
 
 AnswerFuture = TypeVar("AnswerFuture", "asyncio.Future[Answered]", "Future[Answered]")
-
-
-@dataclass(frozen=True)
-class Backlog:
-    """The queue of submitted batches, and that of the writer."""
-
-    posts: QueueState
-    writes: WriterState
 
 
 class _WarmedUp(Exception):

@@ -16,7 +16,7 @@ from starlette.types import Scope
 from service.alarms.limits import Severity
 from service.app.factory import App
 from service.ingest.outcomes import Recorded
-from service.ingest.submit import Backlog
+from service.ingest.queue import Backlog
 from service.storage.models.alarms import Alarm
 from service.storage.models.zones import ZoneCache
 from service.storage.queries.future_dated import LIVE
