@@ -14,7 +14,11 @@ from service.web.console.charts.grades.innovations import innovation_charts
 from service.web.console.charts.grades.panels import GradeChart, TimeAxis
 from service.web.console.charts.grades.time_line import Strip, strips
 from service.web.console.page_context import ContextDep
-from service.web.console.pages.spacecraft import RANGES_S, SpacecraftQuery, shown_period
+from service.web.console.pages.one_spacecraft.spacecraft import (
+    RANGES_S,
+    SpacecraftQuery,
+    shown_period,
+)
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy

@@ -15,7 +15,11 @@ from service.web.console.charts.period.focal_plane import FocalPlaneMap, focal_p
 from service.web.console.charts.period.histogram import Histogram, residual_histogram
 from service.web.console.charts.period.magnitudes import MagnitudeChart, magnitude_chart
 from service.web.console.page_context import ContextDep
-from service.web.console.pages.spacecraft import RANGES_S, SpacecraftQuery, shown_period
+from service.web.console.pages.one_spacecraft.spacecraft import (
+    RANGES_S,
+    SpacecraftQuery,
+    shown_period,
+)
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy

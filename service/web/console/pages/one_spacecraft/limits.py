@@ -9,7 +9,7 @@ from starlette.responses import Response
 from service.alarms.subjects import limited_trackers
 from service.observations.schema import Key
 from service.web.console.page_context import ContextDep, PageQuery
-from service.web.console.pages.spacecraft import charts
+from service.web.console.pages.one_spacecraft.spacecraft import charts
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
