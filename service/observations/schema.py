@@ -216,7 +216,9 @@ APrioriIn = Annotated[
     Discriminator(
         _kind_of_prior,
         custom_error_type="a_priori_kind",
-        custom_error_message="must hold quaternion, boresight, sun_pointed or from, or be null",
+        custom_error_message=(
+            "must hold one of quaternion, boresight, sun_pointed, from, or be null"
+        ),
     ),
 ]
 

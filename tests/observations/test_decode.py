@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from service.observations import decode as canonical
 from service.observations import schema as wire
 from service.observations.decode import batch_from_canonical
+from service.observations.prediction import PredictionIn
 from tests.observations.example import BATCH
 
 ALIKE = [
@@ -19,8 +20,9 @@ ALIKE = [
     (wire.DirectionIn, canonical.SentDirection),
     (wire.OptionsIn, canonical.SentOptions),
     (wire.BatchIn, canonical.SentBatch),
+    (PredictionIn, canonical.SentPrediction),
 ]
-PRIORS = (wire.QuaternionIn, wire.BoresightIn, wire.SunPointedIn)
+PRIORS = (wire.QuaternionIn, wire.BoresightIn, wire.SunPointedIn, wire.FromLastIn)
 
 
 def _defaults(struct):
@@ -50,7 +52,8 @@ def test_what_the_text_leaves_out_has_the_default_of_the_model(model, struct):
 def test_every_kind_of_prior_has_its_fields():
     fields = {name for model in PRIORS for name in model.model_fields}
     assert fields == set(canonical.SentPrior.__struct_fields__)
-    assert {model.model_fields["frame"].default for model in PRIORS} == {
+    with_frame = [model for model in PRIORS if model is not wire.FromLastIn]
+    assert {model.model_fields["frame"].default for model in with_frame} == {
         _defaults(canonical.SentPrior)["frame"]
     }
 

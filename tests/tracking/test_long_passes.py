@@ -26,7 +26,7 @@ CASES = [
     ("XTE", "verified", False, 6),
     ("XTE", "starid", False, 6),
 ]
-COMPARED_EVERY = 3
+COMPARED_EVERY, FEW = 3, 3
 
 
 @pytest.mark.torture
@@ -54,7 +54,6 @@ def test_flips_and_gaps_leave_nothing_wrong(
                 flips=flips,
                 gaps=gaps,
                 dense=dense,
-                most=3 if dense else 5,
             )
         ):
             answer = send(app, flown.body)
@@ -63,11 +62,11 @@ def test_flips_and_gaps_leave_nothing_wrong(
             if k in flips:
                 assert states[-1] != "tracking"
             if states[-1] == "tracking" and k % COMPARED_EVERY == 0:
-                given = _by_default(app, answer["id"], flown, mission, sky, rng)
+                given = _of_few_stars(app, answer["id"], flown, mission, sky, rng)
                 pairs += answer["observations"][0]["zone"]["pairs"]
-                default += given.trackers[0].pairs
-                ambiguous[0] += answer["counts"]["ambiguous"]
-                ambiguous[1] += given.counts["ambiguous"]
+                default += given[1].trackers[0].pairs
+                for place, acquisition in enumerate(given):
+                    ambiguous[place] += acquisition.counts["ambiguous"]
         # The record repeats what was answered, of the last batch as of any.
         told = app.results.what_if(answer["id"], OptionsIn(), record=False, adopt=False)
         again = json.loads(told.body)
@@ -92,12 +91,23 @@ def test_flips_and_gaps_leave_nothing_wrong(
     assert states.count("tracking") >= 0.97 * (batches - 8)
 
 
-def _by_default(app, id, flown, mission, sky, rng):
-    """The acquisition of a batch in the mission's own zone; in a band with any other roll."""
+def _of_few_stars(app, id, flown, mission, sky, rng):
+    """The first three stars of a batch about its prediction, and in the mission's own zone.
+
+    Votes of so few stars are often ambiguous.  In a band the roll is presumed to be any other.
+    """
     with app.store.reading() as connection:
         batch, _ = recorded_batch(connection, id)
     attitude = flown.attitude
     if isinstance(mission.zone, Band):
         attitude = turned_by(attitude, rng.uniform(0.0, 2 * np.pi) * mission.axis_body)
     prior = QuaternionPrior(quaternion_from_matrix(attitude))
-    return acquire(replace(batch, a_priori=prior, tracking=None), mission, sky)
+    few = [_first_of(each) for each in batch.observations]
+    batch = replace(batch, observations=tuple(few))
+    by_default = replace(batch, a_priori=prior, tracking=None)
+    return acquire(batch, mission, sky), acquire(by_default, mission, sky)
+
+
+def _first_of(stars):
+    values = {name: getattr(stars, name)[:FEW] for name in stars.__struct_fields__[1:]}
+    return replace(stars, **values)
