@@ -132,6 +132,7 @@ def test_a_record_holds_the_answer_as_sent_and_the_input_that_made_it(app, make)
         "input": json.loads(submission.text),
         "options": {},
         "current": True,
+        "archived": False,
         "parent": None,
         "what_ifs": [],
     }

@@ -25,7 +25,7 @@ CSV_HELP = """\
 CSV files have a header and one star per row; consecutive rows with the same
 (spacecraft, run, batch) form a batch.  Cells may be empty.  Columns, as in the JSON:
   spacecraft batch run time frame aberration options
-  q1 q2 q3 qc boresight_ra_deg boresight_dec_deg sun_pointed
+  q1 q2 q3 qc boresight_ra_deg boresight_dec_deg sun_pointed a_priori_from
   rate_x_deg_per_s rate_y_deg_per_s rate_z_deg_per_s
   velocity_x_km_per_s velocity_y_km_per_s velocity_z_km_per_s
   position_x_km position_y_km position_z_km sun_vector_x sun_vector_y sun_vector_z
