@@ -49,7 +49,9 @@ Require = Callable[[], object]
 def solve_lines(solver: Solver, lines: TelemetryLines) -> list[LineResult]:
     """The results of some lines, computed in a worker."""
     return line_results(
-        lines, lambda fresh: [solver.solve_one_of_many(each) for each in fresh], solver.tracks
+        lines,
+        lambda fresh: [solver.solve_one_of_many(each) for each in fresh],
+        solver.asks_for_last,
     )
 
 
@@ -137,17 +139,17 @@ class Bulk:
                 made.append(self.solve_here(each))
             return made
 
-        tracks = self._submissions.solver.tracks
-        return line_results(lines, unsaved_results, tracks)
+        asks_for_last = self._submissions.solver.asks_for_last
+        return line_results(lines, unsaved_results, asks_for_last)
 
     def submit_tracked(self, line: TrackedLine) -> Answered | AcquisitionError:
         """Record a line that asks for the last attitude, when all before it are recorded."""
         self._submissions.yield_to_interactive()
         return self._submissions.submit_tracked(submission_from_json(line.text))
 
-    def tracks(self, submission: Submission) -> bool:
+    def asks_for_last(self, submission: Submission) -> bool:
         """Whether a line asks for the last attitude."""
-        return self._submissions.solver.tracks(submission.batch)
+        return self._submissions.solver.asks_for_last(submission.batch)
 
     def solve_here(self, submission: Submission) -> UnsavedResult | AcquisitionError:
         """The result of one line, computed when no single post waits."""
@@ -270,7 +272,7 @@ class BulkChunk:
         if first is None:
             # It is not called what it seemed to be called.
             submission = submission_from_json(text, run=self._lines.run)
-            if self._bulk.tracks(submission):
+            if self._bulk.asks_for_last(submission):
                 return TrackedLine(seen.identity, submission.text)
             return self._bulk.solve_here(submission)
         answer = self._stored[first.result_id]

@@ -59,10 +59,10 @@ class PendingBatch:
     is_long: bool
     future: "asyncio.Future[Answered] | Future[Answered]" = field(default_factory=Future)
     wait_s: float = WAIT_S
-    track: Hashable | None = None
-    """Batches of one track are computed one after another, each when the last is recorded."""
+    sequence: Hashable | None = None
+    """Batches of one sequence are computed one after another, each when the last is recorded."""
     time_ns: int = 0
-    """The order of those of a track that wait together."""
+    """The order of those of a sequence that wait together."""
     received: Utc = field(default_factory=utc_now)
     since_s: float = field(default_factory=time.monotonic)
 
@@ -206,8 +206,8 @@ class IngestQueue:
                 repeats.append(pending)
                 return
             self._in_flight[pending.identity] = []
-            track = pending.track
-            if track is not None and not self._turns.enter(track, pending.time_ns, pending):
+            sequence = pending.sequence
+            if sequence is not None and not self._turns.enter(sequence, pending.time_ns, pending):
                 return
         error = self._start(pending)
         if error is not None:
@@ -254,11 +254,11 @@ class IngestQueue:
     def _finish(self, outcomes: Sequence[tuple[PendingBatch, WriteOutcome]]) -> None:
         """Answer what was computed; its repeats are looked up, for it may have failed."""
         done = list(outcomes)
-        # The next of a track may fail to start: then it is done as well.
+        # The next of a sequence may fail to start: then it is done as well.
         for pending, _ in done:
-            if pending.track is not None:
+            if pending.sequence is not None:
                 with self._lock:
-                    following = self._turns.leave(pending.track)
+                    following = self._turns.leave(pending.sequence)
                 error = None if following is None else self._start(following)
                 if following is not None and error is not None:
                     done.append((following, error))

@@ -53,7 +53,7 @@ class Solver:
         mission = mission or mission_in_input(self.missions, batch.spacecraft)
         return acquire(batch, mission, self.sky)
 
-    def tracks(self, batch: ObservationBatch) -> bool:
+    def asks_for_last(self, batch: ObservationBatch) -> bool:
         """Whether the attitude of a batch is to be predicted from the record first.
 
         False for an unknown spacecraft, whose batch is refused.

@@ -101,7 +101,7 @@ class SubmissionService:
             future,
             is_long=may_take_long(batch),
             tracked_ns=submission.batch.time.tai_ns
-            if self.solver.tracks(submission.batch)
+            if self.solver.asks_for_last(submission.batch)
             else None,
         )
 
@@ -127,7 +127,7 @@ class SubmissionService:
         turn = (None if caller is None else caller.token_id, identity[0])
         pending = PendingBatch(identity, fingerprint, key, make, turn, is_long, future, wait_s)
         if tracked_ns is not None:
-            pending.track, pending.time_ns = identity[:2], tracked_ns
+            pending.sequence, pending.time_ns = identity[:2], tracked_ns
         self._single_s = pending.since_s
         self._queue.put(pending)
         return future
@@ -137,7 +137,7 @@ class SubmissionService:
 
         Those that ask for the last attitude follow one by one.
         """
-        places = [k for k, each in enumerate(submissions) if self.solver.tracks(each.batch)]
+        places = [k for k, each in enumerate(submissions) if self.solver.asks_for_last(each.batch)]
         others = [each for k, each in enumerate(submissions) if k not in places]
         answers = iter(self._submit_together(others) if others else ())
         tracked = {k: self.submit_tracked(submissions[k]) for k in places}
@@ -153,7 +153,7 @@ class SubmissionService:
             lambda: submission,
             "bulk",
             is_long=True,
-            track=identity[:2],
+            sequence=identity[:2],
             time_ns=batch.time.tai_ns,
         )
         self._queue.put(pending)
@@ -309,7 +309,7 @@ class SubmissionService:
 
     def _solve(self, pending: PendingBatch) -> UnsavedResult:
         submission = pending.make()
-        if self.solver.tracks(submission.batch):
+        if self.solver.asks_for_last(submission.batch):
             mission = self.solver.missions[submission.batch.spacecraft]
             with self._store.reading() as connection:
                 submission = with_prediction(connection, submission, mission)

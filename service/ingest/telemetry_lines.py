@@ -56,17 +56,17 @@ ComputeMany = Callable[[Sequence[Submission]], Sequence[UnsavedResult | Acquisit
 
 
 def line_results(
-    lines: TelemetryLines, compute: ComputeMany, tracks: Callable[[ObservationBatch], bool]
+    lines: TelemetryLines, compute: ComputeMany, asks_for_last: Callable[[ObservationBatch], bool]
 ) -> list[LineResult]:
     """The result of each line, in order; `compute` is given all new submissions.
 
-    Except those that `tracks` says ask for the last attitude.
+    Except those for which `asks_for_last` is true: they need what is recorded before them.
     """
     read = [_read(text, lines.run) for text in lines.texts]
     tracked = {
         place
         for place, each in enumerate(read)
-        if isinstance(each, Submission) and place not in lines.known and tracks(each.batch)
+        if isinstance(each, Submission) and place not in lines.known and asks_for_last(each.batch)
     }
     fresh = [
         each
