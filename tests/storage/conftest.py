@@ -8,13 +8,17 @@ from tests.storage import samples
 
 
 @pytest.fixture
-def opened(database):
+def opened(database, tmp_path):
     """Opens operations on the test's database, as often as asked; all are closed at the end."""
     held = []
 
     def open_operations(mission=None, **wanted):
         # Processes of their own take seconds to start: only tests about them ask for some.
-        settings = Settings(**({"database": database, "replay_processes": 0} | wanted))
+        usual = {"database": database, "replay_processes": 0}
+        # With PostgreSQL uploads are stored in the working folder, which all tests share.
+        if not database.startswith("sqlite"):
+            usual["spool"] = tmp_path / "spool"
+        settings = Settings(**(usual | wanted))
         held.append(open_app(settings, mission))
         return held[-1]
 
