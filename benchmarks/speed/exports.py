@@ -141,7 +141,7 @@ def _differing(file: Path, table: Any) -> int:
 
 
 def _bits(values: npt.NDArray[Any]) -> bytes:
-    # Nothing is NaN in the file: it stands for null.
+    # The file holds null where the table holds NaN.
     is_null = np.isnan(values)
     return bytes(np.where(is_null, 0.0, values).tobytes() + is_null.tobytes())
 

@@ -37,6 +37,7 @@ def outcome_of(future: "asyncio.Future[Answered] | Future[Answered]") -> Answere
     try:
         return future.result()
     except Exception as error:
+        # The caller raises or lists it, as it does with errors that came without a future.
         return error
 
 

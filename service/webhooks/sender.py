@@ -258,6 +258,7 @@ class WebhookSender:
         try:
             await self._deliver(queue)
         except Exception as error:
+            # One receiver's trouble must not end the task of all; its events are tried again.
             log.warning("the deliveries of a webhook were interrupted: %s", error)
         else:
             self._poke()

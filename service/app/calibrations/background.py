@@ -72,6 +72,7 @@ class BackgroundCalibrations:
         except AcquisitionError as error:
             ended = {"state": "failed", "fault": str(error)}
         except Exception:
+            # Whatever fails, the calibration must end: a client waits for its state.
             log.exception("calibration %s failed", id)
             fault = "the fault is on the service's side; it is logged"
             ended = {"state": "failed", "fault": fault}

@@ -33,7 +33,7 @@ Step = Callable[[int, int], object]
 
 @dataclass(frozen=True)
 class CalibrationRequest:
-    """What is to be calibrated, and with which batches.
+    """The unknowns of a calibration, and the batches that it is estimated from.
 
     Without `trackers` all of the mission's; the first of them is the reference.  Without
     a `degree` the distortion's is chosen, up to `LARGEST_CHOSEN_DEGREE`.

@@ -108,7 +108,7 @@ class CalibrationService:
     ) -> Comparison:
         """Recorded batches with the settings in force (`a`), and with a calibration (`b`).
 
-        Without a `run` those of the calibration's.  Nothing is recorded.
+        Without a `run` the batches of the calibration's run.  The comparison is not recorded.
         """
         calibration = self.get(id)
         result = calibration.result
