@@ -46,7 +46,7 @@ from benchmarks.validation import (
     zone_counts,
 )
 from benchmarks.validation.lost_in_space import measure as lost_in_space
-from benchmarks.validation.pictures import blind, calibrations
+from benchmarks.validation.pictures import blind, calibrations, offsets
 
 BENCHMARKS: dict[str, Callable[[bool, int], Report]] = {
     "zone_counts": zone_counts.run,
@@ -76,6 +76,7 @@ BENCHMARKS: dict[str, Callable[[bool, int], Report]] = {
     "exports": exports.run,
     "lost_in_space": lost_in_space.run,
     "pictures": blind.run,
+    "picture_offsets": offsets.run,
     "camera_calibrations": calibrations.run,
     "tracker_calibration": tracker_calibration.run,
 }

@@ -112,6 +112,27 @@ def draw_rotation(rng):
     return q * np.sign(np.linalg.det(q))
 
 
+def test_noise_heaped_in_a_corner_is_no_cluster_of_stars(blind):
+    # All but a corner is clipped to black: the noise left there once passed for the Beehive.
+    picture = draw_picture(np.random.default_rng((77, 12)), blind[0])
+    result = solve_picture(frame_of(picture.counts), *blind, 0.9 * picture.lens.focal_px)
+    heaped = (result.points.u_px < 100) & (result.points.v_px < 100)
+    assert heaped.mean() > 0.5
+    assert result.attitude is None
+    assert result.search.best_log_odds < 0
+
+
+def test_a_place_is_as_crowded_as_there_are_other_points_about_it(rng):
+    anywhere = Points(*rng.uniform(0, 1000, (2, 400)), np.ones(400), 1000, 1000)
+    assert np.median(anywhere.crowding) == pytest.approx(1.0, abs=0.15)
+    corner = Points(*rng.uniform(0, 100, (2, 400)), np.ones(400), 1000, 1000)
+    assert np.median(corner.crowding) == pytest.approx(100.0, rel=0.35)
+    one_place = Points(np.full(9, 5.0), np.full(9, 5.0), np.ones(9), 1000, 1000)
+    assert np.isfinite(one_place.crowding).all()
+    few = Points(np.array([1.0, 2.0]), np.array([1.0, 2.0]), np.ones(2), 1000, 1000)
+    assert few.crowding.tolist() == [1.0, 1.0]
+
+
 def test_wide_light_does_not_outrank_stars(rng):
     counts = rng.normal(20.0, 2.0, (300, 400))
     v, u = np.mgrid[0:300, 0:400]

@@ -33,7 +33,7 @@ from benchmarks.validation.pictures.document import SOURCES, write_part
 from benchmarks.validation.pictures.peers import YEAR, PictureSolver, solvers
 from service.acquire.picture import blind_sky
 from service.sky.catalog.star_catalog import load_embedded
-from service.vectors import ARCSEC_PER_RADIAN, Matrix, attitude_error_arcsec
+from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector, attitude_error_arcsec
 from tests.pictures.drawn import draw_picture, middle_attitude
 
 PICTURES, QUICK_PICTURES = 500, 8
@@ -57,11 +57,11 @@ def measured(
     kept = log.read_text(encoding="utf-8") if log is not None and log.exists() else ""
     rows = [json.loads(line) for line in kept.splitlines()]
     done = {(row["picture"], row["solver"], row["told"]) for row in rows}
-    pictures = list(_real(folder)) if folder else []
+    pictures = real_pictures(folder) if folder else []
     with tqdm(total=len(pictures) + count, desc="pictures", unit="picture") as bar:
         for name, counts, truth, field_deg, told_deg in [*pictures, *_later(count)]:
             if counts is None:
-                name, counts, truth, field_deg, told_deg = _drawn(seed, int(name))
+                name, counts, truth, field_deg, told_deg = drawn_picture(seed, int(name))
             for solver in made:
                 for told in TOLD:
                     if (name, solver.name, told) in done:
@@ -81,7 +81,8 @@ def _later(count: int) -> Iterator[tuple[str, Any, Any, float, float]]:
         yield str(number), None, None, 0.0, 0.0
 
 
-def _drawn(seed: int, number: int) -> tuple[str, Any, Matrix, float, float]:
+def drawn_picture(seed: int, number: int) -> tuple[str, Any, Matrix, float, float]:
+    """Name, counts, true attitude, field along the width in degrees, and a field within 10 %."""
     rng = np.random.default_rng((seed, number))
     picture = draw_picture(rng, blind_sky(load_embedded(), YEAR)[0])
     field_deg = _field_deg(picture.counts.shape[1], picture.lens.focal_px)
@@ -89,12 +90,21 @@ def _drawn(seed: int, number: int) -> tuple[str, Any, Matrix, float, float]:
     return f"drawn {number}", picture.counts, middle_attitude(picture), field_deg, told_deg
 
 
-def _real(folder: Path) -> Iterator[tuple[str, Any, Matrix, float, float]]:
+def real_pictures(folder: Path) -> list[tuple[str, Any, Matrix, float, float]]:
+    """The same of every picture of a folder, the field told 10 % too wide."""
+    pictures = []
     for each in json.loads((folder / "truth.json").read_text(encoding="utf-8"))["pictures"]:
         counts = np.asarray(Image.open(folder / each["file"]).convert("L"))
         field_deg = _field_deg(counts.shape[1], each["focal_length_px"])
         truth = np.array(each["rotation_icrs_to_camera"])
-        yield each["file"], counts, truth, field_deg, 1.1 * field_deg
+        pictures.append((each["file"], counts, truth, field_deg, 1.1 * field_deg))
+    return pictures
+
+
+def is_right(error_arcsec: Vector, field_deg: float) -> bool:
+    """Whether an error (3,) is that of a right answer."""
+    across_deg, roll_deg = np.hypot(*error_arcsec[:2]) / 3600.0, abs(error_arcsec[2]) / 3600.0
+    return bool(across_deg < RIGHT_SHARE * field_deg and roll_deg < RIGHT_ROLL_DEG)
 
 
 def _field_deg(width_px: int, focal_px: float) -> float:
@@ -110,8 +120,7 @@ def _row(
     if answer is None:
         return row
     error = attitude_error_arcsec(answer.attitude, truth)
-    across_deg, roll_deg = math.hypot(*error[:2]) / 3600.0, abs(error[2]) / 3600.0
-    row["right"] = bool(across_deg < RIGHT_SHARE * field_deg and roll_deg < RIGHT_ROLL_DEG)
+    row["right"] = is_right(error, field_deg)
     row["error_arcsec"] = [round(float(each), 2) for each in error]
     if answer.covariance_rad2 is not None:
         turn = error / ARCSEC_PER_RADIAN

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +35,8 @@ LEAST_MATCHES = {FREE_SCALE: 4, SCALE_BEND: 7, SCALE_CENTER: 12}
 """Matches from which a model is fitted; of those that are, the evidence chooses."""
 HOPELESS_LOG_ODDS = 0.0
 """Below this after two rounds: what is true stands above 20 by then, and chance below -5."""
+CROWD = 6
+"""The nearest other points by which it is told how crowded a place is."""
 LEAST_REFINED = {FREE_SCALE: 4, SCALE_BEND: 6, SCALE_CENTER: 8}
 """The same once the attitude is known: priors hold what the stars do not."""
 
@@ -50,6 +53,25 @@ class Points:
 
     def __len__(self) -> int:
         return len(self.u_px)
+
+    @cached_property
+    def crowding(self) -> Vector:
+        """By how much denser than on the whole picture other points are about each (n), at least 1.
+
+        Clutter gathers in corners and along horizons.  Taken as spread over the picture it
+        would be a wonder that a cluster of stars explains it.
+        """
+        others = len(self) - 1
+        if others < 2:
+            return np.ones(len(self))
+        places = np.column_stack([self.u_px, self.v_px])
+        near = min(CROWD, others)
+        # Squares about the points, whose parts on the picture are known exactly.
+        reach = cKDTree(places).query(places, k=near + 1, p=math.inf)[0][:, -1:]
+        size = np.array([self.width_px, self.height_px], dtype=np.float64)
+        sides = np.minimum(places + reach, size - 0.5) - np.maximum(places - reach, -0.5)
+        share = np.maximum(sides.prod(axis=1), 1.0) / size.prod()
+        return np.asarray(np.maximum((near - 1) / others / share, 1.0))
 
     def first(self, count: int) -> "Points":
         """The likeliest so many."""
@@ -264,6 +286,7 @@ def _weighed(
     share = len(seen) / (len(points) + 1.0)
     area = float(lens.width_px * lens.height_px)
     gain = area / (expected * 2.0 * math.pi * variance) * np.exp(-0.5 * off2 / variance)
+    gain /= points.crowding[seen]
     weight = float(np.log(1.0 - share + share * gain).sum())
     weight += (len(points) - len(seen)) * math.log(1.0 - share)
     # The covariance is for sigmas as told; what they turned out to be widens it.
