@@ -49,7 +49,8 @@ def record_us(app: App, seed: int) -> float:
     return median(spent)
 
 
-def _ms(call: Callable[[], object]) -> float:
+def milliseconds(call: Callable[[], object]) -> float:
+    """Of some calls, the median."""
     spent = []
     for _ in range(REPEATS):
         started = time.perf_counter()
@@ -101,9 +102,9 @@ def measured(total: int, seed: int) -> tuple[dict[str, Any], list[Bound]]:
                     return app.spacecraft.rates("XTE", start=start, end=end, bucket=bucket)
 
                 rows = read()
-                took = _ms(read)
+                took = milliseconds(read)
                 counted = _scan(app, start.tai_ns, end.tai_ns)
-                scan_ms = _ms(partial(_scan, app, start.tai_ns, end.tai_ns))
+                scan_ms = milliseconds(partial(_scan, app, start.tai_ns, end.tai_ns))
                 figures[f"{name}, buckets"] = len(rows)
                 figures[f"{name}, ms"] = took
                 figures[f"{name}: counted one by one, ms"] = scan_ms

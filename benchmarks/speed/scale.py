@@ -1,0 +1,312 @@
+"""What a batch takes in SQLite, PostgreSQL and the archive, and what years of a fleet then take.
+
+    python -m benchmarks scale --quick      twenty thousand batches
+    python -m benchmarks.speed.scale --batches 1000000 --write      into docs/scale.md
+
+Batches of a pass are recorded in bulk, five stars each, moved to an archive with every
+verification, listed and counted before and after, restored, and compared with what was recorded
+byte for byte.  PostgreSQL is measured where TEST_POSTGRESQL_URL names a
+scratch database.
+"""
+
+import argparse
+import hashlib
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from sqlalchemy import create_engine, select, text
+from tqdm import tqdm
+
+from benchmarks.bounds import Bound, at_least, at_most, equal
+from benchmarks.record import ROOT, SERVICE, record_of
+from benchmarks.report import Report
+from benchmarks.sections import bounds_table, table
+from benchmarks.speed.posts import FIRST, telemetry
+from benchmarks.speed.stored import milliseconds
+from service.app.factory import App, open_app
+from service.observations.schema import submission_from_json
+from service.settings import Settings
+from service.storage.archive.archiving import archive
+from service.storage.archive.restoring import PartFilter, restore, verify_archive
+from service.storage.sql.database import Store
+from service.storage.sql.migrations import upgrade
+from service.storage.sql.tables import batches, results
+from service.times import Utc, parse_utc
+
+BATCHES, QUICK_BATCHES = 1_000_000, 20_000
+CHUNK = 250
+SPACECRAFT = "XTE"
+FIRST_READ = "the first list of 100"
+"""A file is opened, and its part of the batches is decompressed."""
+MOST_BYTES, MOST_NUMERIC_BYTES = 800.0, 280.0
+LEAST_OF_BULK, MOST_OF_LIVE = 1.0, 3.0
+YEARS, HOT_DAYS = 10, 90
+FLEETS = (1, 10, 100)
+PERIODS_S = {"one in 5 minutes": 300.0, "one a second": 1.0}
+TARGET = ROOT / "docs" / "scale.md"
+DATABASES = {"sqlite": "SQLite", "postgresql": "PostgreSQL"}
+
+
+def run(quick: bool, seed: int) -> Report:
+    """The benchmark among the others."""
+    return measured(QUICK_BATCHES if quick else BATCHES, seed)
+
+
+def measured(count: int, seed: int) -> Report:
+    """Record, archive, read and restore so many batches."""
+    figures: dict[str, Any] = {"batches": count}
+    bounds: list[Bound] = []
+    with tempfile.TemporaryDirectory() as folder:
+        url = f"sqlite:///{Path(folder) / 'scale.db'}"
+        figures |= _filled(url, count, seed)
+        done, found = _archived(url, Path(folder), count)
+        figures |= done
+        bounds += found
+        bounds.append(
+            at_least(
+                "archiving over recording in bulk",
+                figures["archive: batches a second, verified"]
+                / figures["SQLite: batches a second in bulk"],
+                LEAST_OF_BULK,
+            )
+        )
+    if postgresql := os.environ.get("TEST_POSTGRESQL_URL"):
+        _emptied(postgresql)
+        upgrade(postgresql)
+        figures |= _filled(postgresql, count, seed)
+        _emptied(postgresql)
+    return Report("scale", figures, bounds)
+
+
+def _opened(url: str, folder: Path | None = None) -> App:
+    app = open_app(Settings(database=url, archive_folder=folder))
+    app.service.ready()
+    return app
+
+
+def _filled(url: str, count: int, seed: int) -> dict[str, Any]:
+    """Record so many batches in bulk: how fast, and how large the database is then."""
+    name = DATABASES[url.split(":")[0].split("+")[0]]
+    made = telemetry(seed)
+    app = _opened(url)
+    spent_s = 0.0
+    try:
+        # Zones and connections are there before the clock runs.
+        _record(app, made.bodies(CHUNK, "first"), "first")
+        before = _size(url)
+        for first in tqdm(range(0, count, CHUNK), desc=name, unit_scale=CHUNK, unit=" batches"):
+            bodies = made.bodies(min(CHUNK, count - first), f"scale-{first}")
+            started = time.perf_counter()
+            _record(app, bodies, "live")
+            spent_s += time.perf_counter() - started
+    finally:
+        app.close()
+    size = _size(url) - before
+    return {
+        f"{name}: batches a second in bulk": count / spent_s,
+        f"{name}: bytes a batch": size / count,
+    }
+
+
+def _record(app: App, bodies: list[bytes], run: str) -> None:
+    made = [submission_from_json(body, run=None if run == "live" else run) for body in bodies]
+    app.submissions.submit_many(made)
+
+
+def _archived(url: str, folder: Path, count: int) -> tuple[dict[str, Any], list[Bound]]:
+    """Move everything to an archive and read it there."""
+    place = folder / "archive"
+    place.mkdir()
+    live, recorded = _read_ms(url, None, count), _digest(url)
+    end = _time_at(count + 3_600)
+    store = Store(url, create=False)
+    started = time.perf_counter()
+    try:
+        moved = archive(store, place, end)
+    finally:
+        store.close()
+    spent_s = time.perf_counter() - started
+    archived = _read_ms(url, place, count)
+    faults = list(verify_archive(place, {}, lambda _: None))
+    store = Store(url, create=False)
+    try:
+        restored = restore(store, place, PartFilter())
+    finally:
+        store.close()
+    size = sum(each.stat().st_size for each in place.rglob("*") if each.is_file())
+    figures: dict[str, Any] = {
+        "archive: batches a second, verified": moved.batches / spent_s,
+        "archive: bytes a batch": size / moved.batches,
+        "archive: bytes a batch, numeric columns": _numeric_bytes(place) / moved.batches,
+    }
+    bounds = [
+        equal("faults that verifying finds", len(faults), 0),
+        equal("batches restored", restored.restored, moved.batches),
+        _same("inputs and answers, restored", _digest(url), recorded),
+        at_most("archive", figures["archive: bytes a batch"], MOST_BYTES, "bytes a batch"),
+        at_most(
+            "archive, numeric columns",
+            figures["archive: bytes a batch, numeric columns"],
+            MOST_NUMERIC_BYTES,
+            "bytes a batch",
+        ),
+    ]
+    for what, took in archived.items():
+        figures[f"{what}, live, ms"], figures[f"{what}, archived, ms"] = live[what], took
+        if what != FIRST_READ:
+            bounds.append(at_most(f"{what}, archived over live", took / live[what], MOST_OF_LIVE))
+    return figures, bounds
+
+
+def _time_at(seconds: float) -> Utc:
+    return parse_utc((FIRST + timedelta(seconds=seconds)).strftime("%Y-%m-%dT%H:%M:%SZ"))
+
+
+def _read_ms(url: str, folder: Path | None, count: int) -> dict[str, float]:
+    """Milliseconds of a page of a list and of trends: of batches that are old enough to go."""
+    start, end = _time_at(0), _time_at(count / 2)
+    app = _opened(url, folder)
+    try:
+        reads: dict[str, Callable[[], object]] = {
+            "a list of 100": lambda: app.results.page(spacecraft=SPACECRAFT, end=end, limit=100),
+            "trends by hour": lambda: app.spacecraft.rates(
+                SPACECRAFT, start=start, end=end, bucket="hour"
+            ),
+        }
+        started = time.perf_counter()
+        reads["a list of 100"]()
+        first = {FIRST_READ: (time.perf_counter() - started) * 1000.0}
+        return first | {what: milliseconds(read) for what, read in reads.items()}
+    finally:
+        app.close()
+
+
+def _same(figure: str, measured: str, recorded: str) -> Bound:
+    return Bound(f"{figure}: SHA-256", measured, recorded, measured == recorded)
+
+
+def _digest(url: str) -> str:
+    """Of every batch as it came and was answered, in order of its id."""
+    state = hashlib.sha256()
+    engine = create_engine(url)
+    chosen = select(batches.c.id, batches.c.input, results.c.answer).where(
+        results.c.batch_id == batches.c.id
+    )
+    with engine.connect() as connection:
+        for row in connection.execute(chosen.order_by(batches.c.id)):
+            state.update("\n".join(str(each) for each in row).encode())
+    engine.dispose()
+    return state.hexdigest()[:16]
+
+
+def _numeric_bytes(folder: Path) -> int:
+    """Compressed bytes of the columns of numbers."""
+    total = 0
+    for path in folder.rglob("*.parquet"):
+        file = pq.ParquetFile(path)
+        kinds = _leaves(file.schema_arrow)
+        for group in range(file.metadata.num_row_groups):
+            for column, kind in enumerate(kinds):
+                chunk = file.metadata.row_group(group).column(column)
+                total += chunk.total_compressed_size if kind else 0
+    return total
+
+
+def _leaves(schema: pa.Schema) -> list[bool]:
+    """Whether each column of the file is of numbers, in their order."""
+
+    def walk(kind: pa.DataType) -> list[bool]:
+        if pa.types.is_struct(kind):
+            return [each for field in kind for each in walk(field.type)]
+        if pa.types.is_list(kind) or pa.types.is_large_list(kind):
+            return walk(kind.value_type)
+        number = (
+            pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
+        )
+        return [number]
+
+    return [each for field in schema for each in walk(field.type)]
+
+
+def _size(url: str) -> int:
+    """Bytes of a database that is closed or at rest."""
+    if url.startswith("sqlite"):
+        path = Path(url.removeprefix("sqlite:///"))
+        return sum(
+            Path(f"{path}{end}").stat().st_size
+            for end in ("", "-wal")
+            if Path(f"{path}{end}").exists()
+        )
+    engine = create_engine(url)
+    with engine.connect() as connection:
+        found = connection.execute(text("SELECT pg_database_size(current_database())")).scalar_one()
+    engine.dispose()
+    return int(found)
+
+
+def _emptied(url: str) -> None:
+    """Drop what a scratch database of PostgreSQL holds."""
+    engine = create_engine(url)
+    with engine.begin() as connection:
+        connection.execute(text("DROP SCHEMA public CASCADE"))
+        connection.execute(text("CREATE SCHEMA public"))
+    engine.dispose()
+
+
+def sizing(figures: dict[str, Any]) -> str:
+    """What fleets take, of the figures of a run: a table in Markdown."""
+    head = ["spacecraft", "batches of each", "a second", "of SQLite's bulk rate"]
+    names = [each for each in DATABASES.values() if f"{each}: bytes a batch" in figures]
+    rows = []
+    for count in FLEETS:
+        for label, period_s in PERIODS_S.items():
+            rate = count / period_s
+            share = rate / figures["SQLite: batches a second in bulk"]
+            hot, years = rate * 86_400.0 * HOT_DAYS, rate * 86_400.0 * 365.25 * YEARS
+            row = [str(count), label, f"{rate:.3g}", f"{100 * share:.2g} %"]
+            row += [_size_text(hot * figures[f"{each}: bytes a batch"]) for each in names]
+            row.append(_size_text(years * figures["archive: bytes a batch"]))
+            rows.append(tuple(row))
+    head += [f"{HOT_DAYS} days in {each}" for each in names]
+    return table([*head, f"{YEARS} years in the archive"], rows)
+
+
+def _size_text(size: float) -> str:
+    return f"{size / 1e9:.3g} GB" if size < 1e12 else f"{size / 1e12:.3g} TB"
+
+
+def write(report: Report, count: int, seed: int) -> None:
+    """Put a run between the comments of docs/scale.md."""
+    start, end = "<!-- measured by benchmarks.speed.scale -->", "<!-- end of scale -->"
+    before, _, rest = TARGET.read_text(encoding="utf-8").partition(start)
+    figures = table(("", "figure"), [(k, f"{v:,.4g}") for k, v in report.figures.items()])
+    again = f"python -m benchmarks.speed.scale --batches {count} --seed {seed}"
+    part = [start, figures, bounds_table(report.bounds), sizing(dict(report.figures))]
+    part.append(f"{record_of(SERVICE).sentence} Again: `{again}`.\n{end}")
+    TARGET.write_text(before + "\n\n".join(part) + rest.partition(end)[2], encoding="utf-8")
+
+
+def main() -> int:
+    """Measure, print, and write the page if asked to; 1 where a figure is out of bounds."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--batches", type=int, default=BATCHES)
+    parser.add_argument("--seed", type=int, default=3)
+    parser.add_argument("--write", action="store_true", help="the figures of docs/scale.md")
+    parsed = parser.parse_args()
+    report = measured(parsed.batches, parsed.seed)
+    print(report.text())
+    if parsed.write:
+        write(report, parsed.batches, parsed.seed)
+    return 0 if report.passed else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
