@@ -17,8 +17,8 @@ class Cause:
 
 _SIGMA = Cause(
     "The mission's sigma is too small, or the focal plane has changed.",
-    "Open the advice for the time of the alarm: it says how many times its sigma each tracker has, "
-    "and which lines to change.",
+    "Open the advice for the time of the alarm: it compares the noise of each tracker with its "
+    "sigma, and gives the lines to change.",
 )
 
 CAUSES: Mapping[str, Cause] = {
@@ -31,7 +31,7 @@ CAUSES: Mapping[str, Cause] = {
         "The a priori attitude drifts, so that stars lie beyond the edge of the zone; or false "
         "stars: particles, planets, radiation.",
         "Look at the angle from the a priori attitude. If it grows too, correct the a priori "
-        "attitude; if it stays, look in the worst batch where the false stars stand.",
+        "attitude. If it stays the same, open the worst batch and look where its false stars are.",
     ),
     "no_attitude_share": Cause(
         "Too few unique stars, or an a priori attitude that is wrong by more than the zone covers.",
@@ -56,13 +56,13 @@ CAUSES: Mapping[str, Cause] = {
         "lost in space, or widen the zone.",
     ),
     "innovation_rejected_share": Cause(
-        "The filter rejects good attitudes: a star that is taken for another one lastingly, a step "
-        "of the clock, or a fault of the gyro.",
-        "Open the innovations of that time. If the attitudes agree with each other, look at the "
-        "gyro and the clock; if its noise is larger than the mission says, the advice tells.",
+        "A star that is misidentified in every batch, a step of the clock, or a fault of the gyro.",
+        "Open the innovations of that time. If the attitudes agree with each other, check the "
+        "clock and the gyro; the advice says whether the gyro is noisier than the mission file "
+        "states.",
     ),
     "silence_s": Cause(
-        "Telemetry, not the sky: the link, or the program that sends the batches.",
+        "A fault of the telemetry link, or of the program that sends the batches.",
         "Check that the sender runs and reaches the service, and whether its batches are refused.",
     ),
 }
