@@ -128,8 +128,10 @@ PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
         409,
         "The state does not allow this",
         "not-now",
-        "The alarm is already acknowledged or cleared, or is not shelved; or the replay has ended.",
-        "Read the alarm or the replay again: somebody else may have acted in the meantime.",
+        "The state of the object does not allow the action. For example, an alarm is already "
+        "acknowledged or cleared, or is not shelved; a replay has ended; a batch is archived; a "
+        "calibration is not done. The detail says what.",
+        "Read the object again: another client may have changed it in the meantime.",
     ),
     KeyReused: ProblemType(
         422,
@@ -144,7 +146,7 @@ PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
         "The service is busy",
         "busy",
         "The service is starting or stopping, its queue is full, or its database does not answer. "
-        "It decided nothing about the request.",
+        "The answer does not say whether the request was recorded.",
         "Wait for as many seconds as the header Retry-After says, then send the same request "
         "again. A batch that was recorded after all is not recorded twice.",
     ),
