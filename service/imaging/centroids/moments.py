@@ -8,14 +8,12 @@ other sign.  The correction that centres the star is minus the displacement.
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from service.imaging.centroids.blending import is_blended
 from service.imaging.centroids.psf import Psf
 from service.imaging.centroids.record import (
-    BREAKDOWN_RATIO,
     CentroidRecord,
     Flag,
     refusal,
@@ -24,42 +22,12 @@ from service.imaging.centroids.record import (
 from service.imaging.centroids.region import Region, symmetric_square_about
 from service.imaging.centroids.shape_fit import fit
 from service.imaging.centroids.window import Array, Window
+from service.observations.scans.profile import BREAKDOWN_RATIO, ProfileMoment, moment
 
 MOST_MOVES = 10
 MOST_SHARE = 0.9
 SLOPE_LEAST = 0.2
 """Below this a moment hardly follows the star any more: the star is outside the hump."""
-
-
-@dataclass(frozen=True)
-class ProfileMoment:
-    """The first moment of one profile over its sum, in steps from its middle sample.
-
-    `variance` is the full law sum (n - d)² sigma_n² / (sum)², of which the report's 7.36
-    is the case of white noise without displacement and without photon noise.
-    """
-
-    displacement: float
-    variance: float
-    total: float
-    total_variance: float
-
-    @property
-    def signal_ratio(self) -> float:
-        """The sum over its own noise (7.30)."""
-        return self.total / math.sqrt(self.total_variance) if self.total_variance > 0 else math.inf
-
-
-def moment(samples: Array, sample_variance: Array, level_sigma: float = 0.0) -> ProfileMoment:
-    """The moment of samples n = -N ... N; `level_sigma` is an error common to all of them."""
-    steps = np.arange(len(samples), dtype=np.float64) - (len(samples) - 1) / 2.0
-    total = float(samples.sum())
-    displacement = float(steps @ samples) / total if total else math.nan
-    arm = steps - displacement
-    square = float(arm**2 @ sample_variance) + (level_sigma * float(arm.sum())) ** 2
-    total_variance = float(sample_variance.sum()) + (level_sigma * len(samples)) ** 2
-    variance = square / total**2 if total else math.inf
-    return ProfileMoment(displacement, variance, total, total_variance)
 
 
 def profiles(square: Array, method: str) -> tuple[Array, Array]:

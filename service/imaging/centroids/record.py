@@ -4,8 +4,7 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 
-BREAKDOWN_RATIO = 5.0
-"""Light over its noise below which a ratio of sums has no usable variance (report, 7.30)."""
+from service.observations.scans.profile import BREAKDOWN_RATIO
 
 
 class Flag(StrEnum):

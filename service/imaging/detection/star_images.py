@@ -15,13 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from service.imaging.centroids.psf import Psf
-from service.imaging.centroids.record import BREAKDOWN_RATIO
 from service.imaging.centroids.shape_fit import fit
 from service.imaging.centroids.window import Array, Detector, Mask, Window, cutout
 from service.imaging.detection.shapes import is_sharp
 from service.imaging.detection.star_image import PsfAt, reach_px, still_psf
 from service.imaging.frames.frame import CountArray
 from service.missions.camera import Camera
+from service.observations.scans.profile import BREAKDOWN_RATIO
 
 ROUNDS = 4
 FAR_FWHMS = 1.2

@@ -8,11 +8,10 @@ import numpy as np
 from service.imaging.centroids.window import Array
 from service.imaging.optics.pupil import disc
 from service.imaging.optics.transfer import image_by_fft
+from service.observations.scans.cross_scan import cross_scan, mean_of_scans
 from service.studies.star_image_report.attitude_correction import by_positions, by_two_scans, sigmas
 from service.studies.star_image_report.claims import Claim, Picture, Row, Study
 from service.studies.star_image_report.cross_scan import (
-    cross_scan,
-    mean_of_scans,
     nyquist_spacing,
     truncated,
     variance_in_full,

@@ -5,9 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from service.observations.scans.cross_scan import cross_scan, mean_of_scans
 from service.studies.star_image_report.cross_scan import (
-    cross_scan,
-    mean_of_scans,
     nyquist_spacing,
     truncated,
     variance_in_full,
