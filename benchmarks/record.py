@@ -43,7 +43,14 @@ SIMULATOR = (
     ":!service/simulate/frames.py",
     ":!service/simulate/frame_files.py",
 )
-IMAGING = ("service/imaging", "service/studies/star_image_report", "service/simulate/drawing.py")
+IMAGING = (
+    "service/imaging",
+    "service/studies/star_image_report",
+    "service/simulate/drawing.py",
+    "service/observations/scans/profile.py",
+    "service/observations/scans/cross_scan.py",
+    "service/observations/scans/line_peaks.py",
+)
 SERVICE = ("service", "catalogs/stars.npz")
 
 _RECORD = re.compile(

@@ -7,10 +7,11 @@ import pytest
 
 from benchmarks.__main__ import main
 from benchmarks.bounds import equal, share_as_expected
-from benchmarks.record import digest_of, read_record
+from benchmarks.record import ROOT, digest_of, read_record
 from benchmarks.sections import Section, Written, bounds_shown, kept, stale, state_of
 from benchmarks.speed import performance, tracker_calibration
 from benchmarks.validation import aberration, centroids, consistency, covariance
+from benchmarks.validation.imaging_claims import HELD_AGAINST
 from benchmarks.validation.lost_in_space.__main__ import main as lost_in_space
 from benchmarks.validation.lost_in_space.conditions import CONDITIONS
 from benchmarks.validation.lost_in_space.document import LEAST_RIGHT
@@ -29,6 +30,11 @@ def test_centroids_are_held_beside_photutils_and_sep(monkeypatch, seed):
     report = centroids.run(quick=True, seed=seed)
     assert report.passed, report.text()
     assert "sep winpos" in report.text()
+
+
+def test_the_tests_that_the_page_on_star_images_names_are_there():
+    for _, _, file, test in HELD_AGAINST:
+        assert f"def {test}(" in (ROOT / "tests" / file).read_text(encoding="utf-8")
 
 
 def test_a_benchmark_prints_its_figures(capsys):

@@ -7,6 +7,33 @@ from benchmarks.sections import Section, Written, table
 from service.studies.star_image_report.claims import Row
 from service.studies.star_image_report.command import ROWS, run_imaging
 
+_REPORT, _FRAMES = "studies/star_image_report/test_further.py", "imaging/test_crossed_frames.py"
+HELD_AGAINST = (
+    ("rotation in the correlation", "a sum over a plane of its definition", _REPORT,
+     "test_phi_of_a_field_is_the_integral_of_its_definition"),
+    ("the search for k, h and theta", "the turns that fields were drawn with", _REPORT,
+     "test_a_field_turned_by_any_angle_is_aligned"),
+    ("a third wire, wires of several diameters", "waves from points all over the aperture",
+     _REPORT, "test_the_tail_of_three_wires_is_that_of_points_all_over_the_aperture"),
+    ("spectra with lines", "the sum of their lines", _REPORT,
+     "test_a_spectrum_of_lines_is_the_sum_of_its_lines"),
+    ("light on the detectors of a tail", "single rays of the disc, colours and orders, counted",
+     _REPORT, "test_light_on_a_tail_s_detector_is_that_of_single_rays"),
+    ("the acquisition aperture", "the share of the disc that falls on it; suns up to 10° off",
+     _REPORT, "test_a_middle_detector_sees_the_share_of_the_disc_that_falls_on_it"),
+    ("three photodiodes, acquisition of the sun", "suns from anywhere are found and centred",
+     _REPORT, "test_a_sun_far_off_gives_no_signals_and_is_found"),
+    ("the optimal order of measurements", "all choices, tried", _REPORT,
+     "test_the_chosen_order_is_nearly_as_good_as_the_best_of_all_choices"),
+    ("learned noise", "the residual variance of numpy's least squares", _REPORT,
+     "test_learned_noise_is_that_of_least_squares"),
+    ("crossed apertures as a camera's PSF", "the integral over the chords of the aperture",
+     _FRAMES, "test_a_wire_spreads_light_across_itself"),
+    ("stars on frames behind crossed wires", "drawn stars; see [frames](crossed-frames.md)",
+     _FRAMES, "test_places_scatter_as_they_say"),
+)  # fmt: skip
+"""What the report only names: the second way to the same number, and the test that takes it."""
+
 
 def _rows(quick: bool, seed: int) -> list[Row]:
     from os import devnull
@@ -50,8 +77,20 @@ What the star image detection report claims, system by system, and what is measu
 pictures in [imaging.md](imaging.md). *Corrected* is a slip of the report that ours mends.
 
 {table(("row", "section", "the report", "here", ""), [[_cell(x) for x in line] for line in lines])}
+
+What the report only names or leaves to others is held against a second way to the same number, each
+in a test under `tests/`:
+
+{table(("piece", "held against", "test"), _tests())}
 """
     return Written(text, bounds_of(measured))
+
+
+def _tests() -> list[list[str]]:
+    return [
+        [piece, against, f"`{file}`: {test.removeprefix('test_').replace('_', ' ')}"]
+        for piece, against, file, test in HELD_AGAINST
+    ]
 
 
 def _mark(verdict: str, holds: bool) -> str:
