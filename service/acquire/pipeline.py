@@ -32,6 +32,7 @@ from service.identify.prior_attitude import prior_attitude
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
 from service.observations.calibrate import correct
+from service.observations.scans.reduce import reduced
 from service.sky.ephemeris import sun_distance_au
 from service.sky.model import SkyModel
 
@@ -47,6 +48,7 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: SkyModel) -> Acquisi
     if batch.tracking is not None and not batch.tracking.resolved:
         told = "last needs the record of a service, which predicts the attitude from it"
         raise BadBatch(Fault("a_priori.from", told, shown_value("last")))
+    batch = reduced(batch, mission)
     choices = choices_of(batch, mission)
     corrected = correct(batch, mission)
     given = batch.a_priori

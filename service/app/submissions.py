@@ -15,7 +15,8 @@ from service.errors import AcquisitionError, BadBatch
 from service.ingest.outcomes import Observer
 from service.ingest.queue import Backlog
 from service.ingest.submit import SubmissionService
-from service.observations.schema import Submission, faults_of, submission_from_json
+from service.observations.faults import faults_of
+from service.observations.schema import Submission, submission_from_json
 from service.storage.recording.unsaved_result import Answered
 
 MAX_ARRAY = 100

@@ -11,7 +11,7 @@ from service.calibration.observability import Marks
 from service.calibration.stars import IdentifiedStars, Indices
 from service.identify.attitude_from_matches import matched_vectors
 from service.observations.batch import TrackerStars
-from service.observations.calibrate import tracker_vectors
+from service.observations.focal_plane import tracker_vectors
 from service.sky.ephemeris import sun_distance_au
 from service.vectors import matrix_from_quaternion
 

@@ -22,6 +22,7 @@ from service.imaging.frames.preview import preview_of
 from service.missions.camera import Camera, CentroidMethod
 from service.missions.mission import Mission, Tracker
 from service.observations.batch import Aberration
+from service.observations.faults import faults_of
 from service.observations.frame_record import FrameRecord
 from service.observations.schema import (
     APrioriIn,
@@ -36,7 +37,6 @@ from service.observations.schema import (
     Submission,
     UnitVector,
     Wire,
-    faults_of,
     is_time,
     submission_from_model,
 )

@@ -32,6 +32,7 @@ from service.missions.identifiers import IDENTIFIERS
 from service.missions.keys import allowed_keys, dotted_key
 from service.missions.packets import Packets
 from service.missions.product_settings import DEFAULT_PRODUCTS, ProductSettings, beside
+from service.missions.scan import Scan
 from service.missions.strict import Strict, is_missing
 from service.missions.tracking import TrackingSettings
 from service.vectors import Matrix, Vector, read_only, unit
@@ -211,6 +212,7 @@ class Tracker(Strict):
     calibration: Calibration = Calibration()
     camera: Camera | None = None
     """Of a tracker that sends frames; the field of view reaches to its farthest corner."""
+    scan: Scan | None = Field(default=None, exclude_if=is_missing)
 
     @model_validator(mode="after")
     def _axes_are_right_handed(self) -> Self:

@@ -76,6 +76,17 @@ class Options(Struct, frozen=True):
     zone_grid_deg: float | None = None
 
 
+class Readings(Struct, frozen=True, eq=False):
+    """What a scanning tracker gave along h and along v, in the words of its mission.
+
+    Of a star `counts` of two lines or `times` of crossings; of a whole raster its `lines`.
+    """
+
+    kind: Literal["counts", "times", "lines"]
+    h: Vector
+    v: Vector
+
+
 class TrackerStars(Struct, frozen=True, eq=False):
     """The stars of one tracker, in the order observed.
 
@@ -90,6 +101,11 @@ class TrackerStars(Struct, frozen=True, eq=False):
     magnitude_mag: Vector
     time_offset_s: Vector
     sigma_arcsec: Vector
+    readings: tuple[Readings | None, ...] = ()
+    """Of a scanning tracker, by star; or the one of a raster, whose stars are still to be found.
+
+    `service.observations.scans.reduce` makes angles of them.
+    """
 
     @property
     def count(self) -> int:

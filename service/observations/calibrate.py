@@ -12,9 +12,11 @@ import numpy.typing as npt
 from msgspec import Struct
 from numba import njit
 
-from service.missions.mission import Calibration, Mission, Tracker
+from service.missions.mission import Mission, Tracker
 from service.observations.batch import ObservationBatch, TrackerStars
-from service.vectors import ARCSEC_PER_RADIAN, Vector, locked, read_only, unit
+from service.observations.focal_plane import tracker_vectors
+from service.observations.scans.reduce import reduced
+from service.vectors import ARCSEC_PER_RADIAN, Vector, locked, read_only
 
 
 class CorrectedObservations(Struct, frozen=True, eq=False, gc=False):
@@ -36,8 +38,10 @@ class CorrectedObservations(Struct, frozen=True, eq=False, gc=False):
 def correct(batch: ObservationBatch, mission: Mission) -> tuple[CorrectedObservations, ...]:
     """Every tracker's stars as body vectors at the epoch.
 
-    Raises `BadInput` naming the field of a tracker that the mission has not.
+    Raises `BadInput` naming the field of a tracker that the mission has not, and as
+    `reduced` does.
     """
+    batch = reduced(batch, mission)
     return tuple(
         _corrected(
             stars,
@@ -129,19 +133,3 @@ def _to_body(  # type: ignore[no-untyped-def]
         body[k, 1] += sine * once1 + versine * (z * once0 - x * once2)
         body[k, 2] += sine * once2 + versine * (x * once1 - y * once0)
     return True
-
-
-def tracker_vectors(angles_deg: Vector, calibration: Calibration) -> Vector:
-    """Unit vectors (n, 3) in tracker axes of measured angles (n, 2).
-
-    The direction is that of (tan h, tan v, 1), h and v being the true angles.
-    """
-    h, v = angles_deg[:, 0], angles_deg[:, 1]
-    true_h, true_v = (
-        calibration.scale * (measured + sum(c * h**i * v**j for i, j, c in terms))
-        for measured, terms in ((h, calibration.h_terms), (v, calibration.v_terms))
-    )
-    plane = np.stack(
-        [np.tan(np.radians(true_h)), np.tan(np.radians(true_v)), np.ones_like(h)], axis=1
-    )
-    return unit(plane)

@@ -20,6 +20,7 @@ from service.observations.batch import (
     Options,
     PredictedPrior,
     QuaternionPrior,
+    Readings,
     SunPointedPrior,
     TrackerStars,
     Tracking,
@@ -46,13 +47,19 @@ class SentStar(_SentPart):
     magnitude: float = _ABSENT
     time_offset_s: float = 0.0
     sigma_arcsec: float = _ABSENT
+    h_counts: list[float] | None = None
+    v_counts: list[float] | None = None
+    h_times: list[float] | None = None
+    v_times: list[float] | None = None
 
 
 class SentTracker(_SentPart):
-    """The stars that one tracker observed."""
+    """The stars that one tracker observed, or the sums of the lines of its raster."""
 
     tracker: str
     stars: list[SentStar]
+    column_counts: list[float] | None = None
+    row_counts: list[float] | None = None
 
 
 class SentDirection(_SentPart):
@@ -217,7 +224,23 @@ def _tracker_stars(tracker: SentTracker) -> TrackerStars:
         magnitude_mag=block[5 * n : 6 * n],
         time_offset_s=block[6 * n : 7 * n],
         sigma_arcsec=block[7 * n :],
+        readings=_readings(tracker),
     )
+
+
+def _readings(tracker: SentTracker) -> tuple[Readings | None, ...]:
+    if tracker.column_counts is not None:
+        return (Readings("lines", _array(tracker.column_counts), _array(tracker.row_counts)),)
+    found = tuple([_reading(star) for star in tracker.stars])
+    return found if any(found) else ()
+
+
+def _reading(star: SentStar) -> Readings | None:
+    if star.h_counts is not None:
+        return Readings("counts", _array(star.h_counts), _array(star.v_counts))
+    if star.h_times is not None:
+        return Readings("times", _array(star.h_times), _array(star.v_times))
+    return None
 
 
 def _array(values: Any) -> Vector:

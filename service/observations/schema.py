@@ -23,6 +23,7 @@ from pydantic import (
 
 from service.errors import BadBatch, BadInput, Fault, shown_value
 from service.missions.mission import GridStep, Identifier, SolverName
+from service.missions.scan import MOST_LINES, MOST_SAMPLES, MOST_WIRES
 from service.observations.batch import (
     MAX_STARS_PER_TRACKER,
     MAX_TRACKERS,
@@ -32,13 +33,12 @@ from service.observations.batch import (
     Options,
 )
 from service.observations.decode import batch_from_canonical, prior_from_canonical
+from service.observations.faults import PRIOR_KINDS, faults_of
 from service.observations.frame_record import FrameRecord
 from service.observations.prediction import PredictionIn
 from service.times import parse_utc
 
 NORM_TOLERANCE = 1e-3
-MAX_FAULTS_SHOWN = 20
-MAX_NAME_SHOWN = 80
 
 ReferenceFrame = Literal["EME2000", "ICRF", "GCRF"]
 
@@ -81,8 +81,18 @@ class Wire(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
+Count = Annotated[Number, Field(ge=0, le=1e12)]
+Counts = Annotated[list[Count], Field(min_length=3, max_length=MOST_SAMPLES)]
+Times = Annotated[list[Annotated[Number, Field(ge=0, le=1e15)]], Field(max_length=MOST_WIRES)]
+Lines = Annotated[list[Count], Field(min_length=8, max_length=MOST_LINES)]
+
+
 class StarIn(Wire):
-    """One observed star: a unit vector in tracker axes, or the angles of (tan h, tan v, 1)."""
+    """One observed star: a unit vector in tracker axes, or the angles of (tan h, tan v, 1).
+
+    Of a scanning tracker: the samples of two lines through these angles, or in their place
+    the times at which the star crossed the wires, in the mission's unit.
+    """
 
     vector: UnitVector | None = None
     h_deg: Annotated[Number, Field(gt=-89, lt=89)] | None = None
@@ -90,22 +100,44 @@ class StarIn(Wire):
     magnitude: Annotated[Number, Field(ge=-30, le=30)] | None = None
     time_offset_s: Annotated[Number, Field(ge=-3600, le=3600)] = 0.0
     sigma_arcsec: Annotated[Number, Field(ge=1e-3, le=3600)] | None = None
+    h_counts: Counts | None = None
+    v_counts: Counts | None = None
+    h_times: Times | None = None
+    v_times: Times | None = None
 
     @model_validator(mode="after")
     def _one_direction(self) -> Self:
         angles = (self.h_deg is not None, self.v_deg is not None)
+        for kind in ("counts", "times"):
+            given = [getattr(self, f"{axis}_{kind}") is not None for axis in ("h", "v")]
+            if any(given) and not all(given):
+                raise ValueError(f"needs both h_{kind} and v_{kind}, or neither")
+        if self.h_times is not None:
+            if self.vector is not None or any(angles) or self.h_counts is not None:
+                raise ValueError("takes h_times and v_times without any other direction")
+            return self
         if self.vector is None and not all(angles):
             raise ValueError("needs either vector, or both h_deg and v_deg")
-        if self.vector is not None and any(angles):
+        if self.vector is not None and (any(angles) or self.h_counts is not None):
             raise ValueError("takes either vector, or h_deg and v_deg, not both")
         return self
 
 
 class TrackerIn(Wire):
-    """The stars that one tracker observed."""
+    """The stars that one tracker observed, or the sums of the lines of its raster."""
 
     tracker: Key
     stars: Annotated[list[StarIn], Field(max_length=MAX_STARS_PER_TRACKER)]
+    column_counts: Lines | None = None
+    row_counts: Lines | None = None
+
+    @model_validator(mode="after")
+    def _stars_or_lines(self) -> Self:
+        if (self.column_counts is None) != (self.row_counts is None):
+            raise ValueError("needs both column_counts and row_counts, or neither")
+        if self.column_counts is not None and self.stars:
+            raise ValueError("takes either stars, or column_counts and row_counts, not both")
+        return self
 
 
 class QuaternionIn(Wire):
@@ -197,15 +229,11 @@ def _named(model: Wire) -> dict[str, Any]:
     return {name: value for name, value in values if value is not None}
 
 
-_KINDS = {each: each for each in ("quaternion", "boresight", "sun_pointed")} | {"from_last": "from"}
-"""The kinds of a priori knowledge, and the field that tells each."""
-
-
 def _kind_of_prior(value: Any) -> str | None:
     if isinstance(value, FromLastIn):
         return "from_last"
     keys = value if isinstance(value, dict) else getattr(value, "model_fields_set", ())
-    return next((kind for kind, key in _KINDS.items() if key in keys), None)
+    return next((kind for kind, key in PRIOR_KINDS.items() if key in keys), None)
 
 
 APrioriIn = Annotated[
@@ -227,7 +255,7 @@ def _stars_of_different_trackers(observations: list[TrackerIn]) -> list[TrackerI
     names = [each.tracker for each in observations]
     if len(set(names)) != len(names):
         raise ValueError(f"a tracker occurs twice: {', '.join(names)}")
-    if not any(each.stars for each in observations):
+    if not any(each.stars or each.column_counts for each in observations):
         raise ValueError("there are no stars; at least one is needed")
     return observations
 
@@ -351,39 +379,3 @@ def tolerances_from_text(texts: Iterable[str], field: str) -> TolerancesIn:
         return TolerancesIn.model_validate(values)
     except ValidationError as error:
         raise BadBatch(faults_of(error, (field,))) from None
-
-
-def faults_of(error: ValidationError, prefix: tuple[str, ...] = ()) -> list[Fault]:
-    """What pydantic found, in the service's words: a dotted field, a message, the value."""
-    return [
-        Fault(_field((*prefix, *fault["loc"])), _message(fault), _value(fault))
-        for fault in error.errors(include_url=False)[:MAX_FAULTS_SHOWN]
-    ]
-
-
-def _field(location: tuple[str | int, ...]) -> str:
-    tags = tuple(_KINDS)
-    parts = [
-        # A client's own key may be of any length.
-        str(part)[:MAX_NAME_SHOWN]
-        for index, part in enumerate(location)
-        # The tag of the kind of prior is pydantic's, not a field of the body.
-        if not (
-            part in tags
-            and index
-            and location[index - 1] == "a_priori"
-            and index + 1 < len(location)
-        )
-    ]
-    return ".".join(parts) or "body"
-
-
-def _message(fault: Any) -> str:
-    if fault["type"] == "extra_forbidden":
-        return "there is no such field"
-    return str(fault["msg"]).removeprefix("Value error, ")
-
-
-def _value(fault: Any) -> str | None:
-    # A missing field or a fault of the whole has nothing to show but its surroundings.
-    return None if fault["type"] == "missing" or not fault["loc"] else shown_value(fault["input"])

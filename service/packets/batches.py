@@ -8,7 +8,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from service.errors import Fault
-from service.observations.schema import BatchIn, checked_from_model, faults_of
+from service.observations.faults import faults_of
+from service.observations.schema import BatchIn, checked_from_model
 from service.packets.carried import GyroRates, Held, PacketAttitude, quaternion_in
 from service.packets.clock import NS, Moment, moment_of, names_of
 from service.packets.definition import PacketFault

@@ -8,7 +8,8 @@ import numpy.typing as npt
 
 from service.missions.mission import Tracker
 from service.observations.batch import ObservationBatch, TrackerStars
-from service.observations.calibrate import CorrectedObservations, tracker_vectors
+from service.observations.calibrate import CorrectedObservations
+from service.observations.focal_plane import tracker_vectors
 from service.sky.ephemeris import natural, observer_velocity
 from service.times import Utc
 from service.tracks.points import Batches, Indices, Points

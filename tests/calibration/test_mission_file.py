@@ -8,7 +8,7 @@ from service.calibration.mission_file import calibrated_mission_text, tracker_li
 from service.calibration.unknowns import Model
 from service.errors import BadConfiguration
 from service.missions.mission import SHIPPED_FOLDER, parse_mission
-from service.observations.calibrate import tracker_vectors
+from service.observations.focal_plane import tracker_vectors
 from tests.calibration.drawn import (
     MISALIGNED,
     TRACKERS,

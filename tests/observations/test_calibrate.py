@@ -8,7 +8,8 @@ import pytest
 
 from service.errors import BadInput
 from service.missions.mission import Calibration, Mission
-from service.observations.calibrate import correct, tracker_vectors
+from service.observations.calibrate import correct
+from service.observations.focal_plane import tracker_vectors
 from service.observations.schema import submission_from_json
 from tests.observations.example import BATCH
 

@@ -11,7 +11,8 @@ import pytest
 
 from service.errors import BadInput
 from service.missions.mission import Calibration
-from service.observations.calibrate import correct, tracker_vectors
+from service.observations.calibrate import correct
+from service.observations.focal_plane import tracker_vectors
 from service.observations.schema import submission_from_json
 from service.simulate.files import read_objects, truth_path, write_pass
 from service.simulate.orbits import HaloOrbit, orbit_of

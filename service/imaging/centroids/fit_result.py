@@ -5,7 +5,6 @@ import math
 from service.imaging.centroids.blending import is_blended
 from service.imaging.centroids.psf import Psf
 from service.imaging.centroids.record import (
-    BREAKDOWN_RATIO,
     CentroidRecord,
     Flag,
     refusal,
@@ -13,6 +12,7 @@ from service.imaging.centroids.record import (
 )
 from service.imaging.centroids.shape_fit import Fit
 from service.imaging.centroids.window import Window
+from service.observations.scans.profile import BREAKDOWN_RATIO
 
 
 def record_of(

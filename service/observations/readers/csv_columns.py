@@ -12,7 +12,15 @@ from collections.abc import Iterable
 from typing import Any
 
 from service.errors import BadFile, Fault, shown_value
-from service.observations.schema import BatchIn, BoresightIn, FromLastIn, QuaternionIn, SunPointedIn
+from service.observations.schema import (
+    BatchIn,
+    BoresightIn,
+    FromLastIn,
+    QuaternionIn,
+    StarIn,
+    SunPointedIn,
+    TrackerIn,
+)
 
 KEY = ("spacecraft", "run", "batch")
 REQUIRED = ("spacecraft", "batch", "time", "tracker")
@@ -27,9 +35,13 @@ VECTORS = {
 }
 DIRECTION = ("x", "y", "z")
 STAR_NUMBERS = ("h_deg", "v_deg", "magnitude", "time_offset_s", "sigma_arcsec")
-STAR_COLUMNS = ("tracker", *DIRECTION, *STAR_NUMBERS)
+READINGS = ("h_counts", "v_counts", "h_times", "v_times")
+"""Of a star of a scanning tracker: numbers with spaces between them, as in `LINES`."""
+LINES = ("column_counts", "row_counts")
+"""Of a tracker with a raster, in a row by themselves: it has no stars."""
+STAR_COLUMNS = ("tracker", *DIRECTION, *STAR_NUMBERS, *READINGS)
 BATCH_COLUMNS = (*TEXTS, *sum(VECTORS.values(), ()), "sun_pointed", "a_priori_from", "options")
-COLUMNS = (*BATCH_COLUMNS, *STAR_COLUMNS)
+COLUMNS = (*BATCH_COLUMNS, *STAR_COLUMNS, *LINES)
 VERBATIM = (*TEXTS, "tracker")
 """Columns whose cells are taken with their spaces; around other cells spaces do no harm."""
 
@@ -63,9 +75,10 @@ def checked_header(names: list[str], where: str) -> None:
     ]
     wanted = list(REQUIRED)
     # A group of columns is there as a whole or not at all; a star needs a direction.
-    for group in (*VECTORS.values(), DIRECTION, ("h_deg", "v_deg")):
+    groups = *VECTORS.values(), DIRECTION, ("h_deg", "v_deg"), READINGS[:2], READINGS[2:], LINES
+    for group in groups:
         wanted += group if any(name in names for name in group) else ()
-    if "h_deg" not in names and "v_deg" not in names:
+    if not any(name in names for name in ("h_deg", "v_deg", *READINGS[2:], *LINES)):
         wanted += DIRECTION
     faults += [
         Fault(f"{where}, column {name}", "is missing")
@@ -86,6 +99,10 @@ def number_cell(row: CsvRow, column: str) -> float:
     cell = row[column]
     if not cell:
         raise BadCell(column, "is empty, while the columns that belong to it are not")
+    return _number(column, cell)
+
+
+def _number(column: str, cell: str) -> float:
     if not _NUMBER.fullmatch(cell):
         raise BadCell(column, "must be a number", cell)
     number = float(cell)
@@ -140,14 +157,35 @@ def batch_fields(row: CsvRow) -> dict[str, Any]:
 def star_of(row: CsvRow) -> dict[str, Any]:
     """The star of a row; raises `BadCell`."""
     star: dict[str, Any] = {name: number_cell(row, name) for name in STAR_NUMBERS if row.get(name)}
+    star |= _numbers(row, READINGS)
     vector = _group(row, DIRECTION)
     return star if vector is None else {"vector": vector, **star}
+
+
+def lines_of(row: CsvRow) -> dict[str, list[float]]:
+    """The sums of the lines of a raster in a row, if it has any; raises `BadCell`."""
+    return _numbers(row, LINES)
+
+
+def _numbers(row: CsvRow, columns: tuple[str, ...]) -> dict[str, list[float]]:
+    """The columns that are not empty, each with numbers between spaces."""
+    return {
+        column: [_number(column, cell) for cell in row[column].split()]
+        for column in columns
+        if row.get(column)
+    }
 
 
 def number_cells(cells: Iterable[tuple[str, float]]) -> CsvRow:
     """Numbers as cells, by column."""
     # repr gives the shortest text that reads back as the same number.
     return {column: repr(value) for column, value in cells}
+
+
+def list_cells(model: StarIn | TrackerIn) -> CsvRow:
+    """The cells of the readings of a star, or of the lines of a tracker's raster."""
+    lists = ((name, getattr(model, name, None)) for name in (*READINGS, *LINES))
+    return {name: " ".join(map(repr, values)) for name, values in lists if values is not None}
 
 
 def batch_cells(batch: BatchIn) -> CsvRow:

@@ -18,12 +18,15 @@ from service.observations.readers.csv_columns import (
     DIRECTION,
     KEY,
     STAR_COLUMNS,
+    STAR_NUMBERS,
     VERBATIM,
     BadCell,
     CsvRow,
     batch_cells,
     batch_fields,
     checked_header,
+    lines_of,
+    list_cells,
     number_cells,
     star_of,
 )
@@ -43,6 +46,7 @@ class _BatchRows:
         self.first: CsvRow = {}
         self.fields: dict[str, Any] = {}
         self.trackers: dict[str, list[dict[str, Any]]] = {}
+        self.rasters: dict[str, dict[str, list[float]]] = {}
         self.rows = 0
 
     def add(self, number: int, row: CsvRow) -> None:
@@ -61,6 +65,10 @@ class _BatchRows:
             stars = self.trackers.setdefault(row["tracker"], [])
             if any(row.get(column) for column in STAR_COLUMNS[1:]):
                 stars.append(star_of(row))
+            if lines := lines_of(row):
+                if row["tracker"] in self.rasters:
+                    raise BadCell(next(iter(lines)), "has lines of the tracker a second time")
+                self.rasters[row["tracker"]] = lines
         except BadCell as bad:
             self.refuse(number, bad.fault(number))
 
@@ -71,7 +79,10 @@ class _BatchRows:
     def line(self) -> Line:
         if self.fault is not None:
             return Line(self.fault_at, None, self.fault)
-        observations = [{"tracker": name, "stars": stars} for name, stars in self.trackers.items()]
+        observations = [
+            {"tracker": name, "stars": stars, **self.rasters.get(name, {})}
+            for name, stars in self.trackers.items()
+        ]
         body = {**self.fields, "observations": observations}
         return Line(self.number, json.dumps(body, separators=(",", ":")).encode())
 
@@ -162,10 +173,9 @@ def write_batches_csv(batches: Iterable[BatchIn], stream: TextIO) -> None:
         for tracker in batch.observations:
             here = {**common, "tracker": tracker.tracker}
             if not tracker.stars:
-                writer.writerow(here)
+                writer.writerow({**here, **list_cells(tracker)})
             for star in tracker.stars:
-                numbers = star.model_dump(exclude_none=True, exclude={"vector"})
+                numbers = star.model_dump(exclude_none=True, include={*STAR_NUMBERS})
                 direction = zip(DIRECTION, star.vector or (), strict=False)
-                writer.writerow(
-                    {**here, **number_cells(direction), **number_cells(numbers.items())}
-                )
+                cells = {**number_cells(direction), **number_cells(numbers.items())}
+                writer.writerow({**here, **cells, **list_cells(star)})

@@ -11,6 +11,7 @@ from service.errors import BadBatch, Fault
 from service.missions.mission import Mission, Tracker
 from service.observations.calibrate import correct
 from service.observations.decode import batch_from_canonical
+from service.observations.scans.reduce import reduced
 from service.storage.models.answers import Answer
 from service.storage.queries.pages import PLACE, ResultFilter
 from service.storage.queries.recorded_batch import recorded_mission
@@ -90,10 +91,11 @@ def unexplained_points(recorded: RecordedBatches) -> Gathering:
         answer = answer_from_json(row["answer"])
         if answer.attitude is None:
             continue
-        batch = batch_from_canonical(row["input"])
+        mission = recorded.missions[row["mission_digest"]]
+        batch = reduced(batch_from_canonical(row["input"]), mission)
         gathered.add(
             batch,
-            correct(batch, recorded.missions[row["mission_digest"]]),
+            correct(batch, mission),
             _unmatched(answer),
             matrix_from_quaternion(answer.attitude.quaternion),
             np.array(answer.attitude.covariance_arcsec2),

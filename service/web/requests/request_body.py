@@ -21,8 +21,8 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.types import Scope
 
 from service.errors import BadBatch, BadInput, Busy, Fault
+from service.observations.faults import faults_of
 from service.observations.readers.decompress import Coding
-from service.observations.schema import faults_of
 from service.web.requests.problem_types import NotJson
 
 JSON = "application/json"

@@ -1,0 +1,111 @@
+"""A scanning tracker: how its times and counts stand for angles.
+
+Three kinds, after the report on star images: samples along a line through each star
+(`cross`, 7.2 to 7.5), the times at which a star crosses wires (`sweep`), and the sums of the
+lines of a raster (`raster`, 7.8).  The angles are those of a batch's `h_deg` and `v_deg`, as
+measured: the tracker's calibration applies to them.
+"""
+
+from itertools import pairwise
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field
+
+from service.missions.strict import Strict
+
+MOST_SAMPLES, MOST_WIRES, MOST_LINES = 1001, 16, 8192
+
+
+def _odd(samples: int) -> int:
+    if samples % 2 == 0:
+        raise ValueError("must be odd: a middle sample with as many on either side")
+    return samples
+
+
+def _rising(wires: tuple[float, ...]) -> tuple[float, ...]:
+    if wires[0] != 0.0 or any(b <= a for a, b in pairwise(wires)):
+        raise ValueError("must begin with 0 and rise: how far each wire follows the first")
+    return wires
+
+
+class _Detector(Strict):
+    """The noise of what is counted, and what the calibration leaves in a place."""
+
+    noise_counts: float = Field(gt=0, le=1e9)
+    """One standard deviation of a sample, of a raster: of the sum of a line, without light."""
+    background_counts: float = Field(default=0.0, ge=0, le=1e9)
+    """Taken off each sample or line."""
+    gain_e_per_count: float | None = Field(default=None, gt=0, le=1e6)
+    """Adds the noise of the photons; None: `noise_counts` has all of it."""
+    saturation_counts: float | None = Field(default=None, gt=0, le=1e12)
+    """A sample at or above this is full."""
+    sigma_floor_arcsec: float = Field(default=0.0, ge=0, le=3600)
+    """What the calibration leaves in a place, per axis, however bright the star."""
+
+
+class CrossScan(_Detector):
+    """Two lines through where each star should stand: samples along h, and along v."""
+
+    kind: Literal["cross"]
+    samples: Annotated[int, Field(ge=3, le=MOST_SAMPLES), AfterValidator(_odd)]
+    """Of a line; the middle one is at the star's `h_deg`, `v_deg`."""
+    step_arcsec: float = Field(gt=0, le=3600)
+    """From one sample to the next (T of the report)."""
+
+    @property
+    def half_length_deg(self) -> float:
+        """From the middle of a line to its end."""
+        return (self.samples // 2) * self.step_arcsec / 3600.0
+
+
+class Sweep(Strict):
+    """A sweep along h and one along v, at a constant rate; a star crosses each wire once.
+
+    At t seconds after a sweep began, its first wire is at `start_deg` + `rate_deg_per_s` t.
+    """
+
+    kind: Literal["sweep"]
+    start_deg: float = Field(gt=-89, lt=89)
+    rate_deg_per_s: float = Field(gt=0, le=3600)
+    duration_s: float = Field(gt=0, le=3600)
+    """Of either sweep; a later time is outside of the scan."""
+    time_unit_s: float = Field(default=1.0, gt=0, le=3600)
+    """Of the times in a batch: seconds for each unit of the tracker's clock."""
+    time_sigma_s: float = Field(gt=0, le=3600)
+    """One standard deviation of the time of one crossing."""
+    wires_deg: Annotated[
+        tuple[float, ...], Field(min_length=1, max_length=MOST_WIRES), AfterValidator(_rising)
+    ] = (0.0,)
+    """How far each wire follows the first one; the first is 0."""
+    v_after_s: float = Field(default=0.0, ge=0, le=3600)
+    """From the beginning of the sweep along h to that of the one along v."""
+    sigma_floor_arcsec: float = Field(default=0.0, ge=0, le=3600)
+    """What the calibration leaves in a place, per axis."""
+
+    @property
+    def end_deg(self) -> float:
+        """Where the first wire is when a sweep ends."""
+        return self.start_deg + self.rate_deg_per_s * self.duration_s
+
+
+class Raster(_Detector):
+    """The sums of all lines of a raster, columns and rows, with the boresight in its middle."""
+
+    kind: Literal["raster"]
+    columns: int = Field(ge=8, le=MOST_LINES)
+    rows: int = Field(ge=8, le=MOST_LINES)
+    step_deg: float = Field(gt=0, le=10)
+    """From one line to the next: columns along h, rows along v."""
+    threshold_sigma: float = Field(default=6.0, ge=3, le=100)
+    """A line is a star's if its sum is a maximum so far above the noise."""
+    half_width_lines: int = Field(default=4, ge=1, le=100)
+    """A star's place is the moment of so many lines on either side of its own."""
+    zero_point_mag: float | None = Field(default=None, ge=-10, le=40)
+    """Instrument magnitude of a star of one count; without it the stars have no magnitudes."""
+
+    def middle(self, axis: Literal["h", "v"]) -> float:
+        """The place of the boresight in lines from the first one."""
+        return ((self.columns if axis == "h" else self.rows) - 1) / 2.0
+
+
+Scan = Annotated[CrossScan | Sweep | Raster, Field(discriminator="kind")]

@@ -1,0 +1,22 @@
+"""From the angles that a tracker measures to directions in its axes."""
+
+import numpy as np
+
+from service.missions.mission import Calibration
+from service.vectors import Vector, unit
+
+
+def tracker_vectors(angles_deg: Vector, calibration: Calibration) -> Vector:
+    """Unit vectors (n, 3) in tracker axes of measured angles (n, 2).
+
+    The direction is that of (tan h, tan v, 1), h and v being the true angles.
+    """
+    h, v = angles_deg[:, 0], angles_deg[:, 1]
+    true_h, true_v = (
+        calibration.scale * (measured + sum(c * h**i * v**j for i, j, c in terms))
+        for measured, terms in ((h, calibration.h_terms), (v, calibration.v_terms))
+    )
+    plane = np.stack(
+        [np.tan(np.radians(true_h)), np.tan(np.radians(true_v)), np.ones_like(h)], axis=1
+    )
+    return unit(plane)

@@ -1,0 +1,99 @@
+"""Stars from the sums of the lines of a raster (report on star images, 7.8).
+
+Columns show the h of the stars and rows their v, unpaired.  The report's pattern constant
+does not ask which belong together; an attitude does.  A star puts the same light into its
+columns as into its rows, which tells the pairs apart.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from service.errors import BadBatch, Fault, shown_value
+from service.missions.scan import Raster
+from service.observations.scans.line_peaks import line_peaks
+from service.observations.scans.profile import BREAKDOWN_RATIO, moment
+from service.vectors import Vector
+
+SAME_LIGHT_SIGMAS = 4.0
+SAME_LIGHT_SHARE = 0.02
+"""Light differs by no more between columns and rows: each moment cuts off its own tails."""
+
+
+class LinePlace(NamedTuple):
+    """A star along one axis: its place in lines from the first one, and its light."""
+
+    line: float
+    sigma_lines: float
+    light_counts: float
+    sigma_light_counts: float
+
+
+class RasterStars(NamedTuple):
+    """Stars of a raster, the brightest first: arrays (n, 2) along h and v, and light (n,)."""
+
+    angles_deg: Vector
+    sigma_arcsec: Vector
+    light_counts: Vector
+
+
+def raster_stars(columns: Vector, rows: Vector, scan: Raster, field: str) -> RasterStars:
+    """The stars whose column and row are told apart from all others.
+
+    Left out are stars that share a band of lines with another one, that stand at the edge, and
+    those whose light fits several columns or rows.  Raises `BadBatch` naming `field` for
+    another number of lines than the mission has, and for lines that are full.
+    """
+    along_h = _places(columns, scan.columns, scan, f"{field}.column_counts")
+    along_v = _places(rows, scan.rows, scan, f"{field}.row_counts")
+    pairs = sorted(_pairs(along_h, along_v), key=lambda pair: -pair[0].light_counts)
+    middles = scan.middle("h"), scan.middle("v")
+    angles = [[(place.line - m) for place, m in zip(pair, middles, strict=True)] for pair in pairs]
+    sigmas = [[place.sigma_lines for place in pair] for pair in pairs]
+    light = [0.5 * (h.light_counts + v.light_counts) for h, v in pairs]
+    return RasterStars(
+        np.array(angles).reshape(-1, 2) * scan.step_deg,
+        np.array(sigmas).reshape(-1, 2) * scan.step_deg * 3600.0,
+        np.array(light),
+    )
+
+
+def _places(counts: Vector, lines: int, scan: Raster, field: str) -> list[LinePlace]:
+    if len(counts) != lines:
+        raise BadBatch(Fault(field, f"has {len(counts)} lines; the raster has {lines}"))
+    if scan.saturation_counts is not None:
+        full = np.flatnonzero(counts >= scan.saturation_counts)
+        if len(full):
+            at = int(full[0])
+            message = f"is full: a line saturates at {scan.saturation_counts:g} counts"
+            raise BadBatch(Fault(f"{field}.{at}", message, shown_value(float(counts[at]))))
+    light = counts - scan.background_counts
+    variance = np.full(lines, scan.noise_counts**2)
+    if scan.gain_e_per_count is not None:
+        variance += counts / scan.gain_e_per_count
+    peaks = np.round(line_peaks(light, scan.threshold_sigma * scan.noise_counts)).astype(np.intp)
+    half = scan.half_width_lines
+    places = []
+    for k, peak in enumerate(peaks.tolist()):
+        others = np.abs(np.delete(peaks, k) - peak)
+        if peak < half or peak + half >= lines or (others <= 2 * half).any():
+            continue
+        around = slice(peak - half, peak + half + 1)
+        found = moment(light[around], variance[around])
+        if found.signal_ratio >= BREAKDOWN_RATIO:
+            place = peak + found.displacement, math.sqrt(found.variance)
+            places.append(LinePlace(*place, found.total, math.sqrt(found.total_variance)))
+    return places
+
+
+def _pairs(along_h: list[LinePlace], along_v: list[LinePlace]) -> list[tuple[LinePlace, LinePlace]]:
+    """Places of equal light, where each fits the other and nothing else."""
+    light, sigma = (
+        [np.array([place[k] for place in along]) for along in (along_h, along_v)] for k in (2, 3)
+    )
+    apart = np.abs(light[0][:, None] - light[1][None, :])
+    allowed = SAME_LIGHT_SIGMAS * np.hypot(sigma[0][:, None], sigma[1][None, :])
+    same = apart <= allowed + SAME_LIGHT_SHARE * np.maximum(light[0][:, None], light[1][None, :])
+    alone = same & (same.sum(axis=1, keepdims=True) == 1) & (same.sum(axis=0) == 1)
+    return [(along_h[i], along_v[j]) for i, j in np.argwhere(alone).tolist()]

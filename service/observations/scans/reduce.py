@@ -1,0 +1,164 @@
+"""A batch of scanning trackers as one of measured angles.
+
+The record keeps what was sent; angles and sigmas are made of it with the settings of the
+mission, as often as it is read.
+"""
+
+import math
+
+import numpy as np
+from msgspec import structs
+
+from service.errors import BadBatch, Fault
+from service.missions.mission import Mission, Tracker
+from service.missions.scan import CrossScan, Raster, Sweep
+from service.observations.batch import (
+    MAX_STARS_PER_TRACKER,
+    ObservationBatch,
+    Readings,
+    TrackerStars,
+)
+from service.observations.focal_plane import tracker_vectors
+from service.observations.scans.cross_scan import cross_scan
+from service.observations.scans.profile import BREAKDOWN_RATIO
+from service.observations.scans.raster import raster_stars
+from service.observations.scans.sweep import crossing_of
+from service.vectors import Vector, read_only, rotate_about
+
+_GIVES = {CrossScan: "counts", Sweep: "times", Raster: "lines"}
+_FIELDS = {"counts": "h_counts", "times": "h_times"}
+_ROUNDS = 4
+
+
+def reduced(batch: ObservationBatch, mission: Mission) -> ObservationBatch:
+    """The batch with angles, sigmas and, of a raster, stars in the place of readings.
+
+    A batch without readings is returned as it is.  Raises `BadInput` naming the field of a
+    tracker that the mission has not, and of readings that its scan cannot give.
+    """
+    if not any(each.readings for each in batch.observations):
+        return batch
+    observations = []
+    for index, stars in enumerate(batch.observations):
+        field = f"observations.{index}"
+        tracker = mission.tracker(stars.tracker, f"{field}.tracker")
+        rates_body = np.radians(batch.body_rates_deg_per_s)
+        rates = tracker.body_from_tracker.T @ rates_body
+        observations.append(_reduced(stars, tracker, rates, field) if stars.readings else stars)
+    if not any(each.count for each in observations):
+        raise BadBatch(Fault("observations", "no star can be told in the lines of the raster"))
+    return structs.replace(batch, observations=tuple(observations))
+
+
+def _reduced(stars: TrackerStars, tracker: Tracker, rates: Vector, field: str) -> TrackerStars:
+    """`rates` are of the body, in rad/s about the tracker's axes."""
+    first = next(each for each in stars.readings if each is not None)
+    if first.kind == "lines":
+        return _of_raster(first, tracker, field)
+    angles, sigma = stars.angles_deg.copy(), stars.sigma_arcsec.copy()
+    offset = stars.time_offset_s.copy()
+    for k, reading in enumerate(stars.readings):
+        if reading is None:
+            continue
+        here = f"{field}.stars.{k}"
+        if isinstance(tracker.scan, CrossScan) and reading.kind == "counts":
+            shift, of_scan = _of_counts(reading, tracker.scan, here)
+            angles[k] += shift
+        elif isinstance(tracker.scan, Sweep) and reading.kind == "times":
+            angles[k], of_scan, passed_s = _of_times(reading, tracker, tracker.scan, rates, here)
+            offset[k] += passed_s
+        else:
+            raise _other_kind(tracker, f"{here}.{_FIELDS[reading.kind]}", reading.kind)
+        if math.isnan(sigma[k]):
+            sigma[k] = of_scan
+    return structs.replace(
+        stars,
+        angles_deg=read_only(angles),
+        sigma_arcsec=read_only(sigma),
+        time_offset_s=read_only(offset),
+        readings=(),
+    )
+
+
+def _other_kind(tracker: Tracker, field: str, kind: str) -> BadBatch:
+    given = "no scan" if tracker.scan is None else f"a scan of the kind {tracker.scan.kind}"
+    message = f"the mission file gives {tracker.name} {given}, which has no {kind}"
+    return BadBatch(Fault(field, message))
+
+
+def _of_counts(reading: Readings, scan: CrossScan, field: str) -> tuple[Vector, float]:
+    """The displacement (2,) from the middle of the lines in deg, and its sigma in arcsec."""
+    places, variance = [], scan.sigma_floor_arcsec**2
+    for axis, counts in (("h", reading.h), ("v", reading.v)):
+        here = f"{field}.{axis}_counts"
+        if len(counts) != scan.samples:
+            message = f"has {len(counts)} samples; a scan of the tracker has {scan.samples}"
+            raise BadBatch(Fault(here, message))
+        if scan.saturation_counts is not None and (counts >= scan.saturation_counts).any():
+            at = int(np.argmax(counts))
+            message = f"is full: a sample saturates at {scan.saturation_counts:g} counts"
+            raise BadBatch(Fault(f"{here}.{at}", message, str(float(counts[at]))))
+        found = cross_scan(
+            counts,
+            scan.step_arcsec,
+            scan.noise_counts,
+            scan.background_counts,
+            math.inf if scan.gain_e_per_count is None else scan.gain_e_per_count,
+        )
+        if found.refused:
+            message = (
+                f"holds no star: its light is {found.signal_ratio:.2f} times the noise, below "
+                f"{BREAKDOWN_RATIO:g}; leave the star out"
+            )
+            raise BadBatch(Fault(here, message))
+        places.append(found.displacement / 3600.0)
+        variance += 0.5 * found.sigma**2
+    return np.array(places), math.sqrt(variance)
+
+
+def _of_times(
+    reading: Readings, tracker: Tracker, scan: Sweep, rates: Vector, field: str
+) -> tuple[Vector, float, float]:
+    """Angles (2,) in deg, their sigma in arcsec, and when they hold, in s after the first sweep.
+
+    Both hold when the star crossed along h: until it crossed along v the body turned on.
+    """
+    h = crossing_of(reading.h, scan, f"{field}.h_times")
+    v = crossing_of(reading.v, scan, f"{field}.v_times")
+    later_s = scan.v_after_s + v.time_s - h.time_s
+    angles = np.array([[h.angle_deg, v.angle_deg]])
+    if rates.any():
+        aim = _v_deg(tracker_vectors(angles, tracker.calibration))
+        for _ in range(_ROUNDS):
+            direction = tracker_vectors(angles, tracker.calibration)
+            off_deg = aim - _v_deg(rotate_about(-rates * later_s, direction))
+            angles[0, 1] += off_deg / tracker.calibration.scale
+    variance = scan.sigma_floor_arcsec**2 + 0.5 * (h.sigma_arcsec**2 + v.sigma_arcsec**2)
+    return angles[0], math.sqrt(variance), h.time_s
+
+
+def _v_deg(direction: Vector) -> float:
+    return math.degrees(math.atan2(direction[0, 1], direction[0, 2]))
+
+
+def _of_raster(reading: Readings, tracker: Tracker, field: str) -> TrackerStars:
+    scan = tracker.scan
+    if not isinstance(scan, Raster):
+        raise _other_kind(tracker, f"{field}.column_counts", reading.kind)
+    found = raster_stars(reading.h, reading.v, scan, field)
+    light = found.light_counts[:MAX_STARS_PER_TRACKER]
+    count = len(light)
+    sigmas = found.sigma_arcsec[:count]
+    magnitude = np.full(count, np.nan)
+    if scan.zero_point_mag is not None:
+        magnitude = scan.zero_point_mag - 2.5 * np.log10(light)
+    return TrackerStars(
+        tracker=tracker.name,
+        vector=read_only(np.full((count, 3), np.nan)),
+        angles_deg=read_only(found.angles_deg[:count].copy()),
+        magnitude_mag=read_only(magnitude),
+        time_offset_s=read_only(np.zeros(count)),
+        sigma_arcsec=read_only(
+            np.sqrt(scan.sigma_floor_arcsec**2 + 0.5 * np.sum(sigmas**2, axis=1))
+        ),
+    )
