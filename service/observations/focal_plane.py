@@ -1,4 +1,4 @@
-"""From the angles that a tracker measures to directions in its axes."""
+"""Between the angles that a tracker measures and directions in its axes."""
 
 import numpy as np
 
@@ -20,3 +20,18 @@ def tracker_vectors(angles_deg: Vector, calibration: Calibration) -> Vector:
         [np.tan(np.radians(true_h)), np.tan(np.radians(true_v)), np.ones_like(h)], axis=1
     )
     return unit(plane)
+
+
+def measured_angles_deg(direction: Vector, calibration: Calibration) -> Vector:
+    """The angles (n, 2) that a tracker of this calibration would measure for directions (n, 3)."""
+    true = np.degrees(np.arctan2(direction[:, :2], direction[:, 2:]))
+    measured = true / calibration.scale
+    # The terms are small: a fixed point is reached in a few rounds.
+    for _ in range(20):
+        h, v = measured.T
+        bent = [
+            sum((c * h**i * v**j for i, j, c in terms), np.zeros_like(h))
+            for terms in (calibration.h_terms, calibration.v_terms)
+        ]
+        measured = true / calibration.scale - np.stack(bent, axis=1)
+    return np.asarray(measured)

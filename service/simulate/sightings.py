@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from service.missions.mission import Band, Calibration, Mission, Tracker
+from service.missions.mission import Band, Mission, Tracker
 from service.observations.batch import Aberration
+from service.observations.focal_plane import measured_angles_deg
 from service.simulate.motion import across, random_axis, turned_by
 from service.simulate.real_sky import RealSky
+from service.simulate.scans import readings
 from service.simulate.stretches import Stretch
 from service.sky.ephemeris import apparent
 from service.times import Utc
@@ -89,7 +91,7 @@ class BatchScene:
         return Seen(tracker, direction, offset_s[chosen], magnitude, star)
 
     def measured(self, seen: Seen, as_angles: bool) -> list[dict[str, Any]]:
-        """The stars as they are sent, with noise."""
+        """The stars as they are sent, with noise; a scanning tracker's has that of its scan."""
         kind, size = self.stretch.kind, self.stretch.size
         sigma_arcsec = size if kind == "position_error" else seen.tracker.sigma_arcsec
         sigma_mag = size if kind == "magnitude_error" else seen.tracker.magnitude_sigma_mag
@@ -103,6 +105,12 @@ class BatchScene:
             where = [{"h_deg": h, "v_deg": v} for h, v in angles]
         else:
             where = [{"vector": vector} for vector in np.round(direction, 10).tolist()]
+        if seen.tracker.scan is not None:
+            exact = direction if kind == "position_error" else seen.direction
+            rates = seen.tracker.body_from_tracker.T @ np.radians(self.rates_deg_per_s)
+            for k, magnitude_mag in enumerate(seen.magnitude.tolist()):
+                given = readings(seen.tracker, exact[k], rates, magnitude_mag, self.rng)
+                where[k] = where[k] if given is None else given
         return [
             {**place, "magnitude": magnitude, "time_offset_s": offset_s}
             for place, magnitude, offset_s in zip(
@@ -124,18 +132,3 @@ def shaken(direction: Vector, sigma_rad: float, rng: np.random.Generator) -> Vec
     aside, above = across(direction)
     noise = rng.normal(0.0, sigma_rad, (len(direction), 2))
     return unit(direction + noise[:, :1] * aside + noise[:, 1:] * above)
-
-
-def measured_angles_deg(direction: Vector, calibration: Calibration) -> Vector:
-    """The angles (n, 2) that a tracker of this calibration would measure for directions (n, 3)."""
-    true = np.degrees(np.arctan2(direction[:, :2], direction[:, 2:]))
-    measured = true / calibration.scale
-    # The terms are small: a fixed point is reached in a few rounds.
-    for _ in range(20):
-        h, v = measured.T
-        bent = [
-            sum((c * h**i * v**j for i, j, c in terms), np.zeros_like(h))
-            for terms in (calibration.h_terms, calibration.v_terms)
-        ]
-        measured = true / calibration.scale - np.stack(bent, axis=1)
-    return np.asarray(measured)

@@ -69,10 +69,11 @@ def _places(counts: Vector, lines: int, scan: Raster, field: str) -> list[LinePl
             message = f"is full: a line saturates at {scan.saturation_counts:g} counts"
             raise BadBatch(Fault(f"{field}.{at}", message, shown_value(float(counts[at]))))
     light = counts - scan.background_counts
-    variance = np.full(lines, scan.noise_counts**2)
-    if scan.gain_e_per_count is not None:
-        variance += counts / scan.gain_e_per_count
-    peaks = np.round(line_peaks(light, scan.threshold_sigma * scan.noise_counts)).astype(np.intp)
+    per_count = 0.0 if scan.gain_e_per_count is None else 1.0 / scan.gain_e_per_count
+    variance = scan.noise_counts**2 + counts * per_count
+    # Of a line without a star.
+    noise = math.sqrt(scan.noise_counts**2 + scan.background_counts * per_count)
+    peaks = np.round(line_peaks(light, scan.threshold_sigma * noise)).astype(np.intp)
     half = scan.half_width_lines
     places = []
     for k, peak in enumerate(peaks.tolist()):

@@ -1,0 +1,295 @@
+"""Counts and times of scanning trackers: places and sigmas against drawn truth, faults by name."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.errors import BadBatch, BadConfiguration, BadFile
+from service.missions.mission import parse_mission, read_mission
+from service.observations.calibrate import correct
+from service.observations.readers.csv_rows import write_batches_csv
+from service.observations.readers.telemetry import read_lines
+from service.observations.scans.reduce import reduced
+from service.observations.schema import BatchIn, submission_from_json
+from service.simulate.scans import readings
+from service.studies.star_image_report.attitude_correction import by_two_scans, sigmas
+from service.vectors import rotate_about, unit
+from tests.observations.example import BATCH
+
+FILE = Path(__file__).resolve().parents[2] / "docs" / "scanning-mission.toml"
+GOOD_TIMES = {"h_times": [420_000.0, 430_000.0, 450_000.0], "v_times": [1.0, 10_001.0, 30_001.0]}
+
+
+@pytest.fixture(scope="module")
+def scanner():
+    return read_mission(FILE)
+
+
+def batch_of(tracker, rates=(0.0, 0.0, 0.0), **given):
+    observation = {"tracker": tracker, "stars": [], **given}
+    own = {"spacecraft": "SCANNER", "body_rates_deg_per_s": list(rates)}
+    return {**BATCH, **own, "observations": [observation]}
+
+
+def read(mission, *of, **given):
+    return reduced(submission_from_json(json.dumps(batch_of(*of, **given))).batch, mission)
+
+
+def fault_of(mission, tracker, **given):
+    with pytest.raises(BadBatch) as refused:
+        read(mission, tracker, **given)
+    (fault,) = refused.value.faults
+    return fault
+
+
+def lines_of(scan, stars, rng=None):
+    """Sums of columns and rows of Gaussian stars (h, v, light), with noise where there is `rng`."""
+    sums = []
+    for axis, lines in (("h", scan.columns), ("v", scan.rows)):
+        place = np.arange(lines)
+        level = np.full(lines, scan.background_counts)
+        for h, v, light in stars:
+            at = (h if axis == "h" else v) / scan.step_deg + (lines - 1) / 2
+            image = np.exp(-0.5 * ((place - at) / 1.2) ** 2)
+            level += light * image / (1.2 * math.sqrt(math.tau))
+        if rng is not None:
+            variance = scan.noise_counts**2 + level / scan.gain_e_per_count
+            level = level + rng.normal(0.0, np.sqrt(variance))
+        sums.append(level.tolist())
+    return {"column_counts": sums[0], "row_counts": sums[1]}
+
+
+class TestLinesThroughAStar:
+    def test_the_place_is_the_moment_over_the_sum(self, scanner):
+        """Equations 7.21 and 7.22 written out, from the middle that the batch tells."""
+        counts = [50.0] * 11 + [60.0, 90.0, 250.0, 130.0, 70.0] + [50.0] * 9
+        star = {"h_deg": 1.5, "v_deg": -0.7, "h_counts": counts, "v_counts": counts[::-1]}
+        stars = read(scanner, "LINES", stars=[star]).observations[0]
+        light = [each - 50.0 for each in counts]
+        d = 15.0 * sum((n - 12) * each for n, each in enumerate(light)) / sum(light) / 3600.0
+        assert stars.angles_deg[0] == pytest.approx([1.5 + d, -0.7 - d], abs=1e-12)
+        # sigma² sum (n - d)² / (sum Phi)² with read and photon noise, and the floor.
+        shift = d * 3600.0 / 15.0
+        variance = sum((n - 12 - shift) ** 2 * (16.0 + each / 2.0) for n, each in enumerate(counts))
+        told = math.hypot(1.0, 15.0 * math.sqrt(variance) / sum(light))
+        assert stars.sigma_arcsec[0] == pytest.approx(told, rel=1e-12)
+
+    def test_places_scatter_as_their_sigmas_say(self, scanner, rng):
+        tracker, direction = scanner.tracker("LINES", ""), unit(np.array([0.02, -0.03, 1.0]))
+        true = np.degrees(np.arctan2(direction[:2], direction[2]))
+        ratios = []
+        for _ in range(400):
+            star = readings(tracker, direction, np.zeros(3), 5.5, rng)
+            stars = read(scanner, "LINES", stars=[star]).observations[0]
+            of_scan = math.sqrt(stars.sigma_arcsec[0] ** 2 - 1.0)
+            ratios.extend((stars.angles_deg[0] - true) * 3600.0 / of_scan)
+        assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1.0, abs=5 / math.sqrt(1600))
+
+    def test_two_stars_give_the_roll_of_the_report(self, scanner, rng):
+        """Equations 7.23 to 7.25, with displacements from the counts of a turned field."""
+        u0, roll = 2.0, 0.01
+        tracker, turn = scanner.tracker("LINES", ""), np.array([0.0, 0.0, roll])
+        off, told_arcsec = [], []
+        for place in (-u0, u0):
+            direction = rotate_about(turn, unit([math.tan(math.radians(place)), 0.0, 1.0]))
+            star = readings(tracker, direction, np.zeros(3), -1.0, rng)
+            stars = read(scanner, "LINES", stars=[star]).observations[0]
+            off += [stars.angles_deg[0, 0] - place, stars.angles_deg[0, 1]]
+            told_arcsec.append(stars.sigma_arcsec[0])
+        _, sigma_rad = sigmas(max(told_arcsec) / 3600.0, u0)
+        assert sigma_rad < 3e-4
+        assert by_two_scans(*off, u0).roll_rad == pytest.approx(roll, abs=4 * sigma_rad)
+
+    @pytest.mark.parametrize(
+        ("changed", "field", "message"),
+        [
+            ({"h_counts": [60.0] * 24}, "h_counts", "has 24 samples"),
+            ({"v_counts": [50.0] * 25}, "v_counts", "leave the star out"),
+            ({"h_counts": [50.0] * 12 + [4095.0] + [50.0] * 12}, "h_counts.12", "is full"),
+        ],
+    )
+    def test_counts_that_cannot_be_are_named(self, scanner, changed, field, message):
+        counts = [50.0] * 11 + [300.0] * 3 + [50.0] * 11
+        star = {"h_deg": 0, "v_deg": 0, "h_counts": counts, "v_counts": counts} | changed
+        fault = fault_of(scanner, "LINES", stars=[star])
+        assert fault.field == f"observations.0.stars.0.{field}"
+        assert message in fault.message
+
+
+class TestTimesOfWires:
+    def test_each_time_is_a_place_of_the_sweep(self, scanner):
+        stars = read(scanner, "WIRES", stars=[GOOD_TIMES]).observations[0]
+        assert stars.angles_deg[0] == pytest.approx([0.0, -4.2 + 1e-5], abs=1e-12)
+        assert stars.sigma_arcsec[0] == pytest.approx(3600 * 10.0 * 1e-4 / math.sqrt(3))
+        # The direction holds when the star crossed along h.
+        assert stars.time_offset_s[0] == pytest.approx((0.42 + 0.43 + 0.45) / 3)
+
+    def test_a_turning_body_moves_no_star(self, scanner, rng):
+        """Both sweeps a second apart, at .3 deg/s: the vector at the batch's epoch is the same."""
+        exact = scanner.model_dump(mode="json")
+        exact["trackers"][1]["scan"]["time_sigma_s"] = 1e-12
+        still = type(scanner).model_validate(exact)
+        tracker, direction = still.tracker("WIRES", ""), unit(np.array([0.03, -0.02, 1.0]))
+        rates = (0.2, -0.3, 0.25)
+        about = tracker.body_from_tracker.T @ np.radians(rates)
+        star = readings(tracker, direction, about, 5.0, rng)
+        batch = submission_from_json(json.dumps(batch_of("WIRES", rates, stars=[star]))).batch
+        (found,) = correct(batch, still)
+        expected = tracker.body_from_tracker @ direction
+        assert np.degrees(np.linalg.norm(found.direction_body[0] - expected)) * 3600.0 < 0.01
+
+    @pytest.mark.parametrize(
+        ("changed", "field", "message"),
+        [
+            ({"h_times": [420_000.0, 430_000.0]}, "h_times", "has 2 times; the tracker has 3"),
+            ({"h_times": [4e5, 3.9e5, 4.3e5]}, "h_times.1", "is not after the time before it"),
+            ({"v_times": [4e5, 4.1e5, 9.1e5]}, "v_times.2", "outside of the scan"),
+        ],
+    )
+    def test_times_that_cannot_be_are_named(self, scanner, changed, field, message):
+        fault = fault_of(scanner, "WIRES", stars=[GOOD_TIMES | changed])
+        assert fault.field == f"observations.0.stars.0.{field}"
+        assert message in fault.message
+
+
+class TestLinesOfARaster:
+    STARS = ((1.2, -2.0, 4e4), (-3.1, 0.4, 1e4), (0.3, 3.3, 2.2e4))
+
+    def test_stars_are_paired_by_their_light(self, scanner):
+        given = lines_of(scanner.tracker("RASTER", "").scan, self.STARS)
+        stars = read(scanner, "RASTER", **given).observations[0]
+        brightest_first = sorted(self.STARS, key=lambda star: -star[2])
+        assert stars.angles_deg == pytest.approx(np.array(brightest_first)[:, :2], abs=1e-4)
+        told = [18.0 - 2.5 * math.log10(light) for _, _, light in brightest_first]
+        assert stars.magnitude_mag == pytest.approx(told, abs=0.01)
+
+    def test_places_scatter_as_their_sigmas_say(self, scanner, rng):
+        scan, ratios = scanner.tracker("RASTER", "").scan, []
+        truth = {light: (h, v) for h, v, light in self.STARS}
+        for _ in range(200):
+            stars = read(scanner, "RASTER", **lines_of(scan, self.STARS, rng)).observations[0]
+            for angles, sigma, mag in zip(
+                stars.angles_deg, stars.sigma_arcsec, stars.magnitude_mag, strict=True
+            ):
+                light = min(truth, key=lambda each: abs(math.log10(each) - (18.0 - mag) / 2.5))
+                ratios.extend((angles - truth[light]) * 3600.0 / sigma)
+        assert len(ratios) > 1100
+        spread = np.sqrt(np.mean(np.square(ratios)))
+        assert spread == pytest.approx(1.0, abs=5 / math.sqrt(2 * len(ratios)) + 0.02)
+
+    def test_stars_that_cannot_be_told_apart_are_left_out(self, scanner):
+        """Two of one light, and two in one band of columns."""
+        scan = scanner.tracker("RASTER", "").scan
+        alike = ((1.0, 1.0, 1e4), (2.0, -1.0, 1e4), *self.STARS[:1])
+        assert read(scanner, "RASTER", **lines_of(scan, alike)).observations[0].count == 1
+        band = ((1.0, 1.0, 1e4), (1.06, -1.0, 2e4), (-3.1, 3.0, 4e4))
+        assert read(scanner, "RASTER", **lines_of(scan, band)).observations[0].count == 1
+
+    def test_lines_that_cannot_be_are_named(self, scanner):
+        good = lines_of(scanner.tracker("RASTER", "").scan, self.STARS)
+        fault = fault_of(scanner, "RASTER", **good | {"row_counts": good["row_counts"][1:]})
+        assert fault.field == "observations.0.row_counts"
+        assert "has 400 lines; the raster has 401" in fault.message
+        empty = {"column_counts": [5000.0] * 401, "row_counts": [5000.0] * 401}
+        assert "no star" in fault_of(scanner, "RASTER", **empty).message
+
+
+@pytest.mark.parametrize(
+    ("tracker", "given"),
+    [
+        (
+            "WIRES",
+            {"stars": [{"h_deg": 0, "v_deg": 0, "h_counts": [1] * 9, "v_counts": [1] * 9}]},
+        ),
+        ("LINES", {"stars": [GOOD_TIMES]}),
+        ("LINES", {"column_counts": [1.0] * 9, "row_counts": [1.0] * 9}),
+    ],
+)
+def test_readings_of_another_kind_of_scan_are_refused_by_name(scanner, tracker, given):
+    fault = fault_of(scanner, tracker, **given)
+    assert fault.field.startswith("observations.0.")
+    assert f"gives {tracker} a scan of the kind" in fault.message
+
+
+@pytest.mark.parametrize(
+    ("star", "field"),
+    [
+        ({"h_deg": 0, "v_deg": 0, "h_counts": [-1.0, 2, 3], "v_counts": [1, 2, 3]}, "h_counts.0"),
+        ({"h_deg": 0, "v_deg": 0, "h_counts": [1, math.nan, 3], "v_counts": [1, 2, 3]}, "h_counts"),
+        ({"h_times": [1.0, 2.0, -3.0], "v_times": [1.0, 2.0, 3.0]}, "h_times.2"),
+        ({"h_deg": 0, "v_deg": 0, "h_counts": [1, 2, 3]}, "stars.0"),
+        ({"h_times": [1.0], "v_times": [1.0], "h_deg": 0.0, "v_deg": 0.0}, "stars.0"),
+        ({"vector": [0, 0, 1], "h_counts": [1, 2, 3], "v_counts": [1, 2, 3]}, "stars.0"),
+    ],
+)
+def test_a_star_that_no_scan_gives_is_refused_by_its_form(star, field):
+    with pytest.raises(BadBatch) as refused:
+        submission_from_json(json.dumps(batch_of("LINES", stars=[star])))
+    assert any(field in fault.field for fault in refused.value.faults)
+
+
+def test_a_tracker_takes_stars_or_lines_and_not_both():
+    lines = {"column_counts": [1.0] * 9, "row_counts": [1.0] * 9}
+    for given in ({"stars": [GOOD_TIMES], **lines}, {"column_counts": [1.0] * 9}):
+        with pytest.raises(BadBatch, match="column_counts and row_counts"):
+            submission_from_json(json.dumps(batch_of("RASTER", **given)))
+
+
+def test_rows_of_a_csv_file_hold_readings(tmp_path, scanner, rng):
+    tracker = scanner.tracker("LINES", "")
+    counts = readings(tracker, unit([0.02, 0.01, 1.0]), np.zeros(3), 5.0, rng)
+    sent = batch_of("LINES", stars=[{**counts, "magnitude": 5.0}, {"h_deg": 1.0, "v_deg": 2.0}])
+    sent["observations"] += [
+        {"tracker": "WIRES", "stars": [GOOD_TIMES]},
+        {"tracker": "RASTER", "stars": [], **lines_of(scanner.tracker("RASTER", "").scan, ())},
+    ]
+    path = tmp_path / "readings.csv"
+    checked = BatchIn.model_validate(sent)
+    with path.open("w", newline="") as stream:
+        write_batches_csv([checked], stream)
+    (line,) = read_lines(path)
+    assert BatchIn.model_validate_json(line.body) == checked
+
+
+@pytest.mark.parametrize(
+    ("cell", "message"), [("1 2 x", "must be a number"), ("1 1e999 3", "must be a finite number")]
+)
+def test_a_cell_of_readings_that_cannot_be_read_is_named(tmp_path, cell, message):
+    path = tmp_path / "bad.csv"
+    head = "spacecraft,batch,time,tracker,h_times,v_times"
+    path.write_text(f"{head}\nSCANNER,1,1996-01-10T12:00:00Z,WIRES,1 2 3,{cell}\n")
+    (line,) = read_lines(path)
+    assert line.fault.field == "line 2, column v_times"
+    assert message in line.fault.message
+
+
+def test_columns_of_readings_come_in_pairs(tmp_path):
+    path = tmp_path / "half.csv"
+    path.write_text("spacecraft,batch,time,tracker,h_times\n")
+    with pytest.raises(BadFile, match="v_times"):
+        list(read_lines(path))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "key"),
+    [
+        ("samples = 25", "samples = 24", "trackers.0.scan.samples: Value error, must be odd"),
+        ("wires_deg = [0.0, 0.1, 0.3]", "wires_deg = [0.0, 0.3, 0.1]", "trackers.1.scan.wires_deg"),
+        ('kind = "raster"', 'kind = "spiral"', "trackers.2.scan"),
+        ("time_unit_s = 1e-6", "time_unit = 1e-6", "trackers.1.scan.time_unit: no such key"),
+    ],
+)
+def test_a_wrong_key_of_a_scan_is_named(old, new, key):
+    text = FILE.read_text(encoding="utf-8")
+    assert old in text
+    with pytest.raises(BadConfiguration) as refused:
+        parse_mission(text.replace(old, new), "x.toml")
+    assert key in str(refused.value)
+
+
+def test_a_batch_without_readings_is_left_as_it_is(missions):
+    batch = submission_from_json(json.dumps(BATCH)).batch
+    assert reduced(batch, missions["XTE"]) is batch
