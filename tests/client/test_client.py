@@ -33,6 +33,7 @@ from service.client import (
 )
 from service.client._sync import alarms, batches, gyro, pages, replays, spacecraft
 from service.client._sync import client as whole
+from service.missions.mission import load_missions
 from service.settings import Settings
 from service.storage.recording import events as records
 from service.storage.recording.ids import Ulids
@@ -40,6 +41,7 @@ from service.times import shifted, utc_now
 from service.web import event_stream as live
 from service.web.app import create_app
 from tests.client.cutting_proxy import CuttingProxy
+from tests.tracks.drawn import conjunctions, draw
 from tests.web.serving import Server
 
 GYRO = {
@@ -184,6 +186,24 @@ def test_tables_have_a_row_for_each_item_and_the_same_values(client, drawn):
         history = client.history("XTE", run="tables", strategy=strategy)
         assert history.to_arrow().num_rows == len(history.unix_s)
         assert column in history.to_pandas().columns
+
+
+def test_tracks_are_those_of_the_service(client, sky):
+    """An object among the stars, two planets and three hot pixels."""
+    rng = np.random.default_rng(7)
+    stretch = conjunctions(rng, 1)[0]
+    for each in draw(load_missions()["XTE"], sky, stretch, rng).with_points:
+        client.submit(each | {"run": "tracks"})
+    found = client.tracks("XTE", run="tracks")
+    kinds = sorted(each.kind for each in found.items)
+    assert kinds == ["fixed_on_detector"] * 3 + ["moving"] + ["planet"] * 2
+    (moving,) = [each for each in found.items if each.kind == "moving"]
+    assert client.batch(moving.points[0].id).answer.run == "tracks"
+    tdm = client.tracks_tdm("XTE", run="tracks")
+    assert tdm.startswith("CCSDS_TDM_VERS")
+    assert tdm.count("META_START") == 1
+    with pytest.raises(NotFound):
+        client.tracks_tdm("XTE", run="tracks", end=found.items[0].first)
 
 
 def test_a_replay_is_followed_to_its_end_and_its_refused_lines_are_told(client, drawn, tmp_path):

@@ -38,6 +38,7 @@ NAMES = {
     "Star": "StarOut",
     "StarCounts": "CountsOut",
     "Timings": "TimingsOut",
+    "Track": "TrackOut",
     "TrackerFit": "TrackerFitOut",
     "TrackerStars": "TrackerOut",
 }

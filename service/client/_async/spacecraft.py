@@ -12,6 +12,7 @@ from ..models import (
     Rates,
     SpacecraftRow,
     SpacecraftState,
+    TrackList,
 )
 from .connection import AsyncConnection
 from .pages import AsyncItems
@@ -69,6 +70,37 @@ class AsyncSpacecraft(AsyncConnection):
         """
         query = {"run": run, "start": start, "end": end}
         return AsyncItems(self, Innovation, path_of("spacecraft", spacecraft, "innovations"), query)
+
+    async def tracks(
+        self,
+        spacecraft: str,
+        *,
+        run: str = "live",
+        start: Time | None = None,
+        end: Time | None = None,
+    ) -> TrackList:
+        """Tracks of points that no catalog star explains: objects, planets, hot pixels.
+
+        The period has at most 2,000 batches.
+
+        >>> [each.kind for each in (await client.tracks("XTE")).items]
+        []
+        """
+        query = {"run": run, "start": start, "end": end}
+        return await self.get(TrackList, path_of("spacecraft", spacecraft, "tracks"), query)
+
+    async def tracks_tdm(
+        self,
+        spacecraft: str,
+        *,
+        run: str = "live",
+        start: Time | None = None,
+        end: Time | None = None,
+    ) -> str:
+        """The moving tracks of a period as a CCSDS TDM; raises `NotFound` if there are none."""
+        query = {"run": run, "start": start, "end": end, "format": "tdm"}
+        path = path_of("spacecraft", spacecraft, "tracks")
+        return (await self.request("GET", path, query=query)).text
 
     async def history(
         self,

@@ -12,6 +12,7 @@ from ..models import (
     Rates,
     SpacecraftRow,
     SpacecraftState,
+    TrackList,
 )
 from .connection import Connection
 from .pages import Items
@@ -69,6 +70,37 @@ class Spacecraft(Connection):
         """
         query = {"run": run, "start": start, "end": end}
         return Items(self, Innovation, path_of("spacecraft", spacecraft, "innovations"), query)
+
+    def tracks(
+        self,
+        spacecraft: str,
+        *,
+        run: str = "live",
+        start: Time | None = None,
+        end: Time | None = None,
+    ) -> TrackList:
+        """Tracks of points that no catalog star explains: objects, planets, hot pixels.
+
+        The period has at most 2,000 batches.
+
+        >>> [each.kind for each in (client.tracks("XTE")).items]
+        []
+        """
+        query = {"run": run, "start": start, "end": end}
+        return self.get(TrackList, path_of("spacecraft", spacecraft, "tracks"), query)
+
+    def tracks_tdm(
+        self,
+        spacecraft: str,
+        *,
+        run: str = "live",
+        start: Time | None = None,
+        end: Time | None = None,
+    ) -> str:
+        """The moving tracks of a period as a CCSDS TDM; raises `NotFound` if there are none."""
+        query = {"run": run, "start": start, "end": end, "format": "tdm"}
+        path = path_of("spacecraft", spacecraft, "tracks")
+        return (self.request("GET", path, query=query)).text
 
     def history(
         self,

@@ -62,6 +62,7 @@ from .spacecraft import (
     SpacecraftRow,
     SpacecraftState,
 )
+from .tracks import Track, TrackList, TrackPoint
 
 __all__ = [
     "Acted",
@@ -122,6 +123,9 @@ __all__ = [
     "StarRef",
     "Summary",
     "Timings",
+    "Track",
+    "TrackList",
+    "TrackPoint",
     "TrackerFit",
     "TrackerGeometry",
     "TrackerStars",
