@@ -13,6 +13,7 @@ import numpy as np
 
 from service.advice.zone_census import Spread, ZoneCensus, share_below, spread_of, stars_in_view
 from service.missions.mission import Band, Mission, Tracker
+from service.missions.scan import Raster, Sweep
 from service.sky.catalog.run_catalog import RunCatalog
 from service.vectors import separation_deg
 
@@ -30,6 +31,8 @@ SIGMAS_ARCSEC = 0.1, 120.0
 SAME_BORESIGHT_DEG = 0.1
 COELEVATION_DEG = 0.5
 CORNER_SHARE = 0.05
+OTHER_SIGMA = 3.0
+"""A scan whose sigma is so many times more, or less, than the tracker's contradicts it."""
 
 
 @dataclass(frozen=True)
@@ -185,6 +188,7 @@ def _trackers(mission: Mission) -> Iterator[Finding]:
             text = f"{tracker.calibration.scale:g} changes angles by more than a tenth"
             yield Finding("unusual", f"{key}.calibration.scale", text)
         yield from _camera(key, tracker)
+        yield from _scan(key, tracker)
         for other in mission.trackers[:place]:
             if separation_deg(other.boresight_body, tracker.boresight_body) < SAME_BORESIGHT_DEG:
                 text = f"looks where {other.name} looks: are its axes those of the other?"
@@ -201,6 +205,33 @@ def _camera(key: str, tracker: Tracker) -> Iterator[Finding]:
             f"{key}.field_of_view_radius_deg",
             f"{told_deg:g}, but the corner of the camera's frame is {corner_deg:.2f} deg from the "
             "boresight",
+        )
+
+
+def _scan(key: str, tracker: Tracker) -> Iterator[Finding]:
+    scan, radius_deg = tracker.scan, tracker.field_of_view_radius_deg
+    if isinstance(scan, Sweep):
+        reach_deg = min(-scan.start_deg, scan.end_deg - scan.wires_deg[-1])
+        sigma_arcsec = 3600.0 * scan.rate_deg_per_s * scan.time_sigma_s
+        sigma_arcsec /= math.sqrt(len(scan.wires_deg))
+        times = sigma_arcsec / tracker.sigma_arcsec
+        if not 1.0 / OTHER_SIGMA <= times <= OTHER_SIGMA:
+            yield Finding(
+                "unusual",
+                f"{key}.sigma_arcsec",
+                f"{tracker.sigma_arcsec:g}, but rate and time_sigma_s of the scan give stars "
+                f"{sigma_arcsec:.3g} arcsec: tolerances are judged by the first",
+            )
+    elif isinstance(scan, Raster):
+        reach_deg = min(scan.middle("h"), scan.middle("v")) * scan.step_deg
+    else:
+        return
+    if reach_deg < radius_deg:
+        yield Finding(
+            "unusual",
+            f"{key}.scan",
+            f"reaches {reach_deg:.2f} deg from the boresight, less than the field of view of "
+            f"{radius_deg:g} deg: stars at its edge are not seen",
         )
 
 
