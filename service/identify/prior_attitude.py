@@ -18,6 +18,7 @@ from service.observations.batch import (
     QuaternionPrior,
     SunPointedPrior,
 )
+from service.observations.scans.sun import sun_body
 from service.sky.ephemeris import ecliptic_north, sun_direction
 from service.sky.zones import SearchRegion
 from service.times import Utc
@@ -109,10 +110,13 @@ def _sun_pointed(prior: SunPointedPrior, time: Utc, mission: Mission) -> PriorAt
             )
             warnings = (warned,)
     # Body Z is presumed along the projection of ecliptic north.
-    body = _frame(mission.axis_body, np.array([0.0, 0.0, 1.0]))
+    sun_axis = mission.axis_body
+    if prior.sun_counts is not None:
+        sun_axis = sun_body(prior.sun_counts, mission, "a_priori.sun_counts")
+    body = _frame(sun_axis, np.array([0.0, 0.0, 1.0]))
     inertial = _frame(pole, ecliptic_north(time))
     attitude = body.T @ inertial
-    axis = np.dot(mission.axis_body, attitude)
+    axis = np.dot(sun_axis, attitude)
     return PriorAttitude(attitude, axis, False, pole, growth_deg, warnings)
 
 

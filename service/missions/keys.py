@@ -1,6 +1,6 @@
 """Keys of a mission file, for messages: the one that is wrong, and those that are allowed."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, get_args
 
 from pydantic import BaseModel
@@ -19,6 +19,14 @@ def allowed_keys(model: type[BaseModel], location: Sequence[str | int]) -> list[
     for part in location:
         models = _after(models, part)[1]
     return list(dict.fromkeys(key for each in models for key in each.model_fields))
+
+
+def explained(model: type[BaseModel], error: Mapping[str, Any]) -> str:
+    """A fault that pydantic found; for an unknown key the keys that are allowed there."""
+    if error["type"] != "extra_forbidden":
+        return str(error["msg"])
+    allowed = allowed_keys(model, error["loc"][:-1])
+    return f"no such key; allowed here: {', '.join(allowed)}"
 
 
 def _steps(model: type[BaseModel], location: Sequence[str | int]) -> Iterator[str | int]:

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import (
@@ -29,11 +29,12 @@ from service.missions.camera import Camera
 from service.missions.camera_defaults import with_camera_defaults
 from service.missions.gyro import GyroSettings, MotionSettings
 from service.missions.identifiers import IDENTIFIERS
-from service.missions.keys import allowed_keys, dotted_key
+from service.missions.keys import dotted_key, explained
 from service.missions.packets import Packets
 from service.missions.product_settings import DEFAULT_PRODUCTS, ProductSettings, beside
 from service.missions.scan import Scan
 from service.missions.strict import Strict, is_missing
+from service.missions.sun_tracker import SunTracker
 from service.missions.tracking import TrackingSettings
 from service.vectors import Matrix, Vector, read_only, unit
 
@@ -260,6 +261,7 @@ class Mission(Strict):
     motion: MotionSettings | None = Field(default=None, exclude_if=is_missing)
     """How the body moves while there is no gyro; missing: as `MotionSettings` has it."""
     tracking: TrackingSettings | None = Field(default=None, exclude_if=is_missing)
+    sun_tracker: SunTracker | None = Field(default=None, exclude_if=is_missing)
 
     @field_validator("trackers")
     @classmethod
@@ -349,7 +351,7 @@ def parse_mission(text: str, file: str) -> Mission:
         raise BadConfiguration(f"{file}: not TOML: {error}") from None
     except ValidationError as error:
         lines = [
-            f"{file}: {dotted_key(Mission, e['loc'])}: {_explained(e)} "
+            f"{file}: {dotted_key(Mission, e['loc'])}: {explained(Mission, e)} "
             f"(got {shown_value(e['input'])})"
             for e in error.errors()
         ]
@@ -363,13 +365,6 @@ def read_mission(path: Path) -> Mission:
     except (OSError, UnicodeDecodeError) as error:
         raise BadConfiguration(f"{path}: cannot be read: {error}") from None
     return parse_mission(text, str(path))
-
-
-def _explained(error: Mapping[str, Any]) -> str:
-    if error["type"] != "extra_forbidden":
-        return str(error["msg"])
-    allowed = allowed_keys(Mission, error["loc"][:-1])
-    return f"no such key; allowed here: {', '.join(allowed)}"
 
 
 def load_missions(folder: Path | None = None) -> dict[str, Mission]:

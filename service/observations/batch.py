@@ -57,10 +57,13 @@ class SunPointedPrior(Struct, frozen=True):
 
     `sun_vector` is inertial, spacecraft to Sun; without it the Sun is taken
     from an ephemeris, seen from `position_km` (geocentric, EME2000) if given.
+    `sun_counts` (4,) of the mission's sun tracker tell where in the body the Sun is; without
+    them it is taken to be along the zone's axis.
     """
 
     sun_vector: Vector | None
     position_km: Vector | None
+    sun_counts: Vector | None = None
 
 
 APriori = QuaternionPrior | BoresightPrior | SunPointedPrior

@@ -87,6 +87,7 @@ class SentPrior(_SentPart):
     quaternion: tuple[float, float, float, float] | None = None
     boresight: SentDirection | None = None
     sun_pointed: bool = False
+    sun_counts: tuple[float, float, float, float] | None = None
     sun_vector: Triple | None = None
     position_km: Triple | None = None
     frame: str = "EME2000"
@@ -179,6 +180,7 @@ def _prior_of(
     return SunPointedPrior(
         None if sun is None else read_only(unit_of(np.array(sun))),
         _optional_array(prior.position_km or position_km),
+        None if prior.sun_counts is None else _array(prior.sun_counts),
     )
 
 

@@ -165,6 +165,8 @@ class SunPointedIn(Wire):
     """A pole at the Sun with unknown roll (band missions)."""
 
     sun_pointed: Literal[True]
+    sun_counts: tuple[Count, Count, Count, Count] | None = None
+    """Of the mission's sun tracker: I+ and I- of the pair along its X, then along its Y."""
     sun_vector: UnitVector | None = None
     position_km: Position | None = None
     frame: ReferenceFrame = "EME2000"

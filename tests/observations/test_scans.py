@@ -2,24 +2,33 @@
 
 import json
 import math
-from pathlib import Path
+from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
 
+from service.acquire import acquire
+from service.acquire.result import Path
 from service.errors import BadBatch, BadConfiguration, BadFile
-from service.missions.mission import parse_mission, read_mission
+from service.identify.prior_attitude import prior_attitude
+from service.missions.mission import SHIPPED_FOLDER, parse_mission, read_mission
+from service.observations.batch import SunPointedPrior
 from service.observations.calibrate import correct
 from service.observations.readers.csv_rows import write_batches_csv
 from service.observations.readers.telemetry import read_lines
 from service.observations.scans.reduce import reduced
+from service.observations.scans.sun import sun_body
 from service.observations.schema import BatchIn, submission_from_json
 from service.simulate.scans import readings
+from service.simulate.stretches import NO_TROUBLES, Pass
+from service.simulate.telemetry import draw_pass
+from service.sky.ephemeris import sun_direction
 from service.studies.star_image_report.attitude_correction import by_two_scans, sigmas
-from service.vectors import rotate_about, unit
+from service.studies.star_image_report.sun_tracker import SunTracker as Screen
+from service.vectors import matrix_from_quaternion, rotate_about, unit
 from tests.observations.example import BATCH
 
-FILE = Path(__file__).resolve().parents[2] / "docs" / "scanning-mission.toml"
+FILE = FilePath(__file__).resolve().parents[2] / "docs" / "scanning-mission.toml"
 GOOD_TIMES = {"h_times": [420_000.0, 430_000.0, 450_000.0], "v_times": [1.0, 10_001.0, 30_001.0]}
 
 
@@ -293,3 +302,93 @@ def test_a_wrong_key_of_a_scan_is_named(old, new, key):
 def test_a_batch_without_readings_is_left_as_it_is(missions):
     batch = submission_from_json(json.dumps(BATCH)).batch
     assert reduced(batch, missions["XTE"]) is batch
+
+
+class TestSunTracker:
+    AXES = """
+[sun_tracker]
+x_axis_body = [0.0, 1.0, 0.0]
+y_axis_body = [0.0, 0.0, 1.0]
+z_axis_body = [1.0, 0.0, 0.0]
+slope_per_arcmin = 0.11
+straight_to_arcmin = 5.0
+background_counts = 100.0
+noise_counts = 10.0
+"""
+
+    @pytest.fixture
+    def soho(self):
+        """SOHO's band lies about body X."""
+        text = (SHIPPED_FOLDER / "soho.toml").read_text(encoding="utf-8")
+        return parse_mission(text + self.AXES, "soho.toml")
+
+    def counts(self, p_arcmin, q_arcmin):
+        """By the tails of the report's screen, not by the straight line."""
+        signals = Screen().errors(p_arcmin, q_arcmin)
+        return [100.0 + 5e4 * (1.0 + side * e) for e in signals for side in (1.0, -1.0)]
+
+    @pytest.mark.parametrize(("p", "q"), [(0.0, 0.0), (1.0, -2.0), (-3.0, 0.5)])
+    def test_the_sun_is_where_the_tails_of_the_screen_put_it(self, soho, p, q):
+        found = sun_body(np.array(self.counts(p, q)), soho, "sun_counts")
+        true = unit(np.array([1.0, *np.tan(np.radians(np.array([p, q]) / 60.0))]))
+        assert np.degrees(np.linalg.norm(found - true)) * 60.0 < 0.1
+
+    def test_the_presumed_attitude_has_the_sun_where_it_was_seen(self, soho):
+        """A star's angle to the Sun, of which the votes make use, is then that of the body."""
+        body = batch_of("T", stars=[{"vector": [0, 0, 1]}]) | {
+            "a_priori": {"sun_pointed": True, "sun_counts": self.counts(3.0, -2.0)}
+        }
+        batch = submission_from_json(json.dumps(body)).batch
+        prior = prior_attitude(batch.a_priori, batch.time, soho)
+        sun = sun_direction(batch.time, None)
+        seen = sun_body(batch.a_priori.sun_counts, soho, "")
+        assert prior.attitude @ sun == pytest.approx(seen, abs=1e-12)
+        assert not prior.roll_known
+        without = SunPointedPrior(None, None)
+        nominal = prior_attitude(without, batch.time, soho).attitude @ sun
+        assert np.degrees(np.arccos(nominal @ seen)) * 60.0 == pytest.approx(3.6, abs=0.1)
+
+    @pytest.mark.parametrize(
+        ("given", "message"),
+        [
+            ([100.0, 100.0, 5e4, 5e4], "along X sees no sun"),
+            ([5e4, 5e4, 9e4, 1e4], "along Y is beyond 0.55"),
+        ],
+    )
+    def test_counts_without_a_sun_are_named(self, soho, given, message):
+        with pytest.raises(BadBatch, match=message) as refused:
+            sun_body(np.array(given), soho, "a_priori.sun_counts")
+        assert refused.value.faults[0].field == "a_priori.sun_counts"
+
+    def test_a_body_that_looks_beside_the_sun_gets_its_attitude(self, soho, sky):
+        solved = 0
+        wanted = Pass(batches=8, seed=3, troubles=NO_TROUBLES, prior="direction")
+        for each in draw_pass(soho, sky, wanted):
+            truth = matrix_from_quaternion(np.array(each.truth["quaternion"]))
+            time = submission_from_json(json.dumps(each.batch)).batch.time
+            sun = truth @ sun_direction(time, np.array(each.batch["position_km"]))
+            p, q = np.degrees(np.arctan2(sun[1:], sun[0])) * 60.0
+            if max(abs(p), abs(q)) < 4.0:
+                prior = {"sun_pointed": True, "sun_counts": self.counts(p, q)}
+                sent = json.dumps(each.batch | {"a_priori": prior})
+                found = acquire(submission_from_json(sent).batch, soho, sky)
+                assert found.path is Path.ZONE
+                across = found.solution.matrix @ truth.T
+                assert abs(across[1, 2]) < 1e-3
+                assert math.degrees(math.hypot(*across[2, :2])) * 3600.0 < 60.0
+                solved += 1
+        assert solved > 2
+
+    def test_a_mission_without_one_refuses_its_counts(self, missions):
+        with pytest.raises(BadBatch, match="has no sun_tracker"):
+            sun_body(np.ones(4), missions["SOHO"], "a_priori.sun_counts")
+
+    def test_a_row_of_a_csv_file_holds_its_counts(self, tmp_path):
+        prior = {"sun_pointed": True, "sun_counts": self.counts(1.0, 2.0)}
+        stars = [{"vector": [0, 0, 1]}]
+        checked = BatchIn.model_validate(batch_of("T", stars=stars) | {"a_priori": prior})
+        path = tmp_path / "sun.csv"
+        with path.open("w", newline="") as stream:
+            write_batches_csv([checked], stream)
+        (line,) = read_lines(path)
+        assert BatchIn.model_validate_json(line.body) == checked

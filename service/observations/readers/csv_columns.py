@@ -40,7 +40,8 @@ READINGS = ("h_counts", "v_counts", "h_times", "v_times")
 LINES = ("column_counts", "row_counts")
 """Of a tracker with a raster, in a row by themselves: it has no stars."""
 STAR_COLUMNS = ("tracker", *DIRECTION, *STAR_NUMBERS, *READINGS)
-BATCH_COLUMNS = (*TEXTS, *sum(VECTORS.values(), ()), "sun_pointed", "a_priori_from", "options")
+PRIORS = ("sun_pointed", "sun_counts", "a_priori_from")
+BATCH_COLUMNS = (*TEXTS, *sum(VECTORS.values(), ()), *PRIORS, "options")
 COLUMNS = (*BATCH_COLUMNS, *STAR_COLUMNS, *LINES)
 VERBATIM = (*TEXTS, "tracker")
 """Columns whose cells are taken with their spaces; around other cells spaces do no harm."""
@@ -134,7 +135,9 @@ def batch_fields(row: CsvRow) -> dict[str, Any]:
         if sun_pointed.lower() not in ("true", "false", "1", "0"):
             raise BadCell("sun_pointed", "must be true, false or empty", sun_pointed)
         if sun_pointed.lower() in ("true", "1"):
-            priors.append({"sun_pointed": True})
+            priors.append({"sun_pointed": True, **_numbers(row, ("sun_counts",))})
+    if row.get("sun_counts") and "sun_pointed" not in (priors[-1] if priors else ()):
+        raise BadCell("sun_counts", "belongs to sun_pointed, which is not true", row["sun_counts"])
     if told := row.get("a_priori_from", ""):
         if told != "last":
             raise BadCell("a_priori_from", "must be last or empty", told)
@@ -182,9 +185,10 @@ def number_cells(cells: Iterable[tuple[str, float]]) -> CsvRow:
     return {column: repr(value) for column, value in cells}
 
 
-def list_cells(model: StarIn | TrackerIn) -> CsvRow:
-    """The cells of the readings of a star, or of the lines of a tracker's raster."""
-    lists = ((name, getattr(model, name, None)) for name in (*READINGS, *LINES))
+def list_cells(model: StarIn | TrackerIn | SunPointedIn) -> CsvRow:
+    """The cells of readings: of a star, of a tracker's raster, of the sun tracker."""
+    names = *READINGS, *LINES, "sun_counts"
+    lists = ((name, getattr(model, name, None)) for name in names)
     return {name: " ".join(map(repr, values)) for name, values in lists if values is not None}
 
 
@@ -207,6 +211,7 @@ def batch_cells(batch: BatchIn) -> CsvRow:
         vectors["boresight"] = (prior.boresight.ra_deg, prior.boresight.dec_deg)
     elif isinstance(prior, SunPointedIn):
         cells["sun_pointed"] = "true"
+        cells |= list_cells(prior)
         vectors["sun_vector"] = prior.sun_vector or batch.sun_vector
         vectors["position_km"] = prior.position_km or batch.position_km
     for name, columns in VECTORS.items():
