@@ -177,3 +177,19 @@ def test_not_a_number_is_a_422(scan_client, drawn):
 
 def test_the_example_is_checked_without_a_finding_that_it_is_wrong(acquire):
     assert acquire("mission", "check", FILE)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "key"),
+    [
+        ("duration_s = 0.9", "duration_s = 0.5", "trackers.1.scan"),
+        ("time_sigma_s = 1e-4", "time_sigma_s = 1e-3", "trackers.1.sigma_arcsec"),
+        ("columns = 401", "columns = 201", "trackers.2.scan"),
+    ],
+)
+def test_a_scan_that_does_not_fit_its_tracker_is_unusual(acquire, tmp_path, before, after, key):
+    text = FILE.read_text(encoding="utf-8")
+    assert before in text
+    (tmp_path / "mine.toml").write_text(text.replace(before, after))
+    _, out, _ = acquire("mission", "check", "mine.toml", "--json")
+    assert key in [each["key"] for each in json.loads(out)["findings"]]
