@@ -1,13 +1,18 @@
 """Named runs: lists, alarms on or off, comparisons, and reprocessing into one."""
 
 import hashlib
+import os
 from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
 
 from service.access.audit import Entry
 from service.app.context import Context, checked_run_name
 from service.errors import BadBatch, Fault
+from service.ingest.local_workers import WorkerConfig
 from service.ingest.reprocess import ReprocessPlan, ReprocessProgress, reprocess
+from service.ingest.solver_pool import Solver
 from service.missions.mission import Mission, mission_named
+from service.storage.archive.reprocessing import Reprocessing, reprocessings
 from service.storage.models.compare import RunChange, RunComparison
 from service.storage.models.runs import Run, RunState
 from service.storage.queries import histories, overview
@@ -113,6 +118,84 @@ class Runs:
         settings.  Batches that the run already has are not processed again.
         Raises `BadBatch` if the run has results of other settings.
         """
+        progress = self.reprocess_recorded(
+            run,
+            source=source,
+            spacecraft=spacecraft,
+            start=start,
+            end=end,
+            processes=processes,
+            step=step,
+        )
+        return progress, self.compare(source, progress.run, spacecraft, start, end)
+
+    def reprocess_recorded(
+        self,
+        run: str | None,
+        *,
+        source: str = LIVE,
+        spacecraft: str | None = None,
+        start: Utc | None = None,
+        end: Utc | None = None,
+        processes: int = 0,
+        step: Callable[[ReprocessProgress], object] = lambda progress: None,
+    ) -> ReprocessProgress:
+        """`reprocess` without the comparison."""
+        plan = self._plan(run, source, spacecraft, start, end, processes)
+        return reprocess(self._context.store, plan, self._context.sky.catalog.digest, step)
+
+    def reprocess_into_archive(
+        self,
+        run: str | None,
+        folder: Path,
+        *,
+        source: str = LIVE,
+        spacecraft: str | None = None,
+        start: Utc | None = None,
+        end: Utc | None = None,
+        processes: int = 0,
+        scheduler: str | None = None,
+        step: Callable[[ReprocessProgress], object] = lambda progress: None,
+    ) -> ReprocessProgress:
+        """Process the batches of a run again, archived ones too, into parts of an archive.
+
+        Local processes compute, or the workers of a Dask scheduler.  See `reprocess`.
+        """
+        from service.ingest.partitions.coordinator import reprocess_partitions
+        from service.ingest.partitions.workers import LocalProcesses, OwnProcess, Workers
+
+        plan = self._plan(run, source, spacecraft, start, end, processes)
+        if plan.run == LIVE:
+            raise BadBatch(Fault("run", "must be another run than the live one", LIVE))
+        digest = self._context.sky.catalog.digest
+        config = WorkerConfig(plan.missions, plan.catalog, digest, plan.cache_bytes)
+
+        def workers() -> Workers:
+            if scheduler is not None:
+                from service.ingest.partitions.dask_workers import DaskWorkers
+
+                return DaskWorkers(scheduler, config, folder)
+            count = processes or os.cpu_count() or 1
+            if count == 1:
+                return OwnProcess(Solver(plan.missions, self._context.sky))
+            return LocalProcesses(config, count)
+
+        return reprocess_partitions(self._context.store, folder, plan, digest, workers, step)
+
+    def reprocessings(self) -> list[Reprocessing]:
+        """The reprocessings into the service's archive, the latest first; none without one."""
+        folder = self._context.settings.archive_folder
+        return [] if folder is None else reprocessings(folder)
+
+    def _plan(
+        self,
+        run: str | None,
+        source: str,
+        spacecraft: str | None,
+        start: Utc | None,
+        end: Utc | None,
+        processes: int,
+    ) -> ReprocessPlan:
         if spacecraft is not None:
             mission_named(self._context.missions, spacecraft)
         chosen = {
@@ -120,17 +203,14 @@ class Runs:
             for name, each in self._context.missions.items()
             if spacecraft in (None, name)
         }
-        stretch = ResultFilter(source, spacecraft, start, end)
-        plan = ReprocessPlan(
-            stretch=stretch,
+        return ReprocessPlan(
+            stretch=ResultFilter(source, spacecraft, start, end),
             run=checked_run_name(run or self._run_of_settings(source, chosen)),
             missions=chosen,
             catalog=self._context.settings.catalog,
             cache_bytes=self._context.settings.shelf_mb << 20,
             processes=processes,
         )
-        progress = reprocess(self._context.store, plan, self._context.sky.catalog.digest, step)
-        return progress, self.compare(source, plan.run, spacecraft, start, end)
 
     def _run_of_settings(self, source: str, missions: Mapping[str, Mission]) -> str:
         """A name derived from the settings, so that an interrupted run can continue."""

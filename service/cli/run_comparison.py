@@ -6,16 +6,19 @@ from service.storage.models.compare import RunComparison, RunTransition
 WORDS = {"good": "attitudes good", "suspect": "attitudes suspect", "none": "no attitude"}
 
 
-def comparison_text(progress: ReprocessProgress, compared: RunComparison) -> str:
-    """The number of processed batches, and the stars and attitudes of both runs."""
-    stars, attitudes = compared.stars, compared.attitudes
-    observed = stars.observed or 1
+def progress_text(progress: ReprocessProgress) -> str:
+    """The number of processed batches."""
     done = (
         f"{progress.recorded} recorded, {progress.before} there already, {progress.refused} refused"
     )
+    return f"run {progress.run}, of {progress.total} batches:\n  {done}"
+
+
+def comparison_text(compared: RunComparison) -> str:
+    """The stars and attitudes of both runs."""
+    stars, attitudes = compared.stars, compared.attitudes
+    observed = stars.observed or 1
     lines = [
-        f"run {progress.run}, of {progress.total} batches:",
-        f"  {done}",
         "",
         f"{'':<26}{compared.run or 'every run':>16}{compared.other:>28}",
         f"{'batches in both':<26}{compared.batches:>16}{compared.batches:>28}",

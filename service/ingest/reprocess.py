@@ -20,7 +20,8 @@ from service.errors import AcquisitionError, BadBatch, Busy, Fault, shown_value
 from service.ingest.local_workers import ChunkEndsWorkers, LocalWorkers, WorkerConfig, WorkerLost
 from service.ingest.solver_pool import Solver
 from service.missions.mission import Mission
-from service.observations.schema import BatchIn, OptionsIn, submission_from_model
+from service.observations.schema import BatchIn, OptionsIn, Submission, submission_from_model
+from service.storage.archive.tables import archived_batches
 from service.storage.queries.pages import PLACE, ResultFilter
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.sql.database import Store
@@ -47,6 +48,15 @@ class ReprocessProgress:
     refused: int = 0
     refusals: list[str] = field(default_factory=list)
     """The first of them, each naming its batch."""
+    partitions: int = 0
+    """Of a reprocessing into an archive: how many there are, at most."""
+    partitions_done: int = 0
+
+    def add_refused(self, refused: Sequence["RefusedBatch"]) -> None:
+        """Count refused batches, and note the first ones."""
+        self.refused += len(refused)
+        room = REFUSALS_KEPT - len(self.refusals)
+        self.refusals += [f"{each.batch}: {each.why}" for each in refused[:room]]
 
 
 @dataclass(frozen=True)
@@ -81,7 +91,7 @@ def reprocess(
     `step` is called at the start and after each transaction.  Raises `BadBatch`
     for a run that is the source itself, or holds results of other settings.
     """
-    _require_same_settings(store, plan, catalog_digest)
+    require_same_settings(store, plan, catalog_digest)
     progress = _counted(store, plan)
     step(progress)
     with closing(_ChunkSolver(plan, catalog_digest)) as solver:
@@ -105,7 +115,8 @@ def require_other_run(run: str, source: str | None) -> None:
         raise BadBatch(Fault("run", message, shown_value(run)))
 
 
-def _require_same_settings(store: Store, plan: ReprocessPlan, catalog_digest: str) -> None:
+def require_same_settings(store: Store, plan: ReprocessPlan, catalog_digest: str) -> None:
+    """Raise `BadBatch` where the run is the source, or has results of other settings."""
     require_other_run(plan.run, plan.stretch.run)
     made_with = select(
         results.c.spacecraft, results.c.mission_digest, results.c.catalog_digest
@@ -124,14 +135,17 @@ def _conditions(plan: ReprocessPlan) -> list[ColumnElement[bool]]:
     return [*plan.stretch.conditions(), results.c.spacecraft.in_(sorted(plan.missions))]
 
 
-def _not_yet(plan: ReprocessPlan) -> ColumnElement[bool]:
-    """Whether a batch is not in the plan's run, as SQL beside `batches`."""
+def not_yet(run: str) -> ColumnElement[bool]:
+    """Whether a batch is not in a run, neither recorded nor archived, as SQL beside `batches`."""
     done = batches.alias("done")
-    return ~exists().where(
-        and_(
-            done.c.spacecraft == batches.c.spacecraft,
-            done.c.run == plan.run,
-            done.c.batch == batches.c.batch,
+    return and_(
+        *(
+            ~exists().where(
+                table.c.spacecraft == batches.c.spacecraft,
+                table.c.run == run,
+                table.c.batch == batches.c.batch,
+            )
+            for table in (done, archived_batches)
         )
     )
 
@@ -142,7 +156,7 @@ def _counted(store: Store, plan: ReprocessPlan) -> ReprocessProgress:
     )
     with store.reading() as connection:
         total = connection.scalar(joined.where(*_conditions(plan))) or 0
-        left = connection.scalar(joined.where(*_conditions(plan), _not_yet(plan))) or 0
+        left = connection.scalar(joined.where(*_conditions(plan), not_yet(plan.run))) or 0
     return ReprocessProgress(plan.run, int(total), int(total) - int(left))
 
 
@@ -152,12 +166,12 @@ def _chunks(store: Store, plan: ReprocessPlan) -> Iterator[list[StoredBatch]]:
     query = (
         select(*PLACE, batches.c.input, results.c.options)
         .join_from(results, batches, results.c.batch_id == batches.c.id)
-        .where(*_conditions(plan), _not_yet(plan))
+        .where(*_conditions(plan), not_yet(plan.run))
         .order_by(*PLACE)
         .limit(CHUNK)
     )
     while True:
-        beyond = query if place is None else query.where(_after(place))
+        beyond = query if place is None else query.where(after_place(place))
         with store.reading() as connection:
             rows = connection.execute(beyond).all()
         if not rows:
@@ -166,7 +180,8 @@ def _chunks(store: Store, plan: ReprocessPlan) -> Iterator[list[StoredBatch]]:
         yield [(row[2], row[3]) for row in rows]
 
 
-def _after(place: tuple[int, str]) -> ColumnElement[bool]:
+def after_place(place: tuple[int, str]) -> ColumnElement[bool]:
+    """Whether a result comes after a place in order of time, as SQL."""
     time_ns, batch_id = PLACE
     return (time_ns > place[0]) | and_(time_ns == place[0], batch_id > place[1])
 
@@ -185,9 +200,7 @@ def _record(
         else:
             # Trouble of the database: nothing was decided about any of them.
             raise outcome
-    progress.refused += len(refused)
-    room = REFUSALS_KEPT - len(progress.refusals)
-    progress.refusals += [f"{each.batch}: {each.why}" for each in refused[:room]]
+    progress.add_refused(refused)
 
 
 # ---- workers -----------------------------------------------------------------------------------
@@ -206,14 +219,20 @@ def process_again(solver: Solver, part: _WorkerTask) -> list[UnsavedResult | Ref
     return [_again(solver, part.run, *each) for each in part.stored]
 
 
-def _again(solver: Solver, run: str, input: str, options: str) -> UnsavedResult | RefusedBatch:
+def submission_again(input: str, options: str, run: str) -> Submission:
+    """A stored batch in another run, with the options of its current result."""
     model = BatchIn.model_validate_json(input).model_copy(
         update={"run": run, "options": OptionsIn.model_validate(json.loads(options))}
     )
+    return submission_from_model(model)
+
+
+def _again(solver: Solver, run: str, input: str, options: str) -> UnsavedResult | RefusedBatch:
+    submission = submission_again(input, options, run)
     try:
-        return solver.solve(submission_from_model(model))
+        return solver.solve(submission)
     except AcquisitionError as error:
-        return RefusedBatch(model.batch, str(error))
+        return RefusedBatch(submission.batch.batch, str(error))
 
 
 class _ChunkSolver:

@@ -15,7 +15,11 @@ from service.cli.arguments import (
     print_json,
 )
 from service.cli.configuration import period_of, settings_of, settings_of_existing
-from service.errors import BadInput, Fault
+from service.errors import BadConfiguration, BadInput, Fault
+
+SCHEDULER = """\
+A Dask scheduler runs whatever code it is sent: use tls://, with the certificates that Dask's own
+settings name, and tcp:// only in a network that you trust.  The extra `dask` has the packages."""
 
 
 def add(commands: Any) -> None:
@@ -24,15 +28,20 @@ def add(commands: Any) -> None:
         commands,
         "reprocess",
         "Process recorded batches again, on all cores, with the present settings or with a "
-        "mission file, and record the results in a separate run; then compare both runs.  After "
+        "mission file, and record the results in a separate run; then compare both runs.  With "
+        "--archive, process archived batches too, and write the results to the archive, a file "
+        "for each of its files and for each recorded day.  After "
         "an interruption, run the same command again to continue.  With SQLite, stop the "
         "service first.",
         """
         acquire reprocess --start 1996-010T00:00:00Z --end 1996-020T00:00:00Z
         acquire reprocess --mission wider.toml --run wider
         acquire reprocess --source pass-7 --spacecraft XTE --run pass-7-again --json
+        acquire reprocess --mission wider.toml --run wider --archive /archive
+        acquire reprocess --run again --archive /archive --scheduler tls://10.0.0.1:8786
         """,
         run,
+        notes=SCHEDULER,
     )
     add_period(parser, "the run for the results; default: a name derived from the settings")
     parser.add_argument(
@@ -49,6 +58,18 @@ def add(commands: Any) -> None:
         "its batches",
     )
     parser.add_argument("--processes", type=count, metavar="N", help="default: one per core")
+    parser.add_argument(
+        "--archive",
+        type=Path,
+        metavar="FOLDER",
+        help="also process the batches in this archive, and write the results there",
+    )
+    parser.add_argument(
+        "--scheduler",
+        metavar="tls://HOST:PORT",
+        help="with --archive: compute on the workers of this Dask scheduler",
+    )
+    parser.add_argument("--no-comparison", action="store_true", help="do not compare both runs")
     add_json(parser, "the comparison")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     add_database(parser)
@@ -56,12 +77,14 @@ def add(commands: Any) -> None:
 
 def run(parsed: Namespace) -> int:
     """Run recorded batches again into another run, and print how both compare."""
+    import dataclasses
+
     import msgspec
     from tqdm import tqdm
 
     from service.app.context import checked_run_name
     from service.app.factory import open_app
-    from service.cli.run_comparison import comparison_text
+    from service.cli.run_comparison import comparison_text, progress_text
     from service.ingest.reprocess import ReprocessProgress, require_other_run
     from service.missions.mission import load_missions, mission_named, read_mission
     from service.storage.sql.served import unserved
@@ -78,7 +101,10 @@ def run(parsed: Namespace) -> int:
         mission_named(load_missions(settings_of(parsed).missions), spacecraft)
     if parsed.run is not None:
         require_other_run(checked_run_name(parsed.run), parsed.source)
+    _check_archive(parsed)
     settings = settings_of_existing(parsed)
+    if parsed.archive is not None:
+        settings = dataclasses.replace(settings, archive_folder=parsed.archive)
     with ExitStack() as held:
         held.enter_context(unserved(settings.database))
         app = open_app(settings, mission)
@@ -89,24 +115,66 @@ def run(parsed: Namespace) -> int:
 
             def step(progress: ReprocessProgress) -> None:
                 bar.total = progress.total
+                if progress.partitions:
+                    done = f"{progress.partitions_done} of {progress.partitions} partitions"
+                    bar.set_postfix_str(done, refresh=False)
                 bar.update(progress.before + progress.recorded + progress.refused - bar.n)
 
-            progress, compared = app.runs.reprocess(
-                parsed.run,
-                source=parsed.source,
-                spacecraft=spacecraft,
-                start=start,
-                end=end,
-                processes=parsed.processes or 0,
-                step=step,
-            )
+            period: dict[str, Any] = {"source": parsed.source, "spacecraft": spacecraft}
+            period |= {"start": start, "end": end}
+            processes = parsed.processes or 0
+            if parsed.archive is None:
+                progress = app.runs.reprocess_recorded(
+                    parsed.run, **period, processes=processes, step=step
+                )
+            else:
+                progress = app.runs.reprocess_into_archive(
+                    parsed.run,
+                    parsed.archive,
+                    **period,
+                    processes=processes,
+                    scheduler=parsed.scheduler,
+                    step=step,
+                )
+        compared = None
+        if not parsed.no_comparison:
+            compared = app.runs.compare(parsed.source, progress.run, spacecraft, start, end)
     for refusal in progress.refusals:
         print(f"refused: {refusal}", file=sys.stderr)
     if parsed.json:
         counts = {
             name: getattr(progress, name) for name in ("total", "before", "recorded", "refused")
         }
-        print_json(counts | msgspec.to_builtins(compared))
+        print_json(counts | ({} if compared is None else msgspec.to_builtins(compared)))
     else:
-        print(comparison_text(progress, compared))
+        print(progress_text(progress))
+        if compared is not None:
+            print(comparison_text(compared))
     return 1 if progress.refused else 0
+
+
+def _check_archive(parsed: Namespace) -> None:
+    """Raise `BadInput` or `BadConfiguration` for what --archive and --scheduler cannot be."""
+    from service.extras import require_extra
+
+    if parsed.scheduler is not None and parsed.archive is None:
+        raise BadInput(Fault("--scheduler", "needs --archive", parsed.scheduler))
+    if parsed.scheduler is not None and parsed.processes is not None:
+        raise BadInput(Fault("--processes", "is of this machine: leave it out with --scheduler"))
+    if parsed.archive is None:
+        return
+    if not parsed.archive.is_dir():
+        raise BadConfiguration(f"{parsed.archive}: there is no such folder")
+    # A worker on another machine has another working folder.
+    parsed.archive = parsed.archive.resolve()
+    require_extra("tables", "pyarrow", "--archive", str(parsed.archive))
+    if parsed.scheduler is not None:
+        from service.ingest.partitions.dask_workers import require_scheduler
+
+        require_scheduler(parsed.scheduler)
+        if parsed.scheduler.startswith("tcp://"):
+            print(
+                "acquire: --scheduler: tcp:// is neither encrypted nor authenticated, and whoever "
+                "reaches the scheduler can run code on its workers: use tls://",
+                file=sys.stderr,
+            )

@@ -14,9 +14,10 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
-from sqlalchemy import ColumnElement, Connection, Table, func, insert, select
+from sqlalchemy import ColumnElement, Connection, func, insert, select
 
 from service.errors import BadConfiguration
 from service.storage.archive.folder import (
@@ -33,6 +34,7 @@ from service.storage.archive.folder import (
     write_partition,
     write_settings,
 )
+from service.storage.archive.owner import claim
 from service.storage.archive.rows import (
     Rows,
     differing,
@@ -51,6 +53,8 @@ from service.storage.sql.statements import insert_all
 from service.storage.sql.tables import catalogs, missions, results
 from service.storage.upkeep.prune import delete_batches
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, utc_now
+
+Integers = npt.NDArray[np.int64]
 
 MOST_BATCHES = 10_000
 """Of a part: what is held in memory, and deleted in one transaction."""
@@ -90,11 +94,13 @@ def archive(
 
     Of each spacecraft and run the hours of the newest batch and of the newest attitude stay, so
     that its state is known without the archive.  Gyro blocks stay.  Interrupted, it is called
-    again and goes on.  Raises `BadConfiguration` where the folder is missing or in use, where
-    batches are not split by tracker yet, and where a part of the archive contradicts the record.
+    again and goes on.  Raises `BadConfiguration` where the folder is missing, in use or of
+    another database, where batches are not split by tracker yet, and where a part of the archive
+    contradicts the record.
     """
     with locked(folder):
         with store.reading() as connection:
+            claim(connection, folder)
             days = _days(connection, before)
             chosen = {day: _chosen(connection, day, before) for day in days}
             counted = select(func.count()).select_from(results)
@@ -174,10 +180,14 @@ def _archive(store: Store, folder: Path, day: _Day, batch_ids: Sequence[str]) ->
     for _ in range(MAX_ATTEMPTS):
         with store.reading() as connection:
             rows = read_rows(connection, batch_ids)
-            _keep_settings(connection, folder, rows)
+            made = rows["results"]
+            used = (
+                pc.unique(made[f"{kind}_digest"]).to_pylist() for kind in ("mission", "catalog")
+            )
+            keep_settings(connection, folder, *used)
         file = _new_file(day_folder(folder, day.spacecraft, day.text))
         content = write_partition(file, to_partition(rows))
-        part = _described(file.name, day.run, rows, content)
+        part = described(file.name, day.run, rows, content)
         manifest = manifest_of(folder, day.spacecraft, day.text)
         manifest = msgspec.structs.replace(manifest, parts=[*manifest.parts, part])
         write_manifest(folder, manifest)
@@ -198,7 +208,8 @@ def _new_file(folder: Path) -> Path:
     return folder / f"part-{1 + max(numbers, default=0)}.parquet"
 
 
-def _described(name: str, run: str, rows: Rows, content: bytes) -> Part:
+def described(name: str, run: str, rows: Rows, content: bytes) -> Part:
+    """The entry of a partition in the manifest of its day."""
     found = rows["batches"]
     first, last = found.slice(0, 1).to_pylist()[0], found.slice(len(found) - 1).to_pylist()[0]
     made = rows["results"]
@@ -218,28 +229,24 @@ def _described(name: str, run: str, rows: Rows, content: bytes) -> Part:
     )
 
 
-def _keep_settings(connection: Connection, folder: Path, rows: Rows) -> None:
-    kinds: tuple[tuple[str, Table], ...] = (
-        ("mission_digest", missions),
-        ("catalog_digest", catalogs),
-    )
-    for column, table in kinds:
-        digests = pc.unique(rows["results"][column]).to_pylist()
+def keep_settings(
+    connection: Connection, folder: Path, of_missions: Sequence[str], of_catalogs: Sequence[str]
+) -> None:
+    """Keep in the archive what these digests stand for."""
+    for digests, table in ((of_missions, missions), (of_catalogs, catalogs)):
         query = select(table).where(table.c.digest.in_(digests))
         for row in connection.execute(query).mappings():
             write_settings(folder, Settings(digest=row["digest"], row=dict(row)))
 
 
-def _take_out(connection: Connection, day: _Day, part: Part, path: str, written: Rows) -> bool:
-    """Note the batches of a part as archived and delete them; False: the record is another now."""
-    ids = written["batches"]["id"].to_pylist()
-    lock_rows(connection, ids)
-    if differing(read_rows(connection, ids), written) is not None:
-        return False
+def note_part(
+    connection: Connection, spacecraft: str, part: Part, path: str, found: pa.Table
+) -> int:
+    """Note the batches of a part as archived; returns the id of the part."""
     row = {
         "path": path,
-        "spacecraft": day.spacecraft,
-        "run": day.run,
+        "spacecraft": spacecraft,
+        "run": part.run,
         "first_ns": part.first_ns,
         "last_ns": part.last_ns,
         "batches": part.batches,
@@ -248,12 +255,19 @@ def _take_out(connection: Connection, day: _Day, part: Part, path: str, written:
     part_id = connection.execute(insert(archived_parts).returning(archived_parts.c.id), row)
     number = int(part_id.scalar_one())
     columns = [each.name for each in archived_batches.columns if each.name != "part_id"]
-    noted = (
-        written["batches"]
-        .select(columns)
-        .append_column("part_id", pa.array([number] * len(ids), pa.int32()))
-    )
+    numbers = pa.array([number] * len(found), pa.int32())
+    noted = found.select(columns).append_column("part_id", numbers)
     insert_all(connection, archived_batches, noted.to_pylist())
+    return number
+
+
+def _take_out(connection: Connection, day: _Day, part: Part, path: str, written: Rows) -> bool:
+    """Note the batches of a part as archived and delete them; False: the record is another now."""
+    ids = written["batches"]["id"].to_pylist()
+    lock_rows(connection, ids)
+    if differing(read_rows(connection, ids), written) is not None:
+        return False
+    number = note_part(connection, day.spacecraft, part, path, written["batches"])
     made = written["results"]
     further = made.filter(pc.not_equal(made["id"], made["batch_id"])).select(["id", "batch_id"])
     insert_all(connection, archived_what_ifs, further.to_pylist())
@@ -267,15 +281,20 @@ def _take_out(connection: Connection, day: _Day, part: Part, path: str, written:
 
 def _by_hour(day: _Day, rows: Rows) -> dict[int, list[str]]:
     """The ids of the batches of each hour of a day."""
-    hours = range(24 * day.number, 24 * day.number + 24)
+    hours = hours_of(day.number, rows["batches"]["time_ns"].to_numpy())
+    found: dict[int, list[str]] = {}
+    for hour, id in zip(hours, rows["batches"]["id"].to_pylist(), strict=True):
+        found.setdefault(hour, []).append(id)
+    return found
+
+
+def hours_of(day: int, times_ns: Integers) -> list[int]:
+    """The numbers of the hours of batches (n,) of a day, as `Utc.bucket` gives them."""
+    hours = range(24 * day, 24 * day + 24)
     starts_ns = np.array([bucket_start(hour, HOUR_S).tai_ns for hour in hours])
-    times_ns = rows["batches"]["time_ns"].to_numpy()
     # A leap second belongs to the hour that it ends, and begins no other.
     place = np.searchsorted(starts_ns, times_ns, side="right") - 1
-    found: dict[int, list[str]] = {}
-    for k, id in zip(place.tolist(), rows["batches"]["id"].to_pylist(), strict=True):
-        found.setdefault(hours[k], []).append(id)
-    return found
+    return [hours[k] for k in place.tolist()]
 
 
 def _discard_unfinished(store: Store, folder: Path, day: _Day) -> None:

@@ -1,6 +1,8 @@
 """The folder of an archive: partitions of Parquet, and a manifest beside those of a day.
 
+    archive.json
     spacecraft=NAME/day=YYYY-MM-DD/part-N.parquet
+    spacecraft=NAME/day=YYYY-MM-DD/run-RUN-DIGEST.parquet
     spacecraft=NAME/day=YYYY-MM-DD/manifest.json
     settings/DIGEST.json
 
@@ -12,6 +14,7 @@ import fcntl
 import hashlib
 import io
 import os
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,6 +32,9 @@ from service.storage.upkeep.backup import sync_folder
 T = TypeVar("T")
 
 MANIFEST = "manifest.json"
+OWNER = "archive.json"
+UNFINISHED = ".part"
+"""The end of the name of a file that is being written."""
 COMPRESSION_LEVEL = 1
 """Of zstd: higher levels take longer, and those up to 9 make nothing smaller."""
 ROWS_TOGETHER = 2_048
@@ -52,6 +58,8 @@ class Part(Struct, frozen=True, kw_only=True):
     missions: list[str]
     """Digests of the settings in `settings/`."""
     catalogs: list[str]
+    source: str | None = None
+    """Of a reprocessed partition: the digest of what it was made from."""
 
 
 class Manifest(Struct, frozen=True, kw_only=True):
@@ -60,6 +68,13 @@ class Manifest(Struct, frozen=True, kw_only=True):
     spacecraft: str
     day: str
     parts: list[Part]
+
+
+class Owner(Struct, frozen=True, kw_only=True):
+    """The database whose batches an archive has."""
+
+    database: str
+    """A digest; see `owner.identity_of`."""
 
 
 class Settings(Struct, frozen=True, kw_only=True):
@@ -114,8 +129,20 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
     write_whole(file, msgspec.json.format(msgspec.json.encode(manifest), indent=1))
 
 
+def read_owner(folder: Path) -> Owner | None:
+    """The database that owns an archive; None: none has written to it yet."""
+    file = folder / OWNER
+    return _decoded(file, Owner) if file.exists() else None
+
+
 def write_partition(file: Path, partition: pa.Table) -> bytes:
     """Write a partition; returns the bytes that then stand in the file."""
+    write_whole(file, encoded(partition))
+    return file.read_bytes()
+
+
+def encoded(partition: pa.Table) -> bytes:
+    """The bytes of a partition's file; the same for the same rows and version of pyarrow."""
     buffer = io.BytesIO()
     parquet.write_table(
         partition,
@@ -125,8 +152,7 @@ def write_partition(file: Path, partition: pa.Table) -> bytes:
         row_group_size=ROWS_TOGETHER,
         write_page_checksum=True,
     )
-    write_whole(file, buffer.getvalue())
-    return file.read_bytes()
+    return buffer.getvalue()
 
 
 def read_partition(content: bytes) -> pa.Table:
@@ -162,13 +188,27 @@ def read_settings(folder: Path, digest: str) -> Settings:
     return _decoded(settings_file(folder, digest), Settings)
 
 
-def write_whole(file: Path, content: bytes) -> None:
-    """Write a file that appears whole and outlasts a power cut."""
+def write_first(file: Path, content: bytes) -> bytes:
+    """Write a file that appears whole, unless it is there; returns the bytes that are there then.
+
+    Several processes may write the same file at a time: each writes one of its own beside it.
+    """
+    if file.exists():
+        return file.read_bytes()
+    write_whole(file, content, f".{file.name}.{uuid.uuid4().hex}{UNFINISHED}")
+    return file.read_bytes()
+
+
+def write_whole(file: Path, content: bytes, beside_as: str | None = None) -> None:
+    """Write a file that appears whole and outlasts a power cut.
+
+    Until then it is written under another name beside it.
+    """
     new = [folder for folder in file.parents if not folder.exists()]
     file.parent.mkdir(parents=True, exist_ok=True)
     for folder in new:
         sync_folder(folder.parent)
-    beside = file.with_name(f"{file.name}.part")
+    beside = file.with_name(beside_as or f"{file.name}{UNFINISHED}")
     try:
         with beside.open("wb") as part:
             part.write(content)

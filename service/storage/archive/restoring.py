@@ -89,9 +89,9 @@ def restore(
         for path, part in parts:
             content = whole_content(folder, path, part.sha256)
             rows = from_partition(read_partition(content))
-            put_back = partial(_put_back, folder=folder, part=part, rows=rows)
+            record_again = partial(put_back, folder=folder, part=part, rows=rows)
             try:
-                is_new = store.writer.change(put_back).result()
+                is_new = store.writer.change(record_again).result()
             except IntegrityError as error:
                 raise BadConfiguration(
                     f"{folder / path}: the database has other batches of these names: {error.orig}"
@@ -102,7 +102,7 @@ def restore(
     return restored
 
 
-def _put_back(connection: Connection, folder: Path, part: Part, rows: Rows) -> bool:
+def put_back(connection: Connection, folder: Path, part: Part, rows: Rows) -> bool:
     """Insert the rows of a part; False: they are there."""
     ids = rows["batches"]["id"].to_pylist()
     some = select(batches.c.id).where(batches.c.id.in_(ids[:1]))

@@ -32,7 +32,7 @@ def keep_share(
 
     `of_hour` has the ids of the batches by the number of their hour.
     """
-    own = {"spacecraft": spacecraft, "run": run, "part_id": part_id}
+    found: dict[int, dict[str, Row]] = {}
     for hour, batch_ids in of_hour.items():
         chosen = results.c.current, results.c.batch_id.in_(batch_ids)
         whole = connection.execute(select(*SUMMED.values()).where(*chosen)).mappings().one()
@@ -42,12 +42,28 @@ def keep_share(
             .where(*chosen)
             .group_by(tracker_values.c.tracker)
         )
-        shares = [{"tracker": WHOLE} | dict(whole)]
-        shares += [dict(row) for row in connection.execute(of_trackers).mappings()]
-        rows = [
-            own | {"bucket": hour, "tracker": share.pop("tracker"), "sums": json.dumps(share)}
-            for share in shares
-        ]
+        found[hour] = {WHOLE: dict(whole)}
+        for row in connection.execute(of_trackers).mappings():
+            share = dict(row)
+            found[hour][share.pop("tracker")] = share
+    insert_share(connection, part_id, spacecraft, run, found)
+
+
+def insert_share(
+    connection: Connection,
+    part_id: int,
+    spacecraft: str,
+    run: str,
+    of_hour: Mapping[int, Mapping[str, Row]],
+) -> None:
+    """Note the share of a part in each hour, by tracker and for the `WHOLE`."""
+    own = {"spacecraft": spacecraft, "run": run, "part_id": part_id}
+    rows = [
+        own | {"bucket": hour, "tracker": tracker, "sums": json.dumps(share)}
+        for hour, shares in of_hour.items()
+        for tracker, share in shares.items()
+    ]
+    if rows:
         connection.execute(insert(archived_hours), rows)
 
 

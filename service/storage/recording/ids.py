@@ -1,5 +1,6 @@
 """Identifiers of results and replays: ULIDs, 26 characters that sort by time."""
 
+import hashlib
 import os
 import threading
 import time
@@ -35,6 +36,14 @@ class Ulids:
             )
             value = self._last
         return "".join([_PAIRS[value >> shift & 1023] for shift in _SHIFTS])
+
+
+def derived_ulid(id: str, *of: str) -> str:
+    """An identifier of the same millisecond as another; the same again for the same texts."""
+    digest = hashlib.sha256("\0".join((id, *of)).encode()).digest()
+    value = int.from_bytes(digest[: _RANDOM_BITS // 8], "big")
+    shifts = range(_RANDOM_BITS - 10, -1, -10)
+    return id[: LENGTH - 2 * len(shifts)] + "".join([_PAIRS[value >> k & 1023] for k in shifts])
 
 
 def unguessable_ulid() -> str:

@@ -76,6 +76,23 @@ def add_trackers(connection: Connection, new: Iterable[tuple[Buckets, Row]]) -> 
     _add(connection, of_hour, (tracker_rollups_hourly, tracker_rollups_daily), _TRACKER_KEY)
 
 
+def add_shares(
+    connection: Connection, spacecraft: str, run: str, of_hour: Mapping[int, Mapping[str, Row]]
+) -> None:
+    """Add rollups that are there already, by hour and by tracker; `WHOLE` is the spacecraft's."""
+    whole: Rollups = {}
+    of_trackers: Rollups = {}
+    for hour, shares in of_hour.items():
+        for tracker, share in shares.items():
+            if tracker == WHOLE:
+                whole[spacecraft, run, hour] = share
+            else:
+                of_trackers[spacecraft, run, tracker, hour] = share
+    _add_hours(connection, whole, (rollups_hourly, rollups_daily), _KEY)
+    tables = tracker_rollups_hourly, tracker_rollups_daily
+    _add_hours(connection, of_trackers, tables, _TRACKER_KEY)
+
+
 def lock(connection: Connection, hours: Iterable[BucketKey]) -> None:
     """Lock the hours of spacecraft, and their days, so that only this transaction changes them."""
     keys = sorted(set(hours))
@@ -91,7 +108,12 @@ def _add(
     tables: tuple[Table, Table],
     names: tuple[str, ...],
 ) -> None:
-    hourly = {key: rolled_up(found) for key, found in of_hour.items()}
+    _add_hours(connection, {key: rolled_up(found) for key, found in of_hour.items()}, tables, names)
+
+
+def _add_hours(
+    connection: Connection, hourly: Rollups, tables: tuple[Table, Table], names: tuple[str, ...]
+) -> None:
     daily: Rollups = {}
     for (*owner, hour), row in hourly.items():
         _put(daily, (*owner, hour // 24), row)

@@ -1,0 +1,1 @@
+"""Reprocessing of whole partitions, one task each, by local processes or on a Dask scheduler."""

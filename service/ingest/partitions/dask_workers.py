@@ -1,0 +1,160 @@
+"""Tasks on a Dask scheduler: its workers need this package and the folder of the archive.
+
+A scheduler runs whatever code it is sent: its address comes from the command line, never from a
+request, and should be one of TLS.
+"""
+
+import logging
+import pickle
+import threading
+from asyncio import CancelledError
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from service import __version__
+from service.acquire.prewarm import prewarm_kernels
+from service.errors import BadConfiguration, BadInput, Fault
+from service.extras import require_extra
+from service.ingest.local_workers import WorkerConfig
+from service.ingest.partitions.tasks import PartitionResult, PartitionTask
+from service.ingest.partitions.workers import Outcome, Wait, attempt, result_of
+from service.ingest.solver_pool import Solver
+from service.storage.archive.folder import write_whole
+
+RETRIES = 3
+"""Of a task that raises; one whose worker dies goes to another worker by itself."""
+CONNECT_S = 20
+FEWEST_PENDING, PENDING_A_WORKER = 4, 2
+SCHEMES = ("tls://", "tcp://")
+
+log = logging.getLogger(__name__)
+
+
+def require_scheduler(address: str) -> None:
+    """Raise `BadInput` for an address that is none, `NotAvailable` without the package."""
+    if not address.startswith(SCHEMES) or not address.rpartition(":")[2].isdigit():
+        raise BadInput(Fault("--scheduler", "must be tls://HOST:PORT or tcp://HOST:PORT", address))
+    require_extra("dask", "distributed", "--scheduler", address)
+
+
+class DaskWorkers:
+    """The workers of a scheduler, which may come and go."""
+
+    def __init__(self, address: str, config: WorkerConfig, folder: Path) -> None:
+        """Raises `BadConfiguration` where the scheduler does not answer."""
+        from distributed import Client
+
+        # What goes wrong is told here, in a line and without the trace.
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        # Its methods have no types.
+        connect: Any = Client
+        self._address = address
+        self._config = pickle.dumps(replace(config, catalog=_kept_catalog(config, folder)))
+        try:
+            self._client = connect(address, timeout=CONNECT_S, set_as_default=False)
+        except (OSError, TypeError, ValueError) as error:
+            # A TypeError tells of certificates that are missing.
+            raise BadConfiguration(f"--scheduler: {address}: {error}") from None
+        self._unfinished: set[Any] = set()
+
+    @property
+    def workers(self) -> int:
+        """How many workers the scheduler has."""
+        return len(self._client.scheduler_info(n_workers=-1)["workers"])
+
+    @property
+    def most_pending(self) -> int:
+        """How many tasks should be begun before the first of them is taken."""
+        return max(FEWEST_PENDING, PENDING_A_WORKER * self.workers)
+
+    def submit(self, task: PartitionTask) -> Wait:
+        """Queue a task."""
+        # Its file is what it is done for: a result that is known from before would not make one.
+        future = self._client.submit(
+            do_task, self._config, versions(), task, pure=False, retries=RETRIES
+        )
+        self._unfinished.add(future)
+        return self._wait(future, task)
+
+    def _wait(self, future: Any, task: PartitionTask) -> Callable[[float], PartitionResult | None]:
+        def wait(seconds: float) -> PartitionResult | None:
+            try:
+                outcome = future.result(timeout=seconds)
+            except TimeoutError:
+                # A result that went with its worker is computed anew.
+                if self._client.status == "closed":
+                    raise self._gone(task) from None
+                return None
+            except BadConfiguration:
+                raise
+            except (Exception, CancelledError) as error:
+                # Of the scheduler: workers died over it, or it is gone itself.
+                raise self._gone(task, error) from None
+            self._unfinished.discard(future)
+            return result_of(outcome)
+
+        return wait
+
+    def _gone(self, task: PartitionTask, error: BaseException | None = None) -> BadConfiguration:
+        why = "the scheduler is gone" if error is None else f"{type(error).__name__}: {error}"
+        return BadConfiguration(
+            f"--scheduler: {self._address}: {task.target.name}: {why}; to go on, run the command "
+            "again"
+        )
+
+    def close(self) -> None:
+        """Let what is unfinished go."""
+        try:
+            self._client.cancel(list(self._unfinished), force=True)
+        except Exception as error:  # a scheduler that is gone cancels nothing
+            log.debug("nothing was cancelled: %s", error)
+        self._client.close()
+
+
+def _kept_catalog(config: WorkerConfig, folder: Path) -> Path | None:
+    """A copy of a site's own catalog in the archive, where workers find it; None: it is shipped."""
+    if config.catalog is None:
+        return None
+    place = folder / "catalogs" / config.catalog_digest.replace(":", "-") / config.catalog.name
+    if not place.exists():
+        write_whole(place, config.catalog.read_bytes())
+    return place
+
+
+# ---- in a worker -------------------------------------------------------------------------------
+
+_lock = threading.Lock()
+_solvers: dict[bytes, Solver] = {}
+
+
+def versions() -> dict[str, str]:
+    """What the bytes of a part depend on, beside its batches and the processor."""
+    return {"attitude-acquisition": __version__, "pyarrow": pa.__version__}
+
+
+def do_task(config: bytes, expected: dict[str, str], task: PartitionTask) -> Outcome:
+    """Do a task in a worker, whose versions and catalog must be those of the command."""
+    for package, version in versions().items():
+        if expected[package] != version:
+            raise BadConfiguration(
+                f"a worker has {package} {version}, and the command {expected[package]}: install "
+                "the same version"
+            )
+    if not task.folder.is_dir():
+        raise BadConfiguration(f"{task.folder}: a worker has no such folder: mount it there")
+    return attempt(_solver_of(config), task)[0]
+
+
+def _solver_of(config: bytes) -> Solver:
+    """The solver with these settings, whose kernels are compiled; a worker keeps the latest."""
+    with _lock:
+        if config not in _solvers:
+            solver = pickle.loads(config).solver()
+            prewarm_kernels(solver.sky, solver.missions)
+            _solvers.clear()
+            _solvers[config] = solver
+        return _solvers[config]

@@ -1,0 +1,191 @@
+"""One partition: read its batches, acquire them with other settings, write the results beside.
+
+A task may run twice, here or on another machine, and be killed anywhere: its bytes follow from its
+input alone, and its file appears whole.  What would differ between two runs is left out of the
+results: ids follow from the source's, a result is dated when its batch was received, and the steps
+took no time.
+"""
+
+import hashlib
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import quote
+
+import pyarrow as pa
+from msgspec import structs
+from pyarrow import parquet
+from sqlalchemy import Table
+
+from service import __version__
+from service.acquire import Acquisition
+from service.errors import AcquisitionError
+from service.ingest.reprocess import RefusedBatch, submission_again
+from service.ingest.solver_pool import Solver, mission_in_input
+from service.observations.schema import Submission
+from service.storage.archive.folder import (
+    day_folder,
+    encoded,
+    read_partition,
+    whole_content,
+    write_first,
+)
+from service.storage.archive.reprocessed import RunPart, run_part
+from service.storage.archive.rows import CHILDREN, Rows, from_partition, schema_of, to_partition
+from service.storage.recording.ids import derived_ulid
+from service.storage.recording.unsaved_result import UnsavedResult, unsaved_submission
+from service.storage.sql.columns import Row
+from service.storage.sql.tables import batches, results
+from service.times import recorded_utc
+
+COLUMNS = ("id", "batch_id", "batch", "received", "created", "input", "options", "current")
+"""What a task reads of its source."""
+_DIGITS = 24
+"""Of a digest in the name of a file."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """The batches of a task: a part of the archive, or a file's content made of the record."""
+
+    digest: str
+    """SHA-256 of the file."""
+    path: str | None
+    """Below the folder; None: the content is here."""
+    content: bytes = b""
+
+    def read(self, folder: Path) -> bytes:
+        """The content; raises `BadConfiguration` where the file is missing or damaged."""
+        return self.content if self.path is None else whole_content(folder, self.path, self.digest)
+
+
+@dataclass(frozen=True)
+class PartitionTask:
+    """The batches of a day to run again, and where the results go."""
+
+    folder: Path
+    spacecraft: str
+    day: str
+    run: str
+    source: Source
+    batches: int
+    settings: tuple[str, str]
+    """The digests of the mission and of the catalog."""
+    left_out: frozenset[str] = frozenset()
+    """Names of batches that the run has."""
+
+    @property
+    def digest(self) -> str:
+        """What the results are made from: the source without what is left out."""
+        if not self.left_out:
+            return self.source.digest
+        names = "\0".join((self.source.digest, *sorted(self.left_out)))
+        return hashlib.sha256(names.encode()).hexdigest()
+
+    @property
+    def target(self) -> Path:
+        """The file of the results: another one for another source, other settings or version."""
+        made_from = "\0".join((self.digest, *self.settings, __version__))
+        digest = hashlib.sha256(made_from.encode()).hexdigest()[:_DIGITS]
+        place = day_folder(self.folder, self.spacecraft, self.day)
+        return place / f"run-{quote(self.run, safe='')}-{digest}.parquet"
+
+
+@dataclass(frozen=True)
+class PartitionResult:
+    """What came of a task: its part, and the batches that the settings cannot take."""
+
+    made: RunPart | None
+    """None: every batch was refused."""
+    refused: Sequence[RefusedBatch]
+
+    @property
+    def batches(self) -> int:
+        """How many batches have a result."""
+        return 0 if self.made is None else self.made.part.batches
+
+
+def process_partition(solver: Solver, task: PartitionTask) -> list[PartitionResult]:
+    """Do a task, and write its file unless that is there."""
+    found: list[UnsavedResult] = []
+    refused: list[RefusedBatch] = []
+    for row in _stored(task):
+        if row["batch"] in task.left_out:
+            continue
+        submission = submission_again(row["input"], row["options"], task.run)
+        try:
+            found.append(_solve(solver, submission, row))
+        except AcquisitionError as error:
+            refused.append(RefusedBatch(row["batch"], str(error)))
+    if not found:
+        return [PartitionResult(None, refused)]
+    rows = _rows_of(found)
+    content = encoded(to_partition(rows))
+    written = write_first(task.target, content)
+    if written != content:
+        # A process of another kind was faster: its results are those of the run.
+        rows = from_partition(read_partition(written))
+    return [PartitionResult(run_part(task.target.name, task.digest, rows, written), refused)]
+
+
+def _stored(task: PartitionTask) -> list[dict[str, str]]:
+    content = io.BytesIO(task.source.read(task.folder))
+    table = parquet.read_table(
+        content,
+        columns=list(COLUMNS),
+        filters=[("current", "=", True)],
+        page_checksum_verification=True,
+    )
+    found: list[dict[str, str]] = table.to_pylist()
+    return found
+
+
+def _solve(solver: Solver, submission: Submission, row: dict[str, str]) -> UnsavedResult:
+    batch = submission.batch
+    mission = mission_in_input(solver.missions, batch.spacecraft)
+    # Of the first result, where the source's current one is an adopted what-if.
+    first = row["batch_id"] or row["id"]
+    id = derived_ulid(first, batch.run, mission.digest, solver.sky.catalog.digest)
+    received = recorded_utc(row["received"] or row["created"])
+    return unsaved_submission(
+        submission, _repeatable(solver.acquire(batch, mission)), id=id, received=received
+    )
+
+
+def _repeatable(acquisition: Acquisition) -> Acquisition:
+    """Without what differs between equal runs: times, and which zones were cached."""
+    return structs.replace(
+        acquisition,
+        timings_us=dict.fromkeys(acquisition.timings_us, 0),
+        trackers=tuple(structs.replace(each, zone_cached=False) for each in acquisition.trackers),
+    )
+
+
+def _rows_of(found: Sequence[UnsavedResult]) -> Rows:
+    """The rows that recording these results would insert, in the order of `read_rows`."""
+    in_order = sorted(found, key=lambda each: (each.result["time_ns"], each.id))
+    children = {
+        "stars": [_ordered(each.stars, "tracker", "position") for each in in_order],
+        "solution": [[each.solution] if each.solution else [] for each in in_order],
+        "trackers": [_ordered(each.trackers, "tracker") for each in in_order],
+        "frame": [],
+        "keys": [],
+    }
+    rows = {
+        "batches": _table(batches, [each.batch for each in in_order]),
+        "results": _table(
+            results, [each.result | {"answer": each.answer.decode()} for each in in_order]
+        ),
+    }
+    for name, (table, _, _) in CHILDREN.items():
+        rows[table.name] = _table(table, [row for some in children[name] for row in some])
+    return rows
+
+
+def _ordered(rows: Sequence[Row], *names: str) -> list[Row]:
+    return sorted(rows, key=lambda row: tuple(row[name] for name in names))
+
+
+def _table(table: Table, rows: Sequence[Row | None]) -> pa.Table:
+    return pa.Table.from_pylist(rows, schema=schema_of(table))

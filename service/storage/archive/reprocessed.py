@@ -1,0 +1,228 @@
+"""Parts of a run that was made from other parts: what the database keeps of them.
+
+The parts are like those of `acquire archive`, but their batches were never in the database.  It
+gets their identities, their share in the trends, and what their limits say.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import msgspec
+import pyarrow as pa
+from sqlalchemy import Connection, func, select
+from sqlalchemy.exc import IntegrityError
+
+from service.errors import BadConfiguration
+from service.storage.archive.archiving import described, hours_of, note_part
+from service.storage.archive.folder import (
+    Manifest,
+    Part,
+    manifest_of,
+    manifests,
+    path_of,
+    read_partition,
+    whole_content,
+    write_manifest,
+)
+from service.storage.archive.restoring import put_back
+from service.storage.archive.rows import Rows, from_partition
+from service.storage.archive.tables import archived_batches, archived_parts
+from service.storage.recording import rollups
+from service.storage.recording.alarm_evaluation import evaluate_limits, runs_with_alarms
+from service.storage.recording.archived_hours import WHOLE, insert_share
+from service.storage.recording.identity import look_up
+from service.storage.recording.result_metrics import rolled_up
+from service.storage.recording.unsaved_result import Buckets, UnsavedResult
+from service.storage.sql.columns import Row
+from service.storage.sql.database import Store
+from service.storage.sql.rollup_tables import rollups_hourly
+from service.storage.sql.tables import batches
+from service.times import DAY_S, HOUR_S, bucket_start, parse_utc, recorded_utc
+
+IDENTITY = ("id", "spacecraft", "run", "batch", "fingerprint")
+"""The columns of a batch that stay in the database."""
+_LONG = ["answer", "options"]
+_AT_ONCE = 1_000
+
+
+@dataclass(frozen=True)
+class RunPart:
+    """A part of a run that is written, with all that the database keeps of it."""
+
+    spacecraft: str
+    day: str
+    part: Part
+    identities: pa.Table
+    """The columns of `IDENTITY`."""
+    shares: Mapping[int, Mapping[str, Row]]
+    """The rollups by hour, of each tracker and of the `WHOLE`."""
+
+
+def run_part(name: str, source: str, rows: Rows, content: bytes) -> RunPart:
+    """What there is to know of a part with these rows, whose file has this content."""
+    found = rows["batches"]
+    first = found.slice(0, 1).to_pylist()[0]
+    part = msgspec.structs.replace(described(name, first["run"], rows, content), source=source)
+    number = parse_utc(first["time"]).bucket(DAY_S)
+    return RunPart(
+        first["spacecraft"],
+        bucket_start(number, DAY_S).text[:10],
+        part,
+        found.select(IDENTITY),
+        _shares(rows, number),
+    )
+
+
+def _shares(rows: Rows, day: int) -> dict[int, dict[str, Row]]:
+    made = rows["results"].drop_columns(_LONG)
+    hours = hours_of(day, rows["results"]["time_ns"].to_numpy())
+    of: dict[tuple[int, str], list[Row]] = {}
+    of_batch = {}
+    for hour, row in zip(hours, made.to_pylist(), strict=True):
+        of.setdefault((hour, WHOLE), []).append(row)
+        of_batch[row["batch_id"]] = hour
+    for row in rows["tracker_values"].to_pylist():
+        of.setdefault((of_batch[row["batch_id"]], row["tracker"]), []).append(row)
+    found: dict[int, dict[str, Row]] = {}
+    for (hour, tracker), some in of.items():
+        found.setdefault(hour, {})[tracker] = rolled_up(some)
+    return found
+
+
+def name_part(folder: Path, made: RunPart) -> str:
+    """Name a part in the manifest of its day; returns its path below the folder."""
+    manifest = manifest_of(folder, made.spacecraft, made.day)
+    others = [each for each in manifest.parts if each.file != made.part.file]
+    write_manifest(folder, msgspec.structs.replace(manifest, parts=[*others, made.part]))
+    return path_of(folder, manifest, made.part)
+
+
+def merge(store: Store, folder: Path, path: str, made: RunPart) -> None:
+    """Note a part that a manifest names in the database, in one transaction.
+
+    Raises `BadConfiguration` where the run has other batches of the same names.
+    """
+    try:
+        store.writer.change(partial(_merge, folder=folder, path=path, made=made)).result()
+    except IntegrityError as error:
+        raise _taken(made, str(error.orig)) from None
+
+
+def _merge(connection: Connection, folder: Path, path: str, made: RunPart) -> None:
+    spacecraft, run = made.spacecraft, made.part.run
+    recorded = select(batches.c.id).where(batches.c.spacecraft == spacecraft, batches.c.run == run)
+    if connection.scalar(recorded.limit(1)) is not None:
+        names = made.identities["batch"].to_pylist()
+        for first in range(0, len(names), _AT_ONCE):
+            some = {(spacecraft, run, name) for name in names[first : first + _AT_ONCE]}
+            if known := look_up(connection, some).identities:
+                raise _taken(made, next(iter(known))[2])
+    number = note_part(connection, spacecraft, made.part, path, made.identities)
+    # Whoever counts an hour anew locks its rollup and then reads the shares.
+    rollups.add_shares(connection, spacecraft, run, made.shares)
+    insert_share(connection, number, spacecraft, run, made.shares)
+    if runs_with_alarms(connection, {run}):
+        content = whole_content(folder, path, made.part.sha256)
+        for unsaved_results in _as_recorded(from_partition(read_partition(content))):
+            evaluate_limits(connection, unsaved_results)
+
+
+def _taken(made: RunPart, what: str) -> BadConfiguration:
+    return BadConfiguration(
+        f"run {made.part.run}: has other batches of {made.spacecraft} with the names of some that "
+        f"were run again ({what}): name another run"
+    )
+
+
+def _as_recorded(rows: Rows) -> Iterator[Sequence[UnsavedResult]]:
+    """The results of a part as they would have been recorded, in order of time, some at a time."""
+    made = {row["batch_id"]: row for row in rows["results"].drop_columns(["answer"]).to_pylist()}
+    trackers: dict[str, list[Row]] = {}
+    for row in rows["tracker_values"].to_pylist():
+        trackers.setdefault(row["batch_id"], []).append(row)
+    found = []
+    for batch in rows["batches"].to_pylist():
+        time = parse_utc(batch["time"])
+        found.append(
+            UnsavedResult(
+                mission=None,
+                identity=(batch["spacecraft"], batch["run"], batch["batch"]),
+                answer=b"",
+                batch=batch,
+                result=made[batch["id"]],
+                stars=[],
+                solution=None,
+                buckets=Buckets(
+                    batch["spacecraft"], batch["run"], time.bucket(HOUR_S), time.bucket(DAY_S)
+                ),
+                key=None,
+                received_ns=recorded_utc(batch["received"]).tai_ns,
+                trackers=trackers.get(batch["id"], ()),
+            )
+        )
+    for first in range(0, len(found), _AT_ONCE):
+        yield found[first : first + _AT_ONCE]
+
+
+def unmerged(store: Store, folder: Path, run: str) -> Iterator[tuple[str, RunPart]]:
+    """The parts of a run that manifests name and the database does not know, with their paths.
+
+    A process that was killed in between left them.  Raises `BadConfiguration` for a damaged one.
+    """
+    for manifest in manifests(folder):
+        for part in manifest.parts:
+            path = path_of(folder, manifest, part)
+            if part.run != run or part.source is None or _is_known(store, path):
+                continue
+            rows = from_partition(read_partition(whole_content(folder, path, part.sha256)))
+            if not _has_batch(store, rows["batches"]["id"][0].as_py()):
+                made = run_part(part.file, part.source, rows, b"")
+                yield path, _with(made, manifest, part)
+
+
+def _with(made: RunPart, manifest: Manifest, part: Part) -> RunPart:
+    return RunPart(manifest.spacecraft, manifest.day, part, made.identities, made.shares)
+
+
+def _is_known(store: Store, path: str) -> bool:
+    with store.reading() as connection:
+        query = select(archived_parts.c.id).where(archived_parts.c.path == path)
+        return connection.scalar(query) is not None
+
+
+def _has_batch(store: Store, id: str) -> bool:
+    """Whether a batch is recorded, or archived in whatever part."""
+    with store.reading() as connection:
+        return any(
+            connection.scalar(select(table.c.id).where(table.c.id == id)) is not None
+            for table in (batches, archived_batches)
+        )
+
+
+def restore_newest(store: Store, folder: Path, spacecraft: str, run: str) -> None:
+    """Record the batches of the part with a run's newest batch, and with its newest attitude.
+
+    As with `acquire archive`, the state of a spacecraft is known without the archive.
+    """
+    wanted: dict[str, str] = {}
+    with store.reading() as connection:
+        c, hourly = archived_parts.c, rollups_hourly.c
+        own = c.spacecraft == spacecraft, c.run == run
+        for has in (hourly.batches, hourly.solved):
+            newest = select(func.max(hourly.bucket)).where(
+                hourly.spacecraft == spacecraft, hourly.run == run, has > 0
+            )
+            hour = connection.scalar(newest)
+            if hour is None:
+                continue
+            begin_ns, end_ns = (bucket_start(hour + k, HOUR_S).tai_ns for k in (0, 1))
+            query = select(c.path, c.sha256).where(*own, c.last_ns >= begin_ns, c.first_ns < end_ns)
+            wanted |= dict(map(tuple, connection.execute(query)))
+    for path, sha256 in sorted(wanted.items()):
+        content = whole_content(folder, path, sha256)
+        manifest = manifest_of(folder, spacecraft, Path(path).parent.name.removeprefix("day="))
+        part = next(each for each in manifest.parts if each.file == Path(path).name)
+        rows = from_partition(read_partition(content))
+        store.writer.change(partial(put_back, folder=folder, part=part, rows=rows)).result()

@@ -1,0 +1,93 @@
+"""How far the reprocessings into an archive are: a file for each run, beside the archive's parts.
+
+    reprocessing/RUN.json
+
+The command writes it, the service shows it; pyarrow is not needed.
+"""
+
+import logging
+import os
+from pathlib import Path
+from typing import Literal
+from urllib.parse import quote
+
+import msgspec
+from msgspec import Struct
+
+from service.times import Utc, recorded_utc, utc_now
+
+FOLDER = "reprocessing"
+SILENT_S = 60.0
+"""A command that has not written for so long is taken for stopped."""
+
+log = logging.getLogger(__name__)
+
+
+class Reprocessing(Struct, frozen=True, kw_only=True):
+    """A reprocessing into an archive, as it was when it was written last."""
+
+    run: str
+    source: str
+    partitions: int
+    partitions_done: int
+    batches: int
+    """Of the selected period."""
+    before: int
+    """Of them in the run before the command began."""
+    recorded: int
+    refused: int
+    started: str
+    updated: str
+    finished: str | None
+
+    @property
+    def batches_per_s(self) -> float:
+        """Batches a second since the command began."""
+        passed_s = _seconds(self.started, self.finished or self.updated)
+        return (self.recorded + self.refused) / passed_s if passed_s > 0.0 else 0.0
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds that the rest takes at the same rate; None: it is not known."""
+        left = self.batches - self.before - self.recorded - self.refused
+        if self.finished is not None or left <= 0:
+            return 0.0
+        return left / self.batches_per_s if self.batches_per_s > 0.0 else None
+
+    def state(self, now: Utc) -> Literal["running", "done", "interrupted"]:
+        """The state at a time."""
+        if self.finished is not None:
+            return "done"
+        silent_s = (now.tai_ns - recorded_utc(self.updated).tai_ns) * 1e-9
+        return "running" if silent_s < SILENT_S else "interrupted"
+
+
+def write_reprocessing(folder: Path, state: Reprocessing) -> None:
+    """Put a state in the place of the one before."""
+    place = folder / FOLDER
+    place.mkdir(exist_ok=True)
+    file = place / f"{quote(state.run, safe='')}.json"
+    beside = file.with_suffix(".new")
+    beside.write_bytes(msgspec.json.format(msgspec.json.encode(state), indent=1))
+    # It may be lost in a power cut: nothing depends on it.
+    os.replace(beside, file)
+
+
+def reprocessings(folder: Path) -> list[Reprocessing]:
+    """The reprocessings into an archive, the latest first; one that cannot be read is left out."""
+    found = []
+    for file in (folder / FOLDER).glob("*.json"):
+        try:
+            found.append(msgspec.json.decode(file.read_bytes(), type=Reprocessing))
+        except (OSError, msgspec.MsgspecError) as error:
+            log.warning("%s: cannot be read: %s", file, error)
+    return sorted(found, key=lambda each: each.started, reverse=True)
+
+
+def now_text() -> str:
+    """This moment as a state has it."""
+    return utc_now().text
+
+
+def _seconds(start: str, end: str) -> float:
+    return (recorded_utc(end).tai_ns - recorded_utc(start).tai_ns) * 1e-9

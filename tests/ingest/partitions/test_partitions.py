@@ -1,0 +1,256 @@
+"""Reprocessing into an archive: every batch once, byte-equal, and a run like any other."""
+
+import json
+
+import pytest
+from msgspec.structs import asdict
+from sqlalchemy import func, select
+
+from service.errors import BadBatch, BadConfiguration
+from service.ingest.partitions import coordinator
+from service.missions.mission import Mission
+from service.observations.schema import submission_from_json
+from service.storage.archive import archiving, folder
+from service.storage.recording import rollups
+from service.storage.sql.tables import batches
+from service.storage.upkeep.verify import verify
+from service.times import parse_utc, shifted
+from tests.ingest.partitions.checks import (
+    BATCHES,
+    PART,
+    START,
+    assert_trends,
+    assert_whole,
+    files_of,
+    names_of,
+)
+
+ALL = BATCHES + 12
+NOON = shifted(parse_utc(START), 10_000.0)
+
+
+def again(app, place, run="again", **wanted):
+    return app.runs.reprocess_into_archive(run, place, **({"processes": 1} | wanted))
+
+
+def test_archived_and_recorded_batches_are_run_again_into_the_archive(archived, place, database):
+    steps = []
+    progress = again(archived, place, step=lambda p: steps.append(p.partitions_done))
+    assert (progress.total, progress.before, progress.recorded) == (ALL, 0, ALL)
+    assert progress.partitions == progress.partitions_done == steps[-1] > ALL // PART
+    assert_whole(archived, place)
+    assert verify(database) == []
+    (run,) = [each for each in archived.runs.all() if each.run == "again"]
+    assert run.batches == ALL
+    (told,) = archived.runs.reprocessings()
+    assert (told.run, told.partitions_done, told.recorded) == ("again", progress.partitions, ALL)
+    assert told.left_s == 0.0
+    assert told.finished is not None
+
+
+def test_with_the_same_settings_every_star_comes_out_alike_and_with_others_not(
+    archived, place, missions, opened
+):
+    again(archived, place)
+    compared = archived.runs.compare("live", "again")
+    assert compared.batches == ALL
+    assert all(each.before == each.after for each in compared.stars.transitions)
+    assert compared.attitudes.angle_arcsec.max == 0.0
+    settings = missions["XTE"].model_dump()
+    settings["identifier"] = "starid"
+    settings["tolerances"]["separation_deg"] = 0.004
+    other = opened(mission=Mission.model_validate(settings), archive_folder=place)
+    again(other, place, "tight", spacecraft="XTE")
+    compared = other.runs.compare("live", "tight", "XTE")
+    assert compared.batches == BATCHES
+    assert any(each.is_change for each in compared.stars.transitions)
+    with pytest.raises(BadBatch, match="holds results of XTE with another mission"):
+        again(archived, place, "tight", spacecraft="XTE")
+
+
+def test_trends_pages_and_lists_of_the_run_are_those_of_a_recorded_one(archived, place):
+    """Held against the same batches run again into the database."""
+    recorded, _ = archived.runs.reprocess("recorded", processes=1)
+    again(archived, place)
+    source = archived.runs.compare("live", "again", "XTE", NOON)
+    assert source.batches > recorded.recorded - 12
+    for bucket in ("hour", "day"):
+        live = [asdict(each) for each in archived.spacecraft.rates("XTE", bucket=bucket)]
+        of_run = archived.spacecraft.rates("XTE", run="again", bucket=bucket)
+        assert [asdict(each) for each in of_run] == live
+    page = archived.results.page(run="again", spacecraft="XTE", limit=500).items
+    lived = archived.results.page(spacecraft="XTE", limit=500).items
+    assert [(each.batch, each.status, each.counts) for each in page] == [
+        (each.batch, each.status, each.counts) for each in lived
+    ]
+    assert {each.archived for each in page} == {True, False}
+    (row,) = [each for each in archived.spacecraft.overview("again").items if each.name == "XTE"]
+    assert row.latest_batch.batch == lived[0].batch
+    first = next(each for each in page if each.archived)
+    answer = archived.results.get(first.id).answer
+    assert (answer.run, answer.id, answer.timings_us.zone) == ("again", first.id, 0)
+
+
+def test_bytes_follow_from_the_input_alone(archived, place):
+    again(archived, place)
+    made = files_of(place, "again")
+    for file in made:
+        (place / file).unlink()
+    for manifest in folder.manifests(place):
+        kept = [part for part in manifest.parts if part.run != "again"]
+        folder.write_manifest(place, folder.Manifest(**(asdict(manifest) | {"parts": kept})))
+    archived.store.writer.change(forget("again")).result()
+    again(archived, place, processes=2)
+    assert files_of(place, "again") == made
+    assert_whole(archived, place)
+
+
+def forget(run):
+    """A change that takes all of an archived run out of a database."""
+    from service.storage.sql.columns import metadata
+    from service.storage.upkeep.prune import delete_batches
+
+    def change(connection):
+        ids = list(connection.scalars(select(batches.c.id).where(batches.c.run == run)))
+        delete_batches(connection, ids)
+        names = ("archived_batches", "archived_parts", "archived_hours")
+        rolled = [name for name in metadata.tables if "rollups" in name]
+        for name in (*names, *rolled):
+            table = metadata.tables[name]
+            connection.execute(table.delete().where(table.c.run == run))
+
+    return change
+
+
+class _Stopped(Exception):
+    pass
+
+
+@pytest.mark.parametrize("at", ["name_part", "merge", "_take", "restore_newest"])
+def test_what_ends_anywhere_goes_on_and_every_batch_comes_once(archived, place, monkeypatch, at):
+    """Before and after each step of every partition in turn."""
+    real = getattr(coordinator, at)
+    calls = 0
+    for fails_after in (False, True):
+
+        def fail(*given, fails_after=fails_after):
+            nonlocal calls
+            calls += 1
+            if calls % 4:
+                return real(*given)
+            if fails_after:
+                real(*given)
+            raise _Stopped
+
+        monkeypatch.setattr(coordinator, at, fail)
+        for _ in range(2):
+            with pytest.raises(_Stopped):
+                again(archived, place, f"again-{fails_after}")
+    monkeypatch.setattr(coordinator, at, real)
+    for fails_after in (False, True):
+        run = f"again-{fails_after}"
+        progress = again(archived, place, run)
+        assert progress.before + progress.recorded == progress.total == ALL
+        assert_whole(archived, place, run)
+    assert again(archived, place, run).recorded == 0
+
+
+def test_a_period_is_run_again_and_then_the_rest(archived, place):
+    end = shifted(parse_utc(START), 40 * 2_700.0)
+    first = again(archived, place, spacecraft="XTE", start=NOON, end=end)
+    assert first.recorded == 36
+    assert len(names_of(archived, "again")) == 36
+    rest = again(archived, place)
+    assert (rest.before, rest.recorded) == (36, ALL - 36)
+    assert_whole(archived, place)
+
+
+def test_what_is_archived_only_after_it_was_run_again_is_not_run_twice(archived, place):
+    again(archived, place)
+    archiving.archive(archived.store, place, shifted(parse_utc(START), 10 * 86_400.0))
+    progress = again(archived, place)
+    assert (progress.before, progress.recorded) == (ALL, 0)
+    assert names_of(archived, "again") == names_of(archived, "live")
+    assert_trends(archived)
+
+
+def test_a_run_that_has_recorded_batches_gets_no_second_ones(archived, place):
+    """They are left out, wherever they are."""
+    recorded, _ = archived.runs.reprocess("again", processes=1)
+    progress = again(archived, place)
+    assert (progress.before, progress.recorded) == (recorded.recorded, ALL - recorded.recorded)
+    assert names_of(archived, "again") == names_of(archived, "live")
+    more, _ = archived.runs.reprocess("again", processes=1)
+    assert (more.before, more.recorded) == (recorded.recorded, 0)
+
+
+def test_a_batch_that_no_longer_fits_is_refused_by_name_and_the_rest_goes_on(
+    archived, place, missions, opened
+):
+    settings = missions["SWAS"].model_dump()
+    settings["trackers"][0]["name"] = "OTHER"
+    renamed = opened(mission=Mission.model_validate(settings), archive_folder=place)
+    progress = again(renamed, place)
+    assert (progress.recorded, progress.refused) == (BATCHES, 12)
+    assert "observations.0.tracker: SWAS has OTHER" in progress.refusals[0]
+    once_more = again(renamed, place)
+    assert (once_more.before, once_more.recorded, once_more.refused) == (BATCHES, 0, 12)
+
+
+def test_limits_of_a_run_with_alarms_are_evaluated_in_order_of_time(archived, place, make):
+    """As if the same batches had been replayed."""
+    archived.runs.watch("replayed")
+    archived.runs.watch("again")
+    ids = archived.results.page(spacecraft="XTE", limit=500).items
+    for each in ids[::-1]:
+        body = dict(archived.results.get(each.id).input) | {"run": "replayed"}
+        archived.submissions.submit(submission_from_json(json.dumps(body)))
+    again(archived, place, spacecraft="XTE")
+
+    def raised(run):
+        return [
+            (each.quantity, each.severity, each.raised.time, each.worst.value)
+            for each in archived.alarms.page(run=run, state="all", limit=100).items
+        ]
+
+    assert raised("again") == raised("replayed") != []
+
+
+def test_the_live_run_and_the_source_are_no_targets(archived, place):
+    with pytest.raises(BadBatch, match="must be another run"):
+        again(archived, place, "live", source="live")
+    with pytest.raises(BadBatch, match="must be another run"):
+        again(archived, place, "live", source="pass")
+
+
+def test_a_damaged_part_ends_it_by_name_and_what_was_done_stays(archived, place):
+    parts = sorted(place.glob("spacecraft=XTE/*/part-*.parquet"))
+    content = parts[-1].read_bytes()
+    parts[-1].write_bytes(content[:-9] + bytes(9))
+    with pytest.raises(BadConfiguration, match=rf"{parts[-1].name}: is damaged"):
+        again(archived, place)
+    parts[-1].write_bytes(content)
+    progress = again(archived, place)
+    assert progress.before > 0
+    assert_whole(archived, place)
+
+
+def test_an_archive_of_another_database_is_refused(archived, place, tmp_path):
+    from service.app.factory import open_app
+    from service.settings import Settings
+    from service.storage.archive.restoring import PartFilter, restore
+
+    other = open_app(Settings(database=f"sqlite:///{tmp_path / 'other.db'}", replay_processes=0))
+    try:
+        restore(other.store, place, PartFilter())
+        before = {file: file.read_bytes() for file in place.rglob("*.parquet")}
+        with pytest.raises(BadConfiguration, match="belongs to another database"):
+            archiving.archive(other.store, place, shifted(parse_utc(START), 10 * 86_400.0))
+        with pytest.raises(BadConfiguration, match="belongs to another database"):
+            again(other, place)
+        assert {file: file.read_bytes() for file in place.rglob("*.parquet")} == before
+        with other.store.reading() as connection:
+            assert connection.scalar(select(func.count()).select_from(batches)) > 0
+            assert rollups.stored(connection, "hour")
+    finally:
+        other.close()
