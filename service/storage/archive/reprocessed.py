@@ -5,12 +5,13 @@ gets their identities, their share in the trends, and what their limits say.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import msgspec
 import pyarrow as pa
+import pyarrow.compute as pc
 from sqlalchemy import Connection, func, select
 from sqlalchemy.exc import IntegrityError
 
@@ -29,12 +30,12 @@ from service.storage.archive.folder import (
 from service.storage.archive.restoring import put_back
 from service.storage.archive.rows import Rows, from_partition
 from service.storage.archive.tables import archived_batches, archived_parts
-from service.storage.recording import rollups
+from service.storage.recording import events, rollups
 from service.storage.recording.alarm_evaluation import evaluate_limits, runs_with_alarms
 from service.storage.recording.archived_hours import WHOLE, insert_share
 from service.storage.recording.identity import look_up
 from service.storage.recording.result_metrics import rolled_up
-from service.storage.recording.unsaved_result import Buckets, UnsavedResult
+from service.storage.recording.unsaved_result import STARS, Buckets, UnsavedResult
 from service.storage.sql.columns import Row
 from service.storage.sql.database import Store
 from service.storage.sql.rollup_tables import rollups_hourly
@@ -58,6 +59,8 @@ class RunPart:
     """The columns of `IDENTITY`."""
     shares: Mapping[int, Mapping[str, Row]]
     """The rollups by hour, of each tracker and of the `WHOLE`."""
+    latest: Row
+    """What an event tells of the latest batch."""
 
 
 def run_part(name: str, source: str, rows: Rows, content: bytes) -> RunPart:
@@ -72,7 +75,19 @@ def run_part(name: str, source: str, rows: Rows, content: bytes) -> RunPart:
         part,
         found.select(IDENTITY),
         _shares(rows, number),
+        _latest(rows),
     )
+
+
+def _latest(rows: Rows) -> Row:
+    """As `results._note_events` has it."""
+    batch = rows["batches"].slice(len(rows["batches"]) - 1).to_pylist()[0]
+    (result,) = (
+        rows["results"].filter(pc.equal(rows["results"]["batch_id"], batch["id"])).to_pylist()
+    )
+    found = {name: batch[name] for name in ("id", "batch", "time")}
+    found |= {name: result[name] for name in ("status", "reason")}
+    return found | {"counts": {name: result[name] for name in STARS}}
 
 
 def _shares(rows: Rows, day: int) -> dict[int, dict[str, Row]]:
@@ -127,6 +142,9 @@ def _merge(connection: Connection, folder: Path, path: str, made: RunPart) -> No
         content = whole_content(folder, path, made.part.sha256)
         for unsaved_results in _as_recorded(from_partition(read_partition(content))):
             evaluate_limits(connection, unsaved_results)
+    told = {"spacecraft": spacecraft, "run": run, "batches": made.part.batches}
+    told |= {"latest": made.latest}
+    events.add_event(connection, "batches", told, run=run, spacecraft=spacecraft)
 
 
 def _taken(made: RunPart, what: str) -> BadConfiguration:
@@ -183,7 +201,7 @@ def unmerged(store: Store, folder: Path, run: str) -> Iterator[tuple[str, RunPar
 
 
 def _with(made: RunPart, manifest: Manifest, part: Part) -> RunPart:
-    return RunPart(manifest.spacecraft, manifest.day, part, made.identities, made.shares)
+    return replace(made, spacecraft=manifest.spacecraft, day=manifest.day, part=part)
 
 
 def _is_known(store: Store, path: str) -> bool:

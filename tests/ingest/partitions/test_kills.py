@@ -25,7 +25,7 @@ from tests.storage.test_faulty_disk import faulty_disk
 
 __all__ = ["faulty_disk"]
 
-WORKER_KILLS, COORDINATOR_KILLS, FAULTS = 200, 20, 100
+WORKER_KILLS, COORDINATOR_KILLS, FAULTS = 200, 20, 50
 
 
 @pytest.fixture
@@ -182,7 +182,7 @@ def test_a_full_disk_stops_it_with_a_message_and_it_goes_on(
         database, place = folders()
         ended_well = False
         while not ended_well:
-            after = str(int(rng.integers(0, 60)))
+            after = str(int(rng.integers(0, 40)))
             ran = subprocess.run(
                 [sys.executable, "-m", "tests.ingest.partitions.full_disk", database, place, after],
                 env={"LD_PRELOAD": str(faulty_disk), "FAULTY_FOLDER": str(place)} | environment(),

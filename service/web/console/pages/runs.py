@@ -5,6 +5,7 @@ from typing import Annotated
 from fastapi import Query as InQuery
 from starlette.responses import Response
 
+from service.times import utc_now
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
@@ -13,12 +14,14 @@ from service.web.requests.access import READ
 
 @console_page("/runs", "Runs", READ, position=50)
 def runs_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
-    """Every run, and the replays with their progress."""
+    """Every run, and the replays and reprocessings with their progress."""
     return rendered(
         "runs.html.jinja",
         context.layout(query.run),
         runs=context.app.runs.all(),
+        reprocessings=context.app.runs.reprocessings(),
         replays=context.app.replays.all(),
+        now=utc_now(),
     )
 
 
