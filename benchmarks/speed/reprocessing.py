@@ -1,0 +1,129 @@
+"""Reprocessing into an archive beside bulk loading, and two processes beside one.
+
+    python -m benchmarks reprocessing           40,000 batches, some minutes
+    python -m benchmarks reprocessing --quick   4,000
+
+The same drawn telemetry is loaded in bulk by two processes, archived, and run again by two
+processes and by one.  Of each the rate is that of the time after its processes have begun.
+"""
+
+import json
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from benchmarks.bounds import Bound, at_least, equal
+from benchmarks.report import Report
+from service.app.factory import App, open_app
+from service.ingest.reprocess import ReprocessProgress
+from service.missions.mission import load_missions
+from service.settings import Settings
+from service.simulate.stretches import Pass
+from service.simulate.telemetry import draw_pass
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.model import SkyModel
+from service.storage.archive import archiving
+from service.times import parse_utc, shifted
+
+BATCHES, QUICK_BATCHES = 40_000, 4_000
+PARTITIONS = 40
+"""Of a day each."""
+PROCESSES = 2
+LEAST_OF_BULK, LEAST_OF_ONE = 1.0, 1.6
+START = "1999-03-01T00:00:00.000Z"
+
+
+class Pace:
+    """Batches a second since the first ones came."""
+
+    def __init__(self) -> None:
+        self._begun: tuple[float, int] | None = None
+        self.rate = 0.0
+
+    def note(self, done: int) -> None:
+        """Take that so many are done."""
+        now_s = time.perf_counter()
+        if self._begun is None:
+            if done:
+                self._begun = now_s, done
+        elif done > self._begun[1]:
+            self.rate = (done - self._begun[1]) / (now_s - self._begun[0])
+
+
+def _telemetry(count: int, seed: int) -> list[bytes]:
+    mission, sky = load_missions()["XTE"], SkyModel(load_embedded(), LruCache(256 << 20))
+    wanted = Pass(count, seed, START, PARTITIONS * 86_400.0 / count)
+    return [json.dumps(each.batch).encode() for each in draw_pass(mission, sky, wanted)]
+
+
+def _bulk(app: App, lines: list[bytes]) -> float:
+    pace = Pace()
+    id = app.replays.start(iter(lines), "source")
+    while (state := app.replays.get(id)).state == "running":
+        pace.note(state.lines.done)
+        time.sleep(0.02)
+    pace.note(state.lines.done)
+    return pace.rate
+
+
+def _again(app: App, folder: Path, processes: int) -> tuple[float, ReprocessProgress]:
+    pace = Pace()
+
+    def step(now: ReprocessProgress) -> None:
+        pace.note(now.recorded)
+
+    progress = app.runs.reprocess_into_archive(
+        f"by-{processes}", folder, source="source", processes=processes, step=step
+    )
+    return pace.rate, progress
+
+
+def _bytes(folder: Path, processes: int) -> int:
+    return sum(each.stat().st_size for each in folder.rglob(f"run-by-{processes}-*"))
+
+
+def measured(count: int, seed: int) -> tuple[dict[str, Any], list[Bound]]:
+    """The figures for so many batches."""
+    lines = _telemetry(count, seed)
+    bounds: list[Bound] = []
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary) / "archive"
+        folder.mkdir()
+        settings = Settings(
+            database=f"sqlite:///{Path(temporary) / 'acquire.db'}",
+            archive_folder=folder,
+            replay_processes=PROCESSES,
+        )
+        app = open_app(settings)
+        try:
+            bulk = _bulk(app, lines)
+            began_s = time.perf_counter()
+            end = shifted(parse_utc(START), (PARTITIONS + 1) * 86_400.0)
+            archived = archiving.archive(app.store, folder, end)
+            archive = archived.batches / (time.perf_counter() - began_s)
+            two, progress = _again(app, folder, PROCESSES)
+            bounds.append(equal("batches run again", progress.recorded, count))
+            one, _ = _again(app, folder, 1)
+            size = _bytes(folder, PROCESSES)
+        finally:
+            app.close()
+    figures = {
+        "batches": count,
+        "partitions": progress.partitions,
+        "bulk loading, two processes, batches/s": bulk,
+        "archiving, batches/s": archive,
+        "run again by two processes, batches/s": two,
+        "run again by one, batches/s": one,
+        "a batch of the run, bytes": size / count,
+    }
+    bounds.append(at_least("run again over bulk loading", two / bulk, LEAST_OF_BULK))
+    bounds.append(at_least("two processes over one", two / one, LEAST_OF_ONE))
+    return figures, bounds
+
+
+def run(quick: bool, seed: int) -> Report:
+    """The benchmark."""
+    figures, bounds = measured(QUICK_BATCHES if quick else BATCHES, seed)
+    return Report("reprocessing", figures, bounds)
