@@ -39,6 +39,16 @@ def require_scheduler(address: str) -> None:
     if not address.startswith(SCHEMES) or not address.rpartition(":")[2].isdigit():
         raise BadInput(Fault("--scheduler", "must be tls://HOST:PORT or tcp://HOST:PORT", address))
     require_extra("dask", "distributed", "--scheduler", address)
+    from distributed.security import Security
+
+    # A client without them fails slowly, and again when it is closed.
+    settings: Any = Security
+    if address.startswith("tls://") and not settings().get_connection_args("client")["ssl_context"]:
+        message = (
+            "needs certificates: set DASK_DISTRIBUTED__COMM__TLS__CA_FILE, and CERT and KEY of "
+            "DASK_DISTRIBUTED__COMM__TLS__CLIENT"
+        )
+        raise BadInput(Fault("--scheduler", message, address))
 
 
 class DaskWorkers:

@@ -12,6 +12,8 @@ def test_options_that_do_not_fit_are_refused_by_name(acquire, tmp_path):
         code, _, complaint = acquire("reprocess", "--archive", tmp_path, "--scheduler", address)
         assert code == 2
         assert "--scheduler: must be tls://HOST:PORT or tcp://HOST:PORT" in complaint
+    code, _, complaint = acquire("reprocess", "--archive", tmp_path, "--scheduler", "tls://h:1")
+    assert (code, "--scheduler: needs certificates: set DASK_" in complaint) == (2, True)
     both = ("--scheduler", "tls://h:1", "--processes", "2")
     code, _, complaint = acquire("reprocess", "--archive", tmp_path, *both)
     assert (code, "--processes: is of this machine" in complaint) == (2, True)
