@@ -6,7 +6,8 @@ star is a result; only bad input raises.
 """
 
 from service import __version__
-from service.acquire.choices import aberration_velocity, choices_of
+from service.acquire.choices import Choices, aberration_velocity, choices_of
+from service.acquire.measured import measured_solution
 from service.acquire.result import (
     Acquisition,
     Path,
@@ -33,6 +34,7 @@ from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
 from service.observations.calibrate import correct
 from service.observations.scans.reduce import reduced
+from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.ephemeris import sun_distance_au
 from service.sky.model import SkyModel
 
@@ -50,6 +52,10 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: SkyModel) -> Acquisi
         raise BadBatch(Fault("a_priori.from", told, shown_value("last")))
     batch = reduced(batch, mission)
     choices = choices_of(batch, mission)
+    if batch.measurement is not None:
+        return _measured(
+            batch, mission, choices, sky, measured_solution(batch.measurement, mission)
+        )
     corrected = correct(batch, mission)
     given = batch.a_priori
     prior = None if given is None else prior_attitude(given, batch.time, mission, batch.position_km)
@@ -94,12 +100,39 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: SkyModel) -> Acquisi
         rival=rival,
         reason=solved if isinstance(solved, NoAttitude) else None,
         warnings=tuple(warnings),
-        timings_us={step: ns // 1000 for step, ns in timer.ns.items()},
-        provenance=Provenance(
-            sky.catalog.digest,
-            run_catalog.digest,
-            run_catalog.epoch_year,
-            mission.digest,
-            __version__,
-        ),
+        timings_us=timer.us,
+        provenance=_provenance(sky, run_catalog, mission),
+    )
+
+
+def _measured(
+    batch: ObservationBatch,
+    mission: Mission,
+    choices: Choices,
+    sky: SkyModel,
+    solution: AttitudeSolution,
+) -> Acquisition:
+    """The acquisition of an attitude that a tracker measured itself."""
+    run_catalog = sky.run_catalog(mission, batch.time)
+    return Acquisition(
+        batch=batch,
+        mission=mission,
+        choices=choices,
+        prior=None,
+        path=Path.MEASURED,
+        run_catalog=run_catalog,
+        trackers=(),
+        counts=outcome_counts(()),
+        solution=solution,
+        rival=None,
+        reason=None,
+        warnings=(),
+        timings_us=StepTimer().us,
+        provenance=_provenance(sky, run_catalog, mission),
+    )
+
+
+def _provenance(sky: SkyModel, run_catalog: RunCatalog, mission: Mission) -> Provenance:
+    return Provenance(
+        sky.catalog.digest, run_catalog.digest, run_catalog.epoch_year, mission.digest, __version__
     )

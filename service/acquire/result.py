@@ -55,6 +55,8 @@ class Path(StrEnum):
     ZONE = "zone"
     LOST_IN_SPACE = "lost_in_space"
     """No a priori attitude was given, or it was not to be used."""
+    MEASURED = "measured"
+    """A tracker measured the attitude itself; nothing was searched for."""
     ZONE_THEN_LOST_IN_SPACE = "zone_then_lost_in_space"
     """Nothing good was found about the a priori attitude, and the whole sky was searched."""
 

@@ -101,6 +101,11 @@ class StepTimer:
         self.ns[step] += now - self._last
         self._last = now
 
+    @property
+    def us(self) -> dict[str, int]:
+        """Whole microseconds of each step."""
+        return {step: ns // 1000 for step, ns in self.ns.items()}
+
 
 @dataclass(frozen=True)
 class Search:

@@ -12,15 +12,19 @@ if TYPE_CHECKING:
 
 
 def residual_rms_arcsec(acquisition: "Acquisition") -> float | None:
-    """The rms of the attitude's residuals; None without an attitude."""
+    """The rms of the attitude's residuals; None without an attitude from stars."""
     solution = acquisition.solution
-    return None if solution is None else solution.residual_rms_arcsec
+    return None if solution is None else _known(solution.residual_rms_arcsec)
 
 
 def predicted_rms_arcsec(acquisition: "Acquisition") -> float | None:
-    """The residual rms that the covariance predicts; None without an attitude."""
+    """The residual rms that the covariance predicts; None without an attitude from stars."""
     solution = acquisition.solution
-    return None if solution is None else solution.predicted_rms_arcsec
+    return None if solution is None else _known(solution.predicted_rms_arcsec)
+
+
+def _known(value: float) -> float | None:
+    return None if math.isnan(value) else value
 
 
 def magnitude_offset_mag(acquisition: "Acquisition") -> float | None:

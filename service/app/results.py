@@ -119,7 +119,7 @@ class Results:
         with self._context.reading_batch(known_id(id, "batch")) as (connection, _):
             batch, recorded = recorded_batch(connection, id)
             answer = answer or recorded
-            if len(answer.observations) == 1:
+            if len(answer.observations) < 2:
                 return []
             mission = recorded_mission(connection, answer.provenance.mission)
         return tracker_comparison(batch, mission, self._context.sky, answer)

@@ -43,6 +43,8 @@ class AttitudeSolution(Struct, frozen=True, eq=False, gc=False):
     from.  `taste` is the weighted sum of squares at QUEST's attitude whichever
     method is chosen, about chi-square with 2N - 3 degrees of freedom; beyond its
     99.9 % point the solution is suspect.
+
+    Of an attitude that a tracker measured itself (`acquire.measured`) all that needs stars is NaN.
     """
 
     quaternion: Vector

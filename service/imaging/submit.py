@@ -24,18 +24,17 @@ from service.missions.mission import Mission, Tracker
 from service.observations.batch import Aberration
 from service.observations.faults import faults_of
 from service.observations.frame_record import FrameRecord
+from service.observations.numbers import Number, UnitVector
 from service.observations.schema import (
     APrioriIn,
     BatchIn,
     BodyRate,
     Key,
-    Number,
     OptionsIn,
     Position,
     RunName,
     Speed,
     Submission,
-    UnitVector,
     Wire,
     is_time,
     submission_from_model,

@@ -99,7 +99,7 @@ def mission_in_input(missions: Mapping[str, Mission], name: str) -> Mission:
 def may_take_long(batch: ObservationBatch) -> bool:
     """Whether a batch may take seconds rather than a millisecond, as far as its form tells."""
     return (
-        batch.a_priori is None
+        (batch.a_priori is None and batch.measurement is None)
         or bool(batch.options.tolerances)
         or batch.options.identifier in ("lost_in_space", "ptp")
         or sum(each.count for each in batch.observations) > LONG_STARS

@@ -47,7 +47,7 @@ def asks_for_last(batch: ObservationBatch, mission: Mission | None) -> bool:
     if batch.tracking is not None:
         return not batch.tracking.resolved
     is_default = mission is not None and mission.tracking is not None and mission.tracking.default
-    return is_default and batch.a_priori is None
+    return is_default and batch.a_priori is None and batch.measurement is None
 
 
 def with_prediction(connection: Connection, submission: Submission, mission: Mission) -> Submission:

@@ -116,11 +116,24 @@ class TrackerStars(Struct, frozen=True, eq=False):
         return len(self.magnitude_mag)
 
 
+class MeasuredAttitude(Struct, frozen=True, eq=False):
+    """An attitude that a tracker measured itself: inertial to its axes, or to the body.
+
+    `tracker` names the tracker; None: the axes are those of the body.  `covariance_arcsec2`
+    (3, 3) is of the small rotation about the same axes.
+    """
+
+    quaternion: Vector
+    covariance_arcsec2: Matrix
+    tracker: str | None = None
+
+
 class ObservationBatch(Struct, frozen=True, eq=False):
     """One batch: who, when, the a priori attitude, and the stars of each tracker.
 
-    Without `a_priori` it is lost in space.  `tracking` is there where it asks for the last
-    attitude.
+    With a `measurement` there are neither stars nor a priori knowledge.
+    Without `a_priori` a batch of stars is lost in space.  `tracking` is there where it
+    asks for the last attitude.
     Body rates are of the body relative to inertial, in body axes.  Velocity and
     position are geocentric, EME2000, None where they were not given.
     """
@@ -137,3 +150,4 @@ class ObservationBatch(Struct, frozen=True, eq=False):
     options: Options
     position_km: Vector | None = None
     tracking: Tracking | None = None
+    measurement: MeasuredAttitude | None = None

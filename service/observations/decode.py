@@ -16,6 +16,7 @@ from service.observations.batch import (
     Aberration,
     APriori,
     BoresightPrior,
+    MeasuredAttitude,
     ObservationBatch,
     Options,
     PredictedPrior,
@@ -81,6 +82,16 @@ class SentPrediction(_SentPart):
     reason: str | None = None
 
 
+class SentMeasurement(_SentPart):
+    """An attitude that a tracker measured itself."""
+
+    quaternion: tuple[float, float, float, float]
+    tracker: str | None = None
+    sigma_arcsec: Triple | None = None
+    covariance_arcsec2: tuple[Triple, Triple, Triple] | None = None
+    frame: str = "EME2000"
+
+
 class SentPrior(_SentPart):
     """A priori knowledge of one kind, the others left out."""
 
@@ -107,13 +118,14 @@ class SentOptions(_SentPart):
 
 
 class SentBatch(_SentPart):
-    """A batch of observed stars."""
+    """A batch of observed stars, or of an attitude that a tracker measured itself."""
 
     spacecraft: str
     batch: str
     time: str
-    observations: list[SentTracker]
     a_priori: SentPrior | None
+    observations: list[SentTracker] = []
+    measurement: SentMeasurement | None = None
     run: str = "live"
     body_rates_deg_per_s: Triple = (0.0, 0.0, 0.0)
     velocity_km_per_s: Triple | None = None
@@ -150,6 +162,7 @@ def batch_from_canonical(text: str) -> ObservationBatch:
         ),
         position_km=_optional_array(told.position_km),
         tracking=None if prior is None or prior.from_ is None else _tracking_of(prior),
+        measurement=None if told.measurement is None else _measured(told.measurement),
     )
 
 
@@ -182,6 +195,13 @@ def _prior_of(
         _optional_array(prior.position_km or position_km),
         None if prior.sun_counts is None else _array(prior.sun_counts),
     )
+
+
+def _measured(sent: SentMeasurement) -> MeasuredAttitude:
+    covariance: Any = sent.covariance_arcsec2
+    if sent.sigma_arcsec is not None:
+        covariance = np.diag(np.square(sent.sigma_arcsec))
+    return MeasuredAttitude(_quaternion(sent.quaternion), _array(covariance), sent.tracker)
 
 
 def _quaternion(components: tuple[float, float, float, float]) -> Vector:

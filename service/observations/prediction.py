@@ -5,8 +5,9 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-Number = Annotated[float, Field(strict=True)]
-Row = tuple[Number, Number, Number]
+from service.observations.numbers import Components, Number
+
+Row = Components
 NoPrediction = Literal["no_good_attitude", "too_uncertain", "flip"]
 RateSource = Literal["gyro", "body_rates", "attitudes", "unknown"]
 

@@ -5,7 +5,6 @@ same words.  The pydantic models are also what `openapi.yaml` shows.
 """
 
 import hashlib
-import math
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal, Self
 
@@ -18,6 +17,7 @@ from pydantic import (
     Field,
     Tag,
     ValidationError,
+    ValidationInfo,
     model_validator,
 )
 
@@ -35,19 +35,14 @@ from service.observations.batch import (
 from service.observations.decode import batch_from_canonical, prior_from_canonical
 from service.observations.faults import PRIOR_KINDS, faults_of
 from service.observations.frame_record import FrameRecord
+from service.observations.measurement import (
+    MeasurementIn,
+    no_options_beside_measurement,
+    none_beside_measurement,
+)
+from service.observations.numbers import Number, Quaternion, ReferenceFrame, UnitVector
 from service.observations.prediction import PredictionIn
 from service.times import parse_utc
-
-NORM_TOLERANCE = 1e-3
-
-ReferenceFrame = Literal["EME2000", "ICRF", "GCRF"]
-
-
-def _near_unit(components: tuple[float, ...]) -> tuple[float, ...]:
-    norm = math.hypot(*components)
-    if abs(norm - 1.0) > NORM_TOLERANCE:
-        raise ValueError(f"must have norm 1 within {NORM_TOLERANCE}; its norm is {norm:.6g}")
-    return components
 
 
 def is_time(text: str) -> str:
@@ -59,11 +54,6 @@ def is_time(text: str) -> str:
     return text
 
 
-Number = Annotated[float, Field(strict=True)]
-"""Strict: JSON's true and "5.3" are no numbers, though pydantic would take them for some."""
-Components = tuple[Number, Number, Number]
-UnitVector = Annotated[Components, AfterValidator(_near_unit)]
-Quaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_near_unit)]
 Key = Annotated[str, Field(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\x7f]+$")]
 RunName = Annotated[
     str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.:-]*$")
@@ -253,7 +243,18 @@ APrioriIn = Annotated[
 ]
 
 
-def _stars_of_different_trackers(observations: list[TrackerIn]) -> list[TrackerIn]:
+def _stars_of_different_trackers(
+    observations: list[TrackerIn], info: ValidationInfo
+) -> list[TrackerIn]:
+    if "measurement" not in info.data:
+        # It is refused itself.
+        return observations
+    if info.data["measurement"] is not None:
+        if observations:
+            raise ValueError("takes either measurement or observations, not both")
+        return observations
+    if not observations:
+        raise ValueError("must have at least 1 tracker; a measured attitude is a measurement")
     names = [each.tracker for each in observations]
     if len(set(names)) != len(names):
         raise ValueError(f"a tracker occurs twice: {', '.join(names)}")
@@ -263,13 +264,18 @@ def _stars_of_different_trackers(observations: list[TrackerIn]) -> list[TrackerI
 
 
 class BatchIn(Wire):
-    """A batch of observed stars."""
+    """A batch of observed stars, or of an attitude that a tracker measured itself."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"anyOf": [{"required": ["observations"]}, {"required": ["measurement"]}]}
+    )
 
     spacecraft: Key
     batch: Key
     time: Annotated[str, AfterValidator(is_time)]
     run: RunName = "live"
-    a_priori: APrioriIn | None
+    measurement: MeasurementIn | None = None
+    a_priori: Annotated[APrioriIn | None, AfterValidator(none_beside_measurement)]
     body_rates_deg_per_s: tuple[BodyRate, BodyRate, BodyRate] = (0.0, 0.0, 0.0)
     velocity_km_per_s: tuple[Speed, Speed, Speed] | None = None
     sun_vector: UnitVector | None = None
@@ -277,10 +283,10 @@ class BatchIn(Wire):
     aberration: Aberration = "to_correct"
     observations: Annotated[
         list[TrackerIn],
-        Field(min_length=1, max_length=MAX_TRACKERS),
+        Field(max_length=MAX_TRACKERS, validate_default=True),
         AfterValidator(_stars_of_different_trackers),
-    ]
-    options: OptionsIn = OptionsIn()
+    ] = []
+    options: Annotated[OptionsIn, AfterValidator(no_options_beside_measurement)] = OptionsIn()
 
 
 def prior_of(prior: APrioriIn) -> APriori:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from service.missions.packets import PacketGyro, PacketPrior
-from service.observations.schema import NORM_TOLERANCE
+from service.observations.numbers import NORM_TOLERANCE
 from service.packets.clock import NS, Moment
 from service.packets.definition import PacketFault
 from service.packets.values import finite_all, number, whole

@@ -47,7 +47,7 @@ class AttitudeCarrier:
 
     def prepared(self, item: Item) -> Item:
         """The item with the attitude in its `a_priori`, unchanged where none is known."""
-        if item.submission is None:
+        if item.submission is None or item.submission.batch.measurement is not None:
             return item
         batch = item.submission.batch
         known = self._known.get(batch.spacecraft)

@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import NODEFAULT
+from msgspec.structs import fields
 
 from service.observations import decode as canonical
 from service.observations import schema as wire
 from service.observations.decode import batch_from_canonical
+from service.observations.measurement import MeasurementIn
 from service.observations.prediction import PredictionIn
 from tests.observations.example import BATCH
 
@@ -21,14 +24,17 @@ ALIKE = [
     (wire.OptionsIn, canonical.SentOptions),
     (wire.BatchIn, canonical.SentBatch),
     (PredictionIn, canonical.SentPrediction),
+    (MeasurementIn, canonical.SentMeasurement),
 ]
 PRIORS = (wire.QuaternionIn, wire.BoresightIn, wire.SunPointedIn, wire.FromLastIn)
 
 
 def _defaults(struct):
-    empty = struct.__struct_defaults__
-    names = struct.__struct_fields__
-    return dict(zip(names[len(names) - len(empty) :], empty, strict=True))
+    return {
+        each.name: each.default if each.default_factory is NODEFAULT else each.default_factory()
+        for each in fields(struct)
+        if not each.required
+    }
 
 
 def _is_absent(default):

@@ -85,21 +85,22 @@ class Rival(Model, frozen=True):
 class Attitude(Model, frozen=True):
     """An attitude with its accuracy; use it only where `status` is good.
 
-    `covariance_arcsec2` (3, 3) is of the small error rotation about the body axes.
+    `covariance_arcsec2` (3, 3) is of the small error rotation about the body axes.  The method
+    `measured` is that of an attitude that a tracker sent: what needs stars is None then.
     """
 
     quaternion: Sequence[float]
     frame: str
     covariance_arcsec2: Sequence[Sequence[float]]
     method: str
-    residual_rms_arcsec: float
-    predicted_rms_arcsec: float
-    taste: float
+    residual_rms_arcsec: float | None
+    predicted_rms_arcsec: float | None
+    taste: float | None
     degrees_of_freedom: int
     status: str
-    triad: Sequence[float]
-    quest: Sequence[float]
-    triad_quest_angle_arcsec: float
+    triad: Sequence[float] | None
+    quest: Sequence[float] | None
+    triad_quest_angle_arcsec: float | None
     trackers: Sequence[TrackerFit] = ()
     outlier: str | None = None
     rival: Rival | None = None

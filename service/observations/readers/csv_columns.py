@@ -32,6 +32,15 @@ VECTORS = {
     "velocity_km_per_s": ("velocity_x_km_per_s", "velocity_y_km_per_s", "velocity_z_km_per_s"),
     "position_km": ("position_x_km", "position_y_km", "position_z_km"),
     "sun_vector": ("sun_vector_x", "sun_vector_y", "sun_vector_z"),
+    "measured_quaternion": ("measured_q1", "measured_q2", "measured_q3", "measured_qc"),
+    "measured_sigma_arcsec": (
+        "measured_sigma_x_arcsec",
+        "measured_sigma_y_arcsec",
+        "measured_sigma_z_arcsec",
+    ),
+    "measured_covariance_arcsec2": tuple(
+        f"measured_p{each}_arcsec2" for each in ("11", "12", "13", "22", "23", "33")
+    ),
 }
 DIRECTION = ("x", "y", "z")
 STAR_NUMBERS = ("h_deg", "v_deg", "magnitude", "time_offset_s", "sigma_arcsec")
@@ -43,6 +52,8 @@ STAR_COLUMNS = ("tracker", *DIRECTION, *STAR_NUMBERS, *READINGS)
 PRIORS = ("sun_pointed", "sun_counts", "a_priori_from")
 BATCH_COLUMNS = (*TEXTS, *sum(VECTORS.values(), ()), *PRIORS, "options")
 COLUMNS = (*BATCH_COLUMNS, *STAR_COLUMNS, *LINES)
+MEASURED = ("measured_quaternion", "measured_sigma_arcsec", "measured_covariance_arcsec2")
+"""Vectors of an attitude that a tracker measured itself: a row that has them has no star."""
 VERBATIM = (*TEXTS, "tracker")
 """Columns whose cells are taken with their spaces; around other cells spaces do no harm."""
 
@@ -79,7 +90,10 @@ def checked_header(names: list[str], where: str) -> None:
     groups = *VECTORS.values(), DIRECTION, ("h_deg", "v_deg"), READINGS[:2], READINGS[2:], LINES
     for group in groups:
         wanted += group if any(name in names for name in group) else ()
-    if not any(name in names for name in ("h_deg", "v_deg", *READINGS[2:], *LINES)):
+    if not any(
+        name in names
+        for name in (*VECTORS["measured_quaternion"], "h_deg", "v_deg", *READINGS[2:], *LINES)
+    ):
         wanted += DIRECTION
     faults += [
         Fault(f"{where}, column {name}", "is missing")
@@ -125,6 +139,9 @@ def batch_fields(row: CsvRow) -> dict[str, Any]:
     frame = fields.pop("frame", None)
     given = {name: _group(row, columns) for name, columns in VECTORS.items()}
     quaternion, boresight = given.pop("quaternion"), given.pop("boresight")
+    measured = {name: given.pop(name) for name in MEASURED}
+    if any(measured.values()):
+        fields["measurement"] = _measurement(row, measured, frame)
     fields.update({name: value for name, value in given.items() if value is not None})
     priors: list[dict[str, Any]] = []
     if quaternion is not None:
@@ -155,6 +172,25 @@ def batch_fields(row: CsvRow) -> dict[str, Any]:
         except ValueError:
             raise BadCell("options", "must be a JSON object", options) from None
     return fields
+
+
+def _measurement(
+    row: CsvRow, measured: dict[str, list[float] | None], frame: str | None
+) -> dict[str, Any]:
+    """A tracker's own attitude; the cell `tracker` may be empty: then it is that of the body."""
+    told: dict[str, Any] = {
+        name.removeprefix("measured_"): value
+        for name, value in measured.items()
+        if value is not None
+    }
+    if "covariance_arcsec2" in told:
+        p11, p12, p13, p22, p23, p33 = told["covariance_arcsec2"]
+        told["covariance_arcsec2"] = [[p11, p12, p13], [p12, p22, p23], [p13, p23, p33]]
+    if row["tracker"]:
+        told["tracker"] = row["tracker"]
+    if frame is not None:
+        told["frame"] = frame
+    return told
 
 
 def star_of(row: CsvRow) -> dict[str, Any]:
@@ -214,6 +250,13 @@ def batch_cells(batch: BatchIn) -> CsvRow:
         cells |= list_cells(prior)
         vectors["sun_vector"] = prior.sun_vector or batch.sun_vector
         vectors["position_km"] = prior.position_km or batch.position_km
+    if (measured := batch.measurement) is not None:
+        cells |= {"tracker": measured.tracker or "", "frame": measured.frame}
+        vectors["measured_quaternion"] = measured.quaternion
+        vectors["measured_sigma_arcsec"] = measured.sigma_arcsec
+        if measured.covariance_arcsec2 is not None:
+            (p11, p12, p13), (_, p22, p23), (_, _, p33) = measured.covariance_arcsec2
+            vectors["measured_covariance_arcsec2"] = (p11, p12, p13, p22, p23, p33)
     for name, columns in VECTORS.items():
         cells |= number_cells(zip(columns, vectors[name] or (), strict=False))
     options = batch.options.model_dump(mode="json", exclude_defaults=True)

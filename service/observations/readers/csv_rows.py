@@ -62,6 +62,12 @@ class _BatchRows:
                 if row.get(column, "") != self.first.get(column, ""):
                     message = f"differs from line {self.number}, the first of the batch"
                     raise BadCell(column, message, row[column])
+            if "measurement" in self.fields:
+                if self.rows > 1:
+                    raise BadCell("batch", "has a second measured attitude", self.key[-1])
+                if cell := next((row[each] for each in STAR_COLUMNS[1:] if row.get(each)), None):
+                    raise BadCell("batch", "has stars beside a measured attitude", cell)
+                return
             stars = self.trackers.setdefault(row["tracker"], [])
             if any(row.get(column) for column in STAR_COLUMNS[1:]):
                 stars.append(star_of(row))
@@ -83,7 +89,7 @@ class _BatchRows:
             {"tracker": name, "stars": stars, **self.rasters.get(name, {})}
             for name, stars in self.trackers.items()
         ]
-        body = {**self.fields, "observations": observations}
+        body = {**self.fields, "observations": observations} if observations else self.fields
         return Line(self.number, json.dumps(body, separators=(",", ":")).encode())
 
 
@@ -170,6 +176,8 @@ def write_batches_csv(batches: Iterable[BatchIn], stream: TextIO) -> None:
     writer.writeheader()
     for batch in batches:
         common = batch_cells(batch)
+        if batch.measurement is not None:
+            writer.writerow(common)
         for tracker in batch.observations:
             here = {**common, "tracker": tracker.tracker}
             if not tracker.stars:

@@ -13,7 +13,7 @@ from typing import IO
 
 import numpy as np
 
-from service.observations.schema import NORM_TOLERANCE
+from service.observations.numbers import NORM_TOLERANCE
 from service.products.reading.known_attitudes import (
     MOST_RECORDS,
     KnownAttitudes,

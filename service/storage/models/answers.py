@@ -160,18 +160,22 @@ class Attitude(Record, frozen=True, kw_only=True):
     quaternion: Quaternion
     frame: Annotated[str, DescribedAs(Literal["EME2000"])]
     covariance_arcsec2: Covariance
-    method: Annotated[str, DescribedAs(Literal["quest", "triad"])]
-    residual_rms_arcsec: float
-    predicted_rms_arcsec: float
-    taste: Annotated[float, doc("Weighted sum of squared residuals; follows chi-square.")]
+    method: Annotated[
+        str,
+        DescribedAs(Literal["quest", "triad", "measured"]),
+        doc("`measured`: by a tracker itself; all that needs stars is null then."),
+    ]
+    residual_rms_arcsec: float | None
+    predicted_rms_arcsec: float | None
+    taste: Annotated[float | None, doc("Weighted sum of squared residuals; follows chi-square.")]
     degrees_of_freedom: Count
     status: Annotated[
         Status,
         doc("`suspect`: `taste` exceeds its 99.9 % point, or there is a `rival`."),
     ]
-    triad: Quaternion
-    quest: Quaternion
-    triad_quest_angle_arcsec: float
+    triad: Quaternion | None
+    quest: Quaternion | None
+    triad_quest_angle_arcsec: float | None
     trackers: Annotated[list[TrackerFit], doc("If there are several trackers.")] | UnsetType = UNSET
     outlier: Annotated[str | None, doc("The tracker that disagrees.")] | UnsetType = UNSET
     rival: (
@@ -249,12 +253,13 @@ class Answer(Record, frozen=True, kw_only=True):
     identifier: Annotated[str, DescribedAs(Identifier)]
     path: Annotated[
         str,
-        DescribedAs(Literal["zone", "lost_in_space", "zone_then_lost_in_space"]),
+        DescribedAs(Literal["zone", "lost_in_space", "zone_then_lost_in_space", "measured"]),
         doc(
             "`zone`: the service searched about the a priori attitude. `lost_in_space`: without "
             "an a priori attitude, it searched about an attitude from the whole sky. "
             "`zone_then_lost_in_space`: the first search found nothing good, so the service "
-            "made the second."
+            "made the second. `measured`: the batch holds an attitude that a tracker measured; "
+            "nothing was searched for, and `identifier` was not used."
         ),
     ]
     observations: list[TrackerStars]

@@ -45,10 +45,12 @@ class ProductAttitude(Record, frozen=True, kw_only=True):
     status: Status
     method: Annotated[
         str,
-        DescribedAs(Literal["quest", "triad", "ekf", "filter_smoother"]),
+        DescribedAs(Literal["quest", "triad", "measured", "ekf", "filter_smoother"]),
         doc("`ekf` of the grade `filtered`, `filter_smoother` of `smoothed`."),
     ]
-    residual_rms_arcsec: Annotated[float | None, doc("null unless the grade is `raw`.")]
+    residual_rms_arcsec: Annotated[
+        float | None, doc("null unless the grade is `raw` and the attitude is of stars.")
+    ]
     predicted_rms_arcsec: Annotated[float | None, doc("null unless the grade is `raw`.")]
     stretch: Annotated[Count, doc("Number of the unbroken stretch, from 0.")]
     batch: Annotated[str | None, doc("null unless the grade is `raw`.")]

@@ -30,10 +30,12 @@ class AttitudeRow(Record, frozen=True, kw_only=True):
     quaternion: Quaternion
     frame: Annotated[str, DescribedAs(Literal["EME2000"])]
     covariance_arcsec2: Covariance
-    residual_rms_arcsec: float
-    predicted_rms_arcsec: float
-    taste: float
-    method: Annotated[str, DescribedAs(Literal["quest", "triad"])]
+    residual_rms_arcsec: Annotated[
+        float | None, doc("Null, as the next two, of an attitude that a tracker measured itself.")
+    ]
+    predicted_rms_arcsec: float | None
+    taste: float | None
+    method: Annotated[str, DescribedAs(Literal["quest", "triad", "measured"])]
     status: Status
 
 

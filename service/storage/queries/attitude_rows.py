@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 from sqlalchemy import Select, select
 
+from service.acquire.measured import METHOD
 from service.products.attitudes import AttitudeRows
 from service.storage.archive.reading import Archive
 from service.storage.queries.pages import PLACE, ResultFilter
@@ -75,6 +76,8 @@ def attitude_pages(
 def _columns(rows: Sequence[Any]) -> AttitudeRows:
     time_ns, _, id, status, batch, time, sent, method, *numbers = zip(*rows, strict=True)
     values = np.array(numbers, dtype=np.float64)
+    # In the table they are zero.
+    values[10:12, np.array(method, dtype=object) == METHOD] = np.nan
     rates = [_RATES.decode(each).body_rates_deg_per_s for each in sent]
     return AttitudeRows(
         time_ns=np.array(time_ns, dtype=np.int64),

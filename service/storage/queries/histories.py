@@ -6,6 +6,7 @@ from typing import Any
 
 from sqlalchemy import Connection, Select, func, select
 
+from service.acquire.measured import METHOD
 from service.missions.mission import Mission
 from service.storage.archive.reading import Archive
 from service.storage.models.base import Page
@@ -134,6 +135,7 @@ def attitudes() -> Select[Any]:
 
 def attitude_row(row: Any) -> AttitudeRow:
     """An attitude in a history: of which batch, at what time, how good."""
+    is_measured = row["method"] == METHOD
     p = {name: row[name] for name in ("p11", "p12", "p13", "p22", "p23", "p33")}
     return AttitudeRow(
         id=row["id"],
@@ -146,9 +148,9 @@ def attitude_row(row: Any) -> AttitudeRow:
             [p["p12"], p["p22"], p["p23"]],
             [p["p13"], p["p23"], p["p33"]],
         ],
-        residual_rms_arcsec=row["residual_rms_arcsec"],
-        predicted_rms_arcsec=row["predicted_rms_arcsec"],
-        taste=row["taste"],
+        residual_rms_arcsec=None if is_measured else row["residual_rms_arcsec"],
+        predicted_rms_arcsec=None if is_measured else row["predicted_rms_arcsec"],
+        taste=None if is_measured else row["taste"],
         method=row["method"],
         status=row["status"],
     )

@@ -201,20 +201,20 @@ def _attitude(acquisition: Acquisition) -> Attitude | None:
     solution, rival = acquisition.solution, acquisition.rival
     if solution is None:
         return None
-    several = solution.trackers
+    several, has_stars = solution.trackers, len(solution.residual_arcsec) > 0
     return Attitude(
         quaternion=solution.quaternion.tolist(),
         frame=FRAME,
         covariance_arcsec2=solution.covariance_arcsec2.tolist(),
         method=solution.method,
-        residual_rms_arcsec=solution.residual_rms_arcsec,
-        predicted_rms_arcsec=solution.predicted_rms_arcsec,
-        taste=solution.taste,
+        residual_rms_arcsec=_number(solution.residual_rms_arcsec),
+        predicted_rms_arcsec=_number(solution.predicted_rms_arcsec),
+        taste=_number(solution.taste),
         degrees_of_freedom=solution.degrees_of_freedom,
         status="suspect" if solution.suspect else "good",
-        triad=solution.triad.tolist(),
-        quest=solution.quest.tolist(),
-        triad_quest_angle_arcsec=solution.triad_quest_angle_arcsec,
+        triad=solution.triad.tolist() if has_stars else None,
+        quest=solution.quest.tolist() if has_stars else None,
+        triad_quest_angle_arcsec=_number(solution.triad_quest_angle_arcsec),
         trackers=[
             TrackerFit(tracker=fit.tracker, stars=fit.stars, taste=fit.taste, outlier=fit.outlier)
             for fit in several

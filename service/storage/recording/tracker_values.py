@@ -106,7 +106,7 @@ def _scale(answer: Answer, expected: Sequence[Vector]) -> float:
 
     TRIAD's attitude takes its own part of the noise, which its answer says of all stars only.
     """
-    if answer.attitude is None:
+    if answer.attitude is None or answer.attitude.predicted_rms_arcsec is None:
         return 0.0
     used = [
         squares[place]

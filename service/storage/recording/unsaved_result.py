@@ -275,9 +275,10 @@ def _solution_row(acquisition: Acquisition, answer: Answer, result_id: str) -> R
         "p22": p22,
         "p23": p23,
         "p33": p33,
-        "residual_rms_arcsec": attitude.residual_rms_arcsec,
-        "predicted_rms_arcsec": solution.predicted_rms_arcsec,
-        "taste": attitude.taste,
+        # Of a measured attitude they are unknown; the columns take no null.
+        "residual_rms_arcsec": attitude.residual_rms_arcsec or 0.0,
+        "predicted_rms_arcsec": attitude.predicted_rms_arcsec or 0.0,
+        "taste": attitude.taste or 0.0,
         "method": attitude.method,
         "status": attitude.status,
     }

@@ -88,6 +88,7 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
         shown=shown,
         trackers=_trackers(context.app.results.trackers(id, tried)),
         stars=_stars(shown, answer if tried else None, field),
+        measured=record.input.get("measurement"),
         charts=[sky_chart(each, field.through, view) for each in field.trackers],
         view=view,
         here=lambda **more: f"/batches/{id}?{urlencode(query | more)}",
@@ -156,11 +157,16 @@ def _pointing(shown: Answer) -> list[dict[str, Any]]:
     if solved is None:
         return []
     rows = []
-    for method in ("quest", "triad"):
-        attitude = matrix_from_quaternion(getattr(solved, method))
+    by_method = {"quest": solved.quest, "triad": solved.triad}
+    if solved.quest is None:
+        by_method = {solved.method: solved.quaternion}
+    for method, quaternion in by_method.items():
+        if quaternion is None:
+            continue
+        attitude = matrix_from_quaternion(quaternion)
         axes = {}
         for name, axis in zip("XYZ", attitude, strict=True):
             ra_deg, dec_deg = to_ra_dec(axis)
             axes[name] = (float(ra_deg), float(dec_deg))
-        rows.append({"method": method, "quaternion": getattr(solved, method), "axes": axes})
+        rows.append({"method": method, "quaternion": quaternion, "axes": axes})
     return rows
