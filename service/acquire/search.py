@@ -9,6 +9,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from service.acquire.choices import Choices
+from service.acquire.lone_stars import identify_lone_stars
 from service.acquire.result import Path
 from service.acquire.warnings import PREDICTION_CONTRADICTED, WORK_BOUND_HIT
 from service.attitude.solution import AttitudeSolution, NoAttitude
@@ -22,9 +23,10 @@ from service.identify.prior_attitude import PriorAttitude, prior_attitude, searc
 from service.identify.sighting import Sighting
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Mission
-from service.observations.batch import ObservationBatch, QuaternionPrior
+from service.observations.batch import ObservationBatch, PredictedPrior, QuaternionPrior
 from service.observations.calibrate import CorrectedObservations
 from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.ephemeris import apparent
 from service.sky.model import SkyModel
 from service.sky.zones import SearchRegion, Zone
 from service.vectors import (
@@ -142,6 +144,8 @@ class Search:
                 warnings.append(PREDICTION_CONTRADICTED)
             if falls_back:
                 path = Path.ZONE_THEN_LOST_IN_SPACE
+            elif in_zones is not None and prior.predicted is not None:
+                in_zones = self._with_lone_stars(corrected, in_zones, prior.predicted)
         if path is not Path.ZONE:
             found = find_attitude(
                 corrected,
@@ -201,6 +205,28 @@ class Search:
         solved = self._solve(found.corrected, identifications)
         self.timer.end("solve")
         return ZoneResult(in_zones.prior, in_zones.places, identifications, solved)
+
+    def _with_lone_stars(
+        self,
+        corrected: Sequence[CorrectedObservations],
+        in_zones: ZoneResult,
+        predicted: PredictedPrior,
+    ) -> ZoneResult:
+        """The result in zones, with the stars that the prediction identifies if it is poor."""
+        if isinstance(in_zones.solved, AttitudeSolution):
+            return in_zones
+        identifications = identify_lone_stars(
+            corrected,
+            in_zones.identifications,
+            in_zones.prior.attitude,
+            predicted.covariance_arcsec2,
+            self.run_catalog,
+            apparent(self.run_catalog.direction, self.velocity_c, self.batch.time),
+        )
+        solved = self._solve(corrected, identifications)
+        self.timer.end("identify")
+        found = replace(in_zones, identifications=identifications, solved=solved)
+        return in_zones if contradicts(found, in_zones.prior) else found
 
     def find_about(
         self,

@@ -266,10 +266,6 @@ def _stars_of_different_trackers(
 class BatchIn(Wire):
     """A batch of observed stars, or of an attitude that a tracker measured itself."""
 
-    model_config = ConfigDict(
-        json_schema_extra={"anyOf": [{"required": ["observations"]}, {"required": ["measurement"]}]}
-    )
-
     spacecraft: Key
     batch: Key
     time: Annotated[str, AfterValidator(is_time)]

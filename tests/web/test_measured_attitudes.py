@@ -46,6 +46,9 @@ def test_it_is_recorded_as_a_good_attitude_without_stars(post, client, measured)
     assert record["measures"]["residual_rms_arcsec"] is None
     again = client.post(f"{URL}/{told['id']}/what-if", json={})
     assert again.json()["attitude"] == attitude
+    refused = client.post(f"{URL}/{told['id']}/what-if", json={"options": {"solver": "triad"}})
+    assert refused.status_code == 422
+    assert refused.json()["errors"][0]["field"] == "options"
 
 
 def test_the_same_again_gives_the_stored_answer_and_another_is_a_conflict(post, measured):

@@ -109,7 +109,7 @@ class Grades:
             if holds_any(connection, key.spacecraft, key.run, *window):
                 progress.archived += 1
                 return
-            recorded = recorded_in(connection, key.spacecraft, key.run, *window)
+            recorded = recorded_in(connection, self._context.sky, key.spacecraft, key.run, *window)
             before = current_day(connection, key)
         inputs = inputs_digest(recorded, mission)
         if before is not None and before.inputs == inputs:

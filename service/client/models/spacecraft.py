@@ -21,9 +21,9 @@ class AttitudeRow(Model, frozen=True):
     quaternion: Sequence[float]
     frame: str
     covariance_arcsec2: Sequence[Sequence[float]]
-    residual_rms_arcsec: float
-    predicted_rms_arcsec: float
-    taste: float
+    residual_rms_arcsec: float | None
+    predicted_rms_arcsec: float | None
+    taste: float | None
     method: str
     status: str
 

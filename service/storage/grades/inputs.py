@@ -6,11 +6,12 @@ import json
 import numpy as np
 from sqlalchemy import Connection, select
 
-from service.filtering.samples import no_directions
 from service.grades.day import METHOD, day_bounds
 from service.grades.measured import Recorded, usable_attitudes
 from service.gyro.block import Nanoseconds, tai_ns_of
 from service.missions.mission import Mission
+from service.sky.model import SkyModel
+from service.storage.grades.lone_stars import lone_stars
 from service.storage.gyro.blocks import BlockFilter, rates_of, times_of
 from service.storage.queries.pages import PLACE, ResultFilter
 from service.storage.sql.gyro_tables import gyro_blocks
@@ -42,11 +43,11 @@ def days_with_batches(
 
 
 def recorded_in(
-    connection: Connection, spacecraft: str, run: str, start: Utc, end: Utc
+    connection: Connection, sky: SkyModel, spacecraft: str, run: str, start: Utc, end: Utc
 ) -> Recorded:
-    """What was recorded from `start` to before `end`: good attitudes, and gyro samples."""
-    chosen = ResultFilter(run, spacecraft, start, end).conditions()
-    query = _ATTITUDES.where(*chosen, results.c.status == "good").order_by(*PLACE)
+    """What was recorded from `start` to before `end`: good attitudes, lone stars, gyro samples."""
+    selected = ResultFilter(run, spacecraft, start, end)
+    query = _ATTITUDES.where(*selected.conditions(), results.c.status == "good").order_by(*PLACE)
     rows = np.array([tuple(row) for row in connection.execute(query)], dtype=object)
     rows = rows.reshape(-1, 11)
     numbers = rows[:, 1:].astype(np.float64)
@@ -54,7 +55,8 @@ def recorded_in(
         rows[:, 0].astype(np.int64), numbers[:, :4], numbers[:, 4:]
     )
     gyro_ns, rates = gyro_in(connection, BlockFilter(spacecraft, run, start, end))
-    return Recorded(gyro_ns, rates, attitudes, no_directions(), unusable)
+    directions = lone_stars(connection, sky, selected)
+    return Recorded(gyro_ns, rates, attitudes, directions, unusable)
 
 
 def gyro_in(connection: Connection, selected: BlockFilter) -> tuple[Nanoseconds, Vector]:

@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 from sqlalchemy import Connection, bindparam, func, select
 
+from service.errors import BadBatch, Fault, shown_value
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
 from service.observations.schema import OptionsIn, submission_from_json
@@ -56,9 +57,14 @@ def recorded_mission(connection: Connection, digest: str) -> Mission:
 def batch_with_options(input: str, own: str, options: OptionsIn | None = None) -> ObservationBatch:
     """A recorded batch with the options of its result; `options` replace what they name of those.
 
-    `input` and `own` are the JSON texts that are stored.
+    `input` and `own` are the JSON texts that are stored.  Raises `BadBatch` for options of a
+    batch that holds a measured attitude.
     """
     batch = submission_from_json(input).batch
+    if batch.measurement is not None and options is not None and options.model_fields_set:
+        asked = sorted(options.model_fields_set)
+        message = "must be left out: a measured attitude is not searched for"
+        raise BadBatch(Fault("options", message, shown_value(", ".join(asked))))
     merged = merged_options(json.loads(own), options or OptionsIn())
     return msgspec.structs.replace(batch, options=merged.to_options())
 
