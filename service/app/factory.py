@@ -22,6 +22,7 @@ from service.app.spacecraft import Spacecraft
 from service.app.submissions import Submissions
 from service.app.telemetry.grades import Grades
 from service.app.telemetry.gyro import Gyro
+from service.app.telemetry.live_filter import LiveFilter
 from service.app.telemetry.tracks import Tracks
 from service.app.zones import Zones
 from service.missions.mission import Mission, load_missions
@@ -60,6 +61,7 @@ class App:
         self.products = Products(context)
         self.gyro = Gyro(context)
         self.grades = Grades(context)
+        self.live_filter = LiveFilter(context)
         self.tracks = Tracks(context)
         self.limits = Limits(context)
         self.alarms = Alarms(context)
@@ -87,6 +89,7 @@ class App:
         self.webhooks.sender.stop()
         self.replays.stop()
         self.calibrations.close()
+        self.live_filter.stop()
         self.tracker_split.stop()
         self.submissions.close()
         self.store.close()

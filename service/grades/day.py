@@ -175,8 +175,8 @@ def _graded(
     return GradedStretch(
         "constant_rate" if is_constant else "gyro",
         {
-            "filtered": _samples(result.history, kept, is_constant),
-            "smoothed": _samples(smoothed, kept, is_constant),
+            "filtered": samples_of(result.history, kept, is_constant),
+            "smoothed": samples_of(smoothed, kept, is_constant),
         },
         innovations_of(stretch.attitudes, result, smoothed, start, end),
     )
@@ -191,7 +191,8 @@ def _kept(history: AttitudeHistory, start: int, end: int) -> Mask:
     return np.asarray(inside & is_first)
 
 
-def _samples(history: AttitudeHistory, kept: Mask, is_constant: bool) -> GradedSamples:
+def samples_of(history: AttitudeHistory, kept: Mask, is_constant: bool) -> GradedSamples:
+    """The epochs of a history where a mask (n,) is true, as samples of a grade."""
     quaternion = history.quaternion[kept]
     quaternion = np.where(quaternion[:, 3:] < 0.0, -quaternion, quaternion)
     covariance = history.model_covariance[kept]

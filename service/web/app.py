@@ -99,6 +99,7 @@ def create_app(app: App, limits: BodyLimits = DEFAULT_LIMITS) -> FastAPI:
         try:
             await web_app.state.live.start()
             app.webhooks.sender.start()
+            app.live_filter.start()
             yield
         finally:
             reporting.cancel()

@@ -8,6 +8,7 @@ from ..models import (
     AttitudeRow,
     History,
     Innovation,
+    LiveAttitude,
     Ranking,
     Rates,
     SpacecraftRow,
@@ -52,6 +53,10 @@ class Spacecraft(Connection):
         """
         query = {"run": run, "start": start, "end": end}
         return Items(self, AttitudeRow, path_of("spacecraft", spacecraft, "attitudes"), query)
+
+    def live_attitude(self, spacecraft: str) -> LiveAttitude:
+        """The filtered attitude at the last epoch, of a mission with a live filter."""
+        return self.get(LiveAttitude, path_of("spacecraft", spacecraft, "attitude", "latest"))
 
     def innovations(
         self,

@@ -28,6 +28,23 @@ class AttitudeRow(Model, frozen=True):
     status: str
 
 
+class LiveAttitude(Model, frozen=True, kw_only=True):
+    """The filtered attitude at the last epoch of live data; use it only where `status` is good.
+
+    `bias_sigma_deg_per_h` is that of the gyro's bias or, at a constant rate, of the rate.
+    """
+
+    spacecraft: str
+    time: str
+    quaternion: Sequence[float]
+    covariance_arcsec2: Sequence[Sequence[float]]
+    rate_deg_per_s: Sequence[float]
+    bias_deg_per_h: Sequence[float] | None
+    bias_sigma_deg_per_h: Sequence[float]
+    status: str
+    model: str
+
+
 class Innovation(Model, frozen=True, kw_only=True):
     """How a measured attitude met the filter, and how far it is from the smoothed attitude.
 

@@ -18,7 +18,7 @@ from service.times import DAY_S
 
 METHODS: dict[Grade, str] = {"filtered": "ekf", "smoothed": "filter_smoother"}
 """The words of CCSDS ACM's AD_METHOD."""
-_STATUS = {Status.GOOD: "good", Status.STARTING: "suspect", Status.DOUBTFUL: "suspect"}
+STATUS = {Status.GOOD: "good", Status.STARTING: "suspect", Status.DOUBTFUL: "suspect"}
 _PLACE = (graded_days.c.day, graded_blocks.c.position)
 _BLOCKS = select(
     *_PLACE,
@@ -96,7 +96,7 @@ def _rows(row: Any, selected: ResultFilter, grade: Grade) -> AttitudeRows:
     n = len(found)
     start, _ = day_bounds(row["day"])
     status = _repeated(None, n)
-    for code, word in _STATUS.items():
+    for code, word in STATUS.items():
         status[found.status == code] = word
     known = np.where([each is None for each in status], np.nan, 1.0).reshape(n, 1)
     time = _repeated(None, n)

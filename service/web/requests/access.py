@@ -80,6 +80,7 @@ POLICIES: dict[str, Policy] = {
     "list_attitudes": Policy("read", "path"),
     "get_attitude": Policy("read", "path"),
     "get_attitude_at": Policy("read", "path"),
+    "get_live_attitude": Policy("read", "path"),
     "get_table": Policy("read", "path"),
     "list_tracks": Policy("read", "path"),
     "submit_gyro": Policy("submit", "path"),

@@ -1,0 +1,237 @@
+"""The live filter: in portions as at once, late data included, and the same after a kill."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import httpx
+import numpy as np
+import pytest
+
+from service.errors import NotFound
+from service.filtering.samples import AttitudeMeasurements
+from service.grades.carried import CarriedFilter
+from service.grades.day import grade_day
+from service.missions.mission import SHIPPED_FOLDER
+from service.observations.schema import submission_from_json
+from service.times import DAY_S
+from service.vectors import ARCSEC_PER_RADIAN
+from tests.grades.passes import GYRO, NOON, NOON_NS, mission_with
+from tests.grades.records import at, put_gyro
+
+FIELDS = ("tai_ns", "quaternion", "covariance_arcsec2", "rate_deg_per_s", "bias_deg_per_h")
+TABLES = """
+[gyro]
+sigma_v_rad_s0_5 = 3.1622776601683795e-07
+sigma_u_rad_s1_5 = 3.1622776601683795e-10
+
+[live_filter]
+every_s = 0.1
+"""
+
+
+def before(recorded, seconds, *, left_out=()):
+    """What was recorded of a pass until so many seconds after noon, less some of the attitudes."""
+    end = NOON_NS + seconds * 10**9
+    gyro = recorded.gyro_ns <= end
+    a = recorded.attitudes
+    kept = (a.tai_ns <= end) & ~np.isin(np.arange(len(a.tai_ns)), left_out)
+    return replace(
+        recorded,
+        gyro_ns=recorded.gyro_ns[gyro],
+        rates_rad_s=recorded.rates_rad_s[gyro],
+        attitudes=AttitudeMeasurements(a.tai_ns[kept], a.quaternion[kept], a.covariance_rad2[kept]),
+    )
+
+
+def assert_same(found, other):
+    for name in FIELDS:
+        assert np.array_equal(
+            getattr(found.sample, name), getattr(other.sample, name), equal_nan=True
+        ), name
+
+
+@pytest.mark.parametrize("has_gyro", [True, False])
+def test_in_portions_it_gives_the_last_filtered_attitude_of_the_day(missions, half_hour, has_gyro):
+    mission = mission_with(missions["XTE"], **({"gyro": GYRO} if has_gyro else {}))
+    carried, given = CarriedFilter(), 0
+    for seconds in range(100, 1801, 100):
+        recorded = before(half_hour[1], seconds)
+        if not has_gyro:
+            recorded = recorded.without_gyro()
+        found = carried.carry_on(recorded, mission)
+        (stretch,) = grade_day(recorded, mission, NOON.bucket(DAY_S)).stretches
+        whole = stretch.samples["filtered"]
+        assert found.model == stretch.model
+        last = replace(found, sample=whole.taken(slice(-1, None)))
+        assert_same(found, last)
+        given += len(recorded.gyro_ns) if has_gyro else len(recorded.attitudes.tai_ns)
+    # Marks stand every ten minutes: no more than those are filtered again each time.
+    assert carried.filtered < 0.5 * given
+
+
+def test_late_attitudes_and_late_rates_are_filtered_from_the_mark_before(missions, half_hour):
+    mission = mission_with(missions["XTE"], gyro=GYRO)
+    whole = half_hour[1]
+    carried = CarriedFilter()
+    carried.carry_on(before(whole, 1800, left_out=[120, 121, 122]), mission)
+    begun = carried.filtered
+    found = carried.carry_on(whole, mission)
+    assert_same(found, CarriedFilter().carry_on(whole, mission))
+    # 120 measurements are 16 minutes: the first mark still holds, the second does not.
+    assert 1000 < carried.filtered - begun < 1500
+    begun = carried.filtered
+    assert_same(carried.carry_on(whole, mission), found)
+    assert carried.filtered - begun < 650
+
+
+def test_attitudes_after_the_last_rates_wait_for_them(missions, half_hour):
+    mission = mission_with(missions["XTE"], gyro=GYRO)
+    recorded = before(half_hour[1], 1500)
+    gyro = recorded.gyro_ns <= NOON_NS + 1200 * 10**9
+    late = replace(recorded, gyro_ns=recorded.gyro_ns[gyro], rates_rad_s=recorded.rates_rad_s[gyro])
+    found = CarriedFilter().carry_on(late, mission)
+    assert found.model == "gyro"
+    assert int(found.sample.tai_ns[0]) == NOON_NS + 1200 * 10**9
+    assert CarriedFilter().carry_on(before(half_hour[1], -1), mission) is None
+
+
+def bodies(attitudes):
+    """The attitudes as trackers' own, which need no stars."""
+    p = attitudes.covariance_rad2 * ARCSEC_PER_RADIAN**2
+    return [
+        {
+            "spacecraft": "XTE",
+            "batch": f"q{int(ns)}",
+            "time": at(ns).text,
+            "a_priori": None,
+            "measurement": {"quaternion": q.tolist(), "covariance_arcsec2": each.tolist()},
+        }
+        for ns, q, each in zip(attitudes.tai_ns, attitudes.quaternion, p, strict=True)
+    ]
+
+
+def send(app, attitudes):
+    for body in bodies(attitudes):
+        app.submissions.submit(submission_from_json(json.dumps(body)))
+
+
+@pytest.fixture
+def live(opened):
+    return opened(live_filter={})
+
+
+def test_it_answers_what_smooth_records_and_another_process_answers_the_same(
+    live, opened, half_hour
+):
+    first, whole = before(half_hour[1], 900), half_hour[1]
+    with pytest.raises(NotFound):
+        live.live_filter.latest("XTE")
+    put_gyro(live, first.gyro_ns, first.rates_rad_s)
+    send(live, first.attitudes)
+    live.live_filter.refresh("XTE")
+    assert live.live_filter.latest("XTE").time == "1999-03-01T12:15:00.000Z"
+    rest = slice(len(first.gyro_ns), None)
+    put_gyro(live, whole.gyro_ns[rest], whole.rates_rad_s[rest])
+    send(live, whole.attitudes)
+    live.live_filter.refresh("XTE")
+    found = live.live_filter.latest("XTE")
+    assert (found.time, found.status, found.model) == (
+        "1999-03-01T12:30:00.000Z",
+        "good",
+        "gyro",
+    )
+    live.grades.smooth("XTE")
+    *_, block = live.products.attitudes("XTE", grade="filtered").blocks
+    assert block.time[-1] == found.time
+    # The record keeps quaternions to the bit, covariances to seven digits.
+    along = np.abs(block.quaternion[-1] @ found.quaternion)
+    assert along == pytest.approx(1.0, abs=1e-15)
+    assert np.diag(found.covariance_arcsec2) == pytest.approx(
+        block.covariance_arcsec2[-1][[0, 3, 5]], rel=1e-6
+    )
+    other = opened(live_filter={})
+    assert other.live_filter.latest("XTE") == found
+
+
+def test_a_mission_without_the_table_has_none(app):
+    with pytest.raises(NotFound, match="no live filter"):
+        app.live_filter.latest("XTE")
+
+
+def test_a_service_that_is_killed_and_started_again_gives_the_same_state(
+    database, tmp_path, half_hour, missions, monkeypatch
+):
+    mission = mission_with(missions["XTE"], gyro=GYRO)
+    folder = tmp_path / "missions"
+    folder.mkdir()
+    text = (SHIPPED_FOLDER / "xte.toml").read_text(encoding="utf-8") + TABLES
+    (folder / "xte.toml").write_text(text, encoding="utf-8")
+    monkeypatch.setenv("ACQUIRE_MISSIONS", str(folder))
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    api = f"http://127.0.0.1:{port}/api/v1"
+    command = [sys.executable, "-m", "service.cli", "serve", "--port", str(port)]
+
+    def serve():
+        server = subprocess.Popen(
+            [*command, "--database", database], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        while server.poll() is None:
+            try:
+                if httpx.get(f"http://127.0.0.1:{port}/readyz").status_code == 200:
+                    return server
+            except httpx.TransportError:
+                pass
+            time.sleep(0.05)
+        raise AssertionError("the server ended by itself")
+
+    def latest(client, left_out=()):
+        """The answer, once it is made of all that was sent."""
+        known = before(half_hour[1], 300, left_out=left_out)
+        expected = CarriedFilter().carry_on(known, mission).sample
+        give_up = time.monotonic() + 120.0
+        while True:
+            answer = client.get(f"{api}/spacecraft/XTE/attitude/latest")
+            if answer.status_code == 200:
+                found = answer.json()
+                variances = np.diag(found["covariance_arcsec2"])
+                if np.allclose(variances, expected.covariance_arcsec2[0][[0, 3, 5]], rtol=1e-5):
+                    assert np.allclose(found["quaternion"], expected.quaternion[0], atol=1e-9)
+                    return found
+            assert time.monotonic() < give_up, answer.text
+            time.sleep(0.05)
+
+    recorded = before(half_hour[1], 300)
+    measured = bodies(recorded.attitudes)
+    left_out = range(len(measured) - 5, len(measured))
+    block = {
+        "block": "g1",
+        "start": NOON.text,
+        "step_s": 1.0,
+        "rates_rad_per_s": recorded.rates_rad_s.tolist(),
+    }
+    server = serve()
+    try:
+        with httpx.Client(timeout=60) as client:
+            assert client.post(f"{api}/spacecraft/XTE/gyro", json=block).status_code == 201
+            for body in measured[:-5]:
+                assert client.post(f"{api}/batches", json=body).status_code == 201
+            first = latest(client, left_out)
+            assert (first["time"], first["status"]) == ("1999-03-01T12:05:00.000Z", "good")
+            server.send_signal(signal.SIGKILL)
+            server.wait()
+            server = serve()
+            assert latest(client, left_out) == first
+            for body in measured[-5:]:
+                assert client.post(f"{api}/batches", json=body).status_code == 201
+            second = latest(client)
+            assert second["covariance_arcsec2"][0][0] < first["covariance_arcsec2"][0][0]
+    finally:
+        server.kill()
+        server.wait()
