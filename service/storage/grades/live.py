@@ -4,6 +4,7 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
+from service.filtering.state import Status
 from service.grades.carried import Carried
 from service.gyro.block import texts_of
 from service.storage.grades.rows import STATUS
@@ -14,8 +15,10 @@ from service.storage.models.base import (
     Moment,
     Quaternion,
     Record,
-    Status,
     doc,
+)
+from service.storage.models.base import (
+    Status as StatusWord,
 )
 from service.times import Utc
 
@@ -36,14 +39,14 @@ class LiveAttitude(Record, frozen=True, kw_only=True):
         Components, doc("One sigma of the bias or, at a constant rate, of the rate.")
     ]
     status: Annotated[
-        Status, doc("`suspect`: measurements contradict it, or have not confirmed it yet.")
+        StatusWord, doc("`suspect`: measurements contradict it, or have not confirmed it yet.")
     ]
     model: Annotated[str, DescribedAs(Literal["gyro", "constant_rate"])]
 
 
 def live_attitude(name: str, day_start: Utc, carried: Carried | None) -> LiveAttitude | None:
     """What is answered of the last epoch; None where there is no attitude, or it is lost."""
-    if carried is None or (word := STATUS.get(int(carried.sample.status[0]))) is None:
+    if carried is None or (word := STATUS.get(Status(int(carried.sample.status[0])))) is None:
         return None
     sample = carried.sample
     (time,) = texts_of(day_start, np.asarray((sample.tai_ns - day_start.tai_ns) * 1e-9))
