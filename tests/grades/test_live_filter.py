@@ -2,9 +2,6 @@
 
 import json
 import signal
-import socket
-import subprocess
-import sys
 import time
 from dataclasses import replace
 
@@ -22,6 +19,7 @@ from service.times import DAY_S
 from service.vectors import ARCSEC_PER_RADIAN
 from tests.grades.passes import GYRO, NOON, NOON_NS, mission_with
 from tests.grades.records import at, put_gyro
+from tests.web.serving import served
 
 FIELDS = ("tai_ns", "quaternion", "covariance_arcsec2", "rate_deg_per_s", "bias_deg_per_h")
 TABLES = """
@@ -172,32 +170,14 @@ def test_a_service_that_is_killed_and_started_again_gives_the_same_state(
     text = (SHIPPED_FOLDER / "xte.toml").read_text(encoding="utf-8") + TABLES
     (folder / "xte.toml").write_text(text, encoding="utf-8")
     monkeypatch.setenv("ACQUIRE_MISSIONS", str(folder))
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    api = f"http://127.0.0.1:{port}/api/v1"
-    command = [sys.executable, "-m", "service.cli", "serve", "--port", str(port)]
 
-    def serve():
-        server = subprocess.Popen(
-            [*command, "--database", database], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        while server.poll() is None:
-            try:
-                if httpx.get(f"http://127.0.0.1:{port}/readyz").status_code == 200:
-                    return server
-            except httpx.TransportError:
-                pass
-            time.sleep(0.05)
-        raise AssertionError("the server ended by itself")
-
-    def latest(client, left_out=()):
+    def latest(api, left_out=()):
         """The answer, once it is made of all that was sent."""
         known = before(half_hour[1], 300, left_out=left_out)
         expected = CarriedFilter().carry_on(known, mission).sample
         give_up = time.monotonic() + 120.0
         while True:
-            answer = client.get(f"{api}/spacecraft/XTE/attitude/latest")
+            answer = httpx.get(f"{api}/spacecraft/XTE/attitude/latest")
             if answer.status_code == 200:
                 found = answer.json()
                 variances = np.diag(found["covariance_arcsec2"])
@@ -216,22 +196,17 @@ def test_a_service_that_is_killed_and_started_again_gives_the_same_state(
         "step_s": 1.0,
         "rates_rad_per_s": recorded.rates_rad_s.tolist(),
     }
-    server = serve()
-    try:
-        with httpx.Client(timeout=60) as client:
-            assert client.post(f"{api}/spacecraft/XTE/gyro", json=block).status_code == 201
-            for body in measured[:-5]:
-                assert client.post(f"{api}/batches", json=body).status_code == 201
-            first = latest(client, left_out)
-            assert (first["time"], first["status"]) == ("1999-03-01T12:05:00.000Z", "good")
-            server.send_signal(signal.SIGKILL)
-            server.wait()
-            server = serve()
-            assert latest(client, left_out) == first
-            for body in measured[-5:]:
-                assert client.post(f"{api}/batches", json=body).status_code == 201
-            second = latest(client)
-            assert second["covariance_arcsec2"][0][0] < first["covariance_arcsec2"][0][0]
-    finally:
-        server.kill()
+    with served(database) as (server, url), httpx.Client(base_url=url, timeout=60) as client:
+        assert client.post("/api/v1/spacecraft/XTE/gyro", json=block).status_code == 201
+        for body in measured[:-5]:
+            assert client.post("/api/v1/batches", json=body).status_code == 201
+        first = latest(f"{url}/api/v1", left_out)
+        assert (first["time"], first["status"]) == ("1999-03-01T12:05:00.000Z", "good")
+        server.send_signal(signal.SIGKILL)
         server.wait()
+    with served(database) as (server, url), httpx.Client(base_url=url, timeout=60) as client:
+        assert latest(f"{url}/api/v1", left_out) == first
+        for body in measured[-5:]:
+            assert client.post("/api/v1/batches", json=body).status_code == 201
+        second = latest(f"{url}/api/v1")
+        assert second["covariance_arcsec2"][0][0] < first["covariance_arcsec2"][0][0]

@@ -196,6 +196,20 @@ def test_a_recorded_batch_is_sent_again_with_its_prediction(app, flown):
     assert kept(elsewhere) == kept(answers[2])
 
 
+def test_reprocessing_uses_the_recorded_prediction_and_gives_the_same_answers(app, flown):
+    # The third comes late: what would be predicted now for those after it is something else.
+    answers = [send(app, flown[k].body) for k in (0, 1, 3, 4, 2)]
+    app.runs.reprocess("again", processes=1)
+    page = app.results.page(run="again", limit=50).items
+    ids = {each.batch: each.id for each in page}
+    assert len(ids) == 5
+    for one in answers:
+        again = json.loads(_answer(app, ids[one["batch"]]))
+        # The results that are named are those of the first run.
+        assert kept(again) == kept(one)
+    assert verify(app.settings.database) == []
+
+
 def test_csv_says_that_the_last_attitude_is_asked_for(flown):
     model = BatchIn.model_validate_json(json.dumps(flown[0].body))
     cells = batch_cells(model)
