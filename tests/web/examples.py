@@ -16,6 +16,7 @@ import httpx
 
 from service.access.tokens import add_token, new_secret
 from service.app.factory import App, open_app
+from service.missions.live_filter import LiveFilterSettings
 from service.missions.mission import load_missions
 from service.settings import Settings
 from service.simulate.frame_files import frame_bytes
@@ -107,6 +108,7 @@ def walk(client: httpx.Client, app: App) -> Json:
     moment = f"{API}/spacecraft/SWAS/attitude/at?status=all&method=nearest"
     take("get_attitude_at", client.get(f"{moment}&time=1999-060T00:00:05Z"), "nearest")
     take("get_attitude_at", client.get(f"{moment}&time=1999-061T00:00:00Z"), "none")
+    take("get_live_attitude", client.get(f"{API}/spacecraft/XTE/attitude/latest"), "not_kept_up")
     take("list_rates", client.get(f"{API}/spacecraft/XTE/rates"), "one_hour")
 
     _gyro(client, take)
@@ -149,6 +151,7 @@ def walk(client: httpx.Client, app: App) -> Json:
         time.sleep(0.05)
     take("cancel_replay", client.delete(begun.headers["Location"]), "cancelled")
     _calibration(client, take)
+    _measured(client, app, take)
     take("session", client.get(f"{API}/session"), "open_access")
     _sign_in(client, app, take)
     return found
@@ -251,6 +254,25 @@ def _gyro(client: httpx.Client, take: Any) -> None:
     take("list_gyro", client.get(here), "two_blocks")
     take("list_innovations", client.get(f"{API}/spacecraft/XTE/innovations"), "none_smoothed")
     take("get_gyro", client.get(f"{here}/{first['id']}"), "three_samples")
+
+
+def _measured(client: httpx.Client, app: App, take: Any) -> None:
+    for number, second in enumerate(("10", "20", "30"), 1):
+        body = {
+            "spacecraft": "SWAS",
+            "batch": f"ST1-000{number}",
+            "time": f"1999-03-02T00:00:{second}.000Z",
+            "a_priori": None,
+            "measurement": {
+                "quaternion": [0.1, 0.2, 0.3, 0.9273618495495703],
+                "sigma_arcsec": [6.0, 6.0, 40.0],
+            },
+        }
+        answer = client.post(f"{API}/batches", json=body)
+        if number == 1:
+            take("submit_batch", answer, "measured_attitude", body)
+    app.live_filter.refresh("SWAS")
+    take("get_live_attitude", client.get(f"{API}/spacecraft/SWAS/attitude/latest"), "swas")
 
 
 def _tracks(client: httpx.Client, take: Any) -> None:
@@ -357,7 +379,11 @@ def fresh_walk() -> Json:
     with tempfile.TemporaryDirectory() as folder:
         # Where nothing is compiled yet, that takes longer than a client waits.
         compile_kernels()
-        app = open_app(Settings(database=f"sqlite:///{folder}/acquire.db"))
+        kept_up = {"live_filter": LiveFilterSettings()}
+        app = open_app(
+            Settings(database=f"sqlite:///{folder}/acquire.db"),
+            load_missions()["SWAS"].model_copy(update=kept_up),
+        )
         with (
             Server(create_app(app)) as address,
             httpx.Client(base_url=address, timeout=300) as client,
