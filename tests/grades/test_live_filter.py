@@ -15,7 +15,10 @@ from service.grades.carried import CarriedFilter
 from service.grades.day import grade_day
 from service.missions.mission import SHIPPED_FOLDER
 from service.observations.schema import submission_from_json
-from service.times import DAY_S
+from service.storage.archive.archiving import archive
+from service.storage.archive.restoring import PartFilter, restore
+from service.storage.upkeep.verify import verify
+from service.times import DAY_S, parse_utc
 from service.vectors import ARCSEC_PER_RADIAN
 from tests.grades.passes import GYRO, NOON, NOON_NS, mission_with
 from tests.grades.records import at, put_gyro
@@ -124,7 +127,7 @@ def live(opened):
 
 
 def test_it_answers_what_smooth_records_and_another_process_answers_the_same(
-    live, opened, half_hour
+    live, opened, half_hour, database, tmp_path
 ):
     first, whole = before(half_hour[1], 900), half_hour[1]
     with pytest.raises(NotFound):
@@ -154,6 +157,13 @@ def test_it_answers_what_smooth_records_and_another_process_answers_the_same(
     )
     other = opened(live_filter={})
     assert other.live_filter.latest("XTE") == found
+    # Batches without stars are sound records, and come back from the archive.
+    assert verify(database) == []
+    archive(live.store, tmp_path, parse_utc("1999-03-01T12:10:00Z"))
+    restore(live.store, tmp_path, PartFilter())
+    assert verify(database) == []
+    (again,) = live.grades.smooth("XTE").days
+    assert again.revision == 1
 
 
 def test_a_mission_without_the_table_has_none(app):
