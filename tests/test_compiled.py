@@ -4,12 +4,11 @@ import sys
 
 import numpy as np
 import pytest
-from numba import njit
 from numba.core.errors import NumbaError
 
 from service.attitude.covariance import information
 from service.attitude.quest import quest
-from service.compiled.jit import njit_no_refcount
+from service.compiled.jit import njit, njit_no_refcount
 from service.compiled.views import borrowed_view
 from service.identify.voting.fov_rotation import rotation_rad
 from service.vectors import unit
@@ -55,3 +54,35 @@ def test_what_borrows_cannot_make_an_array():
 
     with pytest.raises(NumbaError):
         makes(3)
+
+
+def test_only_what_python_calls_becomes_machine_code():
+    @njit_no_refcount
+    def doubled(x):
+        return 2.0 * x
+
+    @njit
+    def doubled_twice(x):
+        return doubled(doubled(x))
+
+    assert doubled_twice(3.0) == 12.0
+    assert len(doubled_twice.overloads) == 1
+    assert not doubled.overloads
+    assert doubled(3.0) == 6.0
+    assert len(doubled.overloads) == 1
+
+
+def test_an_error_in_what_a_kernel_calls_is_raised():
+    @njit
+    def checked(x):
+        if x < 0.0:
+            raise ValueError("negative")
+        return x
+
+    @njit
+    def outer(x):
+        return checked(x) + 1.0
+
+    assert outer(1.0) == 2.0
+    with pytest.raises(ValueError, match="negative"):
+        outer(-1.0)

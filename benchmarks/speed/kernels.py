@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 from scipy.spatial import cKDTree
 
 from benchmarks.bounds import Bound, at_least, at_most, equal
@@ -23,6 +22,7 @@ from benchmarks.report import Report
 from benchmarks.speed.bare import bare_many, bare_one, room_for
 from service.attitude.kernels import QUEST, solve
 from service.attitude.solve import WORST_AXIS_DEG
+from service.compiled.jit import njit
 from service.identify.attitude_from_matches import attitude_of, match
 from service.identify.sighting import SightedArrays, Sighting
 from service.identify.voting.pair_tests import cast_votes, count_votes, polar_angles

@@ -16,13 +16,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numba import njit
 from tqdm import tqdm
 
 from benchmarks.bounds import Bound, at_least, at_most, equal
 from benchmarks.report import Report
 from service.acquire import acquire
 from service.acquire.prewarm import prewarm_kernels
+from service.compiled.jit import njit
 from service.missions.mission import SHIPPED_FOLDER, load_missions
 from service.observations.batch import ObservationBatch
 from service.observations.schema import submission_from_json
@@ -54,7 +54,7 @@ PLACES = {
 }
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def nothing(direction, magnitude, separation, brighter, dimmer, votes):  # type: ignore[no-untyped-def]
     """The least that a compiled identification can cost: its call."""
     return len(votes)

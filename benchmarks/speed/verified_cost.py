@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 from tqdm import tqdm
 
 from benchmarks.bounds import Bound, at_least, at_most
@@ -23,6 +22,7 @@ from benchmarks.record import CORE, SIMULATOR
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
 from service.acquire import acquire
+from service.compiled.jit import njit
 from service.identify.budget import MAX_WORK
 from service.identify.hypotheses.marginals import marginals
 from service.identify.hypotheses.scene import ObservedStars, ledger_for, scratch_for

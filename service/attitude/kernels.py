@@ -9,7 +9,6 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from service.attitude.covariance import information, inverse_symmetric, within
 from service.attitude.quaternions import to_matrix, to_quaternion
@@ -21,7 +20,7 @@ from service.attitude.triad import (
     triad_covariance,
     widest_pair,
 )
-from service.compiled.jit import njit_no_refcount
+from service.compiled.jit import njit, njit_no_refcount
 from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector
 
 TRIAD, QUEST, START = 0, 1, 2
@@ -148,7 +147,7 @@ def _expected_square(b, weights, p, chosen, first, second):  # type: ignore[no-u
     return max(total, 0.0)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def fit_attitude(b, r, sigma_rad, worst_rad, chosen, workspace):  # type: ignore[no-untyped-def]
     """All that `solve` gives, in one call and in the units that are shown; whether there is any.
 

@@ -157,6 +157,16 @@ def add_period(parser: argparse.ArgumentParser, run_help: str) -> None:
     parser.add_argument("--to", dest="end", help=argparse.SUPPRESS)
 
 
+def add_grade(parser: argparse.ArgumentParser) -> None:
+    """Add `--grade` of attitudes."""
+    parser.add_argument(
+        "--grade",
+        choices=("raw", "filtered", "smoothed"),
+        default="raw",
+        help="raw: of batches (default); the others are recorded by `acquire smooth`",
+    )
+
+
 def count(text: str) -> int:
     """Parse a whole number of at least one."""
     try:

@@ -9,7 +9,14 @@ that work for a microsecond that was the largest single cost.
 from collections.abc import Callable
 from typing import Any
 
-from numba import njit
+from service.compiled.inner import Kernel
+
+
+def njit(*function: Callable[..., Any], **options: Any) -> Any:
+    """Compile a kernel, with the options of `numba.njit`; the cache on disk keeps it."""
+    if function:
+        return Kernel(*function, **options)
+    return lambda given: Kernel(given, **options)
 
 
 def njit_no_refcount(kernel: Callable[..., Any]) -> Any:
@@ -41,5 +48,4 @@ def njit_allocating(kernel: Callable[..., Any]) -> Any:
 
 
 def _compiled(kernel: Callable[..., Any], **options: Any) -> Any:
-    compile_it: Any = njit  # its stubs do not have `_nrt`, numba's own word for it
-    return compile_it(kernel, cache=True, nogil=True, **options)
+    return Kernel(kernel, nogil=True, **options)

@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from service.attitude.kernels import FitWorkspace, fit_attitude
 from service.attitude.solution import AttitudeSolution, NoAttitude
@@ -14,7 +13,7 @@ from service.attitude.solve import (
     solution_of,
     tracker_fits,
 )
-from service.compiled.jit import njit_no_refcount
+from service.compiled.jit import njit, njit_no_refcount
 from service.identify.identification import Integers
 from service.vectors import Vector
 
@@ -54,7 +53,7 @@ def attitude_of(
     return solution_of(workspace, matched, method, fits)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _match_and_fit(  # type: ignore[no-untyped-def]
     direction_body,
     sigma_rad,
@@ -91,7 +90,7 @@ def _match_and_fit(  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def matched_vectors(  # type: ignore[no-untyped-def]
     direction_body, sigma_rad, star, catalog_direction, velocity, sun_distance_au
 ):

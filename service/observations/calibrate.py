@@ -10,8 +10,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
-from numba import njit
 
+from service.compiled.jit import njit
 from service.missions.mission import Mission, Tracker
 from service.observations.batch import ObservationBatch, TrackerStars
 from service.observations.focal_plane import tracker_vectors
@@ -83,7 +83,7 @@ def _corrected(
     )
 
 
-@njit(cache=True)
+@njit
 def _to_body(  # type: ignore[no-untyped-def]
     direction,  # (n, 3) in tracker axes
     body_from_tracker,

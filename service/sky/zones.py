@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
-from numba import njit
 
+from service.compiled.jit import njit
 from service.sky.cache import LruCache
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.geometry.pairs import PairIndex, build_pairs, separation_rad
@@ -211,7 +211,7 @@ def build_zone(
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _polar_angles(direction, axis, brighter, dimmer, polar, difference):  # type: ignore[no-untyped-def]
     for row in range(len(direction)):
         polar[row] = separation_rad(direction[row], axis)
@@ -233,7 +233,7 @@ def counts_within(zone: Zone, region: SearchRegion) -> tuple[int, int]:
     return stars, pairs
 
 
-@njit(cache=True)
+@njit
 def _counts_within(direction, axis, least, most, pair_rows):  # type: ignore[no-untyped-def]
     inside = np.empty(len(direction), np.uint8)
     inner, outer = math.cos(least) if least > 0.0 else 2.0, math.cos(most)

@@ -180,3 +180,17 @@ def test_the_command_exports_a_grade(smoothed, database, capsysbinary):
     answer = json.loads(capsysbinary.readouterr().out)
     assert answer["about"]["grade"] == "smoothed"
     assert len(answer["items"]) == 1801
+
+
+def test_the_command_gives_a_moment_in_a_grade(smoothed, database, capsys):
+    moment = shifted(NOON, 900.5)
+    raw, expected = (
+        smoothed.products.attitude_at("XTE", moment, "interpolated", grade=grade)
+        for grade in ("raw", "smoothed")
+    )
+    smoothed.close()
+    asked = ["export", "attitude-at", moment.text, "--spacecraft", "XTE", "--grade", "smoothed"]
+    assert main([*asked, "--database", database]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["quaternion"] == expected.quaternion != raw.quaternion
+    assert found["covariance_arcsec2"] == expected.covariance_arcsec2

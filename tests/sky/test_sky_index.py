@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from numba import njit
 
+from service.compiled.jit import njit
 from service.missions.mission import RunCatalogSettings
 from service.sky.cache import LruCache
 from service.sky.catalog.run_catalog import build_run_catalog

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 from msgspec import structs
-from numba import njit
 
+from service.compiled.jit import njit
 from service.identify.hypotheses import evidence
 from service.identify.hypotheses.fitting import weigh
 from service.identify.hypotheses.ledger import LEAST_GROUP
@@ -168,7 +168,7 @@ def log_weight_of_group(sighting: Sighting, star: Integers, run_catalog: RunCata
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _log_weight_of(sighted, star_direction, star_magnitude, star, density):  # type: ignore[no-untyped-def]
     """The log weight of stars, -1 in `star` (n,) for none, of these directions and magnitudes.
 

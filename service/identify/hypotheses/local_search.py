@@ -2,9 +2,7 @@
 
 import math
 
-from numba import njit
-
-from service.compiled.jit import njit_no_refcount
+from service.compiled.jit import njit, njit_no_refcount
 from service.identify.hypotheses import evidence
 from service.identify.hypotheses.fitting import (
     fit_match,
@@ -109,7 +107,7 @@ def _neighbours_are_rare(observed, stars):  # type: ignore[no-untyped-def]
     return stars.log_density + math.log(2.0 * math.pi * widest * widest) <= RARE
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def _sits_well(observed, stars, match, k, scratch):  # type: ignore[no-untyped-def]
     """Whether a star fits so well, in place and magnitude, that it can hardly be clutter."""
     # False where there is no magnitude, as with any comparison with NaN.
@@ -123,7 +121,7 @@ def _sits_well(observed, stars, match, k, scratch):  # type: ignore[no-untyped-d
     return square < (NEAR_SIGMAS * observed.sigma_rad[k]) ** 2
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def _match_at(observed, stars, t, first, second):  # type: ignore[no-untyped-def]
     """Match every observed star at an attitude: its nearest zone star, and the second-nearest."""
     direction, velocity = observed.direction, observed.velocity

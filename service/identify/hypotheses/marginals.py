@@ -4,8 +4,8 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from service.compiled.jit import njit
 from service.identify.hypotheses.ledger import FEW
 
 RIVAL_PROBABILITY = 1e-3
@@ -30,7 +30,7 @@ class StarPosterior(NamedTuple):
     hypothesis: Any
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def marginals(ledger, count, unexplored_weight, posterior):  # type: ignore[no-untyped-def]
     """Sum up the first `count` hypotheses of a ledger; into all of `posterior` but `hypothesis`."""
     rivals, rival_probability = posterior.rivals, posterior.rival_probability

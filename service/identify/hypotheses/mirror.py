@@ -8,9 +8,7 @@ once more the whole field fits, which tells the two apart.
 
 import math
 
-from numba import njit
-
-from service.compiled.jit import njit_no_refcount
+from service.compiled.jit import njit, njit_no_refcount
 from service.identify.hypotheses import evidence
 from service.identify.hypotheses.fitting import prior_angle, weigh
 from service.identify.hypotheses.scene import (
@@ -66,7 +64,7 @@ def reflect(observed, boresight, image):  # type: ignore[no-untyped-def]
             image[k, i] = v[i] - 2.0 * across / norm2 * normal
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def in_a_mirror(observed, image):  # type: ignore[no-untyped-def]
     """The same stars with the directions of their mirror image."""
     return ObservedStars(
@@ -81,7 +79,7 @@ def in_a_mirror(observed, image):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def weigh_in_a_mirror(image, boresight, stars, pairs, max_work):  # type: ignore[no-untyped-def]
     """The log weight of the mirror image's heaviest hypothesis; with the work.
 
@@ -89,7 +87,7 @@ def weigh_in_a_mirror(image, boresight, stars, pairs, max_work):  # type: ignore
     """
     n = len(image.direction)
     scratch, ledger = scratch_for(n), ledger_for(n)
-    progress, _ = search(image, stars, pairs, False, max_work, scratch, ledger)
+    progress, _ = search(image, stars, pairs, n < 0, max_work, scratch, ledger)
     match = scratch.match
     matched = 0
     for k in range(n):

@@ -9,9 +9,8 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
-from service.compiled.jit import njit_no_refcount
+from service.compiled.jit import njit, njit_no_refcount
 from service.sky.geometry.pairs import separation_rad
 
 MAX_HYPOTHESES = 2048
@@ -148,7 +147,7 @@ class Progress(NamedTuple):
     max_work: Any
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def scratch_for(n):  # type: ignore[no-untyped-def]
     """The work arrays for n stars."""
     rows = np.full((4, n), -1, np.int32)
@@ -183,7 +182,7 @@ def scratch_for(n):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def ledger_for(n):  # type: ignore[no-untyped-def]
     """An empty ledger of matches of n stars."""
     extremes = np.full((2, 1), -math.inf)
@@ -197,7 +196,7 @@ def ledger_for(n):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def scene_in(sighted, zone, bounds):  # type: ignore[no-untyped-def]
     """The `ObservedStars`, `ZoneStars` and `ZonePairs` of a sighting's arrays, zone and bounds."""
     sigma_rad = sighted.sigma_rad
@@ -259,7 +258,7 @@ def within_bounds(row, stars):  # type: ignore[no-untyped-def]
     return stars.least <= stars.polar[row] <= stars.most
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def log_density(direction, axis, least, most):  # type: ignore[no-untyped-def]
     """Logarithm of the stars per steradian between two angles from an axis."""
     inside = 0

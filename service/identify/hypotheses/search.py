@@ -16,13 +16,12 @@ import math
 
 import numpy as np
 
-from service.compiled.jit import njit_allocating, njit_no_refcount
+from service.compiled.jit import njit_no_refcount
 from service.identify.hypotheses import evidence
 from service.identify.hypotheses.ledger import at_bound, clear, leaves_a_group, left_unexplored
 from service.identify.hypotheses.pair_hypotheses import ObservedPair, weigh_pairs
 from service.identify.hypotheses.scan_pair import scan_pair, weight_bound
 from service.identify.hypotheses.scene import (
-    MAX_SEEDS,
     PREDICTION_GATE,
     Progress,
     with_magnitude,
@@ -131,15 +130,39 @@ def _most_unseen(observed, stars, groups, scratch):  # type: ignore[no-untyped-d
     return bound - math.log(sine) + math.log(max(candidates, 1))
 
 
-@njit_allocating
+@njit_no_refcount
 def _choose_seeds(magnitude, seeds):  # type: ignore[no-untyped-def]
-    """The stars whose pairs are scanned: all, or the brightest; those without a magnitude last."""
-    if len(magnitude) <= MAX_SEEDS:
-        for x in range(len(seeds)):
-            seeds[x] = x
-        return
-    ranked = np.argsort(np.where(np.isnan(magnitude), 99.0, magnitude), kind="mergesort")
-    seeds[:] = np.sort(ranked[:MAX_SEEDS])
+    """The stars whose pairs are scanned: all, or the brightest; those without a magnitude last.
+
+    By insertion: to compile numba's sorts took longer than the rest of this module.
+    """
+    chosen = 0
+    for k in range(len(magnitude)):
+        at = chosen
+        while at > 0 and _is_brighter(magnitude[k], magnitude[seeds[at - 1]]):
+            at -= 1
+        if at < len(seeds):
+            _insert(seeds, min(chosen, len(seeds) - 1), at, k)
+            chosen = min(chosen + 1, len(seeds))
+    for x in range(1, len(seeds)):
+        at = x
+        while at > 0 and seeds[x] < seeds[at - 1]:
+            at -= 1
+        _insert(seeds, x, at, seeds[x])
+
+
+@njit_no_refcount
+def _is_brighter(one, other):  # type: ignore[no-untyped-def]
+    """Whether one magnitude comes before another; NaN comes last."""
+    return one < other or (math.isnan(other) and not math.isnan(one))
+
+
+@njit_no_refcount
+def _insert(seeds, last, at, k):  # type: ignore[no-untyped-def]
+    """Put a star at a place; those from there to before `last` move on by one."""
+    for x in range(last, at, -1):
+        seeds[x] = seeds[x - 1]
+    seeds[at] = k
 
 
 @njit_no_refcount

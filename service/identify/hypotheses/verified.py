@@ -8,8 +8,9 @@ posterior (`search`, `evidence`); a star is unique from a probability of
 import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
-from numba import njit
 
+from service.compiled.copying import copy_rows
+from service.compiled.jit import njit
 from service.identify.hypotheses.evidence import log_sum
 from service.identify.hypotheses.marginals import StarPosterior, marginals
 from service.identify.hypotheses.mirror import (
@@ -124,7 +125,7 @@ def scene_of(sighting: Sighting) -> tuple[ObservedStars, ZoneStars, ZonePairs]:
     return scene  # type: ignore[no-any-return]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _weigh(sighted, zone, bounds, exhaustive, max_work, posterior):  # type: ignore[no-untyped-def]
     """Search and marginals of a scene; whether it was bounded, whether mirrored, and the work."""
     n = len(sighted.direction)
@@ -135,7 +136,7 @@ def _weigh(sighted, zone, bounds, exhaustive, max_work, posterior):  # type: ign
     observed, stars, pairs = scene_in(sighted, zone, bounds)
     scratch, ledger = scratch_for(n), ledger_for(n)
     progress, bounded = search(observed, stars, pairs, exhaustive, max_work, scratch, ledger)
-    posterior.hypothesis[:] = ledger.heaviest_match
+    copy_rows(ledger.heaviest_match, posterior.hypothesis)
     unexplored_weight = progress.unexplored_weight
     mirrored, work = False, progress.work
     if may_be_mirrored(observed, ledger):

@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from service.attitude.covariance import within
+from service.compiled.jit import njit
 from service.identify.lost_in_space import posterior
 from service.identify.lost_in_space.matching import LARGEST_GATE_RAD, nearest_stars
 from service.identify.lost_in_space.search import SAME_ATTITUDE_RAD
@@ -19,7 +19,7 @@ LEAST = 1e-300
 FOUND, TOO_FEW, NOTHING, DOUBTFUL, DEGENERATE = 0, 1, 2, 3, 4
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def decide(ledger, count):  # type: ignore[no-untyped-def]
     """The heaviest match, the log odds of its attitude against all else, and the decision."""
     weights, attitudes, covariances = ledger.weight, ledger.attitude, ledger.covariance
@@ -51,7 +51,7 @@ def decide(ledger, count):  # type: ignore[no-untyped-def]
     return best, log_odds, FOUND
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def star_probabilities(  # type: ignore[no-untyped-def]
     points, index, field, magnitude_gate, t, covariance, match, doubt
 ):

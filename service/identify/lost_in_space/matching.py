@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from service.attitude.covariance import inverse_symmetric
+from service.compiled.jit import njit
 from service.identify.hypotheses.evidence import log_sum
 from service.identify.hypotheses.fitting import turn
 from service.identify.lost_in_space import posterior
@@ -22,7 +22,7 @@ EDGE = 0.985
 """A star is expected in the field only within this share of its half widths."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def nearest_stars(  # type: ignore[no-untyped-def]
     cell_place, faces, cell_start, cell_rows, x, y, z, gate, brightest, faintest
 ):
@@ -73,13 +73,13 @@ def nearest_stars(  # type: ignore[no-untyped-def]
     return nearest, other, best
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def faintest_star(limit_mag, magnitude, gate):  # type: ignore[no-untyped-def]
     """How faint a point's star may be; of unknown magnitude none beyond the limit of pairs."""
     return limit_mag if np.isnan(magnitude) else magnitude + gate
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@njit(nogil=True, error_model="numpy", forceinline=True)
 def gauss_newton_step(points, stars, candidate):  # type: ignore[no-untyped-def]
     """One Gauss-Newton step of T towards the matched stars.
 
@@ -138,7 +138,7 @@ def gauss_newton_step(points, stars, candidate):  # type: ignore[no-untyped-def]
     return max(chi2, 0.0), math.log(det)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@njit(nogil=True, error_model="numpy", forceinline=True)
 def match_at(points, index, magnitude_gate, candidate):  # type: ignore[no-untyped-def]
     """Match every point at an attitude known to a covariance; how many, and whether any changed."""
     faces, cell_place = index.face, index.cell_place
@@ -184,7 +184,7 @@ def match_at(points, index, magnitude_gate, candidate):  # type: ignore[no-untyp
     return matched, changed
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def refine(points, index, field, magnitude_gate, candidate):  # type: ignore[no-untyped-def]
     """Fit to the present match, then match and fit until nothing changes.
 
@@ -213,7 +213,7 @@ def refine(points, index, field, magnitude_gate, candidate):  # type: ignore[no-
     return matched, evidence(points, index, field, candidate, matched, chi2, log_det)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@njit(nogil=True, error_model="numpy", forceinline=True)
 def points_alone(points, stars, field, match, matched, chi2, log_det):  # type: ignore[no-untyped-def]
     """The evidence without what stars are missing, which can only be less.
 
@@ -252,7 +252,7 @@ def points_alone(points, stars, field, match, matched, chi2, log_det):  # type: 
     return weight, compared, faintest
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@njit(nogil=True, error_model="numpy", forceinline=True)
 def stars_inside(place, patch_rows, at, end, reach, t, field, inside):  # type: ignore[no-untyped-def]
     """The next stars of a patch within the field, as many as fit, and where to go on.
 
@@ -281,7 +281,7 @@ def stars_inside(place, patch_rows, at, end, reach, t, field, inside):  # type: 
     return count, at
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@njit(nogil=True, error_model="numpy", forceinline=True)
 def evidence(points, index, field, candidate, matched, chi2, log_det):  # type: ignore[no-untyped-def]
     """The log weight of a fitted match against all points being clutter; see `posterior`.
 

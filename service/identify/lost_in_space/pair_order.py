@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
 
+from service.compiled.jit import njit
 from service.identify.lost_in_space import posterior
 from service.identify.lost_in_space.predictors import GATE, SLACK_RAD
 from service.sky.whole_sky.index import BRIGHTEST_MAG, BUCKET_RAD, STEP_MAG
@@ -36,13 +36,13 @@ MAGNITUDE_GATE = 3.3
 OFFSET_ALLOWED_MAG = 0.15
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def magnitude_gate(sigma_mag):  # type: ignore[no-untyped-def]
     """How far a point's magnitude may be from its star's."""
     return MAGNITUDE_GATE * math.hypot(sigma_mag, OFFSET_ALLOWED_MAG)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def rows_of_magnitude(brighter, magnitude, gate):  # type: ignore[no-untyped-def]
     """First row and the one past the last of the stars that a point of this magnitude may be.
 
@@ -57,7 +57,7 @@ def rows_of_magnitude(brighter, magnitude, gate):  # type: ignore[no-untyped-def
     return first, NO_ROW if high > last else brighter[max(high, 0)]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def describe_points(points, index, sigma_mag, gate, pairs):  # type: ignore[no-untyped-def]
     """What every point brings to a pair, into `pairs`: its classes, and the chance to be beyond.
 
@@ -79,14 +79,14 @@ def describe_points(points, index, sigma_mag, gate, pairs):  # type: ignore[no-u
             pairs.beyond[k] = min(chance, MOST_BEYOND)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def chord(a, b):  # type: ignore[no-untyped-def]
     """The straight distance between two unit vectors."""
     dx, dy, dz = a[0] - b[0], a[1] - b[1], a[2] - b[2]
     return math.sqrt(dx * dx + dy * dy + dz * dz)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def buckets_of(points, index, i, j, gate):  # type: ignore[no-untyped-def]
     """First and last bucket of separation that a pair's star pair may be in, by so many sigmas."""
     apart = 2.0 * math.asin(min(1.0, 0.5 * chord(points.observed[i], points.observed[j])))
@@ -99,7 +99,7 @@ def buckets_of(points, index, i, j, gate):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def classes_of(magnitude, class_edge, gate):  # type: ignore[no-untyped-def]
     """First and last class of pairs with this magnitude the fainter; all where it is unknown."""
     classes = len(class_edge)
@@ -114,7 +114,7 @@ def classes_of(magnitude, class_edge, gate):  # type: ignore[no-untyped-def]
     return first, last
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def pair_costs(points, index, first_fresh, count, pairs):  # type: ignore[no-untyped-def]
     """What each pair of the first `count` points costs to try; infinite: not at all.
 
@@ -146,7 +146,7 @@ def pair_costs(points, index, first_fresh, count, pairs):  # type: ignore[no-unt
             cost[i, j] = (PRIOR_COST + candidates * (1.0 + passing)) / sure
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def cheapest_pair(pairs, count, groups):  # type: ignore[no-untyped-def]
     """The pair to try next, points tried in vain set back; (-1, -1) where none is left.
 

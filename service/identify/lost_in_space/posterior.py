@@ -16,8 +16,8 @@ missing and any number of points spurious.
 import math
 
 import numpy as np
-from numba import njit
 
+from service.compiled.jit import njit
 from service.identify.hypotheses.evidence import log_sum
 
 DOUBT = 1e-4
@@ -59,7 +59,7 @@ _LOG_2PI = math.log(2.0 * math.pi)
 _LOG_ROTATIONS = math.log(8.0 * math.pi**2)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def log_positions(matched, log_area_per_spot, chi2, log_det):  # type: ignore[no-untyped-def]
     """Positions and the volume of the attitude; `log_area_per_spot`: sum of ln(A/2 pi sigma^2)."""
     most = -math.inf
@@ -74,7 +74,7 @@ def log_positions(matched, log_area_per_spot, chi2, log_det):  # type: ignore[no
     return log_area_per_spot + total + 1.5 * _LOG_2PI - 0.5 * log_det - _LOG_ROTATIONS
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def fewest_stars(points, area, sigma_mag):  # type: ignore[no-untyped-def]
     """How many of the points must be matched to be evidence enough; more than all where none can.
 
@@ -123,7 +123,7 @@ def fewest_stars(points, area, sigma_mag):  # type: ignore[no-untyped-def]
     return ALWAYS_ENOUGH if n >= ALWAYS_ENOUGH else n + 1
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def log_labels(points, matched):  # type: ignore[no-untyped-def]
     """Which of the points are stars, and that the others are clutter."""
     clutter = points - matched
@@ -137,21 +137,21 @@ def log_labels(points, matched):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def log_any_share(matched, expected):  # type: ignore[no-untyped-def]
     """That just these of the stars are seen, where any share is as likely as any other."""
     expected = min(expected, len(LOG_FACTORIAL) - 2)
     return LOG_FACTORIAL[matched] + LOG_FACTORIAL[expected - matched] - LOG_FACTORIAL[expected + 1]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def log_missing(brighter_by_sigma):  # type: ignore[no-untyped-def]
     """That a star brighter than the limit by so many sigmas is not seen in a complete field."""
     at = int((brighter_by_sigma + MISSING_REACH) * MISSING_STEPS + 0.5)
     return LOG_MISSING[min(max(at, 0), len(LOG_MISSING) - 1)]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def log_magnitudes(compared, total, square, sigma_mag):  # type: ignore[no-untyped-def]
     """The density of observed minus catalog magnitudes: their number, sum and sum of squares."""
     if compared == 0:
@@ -166,7 +166,7 @@ def log_magnitudes(compared, total, square, sigma_mag):  # type: ignore[no-untyp
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def log_any_magnitude(magnitude, faintest):  # type: ignore[no-untyped-def]
     """The density of the magnitude of any star or point that is no fainter than a bound."""
     return math.log(COUNT_SLOPE) + COUNT_SLOPE * min(magnitude - faintest, 0.0)

@@ -7,7 +7,7 @@ in the sky.  Handedness is in gamma: a mirrored sky is never predicted.
 
 import math
 
-from numba import njit
+from service.compiled.jit import njit
 
 GATE = 3.6
 """In sigmas: how far a star may lie from its prediction, and a pair from its separation."""
@@ -21,7 +21,7 @@ BEYOND, DEEP_COST = 0.02, 1.5
 """A point likelier than this to be a star beyond the limit tells less: such stars are many."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def predict(points, beyond, i, j, largest, prefilter):  # type: ignore[no-untyped-def]
     """Coefficients and gates of all points, and their order, the most telling first.
 

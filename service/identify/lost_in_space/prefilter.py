@@ -6,15 +6,15 @@ once; for those that are left the places of all further points at once.
 """
 
 import numpy as np
-from numba import njit
 
+from service.compiled.jit import njit
 from service.identify.lost_in_space.predictors import BEYOND
 from service.identify.lost_in_space.workspace import CHUNK
 from service.sky.whole_sky.bitmap import cells_of_candidates, cells_of_points
 from service.sky.whole_sky.index import BITMAP_RADII_RAD
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def ranked(prefilter, beyond, prefiltered):  # type: ignore[no-untyped-def]
     """By rank the coefficients in single precision, and the bitmap to ask.
 
@@ -33,7 +33,7 @@ def ranked(prefilter, beyond, prefiltered):  # type: ignore[no-untyped-def]
             prefilter.single[c, s] = prefilter.coefficients[k, c]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def candidates_of(pairs, place, at, end, rows_i, rows_j, chunk):  # type: ignore[no-untyped-def]
     """The next candidates of a run of pairs: how many, and the pair to go on with.
 
@@ -62,7 +62,7 @@ def candidates_of(pairs, place, at, end, rows_i, rows_j, chunk):  # type: ignore
     return count, at
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def possible_of(bits, count, asked, prefilter, chunk):  # type: ignore[no-untyped-def]
     """How many of a chunk have a star near the place of one of the points asked first.
 
@@ -88,7 +88,7 @@ def possible_of(bits, count, asked, prefilter, chunk):  # type: ignore[no-untype
     return left
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def stars_near(bits, prefilter, plan, places, q):  # type: ignore[no-untyped-def]
     """Which points may have a star in their place in candidate q of a chunk: a bit a rank.
 

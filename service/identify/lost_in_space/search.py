@@ -9,9 +9,10 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from service.attitude.triad import triad
+from service.compiled.copying import copy_rows
+from service.compiled.jit import njit
 from service.identify.lost_in_space import posterior
 from service.identify.lost_in_space.matching import faintest_star, nearest_stars, refine
 from service.identify.lost_in_space.pair_order import (
@@ -91,7 +92,7 @@ class Plan(NamedTuple):
     gate_mag: Any
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def search(points, index, field, max_work, workspace):  # type: ignore[no-untyped-def]
     """Fill the ledger with weighed matches.
 
@@ -156,13 +157,13 @@ def search(points, index, field, max_work, workspace):  # type: ignore[no-untype
     return counters[COUNT], counters[WORK], state == AT_BOUND
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def strong_of(further, prefiltered):  # type: ignore[no-untyped-def]
     """How many further points make a candidate worth refining before others."""
     return min(further + 2, (3 * prefiltered + 3) // 4)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def plan_of(n, i, j, prefiltered, tries, may_be_narrow, further, gate_mag, prefilter):  # type: ignore[no-untyped-def]
     """How a pair's candidates are tried; which ranks are asked first goes to `prefilter.turn`."""
     prefiltered = min(prefiltered, MAX_PREFILTERED)
@@ -186,7 +187,7 @@ def plan_of(n, i, j, prefiltered, tries, may_be_narrow, further, gate_mag, prefi
     return Plan(i, j, prefiltered, firsts, needed, further, strong, gate, gate_mag)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@njit(nogil=True, error_model="numpy", forceinline=True)
 def try_pair(points, index, field, gate_mag, plan, workspace):  # type: ignore[no-untyped-def]
     """Try every star pair that a pair of points may be; whether the search goes on."""
     i, j = plan.i, plan.j
@@ -230,7 +231,7 @@ def try_pair(points, index, field, gate_mag, plan, workspace):  # type: ignore[n
     return GOING_ON
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def bit_count(bits):  # type: ignore[no-untyped-def]
     """How many bits are set."""
     count = 0
@@ -240,7 +241,7 @@ def bit_count(bits):  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@njit(nogil=True, error_model="numpy", forceinline=True)
 def hits_of(points, index, gate_mag, plan, a, b, near, workspace):  # type: ignore[no-untyped-def]
     """How many further points have a star in their place where i and j are a and b.
 
@@ -283,7 +284,7 @@ def hits_of(points, index, gate_mag, plan, a, b, near, workspace):  # type: igno
     return hits
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def defer(workspace, i, j, a, b, near):  # type: ignore[no-untyped-def]
     """Put off the candidate in which points i and j are stars a and b, with what is near."""
     deferred, counters = deferred_in(workspace), counters_in(workspace)
@@ -293,7 +294,7 @@ def defer(workspace, i, j, a, b, near):  # type: ignore[no-untyped-def]
     counters[DEFERRED] += 1
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@njit(nogil=True, forceinline=True)
 def try_deferred(points, index, field, gate_mag, further, workspace):  # type: ignore[no-untyped-def]
     """Try the candidates that were put off, in their order; whether the search goes on."""
     prefilter, counters, deferred = (
@@ -325,7 +326,7 @@ def try_deferred(points, index, field, gate_mag, further, workspace):  # type: i
     return GOING_ON
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def weigh(points, index, field, gate_mag, i, j, workspace):  # type: ignore[no-untyped-def]
     """Refine the candidate and enter it in the ledger; whether it is beyond doubt."""
     candidate, ledger, counters = (
@@ -350,7 +351,7 @@ def weigh(points, index, field, gate_mag, i, j, workspace):  # type: ignore[no-u
     return weight > ACCEPT_LOG + ACCEPT_LOG_PER_CLUTTER * (len(match) - matched)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def enter(candidate, weight, ledger, count):  # type: ignore[no-untyped-def]
     """Enter a match in the ledger, for the lightest where it is full; how many there are."""
     match, weights = candidate.match, ledger.weight
@@ -367,8 +368,8 @@ def enter(candidate, weight, ledger, count):  # type: ignore[no-untyped-def]
         at = np.argmin(weights)
         if weights[at] >= weight:
             return count
-    ledger.match[at] = match
+    copy_rows(match, ledger.match[at])
     weights[at] = weight
-    ledger.attitude[at] = candidate.t
-    ledger.covariance[at] = candidate.covariance
+    copy_rows(candidate.t, ledger.attitude[at])
+    copy_rows(candidate.covariance, ledger.covariance[at])
     return max(count, at + 1)

@@ -10,9 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from service.attitude.solution import NoAttitude
+from service.compiled.copying import copy_rows
+from service.compiled.jit import njit
 from service.compiled.views import borrowed_view
 from service.identify.lost_in_space import decision, posterior
 from service.identify.lost_in_space.matching import match_at, refine
@@ -29,7 +30,7 @@ from service.identify.lost_in_space.workspace import (
     words_for,
 )
 from service.sky.whole_sky.index import SkyIndex, index_in
-from service.vectors import Matrix, Vector
+from service.vectors import Matrix, Vector, locked
 
 Rows = npt.NDArray[np.int64]
 _AT_REST = np.zeros(3)
@@ -152,7 +153,8 @@ class LostInSpace:
         """
         block = _BLOCKS.pop() if _BLOCKS else np.empty(words_for(USUAL_POINTS))
         code, *rest = _solve(
-            *(direction, magnitude_mag, sigma_rad, velocity_c),
+            # Always read-only, or it would be compiled twice.
+            *(direction, locked(magnitude_mag), sigma_rad, velocity_c),
             *(self.index.store, self._field, max_work, block),
         )
         _BLOCKS.append(block)
@@ -195,7 +197,7 @@ class LostInSpace:
         )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _sort_points(direction, magnitude, sigma, velocity, workspace):  # type: ignore[no-untyped-def]
     """The points brightest first, those of unknown magnitude last, each in the order given.
 
@@ -221,7 +223,7 @@ def _sort_points(direction, magnitude, sigma, velocity, workspace):  # type: ign
         points.velocity[i] = velocity[i]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _decided(n, count, work, bounded, workspace, matrices, star):  # type: ignore[no-untyped-def]
     """The decision, rows back in the order given: see `LostInSpaceResult`."""
     ledger, order = ledger_in(workspace), order_in(workspace)
@@ -243,12 +245,12 @@ def _decided(n, count, work, bounded, workspace, matrices, star):  # type: ignor
     return code, log_odds, matched, work, bounded
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _field_in(values):  # type: ignore[no-untyped-def]
     return FieldBounds(values[0], values[1], values[2], values[3], values[4], values[5])
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _solve(direction, magnitude, sigma, velocity, store, field, max_work, block):  # type: ignore[no-untyped-def]
     n = len(direction)
     matrices, star = np.zeros((2, 3, 3)), np.full(n, -1, np.int64)
@@ -262,7 +264,7 @@ def _solve(direction, magnitude, sigma, velocity, store, field, max_work, block)
     return code, matrices, star, log_odds, matched, work, bounded
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _searched(n, store, field, max_work, block, matrices, star):  # type: ignore[no-untyped-def]
     matrices, star = borrowed_view(matrices), borrowed_view(star)
     index, field = index_in(store), _field_in(field)
@@ -283,7 +285,7 @@ def _searched(n, store, field, max_work, block, matrices, star):  # type: ignore
     return code, log_odds, matched, work + more, bounded
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _solve_near(  # type: ignore[no-untyped-def]
     direction, magnitude, sigma, velocity, store, field, block, attitude, covariance
 ):
@@ -295,14 +297,15 @@ def _solve_near(  # type: ignore[no-untyped-def]
     return code, matrices, star, log_odds, matched, work, bounded
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _weighed(n, store, field, block, matrices, star):  # type: ignore[no-untyped-def]
     """What the attitude and covariance in `matrices` come to."""
     index, field = index_in(store), _field_in(field)
     workspace = Workspace(block, n)
     candidate, points = candidate_in(workspace), points_in(workspace)
     candidate.match[:] = -1
-    candidate.t[:], candidate.covariance[:] = matrices[0], matrices[1]
+    copy_rows(matrices[0], candidate.t)
+    copy_rows(matrices[1], candidate.covariance)
     matrices[:] = 0.0
     gate = magnitude_gate(field.magnitude_sigma)
     matched, _ = match_at(points, index, gate, candidate)

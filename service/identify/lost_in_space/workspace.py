@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from service.compiled.jit import njit
 from service.compiled.views import view_into
 from service.identify.lost_in_space.observations import Points
 
@@ -175,20 +175,20 @@ class Workspace(NamedTuple):
     n: Any
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def words_for(n):  # type: ignore[no-untyped-def]
     """How many words of 64 bits a search for n points needs."""
     return (SHARED_BYTES + n * POINT_BYTES) // 8
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _by_point(workspace, offset, shape, dtype):  # type: ignore[no-untyped-def]
     """A field of every point."""
     block, n = workspace
     return view_into(block, SHARED_BYTES + n * offset, shape, dtype)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def points_in(workspace):  # type: ignore[no-untyped-def]
     """The points, brightest first."""
     n = workspace.n
@@ -200,13 +200,13 @@ def points_in(workspace):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def order_in(workspace):  # type: ignore[no-untyped-def]
     """The rows (n,) of the points as they were given."""
     return _by_point(workspace, POINT_AT.order, (workspace.n,), np.int64)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def candidate_in(workspace):  # type: ignore[no-untyped-def]
     """See `Candidate`."""
     block, n = workspace
@@ -220,7 +220,7 @@ def candidate_in(workspace):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def point_pairs_in(workspace):  # type: ignore[no-untyped-def]
     """See `PointPairs`."""
     block, n = workspace
@@ -235,7 +235,7 @@ def point_pairs_in(workspace):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def prefilter_in(workspace):  # type: ignore[no-untyped-def]
     """See `Prefilter`."""
     block, n = workspace
@@ -251,7 +251,7 @@ def prefilter_in(workspace):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def chunk_in(workspace):  # type: ignore[no-untyped-def]
     """See `Chunk`."""
     block = workspace.block
@@ -263,7 +263,7 @@ def chunk_in(workspace):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def ledger_in(workspace):  # type: ignore[no-untyped-def]
     """See `Ledger`."""
     block, n = workspace
@@ -275,13 +275,13 @@ def ledger_in(workspace):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def counters_in(workspace):  # type: ignore[no-untyped-def]
     """What the search counts (5,)."""
     return view_into(workspace.block, AT.counters, (5,), np.int64)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def deferred_in(workspace):  # type: ignore[no-untyped-def]
     """Deferred candidates (MAX_DEFERRED, 4).
 

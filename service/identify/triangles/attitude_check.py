@@ -10,8 +10,9 @@ catalog star.  So many are asked for that chance does not bring them together.
 import math
 
 import numpy as np
-from numba import njit
 
+from service.compiled.copying import copy_rows
+from service.compiled.jit import njit
 from service.identify.hypotheses.fitting import fit_match
 from service.identify.hypotheses.local_search import LARGEST_GATE_RAD
 from service.identify.hypotheses.scene import scratch_for
@@ -38,7 +39,7 @@ MAX_PROPOSALS, MAX_SEEDS = 1000, 256
 FIT_STEPS = 2
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def log_chance(observed, density, stars, separation, sigma_rad):  # type: ignore[no-untyped-def]
     """The logarithm of how many attitudes put so many random points on catalog stars.
 
@@ -71,7 +72,7 @@ def log_chance(observed, density, stars, separation, sigma_rad):  # type: ignore
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def check_attitude(  # type: ignore[no-untyped-def]
     observed, stars, density, pair_image, pair_star, match, rival, t
 ):
@@ -110,9 +111,9 @@ def check_attitude(  # type: ignore[no-untyped-def]
         if chance < least:
             runner_up = least if differs else runner_up
             least = chance
-            match[:] = trial
-            rival[:] = second
-            t[:] = scratch.t
+            copy_rows(trial, match)
+            copy_rows(second, rival)
+            copy_rows(scratch.t, t)
         elif differs:
             runner_up = min(runner_up, chance)
         if least < math.log(CERTAIN_CHANCE):
@@ -120,7 +121,7 @@ def check_attitude(  # type: ignore[no-untyped-def]
     return least < math.inf and runner_up - least > math.log(LEAST_ODDS)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _is_same(match, other):  # type: ignore[no-untyped-def]
     """Whether two attitudes name the same stars: half of those that either names, or more."""
     same = named = 0
@@ -132,7 +133,7 @@ def _is_same(match, other):  # type: ignore[no-untyped-def]
     return 2 * same >= named
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _group(observed, stars, speed, pair_image, pair_star, seed, members):  # type: ignore[no-untyped-def]
     """Proposals that agree with the seed and with each other, the likeliest taken first."""
     members[0] = seed
@@ -160,7 +161,7 @@ def _group(observed, stars, speed, pair_image, pair_star, seed, members):  # typ
     return size
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _agree(observed, stars, speed, i, j, a, b):  # type: ignore[no-untyped-def]
     """Whether observed stars i and j are as far apart as catalog stars a and b; by chords."""
     if i == j or a == b:
@@ -175,7 +176,7 @@ def _agree(observed, stars, speed, i, j, a, b):  # type: ignore[no-untyped-def]
     return max(apart - tolerance, 0.0) ** 2 <= should2 <= (apart + tolerance) ** 2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _grow(observed, stars, density, widest, match, rival, scratch):  # type: ignore[no-untyped-def]
     """Fit, lay all stars on the sky, fit again; ln of what chance could do, or infinity."""
     n = len(match)
@@ -203,7 +204,7 @@ def _grow(observed, stars, density, widest, match, rival, scratch):  # type: ign
     return chance
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _widest(direction):  # type: ignore[no-untyped-def]
     """The greatest separation in a field, at most a right angle: beyond it rings shrink again."""
     widest = 0.0
@@ -213,7 +214,7 @@ def _widest(direction):  # type: ignore[no-untyped-def]
     return min(widest, 0.5 * math.pi)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _lay(observed, stars, t, gate, match, rival):  # type: ignore[no-untyped-def]
     """Which catalog star each observed one lies on under an attitude, and which other as well.
 
@@ -251,7 +252,7 @@ def _lay(observed, stars, t, gate, match, rival):  # type: ignore[no-untyped-def
             match[k] = -1
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _is_right_handed(observed, match, t, references):  # type: ignore[no-untyped-def]
     """Whether every matched star lies where the attitude has it, and their shape tells a mirror.
 

@@ -7,13 +7,14 @@ image: one triangle seen from two of its corners says nothing twice.
 """
 
 import numpy as np
-from numba import njit
+
+from service.compiled.jit import njit
 
 LEAST_TRIANGLES = 2
 """In so many triangles a sharing star carries the same identity."""
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def count_pairs(image, star, stars, pair_image, pair_star, votes, held):  # type: ignore[no-untyped-def]
     """Tally (observed star, catalog star) pairs over matches, the most votes first.
 
@@ -58,7 +59,7 @@ def count_pairs(image, star, stars, pair_image, pair_star, votes, held):  # type
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _numbered(image):  # type: ignore[no-untyped-def]
     """A number for each row of `image`, equal where it holds the same stars; how many there are."""
     triple = np.empty(len(image), np.int64)
@@ -75,12 +76,12 @@ def _numbered(image):  # type: ignore[no-untyped-def]
     return number, distinct + 1
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _pair(image, star, stars, m, corner):  # type: ignore[no-untyped-def]
     return np.int64(image[m, corner]) * stars + np.int64(star[m, corner])
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def validate(pair_image, pair_star, votes, held, match):  # type: ignore[no-untyped-def]
     """Into `match` (n,) the catalog row that sharing stars validate for each, -1 for none.
 

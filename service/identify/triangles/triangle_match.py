@@ -9,8 +9,8 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from service.compiled.jit import njit
 from service.sky.geometry.kvector import rows_within
 from service.sky.geometry.triangles import SIDE_SCALE, TriangleIndex, chord
 
@@ -20,7 +20,7 @@ MAX_MATCHES = 20_000
 """What is kept for one sighting; a real field leaves tens, at a pixel of noise."""
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def spread_along(h0, h1, h2, b, sigma):  # type: ignore[no-untyped-def]
     """The variance along a gradient h of a unit vector b that has noise across it alone.
 
@@ -30,7 +30,7 @@ def spread_along(h0, h1, h2, b, sigma):  # type: ignore[no-untyped-def]
     return sigma * sigma * (h0 * h0 + h1 * h1 + h2 * h2 - along * along)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def side_sigma(a, b, sigma_a, sigma_b):  # type: ignore[no-untyped-def]
     """The standard deviation of the scaled chord between two observed stars."""
     length = chord(a, b) / SIDE_SCALE
@@ -40,7 +40,7 @@ def side_sigma(a, b, sigma_a, sigma_b):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def projection_sigma(m, i, j, axis, sigma_m, sigma_i, sigma_j):  # type: ignore[no-untyped-def]
     """sigma_P, the standard deviation of an observed triangle's projection; equations 6 to 14.
 
@@ -103,7 +103,7 @@ def guide_triangles(index: TriangleIndex) -> GuideTriangles:
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def match_triangles(image, guide, matched_image, matched_guide):  # type: ignore[no-untyped-def]
     """Every pair of an observed and a guide triangle that agree in all three sides.
 

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from service.compiled.jit import njit
 
 Integers = npt.NDArray[Any]
 
@@ -51,7 +52,7 @@ def keep_largest_groups(
     return left <= 0, allowed - max(left, 0)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _largest(star, start, neighbour, member, work):  # type: ignore[no-untyped-def]
     """The size of the largest groups, and the work that is left.
 
@@ -83,7 +84,7 @@ def _largest(star, start, neighbour, member, work):  # type: ignore[no-untyped-d
     return size, work
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _stars(star, nodes):  # type: ignore[no-untyped-def]
     """How many observed stars some nodes, ascending, belong to."""
     count, last = 0, -1
@@ -94,7 +95,7 @@ def _stars(star, nodes):  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _group_of(v, near, least, star, start, neighbour, group, work):  # type: ignore[no-untyped-def]
     """A group of at least `least` nodes with `v` in it, of the nodes `near`; 0 where there is none.
 
@@ -144,7 +145,7 @@ def _group_of(v, near, least, star, start, neighbour, group, work):  # type: ign
     return 0, work
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def _common(some, others, out):  # type: ignore[no-untyped-def]
     """Write what two ascending lists share; how many."""
     count = i = j = 0

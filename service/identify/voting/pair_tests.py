@@ -9,9 +9,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
-from service.compiled.jit import njit_inlined, njit_no_refcount
+from service.compiled.copying import copy_rows
+from service.compiled.jit import njit, njit_inlined, njit_no_refcount
 from service.identify.identification import Outcome
 from service.identify.voting.fov_rotation import rotation_rad
 from service.sky.geometry.pairs import separation_rad
@@ -291,7 +291,7 @@ def _count_up(ballots, i, row):  # type: ignore[no-untyped-def]
     ballots.votes[i, row] += 1
 
 
-@njit(cache=True)
+@njit
 def tally(sighted, zone, bounds, rules, star_of, tallies):  # type: ignore[no-untyped-def]
     """`cast_votes`, `count_votes` and, where a star is ambiguous, `name_rivals` in one call.
 
@@ -316,20 +316,20 @@ def tally(sighted, zone, bounds, rules, star_of, tallies):  # type: ignore[no-un
     return any_tie, compared
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def tally_without_gil(sighted, zone, bounds, rules, star_of, tallies):  # type: ignore[no-untyped-def]
     """`tally` of many stars or pairs, without the interpreter's lock."""
     return tally(sighted, zone, bounds, rules, star_of, tallies)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def polar_angles(zone_polar, stars, bounds, rules):  # type: ignore[no-untyped-def]
     """The zone stars' angles to the axis for `cast_votes`: known ones, or -1; (0,) if not asked."""
     if bounds.all_inside and not rules.switches.pole:
         return np.empty(0)
     polar = np.full(stars, -1.0)
     if bounds.all_inside and len(zone_polar):
-        polar[:] = zone_polar
+        copy_rows(zone_polar, polar)
     return polar
 
 

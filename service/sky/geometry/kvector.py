@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from service.compiled.jit import njit
 from service.vectors import Vector, read_only
 
 
@@ -54,7 +54,7 @@ def build_kvector(value: Vector) -> KVector:
     return KVector(read_only(value), read_only(below), slope, intercept)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def bracket(below, slope, intercept, low, high):  # type: ignore[no-untyped-def]
     """The first row and the row after the last that the k-vector gives for a range of values.
 
@@ -70,7 +70,7 @@ def bracket(below, slope, intercept, low, high):  # type: ignore[no-untyped-def]
     return below[int(jb) - 1], below[int(jt) - 1]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def rows_within(value, below, slope, intercept, low, high):  # type: ignore[no-untyped-def]
     """The first row and the row after the last of low <= value <= high, exactly.
 

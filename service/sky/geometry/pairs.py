@@ -9,9 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
-from service.compiled.jit import njit_no_refcount
+from service.compiled.jit import njit, njit_no_refcount
 from service.errors import BadInput, Fault
 from service.vectors import Vector, read_only
 
@@ -92,7 +91,9 @@ def build_pairs(direction: Vector, separation_max_deg: float) -> PairIndex:
     bins_per_rad = bins / limit
     separation, rows = np.empty(count), np.empty((2, count), np.int32)
     bin_start = np.empty(bins + 1, np.int32)
-    _sort_pairs(*found, bins_per_rad, separation, rows[0], rows[1], bin_start)
+    if not _sort_pairs(*found, bins_per_rad, separation, rows[0], rows[1], bin_start):
+        order = np.lexsort((rows[1], rows[0], separation))
+        separation, rows = separation[order], rows[:, order]
     return PairIndex(read_only(separation), read_only(rows), read_only(bin_start), bins_per_rad)
 
 
@@ -107,7 +108,7 @@ def separation_rad(a, b):  # type: ignore[no-untyped-def]
     return 2.0 * math.atan2(half_chord, 0.5 * math.sqrt(sx * sx + sy * sy + sz * sz))
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _find_pairs(direction, limit, separation, brighter, dimmer):  # type: ignore[no-untyped-def]
     """The number of pairs up to a separation, and whether there was room to write all of them.
 
@@ -184,7 +185,7 @@ def _find_pairs(direction, limit, separation, brighter, dimmer):  # type: ignore
     return kept, True
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def separation_of(square):  # type: ignore[no-untyped-def]
     """The angle in radians of a squared chord; short ones by a series as exact as the arc sine."""
     quarter = 0.25 * square
@@ -202,12 +203,13 @@ def separation_of(square):  # type: ignore[no-untyped-def]
     return 2.0 * math.asin(min(1.0, half))
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _sort_pairs(found, one, other, bins_per_rad, separation, brighter, dimmer, bin_start):  # type: ignore[no-untyped-def]
     """Put pairs in order of separation, then of their stars, and tell where each bin starts.
 
     They are counted into parts of bins, so few to a part that hardly any is out
-    of order.
+    of order.  Stars as evenly spaced as no sky has them crowd the parts: the pairs are
+    then in order of parts alone, and False is returned.
     """
     count, bins = len(separation), len(bin_start) - 1
     parts, parts_per_rad = bins * PARTS, bins_per_rad * PARTS
@@ -226,12 +228,7 @@ def _sort_pairs(found, one, other, bins_per_rad, separation, brighter, dimmer, b
         separation[at], brighter[at], dimmer[at] = found[k], one[k], other[k]
         start[own] = at + 1
     if crowded:
-        # Stars as evenly spaced as no sky has them.
-        order = np.argsort(dimmer, kind="mergesort")
-        order = order[np.argsort(brighter[order], kind="mergesort")]
-        order = order[np.argsort(separation[order], kind="mergesort")]
-        separation[:], brighter[:], dimmer[:] = separation[order], brighter[order], dimmer[order]
-        return
+        return False
     for at in range(1, count):
         angle = separation[at]
         if separation[at - 1] < angle:
@@ -249,3 +246,4 @@ def _sort_pairs(found, one, other, bins_per_rad, separation, brighter, dimmer, b
             brighter[to], dimmer[to] = brighter[to - 1], dimmer[to - 1]
             to -= 1
         separation[to], brighter[to], dimmer[to] = angle, a, b
+    return True

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from service.compiled.jit import njit
 from service.vectors import Vector, read_only
 
 CELL = 0.01
@@ -73,7 +73,7 @@ def build_star_grid(direction: Vector) -> StarGrid:
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def cells_about(p, gate, box, out):  # type: ignore[no-untyped-def]
     """The face of a direction and the block of cells within `gate` radians of it.
 

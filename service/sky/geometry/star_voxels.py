@@ -9,9 +9,8 @@ with wider cubes for a wider reach.
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
-from service.compiled.jit import njit_no_refcount
+from service.compiled.jit import njit, njit_no_refcount
 from service.vectors import Vector, read_only
 
 REACH_RAD = 4.5e-4 * 2.0 ** (0.5 * np.arange(7))
@@ -43,7 +42,7 @@ def level_for(gate):  # type: ignore[no-untyped-def]
     return -1
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def star_within_reach(bits, level, x, y, z):  # type: ignore[no-untyped-def]
     """1 where a star may lie within a level's reach of a point not farther off than 2, else 0."""
     scale = _SCALE[level]
@@ -54,7 +53,7 @@ def star_within_reach(bits, level, x, y, z):  # type: ignore[no-untyped-def]
     return (bits[level, hashed >> 3] >> (hashed & 7)) & 1
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _fill(direction, reach, scale, bits):  # type: ignore[no-untyped-def]
     mask = 8 * len(bits) - 1
     edge = 1.0 / scale
@@ -78,7 +77,7 @@ def _fill(direction, reach, scale, bits):  # type: ignore[no-untyped-def]
                         bits[hashed >> 3] |= np.uint8(1 << (hashed & 7))
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _outside(coordinate, cell, edge):  # type: ignore[no-untyped-def]
     """How far a coordinate lies outside a cell, zero within it."""
     low = cell * edge - 2.0

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from service.compiled.jit import njit
 from service.sky.geometry.kvector import KVector, build_kvector
 from service.vectors import Matrix, Vector, read_only
 
@@ -133,7 +133,7 @@ def project(side: Matrix, axis: Vector, mean: Vector) -> Vector:
     return np.asarray((side - mean) @ axis)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def nearest_slaves(direction, least, most, near):  # type: ignore[no-untyped-def]
     """Into `near` (n, slaves) the rows nearest to each star, the nearest first, -1 for none.
 
@@ -176,7 +176,7 @@ def nearest_slaves(direction, least, most, near):  # type: ignore[no-untyped-def
                 near[master, place] = other
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def make_triangles(direction, near, star, side):  # type: ignore[no-untyped-def]
     """Every master's triangles into `star` and `side`, both (N, 3); how many there are.
 
@@ -197,7 +197,7 @@ def make_triangles(direction, near, star, side):  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def chord(a, b):  # type: ignore[no-untyped-def]
     """The distance of two unit vectors, times SIDE_SCALE; equations 1 and 2."""
     x, y, z = a[0] - b[0], a[1] - b[1], a[2] - b[2]

@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from service.compiled.jit import njit
 from service.vectors import Vector
 
 CELLS = 1248
@@ -35,7 +35,7 @@ def build_sky_bitmap(direction: Vector, radius_rad: float) -> Bits:
     return bits
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def cell_of(x, y, z):  # type: ignore[no-untyped-def]
     """The cell of a direction of any length."""
     scale = 1.0 / (abs(x) + abs(y) + abs(z))
@@ -50,7 +50,7 @@ def cell_of(x, y, z):  # type: ignore[no-untyped-def]
     return cu * CELLS + cv
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def star_near(bits, level, x, y, z):  # type: ignore[no-untyped-def]
     """Whether a star may stand near a direction of any length, by one of several bitmaps."""
     cell = cell_of(x, y, z)
@@ -73,7 +73,7 @@ def _single_cell(x, y, z):  # type: ignore[no-untyped-def]
     return cu * np.int32(CELLS) + cv
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def cells_of_candidates(count, alpha, beta, gamma, pair, cell):  # type: ignore[no-untyped-def]
     """The cells (count) of one point's places in many pairs of stars.
 
@@ -90,7 +90,7 @@ def cells_of_candidates(count, alpha, beta, gamma, pair, cell):  # type: ignore[
         )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def cells_of_points(count, coefficients, pair, q, cell):  # type: ignore[no-untyped-def]
     """The cells (count) of many points' places, coefficients (3, count), in one pair of stars."""
     x0, x1, x2, y0, y1, y2 = pair[0, q], pair[1, q], pair[2, q], pair[3, q], pair[4, q], pair[5, q]
@@ -114,7 +114,7 @@ def _disc(radius_rad: float) -> Vector:
     return np.concatenate([inner[np.hypot(*inner.T) <= radius_rad], rim])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _fill(direction, disc, bits):  # type: ignore[no-untyped-def]
     for row in range(len(direction)):
         star = direction[row]

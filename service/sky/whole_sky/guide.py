@@ -4,8 +4,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from service.compiled.jit import njit
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.geometry.star_buckets import StarBuckets, build_star_buckets
 from service.sky.geometry.triangles import SLAVES, TriangleIndex, build_triangles
@@ -61,7 +61,7 @@ def densities(direction: Vector) -> Vector:
     return np.maximum(mean, crowd / (2.0 * math.pi * (1.0 - math.cos(CROWD_RAD))))
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _count_near(direction, most, count):  # type: ignore[no-untyped-def]
     """Add to `count` (n,) how many others lie within a chord of each star."""
     order = np.argsort(direction[:, 2])

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from service.compiled.jit import njit
 from service.compiled.views import view_into
 from service.sky.cache import LruCache
 from service.sky.catalog.run_catalog import RunCatalog
@@ -205,7 +205,7 @@ def _brighter(magnitude: Vector) -> npt.NDArray[np.int32]:
     return brighter.astype(np.int32)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def index_in(store):  # type: ignore[no-untyped-def]
     """The index that a store holds; the caller holds the store."""
     head = view_into(store, 0, (ARRAYS, 3), np.int64)
@@ -229,12 +229,12 @@ def index_in(store):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _array(store, head, at, columns, dtype):  # type: ignore[no-untyped-def]
     return view_into(store, head[at, FIRST], (head[at, ROWS], columns), dtype)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _column(store, head, at, dtype):  # type: ignore[no-untyped-def]
     return view_into(store, head[at, FIRST], (head[at, ROWS],), dtype)
 
@@ -258,7 +258,7 @@ def _patches(
     return np.array(start, np.int32), np.concatenate(rows).astype(np.uint16)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def patch_of(p):  # type: ignore[no-untyped-def]
     """The patch of a direction (3,)."""
     axis = 0

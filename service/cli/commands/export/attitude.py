@@ -4,7 +4,14 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from service.cli.arguments import MISSION, add_command, add_database, add_period, positive
+from service.cli.arguments import (
+    MISSION,
+    add_command,
+    add_database,
+    add_grade,
+    add_period,
+    positive,
+)
 from service.cli.configuration import period_of, settings_of_existing
 from service.cli.output import written_to
 from service.products.formats import attitude_formats, write_attitudes
@@ -26,12 +33,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--spacecraft", required=True, metavar="NAME", help=MISSION)
     add_period(parser, "the run that is read; default live")
     parser.add_argument("--format", choices=tuple(attitude_formats()), default="csv")
-    parser.add_argument(
-        "--grade",
-        choices=("raw", "filtered", "smoothed"),
-        default="raw",
-        help="raw: of batches (default); the others are recorded by `acquire smooth`",
-    )
+    add_grade(parser)
     parser.add_argument(
         "--status", choices=("good", "suspect", "all"), default="good", help="default good"
     )

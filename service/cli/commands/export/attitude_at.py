@@ -4,7 +4,14 @@ from argparse import Namespace
 from dataclasses import asdict
 from typing import Any
 
-from service.cli.arguments import MISSION, add_command, add_database, positive, print_json
+from service.cli.arguments import (
+    MISSION,
+    add_command,
+    add_database,
+    add_grade,
+    positive,
+    print_json,
+)
 from service.cli.configuration import settings_of_existing
 
 
@@ -17,6 +24,7 @@ def add(commands: Any) -> None:
         """
         acquire export attitude-at 1996-01-10T12:00:00.5Z --spacecraft XTE
         acquire export attitude-at 1996-010T12:00:00Z --spacecraft XTE --method nearest
+        acquire export attitude-at 1996-010T12:00:00Z --spacecraft XTE --grade smoothed
         """,
         run,
     )
@@ -29,6 +37,7 @@ def add(commands: Any) -> None:
         default="interpolated",
         help="the nearest attitude, or one interpolated within a stretch; default interpolated",
     )
+    add_grade(parser)
     parser.add_argument(
         "--status", choices=("good", "suspect", "all"), default="good", help="default good"
     )
@@ -55,6 +64,7 @@ def run(parsed: Namespace) -> int:
             parsed.method,
             run=parsed.run,
             status=parsed.status,
+            grade=parsed.grade,
             largest_gap_s=parsed.largest_gap,
         )
     finally:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numba import njit
 
+from service.compiled.jit import njit
 from service.identify.triangles.triangle_match import MAX_MATCHES, SIGMAS
 from service.simulate.scenes import Scene
 from service.sky.catalog.run_catalog import RunCatalog
@@ -95,7 +95,7 @@ def features(direction: Vector) -> tuple[Rows, Vector]:
     return star[:count], feature[:count]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _measure(direction, near, pairs, star, feature):  # type: ignore[no-untyped-def]
     count = 0
     for master in range(len(direction)):
@@ -119,7 +119,7 @@ def _measure(direction, near, pairs, star, feature):  # type: ignore[no-untyped-
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _match(  # type: ignore[no-untyped-def]
     image, feature, sigma_rad, guide_feature, value, below, slope, intercept, matched, guide
 ):

@@ -10,8 +10,8 @@ another, and so does one that lies beyond the edge of the field.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from service.compiled.jit import njit
 from service.identify.triangles.triangle_match import (
     MAX_MATCHES,
     ImageTriangles,
@@ -71,7 +71,7 @@ def build_p_vector(stars: RunCatalog, within_deg: float = NEIGHBOURS_WITHIN_DEG)
     return PVector(index_triangles(stars.direction, near, within_deg), len(stars))
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def brightest_near(direction, least, most, near):  # type: ignore[no-untyped-def]
     """Into `near` (n, k) the first rows, -1 for none, whose chord to each star is within bounds."""
     n, wanted = near.shape

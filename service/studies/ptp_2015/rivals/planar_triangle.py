@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from service.compiled.jit import njit
 from service.identify.triangles.triangle_match import SIGMAS, spread_along
 from service.simulate.scenes import Scene
 from service.sky.catalog.run_catalog import RunCatalog
@@ -96,12 +96,12 @@ def build_planar_triangle(stars: RunCatalog, side_max_deg: float = SIDE_MAX_DEG)
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _chord(a, b):  # type: ignore[no-untyped-def]
     return math.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def area_and_moment(a, b, c):  # type: ignore[no-untyped-def]
     """Heron's area of a triangle of three sides, and its polar moment A (a^2 + b^2 + c^2) / 36."""
     s = 0.5 * (a + b + c)
@@ -109,7 +109,7 @@ def area_and_moment(a, b, c):  # type: ignore[no-untyped-def]
     return area, area * (a * a + b * b + c * c) / 36.0
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def area_and_moment_sigma(u, v, w, su, sv, sw):  # type: ignore[no-untyped-def]
     """Standard deviations of area and moment of three observed stars, by their gradients.
 
@@ -140,7 +140,7 @@ def area_and_moment_sigma(u, v, w, su, sv, sw):  # type: ignore[no-untyped-def]
     return math.sqrt(variance[0]), math.sqrt(variance[1])
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _all_triangles(direction, other, first, most, star, feature):  # type: ignore[no-untyped-def]
     """Every triangle of mutual neighbours into `star` and `feature`; only counted where empty."""
     count = 0
@@ -160,7 +160,7 @@ def _all_triangles(direction, other, first, most, star, feature):  # type: ignor
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _candidates(  # type: ignore[no-untyped-def]
     u, v, w, su, sv, sw, moment, value, below, slope, intercept, out
 ):
@@ -181,7 +181,7 @@ def _candidates(  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _pivot(  # type: ignore[no-untyped-def]
     observed, sigma, direction, star, moment, value, below, slope, intercept, most, image, out
 ):
@@ -226,7 +226,7 @@ def _pivot(  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _sharing_two(star, kept, count, others, found):  # type: ignore[no-untyped-def]
     """Leave of the kept candidates those that share two stars with one of the others."""
     edge = np.empty(3 * found, np.int64)
@@ -251,7 +251,7 @@ def _sharing_two(star, kept, count, others, found):  # type: ignore[no-untyped-d
     return left
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _corners(observed, sigma, direction, stars, image, out):  # type: ignore[no-untyped-def]
     """Which star of a triangle is which, by its sides; whether they agree at all."""
     best = math.inf

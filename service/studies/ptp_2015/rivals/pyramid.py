@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from service.compiled.jit import njit
 from service.identify.triangles.triangle_match import SIGMAS
 from service.simulate.scenes import Scene
 from service.sky.catalog.run_catalog import RunCatalog
@@ -98,7 +98,7 @@ def build_pyramid(stars: RunCatalog, separation_max_deg: float = SEPARATION_MAX_
     return Pyramid(pairs.brighter, pairs.dimmer, kvector, stars.direction)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _pairs_like(field, i, j, pairs):  # type: ignore[no-untyped-def]
     """The range of catalog pairs that are as far apart as stars i and j."""
     apart = separation_rad(field.direction[i], field.direction[j])
@@ -109,7 +109,7 @@ def _pairs_like(field, i, j, pairs):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _chain(field, i, j, pairs, chains):  # type: ignore[no-untyped-def]
     """Chain the catalog pairs that are as far apart as stars i and j, by either star."""
     head, link, end = chains
@@ -124,14 +124,14 @@ def _chain(field, i, j, pairs, chains):  # type: ignore[no-untyped-def]
         end[at + 1], link[at + 1], head[b] = a, head[b], at + 1
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _fits(field, i, j, a, b):  # type: ignore[no-untyped-def]
     """Whether stars a and b are as far apart as observed i and j."""
     off = separation_rad(field.direction[i], field.direction[j]) - separation_rad(a, b)
     return abs(off) <= SIGMAS * math.sqrt(field.sigma[i] ** 2 + field.sigma[j] ** 2)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _handed(a, b, c):  # type: ignore[no-untyped-def]
     """The triple product: its sign tells a triangle from its mirror image."""
     return (
@@ -141,7 +141,7 @@ def _handed(a, b, c):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _search(field, pairs, image, star):  # type: ignore[no-untyped-def]
     """The first pyramid that fits one place alone into `image` and `star` (4,); whether any."""
     n = len(field.direction)
@@ -171,7 +171,7 @@ def _search(field, pairs, image, star):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _confirmed(field, four, pairs, chains, candidate, image, star):  # type: ignore[no-untyped-def]
     """Whether the fourth star confirms one candidate alone, which goes to `image` and `star`."""
     i, j, k, r = four
@@ -195,7 +195,7 @@ def _confirmed(field, four, pairs, chains, candidate, image, star):  # type: ign
     return confirmed == 1
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _triangles(field, i, j, k, pairs, chains, candidate):  # type: ignore[no-untyped-def]
     """Catalog triangles in the place of stars i, j and k, of the same hand; how many."""
     direction = pairs.direction

@@ -1,0 +1,79 @@
+"""Kernels that other kernels call are not made into machine code of their own.
+
+numba optimises every kernel and makes machine code of it, with all that it calls, before it
+links it into its callers, where the same is done again: once for each level of calls.  That was
+half of the time of compiling.  Here a kernel that another one calls is only typed and translated;
+the one that Python calls is optimised as a whole, and it alone is kept in the cache on disk.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.registry import CPUDispatcher
+
+
+class Kernel(CPUDispatcher):  # type: ignore[misc]
+    """A compiled function: for Python with machine code, from the cache; for kernels without.
+
+    Options are those of `numba.njit`.
+    """
+
+    def __init__(self, function: Callable[..., Any], **options: Any) -> None:
+        options["nopython"] = True
+        super().__init__(function, targetoptions=options)
+        self.enable_caching()
+        without = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+        self._inner = CPUDispatcher(
+            function, targetoptions=options | without, pipeline_class=_Untranslated
+        )
+
+    @property
+    def _numba_type_(self) -> Any:
+        """What kernels call where they name this one."""
+        return self._inner._numba_type_
+
+
+class _Untranslated(CompilerBase):  # type: ignore[misc]
+    """numba's compiler, into a library without machine code."""
+
+    def define_pipelines(self) -> list[Any]:
+        codegen = self.state.targetctx.codegen()
+        self.state.library = _BitcodeLibrary(codegen, self.state.func_id.func_qualname)
+        passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        passes.finalize()
+        return [passes]
+
+
+class _BitcodeLibrary(JITCodeLibrary):  # type: ignore[misc]
+    """A kernel and what it calls, ready for linking and nothing else."""
+
+    @property
+    def codegen(self) -> Any:
+        return _WithoutEnvironment(self._codegen)
+
+    def _optimize_final_module(self) -> None:
+        """Left to the kernel that this one is linked into."""
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._verify_declare_only_symbols()
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """There is no machine code."""
+        return 0
+
+
+class _WithoutEnvironment:
+    """Where machine code is made; none that an environment could be written to."""
+
+    def __init__(self, codegen: Any) -> None:
+        self._own = codegen
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._own, name)
+
+    def set_env(self, name: str, environment: Any) -> None:
+        """Only machine code has a place for it."""
