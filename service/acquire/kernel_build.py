@@ -1,7 +1,7 @@
-"""Compiling the kernels in a child process, before the first batch.
+"""Compiling the kernels in child processes, before the first batch.
 
-Compiling takes minutes, holds the interpreter's lock and cannot be interrupted.  A
-child can be killed, and the parent goes on answering probes; it then loads the
+Compiling takes a minute, holds the interpreter's lock and cannot be interrupted.
+Children can be killed, and the parent goes on answering probes; it then loads the
 kernels from the cache on disk.
 """
 
@@ -28,6 +28,8 @@ from service.sky.model import SkyModel
 RETRY_S = 10
 
 _CONTEXT = multiprocessing.get_context("spawn")
+SIDE_BY_SIDE = (True, False), (False, True)
+"""What each of two children compiles: kernels of zones, the others; see `prewarm_kernels`."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 """By which the service is stopped; they may reach its whole process group."""
 
@@ -37,7 +39,7 @@ class KernelBuild:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._child: SpawnProcess | None = None
+        self._children: list[SpawnProcess] = []
         self._cancelled = False
         self.is_needed = not _marker().exists()
         """Until a build has succeeded: an answer must not depend on what is compiled."""
@@ -48,29 +50,39 @@ class KernelBuild:
             raise Busy("the service is compiling its kernels", RETRY_S)
 
     def run(self, missions: Mapping[str, Mission]) -> None:
-        """Compile what is not compiled; raises `Busy` where that fails, `Stopping` if cancelled."""
+        """Compile what is not compiled, in a child for each of two parts.
+
+        In one, without a second processor.  Raises `Busy` where that fails, `Stopping` if
+        cancelled.
+        """
         if not self.is_needed:
             return
         with self._lock:
             if self._cancelled:
                 raise Stopping("the service is stopping")
-            self._child = child = _CONTEXT.Process(
-                target=_compile, args=(dict(missions),), daemon=True
-            )
-            child.start()
-        child.join()
+            for zones, others in SIDE_BY_SIDE if _processors() > 1 else ((True, True),):
+                child = _CONTEXT.Process(
+                    target=_compile, args=(dict(missions), zones, others), daemon=True
+                )
+                self._children.append(child)
+                child.start()
+        for child in self._children:
+            child.join()
         if self._cancelled:
             raise Stopping("the service is stopping")
-        if child.exitcode != 0:
+        failed = any(child.exitcode != 0 for child in self._children)
+        self._children.clear()
+        if failed:
             raise Busy("the kernels could not be compiled; the log says why", RETRY_S)
+        mark_built()
         self.is_needed = False
 
     def cancel(self) -> None:
         """End a build that is running, and let none begin."""
         with self._lock:
             self._cancelled = True
-            if self._child is not None:
-                self._child.kill()
+            for child in self._children:
+                child.kill()
 
 
 def mark_built() -> None:
@@ -108,7 +120,10 @@ def _marker() -> Path:
     return Path(config.CACHE_DIR) / f"complete-{numba.__version__}-{processor}"
 
 
-def _compile(missions: Mapping[str, Mission]) -> None:
+def _processors() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+def _compile(missions: Mapping[str, Mission], zones: bool, others: bool) -> None:
     end_with_parent()
-    prewarm_kernels(SkyModel(load_embedded(), LruCache(64 << 20)), missions)
-    mark_built()
+    prewarm_kernels(SkyModel(load_embedded(), LruCache(64 << 20)), missions, zones, others)

@@ -45,10 +45,14 @@ def prewarm_zones(sky: SkyModel, mission: Mission, prior: APriori, time: Utc) ->
     ]
 
 
-def prewarm_kernels(sky: SkyModel, missions: Mapping[str, Mission]) -> None:
-    """Compile every kernel by running a batch of real stars of each kind of zone.
+def prewarm_kernels(
+    sky: SkyModel, missions: Mapping[str, Mission], zones: bool = True, others: bool = True
+) -> None:
+    """Compile the kernels by running a batch of real stars of each kind of zone.
 
-    What is built for it goes into a cache of its own, which is dropped.
+    Those of identifiers that search zones, all others, or both.  The two parts take about as
+    long to compile and have little in common.  What is built for it goes into a cache of its
+    own, which is dropped.
     """
     moment = parse_utc("2000-01-01T12:00:00Z")
     # Large enough that nothing is built twice on the way.
@@ -88,6 +92,8 @@ def prewarm_kernels(sky: SkyModel, missions: Mapping[str, Mission]) -> None:
             ],
         }
         for identifier in IDENTIFIERS.values():
+            if not (zones if identifier.searches_zone else others):
+                continue
             if not identifier.searches_zone and kind != first:
                 continue  # the same kernels
             # From JSON, as batches are posted: kernels are compiled for that kind of array.
@@ -97,7 +103,8 @@ def prewarm_kernels(sky: SkyModel, missions: Mapping[str, Mission]) -> None:
             batch = submission_from_json(json.dumps(body | {"options": options})).batch
             brightest = _of_bright_stars(given, BRIGHTEST_MAG)
             acquire(batch, mission if identifier.uses_prior else brightest, apart)
-    compile_linking()
+    if others:
+        compile_linking()
 
 
 def _of_bright_stars(mission: Mission, to_mag: float) -> Mission:
@@ -107,9 +114,7 @@ def _of_bright_stars(mission: Mission, to_mag: float) -> Mission:
 
 
 if __name__ == "__main__":
-    from service.acquire.kernel_build import mark_built
+    from service.acquire.kernel_build import KernelBuild
     from service.missions.mission import load_missions
-    from service.sky.catalog.star_catalog import load_embedded
 
-    prewarm_kernels(SkyModel(load_embedded(), LruCache(64 << 20)), load_missions())
-    mark_built()
+    KernelBuild().run(load_missions())

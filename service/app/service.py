@@ -13,7 +13,6 @@ from service.app.context import Context
 from service.app.replays import Replays
 from service.app.submissions import Submissions
 from service.errors import Busy
-from service.ingest.kernel_helper import compiling_beside
 from service.ingest.kernel_progress import progress_logged
 from service.observations.schema import submission_from_json
 from service.storage.models.overview import About, CatalogAbout, MissionAbout
@@ -68,7 +67,7 @@ class Service:
                 raise Busy("the service is warming up")
             try:
                 if self._kernels is not None and self._kernels.is_needed:
-                    with progress_logged(log), compiling_beside(self._context.missions):
+                    with progress_logged(log):
                         self._kernels.run(self._context.missions)
                 prewarm_kernels(self._context.sky, self._context.missions)
                 self._prewarm_recent_pointings()

@@ -14,7 +14,7 @@ from typing import Any
 
 import numba
 
-KERNEL_BYTES = 26_000_000
+KERNEL_BYTES = 4_240_000
 """Of the machine code of all kernels, about; other processors have a tenth more or less."""
 MOST_SHARE = 0.99
 """Until it is over, since the size is not known to the last byte."""
