@@ -14,7 +14,7 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.registry import CPUDispatcher
 
 
-class Kernel(CPUDispatcher):  # type: ignore[misc]
+class Kernel(CPUDispatcher):
     """A compiled function: for Python with machine code, from the cache; for kernels without.
 
     Options are those of `numba.njit`.
@@ -26,7 +26,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         self.enable_caching()
         without = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
         self._inner = CPUDispatcher(
-            function, targetoptions=options | without, pipeline_class=_Untranslated
+            function, targetoptions=options | without, pipeline_class=_WithoutMachineCode
         )
 
     @property
@@ -35,18 +35,20 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         return self._inner._numba_type_
 
 
-class _Untranslated(CompilerBase):  # type: ignore[misc]
+class _WithoutMachineCode(CompilerBase):
     """numba's compiler, into a library without machine code."""
 
     def define_pipelines(self) -> list[Any]:
         codegen = self.state.targetctx.codegen()
-        self.state.library = _BitcodeLibrary(codegen, self.state.func_id.func_qualname)
-        passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        name = self.state.func_id.func_qualname
+        self.state.library = _BitcodeLibrary(codegen, name)  # type: ignore[no-untyped-call]
+        build: Any = DefaultPassBuilder.define_nopython_pipeline
+        passes = build(self.state)
         passes.finalize()
         return [passes]
 
 
-class _BitcodeLibrary(JITCodeLibrary):  # type: ignore[misc]
+class _BitcodeLibrary(JITCodeLibrary):
     """A kernel and what it calls, ready for linking and nothing else."""
 
     @property
@@ -57,8 +59,8 @@ class _BitcodeLibrary(JITCodeLibrary):  # type: ignore[misc]
         """Left to the kernel that this one is linked into."""
 
     def _finalize_final_module(self) -> None:
-        self._finalize_dynamic_globals()
-        self._verify_declare_only_symbols()
+        self._finalize_dynamic_globals()  # type: ignore[no-untyped-call]
+        self._verify_declare_only_symbols()  # type: ignore[no-untyped-call]
         self._finalized = True
 
     def get_pointer_to_function(self, name: str) -> int:
