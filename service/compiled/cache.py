@@ -19,6 +19,8 @@ SOURCES = (
     "missions",
     "observations/batch.py",
     "observations/calibrate.py",
+    "observations/focal_plane.py",
+    "observations/scans",
     "simulate/scenes.py",
     "sky",
     "studies/ptp_2015/rivals",
