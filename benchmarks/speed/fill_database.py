@@ -160,6 +160,8 @@ def _drawn(rng: np.random.Generator, place: npt.NDArray[np.int64]) -> dict[str, 
         "predicted_rms_arcsec": np.where(solved, predicted, np.nan),
         "magnitude_offset_mag": rng.normal(0.0, 0.05, n),
         "a_priori_angle_deg": np.where(solved, rng.uniform(0.2, 4.8, n), np.nan),
+        "scale_offset_ppm": np.where(solved, rng.normal(0.0, 60.0, n), np.nan),
+        "alignment_offset_arcsec": np.where(solved, rng.normal(0.0, 1.5, n), np.nan),
     }
     columns["residual_ratio"] = columns["residual_rms_arcsec"] / columns["predicted_rms_arcsec"]
     for name in SHARES:
@@ -189,6 +191,7 @@ def _rows(
         **{n: listed[n] for n in ("observed", "unique", "ambiguous", "unmatched")},
         **{n: listed[n] for n in ("residual_rms_arcsec", "predicted_rms_arcsec")},
         **{n: listed[n] for n in ("magnitude_offset_mag", "a_priori_angle_deg")},
+        **{n: listed[n] for n in ("scale_offset_ppm", "alignment_offset_arcsec")},
         "status": [
             ("suspect" if suspect else "good") if solved else None
             for solved, suspect in zip(listed["solved"], listed["suspect"], strict=True)

@@ -13,6 +13,8 @@ class Cause:
 
     cause: str
     remedy: str
+    calibrate: bool = False
+    """Whether a new calibration is the remedy."""
 
 
 _SIGMA = Cause(
@@ -46,9 +48,23 @@ CAUSES: Mapping[str, Cause] = {
     "residual_rms_arcsec": _SIGMA,
     "residual_ratio": _SIGMA,
     "magnitude_offset_mag": Cause(
-        "The tracker's magnitudes have shifted.",
-        "Open the advice for the time of the alarm: it gives the offset. Until it is corrected, "
-        "widen the magnitude tolerance.",
+        "Instrument drift: the tracker's magnitudes have shifted.",
+        "Run `acquire calibrate`, which estimates magnitudes too, or open the calibration page, try "
+        "the result and adopt it. Until then, widen the magnitude tolerance.",
+        calibrate=True,
+    ),
+    "scale_offset_ppm": Cause(
+        "Instrument drift: the focal length has changed.",
+        "Run `acquire calibrate` over the time of the alarm, or open the calibration page; try the "
+        "result over recorded batches, and adopt it.",
+        calibrate=True,
+    ),
+    "alignment_offset_arcsec": Cause(
+        "Instrument drift: a tracker has turned against the others. Of three trackers, the one with "
+        "the largest offset has moved.",
+        "Run `acquire calibrate` over the time of the alarm, or open the calibration page; try the "
+        "result over recorded batches, and adopt it.",
+        calibrate=True,
     ),
     "a_priori_angle_deg": Cause(
         "The a priori attitude drifts, or a slew was not announced.",

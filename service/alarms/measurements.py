@@ -9,6 +9,7 @@ from service.vectors import separation_deg
 
 if TYPE_CHECKING:
     from service.acquire import Acquisition
+    from service.alarms.drift import MeanStars
 
 
 def residual_rms_arcsec(acquisition: "Acquisition") -> float | None:
@@ -40,6 +41,49 @@ def magnitude_offset_mag(acquisition: "Acquisition") -> float | None:
         known = zip(star.tolist(), observed_mag.tolist(), catalog_mag[star].tolist(), strict=True)
         offsets += [mag - known_mag for row, mag, known_mag in known if row >= 0 and mag == mag]
     return math.fsum(offsets) / len(offsets) if offsets else None
+
+
+def scale_offset_ppm(acquisition: "Acquisition") -> float | None:
+    """How much larger the stars' distances are than the catalog's, in millionths.
+
+    None without an attitude, or where the stars are too close together.
+    """
+    from service.alarms import drift
+
+    means = _mean_stars(acquisition)
+    return drift.scale_offset_ppm(means) if means else None
+
+
+def alignment_offset_arcsec(acquisition: "Acquisition") -> float | None:
+    """How much larger the angles between trackers are than the catalog's, as a mean.
+
+    None without an attitude, or where fewer than two trackers have unique stars.
+    """
+    from service.alarms import drift
+
+    if len(acquisition.trackers) == 1:
+        return None
+    offsets = [
+        each
+        for each in drift.alignment_offsets_arcsec(_mean_stars(acquisition))
+        if each is not None
+    ]
+    return math.fsum(offsets) / len(offsets) if offsets else None
+
+
+def _mean_stars(acquisition: "Acquisition") -> list["MeanStars"]:
+    """The mean directions of every tracker; none without an attitude."""
+    # Only what records an acquisition needs the ephemeris.
+    from service.alarms.drift import mean_stars
+
+    if acquisition.solution is None:
+        return []
+    return mean_stars(
+        acquisition.batch,
+        [each.corrected for each in acquisition.trackers],
+        [each.identification.star for each in acquisition.trackers],
+        acquisition.run_catalog.direction,
+    )
 
 
 def a_priori_angle_deg(acquisition: "Acquisition") -> float | None:

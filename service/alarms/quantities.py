@@ -247,6 +247,31 @@ QUANTITIES: dict[str, Quantity] = {
             "from the a priori boresight or pole.",
             rolled_up=True,
         ),
+        Quantity(
+            "scale_offset_ppm",
+            "ppm",
+            "scale offset",
+            Measured(measurements.scale_offset_ppm),
+            # The normal value depends on the tracker; docs/alarms.md says how to set limits.
+            lambda mission: LimitSettings(),
+            worse="size",
+            description="Distances of the unique stars from each other within a tracker, observed "
+            "over catalog, less 1, in millionths: the error of the focal length.",
+            rolled_up=True,
+            by_tracker=True,
+        ),
+        Quantity(
+            "alignment_offset_arcsec",
+            "arcsec",
+            "alignment offset",
+            Measured(measurements.alignment_offset_arcsec),
+            lambda mission: LimitSettings(),
+            worse="size",
+            description="Angle between the unique stars of two trackers, observed minus catalog; "
+            "of a tracker, the mean over the others. Null with one tracker.",
+            rolled_up=True,
+            by_tracker=True,
+        ),
         Quantity("batches_per_hour", "1/h", "batches per hour", Rate()),
         Quantity(
             SILENCE,

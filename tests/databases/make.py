@@ -126,6 +126,8 @@ def record(client: httpx.Client, new_token: Callable[[], str]) -> None:
         client.post(
             path, params=query, content=frame_bytes(frame), headers=headers
         ).raise_for_status()
+    if f"{API}/calibrations" in known:
+        _calibrate(client)
     if f"{API}/session" in known:
         token = new_token()
         # What is known of tokens is believed for a second.
@@ -169,6 +171,21 @@ def _alarm(client: httpx.Client, lone: list[Json]) -> None:
     ):
         client.post(f"{alarm}/{act}", json=SAID | more).raise_for_status()
     client.delete(f"{limit}?who=J.%20Operator").raise_for_status()
+
+
+def _calibrate(client: httpx.Client) -> None:
+    """A calibration that is adopted, and one without a star to calibrate with."""
+    signed = {"who": SAID["who"]}
+    asked = {"spacecraft": "XTE", "degree": 0, **signed}
+    for run, state in (("live", "done"), ("none", "failed")):
+        begun = client.post(f"{API}/calibrations", json=asked | {"run": run})
+        begun.raise_for_status()
+        location = begun.headers["Location"]
+        while (found := client.get(location).json()["state"]) in ("queued", "running"):
+            time.sleep(0.1)
+        assert found == state, (run, found)
+        if state == "done":
+            client.post(f"{location}/adopt", json=signed | {"note": "first"}).raise_for_status()
 
 
 # ---- the code of a tree --------------------------------------------------------------------------

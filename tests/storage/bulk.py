@@ -46,6 +46,8 @@ def result_row(app, time, *, spacecraft="XTE", run="live", name="b", **values):
         "predicted_rms_arcsec": 2.0,
         "magnitude_offset_mag": 0.0,
         "a_priori_angle_deg": 1.0,
+        "scale_offset_ppm": 0.0,
+        "alignment_offset_arcsec": None,
         "answer": "{}",
     } | values
     return batch, result

@@ -6,6 +6,7 @@ import time
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from sqlalchemy import func, select
 
@@ -13,6 +14,8 @@ from service.errors import BadConfiguration, Busy, Conflict
 from service.ingest import submit
 from service.observations.schema import OptionsIn
 from service.storage.archive import archiving, folder, rows
+from service.storage.archive.opened import WHOLE, Opened, columns_of
+from service.storage.archive.reading import Archive
 from service.storage.archive.restoring import PartFilter, restore, verify_archive
 from service.storage.archive.tables import archived_batches
 from service.storage.recording import rollups
@@ -364,6 +367,41 @@ def test_values_of_trackers_are_archived_and_their_trends_stay(opened, place, sk
     assert len(trends_of(app.store)["tracker_rollups_hourly"]) == len(
         trends["tracker_rollups_hourly"]
     )
+
+
+def test_a_part_of_an_earlier_version_has_no_values_of_later_quantities(
+    opened, place, sky, missions
+):
+    """Parts are never written again: columns that they lack are null, in lists and restored."""
+    mission = twin.twin(missions)
+    app = opened(mission, archive_folder=place)
+    for k in range(3):
+        app.submissions.submit(twin.submission(sky, mission, f"b{k}", after_s=k * 4_000.0))
+    later = ("scale_offset_ppm", "alignment_offset_arcsec")
+    with app.store.reading() as connection:
+        ids = list(connection.scalars(select(batches.c.id)))
+        now = rows.read_rows(connection, ids)
+    earlier = dict(now)
+    for name in ("results", "tracker_values"):
+        assert now[name]["scale_offset_ppm"].null_count == 0
+        earlier[name] = now[name].drop_columns(list(later))
+    partition = rows.to_partition(earlier)
+    assert not set(later) & set(partition.column_names)
+    found = rows.from_partition(partition)
+    for name in ("results", "tracker_values"):
+        assert found[name].column_names == now[name].column_names
+        assert found[name].drop_columns(list(later)).equals(earlier[name])
+        assert all(found[name][each].null_count == len(now[name]) for each in later)
+    whole = Opened()
+    whole.add_partition(partition)
+    with whole.reading() as connection:
+        shown = connection.execute(select(results.c.scale_offset_ppm)).scalars().all()
+        of_trackers = connection.execute(select(tracker_values.c.scale_offset_ppm)).scalars()
+        assert [*shown, *of_trackers] == [None] * 9
+    pq.write_table(partition, place / "earlier.parquet")
+    read = Archive(place).read("earlier.parquet", columns_of(WHOLE), None)
+    assert read.num_rows == 3
+    assert not set(later) & set(read.column_names)
 
 
 def test_a_history_over_archived_time_counts_every_batch(filled, place):

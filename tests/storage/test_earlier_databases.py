@@ -256,7 +256,9 @@ def names_of(earlier):
         "tables/{kind}": ["batches", "stars", "gyro"],
         # Earlier versions took none.
         "gyro/{id}": [],
-        "calibrations/{id}": [],
+        "calibrations/{id}": [
+            each["id"] for each in earlier.get(f"{API}/calibrations").json()["items"]
+        ],
         "problems/{slug}": list(types_with_pages()),
         "limits/{quantity}": [
             each["quantity"] for each in earlier.get(f"{API}/spacecraft/XTE/limits").json()["items"]

@@ -33,7 +33,7 @@ def columns_of(needs: Collection[str]) -> list[str]:
 class Opened:
     """A database in memory with some results and what belongs to them, for one thread at a time.
 
-    What was not read of them is empty there: an empty text, no stars.
+    What was not read of them is empty there: null, an empty text, no stars.
     """
 
     def __init__(self) -> None:
@@ -87,7 +87,7 @@ class Opened:
                 row = {"name": name, "created": ""}
                 connection.execute(runs.insert().prefix_with("OR IGNORE"), row)
             for table, values in rows:
-                _insert(connection, table, values, len(partition))
+                _insert(connection, table, values)
 
     def add_rows(self, rows: Rows) -> None:
         """Add rows of the record."""
@@ -95,7 +95,7 @@ class Opened:
             for table in (batches, results, *_CHILD_TABLES):
                 read = rows[table.name]
                 columns = {name: read[name] for name in read.column_names}
-                _insert(connection, table, columns, len(read))
+                _insert(connection, table, columns)
 
     def add_settings(self, found: Iterable[Settings]) -> None:
         """Add settings of missions."""
@@ -105,15 +105,14 @@ class Opened:
 
 
 def _insert(
-    connection: Connection,
-    table: Table,
-    columns: dict[str, pa.ChunkedArray | None],
-    count: int,
+    connection: Connection, table: Table, columns: dict[str, pa.ChunkedArray | None]
 ) -> None:
+    count = next(len(each) for each in columns.values() if each is not None)
     values: list[Sequence[Any]] = []
     for each in table.columns:
         column = columns.get(each.name)
-        values.append([""] * count if column is None else column.to_pylist())
+        missing = None if each.nullable else ""
+        values.append([missing] * count if column is None else column.to_pylist())
     marks = ", ".join("?" * len(values))
     statement = f"INSERT OR IGNORE INTO {table.name} VALUES ({marks})"
     rows = list(zip(*values, strict=True))

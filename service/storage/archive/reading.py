@@ -86,13 +86,19 @@ class Archive:
         return found
 
     def read(self, path: str, columns: Sequence[str] | None, filters: Any) -> "pa.Table":
-        """Some columns, or all, of those results of a part that pass pyarrow's `filters`."""
+        """Some columns, or all, of those results of a part that pass pyarrow's `filters`.
+
+        A column that the version that wrote the part did not have is left out.
+        """
         with self._readable(path) as file:
             from pyarrow import parquet
 
+            if columns is not None:
+                written = parquet.read_schema(file).names
+                columns = [each for each in columns if each in written]
             return parquet.read_table(
                 file,
-                columns=None if columns is None else list(columns),
+                columns=columns,
                 filters=filters,
                 partitioning=None,
                 page_checksum_verification=True,

@@ -156,21 +156,29 @@ def _with_copies(partition: pa.Table) -> pa.Table:
 
 
 def from_partition(partition: pa.Table) -> Rows:
-    """The rows that were put into a partition."""
+    """The rows that were put into a partition; columns of a later version than its are null."""
     partition = _with_copies(partition)
     is_first = pc.equal(partition["id"], partition["batch_id"])
     names = [each.name for each in batches.columns]
     rows = {
         "batches": partition.filter(is_first).select(names),
-        "results": partition.select([each.name for each in results.columns]),
+        "results": _selected(partition, results),
     }
     for name, (table, owner, _) in CHILDREN.items():
         lists = partition[name]
         parts = pa.Table.from_struct_array(_whole(pc.list_flatten(lists)))
         owners = partition["id"].take(pc.list_parent_indices(lists))
         parts = parts.append_column(owner, owners)
-        rows[table.name] = parts.select([each.name for each in table.columns])
+        rows[table.name] = _selected(parts, table)
     return rows
+
+
+def _selected(read: pa.Table, table: Table) -> pa.Table:
+    """The columns of an SQL table, in its order; null where they were not written."""
+    for field in schema_of(table):
+        if field.name not in read.column_names:
+            read = read.append_column(field, pa.nulls(len(read), field.type))
+    return read.select([each.name for each in table.columns])
 
 
 def differing(one: Rows, other: Rows) -> str | None:

@@ -5,13 +5,17 @@ of one alone the result itself has the same values.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from service.acquire import Acquisition
+from service.alarms.drift import alignment_offsets_arcsec, mean_stars, scale_offset_ppm
+from service.identify.identification import Integers
+from service.observations.batch import ObservationBatch
 from service.observations.calibrate import CorrectedObservations
+from service.sky.catalog.run_catalog import RunCatalog
 from service.storage.models.answers import Answer, Star
 from service.storage.sql.tables import MEASURED
 from service.vectors import Vector
@@ -23,33 +27,48 @@ def values_of_trackers(acquisition: Acquisition, answer: Answer, batch_id: str) 
     """The rows of an acquisition; none where its mission has one tracker."""
     if len(acquisition.mission.trackers) == 1:
         return []
-    catalog_mag = acquisition.run_catalog.magnitude_mag
-    found = [each.identification.star for each in acquisition.trackers]
     return tracker_rows(
         batch_id,
         answer,
+        acquisition.batch,
         [each.corrected for each in acquisition.trackers],
-        [np.where(star >= 0, catalog_mag[star], np.nan) for star in found],
+        acquisition.run_catalog,
+        [each.identification.star for each in acquisition.trackers],
     )
+
+
+def catalog_rows(answer: Answer, place: Mapping[str, int]) -> list[Integers]:
+    """The rows of the run catalog (n,) of the stars of every tracker, -1 for others.
+
+    `place` gives the row of a star's id; empty where the catalog is no longer there.
+    """
+    return [
+        np.array([place.get(star.star.id, -1) if star.star else -1 for star in each.stars], int)
+        for each in answer.observations
+    ]
 
 
 def tracker_rows(
     batch_id: str,
     answer: Answer,
+    batch: ObservationBatch,
     corrected: Sequence[CorrectedObservations],
-    catalog_mag: Sequence[Vector],
+    catalog: RunCatalog,
+    star: Sequence[Integers],
 ) -> list[Row]:
     """The rows of an answer, one a tracker, in the order of its observations.
 
-    `corrected` are the observations that it was made from, and `catalog_mag` the
-    catalog magnitudes (n,) of their unique stars, NaN for others and where they
-    are not known.
+    `corrected` are the observations of `batch` that it was made from, and `star` the rows of
+    the catalog (n,) of their unique stars, -1 for others and where they are not known.
     """
+    catalog_mag = [np.where(rows >= 0, catalog.magnitude_mag[rows], np.nan) for rows in star]
+    means = [] if answer.attitude is None else mean_stars(batch, corrected, star, catalog.direction)
+    alignment = alignment_offsets_arcsec(means) or [None] * len(corrected)
     expected = [_expected_squares(answer, each) for each in corrected]
     scale = _scale(answer, expected)
     rows = []
-    for stars, seen, squares, magnitudes in zip(
-        answer.observations, corrected, expected, catalog_mag, strict=True
+    for k, (stars, seen, squares, magnitudes) in enumerate(
+        zip(answer.observations, corrected, expected, catalog_mag, strict=True)
     ):
         outcomes = [star.outcome for star in stars.stars]
         used = list(_residuals(stars.stars))
@@ -68,6 +87,8 @@ def tracker_rows(
                 "magnitude_offset_mag": (
                     math.fsum(offsets.tolist()) / len(offsets) if len(offsets) else None
                 ),
+                "scale_offset_ppm": scale_offset_ppm(means[k : k + 1]) if means else None,
+                "alignment_offset_arcsec": alignment[k],
             }
         )
     return rows

@@ -9,11 +9,10 @@ or whose result was replaced meanwhile, is left as it is.
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 from sqlalchemy import Connection, Select, select, tuple_, update
 from sqlalchemy import delete as deleted
 
@@ -21,13 +20,14 @@ from service.errors import BadInput, Busy
 from service.missions.mission import Mission
 from service.observations.calibrate import correct
 from service.observations.schema import submission_from_json
+from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.model import SkyModel
 from service.storage.models.answers import Answer
 from service.storage.queries.pages import PLACE, newest_first
 from service.storage.queries.recorded_batch import recorded_mission
 from service.storage.queries.results import answer_from_json
 from service.storage.recording import rollups
-from service.storage.recording.tracker_values import tracker_rows
+from service.storage.recording.tracker_values import catalog_rows, tracker_rows
 from service.storage.recording.unsaved_result import Buckets
 from service.storage.sql.columns import Row
 from service.storage.sql.database import Store
@@ -35,7 +35,6 @@ from service.storage.sql.rollup_tables import tracker_splits
 from service.storage.sql.statements import insert_all
 from service.storage.sql.tables import batches, results, tracker_values
 from service.times import DAY_S, HOUR_S, parse_utc
-from service.vectors import Vector
 
 log = logging.getLogger(__name__)
 
@@ -57,7 +56,7 @@ class TrackerSplitter:
     sky: SkyModel
     missions: Mapping[str, Mission]
     _recorded: dict[str, Mission] = field(default_factory=dict)
-    _catalogs: dict[str, dict[str, float]] = field(default_factory=dict)
+    _catalogs: dict[str, tuple[RunCatalog, dict[str, int]]] = field(default_factory=dict)
 
     def waiting(self) -> list[Owner]:
         """The runs of spacecraft with several trackers whose batches are still to be split."""
@@ -112,17 +111,20 @@ class TrackerSplitter:
         except BadInput:
             # `verify` tells of an input that cannot be read.
             return []
-        known = self._catalog_mag(answer, mission, row["time"])
-        magnitudes = [_magnitudes(each.stars, known) for each in answer.observations]
-        return tracker_rows(row["batch_id"], answer, corrected, magnitudes)
+        catalog, place = self._catalog(answer, mission, row["time"])
+        star = catalog_rows(answer, place)
+        return tracker_rows(row["batch_id"], answer, batch, corrected, catalog, star)
 
-    def _catalog_mag(self, answer: Answer, mission: Mission, time: str) -> Mapping[str, float]:
-        """Catalog magnitudes by star; empty if the answer's catalog is no longer there."""
+    def _catalog(
+        self, answer: Answer, mission: Mission, time: str
+    ) -> tuple[RunCatalog, Mapping[str, int]]:
+        """A run catalog with its rows by star; no row if the answer's is no longer there."""
         digest = answer.provenance.run_catalog
         if digest not in self._catalogs:
             catalog = self.sky.run_catalog(mission, parse_utc(time))
-            pairs = zip(catalog.star_id, catalog.magnitude_mag.tolist(), strict=True)
-            self._catalogs[digest] = dict(pairs) if catalog.digest == digest else {}
+            same = catalog.digest == digest
+            place = {id: row for row, id in enumerate(catalog.star_id)} if same else {}
+            self._catalogs[digest] = catalog, place
         return self._catalogs[digest]
 
 
@@ -160,10 +162,6 @@ class BackgroundSplit:
             if not self._stopping.is_set():
                 log.info("%d older batches were looked at and split by tracker", done)
             return
-
-
-def _magnitudes(stars: Iterable[Any], known: Mapping[str, float]) -> Vector:
-    return np.array([known.get(star.star.id, np.nan) if star.star else np.nan for star in stars])
 
 
 def _place(connection: Connection, owner: Owner, *, lock: bool = False) -> Place | None:

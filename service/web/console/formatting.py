@@ -180,6 +180,7 @@ UNITS: Mapping[str, Callable[[float], str]] = {
     "arcsec": arcsec,
     "deg": degrees,
     "mag": magnitude,
+    "ppm": lambda value: f"{number(value, 0)}{THIN}ppm",
     "s": age,
 }
 

@@ -253,7 +253,7 @@ class WorstQuery(PeriodQuery):
 
     by: Annotated[
         RankedName,
-        Field(description="The quantity. For `magnitude_offset_mag`, its absolute value."),
+        Field(description="The quantity. For an offset, its absolute value."),
     ] = "ambiguous_share"
     tracker: OfTracker = None
     limit: Annotated[int, Field(ge=1, le=100, description="Maximum number of items.")] = 20

@@ -63,11 +63,13 @@ CHARTS: Sequence[tuple[str, str, tuple[str, ...]]] = (
         ("residual_rms_arcsec", "predicted_rms_arcsec"),
     ),
     ("magnitude", "Magnitude offset, observed minus catalog", ("magnitude_offset_mag",)),
+    ("scale", "Scale offset, observed over catalog", ("scale_offset_ppm",)),
+    ("alignment", "Angle between trackers, observed minus catalog", ("alignment_offset_arcsec",)),
     ("a-priori", "Angle from the a priori attitude", ("a_priori_angle_deg",)),
     ("rate", "Batches per hour", ("batches_per_hour",)),
 )
 """Id, title and quantities of the charts; every other quantity gets one of its own."""
-UNITS = {"arcsec": "″", "deg": "°", "mag": " mag"}
+UNITS = {"arcsec": "″", "deg": "°", "mag": " mag", "ppm": " ppm"}
 
 
 TRACKER_CHARTS = {"batches": "Batches in which the tracker disagrees with the others"}
