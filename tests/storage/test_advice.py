@@ -48,6 +48,15 @@ def rows(app):
         ]
 
 
+def test_a_sample_has_as_many_batches_as_were_asked_for_and_none_twice(app, recorded):
+    """Also where it is most of them, so that the parts are shorter than two batches."""
+    for size in range(1, BATCHES + 3):
+        for seed in range(5):
+            drawn = drawn_from(app, size, seed)
+            names = {batch.batch for batch in drawn.batches}
+            assert len(names) == len(drawn.batches) == min(size, BATCHES)
+
+
 def test_a_sample_is_spread_over_the_whole_range(app, recorded):
     """One batch of each of ten equal parts, whatever the seed."""
     order = [body["batch"] for body in recorded]

@@ -80,7 +80,7 @@ def merged_options(own: Row, options: OptionsIn) -> OptionsIn:
 def sample_batches(
     connection: Connection, archive: Archive, selected: ResultFilter, size: int, seed: int = 0
 ) -> BatchSample:
-    """At most `size` batches of a period: all, or one drawn from each of as many equal parts.
+    """All batches of a period, or `size` of them: one drawn from each of as many parts.
 
     Drawn and not every n-th, so that nothing periodic in the telemetry is met
     always or never; the same seed draws the same.  The archived ones count as the earlier.
@@ -96,7 +96,9 @@ def sample_batches(
     count = min(size, total)
     ranks = np.arange(1, count + 1)
     if count < total:
-        ranks = 1 + np.floor((np.arange(count) + rng.random(count)) * total / count).astype(int)
+        # Whole parts, so that none is drawn twice.
+        edges = np.arange(count + 1) * total // count
+        ranks = 1 + edges[:-1] + np.floor(rng.random(count) * np.diff(edges)).astype(int)
     rows: list[Row] = []
     for part, begin, end in zip(parts, ends, ends[1:], strict=False):
         within = ranks[(ranks > begin) & (ranks <= end)] - begin - 1
