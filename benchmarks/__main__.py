@@ -43,6 +43,7 @@ from benchmarks.validation import (
     plain_reference,
     ptp,
     spurious,
+    tracker_sigmas,
     two_groups,
     whole_sky,
     zone_counts,
@@ -83,6 +84,7 @@ BENCHMARKS: dict[str, Callable[[bool, int], Report]] = {
     "picture_offsets": offsets.run,
     "camera_calibrations": calibrations.run,
     "tracker_calibration": tracker_calibration.run,
+    "tracker_sigmas": tracker_sigmas.run,
 }
 OF_SPEED = tuple(performance.TITLES)
 BY_NAME_ALONE = ("scale", "soak")

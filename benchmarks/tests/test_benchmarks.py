@@ -10,7 +10,7 @@ from benchmarks.bounds import equal, share_as_expected
 from benchmarks.record import ROOT, digest_of, read_record
 from benchmarks.sections import Section, Written, bounds_shown, kept, stale, state_of
 from benchmarks.speed import performance, tracker_calibration
-from benchmarks.validation import aberration, centroids, consistency, covariance
+from benchmarks.validation import aberration, centroids, consistency, covariance, tracker_sigmas
 from benchmarks.validation.imaging_claims import HELD_AGAINST
 from benchmarks.validation.lost_in_space.__main__ import main as lost_in_space
 from benchmarks.validation.lost_in_space.conditions import CONDITIONS
@@ -19,7 +19,9 @@ from benchmarks.verification import SECTIONS, TARGET, remake
 from benchmarks.verification import main as verification
 
 
-@pytest.mark.parametrize("benchmark", [aberration, consistency, covariance, tracker_calibration])
+@pytest.mark.parametrize(
+    "benchmark", [aberration, consistency, covariance, tracker_calibration, tracker_sigmas]
+)
 def test_a_benchmark_s_small_sample_is_within_its_bounds(benchmark, seed):
     report = benchmark.run(quick=True, seed=seed)
     assert report.passed, report.text()

@@ -10,6 +10,7 @@ from numpy.polynomial.legendre import legval2d
 from scipy.spatial.transform import Rotation
 
 from service.calibration.stars import IdentifiedStars
+from service.calibration.unknowns import Model
 from service.missions.mission import Tracker
 
 ARCSEC = np.pi / 180.0 / 3600.0
@@ -156,6 +157,25 @@ def drawn(
         attitude=off.as_matrix() @ attitude,
         rates_rad_per_s=rates,
     )
+
+
+def varied(rng, batches):
+    """Body rates (batches, 3) in deg/s that differ from batch to batch."""
+    return rng.normal(0.0, 0.05, (batches, 3))
+
+
+def everything(rng, batches, **more):
+    """A stretch with all that a model may hold, and that model."""
+    truth = Truth(
+        MISALIGNED,
+        bending(rng),
+        scale=(2e-4, -1e-4),
+        time_tag_s=0.05,
+        drift=np.array([1.5, -0.7, 2.0]),
+    )
+    stars = drawn(rng, batches, truth, rates_deg_per_s=varied(rng, batches), **more)
+    middle = float(stars.temperature_c.mean())
+    return truth, stars, Model(degree=3, reference_temperature_c=middle, time_tag=True)
 
 
 def truth_of(truth, unknowns):

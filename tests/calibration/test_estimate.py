@@ -17,30 +17,14 @@ from tests.calibration.drawn import (
     bending,
     drawn,
     error_rms_arcsec,
+    everything,
     tracker,
     truth_of,
+    varied,
 )
 
 PER_AXIS_ARCSEC = 6.0 / np.sqrt(2.0)
 """Of stars with a radial error of 6 arcsec."""
-
-
-def varied(rng, batches):
-    return rng.normal(0.0, 0.05, (batches, 3))
-
-
-def everything(rng, batches, **more):
-    """A stretch with all that a model may hold, and that model."""
-    truth = Truth(
-        MISALIGNED,
-        bending(rng),
-        scale=(2e-4, -1e-4),
-        time_tag_s=0.05,
-        drift=np.array([1.5, -0.7, 2.0]),
-    )
-    stars = drawn(rng, batches, truth, rates_deg_per_s=varied(rng, batches), **more)
-    middle = float(stars.temperature_c.mean())
-    return truth, stars, Model(degree=3, reference_temperature_c=middle, time_tag=True)
 
 
 def test_derivatives_are_those_of_finite_differences():
