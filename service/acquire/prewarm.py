@@ -109,7 +109,7 @@ def prewarm_kernels(
 
 def _of_bright_stars(mission: Mission, to_mag: float) -> Mission:
     limit_mag = min(to_mag, mission.catalog.magnitude_limit_mag)
-    settings = mission.catalog.model_copy(update={"magnitude_limit_mag": limit_mag})
+    settings = mission.run_catalog_settings.model_copy(update={"magnitude_limit_mag": limit_mag})
     return mission.model_copy(update={"catalog": settings})
 
 

@@ -49,8 +49,9 @@ CAUSES: Mapping[str, Cause] = {
     "residual_ratio": _SIGMA,
     "magnitude_offset_mag": Cause(
         "Instrument drift: the tracker's magnitudes have shifted.",
-        "Run `acquire calibrate`, which estimates magnitudes too, or open the calibration page, try "
-        "the result and adopt it. Until then, widen the magnitude tolerance.",
+        "Run `acquire calibrate`, which estimates magnitudes too, or open the calibration page; "
+        "try the result over recorded batches, and adopt it. Until then, widen the magnitude "
+        "tolerance.",
         calibrate=True,
     ),
     "scale_offset_ppm": Cause(
@@ -60,8 +61,8 @@ CAUSES: Mapping[str, Cause] = {
         calibrate=True,
     ),
     "alignment_offset_arcsec": Cause(
-        "Instrument drift: a tracker has turned against the others. Of three trackers, the one with "
-        "the largest offset has moved.",
+        "Instrument drift: a tracker has turned against the others. Of three trackers, the one "
+        "with the largest offset has moved.",
         "Run `acquire calibrate` over the time of the alarm, or open the calibration page; try the "
         "result over recorded batches, and adopt it.",
         calibrate=True,

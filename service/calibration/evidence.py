@@ -7,13 +7,14 @@ import numpy as np
 
 from service.acquire import Acquisition
 from service.acquire.choices import aberration_velocity
+from service.calibration.magnitudes import MagnitudeStars, joined
 from service.calibration.observability import Marks
 from service.calibration.stars import IdentifiedStars, Indices
 from service.identify.attitude_from_matches import matched_vectors
 from service.observations.batch import TrackerStars
 from service.observations.focal_plane import tracker_vectors
 from service.sky.ephemeris import sun_distance_au
-from service.vectors import matrix_from_quaternion
+from service.vectors import Vector, matrix_from_quaternion
 
 Columns = dict[str, Any]
 
@@ -51,6 +52,30 @@ def identified_stars(acquisition: Acquisition, trackers: Collection[str]) -> Ide
         rates_rad_per_s=np.radians(acquisition.batch.body_rates_deg_per_s)[None],
         **columns,
     )
+
+
+def identified_magnitudes(
+    acquisition: Acquisition, trackers: Collection[str], color_bv_mag: Vector
+) -> MagnitudeStars | None:
+    """The magnitudes of the same stars; `color_bv_mag` (N,) are the colours of the star catalog.
+
+    None where the batch has no attitude, or no such star with a magnitude.
+    """
+    if acquisition.solution is None:
+        return None
+    run_catalog = acquisition.run_catalog
+    names = [each.name for each in acquisition.mission.trackers if each.name in trackers]
+    parts = []
+    for sent, result in zip(acquisition.batch.observations, acquisition.trackers, strict=True):
+        if sent.tracker in names:
+            star, observed_mag = result.identification.star, result.corrected.magnitude_mag
+            chosen = result.identification.unique & ~_shared(star) & np.isfinite(observed_mag)
+            row = run_catalog.catalog_row[star[chosen]]
+            catalog_mag = run_catalog.magnitude_mag[star[chosen]]
+            index = np.full(len(row), names.index(sent.tracker))
+            found = index, row, observed_mag[chosen], catalog_mag, color_bv_mag[row]
+            parts += [MagnitudeStars(*found)] if len(row) else []
+    return joined(parts)
 
 
 def _shared(star: Indices) -> Marks:

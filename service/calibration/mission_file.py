@@ -1,4 +1,4 @@
-"""A calibration as settings of a mission: alignment, scale and distortion of its trackers."""
+"""A calibration as settings of a mission: alignment, focal plane and magnitudes of trackers."""
 
 import math
 import re
@@ -10,6 +10,7 @@ from numpy.polynomial.legendre import leg2poly
 from service.calibration.estimate import Calibration
 from service.calibration.unknowns import SKEW, STRETCH, Unknown
 from service.errors import BadConfiguration
+from service.missions.corrections import Magnitudes
 from service.missions.mission import Mission, Tracker, parse_mission
 from service.vectors import ARCSEC_PER_RADIAN, Matrix, rotate_about
 
@@ -19,30 +20,39 @@ Terms = tuple[tuple[int, int, float], ...]
 
 _HEADER = re.compile(r"^\s*\[")
 _TRACKERS = re.compile(r"^\s*\[\[\s*trackers\s*\]\]")
-_CALIBRATION = re.compile(r"^\s*\[\s*trackers\.calibration\s*\]")
+_TABLES = {
+    name: re.compile(rf"^\s*\[\s*trackers\.{name}\s*\]") for name in ("calibration", "magnitudes")
+}
 _KEY = re.compile(r"^\s*([A-Za-z_]+)\s*=")
 
 
 def calibrated_mission_text(
-    text: str, file: str, found: Calibration, in_force: Mission | None = None
+    text: str,
+    file: str,
+    found: Calibration,
+    in_force: Mission | None = None,
+    magnitudes: Mapping[str, Magnitudes] | None = None,
 ) -> str:
     """The text of a mission file with a calibration's alignment, scale and distortion.
 
     `in_force` are the settings that the calibration started from, where these are not the
-    file's: what differs is written, too.  Everything else stays as it is.  Raises
+    file's: what differs is written, too.  `magnitudes` are the calibrated ones of trackers by
+    name; others stay as in `in_force`.  Everything else stays as it is.  Raises
     `BadConfiguration` for a file whose trackers are not laid out as `[[trackers]]` with each
     axis in one line.
     """
     mission = parse_mission(text, file)
     lines = text.splitlines()
     based = {each.name: each for each in (in_force or mission).trackers}
+    known = {name: each.magnitudes for name, each in based.items()} | dict(magnitudes or {})
     expected = {
         each.name: tracker_lines(based.get(each.name, each), found, each)
+        | {"magnitudes": magnitude_lines(known.get(each.name, each.magnitudes), each)}
         for each in mission.trackers
     }
     for index in reversed(range(len(mission.trackers))):
         changes = expected[mission.trackers[index].name]
-        if changes["tracker"] or changes["calibration"]:
+        if any(changes.values()):
             _edit(lines, index, changes)
     edited = "\n".join(lines) + "\n"
     if not _holds(parse_mission(edited, file), mission, expected):
@@ -70,6 +80,13 @@ def tracker_lines(
     if not lines["calibration"] and own.calibration != tracker.calibration:
         lines["calibration"] = _focal_plane(tracker, {})
     return lines
+
+
+def magnitude_lines(magnitudes: Magnitudes, own: Tracker) -> Lines:
+    """The keys of the table `magnitudes` of a tracker of the mission file, if they change."""
+    if magnitudes == own.magnitudes:
+        return {}
+    return {name: repr(value) for name, value in magnitudes.model_dump().items()}
 
 
 def _corrected(tracker: Tracker, found: Calibration) -> dict[str, Lines]:
@@ -154,12 +171,18 @@ def _edit(lines: list[str], index: int, changes: Mapping[str, Lines]) -> None:
         key = _KEY.match(lines[at])
         if key and key[1] in changes["tracker"]:
             lines[at] = f"{key[1]} = {changes['tracker'][key[1]]}"
-    if not changes["calibration"]:
-        return
+    for table in _TABLES:
+        if changes[table]:
+            _write_table(lines, begin, table, changes[table])
+
+
+def _write_table(lines: list[str], begin: int, table: str, changes: Lines) -> None:
+    """Put a table of the tracker that begins at a line in its place, or after its own keys."""
+    end = next((at for at in range(begin, len(lines)) if _HEADER.match(lines[at])), len(lines))
     following = next(
         (at for at in range(begin, len(lines)) if _TRACKERS.match(lines[at])), len(lines)
     )
-    old = next((at for at in range(end, following) if _CALIBRATION.match(lines[at])), None)
+    old = next((at for at in range(end, following) if _TABLES[table].match(lines[at])), None)
     if old is not None:
         last = next(
             (at for at in range(old + 1, len(lines)) if _HEADER.match(lines[at])), len(lines)
@@ -171,8 +194,8 @@ def _edit(lines: list[str], index: int, changes: Mapping[str, Lines]) -> None:
             old -= 1
         lines.insert(old, "")
         old += 1
-    written = [f"{key} = {value}" for key, value in changes["calibration"].items()]
-    lines[old:old] = ["[trackers.calibration]", *written, ""]
+    written = [f"{key} = {value}" for key, value in changes.items()]
+    lines[old:old] = [f"[trackers.{table}]", *written, ""]
 
 
 def _holds(edited: Mission, before: Mission, expected: Mapping[str, Mapping[str, Lines]]) -> bool:
@@ -180,15 +203,18 @@ def _holds(edited: Mission, before: Mission, expected: Mapping[str, Mapping[str,
     for old, new in zip(before.trackers, edited.trackers, strict=True):
         wanted = expected[old.name]
         for key, value in wanted["tracker"].items():
-            told = [float(part) for part in value.strip("[]").split(",")]
-            if not np.allclose(getattr(new, key), told, atol=1e-12):
+            axis = [float(part) for part in value.strip("[]").split(",")]
+            if not np.allclose(getattr(new, key), axis, atol=1e-12):
                 return False
         if wanted["calibration"]:
             scale = float(wanted["calibration"]["scale"])
             if not math.isclose(new.calibration.scale, scale, rel_tol=1e-12):
                 return False
+        told = {key: float(value) for key, value in wanted["magnitudes"].items()}
+        if told and new.magnitudes.model_dump() != told:
+            return False
     same = [
-        new.model_copy(update={name: getattr(old, name) for name in (*AXES, "calibration")})
+        new.model_copy(update={name: getattr(old, name) for name in (*AXES, *_TABLES)})
         for old, new in zip(before.trackers, edited.trackers, strict=True)
     ]
     return edited.model_copy(update={"trackers": tuple(same)}) == before

@@ -5,7 +5,13 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from service.app.calibrations.findings import notes, residuals_by_tracker, result_of
+from service.app.calibrations.findings import (
+    not_observable_of,
+    notes,
+    residuals_by_tracker,
+    result_of,
+    unknowns_of,
+)
 
 if TYPE_CHECKING:
     from service.app.calibrations.estimates import CalibrationRun
@@ -30,13 +36,13 @@ def calibration_text(result: "CalibrationRun") -> str:
         )
         lines += ["", f"Held-out residual over sigma by degree of the distortion: {tried}."]
     lines += ["", f"{'':2}{'unknown':34}{'value':>14}{'sigma':>12}  unit"]
-    for unknown, value, sigma in zip(found.unknowns, found.value, found.sigma, strict=True):
-        mark = "* " if abs(value) > CERTAIN_SIGMAS * sigma else "  "
-        lines.append(f"{mark}{unknown.name:34}{value:>14.6g}{sigma:>12.2g}  {unknown.unit}")
+    for each in unknowns_of(result):
+        mark = "* " if abs(each.value) > CERTAIN_SIGMAS * each.sigma else "  "
+        lines.append(f"{mark}{each.name:34}{each.value:>14.6g}{each.sigma:>12.2g}  {each.unit}")
     lines.append(f"* differs from the mission's by more than {CERTAIN_SIGMAS:g} sigmas")
     lines += ["", "Not observable:"]
-    lines += [f"  {each.name}: {each.reason}." for each in found.not_observable]
-    lines += ["", *(f"Note: {each}." for each in notes(found))]
+    lines += [f"  {each.name}: {each.reason}." for each in not_observable_of(result)]
+    lines += ["", *(f"Note: {each}." for each in notes(result))]
     return "\n".join(lines).rstrip()
 
 
@@ -57,4 +63,4 @@ def _residual_lines(found: "Calibration") -> list[str]:
 def calibration_json(result: "CalibrationRun") -> dict[str, Any]:
     """The result as `GET /api/v1/calibrations/{id}` has it, with its covariance."""
     found: dict[str, Any] = msgspec.to_builtins(result_of(result))
-    return found | {"covariance": result.found.covariance.tolist()}
+    return found | {"covariance": result.covariance.tolist()}

@@ -44,7 +44,7 @@ class MissionReport:
 def examined(mission: "Mission", catalog: "Catalog", epoch: float | None) -> MissionReport:
     """Check a mission with the run catalog of an epoch in years, by default this year's."""
     year = mission.catalog.epoch_of(epoch_of(epoch))
-    run_catalog = build_run_catalog(catalog, mission.catalog, year)
+    run_catalog = build_run_catalog(catalog, mission.run_catalog_settings, year)
     wrong = [each for each in axis_findings(mission) if each.level == "wrong"]
     if wrong or len(run_catalog) == 0:
         empty = Finding("wrong", "catalog", "leaves no star in the run catalog")

@@ -27,6 +27,7 @@ from pydantic import (
 from service.errors import BadConfiguration, BadInput, Fault, NotFound, shown_value
 from service.missions.camera import Camera
 from service.missions.camera_defaults import with_camera_defaults
+from service.missions.corrections import AS_MEASURED, Calibration, Magnitudes
 from service.missions.gyro import GyroSettings, MotionSettings
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.keys import dotted_key, explained
@@ -185,18 +186,6 @@ class RunCatalogSettings(Strict):
         return round(julian_year / self.epoch_step_years) * self.epoch_step_years
 
 
-class Calibration(Strict):
-    """Focal-plane calibration: measured angles to true ones.
-
-    With u, v the measured `h_deg`, `v_deg`, each true angle is
-    scale (measured + sum of coefficient u^i v^j) over terms [i, j, coefficient].
-    """
-
-    scale: float = Field(default=1.0, gt=0.5, lt=2)
-    h_terms: tuple[tuple[int, int, float], ...] = ()
-    v_terms: tuple[tuple[int, int, float], ...] = ()
-
-
 class Tracker(Strict):
     """One star tracker: where it looks in the body, how far it sees, how well it measures."""
 
@@ -212,6 +201,7 @@ class Tracker(Strict):
     coelevation_deg: float | None = Field(default=None, gt=0, lt=180)
     """In bands: the coelevation of this tracker's boresight, where it is not the mission's."""
     calibration: Calibration = Calibration()
+    magnitudes: Magnitudes = Field(default=AS_MEASURED, exclude_if=AS_MEASURED.__eq__)
     camera: Camera | None = None
     """Of a tracker that sends frames; the field of view reaches to its farthest corner."""
     scan: Scan | None = Field(default=None, exclude_if=is_missing)
@@ -306,6 +296,16 @@ class Mission(Strict):
     def within_zones(self) -> "Mission":
         """The mission with no look at the whole sky where a zone gave nothing good."""
         return self.model_copy(update={"lost_in_space_fallback": False})
+
+    @cached_property
+    def run_catalog_settings(self) -> RunCatalogSettings:
+        """How the run catalog is made: with the mean colour term of the trackers' magnitudes."""
+        color_mag = math.fsum(each.magnitudes.color_mag for each in self.trackers)
+        if color_mag == 0.0:
+            return self.catalog
+        zero, slope, *rest = (*self.catalog.color_polynomial_mag, 0.0, 0.0)
+        terms = (zero, slope + color_mag / len(self.trackers), *rest)
+        return self.catalog.model_copy(update={"color_polynomial_mag": terms})
 
     @cached_property
     def rules(self) -> Rules:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from msgspec import Struct
 
 from service.compiled.jit import njit
+from service.missions.corrections import Magnitudes
 from service.missions.mission import Mission, Tracker
 from service.observations.batch import ObservationBatch, TrackerStars
 from service.observations.focal_plane import tracker_vectors
@@ -76,7 +77,7 @@ def _corrected(
     return CorrectedObservations(
         tracker,
         read_only(body),
-        locked(stars.magnitude_mag),
+        true_magnitudes(stars.magnitude_mag, tracker.magnitudes),
         read_only(sigma[0]),
         sigma[1],
         outside,
@@ -133,3 +134,15 @@ def _to_body(  # type: ignore[no-untyped-def]
         body[k, 1] += sine * once1 + versine * (z * once0 - x * once2)
         body[k, 2] += sine * once2 + versine * (x * once1 - y * once0)
     return True
+
+
+def true_magnitudes(measured_mag: Vector, settings: Magnitudes) -> Vector:
+    """The magnitudes (n,) that a tracker would measure if it were as the run catalog assumes."""
+    if settings.zero_mag == 0.0 and settings.scale == 1.0:
+        return locked(measured_mag)
+    return read_only(settings.zero_mag + settings.scale * measured_mag)
+
+
+def measured_magnitudes(true_mag: Vector, settings: Magnitudes) -> Vector:
+    """`true_magnitudes` undone."""
+    return np.asarray((true_mag - settings.zero_mag) / settings.scale)

@@ -174,7 +174,7 @@ def whole_sky(sky: SkyModel, mission: Mission, time: Utc) -> RealSky:
         magnitude_limit_mag=FAINTEST_RENDERED_MAG,
         epoch_step_years=mission.catalog.epoch_step_years,
         merge_within_arcsec=0.0,
-        color_polynomial_mag=mission.catalog.color_polynomial_mag,
+        color_polynomial_mag=mission.run_catalog_settings.color_polynomial_mag,
     )
     epoch_year = settings.epoch_of(time.julian_year)
     run, _ = sky.cache.get(

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from service.missions.mission import Band, Mission, Tracker
 from service.observations.batch import Aberration
+from service.observations.calibrate import measured_magnitudes
 from service.observations.focal_plane import measured_angles_deg
 from service.simulate.motion import across, random_axis, turned_by
 from service.simulate.real_sky import RealSky
@@ -99,7 +100,9 @@ class BatchScene:
         error = self.rng.normal(size=len(seen.star))
         while (beyond := np.abs(error) > MAGNITUDE_CUT_SIGMA).any():
             error[beyond] = self.rng.normal(size=int(beyond.sum()))
-        magnitudes = np.round(seen.magnitude + sigma_mag * error, 3).tolist()
+        true_mag = seen.magnitude + sigma_mag * error
+        sent_mag = measured_magnitudes(true_mag, seen.tracker.magnitudes)
+        magnitudes = np.round(sent_mag, 3).tolist()
         if as_angles:
             angles = np.round(measured_angles_deg(direction, seen.tracker.calibration), 9).tolist()
             where = [{"h_deg": h, "v_deg": v} for h, v in angles]

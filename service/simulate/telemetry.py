@@ -80,7 +80,7 @@ def draw_pass(mission: Mission, sky: SkyModel, wanted: Pass) -> Iterator[DrawnBa
         position_km, velocity_km_per_s = (np.round(each, 4) for each in orbit.state(time))
         scene = BatchScene(
             mission=mission,
-            sky=real_sky(sky.catalog, mission.catalog, sky.run_catalog(mission, time)),
+            sky=real_sky(sky.catalog, mission.run_catalog_settings, sky.run_catalog(mission, time)),
             time=time,
             position_km=position_km,
             velocity_c=observer_velocity(time, velocity_km_per_s),

@@ -32,9 +32,9 @@ class SkyModel:
     def run_catalog(self, mission: Mission, time: Utc) -> RunCatalog:
         """The run catalog that serves a mission at a time: that of the nearest epoch."""
         epoch_year = mission.catalog.epoch_of(time.julian_year)
-        key = RunCatalogKey(self.catalog.digest, mission.catalog.digest, epoch_year)
+        key = RunCatalogKey(self.catalog.digest, mission.run_catalog_settings.digest, epoch_year)
         run_catalog, _ = self.cache.get(
-            key, lambda: build_run_catalog(self.catalog, mission.catalog, epoch_year)
+            key, lambda: build_run_catalog(self.catalog, mission.run_catalog_settings, epoch_year)
         )
         return run_catalog
 
@@ -61,7 +61,7 @@ class SkyModel:
         Stars a little beyond the catalog's limit, which noise may show, are known to it.
         """
         limit_mag = mission.catalog.magnitude_limit_mag
-        settings = mission.catalog.model_copy(
+        settings = mission.run_catalog_settings.model_copy(
             update={"magnitude_limit_mag": limit_mag + FURTHER_MAG}
         )
         index, _ = sky_index_for(

@@ -1,5 +1,6 @@
 """Calibrations over HTTP: estimated beside other work, tried, adopted, taken back, remembered."""
 
+import json
 import time
 
 import httpx
@@ -21,6 +22,9 @@ from tests.calibration.wrong_file import (
 )
 from tests.web.conformance import check
 from tests.web.serving import Server
+from tests.webhooks.conftest import LOOPBACK, receiver
+
+__all__ = ["receiver"]
 
 BEFORE, AFTER = 40, 20
 API = "/api/v1"
@@ -28,7 +32,7 @@ API = "/api/v1"
 
 def serve(folder):
     missions, database = folder / "assumed", f"sqlite:///{folder}/acquire.db"
-    return open_app(Settings(database=database, missions=missions))
+    return open_app(Settings(database=database, missions=missions, webhook_networks=LOOPBACK))
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +89,10 @@ def test_a_calibration_is_a_versioned_record_of_all_that_was_found(client, calib
     )
     assert (calibrated["done"], calibrated["total"]) == (BEFORE, BEFORE)
     found = calibrated["result"]
+    own = [each for each in found["unknowns"] if each["kind"] == "magnitude"]
+    assert {each["tracker"] for each in own} == {"STARTRACKER_1", "SECOND"}
+    # Telemetry is drawn with the magnitudes of the catalog.
+    assert all(abs(each["value"]) < 4.5 * each["sigma"] for each in own)
     (turn,) = (each for each in found["unknowns"] if each["name"] == "SECOND alignment z")
     # The bent field counts as alignment in part: see docs/calibration.md.
     assert abs(turn["value"] - TURNED_ARCSEC) < 15.0
@@ -123,8 +131,10 @@ def test_a_trial_tells_what_an_adoption_would_do_and_changes_nothing(client, cal
 
 
 def test_new_batches_are_as_good_as_with_the_true_file_until_it_is_taken_back(
-    client, calibrated, batches, sky
+    client, calibrated, batches, sky, receiver
 ):
+    hook = {"name": "changes", "url": receiver.url, "kinds": ["calibration"]}
+    client.post(f"{API}/webhooks", json=hook).raise_for_status()
     here = f"{API}/calibrations/{calibrated['id']}/adopt"
     signed = {"who": "J. Operator", "note": "after the first pass"}
     unsigned = client.post(here, json={})
@@ -152,6 +162,11 @@ def test_new_batches_are_as_good_as_with_the_true_file_until_it_is_taken_back(
     again = back | {"to": adopted["id"]}
     put_back = client.post(f"{API}/spacecraft/TWO/calibration/revert", json=again).json()
     assert put_back["mission"] == adopted["mission"]
+    sent_on = [json.loads(receiver.next().body) for _ in range(3)]
+    assert [each["type"] for each in sent_on] == ["calibration"] * 3
+    changes = [adopted, reverted, put_back]
+    assert [each["data"]["id"] for each in sent_on] == [each["id"] for each in changes]
+    assert [each["data"]["mission"] for each in sent_on] == [each["mission"] for each in changes]
     actions = [each["action"] for each in client.get(f"{API}/audit").json()["items"]]
     assert actions[:2] == ["revert_calibration", "revert_calibration"]
     assert actions.count("adopt_calibration") == 3  # two were refused

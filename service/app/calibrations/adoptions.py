@@ -23,9 +23,13 @@ from service.storage.calibrations.models import (
     CalibrationInForce,
     TrackerGeometry,
 )
+from service.storage.recording import events
 from service.storage.recording.ids import Ulids
 from service.storage.recording.results import register
 from service.times import utc_now
+
+TOLD = ("id", "spacecraft", "adopted", "who", "note", "calibration", "version", "mission")
+"""What the event of a change says of it; the rest is long."""
 
 log = logging.getLogger(__name__)
 
@@ -154,7 +158,10 @@ class CalibrationAdoptions:
         def change(connection: Connection) -> CalibrationAdoption:
             register(connection, [settings], used)
             stored.add_adoption(connection, row)
-            return stored.list_adoptions(connection, name)[0]
+            adopted = stored.list_adoptions(connection, name)[0]
+            told = {each: getattr(adopted, each) for each in TOLD}
+            events.add_event(connection, "calibration", told, spacecraft=name)
+            return adopted
 
         with self._lock:
             if self._context.missions[name].digest == mission.digest:

@@ -113,5 +113,5 @@ def found_columns(run: CalibrationRun) -> Row:
         "state": "done",
         "ended": utc_now().text,
         "result": msgspec.json.encode(result_of(run)).decode(),
-        "covariance": msgspec.json.encode(run.found.covariance.tolist()).decode(),
+        "covariance": msgspec.json.encode(run.covariance.tolist()).decode(),
     }

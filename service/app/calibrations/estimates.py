@@ -4,23 +4,33 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from msgspec import structs
 
 from service.acquire import Acquisition
 from service.app.context import Context
 from service.app.submissions import Submissions
 from service.calibration.estimate import Calibration, calibrate
-from service.calibration.evidence import identified_stars
+from service.calibration.evidence import identified_magnitudes, identified_stars
 from service.calibration.held_out import HeldOut, calibrate_with_chosen_degree
+from service.calibration.magnitudes import (
+    MagnitudeCalibration,
+    MagnitudeStars,
+    calibrate_magnitudes,
+    calibrated_settings,
+)
+from service.calibration.magnitudes import joined as joined_magnitudes
 from service.calibration.stars import IdentifiedStars, joined
 from service.calibration.unknowns import LARGEST_DEGREE, Model
 from service.errors import BadInput, Busy, Fault, Stopping, shown_value
+from service.missions.corrections import Magnitudes
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.recorded_batch import sample_batches
 from service.times import Utc
+from service.vectors import Matrix
 
 CALIBRATION_SAMPLE = 2_000
 LARGEST_CHOSEN_DEGREE = 5
@@ -48,6 +58,7 @@ class CalibrationRequest:
     alignment: bool = True
     scale: bool = True
     time_tag: bool = False
+    magnitudes: bool = True
     sample: int = CALIBRATION_SAMPLE
 
     def require(self, mission: Mission, trackers_field: str = "trackers") -> None:
@@ -82,6 +93,26 @@ class CalibrationRun:
     refused: int
     first: str | None
     last: str | None
+    magnitudes: tuple[MagnitudeCalibration, ...] = ()
+    """Of each tracker that was calibrated; empty where they were not asked for."""
+
+    @property
+    def calibrated_magnitudes(self) -> dict[str, Magnitudes]:
+        """The settings of every tracker's magnitudes, with what was found, by its name."""
+        names = [each.name for each in self.found.stars.trackers]
+        return calibrated_settings(self.mission.trackers, self.magnitudes, names)
+
+    @property
+    def covariance(self) -> Matrix:
+        """Of all unknowns, those of magnitudes last: these share nothing with the others."""
+        blocks = [self.found.covariance, *(each.covariance for each in self.magnitudes)]
+        size = sum(len(each) for each in blocks)
+        whole, first = np.zeros((size, size)), 0
+        for each in blocks:
+            end = first + len(each)
+            whole[first:end, first:end] = each
+            first = end
+        return whole
 
 
 class Estimator:
@@ -107,6 +138,8 @@ class Estimator:
         with self._context.reading() as connection:
             drawn = sample_batches(connection, self._context.store.archive, selected, wanted.sample)
         parts: list[IdentifiedStars] = []
+        seen: list[MagnitudeStars] = []
+        color_bv_mag = self._context.sky.catalog.color_bv_mag
         refused = 0
         for number, batch in enumerate(drawn.batches, 1):
             options = structs.replace(batch.options, identifier="verified", solver="quest")
@@ -117,13 +150,20 @@ class Estimator:
                 refused += 1
             else:
                 parts += [] if stars is None else [stars]
+                magnitudes = identified_magnitudes(again, names, color_bv_mag)
+                seen += [] if magnitudes is None else [magnitudes]
             step(number, len(drawn.batches))
         if not parts:
             message = "have no identified stars: there is nothing to calibrate with"
             raise BadInput(Fault("batches", message, f"{len(drawn.batches)} batches"))
         found, tried = _calibrated(joined(parts), wanted)
         counts = drawn.total, len(drawn.batches), len(parts), refused
-        return CalibrationRun(mission, found, tried, *counts, drawn.first, drawn.last)
+        used = [each.name for each in found.stars.trackers]
+        of_magnitudes = (
+            calibrate_magnitudes(joined_magnitudes(seen), used) if wanted.magnitudes else ()
+        )
+        ends = drawn.first, drawn.last
+        return CalibrationRun(mission, found, tried, *counts, *ends, of_magnitudes)
 
     def _run_again(self, batch: ObservationBatch, mission: Mission) -> Acquisition:
         """The acquisition of a batch; while the threads are at work on others it waits."""

@@ -2,12 +2,15 @@
 
 import math
 from collections.abc import Iterator
+from itertools import chain
 
 import numpy as np
 
 from service.app.calibrations.estimates import CalibrationRun
 from service.app.calibrations.geometry import calibrated_geometry, mission_file_lines
 from service.calibration.estimate import Calibration
+from service.calibration.magnitudes import UNITS
+from service.calibration.observability import NotObservable
 from service.storage.calibrations.models import (
     CalibrationBatches,
     CalibrationHeldOut,
@@ -25,6 +28,10 @@ VECTORS = (
     "not those sent as vectors"
 )
 TIME_TAGS = "mission files hold no time tag: add it to time_offset_s where telemetry is made"
+COLORS = (
+    "the colour terms of the trackers differ: the run catalog is one for all and has their mean, "
+    "so that magnitudes of very blue and very red stars stay off"
+)
 MAP_CELLS = 12
 """Cells of a residual map across the field of view."""
 
@@ -32,7 +39,6 @@ MAP_CELLS = 12
 def result_of(run: CalibrationRun) -> CalibrationResult:
     """A calibration as a record, without its covariance."""
     found = run.found
-    names = [each.name for each in found.stars.trackers]
     return CalibrationResult(
         batches=CalibrationBatches(
             total=run.total,
@@ -55,26 +61,51 @@ def result_of(run: CalibrationRun) -> CalibrationResult:
         ],
         residual_over_sigma=found.residual_over_sigma,
         residuals=residuals_by_tracker(found),
-        unknowns=[
-            CalibrationUnknown(
-                name=unknown.name,
-                tracker=names[unknown.tracker],
-                kind=unknown.kind,
-                value=float(value),
-                sigma=float(sigma),
-                unit=unknown.unit,
-            )
-            for unknown, value, sigma in zip(found.unknowns, found.value, found.sigma, strict=True)
-        ],
+        unknowns=unknowns_of(run),
         not_observable=[
             CalibrationNotObservable(name=each.name, reason=each.reason)
-            for each in found.not_observable
+            for each in not_observable_of(run)
         ],
-        notes=notes(found),
+        notes=notes(run),
         maps=list(_maps(found)),
-        trackers=calibrated_geometry(run.mission, found),
-        mission_file=mission_file_lines(run.mission, found),
+        trackers=calibrated_geometry(run.mission, found, run.calibrated_magnitudes),
+        mission_file=mission_file_lines(run.mission, found, run.calibrated_magnitudes),
     )
+
+
+def unknowns_of(run: CalibrationRun) -> list[CalibrationUnknown]:
+    """What was estimated, in the order of the covariance."""
+    found = run.found
+    names = [each.name for each in found.stars.trackers]
+    of_positions = [
+        CalibrationUnknown(
+            name=unknown.name,
+            tracker=names[unknown.tracker],
+            kind=unknown.kind,
+            value=float(value),
+            sigma=float(sigma),
+            unit=unknown.unit,
+        )
+        for unknown, value, sigma in zip(found.unknowns, found.value, found.sigma, strict=True)
+    ]
+    return of_positions + [
+        CalibrationUnknown(
+            name=f"{names[each.tracker]} {name}",
+            tracker=names[each.tracker],
+            kind="magnitude",
+            value=float(value),
+            sigma=float(sigma),
+            unit=UNITS[name],
+        )
+        for each in run.magnitudes
+        for name, value, sigma in zip(each.names, each.value, each.sigma, strict=True)
+    ]
+
+
+def not_observable_of(run: CalibrationRun) -> list[NotObservable]:
+    """What the stars do not show."""
+    of_magnitudes = (each.not_observable for each in run.magnitudes)
+    return [*run.found.not_observable, *chain.from_iterable(of_magnitudes)]
 
 
 def residuals_by_tracker(found: Calibration) -> list[CalibrationResiduals]:
@@ -101,11 +132,20 @@ def _rms(values: Vector) -> float:
     return math.sqrt(float(np.mean(values**2)))
 
 
-def notes(found: Calibration) -> list[str]:
+def notes(run: CalibrationRun) -> list[str]:
     """What a mission file cannot hold of this calibration."""
-    kinds = {each.kind for each in found.unknowns}
+    kinds = {each.kind for each in run.found.unknowns}
     told = [VECTORS] if kinds & {"scale", "distortion"} else []
-    return told + ([TIME_TAGS] if "time_tag" in kinds else [])
+    told += [TIME_TAGS] if "time_tag" in kinds else []
+    return told + ([COLORS] if _colors_differ(run) else [])
+
+
+def _colors_differ(run: CalibrationRun) -> bool:
+    """Whether the calibrated trackers do not have one colour term within the noise of a star."""
+    settings = run.calibrated_magnitudes
+    colors = [settings[each.name].color_mag for each in run.mission.trackers]
+    least = min(each.magnitude_sigma_mag for each in run.mission.trackers)
+    return max(colors) - min(colors) > least
 
 
 def _maps(found: Calibration) -> Iterator[ResidualMap]:

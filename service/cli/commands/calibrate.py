@@ -28,10 +28,10 @@ def add(commands: Any) -> None:
     parser = add_command(
         commands,
         "calibrate",
-        "Estimate alignment between trackers, scale and distortion of each, and time tags from "
-        "the identified stars of recorded batches, with sigmas; name the unknowns that these "
-        "cannot show; write a mission file with the result, or record it for the console, where "
-        "an operator may adopt it.  Changes nothing that is in use.",
+        "Estimate alignment between trackers, scale, distortion and magnitudes of each, and time "
+        "tags from the identified stars of recorded batches, with sigmas; name the unknowns that "
+        "these cannot show; write a mission file with the result, or record it for the console, "
+        "where an operator may adopt it.  Changes nothing that is in use.",
         """
         acquire calibrate TWOHEADS
         acquire calibrate TWOHEADS --run commissioning --output twoheads-new.toml
@@ -73,7 +73,7 @@ def add(commands: Any) -> None:
         "--output",
         type=Path,
         metavar="OUT.toml",
-        help="write the mission file with alignment, scale and distortion corrected",
+        help="write the mission file with alignment, scale, distortion and magnitudes corrected",
     )
     parser.add_argument(
         "--record",
@@ -143,10 +143,12 @@ def _write_mission(parsed: Namespace, result: "CalibrationRun") -> None:
         message = "is the mission file in use; name another file, and put it in its place later"
         raise BadInput(Fault("--output", message, shown_value(str(parsed.output))))
     before = source.read_text(encoding="utf-8")
-    text = calibrated_mission_text(before, str(source), result.found, result.mission)
+    text = calibrated_mission_text(
+        before, str(source), result.found, result.mission, result.calibrated_magnitudes
+    )
     parsed.output.write_text(text, encoding="utf-8")
     if not parsed.json:
-        print(f"\n{parsed.output}: {source} with alignment, scale and distortion corrected")
+        print(f"\n{parsed.output}: {source} with what was calibrated")
 
 
 def _mission_file(parsed: Namespace) -> Path:

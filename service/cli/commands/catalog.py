@@ -166,4 +166,4 @@ def _run_catalog(parsed: Namespace) -> "RunCatalog":
         raise BadInput(Fault("--epoch", message, shown_value(parsed.epoch)))
     mission, catalog = mission_and_catalog(parsed.spacecraft)
     epoch_year = mission.catalog.epoch_of(parsed.epoch)
-    return build_run_catalog(catalog, mission.catalog, epoch_year)
+    return build_run_catalog(catalog, mission.run_catalog_settings, epoch_year)

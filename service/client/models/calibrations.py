@@ -13,14 +13,26 @@ class FocalPlane(Model, frozen=True, kw_only=True):
     v_terms: list[list[float]]
 
 
+class TrackerMagnitudes(Model, frozen=True, kw_only=True):
+    """A tracker's magnitude calibration, as in mission files."""
+
+    zero_mag: float
+    scale: float
+    color_mag: float
+
+
 class TrackerGeometry(Model, frozen=True, kw_only=True):
-    """Alignment and focal plane of a tracker, as in mission files."""
+    """Alignment, focal plane and magnitudes of a tracker, as in mission files.
+
+    `magnitudes` are None in an adoption of an earlier version: then they are the file's.
+    """
 
     name: str
     x_axis_body: list[float]
     y_axis_body: list[float]
     z_axis_body: list[float]
     calibration: FocalPlane
+    magnitudes: TrackerMagnitudes | None = None
 
 
 class CalibrationBatches(Model, frozen=True, kw_only=True):

@@ -17,7 +17,7 @@ from service.storage.models.base import (
 )
 
 CalibrationStateName = Literal["queued", "running", "done", "failed", "interrupted"]
-UnknownKind = Literal["alignment", "scale", "distortion", "temperature", "time_tag"]
+UnknownKind = Literal["alignment", "scale", "distortion", "temperature", "time_tag", "magnitude"]
 Terms = Annotated[
     list[Components],
     doc("Powers of the measured h and v in degrees, and the coefficient, as in mission files."),
@@ -33,8 +33,17 @@ class FocalPlane(Record, frozen=True, kw_only=True):
     v_terms: Terms
 
 
+class TrackerMagnitudes(Record, frozen=True, kw_only=True):
+    """A tracker's magnitude calibration, as in mission files."""
+
+    component: ClassVar[str] = "TrackerMagnitudes"
+    zero_mag: float
+    scale: float
+    color_mag: float
+
+
 class TrackerGeometry(Record, frozen=True, kw_only=True):
-    """Alignment and focal plane of a tracker, as in mission files."""
+    """Alignment, focal plane and magnitudes of a tracker, as in mission files."""
 
     component: ClassVar[str] = "TrackerGeometry"
     name: str
@@ -42,6 +51,9 @@ class TrackerGeometry(Record, frozen=True, kw_only=True):
     y_axis_body: Components
     z_axis_body: Components
     calibration: FocalPlane
+    magnitudes: Annotated[
+        TrackerMagnitudes | None, doc("Null: as the mission file has them (earlier versions).")
+    ] = None
 
 
 class CalibrationBatches(Record, frozen=True, kw_only=True):

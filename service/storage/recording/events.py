@@ -20,7 +20,15 @@ from service.storage.sql.tables import event_counter, events
 from service.times import Utc, utc_now
 
 EventKind = Literal[
-    "batches", "adopted", "alarm", "limit", "annotation", "replay", "gyro", "tracking"
+    "batches",
+    "adopted",
+    "alarm",
+    "limit",
+    "annotation",
+    "replay",
+    "gyro",
+    "tracking",
+    "calibration",
 ]
 EVENT_KINDS: tuple[EventKind, ...] = get_args(EventKind)
 KEPT = 20_000

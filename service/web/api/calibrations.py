@@ -83,6 +83,9 @@ class CalibrationIn(_Period):
     time_tag: Annotated[
         bool, Field(description="Estimate how much later than sent stars were measured.")
     ] = False
+    magnitudes: Annotated[
+        bool, Field(description="Estimate zero point, scale and colour term of magnitudes.")
+    ] = True
     sample: Annotated[
         int, Field(ge=1, le=10_000, strict=True, description="Maximum number of batches.")
     ] = CALIBRATION_SAMPLE

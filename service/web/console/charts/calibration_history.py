@@ -5,13 +5,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from service.app.calibrations.geometry import geometry_of
+from service.calibration.magnitudes import COLOR, SCALE
+from service.missions.corrections import AS_MEASURED
 from service.missions.mission import Mission
+from service.sky.catalog.run_catalog import UNKNOWN_COLOR_BV_MAG
 from service.storage.calibrations.models import CalibrationSummary, TrackerGeometry
 from service.times import parse_utc
 from service.vectors import ARCSEC_PER_RADIAN
 
 WIDTH, HEIGHT, PAD = 420.0, 96.0, 10.0
 SIGMAS = 1.0
+STAR_MAG = 5.0
+"""V of the star, of a Sun-like colour, by which zero points are compared."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +56,7 @@ class ParameterHistory:
 def parameter_histories(
     versions: Sequence[CalibrationSummary], file: Mission
 ) -> list[ParameterHistory]:
-    """Alignment and scale by the mission file's, and time tags, of the versions that are done.
+    """Alignment, scale and magnitudes by the mission file's, and time tags, of versions done.
 
     All are counted from the same settings, whatever was in force when they were estimated.
     """
@@ -65,6 +71,7 @@ def parameter_histories(
 def _points(found: CalibrationSummary, file: Mission) -> Iterator[tuple[str, str, Point]]:
     own = {each.name: each for each in found.trackers}
     files = {each.name: each for each in file.trackers}
+    files_geometry = [geometry_of(each) for each in file.trackers]
     for each in found.unknowns:
         if each.tracker not in own or each.tracker not in files:
             continue
@@ -75,10 +82,27 @@ def _points(found: CalibrationSummary, file: Mission) -> Iterator[tuple[str, str
             value = own[each.tracker].calibration.scale - files[each.tracker].calibration.scale
         elif each.kind == "time_tag":
             value = each.value
+        elif each.kind == "magnitude":
+            value = _of_magnitudes(each.name, found.trackers, each.tracker)
+            value -= _of_magnitudes(each.name, files_geometry, each.tracker)
         else:
             continue
         point = Point(found.version, found.first or "", value, each.sigma)
         yield each.name, "" if each.unit == "1" else each.unit, point
+
+
+def _of_magnitudes(name: str, trackers: Sequence[TrackerGeometry], tracker: str) -> float:
+    """What settings say of a tracker: how much fainter it measures a star of `STAR_MAG`, how many
+    magnitudes it measures for one of the catalog, or its colour term.
+    """
+    own = {each.name: each.magnitudes or AS_MEASURED for each in trackers}
+    if name.endswith(COLOR):
+        return own[tracker].color_mag
+    if name.endswith(SCALE):
+        return 1.0 / own[tracker].scale
+    color_mag = sum(each.color_mag for each in own.values()) / len(own)
+    instrument_mag = STAR_MAG + color_mag * UNKNOWN_COLOR_BV_MAG
+    return (instrument_mag - own[tracker].zero_mag) / own[tracker].scale
 
 
 def _turned_arcsec(tracker: TrackerGeometry, before: np.ndarray) -> list[float]:

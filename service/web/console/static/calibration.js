@@ -34,7 +34,8 @@ async function finished(id) {
 form?.addEventListener("submit", (event) => {
   event.preventDefault();
   if (!signed.reportValidity()) return;
-  const { start, end, degree, sample, alignment, scale, time_tag: timeTag } = form.elements;
+  const { start, end, degree, sample, alignment, scale, magnitudes, time_tag: timeTag } =
+    form.elements;
   attempt(event.submitter, message, async () => {
     const begun = await send("POST", "/api/v1/calibrations", JSON.stringify({
       spacecraft: form.dataset.spacecraft,
@@ -45,6 +46,7 @@ form?.addEventListener("submit", (event) => {
       sample: Number(sample.value),
       alignment: alignment.checked,
       scale: scale.checked,
+      magnitudes: magnitudes.checked,
       time_tag: timeTag.checked,
       who: author(),
     }));

@@ -5,7 +5,16 @@
 // connections to a server, and catches up when it is visible again.
 import { fetchLatest, swapRegions } from "./regions.js";
 
-const EVENT_KINDS = ["batches", "alarm", "limit", "annotation", "replay", "adopted", "tracking"];
+const EVENT_KINDS = [
+  "batches",
+  "alarm",
+  "limit",
+  "annotation",
+  "replay",
+  "adopted",
+  "tracking",
+  "calibration",
+];
 const DRAW_EVERY_MS = 1000;
 const SHARE_OF_DRAWING = 0.2;
 const FIRST_RETRY_MS = 1000;

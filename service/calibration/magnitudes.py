@@ -1,0 +1,236 @@
+"""Zero point, scale and colour term of each tracker's magnitudes, from identified stars.
+
+A robust line for each tracker: observed minus catalog magnitude is
+
+    z + s (m - p) + c (b - q),
+
+m the catalog magnitude and b the colour B-V of the star, p and q their medians over the
+tracker's stars.  Sigmas take the observations of one star together, because what the catalog
+has wrong of a star is the same in every batch.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from service.calibration.observability import NotObservable
+from service.calibration.stars import Indices
+from service.missions.corrections import Magnitudes
+from service.missions.mission import Tracker
+from service.vectors import Matrix, Vector
+
+ZERO, SCALE, COLOR = "magnitude zero", "magnitude scale", "magnitude colour"
+UNITS = {ZERO: "mag", SCALE: "1", COLOR: "mag/mag"}
+PLAUSIBLE = {ZERO: 1.0, SCALE: 0.3, COLOR: 0.5}
+"""In the unit of each: stars that leave a sigma beyond it do not show it."""
+REASONS = {
+    ZERO: "too few different stars with a magnitude",
+    SCALE: "the stars are all about as bright as each other",
+    COLOR: "the stars have too few different colours that the catalog knows: it looks like the "
+    "magnitude zero",
+}
+LEAST_STARS = 10
+"""Different stars for each number that is estimated: fewer do not tell how much they scatter."""
+LEAST_SPREAD_MAG = 0.05
+"""Of magnitudes or colours, what the other unknowns must leave of it, rms."""
+HUBER, WRONG = 1.5, 5.0
+"""Bounds of a residual in sigmas: beyond the first it counts less, beyond the second not at all."""
+ROUNDS = 50
+SETTLED_MAG = 1e-6
+MEDIAN_SIZE = 0.6744897501960817
+"""Median of the size of a Gaussian residual, in sigmas."""
+
+
+@dataclass(frozen=True, eq=False)
+class MagnitudeStars:
+    """Observations (n,) of identified stars that have a magnitude.
+
+    `tracker` are indices into the trackers and `star` rows of the star catalog.  `observed_mag`
+    is as corrected by the settings in force, `catalog_mag` the instrument magnitude of the run
+    catalog, `color_bv_mag` B-V, NaN where it is not known.
+    """
+
+    tracker: Indices
+    star: Indices
+    observed_mag: Vector
+    catalog_mag: Vector
+    color_bv_mag: Vector
+
+
+@dataclass(frozen=True, eq=False)
+class MagnitudeCalibration:
+    """What is estimated of a tracker's magnitudes: `value` (p,) and `covariance` (p, p) of `names`.
+
+    The zero point is that of a star of magnitude `pivot_mag` and colour `pivot_bv_mag`.
+    `scatter_mag` is the sigma of one observation.
+    """
+
+    tracker: int
+    names: tuple[str, ...]
+    value: Vector
+    covariance: Matrix
+    pivot_mag: float
+    pivot_bv_mag: float
+    scatter_mag: float
+    stars: int
+    not_observable: tuple[NotObservable, ...]
+
+    @property
+    def sigma(self) -> Vector:
+        """One standard deviation (p,) of each."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def value_of(self, name: str) -> float:
+        """The value of an unknown; 0 where it was not estimated."""
+        return float(self.value[self.names.index(name)]) if name in self.names else 0.0
+
+
+def joined(parts: Sequence[MagnitudeStars]) -> MagnitudeStars | None:
+    """The observations of several batches; None where there is none."""
+    if not parts:
+        return None
+    names = ("tracker", "star", "observed_mag", "catalog_mag", "color_bv_mag")
+    return MagnitudeStars(
+        **{name: np.concatenate([getattr(each, name) for each in parts]) for name in names}
+    )
+
+
+def calibrate_magnitudes(
+    stars: MagnitudeStars | None, trackers: Sequence[str]
+) -> tuple[MagnitudeCalibration, ...]:
+    """Every tracker's magnitudes; what its stars do not show is left out and named."""
+    return tuple(_of_tracker(stars, index, name) for index, name in enumerate(trackers))
+
+
+def calibrated_settings(
+    trackers: Sequence[Tracker], found: Sequence[MagnitudeCalibration], names: Sequence[str]
+) -> dict[str, Magnitudes]:
+    """The settings of a mission's trackers by name with what was found of those of `names`.
+
+    `trackers` are with the settings that the observations were corrected with.  The run catalog
+    has the mean colour term of all trackers, so that each is right at its median colour.
+    """
+    by_name = {names[each.tracker]: each for each in found if each.names}
+    change = sum(each.value_of(COLOR) for each in by_name.values()) / len(trackers)
+    return {
+        each.name: _corrected(each.magnitudes, by_name[each.name], change)
+        if each.name in by_name
+        else each.magnitudes
+        for each in trackers
+    }
+
+
+def _corrected(
+    present: Magnitudes, found: MagnitudeCalibration, color_change_mag: float
+) -> Magnitudes:
+    stretch = 1.0 + found.value_of(SCALE)
+    zero_mag = present.zero_mag - found.value_of(ZERO) + found.value_of(SCALE) * found.pivot_mag
+    return Magnitudes(
+        zero_mag=round(zero_mag / stretch + color_change_mag * found.pivot_bv_mag, 6),
+        scale=round(present.scale / stretch, 8),
+        color_mag=round(present.color_mag + found.value_of(COLOR), 6),
+    )
+
+
+def _of_tracker(stars: MagnitudeStars | None, index: int, tracker: str) -> MagnitudeCalibration:
+    own = np.zeros(0, np.int64) if stars is None else np.flatnonzero(stars.tracker == index)
+    if stars is None or len(np.unique(stars.star[own])) < LEAST_STARS:
+        return _nothing(index, tracker)
+    off = stars.observed_mag[own] - stars.catalog_mag[own]
+    catalog_mag, color = stars.catalog_mag[own], stars.color_bv_mag[own]
+    colored = np.isfinite(color)
+    pivot_mag = float(np.median(catalog_mag))
+    pivot_bv_mag = float(np.median(color[colored])) if colored.any() else 0.0
+    columns = {
+        ZERO: np.ones(len(own)),
+        SCALE: catalog_mag - pivot_mag,
+        COLOR: np.where(colored, color, pivot_bv_mag) - pivot_bv_mag,
+    }
+    kept = _with_spread(columns, stars.star[own])
+    while kept:
+        # A star of unknown colour says nothing where a colour term is estimated.
+        rows = colored if COLOR in kept else np.ones(len(own), dtype=np.bool_)
+        design = np.column_stack([columns[name] for name in kept])[rows]
+        value, covariance, scatter = _robust_line(design, off[rows], stars.star[own][rows])
+        sigma = np.sqrt(np.diag(covariance))
+        beyond = [
+            name
+            for name, each in zip(kept, sigma, strict=True)
+            if not each <= PLAUSIBLE[name] and name != ZERO
+        ]
+        if not beyond:
+            count = int(rows.sum())
+            missing = _missing(tracker, kept)
+            return MagnitudeCalibration(
+                index,
+                tuple(kept),
+                *(value, covariance, pivot_mag, pivot_bv_mag, scatter, count, missing),
+            )
+        kept.remove(beyond[-1])
+    return _nothing(index, tracker)
+
+
+def _with_spread(columns: dict[str, Vector], star: Indices) -> list[str]:
+    """The unknowns that differ enough between stars, whatever those before them are."""
+    _, first = np.unique(star, return_index=True)
+    kept = [ZERO]
+    for name in (SCALE, COLOR):
+        before = np.column_stack([columns[each][first] for each in kept])
+        own = columns[name][first]
+        left = own - before @ np.linalg.lstsq(before, own, rcond=None)[0]
+        enough = len(first) >= LEAST_STARS * (len(kept) + 1)
+        if enough and math.sqrt(float(np.mean(left**2))) > LEAST_SPREAD_MAG:
+            kept.append(name)
+    return kept
+
+
+def _robust_line(design: Matrix, off: Vector, star: Indices) -> tuple[Vector, Matrix, float]:
+    """Values (p,), covariance (p, p) and sigma of one observation, of `design` (n, p).
+
+    The covariance sums what each star pulls at the values (Huber 1967; Liang & Zeger 1986).
+    """
+    n, p = design.shape
+    value = np.zeros(p)
+    value[0] = np.median(off)
+    scatter, weight = 1.0, np.ones(n)
+    for number in range(ROUNDS):
+        residual = off - design @ value
+        size = float(np.median(np.abs(residual))) / MEDIAN_SIZE
+        scatter = max(size * math.sqrt(n / max(n - p, 1)), 1e-6)
+        length = np.abs(residual) / scatter
+        weight = np.minimum(1.0, HUBER / np.maximum(length, 1e-300))
+        # Before the line has found its place, a good star may look wrong.
+        weight[(length > WRONG) & (number > 2)] = 0.0
+        step = np.linalg.solve(
+            design.T @ (design * weight[:, None]), design.T @ (weight * residual)
+        )
+        value = value + step
+        if number > 2 and float(np.abs(step).max()) < SETTLED_MAG:
+            break
+    residual = off - design @ value
+    # Beyond the bound a residual does not pull any harder, and has no slope.
+    slope = (np.abs(residual) <= HUBER * scatter).astype(np.float64)
+    inverse = np.linalg.inv(design.T @ (design * slope[:, None]))
+    _, place = np.unique(star, return_inverse=True)
+    pulls = np.zeros((int(place.max()) + 1, p))
+    np.add.at(pulls, place.reshape(-1), design * (weight * residual)[:, None])
+    count = len(pulls)
+    inner = pulls.T @ pulls * (count / max(count - p, 1))
+    return value, np.asarray(inverse @ inner @ inverse), scatter
+
+
+def _missing(tracker: str, kept: Sequence[str]) -> tuple[NotObservable, ...]:
+    return tuple(
+        NotObservable(f"{tracker} {name}", reason)
+        for name, reason in REASONS.items()
+        if name not in kept
+    )
+
+
+def _nothing(index: int, tracker: str) -> MagnitudeCalibration:
+    reason = REASONS[ZERO]
+    missing = tuple(NotObservable(f"{tracker} {name}", reason) for name in UNITS)
+    none = np.zeros(0)
+    return MagnitudeCalibration(index, (), none, np.zeros((0, 0)), 0.0, 0.0, 0.0, 0, missing)
