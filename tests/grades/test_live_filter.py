@@ -2,7 +2,9 @@
 
 import json
 import signal
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import httpx
@@ -164,6 +166,42 @@ def test_it_answers_what_smooth_records_and_another_process_answers_the_same(
     assert verify(database) == []
     (again,) = live.grades.smooth("XTE").days
     assert again.revision == 1
+
+
+def test_readers_have_the_last_attitude_while_the_next_is_computed(live, half_hour):
+    first, whole = before(half_hour[1], 300), half_hour[1]
+    put_gyro(live, first.gyro_ns, first.rates_rad_s)
+    send(live, first.attitudes)
+    live.live_filter.refresh("XTE")
+    done = threading.Event()
+
+    def read():
+        times = set()
+        while not done.is_set():
+            times.add(live.live_filter.latest("XTE").time)
+        return times
+
+    with ThreadPoolExecutor(1) as reader:
+        reading = reader.submit(read)
+        for begin in range(len(first.gyro_ns), 1801, 100):
+            part = slice(begin, begin + 100)
+            put_gyro(live, whole.gyro_ns[part], whole.rates_rad_s[part])
+            live.live_filter.refresh("XTE")
+        done.set()
+    assert len(reading.result()) > 1
+
+
+def test_a_request_does_not_wait_for_the_first_look_of_the_thread(live, half_hour):
+    recorded = before(half_hour[1], 300)
+    put_gyro(live, recorded.gyro_ns, recorded.rates_rad_s)
+    send(live, recorded.attitudes)
+    live.live_filter.stop()
+    # A thread that ends before it looks.
+    live.live_filter.start()
+    with pytest.raises(NotFound, match="no filtered attitude"):
+        live.live_filter.latest("XTE")
+    live.live_filter.refresh("XTE")
+    assert live.live_filter.latest("XTE").time == "1999-03-01T12:05:00.000Z"
 
 
 def test_a_mission_without_the_table_has_none(app):

@@ -68,18 +68,21 @@ class LiveFilter:
     def latest(self, name: str) -> LiveAttitude:
         """The filtered attitude of a spacecraft at the last epoch.
 
-        Raises `NotFound` for a mission without a live filter, and where no filter could start
-        or the attitude is lost.
+        Raises `NotFound` for a mission without a live filter, and where no filter could start,
+        the thread has not looked at the record yet, or the attitude is lost.
         """
         mission = mission_named(self._context.missions, name)
         if mission.live_filter is None:
             raise NotFound(f"the mission {name} has no live filter")
+        if self._thread is None and name not in self._kept:
+            self._looked(name)
+        # Not of a look in this thread: many requests would wait for the first one, which may
+        # take long, and repeat one that fails.
         kept = self._kept.get(name)
-        if kept is None or kept.version is None:
-            kept = self._looked(name)
-        if kept.attitude is None:
+        attitude = None if kept is None else kept.attitude
+        if attitude is None:
             raise NotFound(f"{name} has no filtered attitude")
-        return kept.attitude
+        return attitude
 
     def refresh(self, name: str) -> None:
         """Filter what is new of a spacecraft."""
@@ -122,9 +125,10 @@ class LiveFilter:
                     recorded = recorded_in(connection, self._context.sky, name, LIVE, *window)
             if day != kept.day:
                 kept.filter, kept.day = CarriedFilter(), day
-            kept.attitude = None
+            attitude = None
             if day is not None:
                 carried = kept.filter.carry_on(recorded, mission)
-                kept.attitude = live_attitude(name, day_bounds(day)[0], carried)
-            kept.version = version
+                attitude = live_attitude(name, day_bounds(day)[0], carried)
+            # Readers do not wait: until now they had the one before.
+            kept.attitude, kept.version = attitude, version
             return kept
