@@ -7,16 +7,17 @@
     settings/DIGEST.json
 
 A partition is whole when the manifest names it with its hash.  Every file appears whole, by a
-rename.
+rename or a link.
 """
 
+import errno
 import fcntl
 import hashlib
 import io
 import os
 import uuid
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import quote
@@ -39,6 +40,8 @@ COMPRESSION_LEVEL = 1
 """Of zstd: higher levels take longer, and those up to 9 make nothing smaller."""
 ROWS_TOGETHER = 2_048
 """Of a row group, the least that is read of a text column."""
+_NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS)
+"""What file systems without hard links say."""
 
 
 class Part(Struct, frozen=True, kw_only=True):
@@ -191,18 +194,39 @@ def read_settings(folder: Path, digest: str) -> Settings:
 def write_first(file: Path, content: bytes) -> bytes:
     """Write a file that appears whole, unless it is there; returns the bytes that are there then.
 
-    Several processes may write the same file at a time: each writes one of its own beside it.
+    Several processes may write the same file at a time: each writes one of its own beside it, and
+    that of the first stays.
     """
-    if file.exists():
-        return file.read_bytes()
-    write_whole(file, content, f".{file.name}.{uuid.uuid4().hex}{UNFINISHED}")
+    if not file.exists():
+        beside_as = f".{file.name}.{uuid.uuid4().hex}{UNFINISHED}"
+        # Another process was faster.
+        with suppress(FileExistsError):
+            write_whole(file, content, beside_as, _move_unless_there)
     return file.read_bytes()
 
 
-def write_whole(file: Path, content: bytes, beside_as: str | None = None) -> None:
+def _move_unless_there(beside: Path, file: Path) -> None:
+    """Rename a file; raises `FileExistsError` where there is one of that name."""
+    try:
+        os.link(beside, file)
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        # Here the last one would stay: between equal machines they are the same.
+        beside.replace(file)
+    else:
+        beside.unlink(missing_ok=True)
+
+
+def write_whole(
+    file: Path,
+    content: bytes,
+    beside_as: str | None = None,
+    move: Callable[[Path, Path], object] = Path.replace,
+) -> None:
     """Write a file that appears whole and outlasts a power cut.
 
-    Until then it is written under another name beside it.
+    Until then it is written under another name beside it, from which `move` takes it.
     """
     new = [folder for folder in file.parents if not folder.exists()]
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -214,7 +238,7 @@ def write_whole(file: Path, content: bytes, beside_as: str | None = None) -> Non
             part.write(content)
             part.flush()
             os.fsync(part.fileno())
-        beside.replace(file)
+        move(beside, file)
     except BaseException:
         beside.unlink(missing_ok=True)
         raise

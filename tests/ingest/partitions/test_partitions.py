@@ -1,6 +1,8 @@
 """Reprocessing into an archive: every batch once, byte-equal, and a run like any other."""
 
 import json
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from msgspec.structs import asdict
@@ -103,6 +105,22 @@ def test_bytes_follow_from_the_input_alone(archived, place):
     again(archived, place, processes=2)
     assert files_of(place, "again") == made
     assert_whole(archived, place)
+
+
+def test_of_several_who_write_the_same_file_the_first_one_s_stays(place):
+    """What each was told is there: the manifest gets the hash of one of them."""
+    with ThreadPoolExecutor(4) as pool:
+        for number in range(8):
+            file = place / "day=1996-01-10" / f"run-again-{number}.parquet"
+            begin = threading.Barrier(4)
+
+            def write(name, file=file, begin=begin):
+                begin.wait()
+                return folder.write_first(file, name)
+
+            found = set(pool.map(write, [b"a", b"b", b"c", b"d"]))
+            assert found == {file.read_bytes()}
+    assert list(place.rglob("*.part")) == []
 
 
 def forget(run):
