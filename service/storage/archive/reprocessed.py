@@ -195,7 +195,7 @@ def unmerged(store: Store, folder: Path, run: str) -> Iterator[tuple[str, RunPar
             if part.run != run or part.source is None or _is_known(store, path):
                 continue
             rows = from_partition(read_partition(whole_content(folder, path, part.sha256)))
-            if not _has_batch(store, rows["batches"]["id"][0].as_py()):
+            if not _has_some(store, rows["batches"]["id"].to_pylist()):
                 made = run_part(part.file, part.source, rows, b"")
                 yield path, _with(made, manifest, part)
 
@@ -210,12 +210,16 @@ def _is_known(store: Store, path: str) -> bool:
         return connection.scalar(query) is not None
 
 
-def _has_batch(store: Store, id: str) -> bool:
-    """Whether a batch is recorded, or archived in whatever part."""
+def _has_some(store: Store, ids: Sequence[str]) -> bool:
+    """Whether some batches are recorded, others of them perhaps pruned, or are archived."""
     with store.reading() as connection:
         return any(
-            connection.scalar(select(table.c.id).where(table.c.id == id)) is not None
+            connection.scalar(
+                select(table.c.id).where(table.c.id.in_(ids[first : first + _AT_ONCE])).limit(1)
+            )
+            is not None
             for table in (batches, archived_batches)
+            for first in range(0, len(ids), _AT_ONCE)
         )
 
 

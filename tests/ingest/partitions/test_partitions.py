@@ -15,6 +15,7 @@ from service.observations.schema import submission_from_json
 from service.storage.archive import archiving, folder
 from service.storage.recording import rollups
 from service.storage.sql.tables import batches
+from service.storage.upkeep.prune import prune
 from service.storage.upkeep.verify import verify
 from service.times import parse_utc, shifted
 from tests.ingest.partitions.checks import (
@@ -189,6 +190,18 @@ def test_what_is_archived_only_after_it_was_run_again_is_not_run_twice(archived,
     progress = again(archived, place)
     assert (progress.before, progress.recorded) == (ALL, 0)
     assert names_of(archived, "again") == names_of(archived, "live")
+    assert_trends(archived)
+
+
+def test_what_is_pruned_of_the_newest_part_is_run_again(archived, place):
+    again(archived, place, spacecraft="XTE")
+    with archived.store.reading() as connection:
+        recorded = select(batches.c.time).where(batches.c.run == "again").order_by(batches.c.time)
+        times = list(connection.scalars(recorded))
+    prune(archived.store, parse_utc(times[2]), "again")
+    progress = again(archived, place, spacecraft="XTE")
+    assert (progress.before, progress.recorded) == (BATCHES - 2, 2)
+    assert len(names_of(archived, "again")) == BATCHES
     assert_trends(archived)
 
 
