@@ -84,6 +84,22 @@ def test_one_without_measurement_and_stars_is_refused(post, measured):
     assert answer.json()["errors"][0]["field"] == "observations"
 
 
+def test_options_are_compared_and_advice_given_although_some_batches_are_measured(
+    post, client, measured, batch, run
+):
+    for body in (measured, batch | {"run": run}):
+        assert post(body).status_code == 201
+    asked = {"spacecraft": "XTE", "run": run, "b": {"solver": "triad"}}
+    answer = client.post("/api/v1/compare", json=asked)
+    assert answer.status_code == 200, answer.text
+    told = answer.json()
+    assert (told["compared"], told["attitudes"]["both"]) == (2, 2)
+    assert measured["batch"] not in {each["batch"] for each in told["changed"]}
+    advice = client.get("/api/v1/spacecraft/XTE/advice", params={"run": run})
+    assert advice.status_code == 200, advice.text
+    assert advice.json()["batches_sampled"] == 2
+
+
 def test_its_page_says_that_there_are_no_stars(post, client, measured):
     id = post(measured).json()["id"]
     page = client.get(f"/batches/{id}")
