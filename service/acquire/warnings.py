@@ -62,7 +62,7 @@ def warnings_of_attitude(
     if prior is None:
         return warnings
     zone = mission.zone
-    off_deg = separation_deg(np.dot(mission.axis_body, solution.matrix), prior.axis)
+    off_deg = separation_deg(np.dot(prior.axis_body(mission), solution.matrix), prior.axis)
     if off_deg > (zone.half_width_deg if isinstance(zone, Band) else zone.radius_deg):
         warnings.append(
             f"attitude_off_a_priori: its {'pole' if isinstance(zone, Band) else 'boresight'} lies "

@@ -97,7 +97,7 @@ def a_priori_angle_deg(acquisition: "Acquisition") -> float | None:
     prior = acquisition.prior
     attitude = acquisition.solution.matrix
     if prior.known_axis is not None:
-        axis = np.dot(acquisition.mission.axis_body, attitude)
+        axis = np.dot(prior.axis_body(acquisition.mission), attitude)
         return separation_deg(axis, prior.known_axis)
     # The Frobenius norm of A - B is 2 sqrt(2) sin(angle / 2).
     apart = math.dist(attitude.ravel().tolist(), prior.attitude.ravel().tolist())

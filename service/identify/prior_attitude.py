@@ -5,6 +5,8 @@ of geometry.  Where the roll is unknown it is made up, and the tests that would
 depend on it are switched off or, in a band, only vote.
 """
 
+import math
+
 import numpy as np
 from msgspec import Struct
 
@@ -48,6 +50,12 @@ class PriorAttitude(Struct, frozen=True, eq=False, gc=False):
     warnings: tuple[str, ...] = ()
     predicted: PredictedPrior | None = None
     """What the attitude was predicted with, if it was: its zones are caps about each boresight."""
+    pole_body: Vector | None = None
+    """Where in the body the pole was measured to be; None: along the zone's body axis."""
+
+    def axis_body(self, mission: Mission) -> Vector:
+        """The body axis (3,) that lies along `axis`."""
+        return mission.axis_body if self.pole_body is None else self.pole_body
 
 
 def prior_attitude(
@@ -110,14 +118,15 @@ def _sun_pointed(prior: SunPointedPrior, time: Utc, mission: Mission) -> PriorAt
             )
             warnings = (warned,)
     # Body Z is presumed along the projection of ecliptic north.
-    sun_axis = mission.axis_body
+    measured: Vector | None = None
     if prior.sun_counts is not None:
-        sun_axis = sun_body(prior.sun_counts, mission, "a_priori.sun_counts")
+        measured = sun_body(prior.sun_counts, mission, "a_priori.sun_counts")
+    sun_axis = mission.axis_body if measured is None else measured
     body = _frame(sun_axis, np.array([0.0, 0.0, 1.0]))
     inertial = _frame(pole, ecliptic_north(time))
     attitude = body.T @ inertial
     axis = np.dot(sun_axis, attitude)
-    return PriorAttitude(attitude, axis, False, pole, growth_deg, warnings)
+    return PriorAttitude(attitude, axis, False, pole, growth_deg, warnings, pole_body=measured)
 
 
 def _frame(first: Vector, second: Vector) -> Matrix:
@@ -149,9 +158,10 @@ def search_region(
     """The region in which the stars of a tracker are searched for.
 
     In a cap, about the tracker's own presumed boresight; in a band, at the
-    boresight's coelevation from the pole.  About a predicted attitude it is the field of
-    view with a margin, in bands too.  Raises `BadBatch` for a tracker
-    whose boresight an a priori direction with unknown roll does not tell.
+    boresight's coelevation from the pole, which changes by as much as a pole that was measured
+    beside the zone's axis is nearer to the boresight or farther.  About a predicted attitude it
+    is the field of view with a margin, in bands too.  Raises `BadBatch` for a tracker whose
+    boresight an a priori direction with unknown roll does not tell.
     """
     zone = mission.zone
     if presumed.predicted is not None:
@@ -161,11 +171,12 @@ def search_region(
     if isinstance(zone, Band):
         coelevation_deg = tracker.coelevation_deg or zone.coelevation_deg
         half_width_deg = zone.half_width_deg + presumed.growth_deg
+        nearer_deg, farther_deg = _pole_shift_deg(tracker, presumed, mission)
         return SearchRegion(
             "band",
             presumed.axis,
-            max(0.0, coelevation_deg - half_width_deg),
-            min(180.0, coelevation_deg + half_width_deg),
+            max(0.0, coelevation_deg + nearer_deg - half_width_deg),
+            min(180.0, coelevation_deg + farther_deg + half_width_deg),
         )
     if not presumed.roll_known and (
         (off_deg := separation_deg(tracker.boresight_body, mission.axis_body)) > SAME_BORESIGHT_DEG
@@ -181,3 +192,21 @@ def search_region(
         )
     axis = np.dot(tracker.boresight_body, presumed.attitude)
     return SearchRegion("cap", axis, 0.0, zone.radius_deg)
+
+
+def _pole_shift_deg(
+    tracker: Tracker, presumed: PriorAttitude, mission: Mission
+) -> tuple[float, float]:
+    """Bounds of what a measured pole adds to the coelevation of a tracker's boresight.
+
+    They are on the zone's grid, so that zones are shared while the pole moves a little.
+    """
+    if presumed.pole_body is None:
+        return 0.0, 0.0
+    shift_deg = separation_deg(tracker.boresight_body, presumed.pole_body) - separation_deg(
+        tracker.boresight_body, mission.axis_body
+    )
+    step_deg = mission.zone.grid_deg
+    if step_deg == 0.0:
+        return shift_deg, shift_deg
+    return math.floor(shift_deg / step_deg) * step_deg, math.ceil(shift_deg / step_deg) * step_deg

@@ -7,13 +7,15 @@ measured: the tracker's calibration applies to them.
 """
 
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from service.missions.strict import Strict
 
 MOST_SAMPLES, MOST_WIRES, MOST_LINES = 1001, 16, 8192
+WIDEST_DEG = 89.0
+"""Of an angle from the boresight: its tangent is what a direction is made of."""
 
 
 def _odd(samples: int) -> int:
@@ -82,6 +84,16 @@ class Sweep(Strict):
     sigma_floor_arcsec: float = Field(default=0.0, ge=0, le=3600)
     """What the calibration leaves in a place, per axis."""
 
+    @model_validator(mode="after")
+    def _is_before_the_tracker(self) -> Self:
+        least_deg = self.start_deg - self.wires_deg[-1]
+        if self.end_deg >= WIDEST_DEG or least_deg <= -WIDEST_DEG:
+            raise ValueError(
+                f"reaches from {least_deg:g} to {self.end_deg:g} deg: start_deg, rate_deg_per_s, "
+                f"duration_s and wires_deg must stay within {WIDEST_DEG:g} of the boresight"
+            )
+        return self
+
     @property
     def end_deg(self) -> float:
         """Where the first wire is when a sweep ends."""
@@ -102,6 +114,16 @@ class Raster(_Detector):
     """A star's place is the moment of so many lines on either side of its own."""
     zero_point_mag: float | None = Field(default=None, ge=-10, le=40)
     """Instrument magnitude of a star of one count; without it the stars have no magnitudes."""
+
+    @model_validator(mode="after")
+    def _is_before_the_tracker(self) -> Self:
+        reach_deg = max(self.middle("h"), self.middle("v")) * self.step_deg
+        if reach_deg >= WIDEST_DEG:
+            raise ValueError(
+                f"reaches {reach_deg:g} deg from the boresight: step_deg times half of the columns "
+                f"and rows must be less than {WIDEST_DEG:g}"
+            )
+        return self
 
     def middle(self, axis: Literal["h", "v"]) -> float:
         """The place of the boresight in lines from the first one."""

@@ -9,8 +9,9 @@ import pytest
 
 from service.acquire import acquire
 from service.acquire.result import Path
+from service.alarms.measurements import a_priori_angle_deg
 from service.errors import BadBatch, BadConfiguration, BadFile
-from service.identify.prior_attitude import prior_attitude
+from service.identify.prior_attitude import prior_attitude, search_region
 from service.missions.mission import SHIPPED_FOLDER, parse_mission, read_mission
 from service.observations.batch import SunPointedPrior
 from service.observations.calibrate import correct
@@ -112,12 +113,21 @@ class TestLinesThroughAStar:
         assert sigma_rad < 3e-4
         assert by_two_scans(*off, u0).roll_rad == pytest.approx(roll, abs=4 * sigma_rad)
 
+    def test_a_place_behind_the_tracker_is_refused(self, scanner):
+        counts = [50.0] * 21 + [300.0] * 3 + [50.0]
+        star = {"h_deg": 88.99, "v_deg": 0, "h_counts": counts, "v_counts": counts}
+        fault = fault_of(scanner, "LINES", stars=[star])
+        assert fault.field == "observations.0.stars.0"
+        assert "no tracker sees it" in fault.message
+
     @pytest.mark.parametrize(
         ("changed", "field", "message"),
         [
             ({"h_counts": [60.0] * 24}, "h_counts", "has 24 samples"),
             ({"v_counts": [50.0] * 25}, "v_counts", "leave the star out"),
             ({"h_counts": [50.0] * 12 + [4095.0] + [50.0] * 12}, "h_counts.12", "is full"),
+            # The level has fallen to zero: what is subtracted too much pushes the moment out.
+            ({"v_counts": [0.0] * 23 + [1500.0, 50.0]}, "v_counts", "a line that ends at 180"),
         ],
     )
     def test_counts_that_cannot_be_are_named(self, scanner, changed, field, message):
@@ -162,6 +172,12 @@ class TestTimesOfWires:
         fault = fault_of(scanner, "WIRES", stars=[GOOD_TIMES | changed])
         assert fault.field == f"observations.0.stars.0.{field}"
         assert message in fault.message
+
+    def test_a_body_too_fast_for_two_sweeps_is_refused(self, scanner):
+        body = batch_of("WIRES", (120.0, 0.0, 0.0), stars=[GOOD_TIMES])
+        with pytest.raises(BadBatch, match="the body turns too fast") as refused:
+            reduced(submission_from_json(json.dumps(body)).batch, scanner)
+        assert refused.value.faults[0].field == "observations.0.stars.0.v_times"
 
 
 class TestLinesOfARaster:
@@ -288,6 +304,8 @@ def test_columns_of_readings_come_in_pairs(tmp_path):
         ("samples = 25", "samples = 24", "trackers.0.scan.samples: Value error, must be odd"),
         ("wires_deg = [0.0, 0.1, 0.3]", "wires_deg = [0.0, 0.3, 0.1]", "trackers.1.scan.wires_deg"),
         ('kind = "raster"', 'kind = "spiral"', "trackers.2.scan"),
+        ("duration_s = 0.9", "duration_s = 9.4", "trackers.1.scan: Value error, reaches"),
+        ("step_deg = 0.02", "step_deg = 0.45", "trackers.2.scan: Value error, reaches 90 deg"),
         ("time_unit_s = 1e-6", "time_unit = 1e-6", "trackers.1.scan.time_unit: no such key"),
     ],
 )
@@ -378,6 +396,61 @@ noise_counts = 10.0
                 assert math.degrees(math.hypot(*across[2, :2])) * 3600.0 < 60.0
                 solved += 1
         assert solved > 2
+
+    @pytest.mark.parametrize(("grid_deg", "room_deg"), [(0.0, 0.0), (0.25, 0.25)])
+    def test_stars_are_sought_where_the_tracker_looks_beside_a_sun_far_off(
+        self, soho, sky, grid_deg, room_deg
+    ):
+        """The boresight is 2.5 deg nearer to the Sun than the band's middle, which is 2.1 wide."""
+        told = soho.model_dump(mode="json")
+        told["zone"]["grid_deg"] = grid_deg
+        told["sun_tracker"] |= {"slope_per_arcmin": 1e-3, "straight_to_arcmin": 300.0}
+        wide = type(soho).model_validate(told)
+        tracker, off_deg = wide.trackers[0], 2.5
+        off = np.degrees(np.arctan(tracker.boresight_body[1:] * np.tan(np.radians(off_deg)))) * 60.0
+        counts = [100.0 + 5e4 * (1.0 + side * 1e-3 * each) for each in off for side in (1.0, -1.0)]
+        (drawn,) = draw_pass(wide, sky, Pass(batches=1, seed=3, troubles=NO_TROUBLES))
+        time = submission_from_json(json.dumps(drawn.batch)).batch.time
+        prior = SunPointedPrior(None, np.array(drawn.batch["position_km"]), np.array(counts))
+        presumed = prior_attitude(prior, time, wide)
+        region = search_region(tracker, presumed, wide, "")
+        middle_deg = 90.0 - off_deg
+        assert region.least_deg <= middle_deg - 2.1 + 1e-9
+        assert region.most_deg >= middle_deg + 2.1 - 1e-9
+        assert region.most_deg - region.least_deg <= 4.2 + room_deg + 1e-9
+
+        # The drawn body, turned so that the Sun is where the counts have it.
+        truth = matrix_from_quaternion(np.array(drawn.truth["quaternion"]))
+        seen = presumed.axis_body(wide)
+        sun = truth @ sun_direction(time, np.array(drawn.batch["position_km"]))
+        turn = np.cross(sun, seen)
+        turn *= math.asin(np.linalg.norm(turn)) / np.linalg.norm(turn)
+        attitude = np.stack([rotate_about(turn, column) for column in truth.T], axis=1)
+        run_catalog = sky.run_catalog(wide, time)
+        inside = run_catalog.direction @ (tracker.boresight_body @ attitude) > np.cos(
+            np.radians(0.9 * tracker.field_of_view_radius_deg)
+        )
+        brightest = np.flatnonzero(inside)[np.argsort(run_catalog.magnitude_mag[inside])][:6]
+        assert len(brightest) >= 4
+        vectors = run_catalog.direction[brightest] @ attitude.T @ tracker.body_from_tracker
+        stars = [
+            {"vector": vector, "magnitude": magnitude}
+            for vector, magnitude in zip(
+                vectors.tolist(), run_catalog.magnitude_mag[brightest].tolist(), strict=True
+            )
+        ]
+        sent = drawn.batch | {
+            "a_priori": {"sun_pointed": True, "sun_counts": counts},
+            "aberration": "ignore",
+            "body_rates_deg_per_s": [0, 0, 0],
+            "observations": [{"tracker": tracker.name, "stars": stars}],
+        }
+        found = acquire(submission_from_json(json.dumps(sent)).batch, wide, sky)
+        assert found.path is Path.ZONE
+        assert np.degrees(np.arccos(found.solution.matrix[2] @ attitude[2])) * 3600.0 < 60.0
+        # Where the Sun was measured is where it was found: the a priori knowledge was right.
+        assert a_priori_angle_deg(found) < 0.02
+        assert not any("off_a_priori" in each for each in found.warnings)
 
     def test_a_mission_without_one_refuses_its_counts(self, missions):
         with pytest.raises(BadBatch, match="has no sun_tracker"):

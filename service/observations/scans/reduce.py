@@ -11,7 +11,7 @@ from msgspec import structs
 
 from service.errors import BadBatch, Fault
 from service.missions.mission import Mission, Tracker
-from service.missions.scan import CrossScan, Raster, Sweep
+from service.missions.scan import WIDEST_DEG, CrossScan, Raster, Sweep
 from service.observations.batch import (
     MAX_STARS_PER_TRACKER,
     ObservationBatch,
@@ -27,7 +27,8 @@ from service.vectors import Vector, read_only, rotate_about
 
 _GIVES = {CrossScan: "counts", Sweep: "times", Raster: "lines"}
 _FIELDS = {"counts": "h_counts", "times": "h_times"}
-_ROUNDS = 4
+_ROUNDS = 20
+_SETTLED_DEG = 1e-9
 
 
 def reduced(batch: ObservationBatch, mission: Mission) -> ObservationBatch:
@@ -69,6 +70,10 @@ def _reduced(stars: TrackerStars, tracker: Tracker, rates: Vector, field: str) -
             offset[k] += passed_s
         else:
             raise _other_kind(tracker, f"{here}.{_FIELDS[reading.kind]}", reading.kind)
+        if not (np.abs(angles[k]) < WIDEST_DEG).all():
+            h_deg, v_deg = angles[k].tolist()
+            message = f"is {h_deg:.4g}, {v_deg:.4g} deg from the boresight: no tracker sees it"
+            raise BadBatch(Fault(here, message))
         if math.isnan(sigma[k]):
             sigma[k] = of_scan
     return structs.replace(
@@ -111,6 +116,14 @@ def _of_counts(reading: Readings, scan: CrossScan, field: str) -> tuple[Vector, 
                 f"{BREAKDOWN_RATIO:g}; leave the star out"
             )
             raise BadBatch(Fault(here, message))
+        half_arcsec = (scan.samples // 2) * scan.step_arcsec
+        if abs(found.displacement) > half_arcsec:
+            message = (
+                f"puts its light {found.displacement:.4g} arcsec from the middle of a line that "
+                f"ends at {half_arcsec:g}: the level is not the {scan.background_counts:g} counts "
+                "of the mission file"
+            )
+            raise BadBatch(Fault(here, message))
         places.append(found.displacement / 3600.0)
         variance += 0.5 * found.sigma**2
     return np.array(places), math.sqrt(variance)
@@ -133,6 +146,11 @@ def _of_times(
             direction = tracker_vectors(angles, tracker.calibration)
             off_deg = aim - _v_deg(rotate_about(-rates * later_s, direction))
             angles[0, 1] += off_deg / tracker.calibration.scale
+            if abs(off_deg) < _SETTLED_DEG:
+                break
+        else:
+            message = f"cannot be carried over the {later_s:.4g} s to the second sweep: the body "
+            raise BadBatch(Fault(f"{field}.v_times", message + "turns too fast"))
     variance = scan.sigma_floor_arcsec**2 + 0.5 * (h.sigma_arcsec**2 + v.sigma_arcsec**2)
     return angles[0], math.sqrt(variance), h.time_s
 
