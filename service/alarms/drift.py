@@ -43,7 +43,8 @@ class MeanStars:
         if self.count < 2:
             return 0.0, 0.0
         observed, catalog = (
-            self.count - math.hypot(*each.tolist()) ** 2 / self.count
+            # Of stars in one place rounding may leave less than nothing.
+            max(self.count - math.hypot(*each.tolist()) ** 2 / self.count, 0.0)
             for each in (self.observed, self.catalog)
         )
         least = LEAST_SPREAD * math.radians(self.tracker.field_of_view_radius_deg)

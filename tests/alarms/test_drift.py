@@ -20,6 +20,7 @@ from service.sky.catalog.star_catalog import load_embedded
 from service.sky.ephemeris import apparent, observer_velocity
 from service.sky.model import SkyModel
 from service.storage.recording.result_metrics import metrics_of
+from service.vectors import unit
 from service.web.app import create_app
 from tests.calibration.wrong_file import TURNED_ARCSEC, mission_texts, true_batches
 from tests.storage.twin import FIRST, SECOND, submission, twin
@@ -128,6 +129,15 @@ def test_without_stars_to_compare_there_is_no_value(missions):
     close = np.array([np.cos(1e-3), np.sin(1e-3), 0.0])
     both = np.array([1.0, 0.0, 0.0]) + close
     assert scale_offset_ppm([MeanStars(mission.trackers[0], 2, both, both)]) is None
+
+
+def test_points_in_one_place_that_tell_of_two_stars_have_a_value(missions, rng):
+    """A tolerance of degrees lets them; rounding leaves less than nothing of their scatter."""
+    tracker = twin(missions).trackers[0]
+    for _ in range(100):
+        seen, other = (unit(rng.normal(size=3)) for _ in range(2))
+        offset = scale_offset_ppm([MeanStars(tracker, 2, 2.0 * seen, seen + other)])
+        assert offset == pytest.approx(-1e6, abs=1.0)
 
 
 def test_both_values_of_every_tracker_are_recorded_and_have_a_history(opened, sky, missions):
