@@ -10,13 +10,16 @@ has wrong of a star is the same in every batch.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
+from pydantic import ValidationError
 
 from service.calibration.observability import NotObservable
 from service.calibration.stars import Indices
+from service.errors import BadInput, Fault
 from service.missions.corrections import Magnitudes
 from service.missions.mission import Tracker
 from service.vectors import Matrix, Vector
@@ -25,6 +28,8 @@ ZERO, SCALE, COLOR = "magnitude zero", "magnitude scale", "magnitude colour"
 UNITS = {ZERO: "mag", SCALE: "1", COLOR: "mag/mag"}
 PLAUSIBLE = {ZERO: 1.0, SCALE: 0.3, COLOR: 0.5}
 """In the unit of each: stars that leave a sigma beyond it do not show it."""
+LARGEST = {ZERO: 20.0, SCALE: 0.4, COLOR: 1.0}
+"""A value beyond it is that of no tracker: what it sends is constant, or in another unit."""
 REASONS = {
     ZERO: "too few different stars with a magnitude",
     SCALE: "the stars are all about as bright as each other",
@@ -87,6 +92,16 @@ class MagnitudeCalibration:
         return float(self.value[self.names.index(name)]) if name in self.names else 0.0
 
 
+@dataclass(frozen=True, eq=False)
+class _Line:
+    """Values (p,), their covariance (p, p), the sigma of one observation, and which are `used`."""
+
+    value: Vector
+    covariance: Matrix
+    scatter: float
+    used: npt.NDArray[np.bool_]
+
+
 def joined(parts: Sequence[MagnitudeStars]) -> MagnitudeStars | None:
     """The observations of several batches; None where there is none."""
     if not parts:
@@ -127,11 +142,16 @@ def _corrected(
 ) -> Magnitudes:
     stretch = 1.0 + found.value_of(SCALE)
     zero_mag = present.zero_mag - found.value_of(ZERO) + found.value_of(SCALE) * found.pivot_mag
-    return Magnitudes(
-        zero_mag=round(zero_mag / stretch + color_change_mag * found.pivot_bv_mag, 6),
-        scale=round(present.scale / stretch, 8),
-        color_mag=round(present.color_mag + found.value_of(COLOR), 6),
-    )
+    try:
+        return Magnitudes(
+            zero_mag=round(zero_mag / stretch + color_change_mag * found.pivot_bv_mag, 6),
+            scale=round(present.scale / stretch, 8),
+            color_mag=round(present.color_mag + found.value_of(COLOR), 6),
+        )
+    except ValidationError as error:
+        (first, *_) = error.errors()
+        told = f"would have {first['loc'][0]} {first['input']:g}, which no mission file may have"
+        raise BadInput(Fault("magnitudes", told)) from None
 
 
 def _of_tracker(stars: MagnitudeStars | None, index: int, tracker: str) -> MagnitudeCalibration:
@@ -149,32 +169,52 @@ def _of_tracker(stars: MagnitudeStars | None, index: int, tracker: str) -> Magni
         COLOR: np.where(colored, color, pivot_bv_mag) - pivot_bv_mag,
     }
     kept = _with_spread(columns, stars.star[own])
+    reasons = dict(REASONS)
     while kept:
         # A star of unknown colour says nothing where a colour term is estimated.
         rows = colored if COLOR in kept else np.ones(len(own), dtype=np.bool_)
         design = np.column_stack([columns[name] for name in kept])[rows]
-        value, covariance, scatter = _robust_line(design, off[rows], stars.star[own][rows])
-        sigma = np.sqrt(np.diag(covariance))
-        beyond = [
-            name
-            for name, each in zip(kept, sigma, strict=True)
-            if not each <= PLAUSIBLE[name] and name != ZERO
-        ]
+        line = _robust_line(design, off[rows], stars.star[own][rows])
+        # One star that is seen far more often than the others may leave none of them.
+        used = np.flatnonzero(rows)[np.zeros(0, np.int64) if line is None else line.used]
+        of_used = {name: each[used] for name, each in columns.items()}
+        if line is None or not set(kept) <= set(_with_spread(of_used, stars.star[own][used])):
+            kept.pop()
+            continue
+        beyond = _beyond(kept, line)
+        reasons |= {
+            name: f"it would be {value:.3g} {UNITS[name]}, which is that of no tracker"
+            for name, value in zip(kept, line.value.tolist(), strict=True)
+            if abs(value) > LARGEST[name]
+        }
         if not beyond:
             count = int(rows.sum())
-            missing = _missing(tracker, kept)
+            missing = _missing(tracker, kept, reasons)
             return MagnitudeCalibration(
                 index,
                 tuple(kept),
-                *(value, covariance, pivot_mag, pivot_bv_mag, scatter, count, missing),
+                *(line.value, line.covariance, pivot_mag, pivot_bv_mag, line.scatter),
+                *(count, missing),
             )
         kept.remove(beyond[-1])
-    return _nothing(index, tracker)
+    return _nothing(index, tracker, reasons)
+
+
+def _beyond(names: Sequence[str], line: _Line) -> list[str]:
+    """The unknowns that the stars do not show, or show to be what they cannot be."""
+    sigma = np.sqrt(np.diag(line.covariance))
+    return [
+        name
+        for name, value, each in zip(names, line.value, sigma, strict=True)
+        if abs(value) > LARGEST[name] or (not each <= PLAUSIBLE[name] and name != ZERO)
+    ]
 
 
 def _with_spread(columns: dict[str, Vector], star: Indices) -> list[str]:
     """The unknowns that differ enough between stars, whatever those before them are."""
     _, first = np.unique(star, return_index=True)
+    if len(first) < LEAST_STARS:
+        return []
     kept = [ZERO]
     for name in (SCALE, COLOR):
         before = np.column_stack([columns[each][first] for each in kept])
@@ -186,11 +226,18 @@ def _with_spread(columns: dict[str, Vector], star: Indices) -> list[str]:
     return kept
 
 
-def _robust_line(design: Matrix, off: Vector, star: Indices) -> tuple[Vector, Matrix, float]:
-    """Values (p,), covariance (p, p) and sigma of one observation, of `design` (n, p).
+def _robust_line(design: Matrix, off: Vector, star: Indices) -> _Line | None:
+    """The line of `design` (n, p); None where what is left of the observations shows none.
 
     The covariance sums what each star pulls at the values (Huber 1967; Liang & Zeger 1986).
     """
+    try:
+        return _fitted(design, off, star)
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _fitted(design: Matrix, off: Vector, star: Indices) -> _Line:
     n, p = design.shape
     value = np.zeros(p)
     value[0] = np.median(off)
@@ -218,19 +265,22 @@ def _robust_line(design: Matrix, off: Vector, star: Indices) -> tuple[Vector, Ma
     np.add.at(pulls, place.reshape(-1), design * (weight * residual)[:, None])
     count = len(pulls)
     inner = pulls.T @ pulls * (count / max(count - p, 1))
-    return value, np.asarray(inverse @ inner @ inverse), scatter
+    return _Line(value, np.asarray(inverse @ inner @ inverse), scatter, weight > 0.0)
 
 
-def _missing(tracker: str, kept: Sequence[str]) -> tuple[NotObservable, ...]:
+def _missing(
+    tracker: str, kept: Sequence[str], reasons: Mapping[str, str]
+) -> tuple[NotObservable, ...]:
     return tuple(
         NotObservable(f"{tracker} {name}", reason)
-        for name, reason in REASONS.items()
+        for name, reason in reasons.items()
         if name not in kept
     )
 
 
-def _nothing(index: int, tracker: str) -> MagnitudeCalibration:
-    reason = REASONS[ZERO]
-    missing = tuple(NotObservable(f"{tracker} {name}", reason) for name in UNITS)
+def _nothing(
+    index: int, tracker: str, reasons: Mapping[str, str] = REASONS
+) -> MagnitudeCalibration:
+    missing = tuple(NotObservable(f"{tracker} {name}", reasons[ZERO]) for name in UNITS)
     none = np.zeros(0)
     return MagnitudeCalibration(index, (), none, np.zeros((0, 0)), 0.0, 0.0, 0.0, 0, missing)

@@ -110,6 +110,48 @@ def test_stars_without_a_known_colour_still_give_zero_and_scale():
     assert [each.name for each in found.not_observable] == [f"B {COLOR}"]
 
 
+@pytest.mark.parametrize(
+    ("observed", "left_out"),
+    [
+        (lambda mag: np.full_like(mag, 5.0), {SCALE}),
+        (lambda mag: 10.0 - mag, {SCALE}),
+        (lambda mag: 2.5 * mag, {SCALE}),
+        (lambda mag: mag - 40.0, {ZERO}),
+    ],
+    ids=["constant", "inverted", "stretched", "far off"],
+)
+def test_numbers_that_are_no_magnitudes_leave_settings_that_a_mission_file_takes(
+    missions, observed, left_out
+):
+    stars = drawn(np.random.default_rng(SEED))
+    sent = MagnitudeStars(
+        *(stars.tracker, stars.star, observed(stars.observed_mag)),
+        *(stars.catalog_mag, stars.color_bv_mag),
+    )
+    (found, _) = calibrate_magnitudes(sent, ("A", "B"))
+    assert not left_out & set(found.names)
+    assert (ZERO in found.names) == (ZERO not in left_out)
+    reasons = {each.name: each.reason for each in found.not_observable}
+    for name in left_out:
+        assert "that of no tracker" in reasons[f"A {name}"]
+    tracker = missions["XTE"].trackers[0].model_copy(update={"name": "A"})
+    settings = calibrated_settings([tracker], [found], ("A", "B"))["A"]
+    assert settings.scale == 1.0
+
+
+def test_one_star_that_is_seen_far_more_often_does_not_stand_for_all():
+    """Its noise, ten times less than what the catalog has wrong, would leave no other star."""
+    rng = np.random.default_rng(SEED)
+    star = np.concatenate([np.zeros(2_000, np.int64), np.arange(1, 60)])
+    catalog_mag, color = rng.uniform(2.0, 6.5, 60)[star], rng.normal(0.6, 0.5, 60)[star]
+    of_star = np.concatenate([[0.0], 1.0 + rng.normal(0.0, 0.2, 59)])
+    observed = catalog_mag + of_star[star] + rng.normal(0.0, 0.005, len(star))
+    stars = MagnitudeStars(np.zeros(len(star), np.int64), star, observed, catalog_mag, color)
+    (found,) = calibrate_magnitudes(stars, ("A",))
+    assert found.names == ()
+    assert len(found.not_observable) == 3
+
+
 def test_a_tracker_with_few_stars_or_none_gives_nothing():
     few = drawn(np.random.default_rng(SEED), stars=5)
     for stars in (few, None):
