@@ -279,6 +279,16 @@ def test_rows_of_a_csv_file_hold_readings(tmp_path, scanner, rng):
     assert BatchIn.model_validate_json(line.body) == checked
 
 
+def test_the_lines_of_the_largest_raster_are_one_cell(tmp_path, rng):
+    lines = {f"{each}_counts": rng.uniform(1e3, 9e3, 8192).tolist() for each in ("column", "row")}
+    checked = BatchIn.model_validate(batch_of("RASTER", **lines))
+    path = tmp_path / "raster.csv"
+    with path.open("w", newline="") as stream:
+        write_batches_csv([checked], stream)
+    (line,) = read_lines(path)
+    assert BatchIn.model_validate_json(line.body) == checked
+
+
 @pytest.mark.parametrize(
     ("cell", "message"), [("1 2 x", "must be a number"), ("1 1e999 3", "must be a finite number")]
 )
