@@ -25,12 +25,18 @@ CSV_HELP = """\
 CSV files have a header and one star per row; consecutive rows with the same
 (spacecraft, run, batch) form a batch.  Cells may be empty.  Columns, as in the JSON:
   spacecraft batch run time frame aberration options
-  q1 q2 q3 qc boresight_ra_deg boresight_dec_deg sun_pointed a_priori_from
+  q1 q2 q3 qc boresight_ra_deg boresight_dec_deg sun_pointed sun_counts a_priori_from
   rate_x_deg_per_s rate_y_deg_per_s rate_z_deg_per_s
   velocity_x_km_per_s velocity_y_km_per_s velocity_z_km_per_s
   position_x_km position_y_km position_z_km sun_vector_x sun_vector_y sun_vector_z
   tracker x y z h_deg v_deg magnitude time_offset_s sigma_arcsec
-spacecraft, batch, time, tracker, and x y z or h_deg v_deg are required."""
+  h_counts v_counts h_times v_times column_counts row_counts
+  measured_q1 measured_q2 measured_q3 measured_qc
+  measured_sigma_x_arcsec measured_sigma_y_arcsec measured_sigma_z_arcsec
+  measured_p11_arcsec2 measured_p12_arcsec2 measured_p13_arcsec2
+  measured_p22_arcsec2 measured_p23_arcsec2 measured_p33_arcsec2
+spacecraft, batch, time are required, with stars (tracker, and x y z, h_deg v_deg or the counts or
+times of a scan) or a measured attitude."""
 
 
 def add(commands: Any) -> None:
