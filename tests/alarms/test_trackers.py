@@ -112,4 +112,6 @@ def test_limits_of_a_tracker_are_set_for_the_quantities_that_it_has(twins):
         "residual_rms_arcsec",
         "residual_ratio",
         "magnitude_offset_mag",
+        "scale_offset_ppm",
+        "alignment_offset_arcsec",
     }

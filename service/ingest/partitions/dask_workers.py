@@ -59,7 +59,14 @@ class DaskWorkers:
         from distributed import Client
 
         # What goes wrong is told here, in a line and without the trace.
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        for name in (
+            "asyncio",
+            "distributed",
+            "distributed.client",
+            "distributed.utils",
+            "tornado",
+        ):
+            logging.getLogger(name).setLevel(logging.CRITICAL)
         # Its methods have no types.
         connect: Any = Client
         self._address = address
