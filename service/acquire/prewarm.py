@@ -51,8 +51,8 @@ def prewarm_kernels(
     """Compile the kernels by running a batch of real stars of each kind of zone.
 
     Those of identifiers that search zones, all others, or both.  The two parts take about as
-    long to compile and have little in common.  What is built for it goes into a cache of its
-    own, which is dropped.
+    long to compile and have little in common.  The zones that this builds go into
+    a cache of its own, which it drops at the end.
     """
     moment = parse_utc("2000-01-01T12:00:00Z")
     # Large enough that nothing is built twice on the way.

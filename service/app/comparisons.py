@@ -66,7 +66,7 @@ class Comparisons:
         def pair_of(row: Row) -> Pair:
             own = batch_with_options(row["input"], row["options"])
             if own.measurement is not None:
-                # Nothing is searched for, and so no option changes it.
+                # Such a batch has no stars to identify: options do not change its answer.
                 return Pair(row["id"], own, own)
             options = (batch_with_options(row["input"], row["options"], each) for each in (a, b))
             return Pair(row["id"], *options)

@@ -66,7 +66,7 @@ class MagnitudeStars:
 
 @dataclass(frozen=True, eq=False)
 class MagnitudeCalibration:
-    """What is estimated of a tracker's magnitudes: `value` (p,) and `covariance` (p, p) of `names`.
+    """The terms of a tracker's magnitudes: `value` (p,) and `covariance` (p, p) of `names`.
 
     The zero point is that of a star of magnitude `pivot_mag` and colour `pivot_bv_mag`.
     `scatter_mag` is the sigma of one observation.

@@ -39,9 +39,9 @@ class _WithoutMachineCode(CompilerBase):
     """numba's compiler, into a library without machine code."""
 
     def define_pipelines(self) -> list[Any]:
-        codegen = self.state.targetctx.codegen()
+        backend = self.state.targetctx.codegen()
         name = self.state.func_id.func_qualname
-        self.state.library = _BitcodeLibrary(codegen, name)  # type: ignore[no-untyped-call]
+        self.state.library = _BitcodeLibrary(backend, name)  # type: ignore[no-untyped-call]
         build: Any = DefaultPassBuilder.define_nopython_pipeline
         passes = build(self.state)
         passes.finalize()

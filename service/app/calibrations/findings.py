@@ -74,7 +74,7 @@ def result_of(run: CalibrationRun) -> CalibrationResult:
 
 
 def unknowns_of(run: CalibrationRun) -> list[CalibrationUnknown]:
-    """What was estimated, in the order of the covariance."""
+    """The names of the estimated parameters, in the order of the covariance."""
     found = run.found
     names = [each.name for each in found.stars.trackers]
     of_positions = [

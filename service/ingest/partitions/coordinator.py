@@ -137,7 +137,7 @@ def _run_tasks(
             if not some:
                 progress.partitions_done += unit.partitions
 
-    # Nobody is started where all is done.
+    # Workers start only if a task is left.
     left = tasks()
     first = next(left, None)
     if first is None:

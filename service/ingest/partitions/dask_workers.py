@@ -127,7 +127,8 @@ class DaskWorkers:
         """Let what is unfinished go."""
         try:
             self._client.cancel(list(self._unfinished), force=True)
-        except Exception as error:  # a scheduler that is gone cancels nothing
+        except Exception as error:
+            # Closing goes on whatever the client raises: a lost scheduler has nothing to cancel.
             log.debug("nothing was cancelled: %s", error)
         self._client.close()
 

@@ -1,4 +1,4 @@
-"""Who does the tasks: this process, local processes, or the workers of a Dask scheduler."""
+"""Where tasks are done: in this process, in local processes, or by workers of a Dask scheduler."""
 
 from collections.abc import Callable
 from concurrent.futures import TimeoutError as NotYet
@@ -94,7 +94,7 @@ class LocalProcesses:
             try:
                 (outcome,) = future.result(seconds)
             except NotYet:
-                # Whoever waits uses them: they would end when nothing is submitted for long.
+                # Workers without new tasks end after a while; this task still needs one.
                 self._workers.start()
                 return None
             except WorkerLost as error:

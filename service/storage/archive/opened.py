@@ -33,7 +33,7 @@ def columns_of(needs: Collection[str]) -> list[str]:
 class Opened:
     """A database in memory with some results and what belongs to them, for one thread at a time.
 
-    What was not read of them is empty there: null, an empty text, no stars.
+    Columns that were not read from the file are empty there: null, an empty text, no stars.
     """
 
     def __init__(self) -> None:

@@ -23,7 +23,7 @@ def test_options_that_do_not_fit_are_refused_by_name(acquire, tmp_path):
 
 def test_the_command_compares_both_runs(archived, place, database, acquire, opened):
     if not database.startswith("sqlite"):
-        pytest.skip("as on SQLite")
+        pytest.skip("the comparison does not depend on the database: SQLite shows it")
     archived.close()
     words = ("reprocess", "--database", database, "--archive", place, "--run", "again")
     code, output, complaint = acquire(*words, "--processes", "1", "--quiet")

@@ -32,7 +32,7 @@ WORKER_KILLS, COORDINATOR_KILLS, FAULTS = 200, 20, 50
 def database(empty_database):
     """With SQLite alone: another process works on it."""
     if not empty_database.startswith("sqlite"):
-        pytest.skip("as on SQLite")
+        pytest.skip("workers never see the database: SQLite shows the same")
     from service.storage.sql.migrations import upgrade
 
     upgrade(empty_database)
