@@ -66,7 +66,7 @@ def measured(count: int, seed: int) -> Report:
     bounds: list[Bound] = []
     with tempfile.TemporaryDirectory() as folder:
         url = f"sqlite:///{Path(folder) / 'scale.db'}"
-        figures |= _filled(url, count, seed)
+        figures |= filled(url, count, seed)
         done, found = _archived(url, Path(folder), count)
         figures |= done
         bounds += found
@@ -79,10 +79,10 @@ def measured(count: int, seed: int) -> Report:
             )
         )
     if postgresql := os.environ.get("TEST_POSTGRESQL_URL"):
-        _emptied(postgresql)
+        emptied(postgresql)
         upgrade(postgresql)
-        figures |= _filled(postgresql, count, seed)
-        _emptied(postgresql)
+        figures |= filled(postgresql, count, seed)
+        emptied(postgresql)
     return Report("scale", figures, bounds)
 
 
@@ -92,7 +92,7 @@ def _opened(url: str, folder: Path | None = None) -> App:
     return app
 
 
-def _filled(url: str, count: int, seed: int) -> dict[str, Any]:
+def filled(url: str, count: int, seed: int) -> dict[str, Any]:
     """Record so many batches in bulk: how fast, and how large the database is then."""
     name = DATABASES[url.split(":")[0].split("+")[0]]
     made = telemetry(seed)
@@ -126,7 +126,7 @@ def _archived(url: str, folder: Path, count: int) -> tuple[dict[str, Any], list[
     place = folder / "archive"
     place.mkdir()
     live, recorded = _read_ms(url, None, count), _digest(url)
-    end = _time_at(count + 3_600)
+    end = time_at(count + 3_600)
     store = Store(url, create=False)
     started = time.perf_counter()
     try:
@@ -166,13 +166,13 @@ def _archived(url: str, folder: Path, count: int) -> tuple[dict[str, Any], list[
     return figures, bounds
 
 
-def _time_at(seconds: float) -> Utc:
+def time_at(seconds: float) -> Utc:
     return parse_utc((FIRST + timedelta(seconds=seconds)).strftime("%Y-%m-%dT%H:%M:%SZ"))
 
 
 def _read_ms(url: str, folder: Path | None, count: int) -> dict[str, float]:
     """Milliseconds of a page of a list and of trends: of batches that are old enough to go."""
-    start, end = _time_at(0), _time_at(count / 2)
+    start, end = time_at(0), time_at(count / 2)
     app = _opened(url, folder)
     try:
         reads: dict[str, Callable[[], object]] = {
@@ -252,7 +252,7 @@ def _size(url: str) -> int:
     return int(found)
 
 
-def _emptied(url: str) -> None:
+def emptied(url: str) -> None:
     """Drop what a scratch database of PostgreSQL holds."""
     engine = create_engine(url)
     with engine.begin() as connection:

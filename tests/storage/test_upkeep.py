@@ -345,6 +345,25 @@ def test_stopped_it_has_taken_out_whole_hours_and_goes_on(filled, database):
     assert counts(filled) == dict.fromkeys(counts(filled), 0)
 
 
+def test_a_dense_hour_goes_in_parts_and_between_them_the_trends_are_right(
+    app, make, database, monkeypatch
+):
+    """As many batches as fill the last part, and one more of the hour that stays."""
+    monkeypatch.setattr("service.storage.upkeep.prune.MOST_BATCHES", 3)
+    for k in range(10):
+        app.submissions.submit(make(f"b{k}", after_s=k * 60.0, kind=KINDS[k % 4]))
+    seen = []
+
+    def step(pruned):
+        (hour,) = app.spacecraft.rates("XTE")
+        left = [item.batch for item in app.results.page().items]
+        seen.append((pruned.batches, hour.batches, left[-1]))
+        assert verify(database) == []
+
+    assert prune(app.store, shifted(START, 540.0), step=step).batches == 9
+    assert seen[:4] == [(0, 10, "b0"), (3, 7, "b3"), (6, 4, "b6"), (9, 1, "b9")]
+
+
 def test_while_it_prunes_batches_are_recorded(opened, make, database):
     """Another connection prunes the first hour while the second is filled."""
     app = opened()

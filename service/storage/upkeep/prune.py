@@ -1,7 +1,7 @@
 """Deletes old batches with their results and their part in the trends, gyro blocks, grades.
 
-One hour of a run at a time, each in one transaction of the writer: other writes
-run between two of them, and the trends always match the stored batches.
+One hour of a run at a time, of a dense hour a part, each in one transaction of the writer: other
+writes run between two of them, and the trends always match the stored batches.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,6 +28,8 @@ from service.times import HOUR_S, Utc, bucket_start
 
 OF_A_RESULT = (star_results, solutions, idempotency_keys)
 OF_A_BATCH = (frames, tracker_values)
+MOST_BATCHES = 10_000
+"""Of one transaction: others that write the same hour, and on SQLite all others, wait for it."""
 _AT_ONCE = 1_000
 _BLOCKS_AT_ONCE = 100
 """Of up to 240 kB each."""
@@ -59,7 +61,7 @@ def prune(
 
     Gyro blocks are deleted whose last sample is before it, and days of filtered and smoothed
     attitudes, with all their revisions, that end by then.  Missions, catalogs, alarms and the
-    audit list stay.  Interrupted, it has deleted whole hours; the same call again goes on.
+    audit list stay.  Interrupted, it has deleted the oldest; the same call again goes on.
     """
     with store.reading() as connection:
         # A batch has exactly one current result, and those have the index by time.
@@ -85,8 +87,12 @@ def prune(
     if dry_run:
         return pruned
     for hour, spacecraft, name in keys:
-        pruned.batches += store.writer.change(_of_an_hour(spacecraft, name, hour, before)).result()
-        step(pruned)
+        some = _of_an_hour(spacecraft, name, hour, before)
+        deleted = MOST_BATCHES
+        while deleted == MOST_BATCHES:
+            deleted = store.writer.change(some).result()
+            pruned.batches += deleted
+            step(pruned)
     while deleted := store.writer.change(partial(_delete_blocks, chosen=old_blocks)).result():
         pruned.gyro_blocks += deleted
     while deleted := store.writer.change(partial(_delete_days, chosen=old_days)).result():
@@ -125,6 +131,7 @@ def _delete_blocks(connection: Connection, chosen: Sequence[ColumnElement[bool]]
 
 
 def _of_an_hour(spacecraft: str, run: str, hour: int, before: Utc) -> Callable[[Connection], int]:
+    """What deletes the oldest batches of an hour, and returns how many."""
     start = bucket_start(hour, HOUR_S).tai_ns
     end = min(bucket_start(hour + 1, HOUR_S).tai_ns, before.tai_ns)
 
@@ -136,7 +143,8 @@ def _of_an_hour(spacecraft: str, run: str, hour: int, before: Utc) -> Callable[[
             results.c.time_ns >= start,
             results.c.time_ns < end,
         )
-        ids = list(connection.scalars(chosen))
+        oldest = chosen.order_by(results.c.time_ns, results.c.batch_id).limit(MOST_BATCHES)
+        ids = list(connection.scalars(oldest))
         delete_batches(connection, ids)
         rollups.renew(connection, [(spacecraft, run, hour)])
         return len(ids)

@@ -1,0 +1,236 @@
+"""What it takes to take old batches out of PostgreSQL, row by row and as partitions.
+
+    python -m benchmarks.speed.pruning --recorded 20000 --days 10
+
+TEST_POSTGRESQL_URL names a scratch database, which is emptied.  Batches of a pass are recorded
+in bulk and copied to further days.  The older half of the days is pruned; a list and trends are
+read before, after, and after VACUUM; as many batches are put in their place; then the other half
+is archived.  Beside that, the same rows of the four largest tables are dropped as partitions.
+"""
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from itertools import pairwise
+from pathlib import Path
+
+from sqlalchemy import Engine, create_engine, inspect
+from tqdm import tqdm
+
+from benchmarks.bounds import at_most, equal
+from benchmarks.report import Report
+from benchmarks.speed.scale import SPACECRAFT, emptied, filled, time_at
+from benchmarks.speed.stored import milliseconds
+from service.app.factory import open_app
+from service.settings import Settings
+from service.storage.archive.archiving import archive
+from service.storage.sql.database import Store
+from service.storage.sql.migrations import upgrade
+from service.storage.upkeep.prune import prune
+from service.times import Utc
+
+RECORDED, DAYS = 20_000, 10
+MOST_AGAIN = 1.25
+"""What VACUUM leaves free is used again, so that a database that is pruned stops growing."""
+DAY_S = 86_400
+LARGEST = ("batches", "results", "star_results", "solutions")
+TRENDS = (
+    "rollups_hourly",
+    "rollups_daily",
+    "tracker_rollups_hourly",
+    "tracker_rollups_daily",
+)
+# Of a copy the first letter of its ids, which is 0 in this millennium.
+_LETTERS = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
+_KEYS = ("id", "batch_id", "result_id")
+_LATER = """to_char(
+    CAST(time AS timestamptz) AT TIME ZONE 'UTC' + make_interval(days => {shift}),
+    'YYYY-MM-DD"T"HH24:MI:SS.MS"Z"')"""
+
+
+def measured(recorded: int, days: int, seed: int, url: str) -> Report:
+    """Fill the scratch database and take its batches out again."""
+    emptied(url)
+    upgrade(url)
+    filled(url, recorded, seed)
+    count, half = recorded * days, days // 2
+    figures: dict[str, float] = {"batches": count, "of these pruned": recorded * half}
+    engine = create_engine(url)
+    try:
+        _forget_first(url)
+        for day in tqdm(range(1, days), desc="copying", unit=" days"):
+            _copy(engine, 0, day)
+        _vacuum(engine, "FULL, ANALYZE")
+        for table, size in _sizes(engine).items():
+            figures[f"{table}: bytes a batch"] = size / count
+        figures["bytes: filled"] = _size(engine)
+        figures |= _dropped(engine, half)
+        figures |= _pruned(url, engine, half)
+        for day in tqdm(range(half), desc="copying", unit=" days"):
+            _copy(engine, days - 1, day)
+        figures["bytes: filled again"] = _size(engine)
+        figures |= _archived(url, days)
+    finally:
+        engine.dispose()
+    emptied(url)
+    bounds = [
+        equal("batches pruned", int(figures.pop("pruned: batches")), recorded * half),
+        # The hours of the newest batch and attitude stay, and both are of the last day.
+        equal("batches archived", int(figures.pop("archived: batches")), recorded * (days - 1)),
+        at_most(
+            "bytes: filled again over filled",
+            figures["bytes: filled again"] / figures["bytes: filled"],
+            MOST_AGAIN,
+        ),
+    ]
+    return Report("pruning", figures, bounds)
+
+
+def _forget_first(url: str) -> None:
+    """Delete the run that was recorded before the clock ran."""
+    store = Store(url, create=False)
+    prune(store, time_at(DAY_S), "first")
+    store.close()
+
+
+def _copy(engine: Engine, source: int, day: int) -> None:
+    """Copy the batches of one day, with all that was made of them and their trends, to another."""
+    shift = day - source
+    with engine.begin() as connection:
+        for table in (*LARGEST, "tracker_values", *TRENDS):
+            columns = [each["name"] for each in inspect(engine).get_columns(table)]
+            new = dict.fromkeys(_KEYS, "'{}' || substr({}, 2)")
+            new = {name: form.format(_LETTERS[day], name) for name, form in new.items()}
+            new |= {"time_ns": f"time_ns + {shift * DAY_S * 10**9}", "batch": f"batch || '-{day}'"}
+            new["time"] = _LATER.format(shift=shift)
+            keys = [f"{each} LIKE '{_LETTERS[source]}%%'" for each in _KEYS if each in columns]
+            chosen = keys[0] if keys else ""
+            if table in TRENDS:
+                width = 1 if table.endswith("daily") else 24
+                new["bucket"] = f"bucket + {shift * width}"
+                first = time_at(source * DAY_S).bucket(DAY_S) * width
+                chosen = f"bucket BETWEEN {first} AND {first + width - 1}"
+            names = ", ".join(f'"{each}"' for each in columns)
+            values = ", ".join(new.get(each, f'"{each}"') for each in columns)
+            sql = f"INSERT INTO {table} ({names}) SELECT {values} FROM {table} WHERE {chosen}"
+            connection.exec_driver_sql(sql)
+
+
+def _pruned(url: str, engine: Engine, days: int) -> dict[str, float]:
+    """Delete the batches of so many days, an hour at a time, then VACUUM."""
+    figures = _reads(url, "filled", _noon(days))
+    ends = []
+    store = Store(url, create=False)
+    start = time.perf_counter()
+    done = prune(store, _noon(days), step=lambda _: ends.append(time.perf_counter()))
+    store.close()
+    spent_s = ends[-1] - start
+    figures["pruned: batches"] = done.batches
+    figures["pruned: batches a second"] = done.batches / spent_s
+    figures["pruned: longest transaction, s"] = max(b - a for a, b in pairwise(ends))
+    figures["bytes: pruned"] = _size(engine)
+    figures |= _reads(url, "pruned", _noon(days))
+    figures["VACUUM, s"] = _vacuum(engine, "ANALYZE")
+    figures["bytes: pruned, after VACUUM"] = _size(engine)
+    return figures | _reads(url, "after VACUUM", _noon(days))
+
+
+def _archived(url: str, days: int) -> dict[str, float]:
+    """Archive all but the last day."""
+    store = Store(url, create=False)
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        done = archive(store, Path(folder), _noon(days - 1))
+        spent_s = time.perf_counter() - start
+    store.close()
+    rate = done.batches / spent_s
+    return {"archived: batches": done.batches, "archived and verified: batches a second": rate}
+
+
+def _dropped(engine: Engine, days: int) -> dict[str, float]:
+    """Copy the largest tables of so many days into partitions of their own, and drop these."""
+    letters = ", ".join(f"'{each}'" for each in _LETTERS[:days])
+    with engine.begin() as connection:
+        for table in LARGEST:
+            key = "result_id" if table in ("star_results", "solutions") else "id"
+            chosen = f"left({key}, 1) IN ({letters})"
+            for sql in (
+                f"CREATE TABLE split_{table} (LIKE {table}) PARTITION BY RANGE ({key})",
+                f"CREATE TABLE month_{table} (LIKE {table} INCLUDING ALL)",
+                f"INSERT INTO month_{table} SELECT * FROM {table} WHERE {chosen}",
+                f"ALTER TABLE split_{table} ATTACH PARTITION month_{table} DEFAULT",
+            ):
+                connection.exec_driver_sql(sql)
+    start = time.perf_counter()
+    with engine.begin() as connection:
+        for table in LARGEST:
+            connection.exec_driver_sql(f"DROP TABLE month_{table}")
+    spent_s = time.perf_counter() - start
+    with engine.begin() as connection:
+        for table in LARGEST:
+            connection.exec_driver_sql(f"DROP TABLE split_{table}")
+    return {"dropped as partitions, s": spent_s}
+
+
+def _noon(day: int) -> Utc:
+    """An hour before the first batch of a day."""
+    return time_at(day * DAY_S - 3_600)
+
+
+def _reads(url: str, when: str, cut: Utc) -> dict[str, float]:
+    """Milliseconds of a list, empty once it is pruned, and of a history summed over batches."""
+    app = open_app(Settings(database=url))
+    try:
+        reads = {
+            "a list before the cut": lambda: app.results.page(end=cut, limit=100),
+            "a whole history": lambda: app.spacecraft.history(SPACECRAFT, size=100),
+        }
+        return {f"{what}, {when}, ms": milliseconds(read) for what, read in reads.items()}
+    finally:
+        app.close()
+
+
+def _sizes(engine: Engine) -> dict[str, int]:
+    """Bytes of the large tables, with what PostgreSQL keeps beside them, and of their indexes."""
+    found = {}
+    with engine.connect() as connection:
+        for table in LARGEST:
+            for part, function in (("rows", "pg_table_size"), ("indexes", "pg_indexes_size")):
+                query = f"SELECT {function}('{table}')"
+                found[f"{table}, {part}"] = int(connection.exec_driver_sql(query).scalar_one())
+    return found
+
+
+def _size(engine: Engine) -> int:
+    with engine.connect() as connection:
+        query = "SELECT pg_database_size(current_database())"
+        return int(connection.exec_driver_sql(query).scalar_one())
+
+
+def _vacuum(engine: Engine, how: str) -> float:
+    """Seconds of a VACUUM of everything."""
+    start = time.perf_counter()
+    with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+        connection.exec_driver_sql(f"VACUUM ({how})")
+    return time.perf_counter() - start
+
+
+def main() -> int:
+    """Measure and print; 1 without a database."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--recorded", type=int, default=RECORDED, help="batches of a day")
+    parser.add_argument("--days", type=int, default=DAYS)
+    parser.add_argument("--seed", type=int, default=3)
+    parsed = parser.parse_args()
+    url = os.environ.get("TEST_POSTGRESQL_URL")
+    if url is None:
+        print("TEST_POSTGRESQL_URL must name a scratch database", file=sys.stderr)
+        return 1
+    print(measured(parsed.recorded, parsed.days, parsed.seed, url).text())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
