@@ -1,9 +1,13 @@
 """Kernels that borrow what they are given: nothing is counted, nothing is made, nothing leaks."""
 
+import multiprocessing
 import sys
+import time
 
+import numba
 import numpy as np
 import pytest
+from numba.core.caching import IndexDataCacheFile
 from numba.core.errors import NumbaError
 
 from service.attitude.covariance import information
@@ -86,3 +90,41 @@ def test_an_error_in_what_a_kernel_calls_is_raised():
     assert outer(1.0) == 2.0
     with pytest.raises(ValueError, match="negative"):
         outer(-1.0)
+
+
+def _save_with(start, kind):
+    """Compile one kernel for one kind of number, and save it when the others are ready, too."""
+    found = _twice_the_sum.py_func
+    save = IndexDataCacheFile._save_index
+
+    def slowly(cache_file, overloads):
+        time.sleep(0.2)  # between reading the index and writing it
+        save(cache_file, overloads)
+
+    IndexDataCacheFile._save_index = slowly
+    start.wait(60)
+    assert njit(found)(kind(3)) == kind(6)
+
+
+@njit
+def _twice_the_sum(value):
+    return value + value
+
+
+def test_processes_that_save_one_kernel_at_once_lose_no_entry(monkeypatch, tmp_path):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    context = multiprocessing.get_context("spawn")
+    start = context.Barrier(2)
+    savers = [
+        context.Process(target=_save_with, args=(start, kind)) for kind in (np.int64, np.float64)
+    ]
+    for each in savers:
+        each.start()
+    for each in savers:
+        each.join()
+        assert each.exitcode == 0
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    kept = njit(_twice_the_sum.py_func)
+    assert (kept(np.int64(3)), kept(np.float64(3.0))) == (6, 6.0)
+    assert sum(kept.stats.cache_hits.values()) == 2
+    assert not kept.stats.cache_misses

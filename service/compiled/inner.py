@@ -6,9 +6,12 @@ half of the time of compiling.  Here a kernel that another one calls is only typ
 the one that Python calls is optimised as a whole, and it alone is kept in the cache on disk.
 """
 
+import fcntl
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+from numba.core.caching import FunctionCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.registry import CPUDispatcher
@@ -23,7 +26,7 @@ class Kernel(CPUDispatcher):
     def __init__(self, function: Callable[..., Any], **options: Any) -> None:
         options["nopython"] = True
         super().__init__(function, targetoptions=options)
-        self.enable_caching()
+        self._cache = _LockedCache(function)  # type: ignore[no-untyped-call]
         without = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
         self._inner = CPUDispatcher(
             function, targetoptions=options | without, pipeline_class=_WithoutMachineCode
@@ -33,6 +36,21 @@ class Kernel(CPUDispatcher):
     def _numba_type_(self) -> Any:
         """What kernels call where they name this one."""
         return self._inner._numba_type_
+
+
+class _LockedCache(FunctionCache):
+    """numba's cache on disk, which one process at a time writes to.
+
+    numba reads the index, adds an entry and writes it again.  Two processes that save a kernel
+    with different signatures at once choose the same file for both, and one entry is lost.
+    """
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Save a kernel while no other process saves one of the same folder."""
+        self._impl.locator.ensure_cache_path()
+        with (Path(self.cache_path) / "saving.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # closing the file unlocks it
+            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
 
 
 class _WithoutMachineCode(CompilerBase):
