@@ -21,7 +21,7 @@ from service.errors import (
 )
 from service.ingest.tracking import asks_for_last
 from service.missions.mission import Mission, mission_named
-from service.observations.batch import ObservationBatch
+from service.observations.batch import ObservationBatch, TrackerStars
 from service.observations.schema import Submission
 from service.sky.model import SkyModel
 from service.storage.recording.identity import OwnKey, identity_of
@@ -102,10 +102,17 @@ def may_take_long(batch: ObservationBatch) -> bool:
         (batch.a_priori is None and batch.measurement is None)
         or bool(batch.options.tolerances)
         or batch.options.identifier in ("lost_in_space", "ptp")
-        or sum(each.count for each in batch.observations) > LONG_STARS
+        or sum(_most_stars(each) for each in batch.observations) > LONG_STARS
         # NaN, where a star has the mission's sigma, is not greater.
         or any((each.sigma_arcsec > LONG_SIGMA_ARCSEC).any() for each in batch.observations)
     )
+
+
+def _most_stars(stars: TrackerStars) -> int:
+    """The stars of a tracker; of a raster, as many as its lines can show."""
+    lines = [each for each in stars.readings if each is not None and each.kind == "lines"]
+    # A star is a line that is brighter than its neighbours, in both directions.
+    return stars.count + sum(min(len(each.h), len(each.v)) // 2 for each in lines)
 
 
 class SolverTask(NamedTuple):

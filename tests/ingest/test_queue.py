@@ -263,3 +263,11 @@ def test_many_stars_and_inaccurate_ones_may_take_long(make):
     assert may_take_long(submission_from_json(json.dumps(sent)).batch)
     sent["observations"][0]["stars"] = stars * 50
     assert may_take_long(submission_from_json(json.dumps(sent)).batch)
+
+
+@pytest.mark.parametrize(("lines", "is_long"), [(100, False), (401, True)])
+def test_a_raster_may_have_as_many_stars_as_its_lines_can_show(make, lines, is_long):
+    sent = json.loads(make("b1").text)
+    sums = {"column_counts": [1.0] * lines, "row_counts": [1.0] * lines}
+    sent["observations"][0] |= {"stars": [], **sums}
+    assert may_take_long(submission_from_json(json.dumps(sent)).batch) is is_long

@@ -117,7 +117,7 @@ PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
     ),
     SampleTaken: ProblemType(
         409,
-        "Another gyro block holds a time of this one",
+        "Time already recorded in another gyro block",
         "sample-taken",
         "A sample of the gyro block has the time of a sample that is recorded in another block of "
         "the spacecraft and the run. The service recorded no part of the block.",
