@@ -4,6 +4,7 @@ import copy
 import json
 import math
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from service.acquire import acquire
 from service.acquire.choices import choices_of
 from service.acquire.prewarm import prewarm_kernels, prewarm_zones
 from service.attitude.solution import NoAttitude
-from service.errors import BadBatch
+from service.errors import BadBatch, Busy
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Mission
 from service.observations.batch import BoresightPrior
@@ -491,3 +492,25 @@ def test_never_an_older_attitude_after_a_batch_that_has_none(rng, mission_files,
     assert alone["attitude"] is None
     assert alone["reason"] == str(NoAttitude.FEWER_THAN_TWO_UNIQUE_STARS)
     assert plain_view(alone)[0][0].outcome in {"unmatched", "ambiguous"}
+
+
+def test_what_needs_the_whole_sky_waits_for_its_kernels_and_a_zone_does_not(
+    rng, mission_files, sky
+):
+    judge = Judge(mission_files["XTE"], sky)
+
+    def not_yet():
+        raise Busy("the service is compiling its kernels", 10)
+
+    compiling = replace(sky, require_whole_sky=not_yet)
+    batch = nominal(rng, judge, 0)
+    answers = [without_clock(answered(batch, judge.mission, each)) for each in (sky, compiling)]
+    assert answers[0] == answers[1]
+    assert answers[0]["path"] == "zone"
+    wrong = batch | {"a_priori": {"quaternion": [0.0, 0.0, 0.0, 1.0]}}
+    assert answered(wrong, judge.mission, sky)["path"] == "zone_then_lost_in_space"
+    without = batch | {"a_priori": None}
+    ptp = batch | {"options": {"identifier": "ptp"}}
+    for each in (wrong, without, ptp):
+        with pytest.raises(Busy, match="compiling"):
+            answered(each, judge.mission, compiling)

@@ -9,17 +9,18 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from multiprocessing import connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import llvmlite.binding  # type: ignore[import-untyped]
 import numba
 
 from service.acquire.prewarm import prewarm_kernels
 from service.errors import Busy, Stopping
+from service.missions.identifiers import IDENTIFIERS, IdentifierEntry
 from service.missions.mission import Mission
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
@@ -28,10 +29,17 @@ from service.sky.model import SkyModel
 RETRY_S = 10
 
 _CONTEXT = multiprocessing.get_context("spawn")
-SIDE_BY_SIDE = (True, False), (False, True)
-"""What each of two children compiles: kernels of zones, the others; see `prewarm_kernels`."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 """By which the service is stopped; they may reach its whole process group."""
+
+
+class _Share(NamedTuple):
+    """What one child compiles, in this order; see `prewarm_kernels`."""
+
+    zones: list[str]
+    """Identifiers that search zones."""
+    others: list[str]
+    linking: bool
 
 
 class KernelBuild:
@@ -43,29 +51,46 @@ class KernelBuild:
         self._cancelled = False
         self.is_needed = not _marker().exists()
         """Until a build has succeeded: an answer must not depend on what is compiled."""
+        self._zones_needed = self.is_needed
+
+    def require_zones_built(self) -> None:
+        """Raise `Busy` until the kernels of batches with a zone are compiled."""
+        if self._zones_needed:
+            self.require_built()
 
     def require_built(self) -> None:
         """Raise `Busy` until the kernels are compiled."""
         if self.is_needed:
             raise Busy("the service is compiling its kernels", RETRY_S)
 
-    def run(self, missions: Mapping[str, Mission]) -> None:
-        """Compile what is not compiled, in a child for each of two parts.
+    def run(
+        self, missions: Mapping[str, Mission], zones_built: Callable[[], None] = lambda: None
+    ) -> None:
+        """Compile what is not compiled, in two children; in one, without a second processor.
 
-        In one, without a second processor.  Raises `Busy` where that fails, `Stopping` if
-        cancelled.
+        Both begin with what batches with a zone need.  When that is compiled, `zones_built` is
+        called while they compile the rest.  Raises `Busy` where a child fails, `Stopping`
+        if cancelled.
         """
         if not self.is_needed:
             return
+        told = []
         with self._lock:
             if self._cancelled:
                 raise Stopping("the service is stopping")
-            for zones, others in SIDE_BY_SIDE if _processors() > 1 else ((True, True),):
+            for share in _shares(_processors()):
+                here, there = _CONTEXT.Pipe(duplex=False)
                 child = _CONTEXT.Process(
-                    target=_compile, args=(dict(missions), zones, others), daemon=True
+                    target=_compile, args=(dict(missions), share, there), daemon=True
                 )
                 self._children.append(child)
                 child.start()
+                # The child alone holds this end: when it has ended there is nothing to wait for.
+                there.close()
+                told.append(here)
+        if all(_is_told(each) for each in told):
+            self._zones_needed = False
+            zones_built()
         for child in self._children:
             child.join()
         if self._cancelled:
@@ -124,6 +149,39 @@ def _processors() -> int:
     return len(os.sched_getaffinity(0))
 
 
-def _compile(missions: Mapping[str, Mission], zones: bool, others: bool) -> None:
+def _shares(processors: int) -> list[_Share]:
+    """What each child compiles.
+
+    Weighing hypotheses is one kernel that takes as long as most others together, and the
+    whole sky needs it, too: by then the first child has saved it.
+    """
+
+    def named(is_meant: Callable[[IdentifierEntry], bool]) -> list[str]:
+        return [name for name, entry in IDENTIFIERS.items() if is_meant(entry)]
+
+    others = named(lambda entry: not entry.searches_zone)
+    if processors < 2:
+        return [_Share(named(lambda entry: entry.searches_zone), others, True)]
+    weighing = named(lambda entry: entry.searches_zone and entry.weighs_hypotheses)
+    counting = named(lambda entry: entry.searches_zone and not entry.weighs_hypotheses)
+    return [_Share(weighing, [], True), _Share(counting, others, False)]
+
+
+def _is_told(child: connection.Connection) -> bool:
+    """Wait until a child has compiled its kernels of zones; False if it ends before that."""
+    with child:
+        try:
+            child.recv_bytes()
+        except EOFError:
+            return False
+    return True
+
+
+def _compile(
+    missions: Mapping[str, Mission], share: _Share, zones_built: connection.Connection
+) -> None:
     end_with_parent()
-    prewarm_kernels(SkyModel(load_embedded(), LruCache(64 << 20)), missions, zones, others)
+    sky = SkyModel(load_embedded(), LruCache(64 << 20))
+    prewarm_kernels(sky, missions, share.zones, False)
+    zones_built.send_bytes(b"zones")
+    prewarm_kernels(sky, missions, share.others, share.linking)

@@ -4,7 +4,7 @@ python -m service.acquire.prewarm    compiles the kernels, so that nothing waits
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
@@ -46,13 +46,15 @@ def prewarm_zones(sky: SkyModel, mission: Mission, prior: APriori, time: Utc) ->
 
 
 def prewarm_kernels(
-    sky: SkyModel, missions: Mapping[str, Mission], zones: bool = True, others: bool = True
+    sky: SkyModel,
+    missions: Mapping[str, Mission],
+    identifiers: Collection[str] | None = None,
+    linking: bool = True,
 ) -> None:
     """Compile the kernels by running a batch of real stars of each kind of zone.
 
-    Those of identifiers that search zones, all others, or both.  The two parts take about as
-    long to compile and have little in common.  The zones that this builds go into
-    a cache of its own, which it drops at the end.
+    Those of the named identifiers (None: of all), and of linking points over batches.
+    The zones that this builds go into a cache of its own, which it drops at the end.
     """
     moment = parse_utc("2000-01-01T12:00:00Z")
     # Large enough that nothing is built twice on the way.
@@ -92,7 +94,7 @@ def prewarm_kernels(
             ],
         }
         for identifier in IDENTIFIERS.values():
-            if not (zones if identifier.searches_zone else others):
+            if identifiers is not None and identifier.name not in identifiers:
                 continue
             if not identifier.searches_zone and kind != first:
                 continue  # the same kernels
@@ -102,8 +104,12 @@ def prewarm_kernels(
             options = {"identifier": identifier.name} | exact
             batch = submission_from_json(json.dumps(body | {"options": options})).batch
             brightest = _of_bright_stars(given, BRIGHTEST_MAG)
-            acquire(batch, mission if identifier.uses_prior else brightest, apart)
-    if others:
+            searched = mission if identifier.uses_prior else brightest
+            if identifier.searches_zone:
+                # So few stars may not be enough, and the whole sky has kernels of its own.
+                searched = searched.model_copy(update={"lost_in_space_fallback": False})
+            acquire(batch, searched, apart)
+    if linking:
         compile_linking()
 
 

@@ -147,6 +147,7 @@ class Search:
             elif in_zones is not None and prior.predicted is not None:
                 in_zones = self._with_lone_stars(corrected, in_zones, prior.predicted)
         if path is not Path.ZONE:
+            self.sky.require_whole_sky()
             found = find_attitude(
                 corrected,
                 self.velocity_c,
@@ -280,6 +281,7 @@ class Search:
         """What the identifier is given of one tracker."""
         guide = None
         if IDENTIFIERS[self.choices.identifier].needs_guide:
+            self.sky.require_whole_sky()
             guide = self.sky.guide(self.run_catalog, corrected.tracker.field_of_view_radius_deg)
         return Sighting(
             np.dot(corrected.direction_body, prior.attitude),

@@ -111,14 +111,18 @@ def open_app(
     missions = load_missions(settings.missions)
     if mission is not None:
         missions[mission.name] = mission
-    sky = SkyModel(open_catalog(settings.catalog), LruCache(settings.shelf_mb << 20))
+    catalog, cache = open_catalog(settings.catalog), LruCache(settings.shelf_mb << 20)
+    kernels = KernelBuild() if serving else None
+    sky = SkyModel(catalog, cache)
+    if kernels is not None:
+        sky = SkyModel(catalog, cache, require_whole_sky=kernels.require_built)
     store = Store(
         settings.database,
         create=create,
         serving=serving,
         archive_folder=settings.archive_folder,
     )
-    app = App(Context(settings, missions, sky, store), KernelBuild() if serving else None)
+    app = App(Context(settings, missions, sky, store), kernels)
     try:
         # A mission that is given takes the place of what was adopted, too.
         app.adoptions.load(leave=mission.name if mission is not None else None)

@@ -77,6 +77,7 @@ class Replays:
 
     def __init__(self, context: Context, submissions: Submissions, gyro: GyroIntake) -> None:
         self._context = context
+        self._submissions = submissions
         config = WorkerConfig(
             context.missions,
             context.settings.catalog,
@@ -215,6 +216,8 @@ class Replays:
         return replay
 
     def _require_slot(self, owner: str | None) -> None:
+        # Each worker would compile what it does not find.
+        self._submissions.require_kernels()
         at_work = self.at_work
         if len(at_work) >= MAX_REPLAYS:
             raise Busy(f"{len(at_work)} replays are running", REPLAY_RETRY_S)

@@ -14,6 +14,7 @@ from service.app.replays import Replays
 from service.app.submissions import Submissions
 from service.errors import Busy
 from service.ingest.kernel_progress import progress_logged
+from service.missions.identifiers import IDENTIFIERS
 from service.observations.schema import submission_from_json
 from service.storage.models.overview import About, CatalogAbout, MissionAbout
 from service.storage.recording.alarm_evaluation import latest_inputs
@@ -59,6 +60,8 @@ class Service:
     def ready(self) -> None:
         """Return once batches run at full speed; the first call compiles and prewarms.
 
+        Other calls return as soon as batches with a zone do, while the first call compiles the
+        rest.
         Raises `Busy` while another call does so, if the database cannot be read, and if the
         last write failed and another write, tried now, fails too.
         """
@@ -66,19 +69,11 @@ class Service:
             if not self._warming.acquire(blocking=False):
                 raise Busy("the service is warming up")
             try:
-                if self._kernels is not None and self._kernels.is_needed:
-                    with progress_logged(log):
-                        self._kernels.run(self._context.missions)
-                prewarm_kernels(self._context.sky, self._context.missions)
-                self._prewarm_recent_pointings()
-                # Collecting the present objects would take longer than a batch, each time.
-                gc.freeze()
-                self._is_warm = True
-                if self._kernels is not None:
-                    # Only the service does this by itself, not a command beside it.
-                    self._replays.resume()
-                    self._tracker_split.start()
-                    self._expiries.warn()
+                self._prepare()
+            except BaseException:
+                # The kernels of zones may be there, but not the others: the next call tries again.
+                self._is_warm = False
+                raise
             finally:
                 gc.enable()
                 self._warming.release()
@@ -86,6 +81,32 @@ class Service:
         self._context.store.writer.require_written()
         with self._context.reading() as connection:
             connection.exec_driver_sql("SELECT 1")
+
+    def _prepare(self) -> None:
+        if self._kernels is not None and self._kernels.is_needed:
+            with progress_logged(log):
+                self._kernels.run(self._context.missions, self._begin_with_zones)
+        prewarm_kernels(self._context.sky, self._context.missions)
+        self._become_warm()
+        if self._kernels is not None:
+            # Only the service does this by itself, not a command beside it.
+            self._replays.resume()
+            self._tracker_split.start()
+            self._expiries.warn()
+
+    def _begin_with_zones(self) -> None:
+        """Load the kernels of batches with a zone, and be ready for these."""
+        in_zones = [name for name, entry in IDENTIFIERS.items() if entry.searches_zone]
+        prewarm_kernels(self._context.sky, self._context.missions, in_zones, False)
+        self._become_warm()
+        log.info("ready for batches with an a priori attitude; still compiling other kernels")
+
+    def _become_warm(self) -> None:
+        if not self._is_warm:
+            self._prewarm_recent_pointings()
+            # Collecting the present objects would take longer than a batch, each time.
+            gc.freeze()
+            self._is_warm = True
 
     def cancel_warmup(self) -> None:
         """End the compiling of kernels, which may take minutes."""

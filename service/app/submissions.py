@@ -50,6 +50,12 @@ class Submissions:
         if self._kernels is not None:
             self._kernels.require_built()
 
+    def _require_kernels_of_zones(self) -> None:
+        # A batch that needs others, without a priori attitude or with a wrong one, is refused
+        # where it needs them: by `SkyModel.require_whole_sky`.
+        if self._kernels is not None:
+            self._kernels.require_zones_built()
+
     def submit(
         self,
         submission: Submission,
@@ -72,7 +78,7 @@ class Submissions:
         A small batch is read in the event loop.  A larger one is not: every other request
         would wait for it.
         """
-        self.require_kernels()
+        self._require_kernels_of_zones()
         loop = asyncio.get_running_loop()
         if len(sent) <= READ_HERE_BYTES and sent.count(b"{") <= READ_HERE_OBJECTS:
             submission = submission_from_json(sent)
@@ -86,7 +92,7 @@ class Submissions:
 
         Raises `BadBatch` where the body is no array of one to `MAX_ARRAY` elements.
         """
-        self.require_kernels()
+        self._require_kernels_of_zones()
         loop = asyncio.get_running_loop()
         return await loop.run_in_executor(self._reader, _submissions_of_array, sent)
 

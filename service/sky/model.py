@@ -1,6 +1,7 @@
 """The sky of one batch: the run catalog of its epoch, and the zones in it."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from service.missions.mission import Mission
@@ -28,6 +29,8 @@ class SkyModel:
 
     catalog: Catalog
     cache: LruCache
+    require_whole_sky: Callable[[], None] = field(default=lambda: None, kw_only=True)
+    """Raises `Busy` while the kernels that search the whole sky are compiled."""
 
     def run_catalog(self, mission: Mission, time: Utc) -> RunCatalog:
         """The run catalog that serves a mission at a time: that of the nearest epoch."""

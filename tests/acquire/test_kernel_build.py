@@ -7,12 +7,18 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import numba
 import pytest
 
+from service.acquire import kernel_build
 from service.acquire.kernel_build import KernelBuild
-from service.errors import Stopping
+from service.acquire.prewarm import prewarm_kernels
+from service.errors import Busy, Stopping
+from service.missions.identifiers import IDENTIFIERS
+from service.sky.cache import LruCache
+from service.sky.model import SkyModel
 
 
 @pytest.fixture
@@ -96,3 +102,67 @@ def test_they_end_with_a_parent_that_is_killed(nothing_compiled):
             return
         time.sleep(0.1)
     raise AssertionError(f"the process {pid} is still there")
+
+
+@pytest.mark.parametrize("processors", [1, 2])
+def test_every_kernel_is_compiled_by_one_child(processors):
+    shares = kernel_build._shares(processors)
+    assert len(shares) == processors
+    named = [name for share in shares for name in (*share.zones, *share.others)]
+    assert sorted(named) == sorted(IDENTIFIERS)
+    assert all(IDENTIFIERS[name].searches_zone for share in shares for name in share.zones)
+    assert [share.linking for share in shares].count(True) == 1
+
+
+def test_what_batches_with_a_zone_need_is_compiled_without_the_whole_sky(
+    missions, sky, monkeypatch
+):
+    monkeypatch.setattr(SkyModel, "index", lambda *_: pytest.fail("the whole sky is searched"))
+    zones = [name for share in kernel_build._shares(2) for name in share.zones]
+    prewarm_kernels(SkyModel(sky.catalog, LruCache(64 << 20)), missions, zones, False)
+
+
+def _wait_between(missions, share, zones_built):
+    """In place of a child's compiling: it ends after its zones when the folder has a file."""
+    zones_built.send_bytes(b"zones")
+    while not (name := [each.name for each in Path(os.environ["NUMBA_CACHE_DIR"]).iterdir()]):
+        time.sleep(0.01)
+    raise SystemExit(name != ["go-on"])
+
+
+def _fail(missions, share, zones_built):
+    raise SystemExit(1)
+
+
+@pytest.mark.parametrize("end", ["go-on", "fail"])
+def test_zones_are_open_while_the_rest_is_compiled(nothing_compiled, monkeypatch, tmp_path, end):
+    monkeypatch.setattr(kernel_build, "_compile", _wait_between)
+    build, told = KernelBuild(), []
+
+    def zones_built():
+        build.require_zones_built()
+        with pytest.raises(Busy, match="compiling"):
+            build.require_built()
+        told.append(True)
+        (tmp_path / end).touch()
+
+    with pytest.raises(Busy, match="compiling"):
+        build.require_zones_built()
+    if end == "go-on":
+        build.run({}, zones_built)
+        build.require_built()
+        assert not KernelBuild().is_needed
+    else:
+        with pytest.raises(Busy, match="could not be compiled"):
+            build.run({}, zones_built)
+        assert build.is_needed
+    assert told == [True]
+
+
+def test_a_child_that_fails_before_its_zones_opens_nothing(nothing_compiled, monkeypatch):
+    monkeypatch.setattr(kernel_build, "_compile", _fail)
+    build = KernelBuild()
+    with pytest.raises(Busy, match="could not be compiled"):
+        build.run({}, lambda: pytest.fail("zones are not compiled"))
+    with pytest.raises(Busy, match="compiling"):
+        build.require_zones_built()

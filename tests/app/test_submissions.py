@@ -1,13 +1,18 @@
 """The app over a database: submissions, observers, readiness, zones."""
 
+import asyncio
 import json
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 from sqlalchemy import select
 
+from service.access.tokens import Caller
+from service.acquire import kernel_build
+from service.acquire.kernel_build import KernelBuild
 from service.app.factory import open_app
 from service.errors import AcquisitionError, BadBatch, BadConfiguration, BadInput, Busy, Conflict
 from service.ingest import solver_pool, submit
@@ -149,6 +154,42 @@ def test_while_one_caller_warms_up_another_is_told_to_wait(app, monkeypatch):
             app.service.ready()
         go_on.set()
         first.result(30)
+
+
+def test_it_is_ready_for_zones_while_other_kernels_are_compiled(make, monkeypatch, tmp_path):
+    begun, go_on = threading.Event(), threading.Event()
+
+    def run(build, missions, zones_built):
+        build._zones_needed = False
+        zones_built()
+        begun.set()
+        assert go_on.wait(30)
+        build.is_needed = False
+
+    monkeypatch.setattr(kernel_build, "_marker", lambda: Path("/none"))
+    monkeypatch.setattr(KernelBuild, "run", run)
+    settings = Settings(database=f"sqlite:///{tmp_path}/served.db", replay_processes=0)
+    app = open_app(settings, serving=True)
+    with pytest.raises(Busy, match="compiling"):
+        asyncio.run(app.submissions.answered(make("b0").text.encode()))
+    with ThreadPoolExecutor(1) as threads:
+        first = threads.submit(app.service.ready)
+        assert begun.wait(30)
+        app.service.ready()
+        answer = asyncio.run(app.submissions.answered(make("b1").text.encode()))
+        assert json.loads(answer.body)["path"] == "zone"
+        lost = json.loads(make("b2").text) | {"a_priori": None}
+        for asked in (
+            lambda: asyncio.run(app.submissions.answered(json.dumps(lost).encode())),
+            lambda: app.results.what_if(answer.id, OptionsIn()),
+            lambda: app.replays.new_upload(Caller("test", frozenset())),
+        ):
+            with pytest.raises(Busy, match="compiling"):
+                asked()
+        go_on.set()
+        first.result(60)
+    assert not asyncio.run(app.submissions.answered(json.dumps(lost).encode())).replayed
+    app.close()
 
 
 def test_what_is_asked_after_closing_is_busy(opened, make):
