@@ -123,11 +123,13 @@ def test_what_batches_with_a_zone_need_is_compiled_without_the_whole_sky(
 
 
 def _wait_between(missions, share, zones_built):
-    """In place of a child's compiling: it ends after its zones when the folder has a file."""
+    """In place of a child's compiling: it ends after its zones, when the folder says how."""
     zones_built.send_bytes(b"zones")
-    while not (name := [each.name for each in Path(os.environ["NUMBA_CACHE_DIR"]).iterdir()]):
+    folder = Path(os.environ["NUMBA_CACHE_DIR"])
+    while not (folder / "go-on").exists():
+        if (folder / "fail").exists():
+            raise SystemExit(1)
         time.sleep(0.01)
-    raise SystemExit(name != ["go-on"])
 
 
 def _fail(missions, share, zones_built):
