@@ -495,22 +495,22 @@ def test_never_an_older_attitude_after_a_batch_that_has_none(rng, mission_files,
 
 
 def test_what_needs_the_whole_sky_waits_for_its_kernels_and_a_zone_does_not(
-    rng, mission_files, sky
+    rng, mission_files, missions, sky
 ):
-    judge = Judge(mission_files["XTE"], sky)
+    judge, mission = Judge(mission_files["XTE"], sky), missions["XTE"]
 
     def not_yet():
         raise Busy("the service is compiling its kernels", 10)
 
     compiling = replace(sky, require_whole_sky=not_yet)
-    batch = nominal(rng, judge, 0)
-    answers = [without_clock(answered(batch, judge.mission, each)) for each in (sky, compiling)]
+    batch = nominal(rng, judge, 0) | {"options": {"identifier": "verified"}}
+    answers = [without_clock(answered(batch, mission, each)) for each in (sky, compiling)]
     assert answers[0] == answers[1]
     assert answers[0]["path"] == "zone"
     wrong = batch | {"a_priori": {"quaternion": [0.0, 0.0, 0.0, 1.0]}}
-    assert answered(wrong, judge.mission, sky)["path"] == "zone_then_lost_in_space"
+    assert answered(wrong, mission, sky)["path"] == "zone_then_lost_in_space"
     without = batch | {"a_priori": None}
     ptp = batch | {"options": {"identifier": "ptp"}}
     for each in (wrong, without, ptp):
         with pytest.raises(Busy, match="compiling"):
-            answered(each, judge.mission, compiling)
+            answered(each, mission, compiling)
