@@ -250,7 +250,8 @@ def _wait_until_ready(server: subprocess.Popen[bytes], url: str, log: Path) -> N
                 output = log.read_text(encoding="utf-8", errors="replace").strip()
                 raise BadConfiguration(f"the server did not start:\n{output}")
             try:
-                if client.get("/readyz").status_code == 200:
+                # Its batches with a wrong a priori attitude need the kernels of the whole sky, too.
+                if not KernelBuild().is_needed and client.get("/readyz").status_code == 200:
                     return
             except httpx.TransportError:
                 pass
