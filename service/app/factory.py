@@ -58,7 +58,7 @@ class App:
         self.frames = Frames(context, self.submissions)
         self.results = Results(context, self.submissions)
         self.spacecraft = Spacecraft(context)
-        self.products = Products(context)
+        self.products = Products(context.missions, context.store)
         self.gyro = Gyro(context)
         self.grades = Grades(context)
         self.live_filter = LiveFilter(context)

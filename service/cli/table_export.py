@@ -33,12 +33,11 @@ def add_table_export(commands: Any, kind: str, summary: str) -> None:
 
 
 def _run(parsed: Namespace) -> int:
-    from service.app.factory import open_app
+    from service.app.products import open_products
 
     start, end = period_of(parsed)
-    app = open_app(settings_of_existing(parsed))
-    try:
-        table = app.products.table(
+    with open_products(settings_of_existing(parsed)) as products:
+        table = products.table(
             parsed.spacecraft,
             parsed.kind,
             run=parsed.run,
@@ -47,6 +46,4 @@ def _run(parsed: Namespace) -> int:
             most_batches=table_formats()[parsed.format].most_batches,
         )
         written_to(parsed.output, write_table(parsed.format, table))
-    finally:
-        app.close()
     return 0

@@ -6,7 +6,7 @@ to inertial, in body axes, deg/s.
 """
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import groupby, pairwise
 from pathlib import Path
@@ -240,7 +240,7 @@ class _Assembler:
 
     def fed(self, page: AttitudeRows) -> AttitudeBlock:
         """The rows that are finished now that a page is known too; perhaps none."""
-        is_wanted = np.isin(page.status.astype(str), self._wanted)
+        is_wanted = _among(page.status, self._wanted)
         gaps = self._unwanted + np.cumsum(~is_wanted)
         self._unwanted = int(gaps[-1]) if len(gaps) else self._unwanted
         origin = OWN if self._about.grade == "raw" else ESTIMATED
@@ -277,6 +277,11 @@ class _Assembler:
         return rows.taken(~dropped) if dropped.any() else rows
 
 
+def _among(texts: Texts, wanted: Sequence[str]) -> npt.NDArray[np.bool_]:
+    """Which texts are among some; `numpy.isin` needs texts of fixed width."""
+    return np.logical_or.reduce([texts == each for each in wanted])
+
+
 def _unfinished(rows: AttitudeRows, gaps: Integers, known: str) -> AttitudeBlock:
     n = len(rows)
     origin = np.where(np.isnan(rows.rate_deg_per_s[:, 0]), NONE, known).astype(object)
@@ -308,7 +313,7 @@ def _with_rates(rows: AttitudeBlock) -> AttitudeBlock:
     Between the steps before and after a row the rate is interpolated linearly; at the ends of
     a stretch it is that of the one step.  A lone attitude has none.
     """
-    if len(rows) < 2 or not np.any(np.isin(rows.rate_origin.astype(str), (NONE, DERIVED))):
+    if len(rows) < 2 or not np.any(_among(rows.rate_origin, (NONE, DERIVED))):
         return rows
     step_s = np.diff(rows.time_ns) * 1e-9
     joined = np.diff(rows.stretch) == 0

@@ -13,7 +13,7 @@ import pytest
 from service.products.attitude_table import COLUMNS
 from service.products.fits_file import write_fits
 from service.products.parquet import write_parquet
-from service.products.tables import Column, Table
+from service.products.tables import Column, Table, write_csv
 from service.times import parse_utc
 from tests.products.series import GOLDEN, random_quaternions, rows, whole, written
 
@@ -126,6 +126,19 @@ def test_values_that_are_not_known_are_nulls_in_each_kind_of_column(tmp_path):
         assert data["VALID"].tolist() == [False, False]
     found = pyarrow.parquet.read_table(tmp_path / "t.parquet").to_pydict()
     assert found == {"n": [1, None], "x": [None, 2.5], "t": ["é", None], "f": [True, False]}
+
+
+def test_csv_reads_back_as_it_was(tmp_path):
+    texts = ["a,b", 'say "x"', "two\r\nlines", None, "é", ""]
+    numbers = [0.1, -5e-324, 1.7976931348623157e308, None, float("nan"), 1e-7]
+    columns = [Column('odd, "name"', "text"), Column("x"), Column("n", "integer")]
+    table = Table(columns, [[texts, numbers, [1, None, -(2**63), 2**63 - 1, 0, 7]], [[], [], []]])
+    names, *found = csv.reader(io.StringIO(b"".join(write_csv(table)).decode(), newline=""))
+    assert names == ['odd, "name"', "x", "n"]
+    assert [row[0] for row in found] == ["a,b", 'say "x"', "two\r\nlines", "", "é", ""]
+    known = [numbers[place] for place in (0, 1, 2, 5)]
+    assert [float(row[1]) for row in found if row[1]] == known
+    assert [row[2] for row in found] == ["1", "", str(-(2**63)), str(2**63 - 1), "0", "7"]
 
 
 @pytest.mark.parametrize("name", ["parquet", "fits"])

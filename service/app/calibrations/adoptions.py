@@ -7,7 +7,7 @@ own alignments or focal planes have changed since, the file holds.
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import msgspec
 from sqlalchemy import Connection
@@ -34,6 +34,27 @@ TOLD = ("id", "spacecraft", "adopted", "who", "note", "calibration", "version", 
 log = logging.getLogger(__name__)
 
 
+def adopted_missions(
+    connection: Connection, files: Mapping[str, Mission], leave: str | None = None
+) -> dict[str, Mission]:
+    """The missions of these files with an adopted calibration over them, but for `leave`."""
+    found: dict[str, Mission] = {}
+    for each in stored.latest_adoptions(connection):
+        file = files.get(each.spacecraft)
+        if file is None or each.spacecraft == leave or each.trackers is None:
+            continue
+        if each.file != geometry_digest(file):
+            log.warning(
+                "%s: the mission file was changed after calibration version %s was adopted; "
+                "the file holds",
+                each.spacecraft,
+                each.version,
+            )
+            continue
+        found[each.spacecraft] = with_geometry(file, each.trackers)
+    return found
+
+
 class CalibrationAdoptions:
     """Adopts calibrations, and says what held when.
 
@@ -51,20 +72,7 @@ class CalibrationAdoptions:
     def load(self, leave: str | None = None) -> None:
         """Put what was adopted over the mission files, but for the spacecraft `leave`."""
         with self._context.reading() as connection:
-            latest = stored.latest_adoptions(connection)
-        for each in latest:
-            file = self._files.get(each.spacecraft)
-            if file is None or each.spacecraft == leave or each.trackers is None:
-                continue
-            if each.file != geometry_digest(file):
-                log.warning(
-                    "%s: the mission file was changed after calibration version %s was adopted; "
-                    "the file holds",
-                    each.spacecraft,
-                    each.version,
-                )
-                continue
-            self._context.missions[each.spacecraft] = with_geometry(file, each.trackers)
+            self._context.missions.update(adopted_missions(connection, self._files, leave))
 
     def in_force(self, spacecraft: str) -> CalibrationInForce:
         """The calibration that new batches use, and every change of it, newest first."""

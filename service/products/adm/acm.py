@@ -10,7 +10,6 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from itertools import chain
-from typing import Any
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from service.products.attitudes import (
     SeriesInfo,
     stretches,
 )
+from service.products.number_texts import rows_of_texts
 from service.products.spool import pieces, spool
 from service.vectors import Vector
 
@@ -159,7 +159,7 @@ def _seconds(elapsed_ns: Integers) -> list[str]:
 
 
 def _lines(seconds: list[str], values: Vector) -> str:
-    rows: list[list[Any]] = values.tolist()
     return "".join(
-        f"{time} {' '.join(map(repr, row))}\n" for time, row in zip(seconds, rows, strict=True)
+        f"{time} {' '.join(row)}\n"
+        for time, row in zip(seconds, rows_of_texts(values), strict=True)
     )

@@ -25,6 +25,7 @@ from service.products.attitudes import (
     SeriesInfo,
     stretches,
 )
+from service.products.number_texts import rows_of_texts
 from service.products.spool import pieces, spool
 
 
@@ -86,12 +87,12 @@ def _metadata(about: SeriesInfo, parts: Iterable[AttitudeBlock]) -> Pairs:
     ]
 
 
-def _values(part: AttitudeBlock) -> Iterator[tuple[float, ...]]:
-    """The numbers of each state: the quaternion and, where there is one, the rate in deg/s."""
+def _values(part: AttitudeBlock) -> list[tuple[str, ...]]:
+    """The numbers of each state as texts: the quaternion and, where known, the rate in deg/s."""
     values = part.quaternion
     if not np.isnan(part.rate_deg_per_s).any():
         values = np.concatenate([values, part.rate_deg_per_s], axis=1)
-    return map(tuple, values.tolist())
+    return rows_of_texts(values)
 
 
 def _kvn_opening(pairs: Pairs) -> str:
@@ -104,7 +105,7 @@ def _kvn_metadata(pairs: Pairs) -> str:
 
 def _kvn_states(part: AttitudeBlock) -> str:
     return "".join(
-        f"{time[:-1]} {' '.join(map(repr, values))}\n"
+        f"{time[:-1]} {' '.join(values)}\n"
         for time, values in zip(part.time.tolist(), _values(part), strict=True)
     )
 
@@ -117,15 +118,15 @@ def _xml_metadata(pairs: Pairs) -> str:
     return f"    <segment>\n      <metadata>\n{xml(pairs, 8)}      </metadata>\n      <data>\n"
 
 
-_QUATERNION = "<quaternion><Q1>%r</Q1><Q2>%r</Q2><Q3>%r</Q3><QC>%r</QC></quaternion>"
+_QUATERNION = "<quaternion><Q1>%s</Q1><Q2>%s</Q2><Q3>%s</Q3><QC>%s</QC></quaternion>"
 _ANGVEL = (
-    '<angVel><ANGVEL_X units="deg/s">%r</ANGVEL_X><ANGVEL_Y units="deg/s">%r</ANGVEL_Y>'
-    '<ANGVEL_Z units="deg/s">%r</ANGVEL_Z></angVel>'
+    '<angVel><ANGVEL_X units="deg/s">%s</ANGVEL_X><ANGVEL_Y units="deg/s">%s</ANGVEL_Y>'
+    '<ANGVEL_Z units="deg/s">%s</ANGVEL_Z></angVel>'
 )
-_STATE = "        <attitudeState><%s><EPOCH>%%s</EPOCH>%s</%s></attitudeState>\n"
+_STATE = "        <attitudeState><{0}><EPOCH>%s</EPOCH>{1}</{0}></attitudeState>\n"
 _STATES = {
-    4: _STATE % ("quaternionEphemeris", _QUATERNION, "quaternionEphemeris"),
-    7: _STATE % ("quaternionAngVel", _QUATERNION + _ANGVEL, "quaternionAngVel"),
+    4: _STATE.format("quaternionEphemeris", _QUATERNION),
+    7: _STATE.format("quaternionAngVel", _QUATERNION + _ANGVEL),
 }
 """By the number of values of a state."""
 

@@ -66,7 +66,7 @@ def add(commands: Any) -> None:
 
 def run(parsed: Namespace) -> int:
     """Write the attitudes, as they are read."""
-    from service.app.factory import open_app
+    from service.app.products import open_products
 
     start, end = period_of(parsed)
     given = {
@@ -78,9 +78,8 @@ def run(parsed: Namespace) -> int:
         )
         if value is not None
     }
-    app = open_app(settings_of_existing(parsed))
-    try:
-        series = app.products.attitudes(
+    with open_products(settings_of_existing(parsed)) as products:
+        series = products.attitudes(
             parsed.spacecraft,
             run=parsed.run,
             start=start,
@@ -92,6 +91,4 @@ def run(parsed: Namespace) -> int:
             **given,
         )
         written_to(parsed.output, write_attitudes(parsed.format, series))
-    finally:
-        app.close()
     return 0

@@ -52,13 +52,12 @@ def add(commands: Any) -> None:
 
 def run(parsed: Namespace) -> int:
     """Print the attitude."""
-    from service.app.factory import open_app
+    from service.app.products import open_products
     from service.times import parse_utc
 
     moment = parse_utc(parsed.time, "UTC")
-    app = open_app(settings_of_existing(parsed))
-    try:
-        found = app.products.attitude_at(
+    with open_products(settings_of_existing(parsed)) as products:
+        found = products.attitude_at(
             parsed.spacecraft,
             moment,
             parsed.method,
@@ -67,7 +66,5 @@ def run(parsed: Namespace) -> int:
             grade=parsed.grade,
             largest_gap_s=parsed.largest_gap,
         )
-    finally:
-        app.close()
     print_json(asdict(found))
     return 0
