@@ -279,7 +279,7 @@ class _Assembler:
 
 def _among(texts: Texts, wanted: Sequence[str]) -> npt.NDArray[np.bool_]:
     """Which texts are among some; `numpy.isin` needs texts of fixed width."""
-    return np.logical_or.reduce([texts == each for each in wanted])
+    return np.asarray(np.logical_or.reduce([texts == each for each in wanted]))
 
 
 def _unfinished(rows: AttitudeRows, gaps: Integers, known: str) -> AttitudeBlock:

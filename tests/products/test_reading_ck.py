@@ -162,6 +162,17 @@ def test_a_mutated_kernel_is_read_or_refused(form, seed, tmp_path):
     assert refused
 
 
+@pytest.mark.parametrize("record", [b"PK\x01\x02", b"PK\x03\x04"])
+def test_a_zip_file_with_a_name_that_is_no_utf_8_is_refused(record, tmp_path):
+    with zipfile.ZipFile(tmp_path / "x.zip", "w") as packed:
+        packed.writestr("é.bc", b"DAF/CK")
+    data = bytearray((tmp_path / "x.zip").read_bytes())
+    data[data.index("é".encode(), data.index(record))] = 0xFF
+    (tmp_path / "x.zip").write_bytes(data)
+    with pytest.raises(BadFile, match=r"x\.zip: cannot be unpacked"):
+        read_attitudes(tmp_path / "x.zip", "FILE")
+
+
 def test_a_zip_file_without_a_kernel_and_a_file_that_is_not_there_are_refused(tmp_path):
     with zipfile.ZipFile(tmp_path / "x.zip", "w") as packed:
         packed.writestr("../a.tsc", "KPL/SCLK")

@@ -5,6 +5,7 @@ segment.  Leap seconds come from ERFA's table unless a kernel of them is given.
 """
 
 import json
+import lzma
 import subprocess
 import sys
 import zipfile
@@ -28,6 +29,11 @@ CHILD_S = 600.0
 """The longest that the child may take."""
 MAX_UNPACKED_BYTES = 1 << 30
 _CHILD = Path(__file__).with_name("ck_reader_child.py")
+_UNPACKING = (
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError),
+    *(EOFError, OSError, RuntimeError, UnicodeDecodeError),
+)
+"""What a damaged zip file raises: a name that is no UTF-8 is among it."""
 _KERNELS = (".tsc", ".tls")
 """Clocks and leap seconds, the kernels that reading takes."""
 
@@ -78,7 +84,7 @@ def _unpacked(file: Path, place: Path) -> tuple[str, list[str]]:
                             message = f"holds more than {MAX_UNPACKED_BYTES >> 20} MiB of kernels"
                             raise BadFile(Fault(file.name, message))
                         out.write(piece)
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError) as error:
+    except _UNPACKING as error:
         raise BadFile(Fault(file.name, f"cannot be unpacked: {error}")) from None
     if len(found[".bc"]) != 1:
         raise BadFile(Fault(file.name, f"must hold one C-kernel (.bc), not {len(found['.bc'])}"))
