@@ -2,6 +2,7 @@
 
 import copy
 import json
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -12,9 +13,10 @@ from service.missions.mission import load_missions
 from service.observations.schema import submission_from_json
 from service.simulate.motion import turned_by
 from service.storage.grades.inputs import recorded_in
-from service.times import parse_utc
+from service.times import parse_utc, shifted
 from service.vectors import quaternion_from_matrix, separation_deg
 from tests.scale import size
+from tests.storage.bulk import put, result_row
 from tests.tracking.conftest import send
 from tests.tracking.passes import fly
 
@@ -134,3 +136,24 @@ def test_recorded_stars_alone_become_directions_of_the_filter(app, sky):
         # Observed and apparent directions agree through the true attitude, to the star's noise.
         off_rad = np.linalg.norm(body - times[tai_ns] @ inertial)
         assert off_rad < 5.0 * sigma
+
+
+def test_long_inputs_are_not_in_memory_all_at_once(app, sky):
+    """1,000 batches of 32 kB: whatever the period holds, a part of it is read at a time."""
+    (each,) = fly(app.context.missions["XTE"], sky, 1, 7)
+    # As JSON may be, with spaces: it is the length that counts.
+    text = json.dumps(each.body) + " " * 32_768
+    none = {"status": None, "reason": "fewer_than_two_unique_stars", "unique": 1}
+    rows = [result_row(app, shifted(DAY[0], 10.0 * k), **none) for k in range(1000)]
+    put(app, [(batch | {"input": text}, result) for batch, result in rows])
+    with app.context.reading() as connection:
+        # The run catalog is built for the first one.
+        recorded_in(connection, app.context.sky, "XTE", "live", DAY[0], shifted(DAY[0], 1.0))
+        tracemalloc.start()
+        try:
+            recorded = recorded_in(connection, app.context.sky, "XTE", "live", *DAY)
+            _, peak = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+    assert len(recorded.directions.tai_ns) == 0
+    assert peak < 0.4 * len(rows) * len(text)

@@ -28,7 +28,8 @@ WITHOUT_ATTITUDE = (
     str(NoAttitude.DEGENERATE_GEOMETRY),
 )
 """Why a batch has no attitude although stars of it are identified."""
-_READ_AT_ONCE = 500
+_READ_AT_ONCE = 100
+"""Inputs may be long: few of them are in memory at a time."""
 
 Stars = Mapping[tuple[str, int], str]
 """The catalog star of each unique star, by tracker and place."""
@@ -46,8 +47,7 @@ def lone_stars(
     rows_of: dict[str, dict[str, int]] = {}
     found: list[tuple[int, Vector, Vector, Vector]] = []
     query = (
-        select(results.c.id, results.c.time_ns, results.c.mission_digest, batches.c.input)
-        .join_from(results, batches, results.c.batch_id == batches.c.id)
+        select(results.c.id, results.c.batch_id, results.c.time_ns, results.c.mission_digest)
         .where(
             *selected.conditions(),
             results.c.status.is_(None),
@@ -60,11 +60,12 @@ def lone_stars(
     for first in range(0, len(read), _READ_AT_ONCE):
         part = read[first : first + _READ_AT_ONCE]
         stars = _unique_stars(connection, [row.id for row in part])
+        inputs = _inputs(connection, [row.batch_id for row in part])
         for row in part:
             digest = row.mission_digest
             if digest not in missions:
                 missions[digest] = recorded_mission(connection, digest)
-            mission, batch = missions[digest], submission_from_json(row.input).batch
+            mission, batch = missions[digest], submission_from_json(inputs[row.batch_id]).batch
             run_catalog = sky.run_catalog(mission, batch.time)
             if run_catalog.digest not in rows_of:
                 rows_of[run_catalog.digest] = {n: k for k, n in enumerate(run_catalog.star_id)}
@@ -81,6 +82,11 @@ def lone_stars(
         np.concatenate([each[2] for each in found]),
         np.concatenate([each[3] for each in found]),
     )
+
+
+def _inputs(connection: Connection, batch_ids: list[str]) -> dict[str, str]:
+    query = select(batches.c.id, batches.c.input).where(batches.c.id.in_(batch_ids))
+    return dict(map(tuple, connection.execute(query)))
 
 
 def _unique_stars(connection: Connection, ids: list[str]) -> dict[str, dict[tuple[str, int], str]]:
