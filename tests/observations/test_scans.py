@@ -213,6 +213,16 @@ class TestLinesOfARaster:
         band = ((1.0, 1.0, 1e4), (1.06, -1.0, 2e4), (-3.1, 3.0, 4e4))
         assert read(scanner, "RASTER", **lines_of(scan, band)).observations[0].count == 1
 
+    def test_a_faint_star_in_the_columns_of_a_bright_one_is_in_its_sigma(self, scanner):
+        """1.5 % of its light, three columns beside it, pull it by nearly 3 arcsec."""
+        scan = scanner.tracker("RASTER", "").scan
+        bright, faint = (1.0, 1.0, 4e5), (1.06, -2.0, 6e3)
+        stars = read(scanner, "RASTER", **lines_of(scan, (bright, faint))).observations[0]
+        assert stars.count == 1
+        off_arcsec = abs(stars.angles_deg[0] - bright[:2]) * 3600.0
+        assert off_arcsec.max() > 2.0
+        assert off_arcsec.max() < 2.0 * stars.sigma_arcsec[0]
+
     def test_lines_that_cannot_be_are_named(self, scanner):
         good = lines_of(scanner.tracker("RASTER", "").scan, self.STARS)
         fault = fault_of(scanner, "RASTER", **good | {"row_counts": good["row_counts"][1:]})

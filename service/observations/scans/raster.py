@@ -19,6 +19,8 @@ from service.vectors import Vector
 SAME_LIGHT_SIGMAS = 4.0
 SAME_LIGHT_SHARE = 0.02
 """Light differs by no more between columns and rows: each moment cuts off its own tails."""
+NOISE_SIGMAS = 2.0
+"""Of a difference of light that noise alone makes often enough."""
 
 
 class LinePlace(NamedTuple):
@@ -50,7 +52,11 @@ def raster_stars(columns: Vector, rows: Vector, scan: Raster, field: str) -> Ras
     pairs = sorted(_pairs(along_h, along_v), key=lambda pair: -pair[0].light_counts)
     middles = scan.middle("h"), scan.middle("v")
     angles = [[(place.line - m) for place, m in zip(pair, middles, strict=True)] for pair in pairs]
-    sigmas = [[place.sigma_lines for place in pair] for pair in pairs]
+    hidden = [_hidden_shift_lines(*pair, scan.half_width_lines) for pair in pairs]
+    sigmas = [
+        [math.hypot(place.sigma_lines, shift) for place in pair]
+        for pair, shift in zip(pairs, hidden, strict=True)
+    ]
     light = [0.5 * (h.light_counts + v.light_counts) for h, v in pairs]
     return RasterStars(
         np.array(angles).reshape(-1, 2) * scan.step_deg,
@@ -86,6 +92,16 @@ def _places(counts: Vector, lines: int, scan: Raster, field: str) -> list[LinePl
             place = peak + found.displacement, math.sqrt(found.variance)
             places.append(LinePlace(*place, found.total, math.sqrt(found.total_variance)))
     return places
+
+
+def _hidden_shift_lines(h: LinePlace, v: LinePlace, half_width_lines: int) -> float:
+    """How far a star that hides beside this one along one axis may move it.
+
+    Its light is in the sum of one axis and not of the other; it is within the half width.
+    """
+    noise = math.hypot(h.sigma_light_counts, v.sigma_light_counts)
+    more = max(0.0, abs(h.light_counts - v.light_counts) - NOISE_SIGMAS * noise)
+    return half_width_lines * more / min(h.light_counts, v.light_counts)
 
 
 def _pairs(along_h: list[LinePlace], along_v: list[LinePlace]) -> list[tuple[LinePlace, LinePlace]]:
