@@ -94,8 +94,8 @@ Version {__version__}. {verdict}
 
 Every section is also a test: `make test` runs the same comparisons on smaller samples, and
 `python -m benchmarks --all` prints them. Each ends with its bounds and with the commit, the library
-versions and the seed that it was measured with; sections may have been measured at different
-commits. `python -m benchmarks.verification --check` names the sections whose source files have
+versions and the seed that it was measured with; its figures, times included, are those of that
+commit. `python -m benchmarks.verification --check` names the sections whose source files have
 changed since then. It is run before a release, and is no part of `make check`.
 
 Where a figure is a count of random events, its bound is the one that chance alone passes once in

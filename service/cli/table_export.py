@@ -15,7 +15,7 @@ def add_table_export(commands: Any, kind: str, summary: str) -> None:
     parser = add_command(
         commands,
         kind,
-        f"{summary} Oldest first; units and descriptions stand in the metadata of Parquet files.",
+        f"{summary} Oldest first; units and descriptions are in the metadata of Parquet files.",
         f"""
         acquire export {kind} --spacecraft XTE --format parquet --output {kind}.parquet
         acquire export {kind} --spacecraft XTE --run pass-7 --start 1996-010T00:00:00Z

@@ -118,7 +118,7 @@ class TestLinesThroughAStar:
         star = {"h_deg": 88.99, "v_deg": 0, "h_counts": counts, "v_counts": counts}
         fault = fault_of(scanner, "LINES", stars=[star])
         assert fault.field == "observations.0.stars.0"
-        assert "no tracker sees it" in fault.message
+        assert "outside of any field of view" in fault.message
 
     @pytest.mark.parametrize(
         ("changed", "field", "message"),
@@ -389,7 +389,7 @@ noise_counts = 10.0
     @pytest.mark.parametrize(
         ("given", "message"),
         [
-            ([100.0, 100.0, 5e4, 5e4], "along X sees no sun"),
+            ([100.0, 100.0, 5e4, 5e4], "along X has no sunlight"),
             ([5e4, 5e4, 9e4, 1e4], "along Y is beyond 0.55"),
         ],
     )

@@ -62,7 +62,7 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("--run", metavar="NAME", help="default: from FILE.json, else live")
     parser.add_argument(
-        "--a-priori", metavar="JSON", help="JSON as in a batch; null: lost in space"
+        "--a-priori", metavar="JSON", help="JSON as in a batch; null: search the whole sky"
     )
     parser.add_argument(
         "--centroid",

@@ -44,7 +44,7 @@ def add(commands: Any) -> None:
         required=True,
         choices=("read", "submit", "operate"),
         help="read: read everything; submit: send batches; operate: change limits, acknowledge "
-        "alarms, record what-ifs, drop zones.  May be repeated",
+        "alarms, adopt what-ifs and calibrations, and all other changes.  May be repeated",
     )
     parser.add_argument(
         "--spacecraft",

@@ -47,7 +47,7 @@ def reduced(batch: ObservationBatch, mission: Mission) -> ObservationBatch:
         rates = tracker.body_from_tracker.T @ rates_body
         observations.append(_reduced(stars, tracker, rates, field) if stars.readings else stars)
     if not any(each.count for each in observations):
-        raise BadBatch(Fault("observations", "no star can be told in the lines of the raster"))
+        raise BadBatch(Fault("observations", "no star stands out in the lines of the raster"))
     return structs.replace(batch, observations=tuple(observations))
 
 
@@ -72,7 +72,8 @@ def _reduced(stars: TrackerStars, tracker: Tracker, rates: Vector, field: str) -
             raise _other_kind(tracker, f"{here}.{_FIELDS[reading.kind]}", reading.kind)
         if not (np.abs(angles[k]) < WIDEST_DEG).all():
             h_deg, v_deg = angles[k].tolist()
-            message = f"is {h_deg:.4g}, {v_deg:.4g} deg from the boresight: no tracker sees it"
+            place = f"{h_deg:.4g}, {v_deg:.4g} deg from the boresight"
+            message = f"is {place}: outside of any field of view"
             raise BadBatch(Fault(here, message))
         if math.isnan(sigma[k]):
             sigma[k] = of_scan

@@ -27,7 +27,7 @@ def sun_body(counts: Vector, mission: Mission, field: str) -> Vector:
     ):
         light = float(plus + minus)
         if light < BREAKDOWN_RATIO * math.sqrt(2.0) * tracker.noise_counts:
-            message = f"the pair along {axis} sees no sun: its light is below the noise"
+            message = f"the pair along {axis} has no sunlight: its light is below the noise"
             raise BadBatch(Fault(field, message, shown_value(light)))
         signal = float(plus - minus) / light
         if abs(signal) > limit:

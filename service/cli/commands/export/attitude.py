@@ -22,7 +22,7 @@ def add(commands: Any) -> None:
     parser = add_command(
         commands,
         "attitude",
-        "Write the attitudes of a spacecraft, oldest first, in any of the formats.",
+        "Write the attitudes of a spacecraft in any of the formats.",
         """
         acquire export attitude --spacecraft XTE --format aem --output xte.aem
         acquire export attitude --spacecraft XTE --run pass-7 --start 1996-010T00:00:00Z
