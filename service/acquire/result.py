@@ -24,7 +24,7 @@ from service.sky.zones import SearchRegion, Zone, counts_within
 from service.vectors import Vector
 
 TrackingState = Literal["acquiring", "tracking", "lost"]
-"""Of a batch: found in the whole sky, found about a prediction, or no good attitude."""
+"""Of a batch: found in the whole sky, found about a prediction, or nothing good."""
 _COUNTED = [
     (int(each), each.word) for each in (Outcome.UNIQUE, Outcome.AMBIGUOUS, Outcome.UNMATCHED)
 ]
@@ -112,10 +112,16 @@ class Acquisition(Struct, frozen=True, eq=False, gc=False):
 
     @property
     def tracking_state(self) -> TrackingState | None:
-        """The state that a batch that asks for the last attitude leaves its spacecraft in."""
+        """The state that a batch that asks for the last attitude leaves its spacecraft in.
+
+        A batch without an attitude is tracked where the prediction identified a star of it.
+        """
         if self.batch.tracking is None:
             return None
-        if self.solution is None or self.solution.suspect:
+        if self.solution is None:
+            is_tracked = self.path is Path.ZONE and self.counts[Outcome.UNIQUE.word] > 0
+            return "tracking" if is_tracked else "lost"
+        if self.solution.suspect:
             return "lost"
         return "tracking" if self.path is Path.ZONE else "acquiring"
 

@@ -273,6 +273,10 @@ class Mission(Strict):
         for each in packets.trackers if packets and known else ():
             if each.tracker not in known:
                 raise ValueError(f"trackers: {each.tracker}: the mission has {', '.join(known)}")
+        for measured in packets.measurements if packets and known else ():
+            if measured.tracker is not None and measured.tracker not in known:
+                there_are = f"the mission has {', '.join(known)}"
+                raise ValueError(f"measurements: {measured.tracker}: {there_are}")
         return packets
 
     @field_validator("tests")

@@ -33,6 +33,14 @@ SlotNames = (
 """One parameter for each slot: an XTCE array, numbered names with `{}`, or a list of names."""
 Triple = ParameterName | tuple[ParameterName, ParameterName, ParameterName]
 Quadruple = ParameterName | tuple[ParameterName, ParameterName, ParameterName, ParameterName]
+Upper = (
+    ParameterName
+    | tuple[
+        ParameterName, ParameterName, ParameterName, ParameterName, ParameterName, ParameterName
+    ]
+)
+"""The upper triangle of a symmetric matrix by rows: 11, 12, 13, 22, 23, 33."""
+SigmaArcsec = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 def element_names(names: str | tuple[str, ...], count: int, first: int = 0) -> tuple[str, ...]:
@@ -146,6 +154,40 @@ class PacketPrior(Strict):
         return self
 
 
+class PacketMeasurement(Strict):
+    """An attitude that a tracker measured itself: a quaternion with its accuracy.
+
+    A packet that holds it gives a batch of its own.
+    """
+
+    quaternion: Quadruple
+    tracker: str | None = Field(default=None, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")
+    """Whose axes are meant; None: those of the body."""
+    scalar: Literal["last", "first"] = "last"
+    direction: Literal["inertial_to_body", "body_to_inertial"] = "inertial_to_body"
+    """With a tracker, its axes stand for those of the body."""
+    frame: Literal["EME2000", "ICRF", "GCRF"] = "EME2000"
+    sigma: Triple | None = None
+    """Parameters of one sigma of the rotation about each of the same axes."""
+    covariance: Upper | None = None
+    """Parameters of the covariance of that rotation, in place of the sigmas."""
+    angle_unit: Literal["deg", "arcmin", "arcsec", "rad"] = "arcsec"
+    """Of `sigma`; the unit of `covariance` is its square."""
+    sigma_arcsec: tuple[SigmaArcsec, SigmaArcsec, SigmaArcsec] | None = None
+    """In place of parameters: the sigmas of every packet."""
+    valid: ParameterName | None = None
+    """The packet holds an attitude where this is not zero."""
+    time: PacketTime | None = None
+    """Of an attitude with a time of its own; by default the time of its packet."""
+
+    @model_validator(mode="after")
+    def _one_accuracy(self) -> Self:
+        given = (self.sigma, self.covariance, self.sigma_arcsec)
+        if sum(each is not None for each in given) != 1:
+            raise ValueError("needs one of sigma, covariance and sigma_arcsec")
+        return self
+
+
 class PacketRates(Strict):
     """Body rates, in body axes and relative to inertial space."""
 
@@ -246,7 +288,11 @@ class Packets(Strict):
     """Only packets of these APIDs are read, others are counted; empty: all that XTCE describes."""
     time: PacketTime
     trackers: tuple[PacketTracker, ...] = Field(default=(), max_length=16)
-    """Without trackers the packets give a priori attitudes and gyro blocks alone."""
+    """Without trackers the packets give what the other tables name alone."""
+    measurements: tuple[PacketMeasurement, ...] = Field(
+        default=(), max_length=16, exclude_if=lambda measurements: not measurements
+    )
+    """Missing, they are no part of the mission's digest."""
     join_within_s: float = Field(default=0.0, ge=0, le=60)
     """Packets of different trackers make one batch if their times differ by at most this."""
     batch: ParameterName | None = None
@@ -267,9 +313,14 @@ class Packets(Strict):
         if self.rates is not None and self.gyro is not None:
             raise ValueError("takes either rates or gyro, not both")
         has_quaternion = self.prior is not None and self.prior.quaternion is not None
-        if not (self.trackers or has_quaternion or self.gyro_blocks):
-            raise ValueError("needs trackers, gyro_blocks, or a prior with a quaternion")
+        if not (self.trackers or has_quaternion or self.gyro_blocks or self.measurements):
+            raise ValueError(
+                "needs trackers, measurements, gyro_blocks, or a prior with a quaternion"
+            )
         names = [each.tracker for each in self.trackers]
         if len(set(names)) != len(names):
             raise ValueError(f"a tracker occurs twice: {', '.join(names)}")
+        measured = [each.tracker or "the body" for each in self.measurements]
+        if len(set(measured)) != len(measured):
+            raise ValueError(f"measurements has axes twice: {', '.join(measured)}")
         return self

@@ -1,5 +1,6 @@
 """An attitude that a star tracker measured itself, as a batch carries it."""
 
+from collections.abc import Sequence
 from typing import Annotated, Any, Self
 
 import numpy as np
@@ -14,14 +15,25 @@ LEAST_RATIO = 1e-10
 
 
 def _of_a_tracker(rows: tuple[Row, Row, Row]) -> tuple[Row, Row, Row]:
-    variances = np.linalg.eigvalsh(np.array(rows))
+    variances = np.linalg.eigvalsh(np.array(rows)).tolist()
     least, largest = LEAST_SIGMA_ARCSEC**2, LARGEST_SIGMA_ARCSEC**2
-    if variances[0] < max(least, LEAST_RATIO * variances[-1]) or variances[-1] > largest:
+    if variances[0] < least or variances[-1] > largest:
         raise ValueError(
             f"must have sigmas from {LEAST_SIGMA_ARCSEC:g} to {LARGEST_SIGMA_ARCSEC:g} arcsec "
             "about every axis"
         )
+    _require_ratio(variances)
     return rows
+
+
+def _of_one_tracker(sigmas: tuple[float, float, float]) -> tuple[float, float, float]:
+    _require_ratio([sigma**2 for sigma in sigmas])
+    return sigmas
+
+
+def _require_ratio(variances: Sequence[float]) -> None:
+    if min(variances) < LEAST_RATIO * max(variances):
+        raise ValueError(f"must have no sigma below {LEAST_RATIO**0.5:g} of the largest")
 
 
 def none_beside_measurement(prior: Any, info: ValidationInfo) -> Any:
@@ -52,7 +64,9 @@ class MeasurementIn(BaseModel):
         str | None, Field(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\x7f]+$")
     ] = None
     """Whose axes are meant; the mission's alignment turns them into the body's."""
-    sigma_arcsec: tuple[Sigma, Sigma, Sigma] | None = None
+    sigma_arcsec: Annotated[tuple[Sigma, Sigma, Sigma], AfterValidator(_of_one_tracker)] | None = (
+        None
+    )
     """One sigma of the rotation about each of the same axes."""
     covariance_arcsec2: Annotated[PositiveDefinite, AfterValidator(_of_a_tracker)] | None = None
     """Of the small rotation about the same axes, in place of the sigmas."""

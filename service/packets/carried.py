@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from service.missions.packets import PacketGyro, PacketPrior
+from service.missions.packets import PacketGyro, PacketMeasurement, PacketPrior
 from service.observations.numbers import NORM_TOLERANCE
 from service.packets.clock import NS, Moment
 from service.packets.definition import PacketFault
@@ -21,7 +21,7 @@ class PacketAttitude:
 
 
 def quaternion_in(
-    values: Mapping[str, Any], names: Sequence[str], prior: PacketPrior
+    values: Mapping[str, Any], names: Sequence[str], table: PacketPrior | PacketMeasurement
 ) -> tuple[float, float, float, float] | None:
     """The quaternion of a packet; None where it is zero or not finite: there is no attitude.
 
@@ -35,10 +35,10 @@ def quaternion_in(
         raise PacketFault(
             ", ".join(names), f"must have norm 1 within {NORM_TOLERANCE}; its norm is {norm:.6g}"
         )
-    if prior.scalar == "first":
+    if table.scalar == "first":
         numbers = [*numbers[1:], numbers[0]]
     x, y, z, scalar = numbers
-    if prior.direction == "body_to_inertial":
+    if table.direction == "body_to_inertial":
         return -x, -y, -z, scalar
     return x, y, z, scalar
 

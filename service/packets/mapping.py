@@ -8,7 +8,13 @@ from typing import Literal
 
 from service.errors import BadInput, Fault, shown_value
 from service.missions.mission import Mission
-from service.missions.packets import PacketGyroBlocks, Packets, PacketTracker, element_names
+from service.missions.packets import (
+    PacketGyroBlocks,
+    PacketMeasurement,
+    Packets,
+    PacketTracker,
+    element_names,
+)
 from service.packets.clock import names_of
 from service.packets.definition import PacketDefinition
 
@@ -38,11 +44,24 @@ class TrackerColumns:
 
 
 @dataclass(frozen=True)
+class MeasurementColumns:
+    """The parameters of an attitude that a tracker measured itself."""
+
+    table: PacketMeasurement
+    quaternion: tuple[str, ...]
+    sigma: tuple[str, ...]
+    covariance: tuple[str, ...]
+    arcsec: float
+    """Of one unit of `sigma`."""
+
+
+@dataclass(frozen=True)
 class PacketMap:
     """The parameters of a batch: a table with every array and pattern written out."""
 
     table: Packets
     trackers: tuple[TrackerColumns, ...]
+    measurements: tuple[MeasurementColumns, ...]
     quaternion: tuple[str, ...]
     rates: tuple[str, ...]
     gyro: tuple[str, ...]
@@ -62,6 +81,7 @@ def packet_map(table: Packets, definition: PacketDefinition) -> PacketMap:
     found = PacketMap(
         table=table,
         trackers=tuple(_columns(each) for each in table.trackers),
+        measurements=tuple(_measurement(each) for each in table.measurements),
         quaternion=_triple(prior.quaternion, 4) if prior and prior.quaternion else (),
         rates=_triple(table.rates.components, 3) if table.rates else (),
         gyro=_triple(table.gyro.counts, 3) if table.gyro else (),
@@ -139,6 +159,16 @@ def _columns(table: PacketTracker) -> TrackerColumns:
     )
 
 
+def _measurement(table: PacketMeasurement) -> MeasurementColumns:
+    return MeasurementColumns(
+        table=table,
+        quaternion=element_names(table.quaternion, 4),
+        sigma=element_names(table.sigma, 3) if table.sigma else (),
+        covariance=element_names(table.covariance, 6) if table.covariance else (),
+        arcsec=DEG_OF_UNIT[table.angle_unit] * 3600.0,
+    )
+
+
 def _keys(found: PacketMap) -> Iterable[tuple[str, Iterable[str]]]:
     """Every key of the table with its parameters."""
     table = found.table
@@ -152,6 +182,12 @@ def _keys(found: PacketMap) -> Iterable[tuple[str, Iterable[str]]]:
         for word in ("magnitude", "time_offset_s", "sigma_arcsec", "valid"):
             yield f"{at}.{word}", getattr(each, word) or ()
         yield f"{at}.count", (each.count,) if each.count else ()
+    for index, columns in enumerate(found.measurements):
+        at = f"measurements.{index}"
+        for word in ("quaternion", "sigma", "covariance"):
+            yield f"{at}.{word}", getattr(columns, word)
+        yield f"{at}.valid", (columns.table.valid,) if columns.table.valid else ()
+        yield f"{at}.time", names_of(columns.table.time) if columns.table.time else ()
     if table.prior is not None and table.prior.time is not None:
         yield "prior.time", names_of(table.prior.time)
     yield "prior.quaternion", found.quaternion

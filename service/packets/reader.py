@@ -1,7 +1,8 @@
 """Files of space packets as lines of telemetry, a batch or a gyro block each, with counts."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import IO
 
@@ -15,6 +16,7 @@ from service.packets.carried import PacketAttitude
 from service.packets.definition import PacketDefinition, PacketFault, UnknownPacket
 from service.packets.gyro_blocks import GyroBlockMaker, PacketBlock
 from service.packets.mapping import packet_map
+from service.packets.measurements import MeasuredBatch, MeasurementMaker
 from service.packets.stream import (
     IDLE_APID,
     ApidCounts,
@@ -32,7 +34,7 @@ class PacketTotals(Struct, kw_only=True):
     bytes: int = 0
     batches: int = 0
     without_stars: int = 0
-    """Packets of a tracker that held no star."""
+    """Packets of a tracker that held neither a star nor an attitude."""
     gyro_blocks: int = 0
     gyro_samples: int = 0
     unknown: int = 0
@@ -58,6 +60,7 @@ class PacketReader:
         self._definition = definition
         mapped = packet_map(mission.packets, definition)
         self._maker = BatchMaker(mission.name, mapped)
+        self._measured = MeasurementMaker(mission.name, mapped)
         self._gyro = GyroBlockMaker(mission, mapped) if mission.packets.gyro_blocks else None
         self._asked = frozenset(mission.packets.apids)
         self._sequence = SequenceCounter()
@@ -125,13 +128,21 @@ class PacketReader:
             totals.unknown += 1
             return
         yield from self._lines_of(self._maker.add(packet, values), name)
+        yield from self._lines_of_measured(self._measured.add(packet, values), name)
         if self._gyro is not None:
             yield from self._lines_of_blocks(self._gyro, self._gyro.add(packet, values))
 
     def _lines_of(self, batches: Iterable[StarBatch], name: str) -> Iterator[Line]:
         for batch in batches:
             if batch.has_stars():
-                yield self._line(batch, name)
+                yield self._line(batch.packet, partial(self._maker.json_of, batch), name)
+            else:
+                self._totals.without_stars += 1
+
+    def _lines_of_measured(self, batches: Iterable[MeasuredBatch], name: str) -> Iterator[Line]:
+        for batch in batches:
+            if batch.body is not None:
+                yield self._line(batch.packet, partial(self._measured.json_of, batch), name)
             else:
                 self._totals.without_stars += 1
 
@@ -143,13 +154,13 @@ class PacketReader:
             self._totals.gyro_samples += len(block.tai_ns)
             yield Line(block.packet.number, maker.json_of(block, block.packet.apid))
 
-    def _line(self, batch: StarBatch, name: str) -> Line:
+    def _line(self, packet: SpacePacket, json_of: Callable[[], bytes], name: str) -> Line:
         try:
-            body = self._maker.json_of(batch)
+            body = json_of()
         except PacketFault as fault:
-            return self._refused(batch.packet, fault, name)
+            return self._refused(packet, fault, name)
         self._totals.batches += 1
-        return Line(batch.packet.number, body)
+        return Line(packet.number, body)
 
     def _refused(self, packet: SpacePacket, fault: PacketFault, name: str) -> Line:
         self._totals.refused += 1

@@ -51,6 +51,16 @@ REFUSED = {
     "both": (told(covariance_arcsec2=COVARIANCE), "measurement", "either sigma_arcsec"),
     "zero": (told(sigma_arcsec=[6.0, 0.0, 6.0]), "measurement.sigma_arcsec.1", "0.001"),
     "negative": (told(sigma_arcsec=[6.0, -6.0, 6.0]), "measurement.sigma_arcsec.1", "-6"),
+    "far apart": (
+        told(sigma_arcsec=[0.009, 6.0, 1000.0]),
+        "measurement.sigma_arcsec",
+        "below 1e-05 of the largest",
+    ),
+    "covariance far apart": (
+        covariance([[0.009**2, 0.0, 0.0], [0.0, 36.0, 0.0], [0.0, 0.0, 1e6]]),
+        "measurement.covariance_arcsec2",
+        "below 1e-05 of the largest",
+    ),
     "not positive": (
         covariance([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
         "measurement.covariance_arcsec2",

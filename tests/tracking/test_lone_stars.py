@@ -112,6 +112,19 @@ def test_a_batch_that_tells_nothing_of_its_attitude_names_no_star_alone(sky):
     assert named(found(body, sky, mission)) == [None]
 
 
+def test_a_batch_without_an_attitude_is_tracked_where_a_star_of_it_is_identified(sky):
+    mission = load_missions()["XTE"]
+    rng = np.random.default_rng(8)
+    for sigma_arcsec, is_named in ((30.0, True), (3600.0, False)):
+        states = set()
+        for each in fly(mission, sky, 10, 8):
+            acquisition = found(predicted(each, rng, sigma_arcsec)[0], sky, mission)
+            assert acquisition.solution is None
+            if (named(acquisition) != [None]) == is_named:
+                states.add(acquisition.tracking_state)
+        assert states == {"tracking" if is_named else "lost"}
+
+
 def test_recorded_stars_alone_become_directions_of_the_filter(app, sky):
     mission = app.context.missions["XTE"]
     flown = list(fly(mission, sky, 14, 7, cadence_s=10.0))

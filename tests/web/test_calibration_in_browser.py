@@ -97,6 +97,7 @@ def test_calibrate_try_adopt_and_take_back(browser, folder):
         browser.run("signed.elements.who.value = 'J. Operator'")
         browser.run("""document.querySelector('[data-revert=""]').click()""")
         browser.wait(lambda: "the mission file" in browser.run(in_force))
-        assert "History of calibrations" in browser.run("document.getElementById('history').innerText")
+        shown = browser.run("document.getElementById('history').innerText")
+        assert "History of calibrations" in shown
         browser.call("Page.navigate", url="about:blank")
     assert browser.complaints == []

@@ -160,7 +160,8 @@ def _check_archive(parsed: Namespace) -> None:
     if parsed.scheduler is not None and parsed.archive is None:
         raise BadInput(Fault("--scheduler", "needs --archive", parsed.scheduler))
     if parsed.scheduler is not None and parsed.processes is not None:
-        raise BadInput(Fault("--processes", "is the number of processes on this machine: leave it out with --scheduler"))
+        wanted = "is the number of processes on this machine: leave it out with --scheduler"
+        raise BadInput(Fault("--processes", wanted))
     if parsed.archive is None:
         return
     if not parsed.archive.is_dir():

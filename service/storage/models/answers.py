@@ -232,8 +232,9 @@ class Tracking(Record, frozen=True, kw_only=True):
         str,
         DescribedAs(TrackingState),
         doc(
-            "`tracking`: a good attitude was found about the prediction. `acquiring`: one was "
-            "found in the whole sky. `lost`: none was found."
+            "`tracking`: a good attitude was found about the prediction, or the prediction "
+            "identified a star of a batch that has no attitude. `acquiring`: a good attitude was "
+            "found in the whole sky. `lost`: none of these."
         ),
     ]
     by_default: Annotated[bool, doc("The mission asks for it, not the batch.")]

@@ -79,7 +79,7 @@ class ReplayPackets(Record, frozen=True, kw_only=True):
     packets: Count
     bytes: Count
     batches: Annotated[Count, doc("Batches that the packets hold.")]
-    without_stars: Annotated[Count, doc("Batches without a star, which are left out.")]
+    without_stars: Annotated[Count, doc("Without a star or a measured attitude: left out.")]
     gyro_blocks: Annotated[Count, doc("Gyro blocks that the packets hold.")]
     gyro_samples: Annotated[Count, doc("Samples of these blocks.")]
     unknown: Annotated[Count, doc("Packets that the XTCE file does not describe.")]

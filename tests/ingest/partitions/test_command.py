@@ -16,7 +16,8 @@ def test_options_that_do_not_fit_are_refused_by_name(acquire, tmp_path):
     assert (code, "--scheduler: needs certificates: set DASK_" in complaint) == (2, True)
     both = ("--scheduler", "tls://h:1", "--processes", "2")
     code, _, complaint = acquire("reprocess", "--archive", tmp_path, *both)
-    assert (code, "--processes: is the number of processes on this machine" in complaint) == (2, True)
+    said = "--processes: is the number of processes on this machine" in complaint
+    assert (code, said) == (2, True)
     code, _, complaint = acquire("reprocess", "--archive", tmp_path / "none")
     assert (code, "there is no such folder" in complaint) == (2, True)
 
