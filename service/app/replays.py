@@ -77,7 +77,6 @@ class Replays:
 
     def __init__(self, context: Context, submissions: Submissions, gyro: GyroIntake) -> None:
         self._context = context
-        self._submissions = submissions
         config = WorkerConfig(
             context.missions,
             context.settings.catalog,
@@ -90,6 +89,7 @@ class Replays:
             context.store,
             config,
             context.settings.replay_processes,
+            submissions.require_kernels,
         )
         self._spool = Spool(context.settings.spool_folder)
         self._lock = threading.Lock()
@@ -216,8 +216,6 @@ class Replays:
         return replay
 
     def _require_slot(self, owner: str | None) -> None:
-        # Each worker would compile what it does not find.
-        self._submissions.require_kernels()
         at_work = self.at_work
         if len(at_work) >= MAX_REPLAYS:
             raise Busy(f"{len(at_work)} replays are running", REPLAY_RETRY_S)

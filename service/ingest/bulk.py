@@ -71,8 +71,11 @@ class Bulk:
         store: Store,
         config: WorkerConfig,
         workers: int,
+        require_kernels: Require,
     ) -> None:
+        """`require_kernels` raises `Busy` while kernels are compiled."""
         self._submissions = submissions
+        self._require_kernels = require_kernels
         self.gyro = gyro
         self._store = store
         self.workers: LocalWorkers[TelemetryLines, LineResult] = LocalWorkers(
@@ -111,6 +114,8 @@ class Bulk:
         `require` is called before each batch that this process computes itself, and
         ends that where it raises.
         """
+        # Without them each worker would compile what it does not find.
+        self._require_kernels()
         self.workers.start()
         self._submissions.yield_to_interactive()
         named = [identity_in(text, run) for text in texts]

@@ -1,10 +1,13 @@
 """Numbers as text from which the same float64 is read again, many at a time."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import msgspec
 
-from service.vectors import Vector
+if TYPE_CHECKING:
+    # numpy takes long to load, and `acquire --help` names the formats.
+    from service.vectors import Vector
 
 _ENCODER = msgspec.json.Encoder()
 
@@ -20,7 +23,7 @@ def number_texts(values: Sequence[float | None], unknown: str = "null") -> list[
     return text.replace("null", unknown).split(",")
 
 
-def rows_of_texts(values: Vector) -> list[tuple[str, ...]]:
+def rows_of_texts(values: "Vector") -> list[tuple[str, ...]]:
     """The numbers of an array (n, k) as texts, a row each, k > 0."""
     texts = iter(number_texts(values.ravel().tolist()))
     return list(zip(*[texts] * values.shape[1], strict=True))

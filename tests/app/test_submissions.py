@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 from sqlalchemy import select
 
-from service.access.tokens import Caller
 from service.acquire import kernel_build
 from service.acquire.kernel_build import KernelBuild
 from service.app.factory import open_app
@@ -182,12 +181,20 @@ def test_it_is_ready_for_zones_while_other_kernels_are_compiled(make, monkeypatc
         for asked in (
             lambda: asyncio.run(app.submissions.answered(json.dumps(lost).encode())),
             lambda: app.results.what_if(answer.id, OptionsIn()),
-            lambda: app.replays.new_upload(Caller("test", frozenset())),
         ):
             with pytest.raises(Busy, match="compiling"):
                 asked()
+        replay = app.replays.start([make("b3").text.encode()], "early")
+        time.sleep(0.5)
+        early = app.replays.get(replay)
+        assert (early.state, early.lines.done) == ("running", 0)
         go_on.set()
         first.result(60)
+    until = time.monotonic() + 60.0
+    while app.replays.get(replay).state == "running" and time.monotonic() < until:
+        time.sleep(0.1)
+    late = app.replays.get(replay)
+    assert (late.state, late.lines.done) == ("done", 1)
     assert not asyncio.run(app.submissions.answered(json.dumps(lost).encode())).replayed
     app.close()
 
