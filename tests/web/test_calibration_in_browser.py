@@ -64,8 +64,10 @@ def test_calibrate_try_adopt_and_take_back(browser, folder):
         browser.run("signed.elements.note.value = 'after the first pass'")
         browser.run("document.querySelector('#calibrate button').click()")
         browser.wait(lambda: "version=1" in browser.run("location.search"), 60)
-        browser.wait(lambda: "residuals over the focal plane" in browser.run("found.innerText"))
+        # The page is shown while the rest of it is still read.
+        browser.wait(lambda: browser.run("document.readyState") == "complete")
         told = browser.run("found.innerText")
+        assert "residuals over the focal plane" in told
         assert "absolute alignment" in told
         assert browser.run("document.querySelectorAll('.maps svg.focal-plane').length") >= 6
         assert "SECOND alignment z" in browser.run("document.getElementById('history').innerText")
