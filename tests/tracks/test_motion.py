@@ -38,7 +38,10 @@ def test_the_optimum_is_that_of_scipy(rng):
         place, turn = unit(state[:3]), state[3:] * 1e-4
         turn = turn - (turn @ place) * place
         moved = rotate_about(turn * (TIMES - found.time_s)[:, None], np.tile(place, (25, 1)))
-        return np.einsum("nij,ni->nj", root, direction - moved).ravel()
+        misfit = np.einsum("nij,ni->nj", root, direction - moved).ravel()
+        # Without these, nothing holds the length of the place and the part of the turn along it.
+        # A step along them once led to the far side of the sky, where the misfit is the same.
+        return np.concatenate([misfit, [state[:3] @ state[:3] - 1.0, state[3:] @ place]])
 
     start = np.concatenate([direction[12], np.cross(direction[0], direction[-1]) / 900.0 * 1e4])
     best = least_squares(off, start, xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale="jac")
