@@ -17,6 +17,7 @@ from service.filtering.smoother import smooth
 from service.grades.innovations import innovations_of
 from tests.filtering.simulated import attitudes_of, gyro_of, slews, truth_of
 from tests.grades.passes import GYRO, mission_with
+from tests.missions.without_gyro import mission_without_gyro
 
 TRUE = GyroModel(10**0.5 * 1e-6, 10**0.5 * 1e-10)
 HOURS = 6
@@ -152,8 +153,8 @@ def test_attitudes_that_are_worse_than_said_point_to_the_trackers(xte):
     assert attitudes.statement.changes == ()
 
 
-def test_without_innovations_the_command_is_named_and_without_a_gyro_nothing_is_said(xte, missions):
+def test_without_innovations_the_command_is_named_and_without_a_gyro_nothing_is_said(xte):
     (only,) = innovation_findings(None, xte, ())
     assert only.statement.action == "wait"
     assert "acquire smooth XTE" in only.statement.text
-    assert innovation_findings(None, missions["XTE"], ()) == []
+    assert innovation_findings(None, mission_without_gyro("XTE"), ()) == []

@@ -20,6 +20,7 @@ from tests.filtering.simulated import (
     truth_of,
 )
 from tests.grades.passes import GYRO, MODEL, NOON_NS, graded, later, mission_with, recorded_of
+from tests.missions.without_gyro import mission_without_gyro
 
 SIGMAS = (6.0, 6.0, 40.0)
 
@@ -96,10 +97,10 @@ def test_a_day_does_not_depend_on_what_lies_beyond_its_window(missions, rng):
     assert found.gyro["samples"] == 901
 
 
-def test_without_a_gyro_the_rate_is_taken_for_constant(missions, rng):
+def test_without_a_gyro_the_rate_is_taken_for_constant(rng):
     truth = truth_of(lambda t: np.tile([0.0, -1e-3, 0.0], (len(t), 1)), 900.0)
     attitudes = attitudes_of(truth, np.arange(0, 901, 5), SIGMAS, rng)
-    mission = mission_with(missions["XTE"], motion={"rate_walk_rad_s1_5": 1e-7})
+    mission = mission_with(mission_without_gyro("XTE"), motion={"rate_walk_rad_s1_5": 1e-7})
     day = graded(recorded_of([], np.zeros((0, 3)), attitudes), mission)
     (stretch,) = day.stretches
     assert stretch.model == "constant_rate"
@@ -114,13 +115,13 @@ def test_without_a_gyro_the_rate_is_taken_for_constant(missions, rng):
     assert rms < 12.0
 
 
-def test_samples_of_a_gyro_that_the_mission_does_not_describe_are_not_used(hours, missions, rng):
+def test_samples_of_a_gyro_that_the_mission_does_not_describe_are_not_used(rng):
     truth = truth_of(slews, 600.0)
     gyro, _ = gyro_of(truth, MODEL, rng)
     attitudes = attitudes_of(truth, np.arange(0, 601, 8), SIGMAS, rng)
     day = graded(
         recorded_of(gyro.tai_ns, gyro.rate_rad_s, attitudes),
-        missions["SWAS"].model_copy(update={"gyro": None}),
+        mission_without_gyro("SWAS"),
     )
     assert [each.model for each in day.stretches] == ["constant_rate"]
 

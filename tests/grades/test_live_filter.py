@@ -15,7 +15,6 @@ from service.errors import NotFound
 from service.filtering.samples import AttitudeMeasurements
 from service.grades.carried import CarriedFilter
 from service.grades.day import grade_day
-from service.missions.mission import SHIPPED_FOLDER
 from service.observations.schema import submission_from_json
 from service.storage.archive.archiving import archive
 from service.storage.archive.restoring import PartFilter, restore
@@ -24,6 +23,7 @@ from service.times import DAY_S, parse_utc
 from service.vectors import ARCSEC_PER_RADIAN
 from tests.grades.passes import GYRO, NOON, NOON_NS, mission_with
 from tests.grades.records import at, put_gyro
+from tests.missions.without_gyro import mission_without_gyro, text_without_gyro
 from tests.web.serving import served
 
 FIELDS = ("tai_ns", "quaternion", "covariance_arcsec2", "rate_deg_per_s", "bias_deg_per_h")
@@ -60,7 +60,9 @@ def assert_same(found, other):
 
 @pytest.mark.parametrize("has_gyro", [True, False])
 def test_in_portions_it_gives_the_last_filtered_attitude_of_the_day(missions, half_hour, has_gyro):
-    mission = mission_with(missions["XTE"], **({"gyro": GYRO} if has_gyro else {}))
+    mission = mission_without_gyro("XTE")
+    if has_gyro:
+        mission = mission_with(missions["XTE"], gyro=GYRO)
     carried, given = CarriedFilter(), 0
     for seconds in range(100, 1801, 100):
         recorded = before(half_hour[1], seconds)
@@ -215,7 +217,7 @@ def test_a_service_that_is_killed_and_started_again_gives_the_same_state(
     mission = mission_with(missions["XTE"], gyro=GYRO)
     folder = tmp_path / "missions"
     folder.mkdir()
-    text = (SHIPPED_FOLDER / "xte.toml").read_text(encoding="utf-8") + TABLES
+    text = text_without_gyro("XTE") + TABLES
     (folder / "xte.toml").write_text(text, encoding="utf-8")
     monkeypatch.setenv("ACQUIRE_MISSIONS", str(folder))
 

@@ -18,6 +18,7 @@ from service.storage.upkeep.verify import verify
 from service.times import parse_utc
 from tests.grades.passes import NOON_NS, later
 from tests.grades.records import put_attitudes, put_pass
+from tests.missions.without_gyro import text_without_gyro
 
 DAY_NS = 86_400 * 10**9
 
@@ -199,18 +200,23 @@ def test_days_that_end_by_the_time_are_pruned(app, half_hour, database):
     assert faults(database) == []
 
 
-def test_the_command_smooths_and_tells_what_it_did(filled, database, capsys):
+def test_the_command_smooths_and_tells_what_it_did(filled, database, capsys, tmp_path, monkeypatch):
+    """With the gyro of the shipped mission; then with a site's mission, which describes none."""
     filled.close()
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "xte.toml").write_text(text_without_gyro("XTE"), encoding="utf-8")
     asked = ["smooth", "XTE", "--database", database, "--quiet"]
-    assert main([*asked, "--json"]) == 0
-    (day,) = json.loads(capsys.readouterr().out)["days"]
-    # The shipped mission describes no gyro.
-    assert [each["model"] for each in day["summary"]["stretches"]] == ["constant_rate"]
-    assert (day["revision"], day["new"]) == (1, True)
-    assert main(asked) == 0
-    told = capsys.readouterr().out
-    assert "1999-03-01 revision 1 (unchanged)" in told
-    assert "constant rate" in told
+    for revision, model in ((1, "gyro"), (2, "constant_rate")):
+        if model == "constant_rate":
+            monkeypatch.setenv("ACQUIRE_MISSIONS", str(tmp_path / "site"))
+        assert main([*asked, "--json"]) == 0
+        (day,) = json.loads(capsys.readouterr().out)["days"]
+        assert [each["model"] for each in day["summary"]["stretches"]] == [model]
+        assert (day["revision"], day["new"]) == (revision, True)
+        assert main(asked) == 0
+        told = capsys.readouterr().out
+        assert f"1999-03-01 revision {revision} (unchanged)" in told
+        assert f": {model.replace('_', ' ')}, " in told
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,11 @@ import pytest
 from service.errors import BadBatch, BadConfiguration
 from service.gyro.schema import GyroBlockIn, block_from_model
 from service.ingest.gyro import GyroIntake
-from service.missions.mission import SHIPPED_FOLDER, parse_mission
+from service.missions.mission import load_missions, parse_mission
 from tests.gyro.blocks import body
+from tests.missions.without_gyro import text_without_gyro
 
-XTE = (SHIPPED_FOLDER / "xte.toml").read_text(encoding="utf-8")
+XTE = text_without_gyro("XTE")
 NOISE = "sigma_v_rad_s0_5 = 3.2e-7\nsigma_u_rad_s1_5 = 3.2e-10\n"
 
 
@@ -24,6 +25,14 @@ def test_a_mission_without_the_table_is_the_one_it_was():
     assert plain.gyro is None
     assert "gyro" not in plain.model_dump()
     assert mission(NOISE).digest != plain.digest
+
+
+def test_the_missions_of_the_sample_telemetry_describe_a_gyro():
+    """The frames of the fourth come without one."""
+    gyros = {name: each.gyro for name, each in load_missions().items()}
+    assert [name for name, gyro in gyros.items() if gyro is None] == ["IMAGER"]
+    for gyro in filter(None, gyros.values()):
+        assert gyro.body_from_gyro.tolist() == np.eye(3).tolist()
 
 
 def test_what_the_table_leaves_out_has_the_default():

@@ -33,11 +33,6 @@ from tests.packets.packing import (
 GYRO_APID = 303
 SAMPLES = 10
 AXES = ("GYRO_X", "GYRO_Y", "GYRO_Z")
-MISSION_GYRO = """
-[gyro]
-sigma_v_rad_s0_5 = 3e-7
-sigma_u_rad_s1_5 = 3e-10
-"""
 BLOCKS = """
 [packets.gyro_blocks]
 samples = 10
@@ -78,7 +73,7 @@ def described(kind="DOUBLE_T", style="default"):
 
 def mission(blocks=BLOCKS):
     directions = 'h = "ST1_A"\nv = "ST1_B"'
-    return mission_with(TABLE.format(directions=directions) + blocks + MISSION_GYRO)
+    return mission_with(TABLE.format(directions=directions) + blocks)
 
 
 def reader_of(blocks=BLOCKS, kind="DOUBLE_T"):
@@ -231,7 +226,7 @@ def test_the_command_records_the_blocks_once_and_counts_them(tmp_path, rates, ca
     (tmp_path / "missions").mkdir()
     directions = 'h = "ST1_A"\nv = "ST1_B"'
     text = (SHIPPED_FOLDER / "xte.toml").read_text(encoding="utf-8")
-    text += TABLE.format(directions=directions) + BLOCKS + MISSION_GYRO
+    text += TABLE.format(directions=directions) + BLOCKS
     (tmp_path / "missions" / "xte.toml").write_text(text, encoding="utf-8")
     (tmp_path / "gyro.xml").write_bytes(described())
     (tmp_path / "gyro.dat").write_bytes(b"".join(packets_of(rates)))

@@ -17,6 +17,7 @@ from service.simulate.telemetry import draw_pass
 from service.times import parse_utc
 from service.vectors import ARCSEC_PER_RADIAN
 from tests.grades.passes import mission_with
+from tests.missions.without_gyro import mission_without_gyro, text_without_gyro
 
 QUIET = {"sigma_v_rad_s0_5": 0.0, "sigma_u_rad_s1_5": 0.0, "bias_sigma_rad_s": 1e-30}
 NOISY = {"sigma_v_rad_s0_5": 1e-5, "sigma_u_rad_s1_5": 1e-7}
@@ -112,10 +113,26 @@ def test_blocks_stand_in_the_file_after_their_batches(missions, sky, tmp_path):
     assert [line for line in lines if "batch" in line] == [each.batch for each in passes]
 
 
-def test_a_mission_without_a_gyro_is_refused(missions, sky):
-    batches = draw_pass(missions["XTE"], sky, Pass(1, 3))
+def test_a_mission_without_a_gyro_is_refused(sky, tmp_path, monkeypatch, capsys):
+    mission = mission_without_gyro("XTE")
+    batches = draw_pass(mission, sky, Pass(1, 3))
     with pytest.raises(BadInput, match=r"gyro: its mission file has no table \[gyro\]"):
-        list(with_gyro(batches, missions["XTE"], GyroWanted(), 1.0, 3))
+        list(with_gyro(batches, mission, GyroWanted(), 1.0, 3))
+    (tmp_path / "xte.toml").write_text(text_without_gyro("XTE"), encoding="utf-8")
+    monkeypatch.setenv("ACQUIRE_MISSIONS", str(tmp_path))
+    asked = ["--spacecraft", "XTE", "--batches", "2", "--gyro", "1", str(tmp_path / "out.ndjson")]
+    assert main(["simulate", "telemetry", *asked]) == 2
+    assert "its mission file has no table [gyro]" in capsys.readouterr().err
+    assert not (tmp_path / "out.ndjson").exists()
+
+
+@pytest.mark.parametrize("spacecraft", ["XTE", "SWAS", "SOHO"])
+def test_the_shipped_missions_have_a_gyro_to_simulate(spacecraft, tmp_path):
+    asked = ["--spacecraft", spacecraft, "--batches", "3", "--gyro", "1"]
+    assert main(["simulate", "telemetry", *asked, str(tmp_path / "out.ndjson")]) == 0
+    (block,) = [each for each in read_objects(tmp_path / "out.ndjson") if "block" in each]
+    assert block["spacecraft"] == spacecraft
+    assert len(block["rates_rad_per_s"]) in (61, 601)
 
 
 @pytest.mark.parametrize(
@@ -125,7 +142,6 @@ def test_a_mission_without_a_gyro_is_refused(missions, sky):
         ("--gyro 1 --gyro-gap -1 out.ndjson", "gyro gap_s: must be from 0 to 86400"),
         ("--gyro 1 out.csv", "--gyro: needs NDJSON"),
         ("--clock-step 1 out.ndjson", "--gyro: is missing"),
-        ("--gyro 1 out.ndjson", "XTE"),
     ],
 )
 def test_what_cannot_be_is_refused(words, said, tmp_path, monkeypatch, capsys):
