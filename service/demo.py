@@ -28,6 +28,7 @@ from service.replay.over_http import replay_over_http
 from service.replay.summary import ReplaySummary
 from service.settings import PREFIX, Settings
 from service.simulate.files import read_objects, truth_path, write_pass
+from service.simulate.gyro import GyroWanted, with_gyro
 from service.simulate.score import Score, score, together
 from service.simulate.score_table import table
 from service.simulate.stretches import Pass
@@ -43,6 +44,8 @@ START = "1999-03-01T00:00:00.000Z"
 """Of every pass: a day on which all three were at work."""
 WIDTH_S = 20 * HOUR_S
 """How long a pass lasts: within the day that the console shows first."""
+GYRO = GyroWanted(step_s=10.0)
+"""The gyro beside a pass: coarse in time, so that 20 hours are 7,200 samples."""
 START_S = 300.0
 """The longest that the server may take to be ready once its kernels are compiled."""
 COMPILING_S = 1800.0
@@ -102,7 +105,7 @@ def run_demo(
                     concurrency=CONCURRENCY,
                     watched_run=run,
                 )
-            scores[name] = score(read_objects(results), read_objects(truth_path(file)))
+            scores[name] = score(_answers(results), read_objects(truth_path(file)))
         whole_s = time.perf_counter() - started
         if as_json:
             seconds = {"seconds": whole_s, "seconds_until_ready": ready_s}
@@ -181,6 +184,11 @@ def _where_next(
             "the latest batch of XTE as the API gives it",
         )
     yield f"{folder}/*.results.ndjson", "every answer; the truth is in *.truth.ndjson beside it"
+    stopped = "" if once else "with this server stopped: "
+    yield (
+        f"acquire smooth XTE --run {run} --database {settings.database}",
+        f"{stopped}filter and smooth XTE with its gyro; its page Attitude over time draws that",
+    )
     yield (
         "acquire frame PICTURE",
         "any picture of the sky, from any camera: its attitude, its lens, the names of its stars",
@@ -195,8 +203,14 @@ def _samples(folder: Path, wanted: Pass) -> list[Path]:
     sky, missions = SkyModel(load_embedded(), LruCache(64 << 20)), load_missions()
     files = [folder / f"{name.lower()}.ndjson" for name in MISSIONS]
     for name, file in zip(MISSIONS, files, strict=True):
-        write_pass(draw_pass(missions[name], sky, wanted), file)
+        drawn = draw_pass(missions[name], sky, wanted)
+        write_pass(with_gyro(drawn, missions[name], GYRO, WIDTH_S, wanted.seed), file)
     return files
+
+
+def _answers(results: Path) -> Iterator[dict[str, Any]]:
+    """Those to the batches; to a gyro block the answer is its record."""
+    return (each for each in read_objects(results) if "block" not in each)
 
 
 def _digest(files: Sequence[Path]) -> str:
