@@ -24,6 +24,7 @@ from service.missions.mission import load_missions
 from service.settings import Settings
 from service.simulate.frame_files import frame_bytes
 from service.simulate.frames import FrameSettings, draw_frames
+from service.simulate.gyro import GyroWanted, with_gyro
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
 from service.web.app import create_app
@@ -38,6 +39,7 @@ BATCHES = 288
 START = "1999-03-01T00:00:00.000Z"
 CADENCE_S = 300.0
 """288 batches are a day, the period that pages show first."""
+GYRO = GyroWanted(step_s=10.0)
 DAY = "start=1999-060T00:00:00Z&end=1999-061T00:00:00Z"
 NOTES = (
     (
@@ -89,12 +91,17 @@ def filled(address: str, app: App) -> Mapping[str, str]:
             time.sleep(0.2)
         for name, mission in load_missions().items():
             wanted = Pass(batches=BATCHES, seed=1, start=START, cadence_s=CADENCE_S)
-            drawn = draw_pass(mission, app.sky, wanted)
-            sent = [each.batch for each in drawn]
-            replay(client, sent, name)
+            drawn = list(draw_pass(mission, app.sky, wanted))
+            if mission.gyro is not None:
+                length_s = CADENCE_S * (BATCHES - 1)
+                drawn = list(with_gyro(drawn, mission, GYRO, length_s, wanted.seed))
+            replay(client, [line for each in drawn for line in (each.batch, *each.gyro)])
             if name == "XTE":
                 by_votes = {"options": {"identifier": "starid"}}
-                replay(client, [each | by_votes for each in sent], name, run=f"{RUN}-votes")
+                sent = [each.batch | by_votes for each in drawn]
+                replay(client, sent, f"{RUN}-votes")
+        # What `acquire smooth` does where no service runs.
+        app.grades.smooth("XTE", run=RUN)
         alarms = client.get("/api/v1/alarms", params={"run": RUN, "state": "all"}).json()["items"]
         signed = {"who": "J. Operator", "comment": "a priori attitude drifts; slew at 08:00"}
         xte = [each for each in alarms if each["spacecraft"] == "XTE"]
@@ -106,6 +113,7 @@ def filled(address: str, app: App) -> Mapping[str, str]:
             client.post("/api/v1/annotations", json=note | {"spacecraft": spacecraft})
         batch = looked_into(client)
         frame = taken(client, app)
+        calibrate(client)
         replays = client.get("/api/v1/replays").json()["items"]
     run = f"run={RUN}"
     tried = "identifier=starid&tolerances.separation_deg=0.012"
@@ -127,6 +135,8 @@ def filled(address: str, app: App) -> Mapping[str, str]:
         "zones": f"/zones?{run}",
         "missions": f"/missions?{run}",
         "advice": f"/advice/XTE?{run}&sample=60",
+        "grades": f"/spacecraft/XTE/grades?{run}&{DAY}",
+        "calibration": f"/spacecraft/XTE/calibration?{run}",
         "about": f"/about?{run}",
         "sign-in": "/sign-in",
     }
@@ -152,21 +162,31 @@ def taken(client: httpx.Client, app: App) -> str:
     return str(answer.raise_for_status().json()["id"])
 
 
-def replay(
-    client: httpx.Client, batches: Sequence[Mapping[str, Any]], name: str, run: str = RUN
-) -> None:
+def calibrate(client: httpx.Client) -> None:
+    """Estimate the tracker of XTE from its sample pass."""
+    asked = {"spacecraft": "XTE", "run": RUN, "who": "J. Operator"}
+    answer = client.post("/api/v1/calibrations", json=asked).raise_for_status()
+    wait_while(client, answer.headers["Location"], ("queued", "running"))
+
+
+def replay(client: httpx.Client, lines: Sequence[Mapping[str, Any]], run: str = RUN) -> None:
     """Send a file and wait until its last batch is recorded."""
     answer = client.post(
         "/api/v1/replays",
         params={"run": run, "alarms": run == RUN},
-        content=b"\n".join(json.dumps(each).encode() for each in batches),
+        content=b"\n".join(json.dumps(each).encode() for each in lines),
         headers={"Content-Type": "application/x-ndjson"},
     )
     answer.raise_for_status()
+    wait_while(client, answer.headers["Location"], ("running",))
+
+
+def wait_while(client: httpx.Client, place: str, states: Sequence[str]) -> None:
+    """Wait until the replay or calibration there has left the states."""
     end = time.monotonic() + PATIENCE_S
-    while client.get(answer.headers["Location"]).json()["state"] == "running":
+    while client.get(place).json()["state"] in states:
         if time.monotonic() > end:
-            raise TimeoutError(f"the replay of {name} does not end")
+            raise TimeoutError(f"{place} does not end")
         time.sleep(0.1)
 
 
