@@ -92,13 +92,18 @@ def _rate(found: GradesOfPeriod, axis: TimeAxis) -> GradeChart | None:
 
 
 def _sigma(found: GradesOfPeriod, axis: TimeAxis) -> GradeChart | None:
-    """One sigma of the attitude of each grade, on a logarithmic scale."""
+    """One sigma of the attitude of each grade, on a logarithmic scale.
+
+    The scale is that of good attitudes: others, as at a start, may be far beyond and are drawn at
+    the edge.
+    """
     by_grade = {
         grade: np.sqrt(np.maximum(each[:, [0, 3, 5]], 0.0))
         for grade, each in _by_grade(found, "covariance_arcsec2").items()
     }
     joins = _joins(found, axis)
     met = found.innovations
+    not_good = {grade: each.status != Status.GOOD for grade, each in found.samples.items()}
     panels, rows = [], []
     for k, name in enumerate(AXES):
         values = {grade: each[:, k] for grade, each in by_grade.items()}
@@ -106,7 +111,10 @@ def _sigma(found: GradesOfPeriod, axis: TimeAxis) -> GradeChart | None:
         if met is not None and len(met):
             raw = Values(met.tai_ns, np.sqrt(met.measured_arcsec2[:, (0, 3, 5)[k]]))
             values["raw"] = raw.value
-        scale = scale_of(values, is_log=True)
+        good = values | {
+            grade: np.where(without, np.nan, values[grade]) for grade, without in not_good.items()
+        }
+        scale = scale_of(good, is_log=True) or scale_of(values, is_log=True)
         if scale is None:
             return None
         times = found.samples["smoothed"].tai_ns
