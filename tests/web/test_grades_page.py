@@ -10,9 +10,12 @@ import pytest
 
 from service.app.factory import open_app
 from service.settings import Settings
+from service.times import shifted
 from service.web.app import create_app
+from service.web.console.charts.grades.grades import grade_charts
+from service.web.console.charts.grades.panels import TimeAxis
 from tests.filtering.simulated import ARCSEC, attitudes_of, gyro_of, slews, truth_of
-from tests.grades.passes import GYRO, MODEL, mission_with, recorded_of
+from tests.grades.passes import GYRO, MODEL, NOON, mission_with, recorded_of
 from tests.grades.records import put_pass
 from tests.web.browser import CHROMIUM, Browser
 from tests.web.fitting import assert_fits
@@ -79,6 +82,30 @@ def test_sigmas_of_the_grades_are_those_of_the_record_raw_the_worst_smoothed_the
     for axis, raw, filtered, smoothed in cells(page, "sigma"):
         assert arcsec(raw) == pytest.approx(40.0 if axis == "z" else 6.0, rel=1e-3)
         assert arcsec(smoothed) < 0.9 * arcsec(filtered) < 0.5 * arcsec(raw)
+
+
+def test_the_scale_of_sigmas_is_that_of_good_attitudes(tmp_path, missions):
+    """Until the second of two attitudes five minutes apart, nothing is known of the bias."""
+    rng = np.random.default_rng(11)
+    truth = truth_of(slews, 1800.0)
+    gyro, _ = gyro_of(truth, MODEL, rng)
+    attitudes = attitudes_of(truth, np.arange(0, 1801, 300), (6.0, 6.0, 40.0), rng)
+    mission = mission_with(missions["XTE"], gyro=GYRO)
+    settings = Settings(database=f"sqlite:///{tmp_path / 'acquire.db'}", replay_processes=0)
+    app = open_app(settings, mission)
+    try:
+        put_pass(app, recorded_of(gyro.tai_ns, gyro.rate_rad_s, attitudes))
+        app.grades.smooth("XTE")
+        axis = TimeAxis(NOON, shifted(NOON, 1800.0))
+        found = app.grades.of_period("XTE", "live", axis.start, axis.end)
+        (chart,) = [each for each in grade_charts(found, axis) if each.id == "sigma"]
+    finally:
+        app.close()
+    sigma_arcsec = np.sqrt(found.samples["filtered"].covariance_arcsec2[:, [0, 3, 5]])
+    assert sigma_arcsec.max() > 2000.0
+    for panel in chart.panels:
+        highest = re.search(r" to (\d+)", panel.note)
+        assert float(highest[1]) < 100.0
 
 
 def test_innovations_and_differences_scatter_about_as_their_bounds_say(address):
