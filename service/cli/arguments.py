@@ -143,7 +143,7 @@ def add_json_file(parser: argparse.ArgumentParser, what: str) -> None:
         nargs="?",
         const=STANDARD_OUTPUT,
         metavar="OUT",
-        help=f"write {what} to OUT; without OUT, print them in the place of the tables",
+        help=f"write {what} to OUT; without OUT, print them instead of the tables",
     )
 
 

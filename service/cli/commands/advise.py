@@ -48,7 +48,7 @@ def add(commands: Any) -> None:
         metavar="NAME=VALUE",
         help="try this tolerance too; may be repeated, to try several together",
     )
-    add_json(parser, "what the API answers,")
+    add_json(parser, "the answer of the API")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     add_database(parser)
 

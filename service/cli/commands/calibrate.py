@@ -28,10 +28,11 @@ def add(commands: Any) -> None:
     parser = add_command(
         commands,
         "calibrate",
-        "Estimate alignment between trackers, scale, distortion and magnitudes of each, and time "
-        "tags from the identified stars of recorded batches, with sigmas; name the unknowns that "
-        "these cannot show; write a mission file with the result, or record it for the console, "
-        "where an operator may adopt it.  Changes nothing that is in use.",
+        "Estimate, from the identified stars of recorded batches, the alignment between trackers, "
+        "and each tracker's scale, distortion, magnitudes and time tags, with sigmas.  Name the "
+        "unknowns that these stars cannot determine.  Write a mission file with the result, or "
+        "record it for the console, where an operator can adopt it.  Change nothing that is in "
+        "use.",
         """
         acquire calibrate TWOHEADS
         acquire calibrate TWOHEADS --run commissioning --output twoheads-new.toml
@@ -53,7 +54,7 @@ def add(commands: Any) -> None:
         "--degree",
         type=int,
         metavar="N",
-        help="degree of the distortion, 0 for none; default: chosen by held-out blocks of time",
+        help="degree of the distortion, 0 for none; default: chosen by cross-validation",
     )
     parser.add_argument(
         "--time-tag",

@@ -42,7 +42,7 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="CAMERA.toml", help="mission file"
     )
-    parser.add_argument("--name", metavar="NAME", help="of the mission; default: from the output")
+    parser.add_argument("--name", metavar="NAME", help="mission name; default: from the output")
     parser.add_argument("--fov", type=degrees, metavar="DEG", help="rough field of view")
     parser.add_argument("--focal-px", type=positive, metavar="PX", help="rough focal length")
     parser.add_argument("--focal-mm", type=positive, metavar="MM", help="with --pixel-um")

@@ -64,7 +64,7 @@ def add(commands: Any) -> None:
     parser = add_command(
         group,
         "restore",
-        "Make a database from a backup: a SQLite file that does not exist yet, or an empty "
+        "Make a database from a backup: an SQLite file that does not exist yet, or an empty "
         "PostgreSQL database.  It appears whole or not at all, with the schema of the backup.",
         """
         acquire database restore night.db --database sqlite:///acquire.db
@@ -72,7 +72,7 @@ def add(commands: Any) -> None:
         """,
         restore,
     )
-    parser.add_argument("backup", type=Path, metavar="FILE", help="of `acquire database backup`")
+    parser.add_argument("backup", type=Path, metavar="FILE", help="made by `database backup`")
     add_database(parser)
     parser = add_command(
         group,
@@ -97,8 +97,8 @@ def _add_split_trackers(group: Any) -> None:
         group,
         "split-trackers",
         "Split the batches of earlier versions by tracker, for trends of each tracker of a "
-        "spacecraft with several.  The service does the same by itself, more slowly.  It can be "
-        "stopped at any time and goes on when started again.",
+        "spacecraft with several.  The service does the same by itself, more slowly.  You can "
+        "stop the command at any time; it continues when you start it again.",
         "acquire database split-trackers",
         split_trackers,
     )

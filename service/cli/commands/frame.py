@@ -21,7 +21,7 @@ from service.errors import BadInput, Fault, shown_value
 
 SIDECAR = """\
 The metadata of a frame are in a JSON file of its name beside it, FILE.json for
-FILE.fits, as `acquire simulate frames` writes it: the fields of a batch but its stars
+FILE.fits, as `acquire simulate frames` writes it: the fields of a batch except its stars
 (time, a_priori, body_rates_deg_per_s, ...).  Options of the command override them."""
 
 

@@ -14,7 +14,7 @@ def add(commands: Any) -> None:
     parser = add_command(
         commands,
         "history",
-        "Print the quantities of every recorded batch of a spacecraft, a row a batch.",
+        "Print the quantities of every recorded batch of a spacecraft, one row per batch.",
         """
         acquire history --spacecraft XTE --format csv
         acquire history --spacecraft XTE --run pass-7 --start 1996-010T00:00:00Z
@@ -25,7 +25,7 @@ def add(commands: Any) -> None:
     add_period(parser, "the run that is read; default live")
     way = parser.add_mutually_exclusive_group()
     way.add_argument("--format", choices=tuple(table_formats()), default="csv", help="default csv")
-    way.add_argument("--json", action="store_true", help="print a JSON object a row, one a line")
+    way.add_argument("--json", action="store_true", help="print one JSON object per line")
     add_database(parser)
 
 

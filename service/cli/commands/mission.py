@@ -9,7 +9,7 @@ from service.cli.arguments import add_command, add_group, add_json, print_json
 from service.errors import BadConfiguration
 
 NOTES = """\
-The exit code is 1 where the file has an error. Unusual settings are allowed, but rarely intended.
+The exit code is 1 if the file has an error. Unusual settings are allowed, but rarely intended.
 Stars and pairs are counted for zones all over the sky; the map shows the pairs."""
 
 

@@ -111,7 +111,7 @@ def _add_knowledge(parser: ArgumentParser) -> None:
         type=Path,
         metavar="FILE",
         help="set each batch's a_priori to the attitude that a file gives for its time: an AEM "
-        "(KVN or XML), or a C-kernel; other batches keep their own",
+        "(KVN or XML), or a C-kernel; batches without one in the file keep their own",
     )
     source.add_argument(
         "--carry-attitude",
@@ -123,8 +123,8 @@ def _add_knowledge(parser: ArgumentParser) -> None:
         "--ephemeris",
         type=Path,
         metavar="FILE",
-        help="give each batch without velocity_km_per_s or position_km those of a file for its "
-        "time: an OEM (KVN or XML), or two-line element sets (TLE)",
+        help="set velocity_km_per_s and position_km of batches that lack them to those that a file "
+        "gives for their time: an OEM (KVN or XML), or two-line element sets (TLE)",
     )
 
 

@@ -29,10 +29,10 @@ def add(commands: Any) -> None:
         "reprocess",
         "Process recorded batches again, on all cores, with the present settings or with a "
         "mission file, and record the results in a separate run; then compare both runs.  With "
-        "--archive, process archived batches too, and write the results to the archive, a file "
-        "for each of its files and for each recorded day.  After "
-        "an interruption, run the same command again to continue.  With SQLite, stop the "
-        "service first.",
+        "--archive, process archived batches too, and write the results to the archive: one file "
+        "for each file of the archive and for each day of batches in the database.  After an "
+        "interruption, run the same command again to continue.  With SQLite, stop the service "
+        "first.",
         """
         acquire reprocess --start 1996-010T00:00:00Z --end 1996-020T00:00:00Z
         acquire reprocess --mission wider.toml --run wider

@@ -41,7 +41,7 @@ def add(commands: Any) -> None:
         "--order",
         choices=("oldest", "newest"),
         default="oldest",
-        help="which come first; newest is for JSON and tables alone",
+        help="which attitudes come first; `newest` only for JSON and tables",
     )
     parser.add_argument(
         "--largest-gap",

@@ -20,7 +20,7 @@ def add(commands: Any) -> None:
     parser = add_command(
         commands,
         "attitude-at",
-        "Print the attitude of a spacecraft at a moment as JSON, with its error.",
+        "Print the attitude of a spacecraft at a given time as JSON, with its covariance.",
         """
         acquire export attitude-at 1996-01-10T12:00:00.5Z --spacecraft XTE
         acquire export attitude-at 1996-010T12:00:00Z --spacecraft XTE --method nearest
@@ -28,7 +28,7 @@ def add(commands: Any) -> None:
         """,
         run,
     )
-    parser.add_argument("time", metavar="UTC", help="the moment")
+    parser.add_argument("time", metavar="UTC", help="the time")
     parser.add_argument("--spacecraft", required=True, metavar="NAME", help=MISSION)
     parser.add_argument("--run", metavar="NAME", help="the run that is read; default live")
     parser.add_argument(

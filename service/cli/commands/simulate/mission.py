@@ -21,7 +21,7 @@ names of a sweep, with the paper's where it has one:
     position_error_arcsec (per tangent axis; SIGOBS is 1.414 times it),
     magnitude_error_mag (SIGMAG), magnitude_bound_mag (RCMAG)
 Without a sweep tolerances, zone, position_error_arcsec and magnitude_error_mag are those of
-the mission file, the angles are 0, off_axis_deg is the room that the zone leaves about the
+the mission file, the angles are 0, off_axis_deg is the margin of the zone about the
 field of view, and magnitude_bound_mag is six times magnitude_error_mag.
 All settings see the same stars and draws. Nothing is searched outside the zone."""
 
@@ -91,13 +91,17 @@ def _add_draws(parser: ArgumentParser) -> None:
         type=count,
         default=DEFAULT_STARS,
         metavar="N",
-        help=f"stars for each setting, about; default {DEFAULT_STARS}",
+        help=f"approximate number of stars for each setting; default {DEFAULT_STARS}",
     )
     parser.add_argument(
         "--views", type=count, default=10, metavar="N", help="views in each zone; default 10"
     )
     parser.add_argument(
-        "--stars-per-view", type=count, default=5, metavar="N", help="at most; default 5"
+        "--stars-per-view",
+        type=count,
+        default=5,
+        metavar="N",
+        help="most stars of a view; default 5",
     )
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="default 1")
 

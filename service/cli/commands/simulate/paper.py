@@ -67,7 +67,7 @@ def add(group: Any) -> None:
         help="named tables: fields per condition; default 10000",
     )
     parser.add_argument("--seed", type=int, nargs="+", default=[1], metavar="S", help="default 1")
-    add_json_file(parser, "the rates, one row per run")
+    add_json_file(parser, "the rates, one row per run,")
     parser.add_argument("--plots", type=Path, metavar="FOLDER", help="write the figures")
     parser.add_argument(
         "--report",

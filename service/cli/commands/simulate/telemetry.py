@@ -90,8 +90,8 @@ def add(group: Any) -> None:
     for flag, unit, share, size, text in (
         ("attitude-error", "DEG", "0.1", "10, bands 5", "growing a priori attitude error"),
         ("spurious", "N", "0.1", "1", "false stars in the place of real ones"),
-        ("magnitude-error", "MAG", "0", "0.5", "standard deviation of magnitudes"),
-        ("position-error", "ARCSEC", "0", "12", "standard deviation per tangent axis"),
+        ("magnitude-error", "MAG", "0", "0.5", "noise of magnitudes (sigma)"),
+        ("position-error", "ARCSEC", "0", "12", "noise of positions (sigma per tangent axis)"),
     ):
         name = f"--{flag}-share"
         serious.add_argument(name, type=float, metavar="SHARE", help=f"{text}; default {share}")
@@ -102,7 +102,7 @@ def add(group: Any) -> None:
 
 def _add_gyro(parser: Any) -> None:
     gyro = parser.add_argument_group(
-        "gyro", "blocks of gyro samples beside the batches, in NDJSON alone"
+        "gyro", "blocks of gyro samples beside the batches, only in NDJSON files"
     )
     gyro.add_argument(
         "--gyro",
@@ -113,7 +113,11 @@ def _add_gyro(parser: Any) -> None:
     for flag, unit, text in (
         ("gyro-quantum", "ARCSEC", "one count of the gyro"),
         ("gyro-gap", "S", "a gap, which begins after 40 %% of the pass"),
-        ("clock-step", "S", "after 70 %% of the pass the clock of trackers and gyro steps ahead"),
+        (
+            "clock-step",
+            "S",
+            "forward step of the trackers' and gyro's clock after 70 %% of the pass",
+        ),
     ):
         gyro.add_argument(f"--{flag}", type=float, default=0.0, metavar=unit, help=text)
 
