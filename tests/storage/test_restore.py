@@ -11,7 +11,7 @@ from sqlalchemy.pool import NullPool
 from service.errors import BadConfiguration
 from service.storage.sql import migrations
 from service.storage.sql.engines import database_url
-from service.storage.sql.served import hold_served
+from service.storage.serving.served import hold_served
 from service.storage.upkeep.backup import back_up
 from service.storage.upkeep.restore import restore
 from service.storage.upkeep.verify import verify

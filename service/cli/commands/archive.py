@@ -79,7 +79,7 @@ def archive(parsed: Namespace) -> int:
 
     from service.extras import require_extra
     from service.storage.sql.database import Store
-    from service.storage.sql.served import unserved
+    from service.storage.serving.served import unserved
     from service.times import parse_utc, utc_now
 
     if parsed.before is None:
@@ -150,7 +150,7 @@ def restore(parsed: Namespace) -> int:
 
     from service.extras import require_extra
     from service.storage.sql.database import Store
-    from service.storage.sql.served import unserved
+    from service.storage.serving.served import unserved
 
     folder = _folder(parsed.folder, "--archive")
     require_extra("tables", "pyarrow", "--archive", str(folder))
