@@ -32,9 +32,11 @@ async def report_to_supervisor(app: App) -> None:
     own = anyio.CapacityLimiter(1)
     while not await anyio.to_thread.run_sync(_is_ready, app, limiter=own):
         await asyncio.sleep(TRY_AGAIN_S)
-    app.single_writer.when_writing(lambda: notify_supervisor("STATUS=ready"))
-    stands_by = not app.single_writer.is_writing
-    notify_supervisor(f"READY=1\nSTATUS={'standing by' if stands_by else 'ready'}")
+    if app.single_writer.is_writing:
+        notify_supervisor("READY=1\nSTATUS=ready")
+    else:
+        notify_supervisor("READY=1\nSTATUS=standing by")
+        app.single_writer.when_writing(lambda: notify_supervisor("STATUS=ready"))
     every_s = int(os.environ.get("WATCHDOG_USEC", "0")) / 2e6
     while every_s > 0.0:
         try:
