@@ -50,7 +50,9 @@ class SingleWriter:
         if self._lock is not None:
             if not self._is_writing:
                 log.info("another service writes to the database: this one stands by")
-            self._thread = threading.Thread(target=self._keep_trying, name="single-writer")
+            self._thread = threading.Thread(
+                target=self._keep_trying, name="single-writer", daemon=True
+            )
             self._thread.start()
 
     def when_writing(self, begin: Callable[[], object]) -> None:
