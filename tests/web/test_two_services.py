@@ -87,7 +87,8 @@ def two_services(database):
         for state in ("ready", "standby"):
             services.append(Service(database))
             stack.callback(services[-1].kill)
-            services[-1].wait_for(state)
+            # On a fresh checkout kernels are compiled first.
+            services[-1].wait_for(state, seconds=900.0)
         yield services
 
 
