@@ -108,7 +108,8 @@ def test_the_second_service_answers_reads_and_refuses_writes_until_it_takes_over
         assert httpx.post(f"{writes.url}/api/v1/batches", content=body, headers=JSON).is_success
         of_batch = f"{stands_by.url}/api/v1/batches?spacecraft={json.loads(body)['spacecraft']}"
         assert [each["batch"] for each in httpx.get(of_batch).json()["items"]] == ["first"]
-        assert httpx.get(f"{stands_by.url}/").status_code == 200
+        assert "This service stands by" in httpx.get(f"{stands_by.url}/").text
+        assert "This service stands by" not in httpx.get(f"{writes.url}/").text
         assert httpx.get(f"{stands_by.url}/livez").status_code == 200
         assert "starid_standby 1.0" in httpx.get(f"{stands_by.url}/metrics").text
         assert "starid_standby 0.0" in httpx.get(f"{writes.url}/metrics").text

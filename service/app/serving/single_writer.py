@@ -24,7 +24,7 @@ class SingleWriter:
         self._writer, self._lock = store.writer, store.lock
         self._take_over: Callable[[], object] = lambda: None
         self._listeners: list[Callable[[], object]] = []
-        self._is_writing = False
+        self._is_writing = self._lock is None
         self._telling = threading.Lock()
         self._stopped = threading.Event()
         self._thread: threading.Thread | None = None
@@ -45,15 +45,15 @@ class SingleWriter:
         `take_over` is called before anything else is written, each time that this process begins
         to write: another may have written in between.
         """
+        if self._lock is None:
+            take_over()
+            return
         self._take_over = take_over
         self._try()
-        if self._lock is not None:
-            if not self._is_writing:
-                log.info("another service writes to the database: this one stands by")
-            self._thread = threading.Thread(
-                target=self._keep_trying, name="single-writer", daemon=True
-            )
-            self._thread.start()
+        if not self._is_writing:
+            log.info("another service writes to the database: this one stands by")
+        self._thread = threading.Thread(target=self._keep_trying, name="single-writer", daemon=True)
+        self._thread.start()
 
     def when_writing(self, begin: Callable[[], object]) -> None:
         """Call a function as soon as this process writes, and again each time that it begins to."""
@@ -103,5 +103,4 @@ class SingleWriter:
                     except Exception:
                         # It belongs to one part of the service: posts are taken in any case.
                         log.exception("work that begins with writing failed")
-            if self._lock is not None:
-                log.info("this service writes to the database from now on")
+            log.info("this service writes to the database from now on")
