@@ -349,6 +349,22 @@ def test_damage_of_a_file_is_found_and_nothing_of_it_is_restored(filled, place):
     assert any("cannot be read" in each for each in verify_archive(place, {}))
 
 
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("part-9.parquet", "the manifest does not name it"),
+        ("run-again-0.parquet", "the manifest does not name it"),
+        (f"part-9.parquet{folder.UNFINISHED}", "was not written to its end"),
+    ],
+)
+def test_files_that_no_manifest_names_are_told(filled, place, name, told):
+    archiving.archive(filled.store, place, LATER)
+    whole = min(place.rglob("part-1.parquet"))
+    stray = whole.with_name(name)
+    stray.write_bytes(whole.read_bytes())
+    assert list(verify_archive(place, {})) == [f"{stray}: {told}"]
+
+
 def test_values_of_trackers_are_archived_and_their_trends_stay(opened, place, sky, missions):
     mission = twin.twin(missions)
     app = opened(mission, archive_folder=place)

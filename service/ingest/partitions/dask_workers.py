@@ -13,6 +13,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numba
+import numpy as np
 import pyarrow as pa
 
 from service import __version__
@@ -151,7 +153,12 @@ _solvers: dict[bytes, Solver] = {}
 
 def versions() -> dict[str, str]:
     """What the bytes of a part depend on, beside its batches and the processor."""
-    return {"attitude-acquisition": __version__, "pyarrow": pa.__version__}
+    return {
+        "attitude-acquisition": __version__,
+        "numba": numba.__version__,
+        "numpy": np.__version__,
+        "pyarrow": pa.__version__,
+    }
 
 
 def do_task(config: bytes, expected: dict[str, str], task: PartitionTask) -> Outcome:

@@ -1,6 +1,6 @@
 """Takes archived batches back into the database, and verifies an archive."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
@@ -13,6 +13,7 @@ from sqlalchemy.exc import IntegrityError
 from service.errors import BadConfiguration, BadInput
 from service.observations.schema import fingerprint_of
 from service.storage.archive.folder import (
+    UNFINISHED,
     Manifest,
     Part,
     day_folder,
@@ -171,12 +172,18 @@ def verify_archive(
                 yield str(error)
             done += part.batches
             step(done)
-        for file in sorted(day_folder(folder, manifest.spacecraft, manifest.day).glob("part-*")):
-            if file.name not in named:
-                yield f"{file}: the manifest does not name it"
+        yield from _unnamed(day_folder(folder, manifest.spacecraft, manifest.day), named)
     for path, sha256 in needed.items():
         if whole.get(path) != sha256:
             yield f"{folder / path}: the database has batches in it, and no manifest names it so"
+
+
+def _unnamed(day: Path, named: Container[str]) -> Iterator[str]:
+    for file in sorted(day.iterdir()):
+        if file.suffix == UNFINISHED:
+            yield f"{file}: was not written to its end"
+        elif file.suffix == ".parquet" and file.name not in named:
+            yield f"{file}: the manifest does not name it"
 
 
 def _is_own(input: str, fingerprint: str) -> bool:

@@ -119,12 +119,13 @@ def test_a_scheduler_that_goes_is_told_and_the_rest_is_done_without(
     check(database, place, undisturbed)
 
 
-def test_a_worker_of_another_version_is_refused(archived, place, missions):
+@pytest.mark.parametrize("package", ["attitude-acquisition", "numba", "numpy", "pyarrow"])
+def test_a_worker_of_another_version_is_refused(archived, place, missions, package):
     from service.ingest.local_workers import WorkerConfig
     from service.ingest.partitions import dask_workers
 
-    versions = dask_workers.versions() | {"pyarrow": "1.0"}
-    with pytest.raises(BadConfiguration, match=r"a worker has pyarrow .*, and the command 1\.0"):
+    versions = dask_workers.versions() | {package: "1.0"}
+    with pytest.raises(BadConfiguration, match=rf"a worker has {package} .*, and the command 1\.0"):
         dask_workers.do_task(b"", versions, None)
     config = WorkerConfig(missions, None, "sha256:another", 1 << 20)
     import pickle
