@@ -14,6 +14,7 @@
     ├── RateLimited           more requests than the token's rate allows
     ├── BadConfiguration      a mission file, a setting: names file, key and allowed values
     └── Busy                  the queue is full, or the database does not answer
+        ├── Standby           another service writes to the database
         └── Stopping          the service is stopping: a later attempt here will fail too
 
 Not finding a star is a result and raises nothing.  Nothing here knows HTTP;
@@ -114,6 +115,13 @@ class Busy(AcquisitionError):
     def __init__(self, message: str, retry_after_s: int = 1) -> None:
         super().__init__(message)
         self.retry_after_s = retry_after_s
+
+
+class Standby(Busy):
+    """Another service writes to the database; this one takes over where that ends."""
+
+    def __init__(self) -> None:
+        super().__init__("another service writes to the database; this one stands by", 2)
 
 
 class Stopping(Busy):

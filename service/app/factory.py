@@ -18,6 +18,7 @@ from service.app.replays import Replays
 from service.app.results import Results
 from service.app.runs import Runs
 from service.app.service import Service
+from service.app.serving.single_writer import SingleWriter
 from service.app.spacecraft import Spacecraft
 from service.app.submissions import Submissions
 from service.app.telemetry.grades import Grades
@@ -51,6 +52,7 @@ class App:
         self.missions = context.missions
         self.sky = context.sky
         self.store = context.store
+        self.single_writer = SingleWriter(context.store)
         self.access = Access(
             context.reading, context.change, is_loopback(context.settings.host), utc_now
         )
@@ -81,11 +83,18 @@ class App:
             TrackerSplitter(context.store, context.sky, context.missions)
         )
         self.service = Service(
-            context, self.submissions, self.replays, kernels, self.tracker_split, self.expiries
+            context,
+            self.submissions,
+            self.replays,
+            kernels,
+            self.tracker_split,
+            self.expiries,
+            self.single_writer,
         )
 
     def close(self) -> None:
         """Stop the replays, write what is queued, and close the database."""
+        self.single_writer.stop()
         self.webhooks.sender.stop()
         self.replays.stop()
         self.calibrations.close()
@@ -103,6 +112,8 @@ def open_app(
     serving: bool = False,
 ) -> App:
     """Read missions and catalog, open the database, start writing.
+
+    With `serving`, another service may write to the database: then this one stands by.
 
     `mission`, where given, takes the place of the one of that name.  `create`
     and `serving` are about the database; see `Store`.
@@ -123,13 +134,21 @@ def open_app(
         archive_folder=settings.archive_folder,
     )
     app = App(Context(settings, missions, sky, store), kernels)
-    try:
-        # A mission that is given takes the place of what was adopted, too.
-        app.adoptions.load(leave=mission.name if mission is not None else None)
+    # A mission that is given takes the place of what was adopted, too.
+    leave = mission.name if mission is not None else None
+
+    def take_over() -> None:
+        # Another service may have adopted a calibration in the meantime.
+        app.adoptions.load(leave)
         _register(app.context)
         if serving:
             # A command may run beside the service that computes one.
             app.calibrations.interrupt()
+
+    try:
+        app.single_writer.start(take_over)
+        if not app.single_writer.is_writing:
+            app.adoptions.load(leave)
     except BaseException:
         app.close()
         raise

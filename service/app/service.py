@@ -11,6 +11,7 @@ from service.acquire.kernel_build import KernelBuild
 from service.acquire.prewarm import prewarm_kernels
 from service.app.context import Context
 from service.app.replays import Replays
+from service.app.serving.single_writer import SingleWriter
 from service.app.submissions import Submissions
 from service.errors import Busy
 from service.ingest.kernel_progress import progress_logged
@@ -45,6 +46,7 @@ class Service:
         kernels: KernelBuild | None,
         tracker_split: BackgroundSplit,
         expiries: ExpiryDates,
+        single_writer: SingleWriter,
     ) -> None:
         self._context = context
         self._submissions = submissions
@@ -52,6 +54,7 @@ class Service:
         self._kernels = kernels
         self._tracker_split = tracker_split
         self._expiries = expiries
+        self._single_writer = single_writer
         self._warming = threading.Lock()
         self._is_warm = False
         self._ids = Ulids()
@@ -63,7 +66,8 @@ class Service:
         Other calls return as soon as batches with a zone do, while the first call compiles the
         rest.
         Raises `Busy` while another call does so, if the database cannot be read, and if the
-        last write failed and another write, tried now, fails too.
+        last write failed and another write, tried now, fails too; `Standby` where this service
+        is as ready, but another one writes.
         """
         if not self._is_warm:
             if not self._warming.acquire(blocking=False):
@@ -77,6 +81,7 @@ class Service:
             finally:
                 gc.enable()
                 self._warming.release()
+        self._single_writer.require()
         self._context.store.writer.require()
         self._context.store.writer.require_written()
         with self._context.reading() as connection:
@@ -90,9 +95,12 @@ class Service:
         self._become_warm()
         if self._kernels is not None:
             # Only the service does this by itself, not a command beside it.
-            self._replays.resume()
-            self._tracker_split.start()
+            self._single_writer.when_writing(self._begin_work)
             self._expiries.warn()
+
+    def _begin_work(self) -> None:
+        self._replays.resume()
+        self._tracker_split.start()
 
     def _begin_with_zones(self) -> None:
         """Load the kernels of batches with a zone, and be ready for these."""
@@ -126,7 +134,9 @@ class Service:
                 sent = submission_from_json(text)
                 for _ in range(1 + WARM_UP_RUNS // len(inputs)):
                     batch = structs.replace(sent.batch, batch=self._ids.new())
-                    self._submissions.ingest.warm_up(structs.replace(sent, batch=batch))
+                    self._submissions.ingest.warm_up(
+                        structs.replace(sent, batch=batch), write=self._single_writer.is_writing
+                    )
             except Exception as error:
                 # A batch that no longer runs must not prevent the start.
                 log.warning("the latest batch of a spacecraft could not be run again: %s", error)

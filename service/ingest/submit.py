@@ -233,11 +233,11 @@ class SubmissionService:
             is_long=may_take_long(batch),
         )
 
-    def warm_up(self, submission: Submission) -> None:
+    def warm_up(self, submission: Submission, write: bool = True) -> None:
         """Look up, solve and record a batch, and take it back: nothing is kept or told.
 
         Connections are opened and statements prepared that the first batch
-        would wait for.
+        would wait for.  Without `write` the batch is not even recorded.
         """
         pending = PendingBatch(
             identity_of(submission.batch),
@@ -254,6 +254,8 @@ class SubmissionService:
             record(connection, [unsaved])
             raise _WarmedUp
 
+        if not write:
+            return
         with suppress(_WarmedUp):
             self._store.writer.change(record_and_roll_back).result()
 

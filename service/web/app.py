@@ -14,6 +14,7 @@ from starlette.staticfiles import StaticFiles
 
 from service import __version__
 from service.app.factory import App
+from service.errors import Standby
 from service.products.formats import OUTPUT_FORMATS
 from service.web.api import (
     advice,
@@ -98,7 +99,7 @@ def create_app(app: App, limits: BodyLimits = DEFAULT_LIMITS) -> FastAPI:
         reporting = asyncio.create_task(report_to_supervisor(app))
         try:
             await web_app.state.live.start()
-            app.webhooks.sender.start()
+            app.single_writer.when_writing(app.webhooks.sender.start)
             app.live_filter.start()
             yield
         finally:
@@ -169,6 +170,8 @@ def _warm_up(web_app: FastAPI, app: App, loop: asyncio.AbstractEventLoop) -> Non
     try:
         app.service.ready()
         asyncio.run_coroutine_threadsafe(warm_request(web_app), loop).result()
+    except Standby as error:
+        log.info("%s", error)
     except Exception as error:
         # /readyz reports it, and its next call tries again.
         log.warning("not ready yet: %s", error)

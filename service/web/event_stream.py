@@ -201,7 +201,8 @@ class Live:
         now_s = asyncio.get_running_loop().time()
         if now_s >= self._swept_s + POLL_S:
             self._swept_s = now_s
-            await self._read(self._app.alarms.evaluate_by_clock)
+            if self._app.single_writer.is_writing:
+                await self._read(self._app.alarms.evaluate_by_clock)
 
     async def _take(self) -> None:
         while found := await self._read(self._app.events.after, self._last, READ_AT_ONCE):

@@ -17,8 +17,8 @@ from service import logs
 from service.app.factory import App, open_app
 from service.errors import BadConfiguration
 from service.settings import Settings, is_loopback, networks
+from service.storage.serving.served import hold_served
 from service.storage.sql.database import warn_of_old_sqlite
-from service.storage.sql.served import hold_served
 from service.web.app import create_app
 from service.web.connection_limits import Admission
 from service.web.middleware import ProbesOnly

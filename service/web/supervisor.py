@@ -13,7 +13,7 @@ import anyio
 import anyio.to_thread
 
 from service.app.factory import App
-from service.errors import AcquisitionError
+from service.errors import AcquisitionError, Standby
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +32,11 @@ async def report_to_supervisor(app: App) -> None:
     own = anyio.CapacityLimiter(1)
     while not await anyio.to_thread.run_sync(_is_ready, app, limiter=own):
         await asyncio.sleep(TRY_AGAIN_S)
-    notify_supervisor("READY=1\nSTATUS=ready")
+    if app.single_writer.is_writing:
+        notify_supervisor("READY=1\nSTATUS=ready")
+    else:
+        notify_supervisor("READY=1\nSTATUS=standing by")
+        app.single_writer.when_writing(lambda: notify_supervisor("STATUS=ready"))
     every_s = int(os.environ.get("WATCHDOG_USEC", "0")) / 2e6
     while every_s > 0.0:
         try:
@@ -64,6 +68,9 @@ def notify_supervisor(message: str) -> None:
 def _is_ready(app: App) -> bool:
     try:
         app.service.ready()
+    except Standby:
+        # It has started: a supervisor that waits for more would end it.
+        return True
     except Exception:  # the warm-up logs why, and the next call tries again
         return False
     return True

@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 
 from sqlalchemy import Connection
 
-from service.errors import Busy, Stopping
+from service.errors import Busy, Standby, Stopping
 from service.settings import Network
 from service.storage.recording.events import Event, events_after, first_event, last_event
 from service.storage.recording.ids import unguessable_ulid
@@ -99,7 +99,9 @@ class WebhookSender:
         """Attempts since the start by outcome."""
 
     def start(self) -> None:
-        """Begin to deliver."""
+        """Begin to deliver, unless that has begun."""
+        if self._thread is not None:
+            return
         self._thread = threading.Thread(
             target=lambda: asyncio.run(self._main()), name="webhooks", daemon=True
         )
@@ -172,6 +174,9 @@ class WebhookSender:
             self._news.clear()
             try:
                 await self._round()
+            except Standby:
+                # The service that writes delivers.
+                await asyncio.sleep(POLL_S)
             except Exception as error:
                 # The records are out of reach for a while: nothing is lost, it comes later.
                 log.warning("webhooks are not delivered: %s", error)

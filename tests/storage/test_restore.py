@@ -9,9 +9,9 @@ from sqlalchemy import MetaData, create_engine, select, text
 from sqlalchemy.pool import NullPool
 
 from service.errors import BadConfiguration
+from service.storage.serving.served import hold_served
 from service.storage.sql import migrations
 from service.storage.sql.engines import database_url
-from service.storage.sql.served import hold_served
 from service.storage.upkeep.backup import back_up
 from service.storage.upkeep.restore import restore
 from service.storage.upkeep.verify import verify

@@ -6,7 +6,7 @@ import json
 import threading
 import time
 from collections import Counter, deque
-from itertools import count
+from itertools import count, cycle
 
 CLIENTS = 8
 
@@ -18,11 +18,12 @@ class Load:
     leave it half of the processors.
     """
 
-    def __init__(self, port, template):
+    def __init__(self, ports, template):
+        """Of several `ports` a client goes to the next where one refuses or is gone."""
         self.acknowledged = {}
         """The id and the digest of the answer under each name."""
         self.met, self._counting = Counter(), threading.Lock()
-        self._port, self._template = port, template
+        self._ports, self._template = ports if isinstance(ports, tuple) else (ports,), template
         self._names = _Locked(f"batch-{number}" for number in count())
         self._again = deque()
         self._stopping, self._given_up = threading.Event(), threading.Event()
@@ -55,7 +56,8 @@ class Load:
             return None if self._stopping.is_set() else next(self._names)
 
     def _send(self):
-        server = http.client.HTTPConnection("127.0.0.1", self._port, timeout=30)
+        ports = cycle(self._ports)
+        server = http.client.HTTPConnection("127.0.0.1", next(ports), timeout=30)
         while (name := self._next()) is not None:
             body = self._template.replace("NAME", name)
             headers = {"Content-Type": "application/json", "Idempotency-Key": name}
@@ -65,6 +67,7 @@ class Load:
                 content = answer.read()
             except (http.client.HTTPException, OSError):
                 server.close()
+                server.port = next(ports)
                 self._count("broken off")
                 self._again.append(name)
                 # More often would keep the processor from the start that is waited for.
@@ -72,6 +75,8 @@ class Load:
                 continue
             self._count(answer.status)
             if answer.status == 503:
+                server.close()
+                server.port = next(ports)
                 self._again.append(name)
                 time.sleep(0.1)
             elif answer.status in (200, 201):

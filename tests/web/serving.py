@@ -62,16 +62,27 @@ class Server:
 
 
 @contextmanager
-def served(
+def serving(
     database: str, stderr: IO[bytes] | None = None
 ) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
-    """`acquire serve` on a database, ready for work: its process, which has others, and its URL."""
+    """`acquire serve` on a database: its process, which has others, and its URL."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     command = [sys.executable, "-m", "service.cli", "serve", "--port", str(port)]
     process = subprocess.Popen([*command, "--database", database], stderr=stderr)
-    url = f"http://127.0.0.1:{port}"
     try:
+        yield process, f"http://127.0.0.1:{port}"
+    finally:
+        process.terminate()
+        process.wait()
+
+
+@contextmanager
+def served(
+    database: str, stderr: IO[bytes] | None = None
+) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
+    """`serving`, ready for work."""
+    with serving(database, stderr) as (process, url):
         while True:
             assert process.poll() is None
             try:
@@ -81,6 +92,3 @@ def served(
                 pass
             time.sleep(0.1)
         yield process, url
-    finally:
-        process.terminate()
-        process.wait()

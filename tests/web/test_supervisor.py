@@ -3,10 +3,17 @@
 import os
 import signal
 import socket
+import time
+from contextlib import suppress
 
+import httpx
 import pytest
+from sqlalchemy import create_engine
+from sqlalchemy.pool import NullPool
 
-from tests.web.serving import served
+from service.storage.serving.writing_lock import WritingLock
+from service.storage.sql.engines import database_url
+from tests.web.serving import served, serving
 
 
 @pytest.fixture
@@ -31,6 +38,27 @@ def test_it_reports_ready_then_signs_of_life_then_that_it_stops(heard, tmp_path)
             last = heard()
         assert last == "STOPPING=1"
         assert process.wait(20) in (0, -signal.SIGTERM)
+
+
+@pytest.mark.parametrize("empty_database", ["postgresql"], indirect=True)
+def test_a_service_that_stands_by_has_started(heard, database):
+    engine = create_engine(database_url(database), poolclass=NullPool)
+    with engine.connect() as other:
+        assert WritingLock().take(other) == "taken"
+        with serving(database) as (_, url):
+            while not standing_by(url):
+                time.sleep(0.1)
+            assert heard() == "READY=1\nSTATUS=standing by"
+            other.close()
+            while (told := heard()) != "STATUS=ready":
+                assert told == "WATCHDOG=1"
+
+
+def standing_by(url):
+    with suppress(httpx.TransportError):
+        answer = httpx.get(f"{url}/readyz")
+        return answer.status_code == 503 and answer.json()["type"] == "/problems/standby"
+    return False
 
 
 def test_a_process_that_stands_gives_no_sign_of_life(heard, tmp_path):

@@ -71,8 +71,13 @@ class CalibrationAdoptions:
 
     def load(self, leave: str | None = None) -> None:
         """Put what was adopted over the mission files, but for the spacecraft `leave`."""
-        with self._context.reading() as connection:
-            self._context.missions.update(adopted_missions(connection, self._files, leave))
+        with self._lock:
+            before = dict(self._context.missions)
+            with self._context.reading() as connection:
+                adopted = adopted_missions(connection, self._files, leave)
+            self._context.missions.update(self._files | adopted)
+            if self._context.missions != before:
+                self._missions_changed()
 
     def in_force(self, spacecraft: str) -> CalibrationInForce:
         """The calibration that new batches use, and every change of it, newest first."""

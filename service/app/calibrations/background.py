@@ -11,7 +11,7 @@ import msgspec
 from service.app.calibrations.estimates import CalibrationRequest, CalibrationRun, Estimator
 from service.app.calibrations.findings import result_of
 from service.app.context import Context
-from service.errors import AcquisitionError, Busy, Stopping
+from service.errors import AcquisitionError, Busy, Standby, Stopping
 from service.missions.mission import Mission
 from service.storage.calibrations import stored
 from service.storage.sql.columns import Row
@@ -67,7 +67,7 @@ class BackgroundCalibrations:
         progress = _Progress(self._context, id, lambda: self._closing)
         try:
             ended = found_columns(self._estimator.estimate(wanted, mission, progress.step))
-        except Stopping:
+        except (Standby, Stopping):
             ended = {"state": "interrupted"}
         except AcquisitionError as error:
             ended = {"state": "failed", "fault": str(error)}

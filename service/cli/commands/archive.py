@@ -78,8 +78,8 @@ def archive(parsed: Namespace) -> int:
     from tqdm import tqdm
 
     from service.extras import require_extra
+    from service.storage.serving.served import unserved
     from service.storage.sql.database import Store
-    from service.storage.sql.served import unserved
     from service.times import parse_utc, utc_now
 
     if parsed.before is None:
@@ -149,8 +149,8 @@ def restore(parsed: Namespace) -> int:
     from tqdm import tqdm
 
     from service.extras import require_extra
+    from service.storage.serving.served import unserved
     from service.storage.sql.database import Store
-    from service.storage.sql.served import unserved
 
     folder = _folder(parsed.folder, "--archive")
     require_extra("tables", "pyarrow", "--archive", str(folder))

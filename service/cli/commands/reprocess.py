@@ -87,7 +87,7 @@ def run(parsed: Namespace) -> int:
     from service.cli.run_comparison import comparison_text, progress_text
     from service.ingest.reprocess import ReprocessProgress, require_other_run
     from service.missions.mission import load_missions, mission_named, read_mission
-    from service.storage.sql.served import unserved
+    from service.storage.serving.served import unserved
 
     start, end = period_of(parsed)
     mission = None if parsed.mission is None else read_mission(parsed.mission)

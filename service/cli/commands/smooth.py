@@ -45,7 +45,7 @@ def run(parsed: Namespace) -> int:
 
     from service.app.factory import open_app
     from service.app.telemetry.grades import SmoothProgress
-    from service.storage.sql.served import unserved
+    from service.storage.serving.served import unserved
 
     start, end = period_of(parsed)
     settings = settings_of_existing(parsed)

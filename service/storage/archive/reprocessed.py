@@ -39,7 +39,7 @@ from service.storage.recording.unsaved_result import STARS, Buckets, UnsavedResu
 from service.storage.sql.columns import Row
 from service.storage.sql.database import Store
 from service.storage.sql.rollup_tables import rollups_hourly
-from service.storage.sql.tables import batches
+from service.storage.sql.tables import batches, runs
 from service.times import DAY_S, HOUR_S, bucket_start, parse_utc, recorded_utc
 
 IDENTITY = ("id", "spacecraft", "run", "batch", "fingerprint")
@@ -127,6 +127,9 @@ def merge(store: Store, folder: Path, path: str, made: RunPart) -> None:
 
 def _merge(connection: Connection, folder: Path, path: str, made: RunPart) -> None:
     spacecraft, run = made.spacecraft, made.part.run
+    # A batch that another process records in the run holds this row until its commit, and waits
+    # for it: the table of archived batches and that of recorded ones have no unique key together.
+    connection.execute(select(runs.c.name).where(runs.c.name == run).with_for_update())
     recorded = select(batches.c.id).where(batches.c.spacecraft == spacecraft, batches.c.run == run)
     if connection.scalar(recorded.limit(1)) is not None:
         names = made.identities["batch"].to_pylist()

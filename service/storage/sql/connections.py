@@ -4,6 +4,7 @@ import sqlite3
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from typing import Any
 
 from sqlalchemy import Connection, Engine
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
@@ -139,10 +140,21 @@ class PersistentConnection:
             raise
         except BaseException:
             # A connection in an unknown state must not serve the next transaction.
-            connection.invalidate()
+            if not self._is_idle(connection):
+                connection.invalidate()
             connection.close()
             raise
         self._keep(connection)
+
+    def _is_idle(self, connection: Connection) -> bool:
+        """Whether a server says that its session is outside of any transaction, after an error.
+
+        The session may hold a lock, which would be lost with it.
+        """
+        if self._is_sqlite or connection.invalidated or connection.in_transaction():
+            return False
+        driver: Any = connection.connection.driver_connection
+        return bool(driver.info.transaction_status.name == "IDLE")
 
     def _keep(self, connection: Connection) -> None:
         if self._is_sqlite:

@@ -11,6 +11,7 @@ from sqlalchemy.exc import DBAPIError, TimeoutError
 
 from service.errors import Busy
 from service.storage.archive.reading import Archive
+from service.storage.serving.writing_lock import WritingLock
 from service.storage.sql.connections import PersistentConnection
 from service.storage.sql.database_file import DatabaseFile
 from service.storage.sql.engines import (
@@ -117,7 +118,8 @@ class Store(Readers):
 
         Without `create` SQLite's file must be there.  Batches that left the database are read
         from the `archive_folder`.
-        `serving` bounds the waiting times; see `Readers`.
+        `serving` bounds the waiting times, see `Readers`, and on PostgreSQL lets one service
+        alone write.
         Raises `BadConfiguration` with what to do.
         """
         self.archive = Archive(archive_folder)
@@ -136,7 +138,10 @@ class Store(Readers):
             self._writing.dispose()
             raise
         super().__init__(database, serving=serving, file=file)
-        self.writer = Writer(self._writing, file=file, wait_s=TURN_S if serving else None)
+        self.lock = WritingLock() if serving and file is None else None
+        """Of PostgreSQL: nothing is written before it is taken."""
+        wait_s = TURN_S if serving else None
+        self.writer = Writer(self._writing, file=file, wait_s=wait_s, lock=self.lock)
 
     @contextmanager
     def reading_batch(self, id: str) -> Iterator[tuple[Connection, bool]]:

@@ -46,12 +46,14 @@ class Timeouts:
     statement_s: float
     idle_s: float = 0.0
     """After so long a server ends a transaction whose client asks nothing, and frees its locks."""
+    lost_s: int = 0
+    """After so long without a sign of life from the client's machine a server ends the session."""
 
 
 # A post waits at most 5 s for its turn, then for one look-up, for the turn to write and for one
 # transaction, of which one ends with a time-out: 15 s in all.
 TO_LOOK_UP = Timeouts(lock_s=2.0, statement_s=3.0)
-TO_COMMIT = Timeouts(lock_s=2.0, statement_s=4.0, idle_s=30.0)
+TO_COMMIT = Timeouts(lock_s=2.0, statement_s=4.0, idle_s=30.0, lost_s=6)
 TO_SHOW = Timeouts(lock_s=2.0, statement_s=12.0)
 """For pages and lists, some of which read much."""
 PATIENT_S = 60.0
@@ -168,6 +170,10 @@ def _bounded(url: URL, timeouts: Timeouts, pool: dict[str, Any]) -> Engine:
         "idle_in_transaction_session_timeout": timeouts.idle_s,
     }
     options = [f"-c {name}={round(1000 * value)}" for name, value in seconds.items()]
+    if timeouts.lost_s:
+        third = timeouts.lost_s // 3
+        options += [f"-c tcp_keepalives_idle={third}", f"-c tcp_keepalives_interval={third}"]
+        options += ["-c tcp_keepalives_count=2", f"-c tcp_user_timeout={1000 * timeouts.lost_s}"]
     own = url.query.get("options", ())
     options += [own] if isinstance(own, str) else own
     given: dict[str, Any] = {

@@ -19,8 +19,9 @@ from typing import Any, TypeVar
 from sqlalchemy import Connection, Engine, update
 from sqlalchemy.exc import DBAPIError
 
-from service.errors import Busy, Stopping
+from service.errors import Busy, Standby, Stopping
 from service.storage.recording.unsaved_result import UnsavedResult
+from service.storage.serving.writing_lock import Attempt, WritingLock
 from service.storage.sql.connections import PersistentConnection, RolledBack
 from service.storage.sql.database_file import DatabaseFile
 from service.storage.sql.engines import TO_WRITE, patience
@@ -62,11 +63,14 @@ class Writer:
         *,
         file: DatabaseFile | None = None,
         wait_s: float | None = None,
+        lock: WritingLock | None = None,
     ) -> None:
         """`file` is that of SQLite; `wait_s` bounds how long results wait to be written.
 
-        Those of a bulk load, and other changes, wait as long as it takes.
+        Those of a bulk load, and other changes, wait as long as it takes.  With a `lock` nothing
+        is written but by the session that holds it; see `take_lock`.
         """
+        self._lock = lock
         self._connection = PersistentConnection(engine, TO_WRITE, file)
         self._max_queued = max_queued
         self._wait_s = wait_s
@@ -112,6 +116,16 @@ class Writer:
         self._put(QueuedJob(_settling(done), change=change))
         return done
 
+    def take_lock(self) -> Attempt:
+        """Take the lock of the service that writes, if no other session has it.
+
+        Raises an error of SQLAlchemy's where the database is out of reach.
+        """
+        if self._lock is None:
+            return "kept"
+        with self._connection.lookup() as connection:
+            return self._lock.take(connection)
+
     def require(self) -> None:
         """Raise `Stopping` unless what is queued will be written."""
         with self._changed:
@@ -152,6 +166,8 @@ class Writer:
         with self._changed:
             if self._closing:
                 raise Stopping("the service is stopping")
+            if self._lock is not None:
+                self._lock.require()
             # A job that alone is larger than the queue is still taken by an empty one.
             if self._queued and self._queued + job.weight > self._max_queued:
                 raise Busy(f"{self._queued} records are waiting to be written")
@@ -203,7 +219,7 @@ class Writer:
             cause = error.orig if isinstance(error, DBAPIError) else repr(error)
             log.error("%d pieces of work could not be written: %s", len(jobs), cause)
             told = _told(error)
-            if isinstance(told, Busy) and not isinstance(told, Stopping):
+            if isinstance(told, Busy) and not isinstance(told, Standby | Stopping):
                 self.note_failure(sum(job.weight for job in jobs))
             for job in jobs:
                 job.settle(told)
@@ -262,6 +278,8 @@ class Writer:
             self._connection.transaction() as connection,
             patience(connection) if has_time else nullcontext(),
         ):
+            if self._lock is not None:
+                self._lock.require_in(connection)
             yield connection
 
     def _tell(self) -> None:

@@ -13,9 +13,9 @@ from pathlib import Path
 from sqlalchemy import URL, inspect
 
 from service.errors import BadConfiguration
+from service.storage.serving.served import unserved
 from service.storage.sql.engines import database_url, reading_engine, shown_url
 from service.storage.sql.migrations import reported, revision_of
-from service.storage.sql.served import unserved
 from service.storage.upkeep.backup import (
     PAGES_AT_ONCE,
     Step,

@@ -62,6 +62,8 @@ class Layout:
     open_alarms: int = 0
     """Alarms of the run that nobody has acknowledged or shelved; every page counts them."""
     worst_alarm: str | None = None
+    stands_by: bool = False
+    """Whether another service writes to the database."""
 
     @property
     def is_live(self) -> bool:
@@ -135,6 +137,7 @@ class PageContext:
             address=self.address,
             open_alarms=alarms.open,
             worst_alarm=alarms.worst,
+            stands_by=not self.app.single_writer.is_writing,
         )
 
     def _stream(self) -> str | None:

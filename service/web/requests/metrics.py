@@ -101,6 +101,11 @@ class _GaugeCollector(Collector):
             yield from _of_expiries(found["expiries"])
         if "webhooks" in found:
             yield from _of_webhooks(found["webhooks"])
+        yield GaugeMetricFamily(
+            "starid_standby",
+            "1 where another service writes to the database and this one stands by, else 0.",
+            value=float(not self._app.single_writer.is_writing),
+        )
         yield _of_attempts(self._app.webhooks.sender.counts)
 
 

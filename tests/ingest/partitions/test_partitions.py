@@ -2,18 +2,20 @@
 
 import json
 import threading
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import suppress
 
 import pytest
 from msgspec.structs import asdict
 from sqlalchemy import func, select
 
-from service.errors import BadBatch, BadConfiguration
+from service.errors import BadBatch, BadConfiguration, Busy, Conflict
 from service.ingest.partitions import coordinator
 from service.missions.mission import Mission
 from service.observations.schema import submission_from_json
-from service.storage.archive import archiving, folder
+from service.storage.archive import archiving, folder, reprocessed
 from service.storage.recording import rollups
+from service.storage.recording.unsaved_result import Answered
 from service.storage.sql.tables import batches
 from service.storage.upkeep.prune import prune
 from service.storage.upkeep.verify import verify
@@ -122,6 +124,35 @@ def test_of_several_who_write_the_same_file_the_first_one_s_stays(place):
             found = set(pool.map(write, [b"a", b"b", b"c", b"d"]))
             assert found == {file.read_bytes()}
     assert list(place.rglob("*.part")) == []
+
+
+@pytest.mark.parametrize("empty_database", ["postgresql"], indirect=True)
+def test_posts_meanwhile_are_recorded_or_archived_but_never_both(
+    archived, opened, place, bodies, monkeypatch
+):
+    """A service records batches of the run while the command notes a part of it as archived."""
+    service, real, posted = opened(archive_folder=place), reprocessed.note_part, []
+    in_run = [submission_from_json(json.dumps(json.loads(b) | {"run": "again"})) for b in bodies]
+    with ThreadPoolExecutor() as pool:
+
+        def note_part(*arguments):
+            if not posted and arguments[1] == "XTE":
+                posted.append(pool.submit(service.submissions.submit_many, in_run[:PART]))
+                # They wait for the end of this transaction.
+                wait(posted, timeout=5.0)
+            return real(*arguments)
+
+        monkeypatch.setattr(reprocessed, "note_part", note_part)
+        with suppress(BadConfiguration):
+            again(archived, place)
+        # A client whose batch was archived meanwhile is told to send it again.
+        assert posted[0].exception() is None or isinstance(posted[0].exception(), Busy)
+    answers = service.submissions.submit_many(in_run[:PART])
+    found = names_of(archived, "again")
+    assert len(found) == len(set(found))
+    assert {("XTE", each.batch.batch) for each in in_run[:PART]} <= set(found)
+    assert all(isinstance(each, Answered | Conflict) for each in answers)
+    assert_trends(archived)
 
 
 def forget(run):

@@ -1,0 +1,1 @@
+"""Which of several services on one database writes."""
