@@ -9,8 +9,8 @@ from sqlalchemy import func, select
 
 from service.app.context import Context
 from service.errors import AcquisitionError, NotFound
-from service.grades.carried import CarriedFilter
-from service.grades.day import day_bounds, window_of
+from service.grades.carried import CarriedFilter, live_window
+from service.grades.day import day_bounds
 from service.missions.mission import mission_named
 from service.storage.grades.inputs import recorded_in
 from service.storage.grades.live import LiveAttitude, live_attitude
@@ -35,7 +35,6 @@ class _Kept:
 
     filter: CarriedFilter = field(default_factory=CarriedFilter)
     version: tuple[int, str | None] | None = None
-    day: int | None = None
     attitude: LiveAttitude | None = None
 
 
@@ -119,16 +118,14 @@ class LiveFilter:
                 if kept.version == version:
                     return kept
                 row = newest(connection, _TIMES, ResultFilter(LIVE, name), utc_now())
-                day = None if row is None else recorded_utc(row["time"]).bucket(DAY_S)
-                if day is not None:
-                    window = window_of(day)
+                latest = None if row is None else recorded_utc(row["time"])
+                if latest is not None:
+                    window = live_window(latest)
                     recorded = recorded_in(connection, self._context.sky, name, LIVE, *window)
-            if day != kept.day:
-                kept.filter, kept.day = CarriedFilter(), day
             attitude = None
-            if day is not None:
+            if latest is not None:
                 carried = kept.filter.carry_on(recorded, mission)
-                attitude = live_attitude(name, day_bounds(day)[0], carried)
+                attitude = live_attitude(name, day_bounds(latest.bucket(DAY_S))[0], carried)
             # Readers do not wait: until now they had the one before.
             kept.attitude, kept.version = attitude, version
             return kept
