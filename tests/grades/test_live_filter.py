@@ -6,11 +6,13 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from types import SimpleNamespace
 
 import httpx
 import numpy as np
 import pytest
 
+from service.app.telemetry.live_filter import LiveFilter
 from service.errors import NotFound
 from service.filtering.samples import AttitudeMeasurements
 from service.grades.carried import CarriedFilter, live_window
@@ -258,6 +260,32 @@ def test_a_request_does_not_wait_for_the_first_look_of_the_thread(live, half_hou
         live.live_filter.latest("XTE")
     live.live_filter.refresh("XTE")
     assert live.live_filter.latest("XTE").time == "1999-03-01T12:05:00.000Z"
+
+
+def test_the_thread_waits_for_the_kernels(live, half_hour):
+    recorded = before(half_hour[1], 300)
+    put_gyro(live, recorded.gyro_ns, recorded.rates_rad_s)
+    send(live, recorded.attitudes)
+    kernels = SimpleNamespace(is_needed=True)
+    waiting = LiveFilter(live.context, kernels)
+    waiting.start()
+
+    def is_there():
+        try:
+            return waiting.latest("XTE").time == "1999-03-01T12:05:00.000Z"
+        except NotFound:
+            return False
+
+    try:
+        time.sleep(0.3)
+        assert not is_there()
+        kernels.is_needed = False
+        give_up = time.monotonic() + 60.0
+        while not is_there():
+            assert time.monotonic() < give_up
+            time.sleep(0.05)
+    finally:
+        waiting.stop()
 
 
 def test_a_mission_without_the_table_has_none(app):

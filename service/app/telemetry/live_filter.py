@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from sqlalchemy import func, select
 
+from service.acquire.kernel_build import KernelBuild
 from service.app.context import Context
 from service.errors import AcquisitionError, NotFound
 from service.grades.carried import CarriedFilter, live_window
@@ -45,8 +46,9 @@ class LiveFilter:
     started again gives the same.
     """
 
-    def __init__(self, context: Context) -> None:
+    def __init__(self, context: Context, kernels: KernelBuild | None = None) -> None:
         self._context = context
+        self._kernels = kernels
         self._kept: dict[str, _Kept] = {}
         self._lock = threading.Lock()
         self._stopped = threading.Event()
@@ -94,6 +96,9 @@ class LiveFilter:
     def _keep_up(self) -> None:
         due = dict.fromkeys(self._names(), 0.0)
         while not self._stopped.wait(max(0.05, min(due.values()) - time.monotonic())):
+            if self._kernels is not None and self._kernels.is_needed:
+                # Compiled here they would hold up the requests; other processes do that.
+                continue
             name = min(due, key=lambda each: due[each])
             begun = time.monotonic()
             try:
