@@ -161,7 +161,7 @@ def begin_run(store: Store, plan: ReprocessPlan) -> None:
 
     def change(connection: Connection) -> None:
         insert_runs(connection, {plan.run: utc_now().text})
-        noted = update(runs).where(runs.c.name == plan.run, runs.c.tracked != plan.track)
+        noted = update(runs).where(runs.c.name == plan.run)
         connection.execute(noted.values(tracked=plan.track))
 
     store.writer.change(change).result()

@@ -85,7 +85,10 @@ def test_a_run_without_tracking_does_not_continue_with_it(app, flown, tmp_path):
     with pytest.raises(BadBatch, match="was begun with --track"):
         app.runs.reprocess_into_archive("tracked", tmp_path, processes=1)
     # Without a name the two are two runs.
-    assert len({app.runs.reprocess(None, track=track, processes=1)[0].run for track in (0, 1)}) == 2
+    assert (
+        len({app.runs.reprocess(None, track=track, processes=1)[0].run for track in (False, True)})
+        == 2
+    )
     assert len(app.runs.all()) == 5
 
 
