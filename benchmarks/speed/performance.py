@@ -71,7 +71,8 @@ ABOUT = {
         "and a live filter that looks as often as a mission may ask for, one without both. "
         "In turns both get the same batches of a nominal pass, one a second of the pass, the first "
         "with the gyro blocks of 1,000 samples among them, which count as no posts but take their "
-        "time. Bound: a post takes at most 1.1 times as long, at 16 connections and over one."
+        "time. Bound: a post takes at most 1.1 times as long at 16 connections and over one, and "
+        "1.1 times as much processor time."
     ),
     "stored": (
         "A database filled by `benchmarks.speed.fill_database`, then batches recorded in earnest "
