@@ -17,6 +17,7 @@ from benchmarks.report import Report
 from benchmarks.speed import (
     exports,
     kernels,
+    live_filter,
     packets,
     performance,
     pipeline,
@@ -73,6 +74,7 @@ BENCHMARKS: dict[str, Callable[[bool, int], Report]] = {
     "ptp": ptp.run,
     "kernels": kernels.run,
     "posts": posts.run,
+    "live_filter": live_filter.run,
     "stored": stored.run,
     "scale": scale.run,
     "soak": soak.run,

@@ -158,6 +158,8 @@ def test_the_version_is_the_packages(acquire):
         ("reprocess --spacecraft NO", "no spacecraft 'NO'; there are IMAGER, SOHO"),
         ("reprocess --run live", "run: must be another run than the one"),
         ("reprocess --run a/b", "run: String should match"),
+        ("reprocess --track --archive /", "--track: cannot be used with --archive: each batch"),
+        ("reprocess --track --processes 2", "--processes: leave it out with --track, which"),
         ("reprocess --mission none.toml", "none.toml: cannot be read: "),
         ("reprocess --from 1996-02-01T00:00:00Z --to 1996-01-01T00:00:00Z", "--end: must not"),
         ("advise", "required: --spacecraft (see `acquire advise --help`)"),

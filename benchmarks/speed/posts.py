@@ -107,7 +107,7 @@ def _posted(served: Served, path: str, bodies: Sequence[bytes], gap_s: float = 0
     return driven
 
 
-def _read(served: Served, path: str) -> Any:
+def read_json(served: Served, path: str) -> Any:
     with urllib.request.urlopen(served.address(path), timeout=60) as answer:
         return json.load(answer)
 
@@ -122,7 +122,7 @@ def _start_replay(served: Served, lines: Sequence[bytes], run: str) -> str:
 
 
 def _finished(served: Served, place: str) -> dict[str, Any]:
-    while (state := _read(served, place))["state"] == "running":
+    while (state := read_json(served, place))["state"] == "running":
         time.sleep(0.05)
     return dict(state)
 
@@ -159,9 +159,9 @@ def singles(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any]
             row = pass_.bodies(ONE_BY_ONE, f"one-by-one-{round_}")
             waits = drive(served.port, [request(f"{API}/batches", each) for each in row], 1)
             p50_ms.append(waits.percentile_ms(50))
-        page = _read(served, f"{API}/batches?limit=500")["items"]
+        page = read_json(served, f"{API}/batches?limit=500")["items"]
         for item in page[:100]:
-            answer = _read(served, f"{API}/batches/{item['id']}")["answer"]
+            answer = read_json(served, f"{API}/batches/{item['id']}")["answer"]
             got, of = pass_.right(int(answer["batch"].rpartition("-")[2]), answer)
             right, seen = right + got, seen + of
         after_mb = served.resident_mb()

@@ -8,10 +8,11 @@ import sys
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 START_S = 120.0
 _TICKS = os.sysconf("SC_CLK_TCK")
@@ -55,10 +56,14 @@ def _stat(pid: int) -> list[str]:
 
 
 @contextmanager
-def service(database: Path) -> Iterator[Served]:
-    """`acquire serve` over a database file; it is told to stop at the end."""
+def service(database: Path, missions: Path | None = None) -> Iterator[Served]:
+    """`acquire serve` over a database file; it is told to stop at the end.
+
+    `missions` is a folder of missions in place of the one that the environment names.
+    """
     arguments = ["-m", "service.cli", "serve", "--database", f"sqlite:///{database}"]
-    with _served(arguments, "/readyz") as served:
+    own = {} if missions is None else {"ACQUIRE_MISSIONS": str(missions)}
+    with _served(arguments, "/readyz", own) as served:
         yield served
 
 
@@ -72,13 +77,20 @@ def no_op() -> Iterator[Served]:
 
 
 @contextmanager
-def _served(arguments: list[str], path: str) -> Iterator[Served]:
+def _served(
+    arguments: list[str], path: str, environment: Mapping[str, str] = MappingProxyType({})
+) -> Iterator[Served]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     started = time.perf_counter()
     command = [sys.executable, *arguments, "--port", str(port)]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, **environment},
+    )
     try:
         while not _answers(f"http://127.0.0.1:{port}{path}"):
             if process.poll() is not None or time.perf_counter() - started > START_S:

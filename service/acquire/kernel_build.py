@@ -39,7 +39,7 @@ class _Share(NamedTuple):
     zones: list[str]
     """Identifiers that search zones."""
     others: list[str]
-    linking: bool
+    over_batches: bool
 
 
 class KernelBuild:
@@ -184,4 +184,4 @@ def _compile(
     sky = SkyModel(load_embedded(), LruCache(64 << 20))
     prewarm_kernels(sky, missions, share.zones, False)
     zones_built.send_bytes(b"zones")
-    prewarm_kernels(sky, missions, share.others, share.linking)
+    prewarm_kernels(sky, missions, share.others, share.over_batches)

@@ -9,6 +9,7 @@ from collections.abc import Collection, Mapping
 import numpy as np
 
 from service.acquire import acquire
+from service.filtering.compiling import compile_filtering
 from service.identify.prior_attitude import prior_attitude, search_region
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Band, Mission
@@ -49,11 +50,12 @@ def prewarm_kernels(
     sky: SkyModel,
     missions: Mapping[str, Mission],
     identifiers: Collection[str] | None = None,
-    linking: bool = True,
+    over_batches: bool = True,
 ) -> None:
     """Compile the kernels by running a batch of real stars of each kind of zone.
 
-    Those of the named identifiers (None: of all), and of linking points over batches.
+    Those of the named identifiers (None: of all), and of what is computed over many batches:
+    links of points, filter and smoother.
     The zones that this builds go into a cache of its own, which it drops at the end.
     """
     moment = parse_utc("2000-01-01T12:00:00Z")
@@ -109,8 +111,9 @@ def prewarm_kernels(
                 # So few stars may not be enough, and the whole sky has kernels of its own.
                 searched = searched.model_copy(update={"lost_in_space_fallback": False})
             acquire(batch, searched, apart)
-    if linking:
+    if over_batches:
         compile_linking()
+        compile_filtering()
 
 
 def _of_bright_stars(mission: Mission, to_mag: float) -> Mission:

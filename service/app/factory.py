@@ -63,7 +63,7 @@ class App:
         self.products = Products(context.missions, context.store)
         self.gyro = Gyro(context)
         self.grades = Grades(context)
-        self.live_filter = LiveFilter(context)
+        self.live_filter = LiveFilter(context, kernels)
         self.tracks = Tracks(context)
         self.limits = Limits(context)
         self.alarms = Alarms(context)

@@ -110,12 +110,14 @@ class Runs:
         start: Utc | None = None,
         end: Utc | None = None,
         processes: int = 0,
+        track: bool = False,
         step: Callable[[ReprocessProgress], object] = lambda progress: None,
     ) -> tuple[ReprocessProgress, RunComparison]:
         """Process the batches of a run again into another run, and compare both.
 
         The settings are those of this app.  Without `run` the name is derived from the
         settings.  Batches that the run already has are not processed again.
+        With `track` they are searched about the last attitude of the run, one after another.
         Raises `BadBatch` if the run has results of other settings.
         """
         progress = self.reprocess_recorded(
@@ -125,6 +127,7 @@ class Runs:
             start=start,
             end=end,
             processes=processes,
+            track=track,
             step=step,
         )
         return progress, self.compare(source, progress.run, spacecraft, start, end)
@@ -138,11 +141,14 @@ class Runs:
         start: Utc | None = None,
         end: Utc | None = None,
         processes: int = 0,
+        track: bool = False,
         step: Callable[[ReprocessProgress], object] = lambda progress: None,
     ) -> ReprocessProgress:
         """`reprocess` without the comparison."""
-        plan = self._plan(run, source, spacecraft, start, end, processes)
-        return reprocess(self._context.store, plan, self._context.sky.catalog.digest, step)
+        plan = self._plan(run, source, spacecraft, start, end, processes, track)
+        sky = self._context.sky
+        own = Solver(plan.missions, sky)
+        return reprocess(self._context.store, plan, sky.catalog.digest, own, step)
 
     def reprocess_into_archive(
         self,
@@ -195,6 +201,7 @@ class Runs:
         start: Utc | None,
         end: Utc | None,
         processes: int,
+        track: bool = False,
     ) -> ReprocessPlan:
         if spacecraft is not None:
             mission_named(self._context.missions, spacecraft)
@@ -205,18 +212,19 @@ class Runs:
         }
         return ReprocessPlan(
             stretch=ResultFilter(source, spacecraft, start, end),
-            run=checked_run_name(run or self._run_of_settings(source, chosen)),
+            run=checked_run_name(run or self._run_of_settings(source, chosen, track)),
             missions=chosen,
             catalog=self._context.settings.catalog,
             cache_bytes=self._context.settings.shelf_mb << 20,
             processes=processes,
+            track=track,
         )
 
-    def _run_of_settings(self, source: str, missions: Mapping[str, Mission]) -> str:
+    def _run_of_settings(self, source: str, missions: Mapping[str, Mission], track: bool) -> str:
         """A name derived from the settings, so that an interrupted run can continue."""
         digests = [
             self._context.sky.catalog.digest,
             *sorted(each.digest for each in missions.values()),
         ]
         short = hashlib.sha256("".join(digests).encode()).hexdigest()[:8]
-        return f"{source[:50]}-again-{short}"
+        return f"{source[:50]}-{'tracked' if track else 'again'}-{short}"

@@ -1,9 +1,12 @@
 """The filter of an unfinished stretch, carried on as more is recorded.
 
 What is given is always the whole record of the window, and what comes out depends on it alone:
-it is what `day.grade_day` would give at the last epoch.  States at marks along the stretch are
-kept, so that only what is new is filtered; a late measurement, or other settings, drop the
-marks after it.
+it is what `day.grade_day` would give at the last epoch, of the same record.  States at marks
+along the stretch are kept, so that only what is new is filtered; a late measurement, or other
+settings, drop the marks after it.
+
+The window does not grow with the day, as that of `day.window_of` does: a look reads seven hours
+of attitudes and gyro samples at any time of the day.
 """
 
 import hashlib
@@ -17,14 +20,27 @@ from service.filtering.gyro import ConstantRateModel
 from service.filtering.result import FilterResult
 from service.filtering.samples import GyroSamples
 from service.filtering.state import FilterState
-from service.grades.day import GradedSamples, Model, samples_of
+from service.grades.day import LOOK_AHEAD_S, WARM_UP_S, GradedSamples, Model, samples_of
 from service.grades.measured import Recorded, attitudes_where, directions_where
 from service.grades.stretches import LONGEST_GAP_S, Stretch, cut
 from service.gyro.block import Nanoseconds
 from service.missions.mission import Mission
+from service.times import DAY_S, HOUR_S, Utc, bucket_start, shifted
 
 MARK_NS = 600 * 10**9
 """A mark ends with the last epoch of each ten minutes of TAI."""
+
+
+def live_window(latest: Utc) -> tuple[Utc, Utc]:
+    """The time whose record a live filter depends on, its end excluded.
+
+    It begins six hours before the UTC hour of the latest batch: late batches and blocks within it
+    are filtered in their order, earlier ones change nothing.  It moves on once an hour, because
+    a filter that begins at another moment has to filter everything again.  The end leaves room
+    for gyro samples while trackers give no attitude, for as long as those of a day count.
+    """
+    hour = bucket_start(latest.bucket(HOUR_S), HOUR_S)
+    return shifted(hour, -WARM_UP_S), shifted(hour, DAY_S + LOOK_AHEAD_S)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numba
 
-KERNEL_BYTES = 4_240_000
+KERNEL_BYTES = 5_060_000
 """Of the machine code of all kernels, about; other processors have a tenth more or less."""
 MOST_SHARE = 0.99
 """Until it is over, since the size is not known to the last byte."""
@@ -31,6 +31,8 @@ STEPS = {
     "whole_sky": "index of the whole sky",
     "lost_in_space": "search of the whole sky",
     "triangles": "triangles",
+    "tracks": "links of points",
+    "filtering": "attitude over time",
 }
 """What the kernels of a folder are for; the cache has a folder for each of them."""
 EVERY_S = 10.0

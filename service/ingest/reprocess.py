@@ -14,18 +14,22 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-from sqlalchemy import ColumnElement, and_, exists, func, select
+from sqlalchemy import ColumnElement, Connection, and_, exists, func, select, update
 
 from service.errors import AcquisitionError, BadBatch, Busy, Fault, shown_value
 from service.ingest.local_workers import ChunkEndsWorkers, LocalWorkers, WorkerConfig, WorkerLost
 from service.ingest.solver_pool import Solver
+from service.ingest.tracking import tracked_again
 from service.missions.mission import Mission
 from service.observations.schema import BatchIn, OptionsIn, Submission, submission_from_model
 from service.storage.archive.tables import archived_batches
+from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import PLACE, ResultFilter
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.sql.database import Store
-from service.storage.sql.tables import batches, results
+from service.storage.sql.statements import insert_runs
+from service.storage.sql.tables import batches, results, runs
+from service.times import utc_now
 
 CHUNK = 100
 """Batches that a worker takes, and that a transaction records."""
@@ -70,6 +74,8 @@ class ReprocessPlan:
     cache_bytes: int
     processes: int = 0
     """How many workers; 0: one a core, 1: none but this process."""
+    track: bool = False
+    """Whether batches are searched about the last attitude of the run, one after another."""
 
 
 @dataclass(frozen=True)
@@ -84,16 +90,23 @@ def reprocess(
     store: Store,
     plan: ReprocessPlan,
     catalog_digest: str,
+    own: Solver,
     step: Callable[[ReprocessProgress], object],
 ) -> ReprocessProgress:
     """Run every batch of the plan's stretch that its run does not hold yet.
 
-    `step` is called at the start and after each transaction.  Raises `BadBatch`
+    `own` computes what is to be tracked, workers all else.
+    `step` is called at the start and after each chunk.  Raises `BadBatch`
     for a run that is the source itself, or holds results of other settings.
     """
     require_same_settings(store, plan, catalog_digest)
     progress = _counted(store, plan)
+    if progress.before < progress.total:
+        begin_run(store, plan)
     step(progress)
+    if plan.track:
+        _track(store, plan, own, progress, step)
+        return progress
     with closing(_ChunkSolver(plan, catalog_digest)) as solver:
         waiting: deque[Callable[[], list[UnsavedResult | RefusedBatch]]] = deque()
         most = PENDING_A_WORKER * solver.count
@@ -116,7 +129,10 @@ def require_other_run(run: str, source: str | None) -> None:
 
 
 def require_same_settings(store: Store, plan: ReprocessPlan, catalog_digest: str) -> None:
-    """Raise `BadBatch` where the run is the source, or has results of other settings."""
+    """Raise `BadBatch` where the run is the source, or has results of other settings.
+
+    Whether it was begun with tracking is one of them.
+    """
     require_other_run(plan.run, plan.stretch.run)
     made_with = select(
         results.c.spacecraft, results.c.mission_digest, results.c.catalog_digest
@@ -129,6 +145,33 @@ def require_same_settings(store: Store, plan: ReprocessPlan, catalog_digest: str
                 what = "mission" if catalog == catalog_digest else "catalog"
                 message = f"holds results of {spacecraft} with another {what}: name another run"
                 raise BadBatch(Fault("run", message, shown_value(plan.run)))
+        was_tracked = connection.scalar(select(runs.c.tracked).where(runs.c.name == plan.run))
+        if was_tracked in (None, plan.track) or not _has_results(connection, plan.run):
+            return
+    message = (
+        "was begun with --track: continue it with --track, or name another run"
+        if was_tracked
+        else "was begun without --track: continue it without, or name another run"
+    )
+    raise BadBatch(Fault("run", message, shown_value(plan.run)))
+
+
+def begin_run(store: Store, plan: ReprocessPlan) -> None:
+    """Note the run, and whether it is tracked, before its first result."""
+
+    def change(connection: Connection) -> None:
+        insert_runs(connection, {plan.run: utc_now().text})
+        noted = update(runs).where(runs.c.name == plan.run)
+        connection.execute(noted.values(tracked=plan.track))
+
+    store.writer.change(change).result()
+
+
+def _has_results(connection: Connection, run: str) -> bool:
+    return any(
+        connection.execute(select(table.c.run).where(table.c.run == run).limit(1)).first()
+        for table in (results, archived_batches)
+    )
 
 
 def _conditions(plan: ReprocessPlan) -> list[ColumnElement[bool]]:
@@ -201,6 +244,33 @@ def _record(
             # Trouble of the database: nothing was decided about any of them.
             raise outcome
     progress.add_refused(refused)
+
+
+def _track(
+    store: Store,
+    plan: ReprocessPlan,
+    solver: Solver,
+    progress: ReprocessProgress,
+    step: Callable[[ReprocessProgress], object],
+) -> None:
+    """Run batches one after another, each recorded before the next is predicted from it."""
+    for chunk in _chunks(store, plan):
+        for input, options in chunk:
+            submission = submission_again(input, options, plan.run)
+            mission = plan.missions[submission.batch.spacecraft]
+            found: UnsavedResult | RefusedBatch
+            try:
+                with store.reading() as connection:
+                    submission = tracked_again(
+                        connection, submission, mission, plan.stretch.run or LIVE
+                    )
+                found = solver.solve(submission)
+            except Busy:
+                raise
+            except AcquisitionError as error:
+                found = RefusedBatch(submission.batch.batch, str(error))
+            _record(store, [found], progress)
+        step(progress)
 
 
 # ---- workers -----------------------------------------------------------------------------------

@@ -50,23 +50,47 @@ def asks_for_last(batch: ObservationBatch, mission: Mission | None) -> bool:
     return is_default and batch.a_priori is None and batch.measurement is None
 
 
-def with_prediction(connection: Connection, submission: Submission, mission: Mission) -> Submission:
+def with_prediction(
+    connection: Connection, submission: Submission, mission: Mission, gyro_run: str | None = None
+) -> Submission:
     """The submission with the prediction in its batch, or the reason why there is none.
 
-    The fingerprint stays that of what was sent.
+    The fingerprint stays that of what was sent.  The gyro is that of `gyro_run`, by default of
+    the batch's own run.
     """
     batch = submission.batch
     told: dict[str, Any] = {"from": "last"}
     if batch.tracking is None:
         told["by_default"] = True
-    told["prediction"] = _prediction(connection, batch, mission)
+    told["prediction"] = _prediction(connection, batch, mission, gyro_run or batch.run)
     body = json.loads(submission.text) | {"a_priori": told}
     made = submission_from_json(json.dumps(body))
     return structs.replace(submission, batch=made.batch, text=made.text)
 
 
+def tracked_again(
+    connection: Connection, submission: Submission, mission: Mission, gyro_run: str
+) -> Submission:
+    """A recorded batch in another run, with a prediction from the last attitude of that run.
+
+    It takes the place of any a priori knowledge.  Where nothing can be predicted, knowledge that
+    was sent with the batch stays.  A batch without stars is left as it is.
+    """
+    if submission.batch.measurement is not None:
+        return submission
+    body = json.loads(submission.text)
+    prior = body.get("a_priori") or {}
+    was_tracked = prior.get("from") == "last"
+    asked = None if prior.get("by_default") else {"from": "last"}
+    anew = submission_from_json(json.dumps(body | {"a_priori": asked}))
+    made = with_prediction(connection, anew, mission, gyro_run)
+    assert made.batch.tracking is not None
+    is_nothing_else = was_tracked or not prior
+    return made if is_nothing_else or made.batch.tracking.reason is None else submission
+
+
 def _prediction(
-    connection: Connection, batch: ObservationBatch, mission: Mission
+    connection: Connection, batch: ObservationBatch, mission: Mission, gyro_run: str
 ) -> dict[str, Any]:
     settings = mission.tracking or TrackingSettings()
     attitudes = last_attitudes(
@@ -80,7 +104,7 @@ def _prediction(
     before = attitudes[1] if len(attitudes) > 1 else None
     if before and any(flip.lies_between(before.time, last.time) for flip in settings.flips):
         before = None
-    predicted, source = _predicted(connection, batch, mission, last, before)
+    predicted, source = _predicted(connection, batch, mission, last, before, gyro_run)
     floor_rad = math.radians(settings.floor_deg) / MARGIN_SIGMAS
     covariance_rad2 = predicted.covariance_rad2 + np.eye(3) * floor_rad**2
     sigma_deg = math.degrees(math.sqrt(float(np.linalg.eigvalsh(covariance_rad2)[-1])))
@@ -106,11 +130,12 @@ def _predicted(
     mission: Mission,
     last: RecordedAttitude,
     before: RecordedAttitude | None,
+    gyro_run: str,
 ) -> tuple[Known, RateSource]:
     """The attitude at the batch's time: by the gyro where it is recorded, else at a rate."""
     now_ns = batch.time.tai_ns
     motion = mission.motion or MotionSettings()
-    by_gyro = _by_gyro(connection, batch, mission, last, motion)
+    by_gyro = _by_gyro(connection, batch, mission, last, motion, gyro_run)
     if by_gyro is not None:
         return by_gyro, "gyro"
     rate, source = _rate(batch, mission, last, before, motion)
@@ -146,13 +171,14 @@ def _by_gyro(
     mission: Mission,
     last: RecordedAttitude,
     motion: MotionSettings,
+    gyro_run: str,
 ) -> Known | None:
     if mission.gyro is None:
         return None
     start = shifted(last.time, -SAMPLES_BEFORE_S)
     # The end of a filter is excluded.
     end = shifted(batch.time, 1e-6)
-    selected = BlockFilter(batch.spacecraft, batch.run, start, end)
+    selected = BlockFilter(batch.spacecraft, gyro_run, start, end)
     tai_ns, rates = gyro_in(connection, selected)
     if len(tai_ns) < 2 or not believed(mission.gyro, rates).all():
         return None

@@ -111,7 +111,7 @@ def test_every_kernel_is_compiled_by_one_child(processors):
     named = [name for share in shares for name in (*share.zones, *share.others)]
     assert sorted(named) == sorted(IDENTIFIERS)
     assert all(IDENTIFIERS[name].searches_zone for share in shares for name in share.zones)
-    assert [share.linking for share in shares].count(True) == 1
+    assert [share.over_batches for share in shares].count(True) == 1
 
 
 def test_what_batches_with_a_zone_need_is_compiled_without_the_whole_sky(

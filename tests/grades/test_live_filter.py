@@ -6,23 +6,28 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from types import SimpleNamespace
 
 import httpx
 import numpy as np
 import pytest
 
+from service.app.telemetry.live_filter import LiveFilter
 from service.errors import NotFound
 from service.filtering.samples import AttitudeMeasurements
-from service.grades.carried import CarriedFilter
-from service.grades.day import grade_day
+from service.grades.carried import CarriedFilter, live_window
+from service.grades.day import grade_day, window_of
+from service.grades.measured import attitudes_where
 from service.observations.schema import submission_from_json
 from service.storage.archive.archiving import archive
 from service.storage.archive.restoring import PartFilter, restore
+from service.storage.grades.inputs import recorded_in
 from service.storage.upkeep.verify import verify
 from service.times import DAY_S, parse_utc
-from service.vectors import ARCSEC_PER_RADIAN
-from tests.grades.passes import GYRO, NOON, NOON_NS, mission_with
-from tests.grades.records import at, put_gyro
+from service.vectors import ARCSEC_PER_RADIAN, attitude_error_arcsec, matrix_from_quaternion
+from tests.filtering.simulated import attitudes_of, gyro_of, slews, truth_of
+from tests.grades.passes import GYRO, MODEL, NOON, NOON_NS, mission_with, recorded_of
+from tests.grades.records import at, put_attitudes, put_gyro
 from tests.missions.without_gyro import mission_without_gyro, text_without_gyro
 from tests.web.serving import served
 
@@ -170,6 +175,59 @@ def test_it_answers_what_smooth_records_and_another_process_answers_the_same(
     assert again.revision == 1
 
 
+def test_it_depends_on_the_six_hours_before_the_hour_of_the_latest_batch(live, missions, rng):
+    """Eight and a half hours from noon on, so that the record of the window begins at 14:00."""
+    mission = mission_with(missions["XTE"], gyro=GYRO)
+    truth = truth_of(slews, 8.5 * 3600.0, step_s=10.0)
+    gyro, _ = gyro_of(truth, MODEL, rng)
+    attitudes = attitudes_of(truth, np.arange(0, len(truth.time_s), 8), (6.0, 6.0, 40.0), rng)
+    recorded = recorded_of(gyro.tai_ns, gyro.rate_rad_s, attitudes)
+    put_gyro(live, recorded.gyro_ns, recorded.rates_rad_s)
+    day, end = NOON.bucket(DAY_S), at(NOON_NS + 30_600 * 10**9)
+    assert live_window(end)[0].text == "1999-03-01T14:00:00.000Z"
+
+    def last_of(window):
+        with live.store.reading() as connection:
+            found = recorded_in(connection, live.sky, "XTE", "live", *window)
+        (stretch,) = grade_day(found, mission, day).stretches
+        return stretch.samples["filtered"].taken(slice(-1, None))
+
+    def latest():
+        live.live_filter.refresh("XTE")
+        return live.live_filter.latest("XTE")
+
+    def assert_is_of_the_window(found):
+        expected = last_of(live_window(end))
+        assert found.time == end.text
+        assert found.quaternion == expected.quaternion[0].tolist()
+        p11, p12, p13, p22, p23, p33 = expected.covariance_arcsec2[0].tolist()
+        assert found.covariance_arcsec2 == [[p11, p12, p13], [p12, p22, p23], [p13, p23, p33]]
+        assert found.bias_deg_per_h == expected.bias_deg_per_h[0].tolist()
+
+    # One attitude every 80 s: those of 13:00 to 13:01:20 and of 15:00 to 15:01:20 come late.
+    row = np.arange(len(attitudes.tai_ns))
+    early, late = (row == 45) | (row == 46), (row == 135) | (row == 136)
+    put_attitudes(live, attitudes_where(recorded.attitudes, ~(early | late)))
+    first = latest()
+    assert_is_of_the_window(first)
+    # The whole day began two hours earlier, which makes no difference any more.
+    whole = last_of(window_of(day))
+    apart_arcsec = attitude_error_arcsec(
+        matrix_from_quaternion(first.quaternion), matrix_from_quaternion(whole.quaternion[0])
+    )
+    sigma_arcsec = np.sqrt(np.diag(first.covariance_arcsec2))
+    assert (np.abs(apart_arcsec) < 1e-3 * sigma_arcsec).all()
+    assert np.diag(first.covariance_arcsec2) == pytest.approx(
+        whole.covariance_arcsec2[0][[0, 3, 5]], rel=1e-3
+    )
+    send(live, attitudes_where(recorded.attitudes, early))
+    assert latest() == first
+    send(live, attitudes_where(recorded.attitudes, late))
+    second = latest()
+    assert_is_of_the_window(second)
+    assert second.bias_deg_per_h != first.bias_deg_per_h
+
+
 def test_readers_have_the_last_attitude_while_the_next_is_computed(live, half_hour):
     first, whole = before(half_hour[1], 300), half_hour[1]
     put_gyro(live, first.gyro_ns, first.rates_rad_s)
@@ -204,6 +262,32 @@ def test_a_request_does_not_wait_for_the_first_look_of_the_thread(live, half_hou
         live.live_filter.latest("XTE")
     live.live_filter.refresh("XTE")
     assert live.live_filter.latest("XTE").time == "1999-03-01T12:05:00.000Z"
+
+
+def test_the_thread_waits_for_the_kernels(live, half_hour):
+    recorded = before(half_hour[1], 300)
+    put_gyro(live, recorded.gyro_ns, recorded.rates_rad_s)
+    send(live, recorded.attitudes)
+    kernels = SimpleNamespace(is_needed=True)
+    waiting = LiveFilter(live.context, kernels)
+    waiting.start()
+
+    def is_there():
+        try:
+            return waiting.latest("XTE").time == "1999-03-01T12:05:00.000Z"
+        except NotFound:
+            return False
+
+    try:
+        time.sleep(0.3)
+        assert not is_there()
+        kernels.is_needed = False
+        give_up = time.monotonic() + 60.0
+        while not is_there():
+            assert time.monotonic() < give_up
+            time.sleep(0.05)
+    finally:
+        waiting.stop()
 
 
 def test_a_mission_without_the_table_has_none(app):

@@ -3,8 +3,8 @@
 from service.storage.recording import rollups
 from service.storage.recording.ids import Ulids
 from service.storage.recording.unsaved_result import Buckets
-from service.storage.sql.statements import insert_all, insert_missing
-from service.storage.sql.tables import batches, results, runs
+from service.storage.sql.statements import insert_all, insert_runs
+from service.storage.sql.tables import batches, results
 from service.times import DAY_S, HOUR_S, parse_utc
 
 
@@ -58,11 +58,7 @@ def put(app, rows):
 
     def write(connection):
         names = {batch["run"]: batch["received"] for batch, _ in rows}
-        insert_missing(
-            connection,
-            runs,
-            [{"name": n, "created": c, "alarms": False} for n, c in names.items()],
-        )
+        insert_runs(connection, names)
         insert_all(connection, batches, [batch for batch, _ in rows])
         insert_all(connection, results, [result for _, result in rows])
         rollups.add(connection, [(_buckets(batch), result) for batch, result in rows])

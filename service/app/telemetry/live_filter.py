@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 
 from sqlalchemy import func, select
 
+from service.acquire.kernel_build import KernelBuild
 from service.app.context import Context
 from service.errors import AcquisitionError, NotFound
-from service.grades.carried import CarriedFilter
-from service.grades.day import day_bounds, window_of
+from service.grades.carried import CarriedFilter, live_window
+from service.grades.day import day_bounds
 from service.missions.mission import mission_named
 from service.storage.grades.inputs import recorded_in
 from service.storage.grades.live import LiveAttitude, live_attitude
@@ -35,7 +36,6 @@ class _Kept:
 
     filter: CarriedFilter = field(default_factory=CarriedFilter)
     version: tuple[int, str | None] | None = None
-    day: int | None = None
     attitude: LiveAttitude | None = None
 
 
@@ -46,8 +46,9 @@ class LiveFilter:
     started again gives the same.
     """
 
-    def __init__(self, context: Context) -> None:
+    def __init__(self, context: Context, kernels: KernelBuild | None = None) -> None:
         self._context = context
+        self._kernels = kernels
         self._kept: dict[str, _Kept] = {}
         self._lock = threading.Lock()
         self._stopped = threading.Event()
@@ -95,6 +96,9 @@ class LiveFilter:
     def _keep_up(self) -> None:
         due = dict.fromkeys(self._names(), 0.0)
         while not self._stopped.wait(max(0.05, min(due.values()) - time.monotonic())):
+            if self._kernels is not None and self._kernels.is_needed:
+                # Compiled here they would hold up the requests; other processes do that.
+                continue
             name = min(due, key=lambda each: due[each])
             begun = time.monotonic()
             try:
@@ -119,16 +123,14 @@ class LiveFilter:
                 if kept.version == version:
                     return kept
                 row = newest(connection, _TIMES, ResultFilter(LIVE, name), utc_now())
-                day = None if row is None else recorded_utc(row["time"]).bucket(DAY_S)
-                if day is not None:
-                    window = window_of(day)
+                latest = None if row is None else recorded_utc(row["time"])
+                if latest is not None:
+                    window = live_window(latest)
                     recorded = recorded_in(connection, self._context.sky, name, LIVE, *window)
-            if day != kept.day:
-                kept.filter, kept.day = CarriedFilter(), day
             attitude = None
-            if day is not None:
+            if latest is not None:
                 carried = kept.filter.carry_on(recorded, mission)
-                attitude = live_attitude(name, day_bounds(day)[0], carried)
+                attitude = live_attitude(name, day_bounds(latest.bucket(DAY_S))[0], carried)
             # Readers do not wait: until now they had the one before.
             kept.attitude, kept.version = attitude, version
             return kept

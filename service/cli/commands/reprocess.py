@@ -36,6 +36,7 @@ def add(commands: Any) -> None:
         """
         acquire reprocess --start 1996-010T00:00:00Z --end 1996-020T00:00:00Z
         acquire reprocess --mission wider.toml --run wider
+        acquire reprocess --spacecraft XTE --run xte-tracked --track
         acquire reprocess --source pass-7 --spacecraft XTE --run pass-7-again --json
         acquire reprocess --mission wider.toml --run wider --archive /archive
         acquire reprocess --run again --archive /archive --scheduler tls://10.0.0.1:8786
@@ -69,6 +70,12 @@ def add(commands: Any) -> None:
         metavar="tls://HOST:PORT",
         help="with --archive: compute on the workers of this Dask scheduler",
     )
+    parser.add_argument(
+        "--track",
+        action="store_true",
+        help="search each batch about the attitude that is predicted from the last good one of "
+        "the results, one batch after another",
+    )
     parser.add_argument("--no-comparison", action="store_true", help="do not compare both runs")
     add_json(parser, "the comparison")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
@@ -101,6 +108,7 @@ def run(parsed: Namespace) -> int:
         mission_named(load_missions(settings_of(parsed).missions), spacecraft)
     if parsed.run is not None:
         require_other_run(checked_run_name(parsed.run), parsed.source)
+    _check_track(parsed)
     _check_archive(parsed)
     settings = settings_of_existing(parsed)
     if parsed.archive is not None:
@@ -125,7 +133,7 @@ def run(parsed: Namespace) -> int:
             processes = parsed.processes or 0
             if parsed.archive is None:
                 progress = app.runs.reprocess_recorded(
-                    parsed.run, **period, processes=processes, step=step
+                    parsed.run, **period, processes=processes, track=parsed.track, step=step
                 )
             else:
                 progress = app.runs.reprocess_into_archive(
@@ -151,6 +159,21 @@ def run(parsed: Namespace) -> int:
         if compared is not None:
             print(comparison_text(compared))
     return 1 if progress.refused else 0
+
+
+def _check_track(parsed: Namespace) -> None:
+    """Raise `BadInput` for what --track cannot be with."""
+    if not parsed.track:
+        return
+    if parsed.archive is not None:
+        message = (
+            "cannot be used with --archive: each batch needs the result of the one before, and "
+            "the parts of an archive are computed in any order"
+        )
+        raise BadInput(Fault("--track", message))
+    if parsed.processes is not None:
+        message = "leave it out with --track, which computes one batch after another"
+        raise BadInput(Fault("--processes", message))
 
 
 def _check_archive(parsed: Namespace) -> None:

@@ -13,20 +13,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import quote
 
-from sqlalchemy import Connection
-
 from service.ingest.partitions.plan import Planner
 from service.ingest.partitions.tasks import PartitionResult, PartitionTask
 from service.ingest.partitions.workers import Wait, Workers, remove_unfinished
-from service.ingest.reprocess import ReprocessPlan, ReprocessProgress, require_same_settings
+from service.ingest.reprocess import (
+    ReprocessPlan,
+    ReprocessProgress,
+    begin_run,
+    require_same_settings,
+)
 from service.storage.archive.archiving import keep_settings
 from service.storage.archive.folder import UNFINISHED, locked
 from service.storage.archive.owner import claim
 from service.storage.archive.reprocessed import merge, name_part, restore_newest, unmerged
 from service.storage.archive.reprocessing import Reprocessing, now_text, write_reprocessing
 from service.storage.sql.database import Store
-from service.storage.sql.statements import insert_missing
-from service.storage.sql.tables import runs
 
 TOLD_EVERY_S = 1.0
 """How often the state is written, and `step` called, while nothing comes."""
@@ -94,7 +95,7 @@ def reprocess_partitions(
             claim(connection, folder)
             digests = [each.digest for each in plan.missions.values()]
             keep_settings(connection, folder, digests, [catalog_digest])
-        store.writer.change(lambda connection: _insert_run(connection, plan.run)).result()
+        begin_run(store, plan)
         unfinished = f".run-{quote(plan.run, safe='')}-*{UNFINISHED}"
         remove_unfinished(folder, unfinished)
         for path, made in unmerged(store, folder, plan.run):
@@ -107,10 +108,6 @@ def reprocess_partitions(
         remove_unfinished(folder, unfinished)
         told.tell(finished=True)
     return progress
-
-
-def _insert_run(connection: Connection, run: str) -> None:
-    insert_missing(connection, runs, [{"name": run, "created": now_text(), "alarms": False}])
 
 
 def _run_tasks(

@@ -30,8 +30,8 @@ from service.storage.recording import rollups
 from service.storage.recording.archived_hours import forget_share
 from service.storage.recording.unsaved_result import Buckets
 from service.storage.sql.database import Store
-from service.storage.sql.statements import insert_missing
-from service.storage.sql.tables import batches, catalogs, missions, runs
+from service.storage.sql.statements import insert_missing, insert_runs
+from service.storage.sql.tables import batches, catalogs, missions
 from service.times import DAY_S, HOUR_S, Utc, parse_utc
 
 _AT_ONCE = 1_000
@@ -115,7 +115,7 @@ def put_back(connection: Connection, folder: Path, part: Part, rows: Rows) -> bo
     for digests, table in ((part.missions, missions), (part.catalogs, catalogs)):
         insert_missing(connection, table, [read_settings(folder, each).row for each in digests])
     created = pc.min(rows["batches"]["received"]).as_py()
-    insert_missing(connection, runs, [{"name": part.run, "created": created, "alarms": False}])
+    insert_runs(connection, {part.run: created})
     if part_id is not None:
         spacecraft = rows["batches"]["spacecraft"][0].as_py()
         # As where they are archived.

@@ -16,7 +16,7 @@ from service.storage.models.base import Page
 from service.storage.recording import events
 from service.storage.sql.columns import Row
 from service.storage.sql.gyro_tables import gyro_blocks
-from service.storage.sql.statements import insert_missing
+from service.storage.sql.statements import insert_runs
 from service.storage.sql.tables import runs
 from service.times import Utc, recorded_utc, shifted
 from service.vectors import Vector
@@ -117,11 +117,7 @@ def find_block(connection: Connection, block: GyroBlock, row: Row) -> GyroBlockR
 
 def record_block(connection: Connection, block: GyroBlock, row: Row) -> Recorded:
     """Record a block that is new, and add an event; see `find_block`."""
-    insert_missing(
-        connection,
-        runs,
-        [{"name": block.run, "created": row["received"], "alarms": False}],
-    )
+    insert_runs(connection, {block.run: row["received"]})
     # Of two processes that record blocks of a run, one waits: neither sees the other's samples.
     lock = select(runs.c.name).where(runs.c.name == block.run)
     connection.execute(lock.with_for_update(key_share=True))

@@ -21,7 +21,7 @@ from service.storage.recording.tracking import note_states
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.sql.access_tables import audit
 from service.storage.sql.columns import Row
-from service.storage.sql.statements import insert_all, insert_missing
+from service.storage.sql.statements import insert_all, insert_missing, insert_runs
 from service.storage.sql.tables import (
     batches,
     catalogs,
@@ -72,7 +72,7 @@ def _trackers(settings: str) -> int:
 
 def set_run_alarms(connection: Connection, run: str, watched: bool, now: str) -> None:
     """Let limits be held against a run, or no longer; the run is made where there is none."""
-    insert_missing(connection, runs, [{"name": run, "created": now, "alarms": watched}])
+    insert_runs(connection, {run: now}, alarms=watched)
     connection.execute(update(runs).where(runs.c.name == run).values(alarms=watched))
 
 
@@ -170,11 +170,7 @@ def _insert(
     if len(known) > _REMEMBERED:
         known.clear()
     missing = [name for name in sorted(names) if not assume_new or name not in known]
-    insert_missing(
-        connection,
-        runs,
-        [{"name": name, "created": names[name], "alarms": False} for name in missing],
-    )
+    insert_runs(connection, {name: names[name] for name in missing})
     known.update(missing)
     insert_all(connection, batches, [unsaved.batch for unsaved, _ in firsts if unsaved.batch])
     require_not_archived(connection, [unsaved.identity for unsaved, _ in firsts])

@@ -21,7 +21,7 @@ from service.storage.sql.engines import database_url, reading_engine, shown_url,
 if TYPE_CHECKING:
     from alembic.config import Config
 
-HEAD = "0015"
+HEAD = "0016"
 """The latest revision of `migrations/`."""
 
 

@@ -1,7 +1,7 @@
 """The inserts of results and of their part in the trends."""
 
 import operator
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -24,6 +24,7 @@ from sqlalchemy.exc import DBAPIError
 from service.storage.sql.columns import Row
 from service.storage.sql.prepared import Prepared
 from service.storage.sql.rollup_tables import COUNTS, MAXIMA, MINIMA, SUMS
+from service.storage.sql.tables import runs
 
 COPIED_FROM = 50
 """Rows; to set a COPY up takes as long as to insert a few."""
@@ -51,6 +52,15 @@ def insert_all(connection: Connection, table: Table, rows: Sequence[Row]) -> Non
 def insert_missing(connection: Connection, table: Table, rows: Sequence[Row]) -> None:
     """Insert the rows whose keys are not there yet; leave the others as they are."""
     _insert_missing(table).run(connection, rows)
+
+
+def insert_runs(
+    connection: Connection, created: Mapping[str, str], *, alarms: bool = False
+) -> None:
+    """Note runs by the moments when they were made; known ones stay as they are."""
+    others = {"alarms": alarms, "tracked": False}
+    rows = [{"name": name, "created": moment} | others for name, moment in created.items()]
+    insert_missing(connection, runs, rows)
 
 
 def add_rollups(connection: Connection, table: Table, rows: Sequence[Row]) -> None:

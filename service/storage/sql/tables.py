@@ -64,6 +64,8 @@ runs = Table(
     Column("created", Moment, nullable=False),
     # Whether limits are held against the run; live batches are watched in any case.
     Column("alarms", Boolean, nullable=False, server_default=false()),
+    # Whether it was reprocessed with tracking: it must not continue without, nor another with.
+    Column("tracked", Boolean, nullable=False, server_default=false()),
 )
 
 missions = Table(
