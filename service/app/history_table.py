@@ -1,4 +1,4 @@
-"""Histories as tables: the names of the columns with their units, and a row a bucket or batch."""
+"""Histories as tables: the names of the columns with units, and one row per bucket or batch."""
 
 from collections.abc import Iterator
 from itertools import chain

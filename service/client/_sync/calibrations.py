@@ -25,7 +25,7 @@ class Calibrations(Connection):
     ) -> Calibration:
         """Begin a calibration from recorded batches; read it again until its `state` is done.
 
-        Without a `degree` that of the distortion is chosen by held-out blocks of time.
+        Without a `degree`, the distortion gets the degree that fits held-out blocks of time best.
         """
         asked = parameters_of(
             {

@@ -116,7 +116,7 @@ def insert_rows(connection: Connection, rows: Rows) -> None:
 
 
 def to_partition(rows: Rows) -> pa.Table:
-    """The rows as one table: a row a result with its batch, and lists of what belongs to it."""
+    """The rows as one table: one row per result with its batch, and lists of what belongs to it."""
     made = rows["results"]
     place = pc.index_in(made["batch_id"], value_set=rows["batches"]["id"])
     columns = {name: made[name] for name in made.column_names}

@@ -1,4 +1,4 @@
-"""Gyro samples as a table, in order of time: a row a sample."""
+"""Gyro samples as a table, in order of time: one row per sample."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager

@@ -1,4 +1,4 @@
-"""The tables of filtered and smoothed attitudes: a row a day, and its samples packed in blocks.
+"""The tables of filtered and smoothed attitudes: one row per day, its samples packed in blocks.
 
 A day that is computed again from other facts gets a new row with the next revision, which is
 then the current one.  Rows of earlier revisions stay, without their samples.

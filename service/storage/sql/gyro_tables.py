@@ -1,4 +1,4 @@
-"""The table of gyro blocks: a row a block, its samples packed."""
+"""The table of gyro blocks: one row per block, with its samples packed."""
 
 from sqlalchemy import (
     BigInteger,

@@ -75,7 +75,8 @@ class CalibrationIn(_Period):
             ge=0,
             le=LARGEST_DEGREE,
             strict=True,
-            description="Of the distortion, 0: none; null: chosen by held-out blocks of time.",
+            description="Degree of the distortion; 0: none; null: the degree that fits held-out "
+            "blocks of time best.",
         ),
     ] = None
     alignment: Annotated[bool, Field(description="Estimate alignment between trackers.")] = True

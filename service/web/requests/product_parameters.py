@@ -37,7 +37,8 @@ Grades = Annotated[
 TableKindPath = Annotated[
     TableKind,
     Path(
-        description="`batches`: a row a batch; `stars`: a row a star; `gyro`: a row a gyro sample."
+        description="`batches`: one row per batch; `stars`: one row per star; "
+        "`gyro`: one row per gyro sample."
     ),
 ]
 

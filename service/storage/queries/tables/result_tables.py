@@ -1,4 +1,4 @@
-"""Current results as tables, in order of time: a row a batch, or a row a star."""
+"""Current results as tables, in order of time: one row per batch, or one per star."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
