@@ -165,21 +165,22 @@ def rows_of(url):
 def schema_of(url):
     """Everything that the database says of its tables, by table and kind; order does not count."""
     engine = create_engine(database_url(url), poolclass=NullPool)
-    seen = inspect(engine)
-    found = {}
-    for table in seen.get_table_names():
+    with engine.connect() as connection:
+        seen = inspect(connection)
         told = (
-            seen.get_columns(table),
-            [seen.get_pk_constraint(table)],
-            seen.get_foreign_keys(table),
-            seen.get_unique_constraints(table),
-            seen.get_indexes(table),
-            seen.get_check_constraints(table),
+            seen.get_multi_columns(),
+            {key: [one] for key, one in seen.get_multi_pk_constraint().items()},
+            seen.get_multi_foreign_keys(),
+            seen.get_multi_unique_constraints(),
+            seen.get_multi_indexes(),
+            seen.get_multi_check_constraints(),
         )
-        for kind, entries in zip(COMPARED, told, strict=True):
-            found[table, kind] = sorted(_as_text(entry) for entry in entries)
     engine.dispose()
-    return found
+    return {
+        (table, kind): sorted(_as_text(entry) for entry in entries)
+        for kind, by_table in zip(COMPARED, told, strict=True)
+        for (_, table), entries in by_table.items()
+    }
 
 
 def _as_text(entry):
