@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from service.errors import BadInput, Fault
 from service.filtering.state import FilterState, Outcome, Status
-from service.vectors import Vector
+from service.vectors import Vector, read_only
 
 Integers = npt.NDArray[np.int64]
 T = TypeVar("T", "AttitudeHistory", "Innovations", "Steps")
@@ -143,5 +143,8 @@ def joined(results: Sequence[FilterResult]) -> FilterResult:
 def _joined(parts: Sequence[T]) -> T:
     """Records of arrays, one after the other."""
     names = [each.name for each in fields(parts[0])]
-    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    # Read-only as in each part: the smoother would be compiled once more for other arrays.
+    joined = {
+        name: read_only(np.concatenate([getattr(part, name) for part in parts])) for name in names
+    }
     return type(parts[0])(**joined)

@@ -6,6 +6,7 @@ from service.filtering.compiling import compile_filtering
 from service.filtering.filter import filter_attitude
 from service.filtering.forward import run_filter
 from service.filtering.gyro import ConstantRateModel, GyroModel
+from service.filtering.result import joined
 from service.filtering.samples import GyroSamples
 from service.filtering.smoother import run_smoother, settle, smooth
 from tests.filtering.simulated import attitudes_of, gyro_of, slews, truth_of
@@ -19,7 +20,7 @@ def test_every_use_finds_what_was_compiled_at_the_start(rng):
     result = filter_attitude(model, gyro, attitudes)
     smooth(result, model)
     later = GyroSamples(gyro.tai_ns[-1:] + 10**9, gyro.rate_rad_s[-1:])
-    filter_attitude(model, later, state=result.state)
+    smooth(joined([result, filter_attitude(model, later, state=result.state)]), model)
     constant = ConstantRateModel(1e-6)
     smooth(filter_attitude(constant, attitudes=attitudes), constant)
     # Another kind of array would be compiled for itself.
