@@ -12,7 +12,6 @@ import numpy.typing as npt
 from service.errors import BadInput, Fault
 from service.filtering.forward import (
     AGREED,
-    CONFIRMED,
     IN_A_ROW,
     SINCE_NS,
     Epochs,
@@ -181,6 +180,7 @@ def noise_of(model: GyroModel, settings: FilterSettings | None = None) -> Noise:
     """The model and the settings as the kernels take them."""
     settings = settings or FilterSettings()
     gate_2, gate_3 = _gates(settings.gate_tail)
+    start_gate_3 = _gates(max(settings.gate_tail, settings.start_gate_tail))[1]
     return Noise(
         angle=float(model.sigma_v_rad_s0_5**2),
         bias=float(model.sigma_u_rad_s1_5**2),
@@ -191,6 +191,8 @@ def noise_of(model: GyroModel, settings: FilterSettings | None = None) -> Noise:
         misalignment=float(model.misalignment_rad**2),
         gate_2=gate_2,
         gate_3=gate_3,
+        start_gate_3=start_gate_3,
+        start_redundancy=settings.start_redundancy,
         confirmations=settings.confirmations,
         reset_after_ns=round(settings.reset_after_s / NS),
         lost=float(settings.lost_rad**2),
@@ -208,15 +210,16 @@ def _gates(tail: float) -> tuple[float, float]:
 
 def _track(state: FilterState | None, noise: Noise) -> Track:
     """The state to work on; a copy of what is given."""
-    counts, doubt_rad = np.zeros(5, dtype=np.int64), np.zeros(1)
+    counts, redundancy, doubt_rad = np.zeros(4, dtype=np.int64), np.zeros(1), np.zeros(1)
     if state is None:
         covariance = np.diag([0.0, 0.0, 0.0, *[noise.first_bias] * 3])
         none, zero = np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
         status = np.array([int(Status.NONE)])
-        return Track(none, zero, covariance, zero.copy(), none.copy(), status, counts, doubt_rad)
-    counts[CONFIRMED], counts[IN_A_ROW] = state.accepted, state.rejected
-    counts[AGREED], counts[SINCE_NS] = state.agreed, state.rejected_since_ns
-    doubt_rad[0] = state.doubt_rad
+        rest = (status, counts, redundancy, doubt_rad)
+        return Track(none, zero, covariance, zero.copy(), none.copy(), *rest)
+    counts[IN_A_ROW], counts[AGREED] = state.rejected, state.agreed
+    counts[SINCE_NS] = state.rejected_since_ns
+    redundancy[0], doubt_rad[0] = state.redundancy, state.doubt_rad
     return Track(
         state.quaternion.copy(),
         state.bias_rad_s.copy(),
@@ -225,6 +228,7 @@ def _track(state: FilterState | None, noise: Noise) -> Track:
         state.rival.copy(),
         np.array([int(state.status)]),
         counts,
+        redundancy,
         doubt_rad,
     )
 
@@ -240,7 +244,7 @@ def _state(track: Track, tai_ns: int, rate_rad_s: Vector) -> FilterState:
         anchor_rad_s=read_only(track.anchor),
         rival=read_only(track.rival),
         status=Status(int(track.status[0])),
-        accepted=counts[CONFIRMED],
+        redundancy=float(track.redundancy[0]),
         rejected=counts[IN_A_ROW],
         agreed=counts[AGREED],
         rejected_since_ns=counts[SINCE_NS],

@@ -15,6 +15,7 @@ from service.filtering.updates import (
     correct,
     innovate,
     innovation_covariance,
+    redundancy_of,
 )
 
 NONE, STARTING, GOOD = int(Status.NONE), int(Status.STARTING), int(Status.GOOD)
@@ -22,14 +23,16 @@ DOUBTFUL, LOST = int(Status.DOUBTFUL), int(Status.LOST)
 UNUSED, ACCEPTED = int(Outcome.UNUSED), int(Outcome.ACCEPTED)
 REJECTED, STARTED = int(Outcome.REJECTED), int(Outcome.STARTED)
 UNDECIDED = int(Outcome.UNDECIDED)
-CONFIRMED, IN_A_ROW, AGREED, SINCE_NS, HERE = 0, 1, 2, 3, 4
+IN_A_ROW, AGREED, SINCE_NS, HERE = 0, 1, 2, 3
 """Rows of `Track.counts`; HERE counts those accepted at the present epoch."""
+LEAST_REDUNDANCY = 0.25
+"""What any accepted measurement adds: some rates are too uncertain ever to predict well."""
 
 
 class Track(NamedTuple):
     """The state while it is worked on: see `FilterState`.
 
-    `status` (1,), `counts` (5,) by the rows above, `doubt_rad` (1,).
+    `status` (1,), `counts` (4,) by the rows above, `redundancy` (1,), `doubt_rad` (1,).
     """
 
     quaternion: Any
@@ -39,6 +42,7 @@ class Track(NamedTuple):
     rival: Any
     status: Any
     counts: Any
+    redundancy: Any
     doubt_rad: Any
 
 
@@ -114,7 +118,14 @@ def _measure(track, m, tai_ns, measured, noise, innovations, work):  # type: ign
         return
     z, s, h, r = innovations.innovation[m], innovations.covariance[m], work.partials, work.noise
     size, angle = innovate(track.quaternion, measured, m, z, h, work.small)
-    gate = noise.gate_3 if size == 3 else noise.gate_2
+    # Before the start is confirmed, nothing speaks for the older measurement.
+    confirmed = track.redundancy[0] >= noise.start_redundancy
+    if size == 2:
+        gate = noise.gate_2
+    elif confirmed:
+        gate = noise.gate_3
+    else:
+        gate = noise.start_gate_3
     copy(measured.covariance[m], r)
     if kind != ATTITUDE:
         add_curvature(track.covariance, r)
@@ -123,13 +134,14 @@ def _measure(track, m, tai_ns, measured, noise, innovations, work):  # type: ign
     innovations.nis[m] = nis
     if nis <= gate and (counts[IN_A_ROW] == 0 or _decides(track, measured, m, gate, noise, work)):
         innovations.outcome[m] = ACCEPTED
+        if not confirmed:
+            track.redundancy[0] += max(redundancy_of(r, size, work), LEAST_REDUNDANCY)
         correct(track.covariance, z, h, size, r, work)
         _accept(track, noise, work)
         return
     innovations.outcome[m] = REJECTED if nis > gate else UNDECIDED
-    # Before the start is confirmed, nothing speaks for the older measurement.
-    again = counts[CONFIRMED] < noise.confirmations
-    if not again and counts[HERE] == 0:
+    again = not confirmed
+    if confirmed and counts[HERE] == 0:
         _contradict(track, tai_ns, nis > gate, angle, z, h, size, work)
         again = tai_ns - counts[SINCE_NS] >= noise.reset_after_ns
     if again and kind == ATTITUDE:
@@ -196,11 +208,10 @@ def _start(track, m, measured, noise, bias_is_known):  # type: ignore[no-untyped
             p[i, j + 3] = p[j + 3, i] = 0.0
             if not bias_is_known:
                 p[i + 3, j + 3] = noise.first_bias if i == j else 0.0
-    for i in range(5):
+    for i in range(4):
         track.counts[i] = 0
-    track.counts[CONFIRMED] = 1
-    track.doubt_rad[0] = 0.0
-    track.status[0] = STARTING if noise.confirmations > 1 else GOOD
+    track.redundancy[0] = track.doubt_rad[0] = 0.0
+    track.status[0] = STARTING if noise.start_redundancy > 0.0 else GOOD
 
 
 @njit_no_refcount
@@ -211,7 +222,6 @@ def _accept(track, noise, work):  # type: ignore[no-untyped-def]
     for i in range(3):
         track.bias[i] += work.dx[i + 3]
     counts[HERE] += 1
-    counts[CONFIRMED] = min(counts[CONFIRMED] + 1, noise.confirmations)
     if counts[IN_A_ROW] > 0:
         counts[AGREED] += 1
         # Short of a confirmation the rejected ones were single bad measurements.
@@ -219,7 +229,7 @@ def _accept(track, noise, work):  # type: ignore[no-untyped-def]
             return
         counts[IN_A_ROW] = counts[AGREED] = 0
         track.doubt_rad[0] = 0.0
-    track.status[0] = GOOD if counts[CONFIRMED] >= noise.confirmations else STARTING
+    track.status[0] = GOOD if track.redundancy[0] >= noise.start_redundancy else STARTING
 
 
 @njit_no_refcount

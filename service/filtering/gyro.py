@@ -81,14 +81,20 @@ class FilterSettings:
     """When the filter rejects a measurement, and what it does when it rejects all of them.
 
     A measurement is rejected where chi-square passes its innovation with a
-    probability below `gate_tail`.  `confirmations` accepted measurements in a row
-    confirm a start, or end a doubt.  After `reset_after_s` in which everything was
-    rejected the filter gives up its own attitude and starts from the measurements: the
-    default is longer than the hour for which a tracker may hold on to wrong stars.
+    probability below `gate_tail`.  A start is confirmed once the redundancy numbers of the
+    measurements accepted since, each of which says how well the filter predicted one, add
+    up to `start_redundancy`: about three measurements where the bias is known, seven where
+    it is not.  Until then the gate of attitudes is `start_gate_tail`, and one that is
+    rejected starts the filter anew.  `confirmations` accepted measurements in a row end a doubt.
+    After `reset_after_s` in which everything was rejected the filter gives up its own
+    attitude and starts from the measurements: the default is longer than the hour for
+    which a tracker may hold on to wrong stars.
     An attitude with an axis worse than `lost_rad` is lost: the next one measured replaces it.
     """
 
     gate_tail: float = 1e-4
+    start_gate_tail: float = 1e-2
+    start_redundancy: float = 2.0
     confirmations: int = 3
     reset_after_s: float = 7200.0
     lost_rad: float = math.radians(17.0)
@@ -96,6 +102,8 @@ class FilterSettings:
     def __post_init__(self) -> None:
         limits = {
             "gate_tail": (self.gate_tail, 1e-12, 0.5),
+            "start_gate_tail": (self.start_gate_tail, 1e-12, 0.5),
+            "start_redundancy": (self.start_redundancy, 0.0, 1000.0),
             "confirmations": (self.confirmations, 1, 1000),
             "reset_after_s": (self.reset_after_s, 0.0, 1e7),
             "lost_rad": (self.lost_rad, 1e-6, 1.0),

@@ -28,7 +28,8 @@ class Noise(NamedTuple):
 
     `angle` is sigma_v^2 in rad^2/s, `bias` sigma_u^2 in rad^2/s^3, `coast` the same
     of the rate in a gap, `first_bias` in rad^2/s^2.  `gate_2` and `gate_3` are the
-    limits of chi-square with two and three degrees of freedom.
+    limits of chi-square with two and three degrees of freedom, `start_gate_3` that of
+    attitudes until a start is confirmed.
     """
 
     angle: float
@@ -40,6 +41,8 @@ class Noise(NamedTuple):
     misalignment: float
     gate_2: float
     gate_3: float
+    start_gate_3: float
+    start_redundancy: float
     confirmations: int
     reset_after_ns: int
     lost: float

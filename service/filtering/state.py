@@ -48,9 +48,10 @@ class FilterState:
     the last measured rate, `anchor_rad_s` (3,) that at its last clear change.  `rival`
     (4,) is the attitude that the rejected measurements say, where there is a doubt.
 
-    `accepted` counts the measurements since the start, up to the confirmation;
-    `rejected` those in a row, `agreed` those accepted since then, `rejected_since_ns`
-    and `doubt_rad` when that began and how far off they were.
+    `redundancy` is how far the measurements since the start have confirmed it (see
+    `FilterSettings`); `rejected` counts those rejected in a row, `agreed` those accepted
+    since then, `rejected_since_ns` and `doubt_rad` say when that began and how far off
+    they were.
     """
 
     tai_ns: int
@@ -61,7 +62,7 @@ class FilterState:
     anchor_rad_s: Vector
     rival: Vector
     status: Status
-    accepted: int = 0
+    redundancy: float = 0.0
     rejected: int = 0
     agreed: int = 0
     rejected_since_ns: int = 0

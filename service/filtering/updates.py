@@ -126,6 +126,22 @@ def chi_square(z, size, work):  # type: ignore[no-untyped-def]
 
 
 @njit_no_refcount
+def redundancy_of(r, size, work):  # type: ignore[no-untyped-def]
+    """How well the prediction checks a measurement: the mean over its components of R S^-1.
+
+    The redundancy number of geodesy (Baarda, 1968).  It is 0 where any measurement would
+    have been accepted, and 1 where the prediction was exact.  `work.small` has the factor of S.
+    """
+    theta, total = work.theta, 0.0
+    for j in range(size):
+        for i in range(size):
+            theta[i] = r[i, j]
+        solve_factored(work.small, size, theta)
+        total += theta[j]
+    return total / size
+
+
+@njit_no_refcount
 def correct(p, z, h, size, r, work):  # type: ignore[no-untyped-def]
     """Correct `p` (6, 6) by a measurement, after `innovation_covariance`.
 

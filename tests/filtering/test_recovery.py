@@ -14,6 +14,7 @@ from service.filtering.samples import AttitudeMeasurements, GyroSamples
 from service.filtering.smoother import smooth
 from service.filtering.state import Outcome, Status
 from tests.filtering.simulated import (
+    ARCSEC,
     attitude_errors,
     attitudes_of,
     directions_of,
@@ -55,6 +56,30 @@ def test_one_wrong_attitude_in_twenty_does_no_harm(rng):
     for history in (result.history, smooth(result, FINE)):
         assert not len(confident_and_wrong(history, truth))
     assert np.mean(smooth(result, FINE).good) > 0.99
+
+
+@pytest.mark.parametrize("place", range(7))
+def test_a_wrong_attitude_among_the_first_is_neither_confirmed_nor_held_on_to(place, rng):
+    """Ten sigmas off: a bias that is not known yet explains it, until others contradict it."""
+    truth = truth_of(slews, 400.0)
+    rows = np.arange(0, 401, 8)
+    offset = np.zeros((len(rows), 3))
+    offset[place, 0] = 10.0 * SIGMAS[0] * ARCSEC
+    for _ in range(20):
+        gyro, _ = gyro_of(truth, FINE, rng)
+        result = filter_attitude(FINE, gyro, attitudes_of(truth, rows, SIGMAS, rng, offset))
+        for history in (result.history, smooth(result, FINE)):
+            assert not len(confident_and_wrong(history, truth))
+        assert (result.history.status[200:] == Status.GOOD).all()
+
+
+def test_a_rate_too_uncertain_to_predict_well_lets_nine_measurements_confirm_a_start(rng):
+    truth = truth_of(inertial_hold, 1200.0)
+    attitudes = attitudes_of(truth, np.arange(0, 1201, 60), SIGMAS, rng)
+    loose = ConstantRateModel(rate_walk_rad_s1_5=1e-5)
+    status = filter_attitude(loose, attitudes=attitudes).history.status
+    assert (status[:8] == Status.STARTING).all()
+    assert (status[8:] == Status.GOOD).all()
 
 
 def test_a_start_from_a_wrong_attitude_is_taken_back_by_the_next(rng):
@@ -190,7 +215,8 @@ def test_a_step_of_the_clock_that_leaves_none_makes_it_doubt_until_it_starts_ane
     assert set(confident_and_wrong(result.history, truth)) <= set(range(1401, 1408))
     assert result.innovations.counts()["undecided"] > 0
     assert (result.history.status[1408:4108] == Status.DOUBTFUL).all()
-    assert (result.history.status[4150:] == Status.GOOD).all()
+    # Seven measurements confirm a start with a bias that is not known.
+    assert (result.history.status[4108 + 7 * 8 :] == Status.GOOD).all()
     assert not len(confident_and_wrong(smooth(result, FINE), truth))
 
 

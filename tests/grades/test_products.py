@@ -57,8 +57,8 @@ def whole(series):
 def test_a_series_has_the_samples_in_order_of_time(smoothed, half_hour, grade):
     truth, _ = half_hour
     rows = whole(smoothed.products.attitudes("XTE", grade=grade))
-    # The first three measurements confirm the filter's start; the smoother knows of them.
-    expected = np.arange(0 if grade == "smoothed" else 16, 1801)
+    # Seven measurements confirm the filter's start; the smoother knows of them.
+    expected = np.arange(0 if grade == "smoothed" else 48, 1801)
     assert (rows.time_ns - NOON_NS).tolist() == (expected * 10**9).tolist()
     assert rows.time[0] == shifted(NOON, float(expected[0])).text
     assert set(rows.method) == {WORDS[grade]}
@@ -86,7 +86,7 @@ def test_a_period_is_cut_to_the_sample(smoothed):
 def test_suspect_samples_are_given_when_they_are_asked_for(smoothed):
     rows = whole(smoothed.products.attitudes("XTE", grade="filtered", status="all"))
     assert len(rows) == 1801
-    assert rows.status[:17].tolist() == ["suspect"] * 16 + ["good"]
+    assert rows.status[:49].tolist() == ["suspect"] * 48 + ["good"]
 
 
 @pytest.mark.parametrize("name", attitude_formats())
