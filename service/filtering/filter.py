@@ -34,6 +34,10 @@ from service.filtering.updates import Innovations as WrittenInnovations
 from service.vectors import Vector, read_only
 
 NS = 1e-9
+LEAST_REDUNDANCY = 0.25
+"""What an accepted measurement adds at least, so that in a gap of the gyro a start ends, too."""
+ESTABLISHED = 10.0
+"""Redundancy of an attitude that is held on to for `reset_after_s`, whatever contradicts it."""
 
 
 def filter_attitude(
@@ -55,6 +59,7 @@ def filter_attitude(
     the state, measurements before it, and a stretch without any epoch.
     """
     attitudes, directions = attitudes or no_attitudes(), directions or no_directions()
+    least_redundancy = LEAST_REDUNDANCY
     if isinstance(model, ConstantRateModel):
         if gyro is not None:
             raise BadInput(Fault("gyro", "must be absent where the model is of a constant rate"))
@@ -62,6 +67,8 @@ def filter_attitude(
         if state is not None:
             times = times[times >= state.tai_ns]
         gyro, model = GyroSamples(times, np.zeros((len(times), 3))), model.as_gyro()
+        # A rate that nothing measures may be too uncertain ever to check an attitude.
+        least_redundancy = 1.0
     elif gyro is None:
         raise BadInput(Fault("gyro", "must be given where the model is of a gyro"))
     else:
@@ -74,7 +81,7 @@ def filter_attitude(
     kind, row = _order(attitudes, directions, state, gyro)
     measured, tai_ns = _measured(attitudes, directions, kind, row)
     timeline = _timeline(gyro, tai_ns, model, state)
-    noise = noise_of(model, settings)
+    noise = noise_of(model, settings, least_redundancy)
     track = _track(state, noise)
     epochs, written = _room(len(timeline.tai_ns), len(kind))
     run_filter(track, timeline, measured, noise, epochs, written, workspace())
@@ -176,7 +183,11 @@ def _timeline(
     )
 
 
-def noise_of(model: GyroModel, settings: FilterSettings | None = None) -> Noise:
+def noise_of(
+    model: GyroModel,
+    settings: FilterSettings | None = None,
+    least_redundancy: float = LEAST_REDUNDANCY,
+) -> Noise:
     """The model and the settings as the kernels take them."""
     settings = settings or FilterSettings()
     gate_2, gate_3 = _gates(settings.gate_tail)
@@ -193,6 +204,8 @@ def noise_of(model: GyroModel, settings: FilterSettings | None = None) -> Noise:
         gate_3=gate_3,
         start_gate_3=start_gate_3,
         start_redundancy=settings.start_redundancy,
+        least_redundancy=least_redundancy,
+        established=max(ESTABLISHED, settings.start_redundancy),
         confirmations=settings.confirmations,
         reset_after_ns=round(settings.reset_after_s / NS),
         lost=float(settings.lost_rad**2),

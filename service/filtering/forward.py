@@ -25,8 +25,10 @@ REJECTED, STARTED = int(Outcome.REJECTED), int(Outcome.STARTED)
 UNDECIDED = int(Outcome.UNDECIDED)
 IN_A_ROW, AGREED, SINCE_NS, HERE = 0, 1, 2, 3
 """Rows of `Track.counts`; HERE counts those accepted at the present epoch."""
-LEAST_REDUNDANCY = 0.25
-"""What any accepted measurement adds: some rates are too uncertain ever to predict well."""
+PREDICTED = 0.25
+"""A measurement of this redundancy number or more was predicted, so that it can be checked."""
+WIDER = 4.0
+"""How much the variance of the bias grows with each start that the next measurement rejects."""
 
 
 class Track(NamedTuple):
@@ -118,24 +120,25 @@ def _measure(track, m, tai_ns, measured, noise, innovations, work):  # type: ign
         return
     z, s, h, r = innovations.innovation[m], innovations.covariance[m], work.partials, work.noise
     size, angle = innovate(track.quaternion, measured, m, z, h, work.small)
-    # Before the start is confirmed, nothing speaks for the older measurement.
-    confirmed = track.redundancy[0] >= noise.start_redundancy
-    if size == 2:
-        gate = noise.gate_2
-    elif confirmed:
-        gate = noise.gate_3
-    else:
-        gate = noise.start_gate_3
     copy(measured.covariance[m], r)
     if kind != ATTITUDE:
         add_curvature(track.covariance, r)
     sound = innovation_covariance(track.covariance, h, size, r, s, work)
     nis = chi_square(z, size, work) if sound else math.inf
     innovations.nis[m] = nis
+    # Before the start is confirmed, nothing speaks for the older measurement.
+    confirmed = track.redundancy[0] >= noise.start_redundancy
+    gate = noise.gate_3 if size == 3 else noise.gate_2
+    redundancy = 0.0
+    if sound and track.redundancy[0] < noise.established:
+        redundancy = redundancy_of(r, size, work)
+        # What is hardly predicted tells of the first guess of the bias, which may be far off.
+        if not confirmed and size == 3 and redundancy >= PREDICTED:
+            gate = noise.start_gate_3
     if nis <= gate and (counts[IN_A_ROW] == 0 or _decides(track, measured, m, gate, noise, work)):
         innovations.outcome[m] = ACCEPTED
-        if not confirmed:
-            track.redundancy[0] += max(redundancy_of(r, size, work), LEAST_REDUNDANCY)
+        if track.redundancy[0] < noise.established:
+            track.redundancy[0] += max(redundancy, noise.least_redundancy)
         correct(track.covariance, z, h, size, r, work)
         _accept(track, noise, work)
         return
@@ -143,7 +146,10 @@ def _measure(track, m, tai_ns, measured, noise, innovations, work):  # type: ign
     again = not confirmed
     if confirmed and counts[HERE] == 0:
         _contradict(track, tai_ns, nis > gate, angle, z, h, size, work)
-        again = tai_ns - counts[SINCE_NS] >= noise.reset_after_ns
+        again = tai_ns - counts[SINCE_NS] >= noise.reset_after_ns or (
+            # A young attitude has no more on its side than those that contradict it.
+            track.redundancy[0] < noise.established and counts[IN_A_ROW] > track.redundancy[0]
+        )
     if again and kind == ATTITUDE:
         _start(track, m, measured, noise, False)
         innovations.outcome[m] = STARTED
@@ -198,16 +204,22 @@ def _contradict(track, tai_ns, rejected, angle, z, h, size, work):  # type: igno
 
 @njit_no_refcount
 def _start(track, m, measured, noise, bias_is_known):  # type: ignore[no-untyped-def]
-    """Replace the attitude by a measured one; the bias keeps its value, or its variance too."""
+    """Replace the attitude by a measured one; the bias keeps its value, or its variance too.
+
+    Where already the measurement after a start rejects it, the bias may be the reason.
+    """
     p = track.covariance
+    is_at_once = track.status[0] == STARTING and track.redundancy[0] == 0.0
     for i in range(4):
         track.quaternion[i] = measured.quaternion[m, i]
     for i in range(3):
         for j in range(3):
             p[i, j] = measured.covariance[m, i, j]
             p[i, j + 3] = p[j + 3, i] = 0.0
-            if not bias_is_known:
-                p[i + 3, j + 3] = noise.first_bias if i == j else 0.0
+            if not bias_is_known and i != j:
+                p[i + 3, j + 3] = 0.0
+        if not bias_is_known:
+            p[i + 3, i + 3] = WIDER * p[i + 3, i + 3] if is_at_once else noise.first_bias
     for i in range(4):
         track.counts[i] = 0
     track.redundancy[0] = track.doubt_rad[0] = 0.0

@@ -83,17 +83,19 @@ class FilterSettings:
     A measurement is rejected where chi-square passes its innovation with a
     probability below `gate_tail`.  A start is confirmed once the redundancy numbers of the
     measurements accepted since, each of which says how well the filter predicted one, add
-    up to `start_redundancy`: about three measurements where the bias is known, seven where
-    it is not.  Until then the gate of attitudes is `start_gate_tail`, and one that is
-    rejected starts the filter anew.  `confirmations` accepted measurements in a row end a doubt.
-    After `reset_after_s` in which everything was rejected the filter gives up its own
-    attitude and starts from the measurements: the default is longer than the hour for
-    which a tracker may hold on to wrong stars.
+    up to `start_redundancy`: about four measurements where the bias is known, seven where
+    it is not; at a constant rate each counts one.  Until then the gate of attitudes that
+    were predicted is `start_gate_tail`, and one that is rejected starts the filter anew.
+    `confirmations` accepted measurements in a row end a doubt.  After `reset_after_s` in
+    which everything was rejected the filter gives up its own attitude and starts from the
+    measurements: the default is longer than the hour for which a tracker may hold on to
+    wrong stars.  A young attitude is given up as soon as more reject it in a row than its
+    redundancy.
     An attitude with an axis worse than `lost_rad` is lost: the next one measured replaces it.
     """
 
     gate_tail: float = 1e-4
-    start_gate_tail: float = 1e-2
+    start_gate_tail: float = 1e-3
     start_redundancy: float = 2.0
     confirmations: int = 3
     reset_after_s: float = 7200.0

@@ -29,7 +29,8 @@ class Noise(NamedTuple):
     `angle` is sigma_v^2 in rad^2/s, `bias` sigma_u^2 in rad^2/s^3, `coast` the same
     of the rate in a gap, `first_bias` in rad^2/s^2.  `gate_2` and `gate_3` are the
     limits of chi-square with two and three degrees of freedom, `start_gate_3` that of
-    attitudes until a start is confirmed.
+    attitudes until a start is confirmed, for which every accepted measurement counts
+    `least_redundancy` or more.  Below `established` an attitude is young.
     """
 
     angle: float
@@ -43,6 +44,8 @@ class Noise(NamedTuple):
     gate_3: float
     start_gate_3: float
     start_redundancy: float
+    least_redundancy: float
+    established: float
     confirmations: int
     reset_after_ns: int
     lost: float

@@ -48,10 +48,10 @@ class FilterState:
     the last measured rate, `anchor_rad_s` (3,) that at its last clear change.  `rival`
     (4,) is the attitude that the rejected measurements say, where there is a doubt.
 
-    `redundancy` is how far the measurements since the start have confirmed it (see
-    `FilterSettings`); `rejected` counts those rejected in a row, `agreed` those accepted
-    since then, `rejected_since_ns` and `doubt_rad` say when that began and how far off
-    they were.
+    `redundancy` is how far the measurements since the start support it (see
+    `FilterSettings`), up to where more make no difference; `rejected` counts those rejected
+    in a row, `agreed` those accepted since then, `rejected_since_ns` and `doubt_rad` say
+    when that began and how far off they were.
     """
 
     tai_ns: int

@@ -5,8 +5,9 @@ it is what `day.grade_day` would give at the last epoch, of the same record.  St
 along the stretch are kept, so that only what is new is filtered; a late measurement, or other
 settings, drop the marks after it.
 
-The window does not grow with the day, as that of `day.window_of` does: a look reads seven hours
-of attitudes and gyro samples at any time of the day.
+The window does not grow with the day, as that of `day.window_of` does: a look reads at most seven
+hours of attitudes at any time of the day, and the gyro samples of these hours; where batches have
+stopped and the gyro goes on, those of up to 32 hours.
 """
 
 import hashlib
