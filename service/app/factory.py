@@ -146,9 +146,7 @@ def open_app(
             app.calibrations.interrupt()
 
     try:
-        app.single_writer.start(take_over)
-        if not app.single_writer.is_writing:
-            app.adoptions.load(leave)
+        app.single_writer.start(take_over, lambda: app.adoptions.follow(leave))
     except BaseException:
         app.close()
         raise

@@ -48,6 +48,18 @@ def test_a_session_that_the_server_ends_writes_nothing_more(opened):
     assert run(second, "SELECT 1") == 1
 
 
+def test_a_lock_that_is_given_back_is_there_for_another(opened):
+    first, second = opened
+    first.writer.take_lock()
+    second.writer.give_lock()
+    assert second.writer.take_lock() == "refused"
+    first.writer.give_lock()
+    with pytest.raises(Standby):
+        run(first, "SELECT 1")
+    assert second.writer.take_lock() == "taken"
+    assert first.writer.take_lock() == "refused"
+
+
 def test_an_error_that_the_server_has_rolled_back_costs_no_lock(opened):
     first, second = opened
     first.writer.take_lock()

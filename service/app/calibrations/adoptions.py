@@ -68,12 +68,22 @@ class CalibrationAdoptions:
         self._missions_changed = missions_changed
         self._ids = Ulids()
         self._lock = threading.Lock()
+        self._loaded: str | None = None
+        """The newest adoption when they were loaded; empty where there was none."""
+
+    def follow(self, leave: str | None = None) -> None:
+        """`load` where they were not loaded yet, or another service has adopted one since."""
+        with self._context.reading() as connection:
+            newest = stored.newest_adoption(connection)
+        if (newest or "") != self._loaded:
+            self.load(leave)
 
     def load(self, leave: str | None = None) -> None:
         """Put what was adopted over the mission files, but for the spacecraft `leave`."""
         with self._lock:
             before = dict(self._context.missions)
             with self._context.reading() as connection:
+                self._loaded = stored.newest_adoption(connection) or ""
                 adopted = adopted_missions(connection, self._files, leave)
             self._context.missions.update(self._files | adopted)
             if self._context.missions != before:

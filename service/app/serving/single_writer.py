@@ -23,6 +23,7 @@ class SingleWriter:
     def __init__(self, store: Store) -> None:
         self._writer, self._lock = store.writer, store.lock
         self._take_over: Callable[[], object] = lambda: None
+        self._follow: Callable[[], object] = lambda: None
         self._listeners: list[Callable[[], object]] = []
         self._is_writing = self._lock is None
         self._telling = threading.Lock()
@@ -39,16 +40,17 @@ class SingleWriter:
         if not self._is_writing:
             raise Standby()
 
-    def start(self, take_over: Callable[[], object]) -> None:
+    def start(self, take_over: Callable[[], object], follow: Callable[[], object]) -> None:
         """Begin to write if no other service does; else try again every second.
 
         `take_over` is called before anything else is written, each time that this process begins
-        to write: another may have written in between.
+        to write: another may have written in between.  While another one writes, `follow` is
+        called at each try.
         """
         if self._lock is None:
             take_over()
             return
-        self._take_over = take_over
+        self._take_over, self._follow = take_over, follow
         self._try()
         if not self._is_writing:
             log.info("another service writes to the database: this one stands by")
@@ -92,9 +94,15 @@ class SingleWriter:
             if self._is_writing:
                 log.warning("another service writes to the database now: this one stands by")
             self._is_writing = False
+            self._follow()
         elif attempt == "taken" or not self._is_writing:
             self._is_writing = False
-            self._take_over()
+            try:
+                self._take_over()
+            except BaseException:
+                # Another service may be able to.
+                self._writer.give_lock()
+                raise
             with self._telling:
                 self._is_writing = True
                 for begin in self._listeners:

@@ -114,6 +114,12 @@ def list_adoptions(connection: Connection, spacecraft: str) -> list[CalibrationA
     return [_adoption(dict(row)) for row in connection.execute(query).mappings()]
 
 
+def newest_adoption(connection: Connection) -> str | None:
+    """The id of the last change of any spacecraft."""
+    id: str | None = connection.scalar(select(func.max(calibration_adoptions.c.id)))
+    return id
+
+
 def latest_adoptions(connection: Connection) -> list[CalibrationAdoption]:
     """The last change of every spacecraft."""
     latest = select(func.max(calibration_adoptions.c.id)).group_by(

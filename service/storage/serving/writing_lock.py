@@ -15,7 +15,9 @@ from sqlalchemy import Connection
 from service.errors import Standby
 
 # Two numbers, the second of which is that of a table: each schema of a database has its own lock.
-_TAKE = "SELECT pg_try_advisory_lock(1633906037, 'event_counter'::regclass::oid::int)"
+_NAME = "1633906037, 'event_counter'::regclass::oid::int"
+_TAKE = f"SELECT pg_try_advisory_lock({_NAME})"
+_GIVE = f"SELECT pg_advisory_unlock({_NAME})"
 
 Attempt = Literal["kept", "taken", "refused"]
 
@@ -49,6 +51,12 @@ class WritingLock:
         taken = connection.exec_driver_sql(_TAKE).scalar_one()
         self._session = session if taken else None
         return "taken" if taken else "refused"
+
+    def give(self, connection: Connection) -> None:
+        """Leave the lock to another service, if this session has it."""
+        if _session(connection) is self._session:
+            self._session = None
+            connection.exec_driver_sql(_GIVE)
 
 
 def _session(connection: Connection) -> object:

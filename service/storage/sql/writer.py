@@ -126,6 +126,15 @@ class Writer:
         with self._connection.lookup() as connection:
             return self._lock.take(connection)
 
+    def give_lock(self) -> None:
+        """Leave the lock to another service.
+
+        Raises an error of SQLAlchemy's where the database is out of reach.
+        """
+        if self._lock is not None:
+            with self._connection.lookup() as connection:
+                self._lock.give(connection)
+
     def require(self) -> None:
         """Raise `Stopping` unless what is queued will be written."""
         with self._changed:
