@@ -365,6 +365,15 @@ def test_files_that_no_manifest_names_are_told(filled, place, name, told):
     assert list(verify_archive(place, {})) == [f"{stray}: {told}"]
 
 
+def test_files_of_a_day_without_a_manifest_are_told(place):
+    day = folder.day_folder(place, "XTE", "1999-03-01")
+    day.mkdir(parents=True)
+    (day / "part-0.parquet").write_bytes(b"")
+    assert list(verify_archive(place, {})) == [
+        f"{day / 'part-0.parquet'}: the manifest does not name it"
+    ]
+
+
 def test_values_of_trackers_are_archived_and_their_trends_stay(opened, place, sky, missions):
     mission = twin.twin(missions)
     app = opened(mission, archive_folder=place)

@@ -118,6 +118,11 @@ def manifests(folder: Path) -> Iterator[Manifest]:
         yield _decoded(file, Manifest)
 
 
+def day_folders(folder: Path) -> list[Path]:
+    """The folders of all spacecraft and days, in this order, also those without a manifest."""
+    return sorted(each for each in folder.glob("spacecraft=*/day=*") if each.is_dir())
+
+
 def manifest_of(folder: Path, spacecraft: str, day: str) -> Manifest:
     """The manifest of a day; one without partitions where there is none."""
     file = day_folder(folder, spacecraft, day) / MANIFEST

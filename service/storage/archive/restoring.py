@@ -17,6 +17,7 @@ from service.storage.archive.folder import (
     Manifest,
     Part,
     day_folder,
+    day_folders,
     locked,
     manifests,
     path_of,
@@ -159,11 +160,12 @@ def verify_archive(
     fingerprints say.  `needed` has the hashes of the parts that a database needs, by path.
     """
     done, whole = 0, {}
+    named: dict[Path, set[str]] = {day: set() for day in day_folders(folder)}
     for manifest in manifests(folder):
-        named = set()
+        of_day = named.setdefault(day_folder(folder, manifest.spacecraft, manifest.day), set())
         for part in manifest.parts:
             path = path_of(folder, manifest, part)
-            named.add(part.file)
+            of_day.add(part.file)
             whole[path] = part.sha256
             try:
                 content = whole_content(folder, path, part.sha256)
@@ -172,7 +174,8 @@ def verify_archive(
                 yield str(error)
             done += part.batches
             step(done)
-        yield from _unnamed(day_folder(folder, manifest.spacecraft, manifest.day), named)
+    for day, files in named.items():
+        yield from _unnamed(day, files)
     for path, sha256 in needed.items():
         if whole.get(path) != sha256:
             yield f"{folder / path}: the database has batches in it, and no manifest names it so"
