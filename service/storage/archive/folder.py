@@ -159,6 +159,11 @@ def encoded(partition: pa.Table) -> bytes:
         compression_level=COMPRESSION_LEVEL,
         row_group_size=ROWS_TOGETHER,
         write_page_checksum=True,
+        # Of a day of few batches each of these defaults would be a tenth of the file: hardly a
+        # number stands there twice, and Parquet's own types are those of the partition.
+        use_dictionary=False,
+        write_statistics=["time_ns"],
+        store_schema=False,
     )
     return buffer.getvalue()
 
