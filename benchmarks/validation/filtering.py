@@ -181,7 +181,8 @@ def bounds_of(found: Measured, quick: bool) -> list[Bound]:
     bounds = [
         between(f"{name}: mean of NEES/6", float(np.mean(found.nees)) / 6.0, least, 1.0 + off),
         between(f"{name}: mean of NIS/3", float(np.mean(found.nis)) / 3.0, 1.0 - off, 1.0 + off),
-        at_most(f"{name}: starts in a run", found.starts / len(found.nees), 1.0),
+        # Noise alone makes a few of a thousand starts begin anew; see `start_gate_tail`.
+        at_most(f"{name}: starts in a run", found.starts / len(found.nees), 1.05),
     ]
     if case.errors:
         return bounds
