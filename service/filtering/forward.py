@@ -132,7 +132,8 @@ def _measure(track, m, tai_ns, measured, noise, innovations, work):  # type: ign
     redundancy = 0.0
     if sound and track.redundancy[0] < noise.established:
         redundancy = redundancy_of(r, size, work)
-        # What is hardly predicted tells of the first guess of the bias, which may be far off.
+        # An attitude that was hardly predicted checks the first guess of the bias, which may be
+        # far off, and not the start.
         if not confirmed and size == 3 and redundancy >= PREDICTED:
             gate = noise.start_gate_3
     if nis <= gate and (counts[IN_A_ROW] == 0 or _decides(track, measured, m, gate, noise, work)):
