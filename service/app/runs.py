@@ -13,12 +13,13 @@ from service.ingest.reprocess import ReprocessPlan, ReprocessProgress, reprocess
 from service.ingest.solver_pool import Solver
 from service.missions.mission import Mission, mission_named
 from service.storage.archive.reprocessing import Reprocessing, reprocessings
-from service.storage.models.compare import RunChange, RunComparison
+from service.storage.models.compare import RatesOfRuns, RunChange, RunComparison
 from service.storage.models.runs import Run, RunState
 from service.storage.queries import histories, overview
 from service.storage.queries.compare_runs import changed_batches, compare_runs
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
+from service.storage.queries.run_rates import run_rates
 from service.storage.recording.results import set_run_alarms
 from service.times import Utc, utc_now
 
@@ -71,17 +72,34 @@ class Runs:
             )
 
     def compare_latest(
-        self, run: str, other: str, spacecraft: str
+        self,
+        run: str,
+        other: str,
+        spacecraft: str,
+        start: Utc | None = None,
+        end: Utc | None = None,
     ) -> tuple[RunComparison, list[RunChange]]:
-        """The same of the latest batches of a spacecraft alone, and those that differ."""
+        """The same of a spacecraft's latest batches of a period alone, and those that differ."""
         mission_named(self._context.missions, spacecraft)
-        place, archive = ResultFilter(run, spacecraft), self._context.store.archive
+        place, archive = ResultFilter(run, spacecraft, start, end), self._context.store.archive
         with self._context.reading() as connection:
             found = compare_runs(connection, archive, place, other, MOST_COMPARED)
             changed = changed_batches(
                 connection, archive, place, other, MOST_COMPARED, MOST_CHANGED
             )
         return found, changed
+
+    def rates(
+        self,
+        run: str,
+        other: str,
+        spacecraft: str,
+        start: Utc | None = None,
+        end: Utc | None = None,
+    ) -> RatesOfRuns | None:
+        """The rates of all batches of a spacecraft in both runs; None without a common period."""
+        with self._context.reading() as connection:
+            return run_rates(connection, spacecraft, (run, other), start, end)
 
     def comparable(
         self, spacecraft: Collection[str], run: str | None = None

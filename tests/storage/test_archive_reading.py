@@ -193,6 +193,8 @@ def compared_of(app):
     sides = [structs.replace(each, us_per_batch=None) for each in (found.a, found.b)]
     return (
         structs.replace(found, a=sides[0], b=sides[1]),
+        # As text: a share of an hour without stars is NaN, which equals nothing.
+        repr(app.runs.rates("live", "r", "XTE")),
         app.runs.compare("live", "r"),
         app.runs.compare("live", "r", "XTE", shifted(START, 30_000.0), shifted(START, 99_000.0)),
         *(app.runs.compare_latest(*runs, "XTE") for runs in (("live", "r"), ("r", "live"))),

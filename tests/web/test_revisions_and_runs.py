@@ -10,7 +10,7 @@ from service.app.factory import open_app
 from service.missions.mission import Mission
 from service.settings import Settings
 from service.storage.archive.reprocessing import Reprocessing, write_reprocessing
-from service.times import shifted, utc_now
+from service.times import parse_utc, shifted, utc_now
 from service.web.app import create_app
 from tests.web.markup import Markup
 from tests.web.serving import Server
@@ -53,6 +53,64 @@ def test_compare_opens_on_two_runs_that_have_data(two_runs):
     for each in (votes, verified):
         unique = sum(found["unique"] for found, _ in each.values())
         assert f'data-name="unique">{unique} ' in html
+
+
+COLUMNS = {
+    "stars": "observed",
+    "unique": "unique",
+    "ambiguous": "ambiguous",
+    "unmatched": "unmatched",
+}
+"""The counts of stars in the table of rates, as the interface names them."""
+
+
+def listed(client, run, **period):
+    """The batches of XTE in a run, from the lists of the interface."""
+    asked = {"run": run, "spacecraft": "XTE", "limit": 100} | period
+    return client.get("/api/v1/batches", params=asked).raise_for_status().json()["items"]
+
+
+def rates_shown(page, run):
+    """The numbers of a run's row of rates, by the name of the column."""
+    (row,) = re.findall(
+        rf'<tr><th scope="row"><strong>[AB]</strong> <a [^>]*>{run}</a>.*?</tr>', page
+    )
+    return dict(re.findall(r'data-name="([a-z ]+)">(\d+) ', row.replace("</td>", " </td>")))
+
+
+@pytest.mark.parametrize("minutes", [None, (5, 20)])
+def test_the_rates_of_two_runs_count_all_batches_of_the_period(two_runs, minutes):
+    period = {}
+    if minutes is not None:
+        first = parse_utc(min(each["time"] for each in listed(two_runs, "votes")))
+        start, end = (shifted(first, 60.0 * each).text for each in minutes)
+        period = {"start": start, "end": end}
+    asked = {"run": "votes", "other": "verified", "spacecraft": "XTE"} | period
+    page = two_runs.get("/compare", params=asked).raise_for_status().text
+    for run in ("votes", "verified"):
+        batches = listed(two_runs, run, **period)
+        assert len(batches) == (60 if minutes is None else 30)
+        states = [each["status"] for each in batches]
+        assert rates_shown(page, run) == {
+            "batches": str(len(batches)),
+            **{
+                name: str(sum(each["counts"][part] for each in batches))
+                for name, part in COLUMNS.items()
+            },
+            "good": str(states.count("good")),
+            "suspect": str(states.count("suspect")),
+            "no attitude": str(states.count(None)),
+        }
+
+
+def test_a_period_that_only_one_run_has_shows_no_rates(two_runs):
+    asked = {"run": "votes", "other": "verified", "spacecraft": "XTE"}
+    page = text_of(two_runs.get("/compare", params=asked | {"start": "2031-01-01T00:00:00Z"}))
+    assert "All batches of both runs" not in page
+    assert "in votes in this period. Batches are the same if they have the same name." in page
+    refused = two_runs.get("/compare", params=asked | {"start": "yesterday"})
+    assert refused.status_code == 422
+    assert "start" in refused.text
 
 
 def test_a_run_without_a_partner_says_so(two_runs):

@@ -1,11 +1,15 @@
 """Two sets of options side by side, and two runs."""
 
-from typing import Annotated, ClassVar
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
 
 from msgspec import field
 
 from service.storage.models.answers import StarCounts
 from service.storage.models.base import Count, Id, MissionSettings, Moment, Outcome, Record, doc
+from service.times import Utc
+from service.vectors import Vector
 
 
 class ComparedSide(StarCounts, frozen=True, kw_only=True):
@@ -177,3 +181,24 @@ class RunChange(Record, frozen=True, kw_only=True):
     time: Moment
     before: RunChangeSide
     after: RunChangeSide
+
+
+@dataclass(frozen=True)
+class RunRates:
+    """All current results of a spacecraft in one run."""
+
+    run: str
+    totals: Mapping[str, int]
+    """Of a rollup's counts, such as `observed`."""
+    shares: Mapping[str, Vector]
+    """Of the observed stars: `ambiguous` and `unmatched` in each cell; NaN without a star."""
+
+
+@dataclass(frozen=True)
+class RatesOfRuns:
+    """Runs over one period, divided into cells of a day or an hour."""
+
+    start: Utc
+    end: Utc
+    cell: Literal["hour", "day"]
+    runs: tuple[RunRates, ...]

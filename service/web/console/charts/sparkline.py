@@ -18,8 +18,8 @@ class SparklineDrawing:
     """A path for each quantity; a lone cell is a dot, drawn as a line without length."""
 
     paths: Mapping[str, str]
-    width: int = WIDTH
-    height: int = HEIGHT
+    width: int
+    height: int
 
 
 def common_top(greatest: float) -> float:
@@ -27,18 +27,21 @@ def common_top(greatest: float) -> float:
     return next(top for top in TOPS if greatest <= top or top == TOPS[-1])
 
 
-def sparkline(shares: Mapping[str, Vector], top: float) -> SparklineDrawing:
+def sparkline(
+    shares: Mapping[str, Vector], top: float, width: int = WIDTH, height: int = HEIGHT
+) -> SparklineDrawing:
     """The picture of shares in cells of equal width; NaN where there was no batch."""
-    return SparklineDrawing({name: _path(values, top) for name, values in shares.items()})
+    paths = {name: _path(values, top, width, height) for name, values in shares.items()}
+    return SparklineDrawing(paths, width, height)
 
 
-def _path(values: Vector, top: float) -> str:
+def _path(values: Vector, top: float, width: int, height: int) -> str:
     """Whole pixels, relative to the point before: a fleet's page has thousands of points."""
     known = np.isfinite(values)
-    step = (WIDTH - 2 * PAD) / max(len(values) - 1, 1)
+    step = (width - 2 * PAD) / max(len(values) - 1, 1)
     xs = np.rint(PAD + step * np.arange(len(values))).astype(int).tolist()
     part = np.minimum(np.where(known, values, 0.0) / top, 1.0)
-    ys = np.rint(HEIGHT - PAD - part * (HEIGHT - 2 * PAD)).astype(int).tolist()
+    ys = np.rint(height - PAD - part * (height - 2 * PAD)).astype(int).tolist()
     text: list[str] = []
     before, level = None, 0
     for x, y, is_known in zip(xs, ys, known.tolist(), strict=True):

@@ -1,7 +1,9 @@
 """The page that compares two runs, or two sets of options over the same recorded batches."""
 
+from dataclasses import dataclass
 from typing import Annotated
 
+import numpy as np
 from fastapi import Depends
 from pydantic import Field, ValidationError
 from starlette.requests import Request
@@ -10,9 +12,10 @@ from starlette.responses import Response
 from service.app.runs import MOST_COMPARED
 from service.errors import BadBatch, Fault, shown_value
 from service.observations.schema import Key, OptionsIn, RunName
-from service.storage.models.compare import Comparison
+from service.storage.models.compare import Comparison, RatesOfRuns
 from service.times import parse_utc
 from service.web.api.compare import WORK_S
+from service.web.console.charts.sparkline import SparklineDrawing, common_top, sparkline
 from service.web.console.options import asked_options, fields_of, settings_of_mission
 from service.web.console.page_context import ContextDep, PageContext, PageQuery
 from service.web.console.registry import console_page
@@ -21,12 +24,14 @@ from service.web.requests.access import Policy
 
 SAMPLE = 100
 SIDES = ("a", "b")
+SPARK_SIZE = 360, 36
+"""Pixels: a year has a point a day."""
 
 
 class CompareQuery(PageQuery):
     """Which batches; the options of the sides are parameters with the prefixes `a.` and `b.`.
 
-    With `other` the run is compared with that run.
+    With `other` the run is compared with that run, in the period or in all that both have.
     """
 
     other: RunName | None = None
@@ -34,6 +39,16 @@ class CompareQuery(PageQuery):
     start: Annotated[str, Field(max_length=40)] = ""
     end: Annotated[str, Field(max_length=40)] = ""
     sample: Annotated[int, Field(ge=1, le=500)] = SAMPLE
+
+
+@dataclass(frozen=True)
+class DrawnRates:
+    """The rates of two runs, and a sparkline of each."""
+
+    rates: RatesOfRuns
+    top: float
+    """The share that the top of a sparkline stands for."""
+    sparks: list[SparklineDrawing]
 
 
 async def _query(request: Request) -> CompareQuery:
@@ -53,10 +68,14 @@ def compare_page(
 ) -> Response:
     """A comparison of two runs, first of two that have data; or one of options, once asked for."""
     pair = _pair(request, query, context)
-    if pair is None or (query.other is None and query.spacecraft is not None):
-        runs = None
-    else:
-        runs = context.app.runs.compare_latest(*pair)
+    start, end = (
+        parse_utc(text, name) if text.strip() else None
+        for name, text in (("start", query.start), ("end", query.end))
+    )
+    runs = rates = None
+    if pair is not None and (query.other is not None or query.spacecraft is None):
+        runs = context.app.runs.compare_latest(*pair, start, end)
+        rates = _drawn(context.app.runs.rates(*pair, start, end))
     asked = {side: asked_options(request.query_params, f"{side}.") for side in SIDES}
     result = None
     if query.spacecraft is not None and query.other is None:
@@ -65,8 +84,8 @@ def compare_page(
         result = context.app.comparisons.of_options(
             query.spacecraft,
             run=query.run,
-            start=parse_utc(query.start, "start") if query.start.strip() else None,
-            end=parse_utc(query.end, "end") if query.end.strip() else None,
+            start=start,
+            end=end,
             sample=query.sample,
             a=a,
             b=b,
@@ -82,6 +101,7 @@ def compare_page(
         name=name,
         other=pair[1] if pair else None,
         runs=runs,
+        rates=rates,
         most_compared=MOST_COMPARED,
         spacecraft=context.spacecraft,
         forms={side: fields_of(asked[side], None, f"{side}.") for side in SIDES},
@@ -103,6 +123,15 @@ def _pair(
     name = query.spacecraft or (found[2] if found else context.filled_spacecraft(query.run))
     context.caller.require(name)
     return query.run, query.other, name
+
+
+def _drawn(rates: RatesOfRuns | None) -> DrawnRates | None:
+    """The rates with a sparkline for each run, all to one scale; None without any."""
+    if rates is None:
+        return None
+    every = np.concatenate([values for each in rates.runs for values in each.shares.values()])
+    top = common_top(float(np.nanmax(every, initial=0.0)))
+    return DrawnRates(rates, top, [sparkline(each.shares, top, *SPARK_SIZE) for each in rates.runs])
 
 
 def _matrix(result: Comparison | None) -> dict[tuple[str, str], int]:
