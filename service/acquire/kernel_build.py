@@ -125,6 +125,11 @@ def end_with_parent(stop: connection.Connection | None = None) -> None:
     for each in SIGNALS:
         signal.signal(each, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+    exit_after_parent(stop)
+
+
+def exit_after_parent(stop: connection.Connection | None = None) -> None:
+    """In a child process: exit when the parent has ended, or the other end of `stop` is closed."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     ends: list[int | connection.Connection] = [parent.sentinel]

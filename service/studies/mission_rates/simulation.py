@@ -18,6 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from service.acquire import acquire
+from service.acquire.kernel_build import exit_after_parent
 from service.advice.intervals import Interval, share_of
 from service.identify.identification import Identification, Outcome
 from service.missions.mission import Identifier
@@ -191,6 +192,7 @@ _sky: SkyModel
 
 def _start(catalog: Path | None) -> None:
     global _sky
+    exit_after_parent()
     _sky = _open(catalog)
 
 

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from tqdm import tqdm
 
 from service.acquire import acquire
+from service.acquire.kernel_build import exit_after_parent
 from service.identify.identification import Outcome
 from service.missions.mission import Identifier
 from service.sky.cache import LruCache
@@ -165,6 +166,7 @@ _sky: SkyModel
 
 def _open() -> None:
     global _sky
+    exit_after_parent()
     _sky = open_sky()
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from tqdm import tqdm
 
+from service.acquire.kernel_build import exit_after_parent
 from service.identify.triangles.ptp import explained
 from service.simulate.scenes import Conditions, Scene, SceneSky, draw_scenes
 from service.sky.geometry.triangles import REACH_DEG
@@ -93,7 +94,8 @@ def _performed(tasks: Sequence[_Task], processes: int | None) -> Iterable[npt.ND
     if count == 1:
         yield from map(_perform, tasks)
         return
-    with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as workers:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(count, context, exit_after_parent) as workers:
         yield from workers.map(_perform, tasks)
 
 
