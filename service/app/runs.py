@@ -16,10 +16,10 @@ from service.storage.archive.reprocessing import Reprocessing, reprocessings
 from service.storage.models.compare import RatesOfRuns, RunChange, RunComparison
 from service.storage.models.runs import Run, RunState
 from service.storage.queries import histories, overview
-from service.storage.queries.compare_runs import changed_batches, compare_runs
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
-from service.storage.queries.run_rates import run_rates
+from service.storage.queries.runs.comparison import changed_batches, compare_runs
+from service.storage.queries.runs.rates import run_rates
 from service.storage.recording.results import set_run_alarms
 from service.times import Utc, utc_now
 

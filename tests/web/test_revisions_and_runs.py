@@ -3,6 +3,7 @@
 import re
 
 import httpx
+import numpy as np
 import pytest
 from msgspec import structs
 
@@ -101,6 +102,24 @@ def test_the_rates_of_two_runs_count_all_batches_of_the_period(two_runs, minutes
             "suspect": str(states.count("suspect")),
             "no attitude": str(states.count(None)),
         }
+
+
+def test_rates_of_any_period_are_drawn_in_a_bounded_number_of_points(chosen_database, drawn):
+    """Here of 127 years, by one batch at each end."""
+    app = open_app(Settings(database=chosen_database()))
+    early = drawn("XTE", 1, start="1972-01-05T00:00:00Z")
+    late = drawn("XTE", 1, start="2099-06-01T00:00:00Z")
+    with Server(create_app(app)) as url:
+        for run in ("one", "two"):
+            for number, each in enumerate(early + late):
+                body = each | {"run": run, "batch": f"b{number}"}
+                httpx.post(f"{url}/api/v1/batches", json=body, timeout=60).raise_for_status()
+    rates = app.runs.rates("one", "two", "XTE", parse_utc("1972-01-01T00:00:00Z", "start"))
+    assert rates.start.text == "1972-01-05T00:00:00.000Z"
+    for each in rates.runs:
+        assert each.totals["batches"] == 2
+        assert all(700 < len(values) <= 733 for values in each.shares.values())
+        assert all(np.isfinite(values).sum() == 2 for values in each.shares.values())
 
 
 def test_a_period_that_only_one_run_has_shows_no_rates(two_runs):

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 from msgspec import field
 
@@ -196,9 +196,9 @@ class RunRates:
 
 @dataclass(frozen=True)
 class RatesOfRuns:
-    """Runs over one period, divided into cells of a day or an hour."""
+    """Runs over one period, divided into cells of an hour, a day or several days."""
 
     start: Utc
     end: Utc
-    cell: Literal["hour", "day"]
+    cell_s: int
     runs: tuple[RunRates, ...]

@@ -13,7 +13,7 @@ from service.app.runs import MOST_COMPARED
 from service.errors import BadBatch, Fault, shown_value
 from service.observations.schema import Key, OptionsIn, RunName
 from service.storage.models.compare import Comparison, RatesOfRuns
-from service.times import parse_utc
+from service.times import DAY_S, parse_utc
 from service.web.api.compare import WORK_S
 from service.web.console.charts.sparkline import SparklineDrawing, common_top, sparkline
 from service.web.console.options import asked_options, fields_of, settings_of_mission
@@ -49,6 +49,12 @@ class DrawnRates:
     top: float
     """The share that the top of a sparkline stands for."""
     sparks: list[SparklineDrawing]
+
+    @property
+    def cells(self) -> str:
+        """What a point of a sparkline counts, in words."""
+        days = self.rates.cell_s // DAY_S
+        return {0: "hours", 1: "days"}.get(days, f"periods of {days} days")
 
 
 async def _query(request: Request) -> CompareQuery:

@@ -1,5 +1,6 @@
 """Rates of a spacecraft in two runs over one period, from rollups, which count archived batches."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,7 +13,9 @@ from service.times import DAY_S, HOUR_S, Utc, bucket_start, unix_seconds
 from service.vectors import Vector
 
 _SHOWN_BY_HOUR_S = 30 * DAY_S
-"""The longest period with a cell an hour; a longer one has a cell a day."""
+"""The longest period with a cell an hour; a longer one has cells of one day or several."""
+_MOST_CELLS_OF_DAYS = 732
+"""Two years of days."""
 _SHARES = ("ambiguous", "unmatched")
 
 
@@ -25,18 +28,19 @@ def run_rates(
 ) -> RatesOfRuns | None:
     """What became of all stars of each run, in total and over time.
 
-    Without a start or an end it is the first or last day that all runs have; None where there
-    is no such period.
+    The period is that between `start` and `end`, and at most the days that all runs have; None
+    where there are none.
     """
     common = _common_days(connection, spacecraft, runs)
     if common is None:
         return None
-    start, end = start or common[0], end or common[1]
+    start = max(start or common[0], common[0], key=_tai_ns)
+    end = min(end or common[1], common[1], key=_tai_ns)
     if start.tai_ns >= end.tai_ns:
         return None
     first_s, end_s = unix_seconds([start.tai_ns, end.tai_ns]).tolist()
     level: Level = "hour" if end_s - first_s <= _SHOWN_BY_HOUR_S else "day"
-    width_s = HOUR_S if level == "hour" else DAY_S
+    width_s = HOUR_S if level == "hour" else DAY_S * _days_of_a_cell(end_s - first_s)
     cells = int(-(-end_s // width_s) - first_s // width_s)
     rates = []
     for run in runs:
@@ -50,7 +54,15 @@ def run_rates(
                 shares={name: _share(buckets, name, place, cells) for name in _SHARES},
             )
         )
-    return RatesOfRuns(start=start, end=end, cell=level, runs=tuple(rates))
+    return RatesOfRuns(start=start, end=end, cell_s=width_s, runs=tuple(rates))
+
+
+def _tai_ns(moment: Utc) -> int:
+    return moment.tai_ns
+
+
+def _days_of_a_cell(length_s: float) -> int:
+    return math.ceil(length_s / (DAY_S * _MOST_CELLS_OF_DAYS))
 
 
 def _common_days(
