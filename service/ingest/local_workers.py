@@ -43,6 +43,8 @@ PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0
 """Before processes are started in place of some that died: twice as long each time."""
 IDLE_S = 600.0
 """After so long without a chunk the processes end, and give their memory back."""
+MOST_STARTS = 3
+"""Of processes for one chunk, where they die before they have it."""
 MOST_DEATHS = 2
 """A chunk that was alone at work when so many processes died is given up."""
 PACKED_TOGETHER, MOST_BYTES = 8, 65_536
@@ -174,14 +176,23 @@ class LocalWorkers(Generic[Input, Output]):
         resource_tracker.ensure_running()  # it would unblock the signals
         # The processes are started now; each hears no signal until it ignores them.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+        ready = []
         try:
-            ready = [executor.submit(_ready) for _ in range(self.count)]
+            ready += [executor.submit(_ready) for _ in range(self.count)]
+        except BrokenProcessPool:
+            # One has died already: whoever submits next finds that out, too.
+            pass
+        except OSError:
+            self._end_processes()
+            executor.shutdown(wait=False)
+            raise
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        for each in ready:
-            each.add_done_callback(partial(self._note_ready, executor))
         self._end_all_with_the_first(executor, self._stop)
         self._check_idle_after(IDLE_S)
+        # Last, since one that has died already is noted here, and its executor replaced.
+        for each in ready:
+            each.add_done_callback(partial(self._note_ready, executor))
         return executor
 
     def _end_processes(self) -> ProcessPoolExecutor | None:
@@ -216,14 +227,23 @@ class LocalWorkers(Generic[Input, Output]):
         threading.Thread(target=wait_for_an_end, name="worker-ends", daemon=True).start()
 
     def _hand_in(self, chunk: _QueuedTask[Input, Output]) -> None:
-        executor = self._executor or self._open()
-        try:
-            future = executor.submit(_compute, self._work, chunk.task)
-        except BrokenProcessPool:
-            self._replace(executor)
-            executor = self._open()
-            future = executor.submit(_compute, self._work, chunk.task)
-        future.add_done_callback(partial(self._take_result, chunk, executor))
+        """Have a chunk computed; without processes that stay up it fails."""
+        reason = "processes died as soon as they were started"
+        for _ in range(MOST_STARTS):
+            try:
+                executor = self._executor or self._open()
+            except OSError as error:
+                reason = f"no process can be started: {error}"
+                break
+            try:
+                future = executor.submit(_compute, self._work, chunk.task)
+            except BrokenProcessPool:
+                self._replace(executor)
+                continue
+            future.add_done_callback(partial(self._take_result, chunk, executor))
+            return
+        _fail(chunk, WorkerLost(reason))
+        self._go_on(chunk)
 
     def _replace(self, broken: ProcessPoolExecutor) -> None:
         if self._executor is broken:

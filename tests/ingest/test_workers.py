@@ -19,7 +19,12 @@ from sqlalchemy import select
 
 from service.app.factory import open_app
 from service.errors import AcquisitionError, BadBatch, BadConfiguration, BadInput
-from service.ingest.local_workers import ChunkEndsWorkers, LocalWorkers, WorkerConfig
+from service.ingest.local_workers import (
+    ChunkEndsWorkers,
+    LocalWorkers,
+    WorkerConfig,
+    WorkerLost,
+)
 from service.ingest.telemetry_lines import identity_in
 from service.observations.schema import submission_from_json
 from service.settings import Settings
@@ -202,6 +207,49 @@ def test_a_chunk_that_ends_its_processes_is_named_and_costs_no_other(missions, s
             else:
                 assert future.result(GIVE_UP_S) == [2 * number]
         assert workers.submit(6).result(GIVE_UP_S) == [12]
+    finally:
+        workers.close()
+
+
+@pytest.fixture
+def dies_at_start(monkeypatch):
+    """Has the first process of each of the next so many starts die before anything else happens."""
+    left = []
+    mask = signal.pthread_sigmask
+
+    def after_a_start(how, signals):
+        found = mask(how, signals)
+        if how == signal.SIG_SETMASK and left:
+            left.pop()
+            (workers,) = WATCHED
+            child, *_ = workers._executor._processes.values()
+            child.kill()
+            wait_until(lambda: workers._executor._broken, "nobody has noticed")
+        return found
+
+    monkeypatch.setattr(signal, "pthread_sigmask", after_a_start)
+    yield lambda starts: left.extend(range(starts))
+    WATCHED.clear()
+
+
+WATCHED = []
+
+
+@pytest.mark.parametrize("starts", [1, 2])
+def test_a_process_that_dies_at_its_start_costs_no_chunk(missions, sky, dies_at_start, starts):
+    config = WorkerConfig(missions, None, sky.catalog.digest, 1 << 20)
+    workers = LocalWorkers(config, double, 2)
+    WATCHED.append(workers)
+    try:
+        assert workers.submit(1).result(GIVE_UP_S) == [2]
+        # Those that take the place of the one that dies over 13 die at their start.
+        dies_at_start(starts)
+        futures = {number: workers.submit(number) for number in (2, 13, 4, 5, 6)}
+        for number, future in futures.items():
+            if number == 13:
+                assert isinstance(future.exception(GIVE_UP_S), WorkerLost)
+            else:
+                assert future.result(GIVE_UP_S) == [2 * number]
     finally:
         workers.close()
 
