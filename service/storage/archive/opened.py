@@ -9,7 +9,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 from sqlalchemy import Connection, StaticPool, Table, create_engine
-from sqlalchemy.schema import CreateTable
+from sqlalchemy.schema import CreateIndex, CreateTable
 
 from service.storage.archive.folder import Settings
 from service.storage.archive.rows import CHILDREN, OF_BATCHES, Rows
@@ -62,6 +62,16 @@ class Opened:
         """The connection to it."""
         with self._lock, self._engine.connect() as connection:
             yield connection
+
+    def add_indexes(self) -> None:
+        """Give it the record's indexes: without them a join of thousands of results takes minutes.
+
+        A page of a list is read faster without.
+        """
+        with self._engine.begin() as connection:
+            for table in _TABLES:
+                for index in sorted(table.indexes, key=lambda each: str(each.name)):
+                    connection.execute(CreateIndex(index))
 
     def add_partition(self, partition: pa.Table) -> None:
         """Add results of a part, with the columns of it that were read."""

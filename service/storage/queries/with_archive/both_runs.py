@@ -62,6 +62,7 @@ def both_runs(
         _add_recorded(connection, opened, [*own[False], *_named(connection, batches, other, names)])
         archived = [*own[True], *_named(connection, archived_batches, other, names)]
         _add_archived(connection, archive, opened, archived)
+        opened.add_indexes()
         yield opened
         beyond = found[-1].place
         left = None if left is None else left - len(found)
