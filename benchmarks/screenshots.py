@@ -62,7 +62,11 @@ PATIENCE_S = 600.0
 
 def main() -> int:
     """Fill a service, look at every page, write the pictures."""
-    parser = argparse.ArgumentParser(prog="benchmarks.screenshots", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="benchmarks.screenshots",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("--folder", type=Path, default=FOLDER, help="where the pictures go")
     parser.add_argument("--only", help="pages by name, with commas between, e.g. batch,alarms")
     asked = parser.parse_args()

@@ -82,7 +82,11 @@ def _hd_numbers(names: dict[str, dict[str, Any]]) -> Iterator[tuple[int, float]]
 
 def main(arguments: list[str] | None = None) -> int:
     """The command; 0 when the file is written, 2 when a package is missing or wrong."""
-    parser = argparse.ArgumentParser(prog="python -m catalogs.build", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m catalogs.build",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("folder", type=Path, help="where the source packages are")
     parser.add_argument("output", type=Path, nargs="?", default=HERE / "stars.npz")
     chosen = parser.parse_args(arguments)

@@ -16,7 +16,7 @@ import tempfile
 import threading
 import time
 import urllib.request
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -46,6 +46,7 @@ ONE_BY_ONE = 200
 """Of a turn, over one connection."""
 BULK, QUICK_BULK = 30_000, 3_000
 ROUNDS, QUICK_ROUNDS = 9, 3
+PACED, QUICK_PACED = 1_000, 200
 GAP_S = 0.02
 """Between the posts of a connection, where waits and not rates are measured."""
 CHUNK = 250
@@ -240,35 +241,16 @@ def bulk(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any], l
     alone = pass_.bodies(min(count, 4_000), "ceiling")
     ceilings = [_parse_and_insert(alone, folder / "before.db")]
     with service(folder / "bulk.db") as served:
-        _posted(served, f"{API}/batches", pass_.bodies(400, "warm"))
+        warm(served, pass_)
         _warm_bulk(served, pass_.bodies(400, "warm-bulk"))
         started = time.perf_counter()
         state = _finished(served, _start_replay(served, lines, "bulk"))
         rate = count / (time.perf_counter() - started)
         done = state["counts"]["new"] if state["state"] == "done" else 0
         bounds.append(equal("batches that the bulk recorded", done, count))
-        paced = 200 if quick else 1_000
-        idle = _posted(served, f"{API}/batches", pass_.bodies(paced, "idle"), GAP_S)
+        idle = waits_idle(served, pass_, quick)
         place = _start_replay(served, lines, "beside")
-        beside = Driven()
-        over = threading.Event()
-
-        def post_beside() -> None:
-            # Only what was posted while the replay ran counts.
-            part = 0
-            while not over.is_set():
-                part += 1
-                driven = _posted(served, f"{API}/batches", pass_.bodies(100, f"b{part}"), GAP_S)
-                if not over.is_set():
-                    beside.waits_ms += driven.waits_ms
-
-        posting = threading.Thread(target=post_beside)
-        posting.start()
-        try:
-            _finished(served, place)
-        finally:
-            over.set()
-            posting.join()
+        beside = waits_beside(served, pass_, lambda: _finished(served, place))
         memory_mb = served.resident_mb()
     # Before and after: the machine may be faster at one time than at another.
     ceilings.append(_parse_and_insert(alone, folder / "after.db"))
@@ -295,6 +277,41 @@ def bulk(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any], l
     # Without a hundred of them there is no p99.
     bounds.append(at_least("single posts while bulk ran", len(beside.waits_ms), 100))
     return figures, bounds
+
+
+def warm(served: Served, pass_: Telemetry) -> None:
+    """Posts that are not measured."""
+    _posted(served, f"{API}/batches", pass_.bodies(400, "warm"))
+
+
+def waits_idle(served: Served, pass_: Telemetry, quick: bool) -> Driven:
+    """Single posts, paced, to a service that does nothing else."""
+    bodies = pass_.bodies(QUICK_PACED if quick else PACED, "idle")
+    return _posted(served, f"{API}/batches", bodies, GAP_S)
+
+
+def waits_beside(served: Served, pass_: Telemetry, work: Callable[[], object]) -> Driven:
+    """Single posts, paced as those of `waits_idle`, for as long as `work` takes."""
+    beside = Driven()
+    over = threading.Event()
+
+    def post() -> None:
+        # Only what was posted while the work went on counts.
+        part = 0
+        while not over.is_set():
+            part += 1
+            driven = _posted(served, f"{API}/batches", pass_.bodies(100, f"b{part}"), GAP_S)
+            if not over.is_set():
+                beside.waits_ms += driven.waits_ms
+
+    posting = threading.Thread(target=post)
+    posting.start()
+    try:
+        work()
+    finally:
+        over.set()
+        posting.join()
+    return beside
 
 
 def _warm_bulk(served: Served, lines: Sequence[bytes]) -> None:

@@ -219,7 +219,9 @@ def _vacuum(engine: Engine, how: str) -> float:
 
 def main() -> int:
     """Measure and print; 1 without a database, or where a figure is out of bounds."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument(
         "--recorded", type=int, default=RECORDED, help="batches of a day, 40000 at most"
     )

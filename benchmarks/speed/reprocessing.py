@@ -5,16 +5,32 @@
 
 The same drawn telemetry is loaded in bulk by two processes, archived, and run again by two
 processes and by one.  Of each the rate is that of the time after its processes have begun.
+Where TEST_POSTGRESQL_URL names a scratch database, single posts go to a service over it while
+the command runs beside.
 """
 
 import json
+import os
+import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
-from benchmarks.bounds import Bound, at_least, equal
+from benchmarks.bounds import Bound, at_least, at_most, equal
 from benchmarks.report import Report
+from benchmarks.speed.posts import (
+    API,
+    MOST_WAIT,
+    read_json,
+    telemetry,
+    waits_beside,
+    waits_idle,
+    warm,
+)
+from benchmarks.speed.scale import emptied
+from benchmarks.speed.serving import service
 from service.app.factory import App, open_app
 from service.ingest.reprocess import ReprocessProgress
 from service.missions.mission import load_missions
@@ -25,14 +41,18 @@ from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
 from service.storage.archive import archiving
+from service.storage.sql.migrations import upgrade
 from service.times import parse_utc, shifted
 
 BATCHES, QUICK_BATCHES = 40_000, 4_000
+BESIDE, QUICK_BESIDE = 20_000, 2_000
 PARTITIONS = 40
 """Of a day each."""
+END_S = (PARTITIONS + 1) * 86_400.0
 PROCESSES = 2
 LEAST_OF_BULK, LEAST_OF_ONE = 1.0, 1.6
 START = "1999-03-01T00:00:00.000Z"
+"""The posts beside are dated years earlier."""
 
 
 class Pace:
@@ -84,6 +104,10 @@ def _bytes(folder: Path, processes: int) -> int:
     return sum(each.stat().st_size for each in folder.rglob(f"run-by-{processes}-*"))
 
 
+def _archived(app: App, folder: Path) -> int:
+    return archiving.archive(app.store, folder, shifted(parse_utc(START), END_S)).batches
+
+
 def measured(count: int, seed: int) -> tuple[dict[str, Any], list[Bound]]:
     """The figures for so many batches."""
     lines = _telemetry(count, seed)
@@ -100,9 +124,7 @@ def measured(count: int, seed: int) -> tuple[dict[str, Any], list[Bound]]:
         try:
             bulk = _bulk(app, lines)
             began_s = time.perf_counter()
-            end = shifted(parse_utc(START), (PARTITIONS + 1) * 86_400.0)
-            archived = archiving.archive(app.store, folder, end)
-            archive = archived.batches / (time.perf_counter() - began_s)
+            archive = _archived(app, folder) / (time.perf_counter() - began_s)
             two, progress = _again(app, folder, PROCESSES)
             bounds.append(equal("batches run again", progress.recorded, count))
             one, _ = _again(app, folder, 1)
@@ -123,7 +145,52 @@ def measured(count: int, seed: int) -> tuple[dict[str, Any], list[Bound]]:
     return figures, bounds
 
 
+def beside(url: str, quick: bool, seed: int) -> tuple[dict[str, Any], list[Bound]]:
+    """The waits of single posts while the command runs again what was archived of `url`."""
+    count = QUICK_BESIDE if quick else BESIDE
+    emptied(url)
+    upgrade(url)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        app = open_app(Settings(database=url, archive_folder=folder, replay_processes=PROCESSES))
+        try:
+            _bulk(app, _telemetry(count, seed))
+            _archived(app, folder)
+        finally:
+            app.close()
+        command = [sys.executable, "-m", "service.cli", "reprocess", "--database", url]
+        command += ["--archive", str(folder), "--source", "source", "--run", "beside"]
+        command += ["--processes", str(PROCESSES), "--no-comparison", "--quiet"]
+        posts = telemetry(seed)
+        with service(url) as served:
+            warm(served, posts)
+            idle = waits_idle(served, posts, quick)
+            waited = waits_beside(
+                served,
+                posts,
+                lambda: subprocess.run(command, check=True, stdout=subprocess.DEVNULL),
+            )
+            days = read_json(served, f"{API}/spacecraft/XTE/rates?bucket=day&run=beside")["items"]
+    emptied(url)
+    wait = waited.percentile_ms(99) / idle.percentile_ms(99)
+    figures = {
+        "beside: p50 of single posts idle, ms": idle.percentile_ms(50),
+        "beside: p99 of single posts idle, ms": idle.percentile_ms(99),
+        "beside: posts meanwhile": len(waited.waits_ms),
+        "beside: p50 of single posts, ms": waited.percentile_ms(50),
+        "beside: p99 of single posts, ms": waited.percentile_ms(99),
+    }
+    return figures, [
+        equal("beside: batches run again", sum(each["batches"] for each in days), count),
+        at_most("beside: p99 of single posts over idle", wait, MOST_WAIT),
+    ]
+
+
 def run(quick: bool, seed: int) -> Report:
     """The benchmark."""
     figures, bounds = measured(QUICK_BATCHES if quick else BATCHES, seed)
+    if postgresql := os.environ.get("TEST_POSTGRESQL_URL"):
+        more, of_posts = beside(postgresql, quick, seed)
+        figures |= more
+        bounds += of_posts
     return Report("reprocessing", figures, bounds)

@@ -339,7 +339,7 @@ def write(report: Report, count: int, seed: int) -> None:
     """Put a run between the comments of docs/scale.md."""
     start, end = "<!-- measured by benchmarks.speed.scale -->", "<!-- end of scale -->"
     before, _, rest = TARGET.read_text(encoding="utf-8").partition(start)
-    figures = table(("", "figure"), [(k, f"{v:,.4g}") for k, v in report.figures.items()])
+    figures = table(("", "figure"), report.figures.items())
     again = f"python -m benchmarks.speed.scale --batches {count} --seed {seed}"
     part = [start, figures, bounds_table(report.bounds), sizing(dict(report.figures))]
     part.append(f"{record_of(SERVICE).sentence} Again: `{again}`.\n{end}")
@@ -348,7 +348,9 @@ def write(report: Report, count: int, seed: int) -> None:
 
 def main() -> int:
     """Measure, print, and write the page if asked to; 1 where a figure is out of bounds."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--batches", type=int, default=BATCHES)
     parser.add_argument("--seed", type=int, default=3)
     parser.add_argument("--write", action="store_true", help="the figures of docs/scale.md")

@@ -56,12 +56,13 @@ def _stat(pid: int) -> list[str]:
 
 
 @contextmanager
-def service(database: Path, missions: Path | None = None) -> Iterator[Served]:
-    """`acquire serve` over a database file; it is told to stop at the end.
+def service(database: Path | str, missions: Path | None = None) -> Iterator[Served]:
+    """`acquire serve` over a file of SQLite or a database of this URL, told to stop at the end.
 
     `missions` is a folder of missions in place of the one that the environment names.
     """
-    arguments = ["-m", "service.cli", "serve", "--database", f"sqlite:///{database}"]
+    url = database if isinstance(database, str) else f"sqlite:///{database}"
+    arguments = ["-m", "service.cli", "serve", "--database", url]
     own = {} if missions is None else {"ACQUIRE_MISSIONS": str(missions)}
     with _served(arguments, "/readyz", own) as served:
         yield served

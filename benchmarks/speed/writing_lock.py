@@ -72,7 +72,9 @@ def _change_a_row(connection: Connection) -> None:
 
 def main() -> int:
     """Measure and print; 1 without a database, or where a figure is out of bounds."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--transactions", type=int, default=TRANSACTIONS, help="of either kind")
     parsed = parser.parse_args()
     url = os.environ.get("TEST_POSTGRESQL_URL")

@@ -206,7 +206,9 @@ def write(text: str, steps: list[Step]) -> None:
 
 def main() -> int:
     """Measure, print, and write the page if asked to; 1 where a figure is out of bounds."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--folder", type=Path, required=True, help=f"holds {FILE}")
     parser.add_argument("--seed", type=int, default=5)
     parser.add_argument("--write", action="store_true", help="the section of docs/calibration.md")

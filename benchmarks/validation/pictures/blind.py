@@ -169,7 +169,9 @@ def _kinds(rows: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
 
 def main() -> int:
     """Measure, print, and write the page if asked to; 1 where a figure is out of bounds."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--pictures", type=int, default=PICTURES)
     parser.add_argument("--seed", type=int, default=3)
     parser.add_argument("--folder", type=Path, help="of real pictures, with truth.json")

@@ -176,7 +176,9 @@ def _percent(values: Any) -> str:
 
 def main() -> int:
     """Measure, print, and write the page if asked to; 1 where a figure is out of bounds."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--runs", type=int, default=RUNS)
     parser.add_argument("--seed", type=int, default=5)
     parser.add_argument("--log", type=Path, help="what is done; default: by the code's digest")

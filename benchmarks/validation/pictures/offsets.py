@@ -168,7 +168,9 @@ SKYLESS = (points_anywhere, clusters, streaks, horizons, grids, double_points)
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, print, and write the page if asked to; 1 where a figure is out of bounds."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--pictures", type=int, default=PICTURES)
     parser.add_argument("--seed", type=int, default=77)
     parser.add_argument("--folder", type=Path, help="of real pictures, with truth.json")
