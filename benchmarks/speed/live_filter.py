@@ -2,10 +2,10 @@
 
     python -m benchmarks live_filter
 
-Two services run as they are served, each over a SQLite file of its own: one whose XTE has a gyro
-and a live filter that looks as often as a mission may ask for, one whose XTE has neither.  Each
-turn posts the same batches to both, to the first with the gyro blocks of that time.  Beside the
-times, the answers must be the same, and the filtered attitude that of the pass.
+Two services run as they are served, each over a SQLite file of its own: one whose XTE has a live
+filter that looks as often as a mission may ask for, one whose XTE has none.  Each turn posts the
+same batches to both, to the first with the gyro blocks of that time.  Beside the times, the
+answers must be the same, and the filtered attitude that of the pass.
 """
 
 import json
@@ -33,13 +33,7 @@ from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion
 
-TABLES = """
-[gyro]
-sigma_v_rad_s0_5 = 3.2e-7
-sigma_u_rad_s1_5 = 3.2e-10
-scale = 1e-5
-misalignment_arcsec = 2.0
-
+TABLE = """
 [live_filter]
 every_s = 0.1
 """
@@ -64,7 +58,7 @@ def run(quick: bool, seed: int) -> Report:
     with tempfile.TemporaryDirectory() as folder:
         missions = Path(folder) / "missions"
         missions.mkdir()
-        text = (SHIPPED_FOLDER / "xte.toml").read_text(encoding="utf-8") + TABLES
+        text = (SHIPPED_FOLDER / "xte.toml").read_text(encoding="utf-8") + TABLE
         (missions / "xte.toml").write_text(text, encoding="utf-8")
         drawn = _drawn(
             read_mission(missions / "xte.toml"), WARM + rounds * (count + ONE_BY_ONE), seed

@@ -41,6 +41,7 @@ TITLES = {
     "posts": "Single posts, bulk, both at once, start, memory",
     "live_filter": "Posts with a gyro and the live filter beside posts without",
     "stored": "As the database fills",
+    "reprocessing": "Reprocessing into an archive, and single posts beside it",
     "soak": "An hour at 70 % load",
 }
 ABOUT = {
@@ -67,8 +68,8 @@ ABOUT = {
         "counted each time."
     ),
     "live_filter": (
-        "Two services in one run, each over a SQLite file of its own: one whose mission has a gyro "
-        "and a live filter that looks as often as a mission may ask for, one without both. "
+        "Two services in one run, each over a SQLite file of its own: one whose mission has a live "
+        "filter that looks as often as a mission may ask for, one without it. "
         "In turns both get the same batches of a nominal pass, one a second of the pass, the first "
         "with the gyro blocks of 1,000 samples among them, which count as no posts but take their "
         "time. Bound: a post takes at most 1.1 times as long at 16 connections and over one, and "
@@ -77,6 +78,14 @@ ABOUT = {
     "stored": (
         "A database filled by `benchmarks.speed.fill_database`, then batches recorded in earnest "
         "and trends read; counted one by one, the results give the same numbers."
+    ),
+    "reprocessing": (
+        "A simulated pass of some weeks is recorded in bulk by two processes, archived with every "
+        "verification, and processed again into the archive by two processes and by one; the time "
+        "until the processes are ready does not count. Then, over PostgreSQL, single posts go to a "
+        "service while the command runs beside it, also while its processes start. Bounds: at "
+        "least the rate of recording in bulk; two processes at least 1.6 times one; p99 of single "
+        "posts under 3 times its idle value."
     ),
     "soak": (
         "What the service can do at 16 connections is measured, then batches come for an hour at "
