@@ -58,16 +58,20 @@ def run(quick: bool, seed: int) -> Report:
     with tempfile.TemporaryDirectory() as folder:
         missions = Path(folder) / "missions"
         missions.mkdir()
-        text = (SHIPPED_FOLDER / "xte.toml").read_text(encoding="utf-8") + TABLE
-        (missions / "xte.toml").write_text(text, encoding="utf-8")
-        drawn = _drawn(
-            read_mission(missions / "xte.toml"), WARM + rounds * (count + ONE_BY_ONE), seed
-        )
+        mission = mission_in(missions)
+        drawn = _drawn(mission, WARM + rounds * (count + ONE_BY_ONE), seed)
         with (
             service(Path(folder) / "with.db", missions) as filtering,
             service(Path(folder) / "without.db") as plain,
         ):
             return _measured(filtering, plain, drawn, count)
+
+
+def mission_in(folder: Path) -> Mission:
+    """The shipped XTE with a live filter, written to a folder of missions."""
+    file = folder / "xte.toml"
+    file.write_text((SHIPPED_FOLDER / "xte.toml").read_text("utf-8") + TABLE, "utf-8")
+    return read_mission(file)
 
 
 def _drawn(mission: Mission, count: int, seed: int) -> list[DrawnBatch]:

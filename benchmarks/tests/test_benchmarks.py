@@ -9,7 +9,7 @@ from benchmarks.__main__ import main
 from benchmarks.bounds import equal, share_as_expected
 from benchmarks.record import ROOT, digest_of, read_record
 from benchmarks.sections import Section, Written, bounds_shown, kept, stale, state_of
-from benchmarks.speed import performance, tracker_calibration
+from benchmarks.speed import live_filter, performance, tracker_calibration
 from benchmarks.validation import aberration, centroids, consistency, covariance, tracker_sigmas
 from benchmarks.validation.imaging_claims import HELD_AGAINST
 from benchmarks.validation.lost_in_space.__main__ import main as lost_in_space
@@ -17,6 +17,7 @@ from benchmarks.validation.lost_in_space.conditions import CONDITIONS
 from benchmarks.validation.lost_in_space.document import LEAST_RIGHT
 from benchmarks.verification import SECTIONS, TARGET, remake
 from benchmarks.verification import main as verification
+from service.missions.mission import load_missions
 
 
 @pytest.mark.parametrize(
@@ -32,6 +33,13 @@ def test_centroids_are_held_beside_photutils_and_sep(monkeypatch, seed):
     report = centroids.run(quick=True, seed=seed)
     assert report.passed, report.text()
     assert "sep winpos" in report.text()
+
+
+def test_the_mission_of_the_live_filter_differs_from_the_shipped_one_in_that_filter_alone(tmp_path):
+    """The service without the filter has the shipped mission."""
+    mission = live_filter.mission_in(tmp_path)
+    assert mission.live_filter is not None
+    assert mission.model_copy(update={"live_filter": None}) == load_missions()["XTE"]
 
 
 def test_the_tests_that_the_page_on_star_images_names_are_there():
