@@ -6,9 +6,10 @@
     python -m tests.pythons --require 3.13   fails where one of them is not there
 
 For each: the packages of requirements.lock with their hashes, the wheel, `pip check`, the
-migrations on an empty database, and the demo, which compiles the kernels, serves, replays three
-missions over HTTP and prints their rates.  Three to six minutes a version, nearly all of it
-compiling.  It needs the package index.
+migrations on an empty database, the demo, which compiles the kernels, serves, replays three
+missions over HTTP and prints their rates, and a worker that is killed over a chunk, since the
+standard executors of the versions differ in what they lock then.  Three to six minutes a version,
+nearly all of it compiling.  It needs the package index.
 """
 
 import argparse
@@ -27,6 +28,32 @@ from tqdm import tqdm
 CHECKOUT = Path(__file__).parents[1]
 UV = Path(sys.executable).parent / "uv"
 BATCHES = 20
+KILLED_WORKER = """
+import os
+import signal
+import time
+
+from service.ingest.local_workers import LocalWorkers, WorkerConfig
+from service.missions.mission import load_missions
+from service.sky.catalog.star_catalog import load_embedded
+
+GIVE_UP_S = 120.0
+
+
+def half_a_second(solver, number):
+    time.sleep(0.5)
+    return [number]
+
+
+if __name__ == "__main__":
+    config = WorkerConfig(load_missions(), None, load_embedded().digest, 1 << 20)
+    workers = LocalWorkers(config, half_a_second, 2)
+    assert workers.submit(0).result(GIVE_UP_S) == [0]
+    futures = [workers.submit(number) for number in range(4)]
+    os.kill(min(workers.pids), signal.SIGKILL)
+    assert [each.result(GIVE_UP_S) for each in futures] == [[0], [1], [2], [3]]
+    workers.close()
+"""
 PREFIX = "Programming Language :: Python :: 3."
 
 
@@ -78,6 +105,9 @@ def try_version(version: str, folder: Path) -> dict[str, object]:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     demo = run(acquire, "demo", "--once", "--json", "--batches", BATCHES, "--port", port)
+    script = home / "killed_worker.py"
+    script.write_text(KILLED_WORKER, "utf-8")
+    run("timeout", "600", python, script)
     return {"seconds": round(time.monotonic() - begun), "demo": json.loads(demo)}
 
 

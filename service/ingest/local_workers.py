@@ -16,7 +16,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future, InvalidStateError, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -88,6 +88,26 @@ class _QueuedTask(Generic[Input, Output]):
     done: "Future[list[Output]]" = field(default_factory=Future)
     deaths: int = 0
     """Processes that died while it was the only chunk at work."""
+    lost_starts: int = 0
+    """How often processes died before they were ready, while it was the only chunk."""
+
+
+@dataclass(eq=False)
+class _Processes(Generic[Input, Output]):
+    """The processes of one executor, and what was handed in to it and is unfinished."""
+
+    executor: ProcessPoolExecutor
+    stop: Connection
+    tasks: "set[_QueuedTask[Input, Output]]" = field(default_factory=set)
+    pids: set[int] = field(default_factory=set)
+    """Those that are ready to work; all are, as soon as one is."""
+    told_to_end: bool = False
+    _closing: threading.Lock = field(default_factory=threading.Lock)
+
+    def end(self) -> None:
+        """Have them exit: they see that the pipe is closed.  May be called again and anywhere."""
+        with self._closing:
+            self.stop.close()
 
 
 class LocalWorkers(Generic[Input, Output]):
@@ -97,11 +117,9 @@ class LocalWorkers(Generic[Input, Output]):
         """`work` is a function of a module, so that a worker finds it by its name."""
         self._config, self._work, self.count = config, work, count
         self._lock = threading.RLock()
-        self._executor: ProcessPoolExecutor | None = None
-        self._stop: Connection | None = None
+        self._processes: _Processes[Input, Output] | None = None
         self._one_by_one: deque[_QueuedTask[Input, Output]] = deque()
         """Chunks that were unfinished when an executor broke, and those that came since."""
-        self._pids: set[int] = set()
         self._pause_s = PAUSE_S
         self._not_before_s = 0.0
         self._used_s = 0.0
@@ -111,20 +129,25 @@ class LocalWorkers(Generic[Input, Output]):
     def pids(self) -> frozenset[int]:
         """The processes that are ready to work."""
         with self._lock:
-            return frozenset(self._pids)
+            return frozenset(self._processes.pids if self._processes else ())
 
     @property
     def up(self) -> int:
         """How many processes are ready to work."""
-        return len(self._pids)
+        processes = self._processes
+        return len(processes.pids) if processes else 0
 
     def start(self) -> None:
         """Have the processes started, unless they are there; returns at once."""
         with self._lock:
             self._used_s = time.monotonic()
             too_soon = self._used_s < self._not_before_s
-            if self._executor is None and self.count and not (self._closing or too_soon):
-                self._open()
+            if self._processes is None and self.count and not (self._closing or too_soon):
+                try:
+                    self._open()
+                except OSError as error:
+                    log.warning("no process that computes chunks can be started: %s", error)
+                    self._pause()
 
     def submit(self, task: Input) -> "Future[list[Output]]":
         """Queue a task; the future gives what was found, or raises `WorkerLost` or `Stopping`."""
@@ -145,163 +168,196 @@ class LocalWorkers(Generic[Input, Output]):
         Tasks that they were at work on are computed anew.
         """
         with self._lock:
-            executor = self._end_processes()
-        if executor is not None:
+            processes = self._end_processes()
+        if processes is not None:
             # Without the lock, which the executor's threads may wait for.
-            executor.shutdown(wait=False)
+            processes.executor.shutdown(wait=False)
 
     def close(self) -> None:
         """End the processes at once, whatever they compute."""
         with self._lock:
             self._closing = True
-            executor = self._end_processes()
-            waiting, self._one_by_one = self._one_by_one, deque()
-        if executor is not None:
+            processes = self._end_processes()
+            left, self._one_by_one = list(self._one_by_one), deque()
+        if processes is not None:
             # Without the lock, which the executor's threads may wait for.
-            executor.shutdown(cancel_futures=True)
-        for chunk in waiting:
+            processes.executor.shutdown(cancel_futures=True)
+            with self._lock:
+                left += processes.tasks
+        for chunk in left:
             _fail(chunk, Stopping("the service is stopping"))
 
     # ---- with the lock held ------------------------------------------------------------------
 
-    def _open(self) -> ProcessPoolExecutor:
+    def _open(self) -> "_Processes[Input, Output]":
+        """Start the processes; raises `OSError` where that cannot be done."""
         context = multiprocessing.get_context("spawn")
-        there, self._stop = context.Pipe(duplex=False)
-        executor = self._executor = ProcessPoolExecutor(
+        there, stop = context.Pipe(duplex=False)
+        executor = ProcessPoolExecutor(
             self.count,
             context,
             _begin,
             (self._config, there, context.Barrier(self.count), logs.configured()),
         )
-        resource_tracker.ensure_running()  # it would unblock the signals
-        # The processes are started now; each hears no signal until it ignores them.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-        ready = []
+        processes = self._processes = _Processes(executor, stop)
+        ready: list[Future[int]] = []
         try:
-            ready += [executor.submit(_ready) for _ in range(self.count)]
-        except BrokenProcessPool:
-            # One has died already: whoever submits next finds that out, too.
-            pass
-        except OSError:
+            resource_tracker.ensure_running()  # it would unblock the signals
+            # The processes are started now; each hears no signal until it ignores them.
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+            try:
+                ready.extend(executor.submit(_ready) for _ in range(self.count))
+            except BrokenProcessPool:
+                # One has died already, which `_see_the_end` finds out, too.
+                pass
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            self._watch(processes)
+        except (OSError, RuntimeError) as error:
+            # A thread that cannot be started is a RuntimeError.
             self._end_processes()
             executor.shutdown(wait=False)
-            raise
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        self._end_all_with_the_first(executor, self._stop)
+            raise OSError(f"{error}") from error
         self._check_idle_after(IDLE_S)
-        # Last, since one that has died already is noted here, and its executor replaced.
         for each in ready:
-            each.add_done_callback(partial(self._note_ready, executor))
-        return executor
+            each.add_done_callback(partial(self._note_ready, processes))
+        return processes
 
-    def _end_processes(self) -> ProcessPoolExecutor | None:
-        """Have the processes exit; gives their executor, which is to be shut down."""
-        executor, self._executor = self._executor, None
-        self._pids.clear()
-        if self._stop is not None:
-            # The processes see that the pipe is closed.
-            self._stop.close()
-            self._stop = None
-        return executor
+    def _end_processes(self) -> "_Processes[Input, Output] | None":
+        """Have the processes exit; gives them, for their executor is to be shut down."""
+        processes, self._processes = self._processes, None
+        if processes is not None:
+            processes.told_to_end = True
+            processes.end()
+        return processes
 
-    def _end_all_with_the_first(self, executor: ProcessPoolExecutor, stop: Connection) -> None:
-        """See to it that the executor notices a process that dies while it sends a result.
+    def _watch(self, processes: "_Processes[Input, Output]") -> None:
+        """Have a thread that sees to what the processes leave unfinished when one has died.
 
-        The executor would wait for the rest of the result for as long as any process can write
+        The executor would wait for the rest of a result for as long as any process can write
         to the pipe of results.  So this process gives up its own writing end, and the other
         workers end with the one that died: the executor is broken anyhow.
         """
+        executor = processes.executor
         executor._result_queue._writer.close()  # type: ignore[attr-defined]
         ends = [os.dup(each.sentinel) for each in executor._processes.values()]
-
-        def wait_for_an_end() -> None:
-            multiprocessing.connection.wait(ends)
-            for end in ends:
-                os.close(end)
-            with self._lock:
-                if self._stop is stop:
-                    stop.close()
-                    self._stop = None
-
-        threading.Thread(target=wait_for_an_end, name="worker-ends", daemon=True).start()
+        arguments = (processes, ends, executor._executor_manager_thread)
+        threading.Thread(
+            target=self._see_the_end, args=arguments, name="worker-ends", daemon=True
+        ).start()
 
     def _hand_in(self, chunk: _QueuedTask[Input, Output]) -> None:
         """Have a chunk computed; without processes that stay up it fails."""
         reason = "processes died as soon as they were started"
         for _ in range(MOST_STARTS):
             try:
-                executor = self._executor or self._open()
+                processes = self._processes or self._open()
             except OSError as error:
                 reason = f"no process can be started: {error}"
                 break
             try:
-                future = executor.submit(_compute, self._work, chunk.task)
+                future = processes.executor.submit(_compute, self._work, chunk.task)
             except BrokenProcessPool:
-                self._replace(executor)
+                self._replace(processes)
                 continue
-            future.add_done_callback(partial(self._take_result, chunk, executor))
+            processes.tasks.add(chunk)
+            future.add_done_callback(partial(self._take_result, chunk, processes))
             return
         _fail(chunk, WorkerLost(reason))
         self._go_on(chunk)
 
-    def _replace(self, broken: ProcessPoolExecutor) -> None:
-        if self._executor is broken:
+    def _replace(self, broken: "_Processes[Input, Output]") -> None:
+        if self._processes is broken:
             log.warning("a process that computed chunks has died; others are started")
-            self._end_processes()
-            broken.shutdown(wait=False)
+            self._processes = None
+            broken.end()
+            broken.executor.shutdown(wait=False)
+
+    def _pause(self) -> None:
+        """Start no processes for a while, unless a chunk needs them."""
+        self._not_before_s = time.monotonic() + self._pause_s
+        self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
 
     # ---- threads of the executor -------------------------------------------------------------
 
-    def _note_ready(self, executor: ProcessPoolExecutor, future: "Future[int]") -> None:
+    def _note_ready(self, processes: "_Processes[Input, Output]", future: "Future[int]") -> None:
+        if future.cancelled() or future.exception() is not None:
+            return
         with self._lock:
-            if self._executor is not executor or future.cancelled():
-                return
-            if future.exception() is None:
-                self._pids.add(future.result())
-                self._pause_s = PAUSE_S
-                return
-            # It died before it was ready: the next one may, too.
-            self._replace(executor)
-            self._not_before_s = time.monotonic() + self._pause_s
-            self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
+            processes.pids.add(future.result())
+            self._pause_s = PAUSE_S
 
     def _take_result(
         self,
         chunk: _QueuedTask[Input, Output],
-        executor: ProcessPoolExecutor,
-        future: "Future[tuple[int, list[bytes]]]",
+        processes: "_Processes[Input, Output]",
+        future: "Future[list[bytes]]",
     ) -> None:
         error = Stopping("the service is stopping") if future.cancelled() else future.exception()
-        if error is None:
-            pid, packs = future.result()
-            with suppress(Exception):
-                chunk.done.set_result([each for some in packs for each in pickle.loads(some)])
-            with self._lock:
-                if self._executor is executor:
-                    self._pids.add(pid)
-        elif isinstance(error, BrokenProcessPool) and not self._closing:
-            self._try_again(chunk, executor)
+        if isinstance(error, BrokenProcessPool):
+            # The executor may hold a lock of its own that a thread with ours waits for: what is
+            # unfinished is seen to in `_see_the_end`.
+            processes.end()
             return
-        elif self._closing:
+        if error is None:
+            try:
+                found = [each for some in future.result() for each in pickle.loads(some)]
+            except Exception as unreadable:
+                error = unreadable
+            else:
+                with suppress(InvalidStateError):  # cancelled meanwhile
+                    chunk.done.set_result(found)
+        with self._lock:
+            processes.tasks.discard(chunk)
+        if isinstance(error, Stopping) or (error is not None and self._closing):
             _fail(chunk, Stopping("the service is stopping"))
-        else:
+        elif error is not None:
             _fail(chunk, WorkerLost(f"a worker failed ({error!r})"))
         self._go_on(chunk)
 
-    def _try_again(self, chunk: _QueuedTask[Input, Output], broken: ProcessPoolExecutor) -> None:
+    # ---- a thread for each executor ----------------------------------------------------------
+
+    def _see_the_end(
+        self, processes: "_Processes[Input, Output]", ends: list[int], manager: threading.Thread
+    ) -> None:
+        multiprocessing.connection.wait(ends)
+        for end in ends:
+            os.close(end)
+        processes.end()
+        # It fails what is unfinished, and waits for the processes.
+        manager.join()
         with self._lock:
-            self._replace(broken)
+            if not (processes.pids or processes.told_to_end):
+                # They died before they were ready: the next ones may, too.
+                self._pause()
+            self._replace(processes)
+            left = [] if self._closing else list(processes.tasks)
+            processes.tasks.difference_update(left)
+        for chunk in left:
+            self._try_again(chunk, processes)
+
+    def _try_again(
+        self, chunk: _QueuedTask[Input, Output], ended: "_Processes[Input, Output]"
+    ) -> None:
+        with self._lock:
+            if self._closing:
+                _fail(chunk, Stopping("the service is stopping"))
+                return
             if not (self._one_by_one and self._one_by_one[0] is chunk):
                 self._one_by_one.append(chunk)
                 if len(self._one_by_one) == 1:
                     self._hand_in(chunk)
                 return
-            chunk.deaths += 1
-            if chunk.deaths < MOST_DEATHS:
+            if not ended.told_to_end:
+                chunk.deaths += bool(ended.pids)
+                chunk.lost_starts += not ended.pids
+            if chunk.deaths < MOST_DEATHS and chunk.lost_starts < MOST_STARTS:
                 self._hand_in(chunk)
                 return
-        _fail(chunk, ChunkEndsWorkers(f"{MOST_DEATHS} processes died over it"))
+        if chunk.deaths >= MOST_DEATHS:
+            _fail(chunk, ChunkEndsWorkers(f"{MOST_DEATHS} processes died over it"))
+        else:
+            _fail(chunk, WorkerLost("processes died as soon as they were started"))
         self._go_on(chunk)
 
     def _go_on(self, finished: _QueuedTask[Input, Output]) -> None:
@@ -313,24 +369,26 @@ class LocalWorkers(Generic[Input, Output]):
                     self._hand_in(self._one_by_one[0])
 
     def _check_idle_after(self, seconds: float) -> None:
-        timer = threading.Timer(seconds, self._check_idle, (self._executor,))
+        timer = threading.Timer(seconds, self._check_idle, (self._processes,))
         timer.daemon = True
         timer.start()
 
-    def _check_idle(self, executor: ProcessPoolExecutor) -> None:
+    def _check_idle(self, processes: "_Processes[Input, Output]") -> None:
         with self._lock:
-            if self._executor is not executor:
+            if self._processes is not processes:
                 return
+            if processes.tasks:
+                self._used_s = time.monotonic()
             idle_s = time.monotonic() - self._used_s
             if idle_s >= IDLE_S:
                 self._end_processes()
-                executor.shutdown(wait=False)
+                processes.executor.shutdown(wait=False)
             else:
                 self._check_idle_after(IDLE_S - idle_s)
 
 
 def _fail(chunk: _QueuedTask[Any, Any], error: Exception) -> None:
-    if not chunk.done.done():
+    with suppress(InvalidStateError):  # done or cancelled before
         chunk.done.set_exception(error)
 
 
@@ -370,10 +428,10 @@ def _ready() -> int:
     return os.getpid()
 
 
-def _compute(work: "Work[Any, Any]", task: Any) -> tuple[int, list[bytes]]:
+def _compute(work: "Work[Any, Any]", task: Any) -> list[bytes]:
     if isinstance(_solver, BadConfiguration):
         raise _solver
-    return os.getpid(), _packed(work(_solver, task))
+    return _packed(work(_solver, task))
 
 
 def _packed(found: Sequence[object]) -> list[bytes]:

@@ -222,9 +222,9 @@ def dies_at_start(monkeypatch):
         if how == signal.SIG_SETMASK and left:
             left.pop()
             (workers,) = WATCHED
-            child, *_ = workers._executor._processes.values()
+            child, *_ = workers._processes.executor._processes.values()
             child.kill()
-            wait_until(lambda: workers._executor._broken, "nobody has noticed")
+            wait_until(lambda: workers._processes.executor._broken, "nobody has noticed")
         return found
 
     monkeypatch.setattr(signal, "pthread_sigmask", after_a_start)
@@ -250,6 +250,62 @@ def test_a_process_that_dies_at_its_start_costs_no_chunk(missions, sky, dies_at_
                 assert isinstance(future.exception(GIVE_UP_S), WorkerLost)
             else:
                 assert future.result(GIVE_UP_S) == [2 * number]
+    finally:
+        workers.close()
+
+
+def test_a_process_that_dies_while_others_are_started_is_replaced(missions, sky, dies_at_start):
+    """Though no chunk is handed in: a replay hands none in before processes are ready."""
+    config = WorkerConfig(missions, None, sky.catalog.digest, 1 << 20)
+    workers = LocalWorkers(config, double, 2)
+    WATCHED.append(workers)
+    try:
+        dies_at_start(1)
+        workers.start()
+
+        def are_up():
+            workers.start()
+            return workers.up == 2
+
+        wait_until(are_up, "the processes have no successors")
+    finally:
+        workers.close()
+
+
+class Unreadable(Exception):
+    """Of two arguments, of which the exception keeps one: it cannot be read from a pickle."""
+
+    def __init__(self, one, other):
+        super().__init__(one)
+
+
+def slow_or_unreadable(solver, number):
+    """Half a second of work; of 13 a result that cannot be read."""
+    time.sleep(0.5)
+    return [Unreadable(1, 2) if number == 13 else number]
+
+
+def test_a_result_that_cannot_be_read_is_told(missions, sky):
+    config = WorkerConfig(missions, None, sky.catalog.digest, 1 << 20)
+    workers = LocalWorkers(config, slow_or_unreadable, 1)
+    try:
+        assert isinstance(workers.submit(13).exception(GIVE_UP_S), WorkerLost)
+        assert workers.submit(1).result(GIVE_UP_S) == [1]
+    finally:
+        workers.close()
+
+
+def test_processes_that_are_replaced_on_purpose_are_not_held_against_a_chunk(missions, sky):
+    config = WorkerConfig(missions, None, sky.catalog.digest, 1 << 20)
+    workers = LocalWorkers(config, slow_or_unreadable, 1)
+    try:
+        future = workers.submit(1)
+        for _ in range(4):
+            before = workers.pids
+            wait_until(lambda before=before: workers.pids - before, "no worker is ready")
+            assert not future.done()
+            workers.restart()
+        assert future.result(GIVE_UP_S) == [1]
     finally:
         workers.close()
 
