@@ -33,7 +33,8 @@ import os
 import signal
 import time
 
-from service.ingest.local_workers import LocalWorkers, WorkerConfig
+from service.ingest.local_workers import LocalWorkers
+from service.ingest.worker_process import WorkerConfig
 from service.missions.mission import load_missions
 from service.sky.catalog.star_catalog import load_embedded
 

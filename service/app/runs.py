@@ -8,9 +8,9 @@ from pathlib import Path
 from service.access.audit import Entry
 from service.app.context import Context, checked_run_name
 from service.errors import BadBatch, Fault
-from service.ingest.local_workers import WorkerConfig
 from service.ingest.reprocess import ReprocessPlan, ReprocessProgress, reprocess
 from service.ingest.solver_pool import Solver
+from service.ingest.worker_process import WorkerConfig
 from service.missions.mission import Mission, mission_named
 from service.storage.archive.reprocessing import Reprocessing, reprocessings
 from service.storage.models.compare import RatesOfRuns, RunChange, RunComparison

@@ -11,7 +11,7 @@ from functools import cached_property
 from service.errors import AcquisitionError, Busy
 from service.gyro.block import GyroBlock
 from service.ingest.gyro import GyroIntake
-from service.ingest.local_workers import ChunkEndsWorkers, LocalWorkers, WorkerConfig, WorkerLost
+from service.ingest.local_workers import ChunkEndsWorkers, LocalWorkers, WorkerLost
 from service.ingest.outcomes import Answers
 from service.ingest.solver_pool import Solver
 from service.ingest.submit import SubmissionService
@@ -24,6 +24,7 @@ from service.ingest.telemetry_lines import (
     identity_in,
     line_results,
 )
+from service.ingest.worker_process import WorkerConfig
 from service.observations.schema import Submission, submission_from_json
 from service.storage.gyro.blocks import Recorded
 from service.storage.recording.identity import Registry, look_up

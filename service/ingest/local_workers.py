@@ -5,7 +5,6 @@ breaks an executor whole: another takes its place, and what was unfinished is ha
 in again, one chunk at a time, so that a chunk that ends its process is known by name.
 """
 
-import gc
 import logging
 import multiprocessing
 import multiprocessing.connection
@@ -15,7 +14,6 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, InvalidStateError, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
@@ -23,22 +21,13 @@ from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
-from multiprocessing.synchronize import Barrier
-from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from service import logs
-from service.acquire.kernel_build import SIGNALS, end_with_parent
-from service.acquire.prewarm import prewarm_kernels
-from service.errors import BadConfiguration, Stopping
-from service.ingest.solver_pool import Solver
-from service.missions.mission import Mission
-from service.sky.cache import LruCache
-from service.sky.catalog.star_catalog import open_catalog
-from service.sky.model import SkyModel
+from service.acquire.kernel_build import SIGNALS
+from service.errors import Stopping
+from service.ingest.worker_process import Work, WorkerConfig, begin, compute, ready_pid
 
-NICENESS = 10
-"""Single batches go first."""
 PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0
 """Before processes are started in place of some that died: twice as long each time."""
 IDLE_S = 600.0
@@ -47,14 +36,11 @@ MOST_STARTS = 3
 """Of processes for one chunk, where they die before they have it."""
 MOST_DEATHS = 2
 """A chunk that was alone at work when so many processes died is given up."""
-PACKED_TOGETHER, MOST_BYTES = 8, 65_536
-"""Results of a worker, unless they are larger than so."""
 
 log = logging.getLogger(__name__)
 
 Input = TypeVar("Input")
 Output = TypeVar("Output")
-Work = Callable[[Solver, Input], Sequence[Output]]
 
 
 class WorkerLost(Exception):
@@ -63,23 +49,6 @@ class WorkerLost(Exception):
 
 class ChunkEndsWorkers(WorkerLost):
     """Processes died over a chunk again and again."""
-
-
-@dataclass(frozen=True)
-class WorkerConfig:
-    """The settings of a worker: the same missions, catalog and cache as its parent."""
-
-    missions: Mapping[str, Mission]
-    catalog: Path | None
-    catalog_digest: str
-    cache_bytes: int
-
-    def solver(self) -> Solver:
-        """The worker's solver; raises `BadConfiguration` where the catalog's file has changed."""
-        catalog = open_catalog(self.catalog)
-        if catalog.digest != self.catalog_digest:
-            raise BadConfiguration(f"catalog {self.catalog}: the file has changed since the start")
-        return Solver(self.missions, SkyModel(catalog, LruCache(self.cache_bytes)))
 
 
 @dataclass(eq=False)
@@ -196,7 +165,7 @@ class LocalWorkers(Generic[Input, Output]):
         executor = ProcessPoolExecutor(
             self.count,
             context,
-            _begin,
+            begin,
             (self._config, there, context.Barrier(self.count), logs.configured()),
         )
         processes = self._processes = _Processes(executor, stop)
@@ -206,7 +175,7 @@ class LocalWorkers(Generic[Input, Output]):
             # The processes are started now; each hears no signal until it ignores them.
             before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
             try:
-                ready.extend(executor.submit(_ready) for _ in range(self.count))
+                ready.extend(executor.submit(ready_pid) for _ in range(self.count))
             except BrokenProcessPool:
                 # One has died already, which `_see_the_end` finds out, too.
                 pass
@@ -256,7 +225,7 @@ class LocalWorkers(Generic[Input, Output]):
                 reason = f"no process can be started: {error}"
                 break
             try:
-                future = processes.executor.submit(_compute, self._work, chunk.task)
+                future = processes.executor.submit(compute, self._work, chunk.task)
             except BrokenProcessPool:
                 self._replace(processes)
                 continue
@@ -390,58 +359,3 @@ class LocalWorkers(Generic[Input, Output]):
 def _fail(chunk: _QueuedTask[Any, Any], error: Exception) -> None:
     with suppress(InvalidStateError):  # done or cancelled before
         chunk.done.set_exception(error)
-
-
-# ---- in a worker -------------------------------------------------------------------------------
-
-_solver: Solver | BadConfiguration
-_all_ready: Barrier
-
-
-def _begin(
-    config: WorkerConfig,
-    stop: Connection,
-    all_ready: Barrier,
-    log_settings: logs.LogSettings | None,
-) -> None:
-    global _solver, _all_ready
-    end_with_parent(stop)
-    _all_ready = all_ready
-    if log_settings is not None:
-        logs.configure(log_settings, "worker")
-    os.nice(NICENESS)
-    try:
-        _solver = config.solver()
-    except BadConfiguration as error:
-        # Raised here it would break the executor.
-        log.error("a worker cannot compute: %s", error)
-        _solver = error
-        return
-    prewarm_kernels(_solver.sky, _solver.missions)
-    gc.collect()
-    gc.freeze()
-
-
-def _ready() -> int:
-    """This process; each waits for the others, so that none answers for two."""
-    _all_ready.wait()
-    return os.getpid()
-
-
-def _compute(work: "Work[Any, Any]", task: Any) -> list[bytes]:
-    if isinstance(_solver, BadConfiguration):
-        raise _solver
-    return _packed(work(_solver, task))
-
-
-def _packed(found: Sequence[object]) -> list[bytes]:
-    """Some together, which share their names; large ones alone: unpacking holds the lock."""
-    packs = []
-    for first in range(0, len(found), PACKED_TOGETHER):
-        some = found[first : first + PACKED_TOGETHER]
-        pack = pickle.dumps(some, pickle.HIGHEST_PROTOCOL)
-        if len(pack) <= MOST_BYTES:
-            packs.append(pack)
-        else:
-            packs += [pickle.dumps([each], pickle.HIGHEST_PROTOCOL) for each in some]
-    return packs

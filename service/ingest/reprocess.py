@@ -17,9 +17,10 @@ from pathlib import Path
 from sqlalchemy import ColumnElement, Connection, and_, exists, func, select, update
 
 from service.errors import AcquisitionError, BadBatch, Busy, Fault, shown_value
-from service.ingest.local_workers import ChunkEndsWorkers, LocalWorkers, WorkerConfig, WorkerLost
+from service.ingest.local_workers import ChunkEndsWorkers, LocalWorkers, WorkerLost
 from service.ingest.solver_pool import Solver
 from service.ingest.tracking import tracked_again
+from service.ingest.worker_process import WorkerConfig
 from service.missions.mission import Mission
 from service.observations.schema import BatchIn, OptionsIn, Submission, submission_from_model
 from service.storage.archive.tables import archived_batches

@@ -22,10 +22,10 @@ from service.errors import AcquisitionError, BadBatch, BadConfiguration, BadInpu
 from service.ingest.local_workers import (
     ChunkEndsWorkers,
     LocalWorkers,
-    WorkerConfig,
     WorkerLost,
 )
 from service.ingest.telemetry_lines import identity_in
+from service.ingest.worker_process import WorkerConfig
 from service.observations.schema import submission_from_json
 from service.settings import Settings
 from service.storage.sql.tables import batches

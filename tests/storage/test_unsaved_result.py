@@ -6,7 +6,7 @@ import pickle
 import pytest
 from msgspec import structs
 
-from service.ingest.local_workers import MOST_BYTES, PACKED_TOGETHER, _packed
+from service.ingest.worker_process import MOST_BYTES, PACKED_TOGETHER, packed
 from tests.storage import samples
 
 
@@ -28,15 +28,15 @@ def test_a_draft_comes_from_another_process_whole_but_for_its_mission(unsaved, k
 def test_drafts_that_come_together_are_small(unsaved):
     """What they are made of has one name for all of them."""
     together = [unsaved(f"b{k}", after_s=60.0 * k) for k in range(2 * PACKED_TOGETHER)]
-    packs = _packed(together)
+    packs = packed(together)
     assert [len(pickle.loads(pack)) for pack in packs] == [PACKED_TOGETHER] * 2
-    alone = sum(len(pack) for each in together for pack in _packed([each]))
+    alone = sum(len(pack) for each in together for pack in packed([each]))
     assert sum(map(len, packs)) < 0.95 * alone
 
 
 def test_what_is_large_comes_alone():
     large = [b"x" * MOST_BYTES, b"y", b"z" * MOST_BYTES]
-    packs = _packed([*large, *[b"small"] * PACKED_TOGETHER])
+    packs = packed([*large, *[b"small"] * PACKED_TOGETHER])
     assert [pickle.loads(pack) for pack in packs[:3]] == [[each] for each in large]
     assert [each for pack in packs for each in pickle.loads(pack)] == [
         *large,

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Protocol
 
 from service.errors import AcquisitionError, BadConfiguration
-from service.ingest.local_workers import LocalWorkers, WorkerConfig, WorkerLost
+from service.ingest.local_workers import LocalWorkers, WorkerLost
 from service.ingest.partitions.tasks import PartitionResult, PartitionTask, process_partition
 from service.ingest.solver_pool import Solver
+from service.ingest.worker_process import WorkerConfig
 
 Outcome = PartitionResult | AcquisitionError
 Wait = Callable[[float], PartitionResult | None]

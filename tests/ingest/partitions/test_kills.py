@@ -121,8 +121,8 @@ def test_a_scheduler_that_goes_is_told_and_the_rest_is_done_without(
 
 @pytest.mark.parametrize("package", ["attitude-acquisition", "numba", "numpy", "pyarrow"])
 def test_a_worker_of_another_version_is_refused(archived, place, missions, package):
-    from service.ingest.local_workers import WorkerConfig
     from service.ingest.partitions import dask_workers
+    from service.ingest.worker_process import WorkerConfig
 
     versions = dask_workers.versions() | {package: "1.0"}
     with pytest.raises(BadConfiguration, match=rf"a worker has {package} .*, and the command 1\.0"):

@@ -1,0 +1,108 @@
+"""A local process that computes chunks of long work: its settings, and what it does.
+
+It has missions and a sky of its own and never sees the database.
+"""
+
+import gc
+import logging
+import os
+import pickle
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.synchronize import Barrier
+from pathlib import Path
+from typing import Any, TypeVar
+
+from service import logs
+from service.acquire.kernel_build import end_with_parent
+from service.acquire.prewarm import prewarm_kernels
+from service.errors import BadConfiguration
+from service.ingest.solver_pool import Solver
+from service.missions.mission import Mission
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import open_catalog
+from service.sky.model import SkyModel
+
+NICENESS = 10
+"""Single batches go first."""
+PACKED_TOGETHER, MOST_BYTES = 8, 65_536
+"""Results of a worker, unless they are larger than so."""
+
+log = logging.getLogger(__name__)
+
+Input = TypeVar("Input")
+Output = TypeVar("Output")
+Work = Callable[[Solver, Input], Sequence[Output]]
+
+
+@dataclass(frozen=True)
+class WorkerConfig:
+    """The settings of a worker: the same missions, catalog and cache as its parent."""
+
+    missions: Mapping[str, Mission]
+    catalog: Path | None
+    catalog_digest: str
+    cache_bytes: int
+
+    def solver(self) -> Solver:
+        """The worker's solver; raises `BadConfiguration` where the catalog's file has changed."""
+        catalog = open_catalog(self.catalog)
+        if catalog.digest != self.catalog_digest:
+            raise BadConfiguration(f"catalog {self.catalog}: the file has changed since the start")
+        return Solver(self.missions, SkyModel(catalog, LruCache(self.cache_bytes)))
+
+
+_solver: Solver | BadConfiguration
+_all_ready: Barrier
+
+
+def begin(
+    config: WorkerConfig,
+    stop: Connection,
+    all_ready: Barrier,
+    log_settings: logs.LogSettings | None,
+) -> None:
+    """Get ready to compute; the process exits when its parent does, or closes `stop`."""
+    global _solver, _all_ready
+    end_with_parent(stop)
+    _all_ready = all_ready
+    if log_settings is not None:
+        logs.configure(log_settings, "worker")
+    os.nice(NICENESS)
+    try:
+        _solver = config.solver()
+    except BadConfiguration as error:
+        # Raised here it would break the executor.
+        log.error("a worker cannot compute: %s", error)
+        _solver = error
+        return
+    prewarm_kernels(_solver.sky, _solver.missions)
+    gc.collect()
+    gc.freeze()
+
+
+def ready_pid() -> int:
+    """This process; each waits for the others, so that none answers for two."""
+    _all_ready.wait()
+    return os.getpid()
+
+
+def compute(work: Work[Any, Any], task: Any) -> list[bytes]:
+    """The results for a task, in packs; raises `BadConfiguration` where it cannot compute."""
+    if isinstance(_solver, BadConfiguration):
+        raise _solver
+    return packed(work(_solver, task))
+
+
+def packed(found: Sequence[object]) -> list[bytes]:
+    """Some together, which share their names; large ones alone: unpacking holds the lock."""
+    packs = []
+    for first in range(0, len(found), PACKED_TOGETHER):
+        some = found[first : first + PACKED_TOGETHER]
+        pack = pickle.dumps(some, pickle.HIGHEST_PROTOCOL)
+        if len(pack) <= MOST_BYTES:
+            packs.append(pack)
+        else:
+            packs += [pickle.dumps([each], pickle.HIGHEST_PROTOCOL) for each in some]
+    return packs
