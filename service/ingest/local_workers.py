@@ -271,7 +271,7 @@ class LocalWorkers(Generic[Input, Output]):
         if error is None:
             try:
                 found = [each for some in future.result() for each in pickle.loads(some)]
-            except Exception as unreadable:
+            except Exception as unreadable:  # whatever the classes of the results raise
                 error = unreadable
             else:
                 with suppress(InvalidStateError):  # cancelled meanwhile
