@@ -1,6 +1,6 @@
 """The benchmarks, each with its answers checked.
 
-    python -m benchmarks                       those of speed, ten minutes: `make bench`
+    python -m benchmarks                       those of speed, 15 minutes: `make bench`
     python -m benchmarks --all                 those of answers as well
     python -m benchmarks pipeline --quick      one, on a small sample
 
