@@ -82,8 +82,9 @@ ABOUT = {
     "reprocessing": (
         "A simulated pass of some weeks is recorded in bulk by two processes, archived with every "
         "verification, and processed again into the archive by two processes and by one; the time "
-        "until the processes are ready does not count. Then, over PostgreSQL, single posts go to a "
-        "service while the command runs beside it, also while its processes start. Bounds: at "
+        "until the processes are ready does not count. Then single posts go to a service over the "
+        "scratch database of PostgreSQL that TEST_POSTGRESQL_URL names while the command runs "
+        "beside it, also while its processes start; without one that part is left out. Bounds: at "
         "least the rate of recording in bulk; two processes at least 1.6 times one; p99 of single "
         "posts under 3 times its idle value."
     ),
