@@ -15,8 +15,13 @@ PARTS ?=
 WORKERS ?= 2
 BENCH_ARGS ?=
 # What comes to the database only after it was checked, or in a browser, is the same over both
-OVER_POSTGRESQL = --database postgresql -m "not torture" tests/web \
+ALL_OVER_POSTGRESQL = tests/web \
 	$(addprefix --ignore tests/web/test_,bad_input.py any_input.py console_in_browser.py)
+# What asks the database in a way of its own.
+SITTING_OVER_POSTGRESQL = $(addprefix tests/web/test_,batches.py bulk.py events.py history.py \
+	many_batches.py period.py revisions_and_runs.py trackers.py)
+OVER_POSTGRESQL = [ -z "$$TEST_POSTGRESQL_URL" ] || \
+	$(TEST) --database postgresql -m "not torture"
 # From the environment: TEST_POSTGRESQL_URL, a scratch database for the PostgreSQL tests, which
 # are skipped without it, e.g. postgresql+psycopg://user@127.0.0.1:5432/test
 
@@ -31,14 +36,15 @@ DEV = $(VENV)/.installed-dev
 .DEFAULT_GOAL = help
 # The steps of `make check` run one after another, also under -j.
 .NOTPARALLEL:
-.PHONY: help run test torture check format-check lint types floors migrations-check openapi-check \
+.PHONY: help run test full kernels torture check format-check lint types floors migrations-check openapi-check \
 	format lock bench compare stale pythons dist openapi clean
 
 help:
 	@echo "make run      set up, serve on http://$(HOST):$(PORT), replay sample telemetry, print a table"
-	@echo "make test     set up and run the tests"
-	@echo "make torture  kills, failing disks, odd input at full size (tests do a fiftieth); goes on"
-	@echo "              where it stopped; PARTS=\"kills and sqlite\" for some, as pytest -k has it"
+	@echo "make test     set up and run the tests of a sitting (minutes)"
+	@echo "make full     run all tests (an hour)"
+	@echo "make torture  kills, failing disks, odd input at full size (hours; goes on where it"
+	@echo "              stopped); PARTS=\"kills and sqlite\" for some, as pytest -k has it"
 	@echo "make check    tests, format, lint, types, import floors, migrations, openapi.yaml"
 	@echo "make format   format the code and mend what the linter can"
 	@echo "make bench    measure speed, write docs/performance.md; BENCH_ARGS=--all for all benchmarks"
@@ -56,17 +62,21 @@ help:
 run: $(RUNTIME)
 	@exec $(BIN)/acquire demo --host $(HOST) --port $(PORT) $(if $(BATCHES),--batches $(BATCHES)) $(DEMO_ARGS)
 
-test: $(DEV)
+TEST = $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile
+
+test: kernels
+	@echo "== tests"
+	@$(TEST) $(PYTEST_ARGS)
+	@$(if $(PYTEST_ARGS),:,$(OVER_POSTGRESQL) $(SITTING_OVER_POSTGRESQL))
+
+full: kernels
+	@echo "== all tests"
+	@$(TEST) --full $(PYTEST_ARGS)
+	@$(if $(PYTEST_ARGS),:,$(OVER_POSTGRESQL) --full $(ALL_OVER_POSTGRESQL))
+
+kernels: $(DEV)
 	@echo "== compiling the kernels (minutes after a change of the core, else seconds)"
 	@$(BIN)/python -m service.acquire.prewarm
-	@echo "== tests"
-	@$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile $(PYTEST_ARGS)
-ifeq ($(strip $(PYTEST_ARGS)),)
-	@if [ -n "$$TEST_POSTGRESQL_URL" ]; then \
-		echo "== the interface and its pages over PostgreSQL"; \
-		$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile $(OVER_POSTGRESQL); \
-	fi
-endif
 
 torture: $(DEV)
 	@echo "== torture: kills, failing disks and odd input at full size; hours"

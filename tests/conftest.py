@@ -3,11 +3,13 @@
 pytest --seed 7           other random draws, for hypothesis as well
 pytest --batches 2000     batches per mission held against the plain implementation
 pytest --database postgresql tests/web     the interface and its pages over PostgreSQL
-pytest --torture          tests of kills, failing disks and odd input at full size, not a fiftieth
+pytest --full             everything, also what takes too long for a sitting
+pytest --torture          tests of kills, failing disks and odd input at full size
 
-Every test that asks for `database` runs on SQLite and on PostgreSQL, which takes
-part where TEST_POSTGRESQL_URL names a database to be used for tests; each test has
-a schema of its own there.
+Every test that asks for `database` runs on SQLite. It runs on PostgreSQL too if
+TEST_POSTGRESQL_URL names a database to be used for tests, and if what the two do
+differs there: in `tests/storage`, where a test has the mark `both_databases`, and
+everywhere under --full.
 """
 
 import faulthandler
@@ -15,28 +17,29 @@ import json
 import logging
 import os
 import tomllib
-import uuid
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
+from pathlib import Path
 
 import hypothesis
 import numpy as np
 import pytest
 from _pytest.faulthandler import fault_handler_stderr_fd_key
-from sqlalchemy import create_engine, make_url, text
 
 from service.cli import main
 from service.missions.mission import SHIPPED_FOLDER, load_missions
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
-from service.storage.sql.engines import database_url
-from service.storage.sql.migrations import upgrade
-from tests import scale
+from tests import fresh_databases, scale
+from tests.fresh_databases import sqlite_at
 from tests.torture import FIGURES
 
 DEFAULT_SEED = 19941026
 DEFAULT_BATCHES = 240
 TORTURE_TIMEOUT_S = 6 * 3600
+STORAGE = Path(__file__).parent / "storage"
+OTHER_DATABASE = "needs no database of its choice"
+LEFT_OUT, LEFT_OUT_BY_WORKERS = pytest.StashKey(), pytest.StashKey()
 
 hypothesis.settings.register_profile(
     # Two shared cores: a deadline would fail on the machine, not on the code.
@@ -68,6 +71,9 @@ def pytest_addoption(parser):
         help="what the tests of pages and of the interface keep their records in",
     )
     parser.addoption(
+        "--full", action="store_true", help="also what takes too long for a sitting (an hour)"
+    )
+    parser.addoption(
         "--torture", action="store_true", help="kills, failing disks, odd input: at full size"
     )
 
@@ -76,6 +82,8 @@ def pytest_addoption(parser):
 def pytest_configure(config):
     if config.getoption("--torture"):
         os.environ.setdefault(scale.VARIABLE, "1")
+    if config.getoption("--full"):
+        os.environ.setdefault(scale.FULL, "1")
     seed = config.getoption("--seed")
     if seed == DEFAULT_SEED:
         hypothesis.settings.load_profile("repeatable")
@@ -85,13 +93,40 @@ def pytest_configure(config):
 
 
 def pytest_collection_modifyitems(config, items):
-    """With a --database of their own choice, only tests that keep something in it."""
-    if config.getoption("--database") == "sqlite":
-        return
-    chosen = [item for item in items if "chosen_database" in item.fixturenames]
-    others = [item for item in items if "chosen_database" not in item.fixturenames]
-    config.hook.pytest_deselected(items=others)
-    items[:] = chosen
+    """Leave out what belongs to `make full`, and with --database what has no choice of it."""
+    left = {}
+    for item in items:
+        why = _why_left_out(config, item)
+        if why:
+            left.setdefault(why, []).append(item)
+    config.stash[LEFT_OUT] = {why: len(those) for why, those in left.items()}
+    without = {id(item) for those in left.values() for item in those}
+    if without:
+        config.hook.pytest_deselected(items=[item for item in items if id(item) in without])
+        items[:] = [item for item in items if id(item) not in without]
+
+
+def _why_left_out(config, item):
+    if config.getoption("--database") != "sqlite" and "chosen_database" not in item.fixturenames:
+        return OTHER_DATABASE
+    if scale.is_full():
+        return None
+    if item.get_closest_marker("slow"):
+        return "slow"
+    if _is_repeated_over_postgresql(item):
+        return "repeated over PostgreSQL"
+    return None
+
+
+def _is_repeated_over_postgresql(item):
+    """Whether a test runs over both databases, and is held for the same over both."""
+    call = getattr(item, "callspec", None)
+    if call is None or "postgresql" not in call.params.values():
+        return False
+    if item.get_closest_marker("both_databases") or item.path.is_relative_to(STORAGE):
+        return False
+    # A test that names PostgreSQL itself is not a repetition.
+    return not any("database" in mark.args[0] for mark in item.iter_markers("parametrize"))
 
 
 def pytest_runtest_setup(item):
@@ -101,8 +136,14 @@ def pytest_runtest_setup(item):
         faulthandler.dump_traceback_later(TORTURE_TIMEOUT_S, exit=True, file=stderr)
 
 
-def pytest_terminal_summary(terminalreporter):
-    """What tests of endurance did, a line each."""
+def pytest_terminal_summary(terminalreporter, config):
+    """What was left for `make full`, and what tests of endurance did, a line each."""
+    left = {why: n for why, n in _left_out(config).items() if why != OTHER_DATABASE}
+    if left:
+        terminalreporter.section("left for `make full`")
+        for why, number in sorted(left.items()):
+            terminalreporter.line(f"{number} tests: {why}")
+        terminalreporter.line("kills, disk faults and mutations: one try of each here, more there")
     told = [
         f"{report.nodeid}: {', '.join(f'{each} {figure}' for each, figure in value.items())}"
         for reports in terminalreporter.stats.values()
@@ -115,6 +156,24 @@ def pytest_terminal_summary(terminalreporter):
         terminalreporter.section("figures")
         for line in sorted(told):
             terminalreporter.line(line)
+
+
+def _left_out(config):
+    """Numbers of tests that were left out, by reason: of this process or of its workers."""
+    return config.stash.get(LEFT_OUT, {}) or config.stash.get(LEFT_OUT_BY_WORKERS, {})
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_sessionfinish(session):
+    """A worker of pytest-xdist tells what it left out; all of them leave out the same."""
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["left_out"] = session.config.stash.get(LEFT_OUT, {})
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node):
+    told = getattr(node, "workeroutput", {}).get("left_out", {})
+    node.config.stash[LEFT_OUT_BY_WORKERS] = told
 
 
 @pytest.fixture(autouse=True)
@@ -177,54 +236,45 @@ def empty_database(request, tmp_path):
     if request.param == "sqlite":
         yield f"sqlite:///{tmp_path / 'acquire.db'}"
         return
-    with _postgresql_schema() as url:
+    with fresh_databases.postgresql_schema() as url:
+        yield url
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def database(request, tmp_path, postgresql_schemas):
+    """The URL of a database that is up to date."""
+    if request.param == "sqlite":
+        yield sqlite_at(tmp_path / "acquire.db")
+        return
+    with postgresql_schemas.fresh() as url:
         yield url
 
 
 @pytest.fixture(scope="session")
-def chosen_database(request, tmp_path_factory):
+def postgresql_schemas():
+    """Gives the URLs of PostgreSQL schemas that are up to date: `with schemas.fresh() as url`."""
+    schemas = fresh_databases.PostgresqlSchemas()
+    yield schemas
+    schemas.close()
+
+
+@pytest.fixture(scope="session")
+def postgresql_schema():
+    """Makes the URL of an empty schema on PostgreSQL, as a context; skips without a server."""
+    return fresh_databases.postgresql_schema
+
+
+@pytest.fixture(scope="session")
+def chosen_database(request, tmp_path_factory, postgresql_schemas):
     """Gives the URLs of databases of the kind that --database names, up to date."""
     with ExitStack() as schemas:
 
         def fresh():
             if request.config.getoption("--database") == "sqlite":
-                return f"sqlite:///{tmp_path_factory.mktemp('chosen') / 'acquire.db'}"
-            url = schemas.enter_context(_postgresql_schema())
-            upgrade(url)
-            return url
+                return sqlite_at(tmp_path_factory.mktemp("chosen") / "acquire.db")
+            return schemas.enter_context(postgresql_schemas.fresh())
 
         yield fresh
-
-
-@pytest.fixture(scope="session")
-def postgresql_schema():
-    """Makes the URL of a schema of its own on PostgreSQL, as a context; skips without a server."""
-    return _postgresql_schema
-
-
-@contextmanager
-def _postgresql_schema():
-    """A schema of its own; skips where no server is named, for SQLite needs none. CI names one."""
-    server = os.environ.get("TEST_POSTGRESQL_URL")
-    if not server:
-        pytest.skip("TEST_POSTGRESQL_URL names no PostgreSQL database to test on")
-    schema = f"test_{uuid.uuid4().hex}"
-    engine = create_engine(database_url(server), isolation_level="AUTOCOMMIT")
-    with engine.connect() as connection:
-        connection.execute(text(f"CREATE SCHEMA {schema}"))
-        # The server itself is never killed here: its commits need not wait for the disk.
-        options = f"-csearch_path={schema} -csynchronous_commit=off"
-        url = make_url(server).update_query_dict({"options": options})
-        yield url.render_as_string(hide_password=False)
-        connection.execute(text(f"DROP SCHEMA {schema} CASCADE"))
-    engine.dispose()
-
-
-@pytest.fixture
-def database(empty_database):
-    """The URL of a database that is up to date."""
-    upgrade(empty_database)
-    return empty_database
 
 
 @pytest.fixture

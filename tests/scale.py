@@ -1,15 +1,35 @@
-"""How often tests of endurance try: a fiftieth of their full size, or all of it (`--torture`).
+"""How much the tests try in each of the three commands.
 
-Another share is given in the environment, such as TEST_TORTURE=0.3.
+|                  | `make test`   | `make full`     | `make torture` |
+| `size(1_000)`    | once          | a fiftieth: 20  | 1,000          |
+| `size(1_000, 5)` | 5             | 20              | 1,000          |
+| `draws(50, 200)` | 50            | 200             | 200            |
+
+Another share of `size` is given in the environment, such as TEST_TORTURE=0.3.
 """
 
 import os
 
-SHARE = 50
+FULL_SHARE = 1 / 50
 VARIABLE = "TEST_TORTURE"
+FULL = "TEST_FULL"
 
 
-def size(full: int) -> int:
-    """How often to try what a torture tries `full` times."""
+def size(full: int, least: int = 1) -> int:
+    """How often to try what a torture tries `full` times; `make test` tries it `least` times."""
     given = os.environ.get(VARIABLE)
-    return max(1, int(full * float(given)) if given else full // SHARE)
+    share = float(given) if given else FULL_SHARE if is_full() else 0.0
+    return max(least, round(full * share))
+
+
+def draws(sitting: int, full: int) -> int:
+    """How many random cases to draw: `sitting` in `make test`, `full` in `make full`.
+
+    Only for a promise whose bound a wrong build still fails with the smaller number.
+    """
+    return full if is_full() else sitting
+
+
+def is_full() -> bool:
+    """Whether everything is to be tested, not only what fits into a sitting."""
+    return bool(os.environ.get(FULL) or os.environ.get(VARIABLE))

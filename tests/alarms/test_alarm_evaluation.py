@@ -458,7 +458,7 @@ def submitted(app, spacecraft, run, wanted):
 
 
 @pytest.mark.parametrize("spacecraft", ["XTE", "SWAS", "SOHO"])
-@pytest.mark.parametrize("empty_database", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("database", ["sqlite"], indirect=True)
 def test_the_sample_raises_an_alarm_in_its_growing_attitude_error(opened, spacecraft, seed):
     """And none in what comes before, nor for good."""
     app = opened()

@@ -14,7 +14,7 @@ from service.settings import Settings
 from service.storage.sql.database import Store
 from tests.calibration.wrong_file import true_batches, write_mission_files
 
-pytestmark = pytest.mark.parametrize("empty_database", ["postgresql"], indirect=True)
+pytestmark = pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 
 WHO = "J. Operator"
 

@@ -183,7 +183,7 @@ def test_a_database_out_of_reach_is_busy_and_the_reason_is_for_the_log_alone(app
     assert app.runs.all() == []
 
 
-@pytest.mark.parametrize("empty_database", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("database", ["sqlite"], indirect=True)
 def test_who_has_glanced_holds_no_moment_and_the_log_can_begin_anew(app, make):
     """By a prepared statement, and by one that SQLAlchemy opens a transaction for."""
     app.submissions.submit(make("b1"))
@@ -201,7 +201,7 @@ def test_who_has_glanced_holds_no_moment_and_the_log_can_begin_anew(app, make):
     assert not busy
 
 
-@pytest.mark.parametrize("empty_database", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("database", ["sqlite"], indirect=True)
 def test_a_table_that_is_missing_is_no_passing_trouble(app):
     rename = text("ALTER TABLE runs RENAME TO elsewhere")
     app.store.writer.change(lambda connection: connection.execute(rename).close()).result()

@@ -102,7 +102,7 @@ def test_one_change_that_fails_spoils_none_of_its_neighbours(store):
     assert names(store) == ["a", "b", "c"]
 
 
-@pytest.mark.parametrize("empty_database", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("database", ["sqlite"], indirect=True)
 def test_a_change_that_fails_with_an_answer_half_read_keeps_no_lock(store):
     """Closed like that, SQLite's connection would live on for as long as the answer does."""
     half_read = []
@@ -185,7 +185,7 @@ def test_a_commit_that_fails_reaches_everyone_who_waits_and_writing_goes_on(
     assert len(app.results.page().items) == 8
 
 
-@pytest.mark.parametrize("empty_database", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("database", ["sqlite"], indirect=True)
 def test_a_full_disk_loses_nothing_acknowledged_and_writing_resumes_with_room(
     app, make, caplog, monkeypatch
 ):

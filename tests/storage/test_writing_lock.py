@@ -7,7 +7,7 @@ import pytest
 from service.errors import Busy, Standby
 from service.storage.sql.database import Store
 
-pytestmark = pytest.mark.parametrize("empty_database", ["postgresql"], indirect=True)
+pytestmark = pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 
 
 @pytest.fixture

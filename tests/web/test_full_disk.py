@@ -31,7 +31,7 @@ def let_files_grow(pid, most_bytes):
         resource.prlimit(each, resource.RLIMIT_FSIZE, (most_bytes, hard))
 
 
-@pytest.mark.parametrize("empty_database", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("database", ["sqlite"], indirect=True)
 def test_readiness_knows_how_the_last_write_ended(database, sky, missions):
     with served(database) as (process, url):
 
@@ -64,7 +64,7 @@ def test_readiness_knows_how_the_last_write_ended(database, sky, missions):
         assert post("first").status_code == 200
 
 
-@pytest.mark.parametrize("empty_database", ["postgresql"], indirect=True)
+@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 def test_what_waits_is_counted_with_its_age(database, sky, missions):
     with served(database) as (_, url), ThreadPoolExecutor(3) as threads:
 

@@ -244,7 +244,7 @@ def assert_each_recorded_once(database, clients):
         app.close()
 
 
-@pytest.mark.parametrize("empty_database", ["postgresql"], indirect=True)
+@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 def test_a_locked_table_delays_nobody_for_long(database, template, figures):
     """Locked are what is looked up first, what is written then, and what is written last."""
     refused = 0
@@ -279,7 +279,7 @@ def test_a_locked_table_delays_nobody_for_long(database, template, figures):
     assert_each_recorded_once(database, clients)
 
 
-@pytest.mark.parametrize("empty_database", ["postgresql"], indirect=True)
+@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 def test_a_server_that_does_not_answer_delays_nobody_for_long(database, template, figures):
     """Whatever was on its way arrives in the end, and was given up by then."""
     there = make_url(database)
@@ -305,7 +305,7 @@ def test_a_server_that_does_not_answer_delays_nobody_for_long(database, template
     assert_each_recorded_once(database, clients)
 
 
-@pytest.mark.parametrize("empty_database", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("database", ["sqlite"], indirect=True)
 def test_a_file_that_another_process_writes_to_for_long_delays_nobody_for_long(
     database, template, figures
 ):
@@ -328,7 +328,7 @@ def test_a_file_that_another_process_writes_to_for_long_delays_nobody_for_long(
     assert_each_recorded_once(database, clients)
 
 
-@pytest.mark.parametrize("empty_database", ["postgresql"], indirect=True)
+@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 def test_tokens_out_of_reach_are_told_of_at_once(database, template):
     """Nobody can be known then: everything but the open routes says so, in time."""
     with served(database) as (_, url), locked(database, "access_tokens"):

@@ -40,7 +40,7 @@ def test_it_reports_ready_then_signs_of_life_then_that_it_stops(heard, tmp_path)
         assert process.wait(20) in (0, -signal.SIGTERM)
 
 
-@pytest.mark.parametrize("empty_database", ["postgresql"], indirect=True)
+@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 def test_a_service_that_stands_by_has_started(heard, database):
     engine = create_engine(database_url(database), poolclass=NullPool)
     with engine.connect() as other:

@@ -24,7 +24,7 @@ KILLS, TERMINATED = 100, 12
 ACKNOWLEDGED_A_ROUND = 1_000
 TAKE_OVER_S = 10.0
 
-pytestmark = pytest.mark.parametrize("empty_database", ["postgresql"], indirect=True)
+pytestmark = pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 
 HOLDS_LOCK = """
     SELECT pid FROM pg_locks

@@ -126,7 +126,7 @@ def test_of_several_who_write_the_same_file_the_first_one_s_stays(place):
     assert list(place.rglob("*.part")) == []
 
 
-@pytest.mark.parametrize("empty_database", ["postgresql"], indirect=True)
+@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 def test_posts_meanwhile_are_recorded_or_archived_but_never_both(
     archived, opened, place, bodies, monkeypatch
 ):
