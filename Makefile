@@ -15,6 +15,8 @@ PARTS ?=
 # of 1 to 1.5 GB; 0 for one after another
 WORKERS ?= auto
 BENCH_ARGS ?=
+# Of `make mutants`: e.g. "--seed 2 --suite sitting"; --help says more
+MUTANTS_ARGS ?=
 # What comes to the database only after it was checked, or in a browser, is the same over both
 ALL_OVER_POSTGRESQL = tests/web \
 	$(addprefix --ignore tests/web/test_,bad_input.py any_input.py console_in_browser.py)
@@ -36,7 +38,8 @@ RUNTIME = $(VENV)/.installed-runtime
 DEV = $(VENV)/.installed-dev
 
 .DEFAULT_GOAL = help
-.PHONY: help run test full kernels torture check static format-check lint types floors migrations-check openapi-check \
+.PHONY: help run test full kernels torture mutants check static format-check lint types floors \
+	migrations-check openapi-check \
 	format lock bench compare stale pythons dist openapi clean
 
 help:
@@ -45,6 +48,8 @@ help:
 	@echo "make full     run all tests (an hour)"
 	@echo "make torture  kills, failing disks, odd input at full size (hours; goes on where it"
 	@echo "              stopped); PARTS=\"kills and sqlite\" for some, as pytest -k has it"
+	@echo "make mutants  give the service 60 single faults, one at a time, and say which of them"
+	@echo "              the tests miss (hours; goes on where it stopped)"
 	@echo "make check    tests, format, lint, types, import floors, migrations, openapi.yaml"
 	@echo "make format   format the code and mend what the linter can"
 	@echo "make bench    measure speed, write docs/performance.md; BENCH_ARGS=--all for all benchmarks"
@@ -57,7 +62,7 @@ help:
 	@echo "make clean    remove .venv and everything that was built or cached"
 	@echo
 	@echo "Variables: PORT, HOST, BATCHES, PYTHON, WORKERS, TEST_POSTGRESQL_URL,"
-	@echo "           DEMO_ARGS, PYTEST_ARGS, PARTS, BENCH_ARGS, BASE, COMPARE_ARGS"
+	@echo "           DEMO_ARGS, PYTEST_ARGS, PARTS, MUTANTS_ARGS, BENCH_ARGS, BASE, COMPARE_ARGS"
 
 run: $(RUNTIME)
 	@exec $(BIN)/acquire demo --host $(HOST) --port $(PORT) $(if $(BATCHES),--batches $(BATCHES)) $(DEMO_ARGS)
@@ -82,6 +87,9 @@ torture: $(DEV)
 	@echo "== torture: kills, failing disks and odd input at full size; hours"
 	@echo "== results are in .torture; what passed with the same code is left out"
 	@$(BIN)/python -m pytest -p tests.torture --torture -m torture $(if $(PARTS),-k "$(PARTS)") $(PYTEST_ARGS)
+
+mutants: $(DEV)
+	@$(BIN)/python -m tests.mutants $(MUTANTS_ARGS)
 
 # What needs no test run goes beside the tests.
 check: $(DEV)

@@ -162,6 +162,20 @@ def test_the_worst_value_is_the_one_furthest_out_on_its_side():
     assert alarm["latest_value"] == -0.21
 
 
+def test_a_value_that_is_as_bad_as_the_worst_leaves_its_time_and_batch():
+    def at(second, value):
+        return Point(value, f"2026-01-01T00:00:0{second}.000Z", f"b{second}")
+
+    first, *later = at(1, 5.5), at(2, 5.2), at(3, 5.5)
+    alarm, _ = state_machine.raised(Severity.WATCH, LIMITS, first, first.time)
+    for point in later:
+        changes, _ = state_machine.observed(alarm, Severity.WATCH, LIMITS, point, point.time)
+        alarm = {**alarm, **changes}
+    worst = tuple(alarm[f"worst_{name}"] for name in ("value", "time", "batch_id"))
+    assert worst == (first.value, first.time, first.batch_id)
+    assert alarm["latest_batch_id"] == "b3"
+
+
 def test_on_the_other_side_the_value_that_is_further_beyond_its_bound_is_the_worst():
     now = "2026-01-01T00:00:00.000Z"
     alarm, _ = state_machine.raised(Severity.WATCH, LIMITS, Point(-0.25, now, "a"), now)
