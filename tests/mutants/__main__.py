@@ -61,6 +61,9 @@ AREAS = {
     ),
 }
 SUITES: dict[str, list[str]] = {"sitting": [], "full": ["--full"]}
+LEFT_OUT = "left out, because it fails without a fault"
+ROUND = 10
+"""How many faults are tried before the tests that killed them run without a fault."""
 RESERVE = 1.3
 """Faults drawn for each that is wanted: some of them are invalid."""
 
@@ -81,7 +84,7 @@ class Results:
         with self._file.open("a") as file:
             file.write(json.dumps(record | {"given": self._given}) + "\n")
         killer = f": {result['test']}" if result["test"] else ""
-        tqdm.write(f"{fault}\n    {result['outcome']}{killer} ({result['seconds']:.0f} s)")
+        print(f"{fault}\n    {result['outcome']}{killer} ({result['seconds']:.0f} s)", flush=True)
 
     def reached(self, suite: str, tree: Tree, jobs: int, tests: Sequence[str]) -> Reached:
         """Which tests reach which place: of an earlier run, or of one that is made now."""
@@ -95,37 +98,47 @@ class Results:
             file.write_text(json.dumps(known), "utf-8")
         found = Reached.read(known["places"], known["outcomes"])
         for test in sorted(found.left_out):
-            print(f"left out, because it fails without a fault: {test}")
+            print(f"{LEFT_OUT}: {test}")
         return found
 
 
 def judge_all(
-    tree: Tree, faults: Sequence[Fault], suite: str, parsed: argparse.Namespace, results: Results
+    tree: Tree, faults: Sequence[Fault], suites: Sequence[str], parsed: Any, results: Results
 ) -> None:
-    """Try the faults that are not killed yet, and others for those that are invalid."""
+    """Try in the last suite what those before did not kill, and others for invalid faults."""
+    *before, suite = suites
     reached = None
     while waiting := [
         number
         for number in chosen(faults, parsed.count, results)
-        if (number, suite) not in results.of and not is_killed(results, number)
+        if (number, suite) not in results.of and not is_killed(results, number, before)
     ]:
         reached = reached or results.reached(suite, tree, parsed.jobs, parsed.tests)
-        print(f"== {suite}: {len(waiting)} faults", flush=True)
-        with ThreadPoolExecutor(parsed.jobs) as pool:
-            futures = {
-                pool.submit(tree.judge, number, SUITES[suite], reached): number
-                for number in waiting
-            }
-            try:
-                progress = tqdm(
-                    as_completed(futures), total=len(futures), unit="fault", disable=None
-                )
-                for done in progress:
-                    results.add(suite, futures[done], faults[futures[done]], done.result())
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                tree.end_processes()
-                raise
+        print(f"== {suite}: {len(waiting)} faults to try", flush=True)
+        found = judge_some(tree, waiting[:ROUND], suite, parsed.jobs, reached)
+        killers = sorted({result["test"] for result in found.values()} - {None})
+        failing = tree.failing(killers, SUITES[suite], reached) if killers else set()
+        reached.left_out |= failing
+        for test in failing:
+            print(f"{LEFT_OUT}: {test}")
+        for number, result in found.items():
+            if result["test"] not in failing:
+                results.add(suite, number, faults[number], result)
+
+
+def judge_some(
+    tree: Tree, numbers: Sequence[int], suite: str, jobs: int, reached: Reached
+) -> dict[int, dict[str, Any]]:
+    """What becomes of some faults, several at a time."""
+    with ThreadPoolExecutor(jobs) as pool:
+        futures = {pool.submit(tree.judge, n, SUITES[suite], reached): n for n in numbers}
+        try:
+            done = tqdm(as_completed(futures), total=len(futures), unit="fault", disable=None)
+            return {futures[future]: future.result() for future in done}
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            tree.end_processes()
+            raise
 
 
 def chosen(faults: Sequence[Fault], count: int, results: Results) -> list[int]:
@@ -134,11 +147,8 @@ def chosen(faults: Sequence[Fault], count: int, results: Results) -> list[int]:
     return [number for number in range(len(faults)) if number not in invalid][:count]
 
 
-def is_killed(results: Results, number: int, suites: Sequence[str] = tuple(SUITES)) -> bool:
-    return any(
-        results.of.get((number, suite), {}).get("outcome", "").startswith("killed")
-        for suite in suites
-    )
+def is_killed(results: Results, number: int, suites: Sequence[str]) -> bool:
+    return any(results.of[n, s]["test"] for n, s in results.of if n == number and s in suites)
 
 
 def main(
@@ -168,11 +178,11 @@ def main(
     suites = list(SUITES) if parsed.suite == "both" else [parsed.suite]
     with closing(Tree(root, faults)) as tree:
         print(
-            "== compiling the kernels of the copy (minutes after a change of the core)", flush=True
+            "== compiling the kernels of the copy, minutes after a change of the core", flush=True
         )
         tree.compile_kernels()
-        for suite in suites:
-            judge_all(tree, faults, suite, parsed, results)
+        for number in range(len(suites)):
+            judge_all(tree, faults, suites[: number + 1], parsed, results)
     return report(faults, chosen(faults, parsed.count, results), suites, results)
 
 
@@ -185,9 +195,7 @@ def report(
     sooner = len(numbers) - len(survived) - len(later)
     print(f"\n{len(numbers)} faults: {sooner} killed by {suites[0]}")
     if suites[1:]:
-        print(
-            f"{len(later)} killed only by {suites[1]}; these tests have to come into the sitting:"
-        )
+        print(f"{len(later)} killed only by {suites[1]}, by tests that belong into the sitting:")
         for number in later:
             print(f"  {faults[number]}\n      {results.of[number, suites[1]]['test']}")
     print(f"{len(survived)} survived:")

@@ -17,8 +17,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from tests.mutants import probe
 from tests.mutants.faults import Fault, replaced
 
@@ -123,43 +121,43 @@ class Tree:
         return lines_of(folder / probe.NOTES), outcomes
 
     def judge(self, place: int, options: Sequence[str], reached: Reached) -> dict[str, Any]:
-        """Run the tests that may kill a fault; what came of it."""
+        """Run the tests that may kill a fault until one does; what came of it."""
         begun = time.monotonic()
         outcome, test = "not reached", None
-        while tests := reached.tests(place):
-            seconds = [reached.outcomes[test]["seconds"] for test in tests]
-            outcome, test = self._run(place, options, tests, seconds)
-            if test is None or self._run(NO_FAULT, options, [test], seconds)[1] is None:
-                break
-            tqdm.write(f"left out, because it fails without a fault: {test}")
-            reached.left_out.add(test)
-            outcome, test = "not reached", None
+        if tests := reached.tests(place):
+            code, failed, last = self._run(place, ["-x", *options], tests, reached)
+            if failed:
+                outcome, test = "killed", failed[0]
+            elif code == 0:
+                outcome = "survived"
+            elif code in PYTEST_STOPPED or not last:
+                outcome = "invalid"
+            else:
+                outcome, test = "killed by a hang or a crash", last
         return {"outcome": outcome, "test": test, "seconds": round(time.monotonic() - begun, 1)}
 
+    def failing(self, tests: Sequence[str], options: Sequence[str], reached: Reached) -> set[str]:
+        """Those of some tests that fail with no fault on."""
+        code, failed, last = self._run(NO_FAULT, options, tests, reached)
+        return {*failed, last} if code not in (0, 1) else set(failed)
+
     def _run(
-        self, place: int, options: Sequence[str], tests: Sequence[str], seconds: Sequence[float]
-    ) -> tuple[str, str | None]:
-        """Run tests with a fault on until one fails; the outcome and the test that failed."""
+        self, place: int, options: Sequence[str], tests: Sequence[str], reached: Reached
+    ) -> tuple[int, list[str], str]:
+        """Run tests with a fault on: exit code, tests that failed, the last that began."""
         folder = self._new_folder()
         (folder / probe.CHOSEN).write_text(json.dumps(tests), "utf-8")
-        hang_s = max(LEAST_HANG_S, HANG_FACTOR * max(seconds))
-        limit = f"faulthandler_timeout={hang_s:.0f}"
+        seconds = [reached.outcomes[test]["seconds"] for test in tests]
+        limit = f"faulthandler_timeout={max(LEAST_HANG_S, HANG_FACTOR * max(seconds)):.0f}"
         code = self._python(
-            *PYTEST, "-x", "-o", limit, f"--basetemp={folder / 'tmp'}", *options,
+            *PYTEST, "-o", limit, f"--basetemp={folder / 'tmp'}", *options,
             *dict.fromkeys(file_of(test) for test in tests),
             folder=folder, place=place, timeout_s=START_S + HANG_FACTOR * sum(seconds),
         )  # fmt: skip
         shutil.rmtree(folder / "tmp", ignore_errors=True)
         failed = [each["test"] for each in lines_of(folder / probe.OUTCOMES) if each["failed"]]
-        if failed:
-            return "killed", failed[0]
-        if code == 0:
-            return "survived", None
         running = [file.read_text("utf-8") for file in folder.glob("running-*")]
-        last = "".join(running).partition("\0")[0]
-        if code in PYTEST_STOPPED or not last:
-            return "invalid", None
-        return "killed by a hang or a crash", last
+        return code, failed, "".join(running).partition("\0")[0]
 
     def _new_folder(self) -> Path:
         folder = self._runs / str(next(self._run_numbers))
