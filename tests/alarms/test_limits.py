@@ -1,7 +1,7 @@
 """Limits: bounds, hysteresis, minimum count and duration."""
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
@@ -112,6 +112,8 @@ def test_the_value_does_not_depend_on_the_order_in_which_batches_come(samples, c
     st.integers(1, 6),
     st.sampled_from([0, 25]),
 )
+# A single value that is out, while the means are within, makes a later mean of values within out.
+@example([([(0, 0.5), (1, 0.5), (2, 1.3)], False), ([(3, 0.95), (4, 0.95)], False)], 3, 0)
 def test_what_is_passed_over_would_have_been_in_limits_one_by_one(groups, count, duration_s):
     """Group after group, whatever order they come in, and where the limits are set anew between."""
     wide, narrow = (
