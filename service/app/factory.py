@@ -102,6 +102,7 @@ class App:
         self.tracker_split.stop()
         self.submissions.close()
         self.store.close()
+        self.service.close()
 
 
 def open_app(

@@ -121,6 +121,14 @@ class Service:
         if self._kernels is not None:
             self._kernels.cancel()
 
+    def close(self) -> None:
+        """Let the garbage collector see the objects again that `ready` withheld from it.
+
+        Otherwise a program that opens and closes services would never free one.
+        """
+        if self._is_warm:
+            gc.unfreeze()
+
     def _prewarm_recent_pointings(self) -> None:
         """Build the zones that the next batch of each live spacecraft will most likely need.
 

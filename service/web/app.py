@@ -111,6 +111,7 @@ def create_app(app: App, limits: BodyLimits = DEFAULT_LIMITS) -> FastAPI:
             own = anyio.CapacityLimiter(1)
             await anyio.to_thread.run_sync(warming.join, limiter=own)
             await anyio.to_thread.run_sync(app.close, limiter=own)
+            web_app.state.metrics.close()
 
     web_app = bare_app()
     web_app.router.lifespan_context = lifespan

@@ -68,13 +68,17 @@ class _TimedReads:
                 found[name] = answer.result()
         return found
 
+    def close(self) -> None:
+        """Let the threads end; one that waits for a hanging database is not waited for."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+
 
 class _GaugeCollector(Collector):
     """Gauges that are read from other threads when the metrics are scraped."""
 
     def __init__(self, app: App) -> None:
         self._app = app
-        self._asked = _TimedReads(
+        self._reads = _TimedReads(
             zones=app.zones.state,
             processes=app.replays.processes,
             alarms=app.alarms.active,
@@ -82,9 +86,10 @@ class _GaugeCollector(Collector):
             expiries=app.expiries.dates,
             webhooks=app.webhooks.all,
         )
+        self.close = self._reads.close
 
     def collect(self) -> Iterator[Metric]:
-        found = self._asked()
+        found = self._reads()
         if "zones" in found:
             yield from _of_zones(found["zones"])
         if "processes" in found:
@@ -274,7 +279,10 @@ class Metrics:
         )
         # `Histogram.labels` checks its labels on every call.
         self._by_labels: dict[tuple[str, str, int], Histogram] = {}
-        self.registry.register(_GaugeCollector(app))
+        gauges = _GaugeCollector(app)
+        self.close = gauges.close
+        """Ends the threads that read gauges; to be called after the last scrape."""
+        self.registry.register(gauges)
         app.submissions.observers.append(self.count_batch)
         for name in app.missions:
             # A counter that exists from the start shows its first increase.
