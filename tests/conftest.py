@@ -277,6 +277,16 @@ def chosen_database(request, tmp_path_factory, postgresql_schemas):
         yield fresh
 
 
+@pytest.fixture(scope="session")
+def shared_service(chosen_database):
+    """One service for all tests that ask for nothing but to add to its records."""
+    # Its imports take seconds, which most tests need not wait for.
+    from tests.web.serving import serving_in_process
+
+    with serving_in_process(chosen_database()) as service:
+        yield service
+
+
 @pytest.fixture
 def acquire(capsys, tmp_path, monkeypatch):
     """Run a command in an empty folder with nothing set; its exit code, output and complaints."""

@@ -19,7 +19,7 @@ from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion, quaternion_from_matrix
 from service.web.app import create_app
-from tests.web.conftest import Server
+from tests.web.serving import Server
 
 
 @pytest.fixture(scope="module")

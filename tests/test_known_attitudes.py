@@ -17,7 +17,7 @@ from service.times import parse_utc
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion
 from service.web.app import create_app
 from tests.products.series import rows, written
-from tests.web.conftest import Server
+from tests.web.serving import Server
 
 N = 12
 

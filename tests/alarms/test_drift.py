@@ -14,7 +14,6 @@ from service.alarms.drift import MeanStars, alignment_offsets_arcsec, scale_offs
 from service.app.factory import open_app
 from service.missions.mission import parse_mission
 from service.observations.schema import submission_from_json
-from service.settings import Settings
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.ephemeris import apparent, observer_velocity
@@ -23,9 +22,10 @@ from service.storage.recording.result_metrics import metrics_of
 from service.vectors import unit
 from service.web.app import create_app
 from tests.calibration.wrong_file import TURNED_ARCSEC, mission_texts, true_batches
+from tests.fresh_databases import sqlite_at
 from tests.storage.twin import FIRST, SECOND, submission, twin
 from tests.web.conformance import check
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 
 BATCHES = 24
 ARCSEC = np.pi / 180.0 / 3600.0
@@ -169,7 +169,7 @@ def client(tmp_path):
     folder = tmp_path / "missions"
     folder.mkdir()
     (folder / "two.toml").write_text(mission_texts()["assumed"], "utf-8")
-    app = open_app(Settings(database=f"sqlite:///{tmp_path}/acquire.db", missions=folder))
+    app = open_app(in_process_settings(sqlite_at(tmp_path / "acquire.db"), missions=folder))
     with (
         Server(create_app(app)) as address,
         httpx.Client(base_url=address, timeout=60, event_hooks={"response": [check]}) as client,

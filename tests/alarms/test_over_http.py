@@ -3,27 +3,32 @@
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from tests.web.conftest import (
-    address,
-    app,
-    batch,
-    client,
-    drawn,
-)
-
-__all__ = ["address", "app", "batch", "client", "drawn"]
+from tests.web.conformance import checked
+from tests.web.serving import serving_in_process
 
 LIMITS = "/api/v1/spacecraft/XTE/limits"
 TIGHT = {"warning": {"high": 0.5}, "minimum_count": 1, "duration_s": 0}
 
 
 @pytest.fixture(scope="module")
-def alarm(client, drawn):
+def service(chosen_database):
+    """A service of this module's own: its limits would be in the way of other tests."""
+    with serving_in_process(chosen_database()) as service:
+        yield service
+
+
+@pytest.fixture(scope="module")
+def client(service):
+    return checked(service.client)
+
+
+@pytest.fixture(scope="module")
+def alarm(client, service):
     """An open alarm of a run of its own."""
     asked = {"settings": TIGHT, "who": "jb"}
     assert client.put(f"{LIMITS}/no_attitude_share", json=asked).status_code == 200
     assert client.put("/api/v1/runs/watched", json={"alarms": True}).status_code == 200
-    (lone,) = drawn("XTE", 1, stars=1)
+    (lone,) = service.draw("XTE", 1, stars=1)
     client.post("/api/v1/batches", json=lone | {"run": "watched"}).raise_for_status()
     (found,) = client.get("/api/v1/alarms?run=watched").json()["items"]
     return found
@@ -116,7 +121,7 @@ def test_live_batches_are_always_watched(client):
     assert answer.status_code == 422
 
 
-def test_live_alarms_are_counted_for_prometheus(client, drawn):
+def test_live_alarms_are_counted_for_prometheus(client, service):
     """None but those of live batches, each under how bad it is and where it stands."""
 
     def counted():
@@ -130,7 +135,7 @@ def test_live_alarms_are_counted_for_prometheus(client, drawn):
     url = "/api/v1/spacecraft/SWAS/limits/no_attitude_share"
     assert client.put(url, json=asked).status_code == 200
     assert counted() == set()
-    (lone,) = drawn("SWAS", 1, stars=1)
+    (lone,) = service.draw("SWAS", 1, stars=1)
     client.put("/api/v1/runs/apart", json={"alarms": True}).raise_for_status()
     client.post("/api/v1/batches", json=lone | {"run": "apart"}).raise_for_status()
     assert counted() == set()

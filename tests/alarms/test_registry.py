@@ -9,16 +9,9 @@ from service.alarms.limits import LimitSettings, above
 from service.alarms.quantities import QUANTITIES, BatchShare, Quantity, StarShare
 from service.cli import main
 from service.web.app import bare_app
-from tests.web.conftest import (
-    address,
-    app,
-    client,
-    drawn,
-    full_run,
-)
+from tests.web.conformance import checked
 from tests.web.markup import Markup
-
-__all__ = ["address", "app", "client", "drawn", "full_run"]
+from tests.web.serving import serving_in_process
 
 HISTORY = "/api/v1/spacecraft/XTE/history"
 LIMITS = "/api/v1/spacecraft/XTE/limits"
@@ -39,6 +32,23 @@ ADDED = (
         lambda mission: LimitSettings(),
     ),
 )
+
+
+@pytest.fixture(scope="module")
+def service(chosen_database):
+    """A service of this module's own: its quantities would be in the way of other tests."""
+    with serving_in_process(chosen_database()) as service:
+        yield service
+
+
+@pytest.fixture(scope="module")
+def client(service):
+    return checked(service.client)
+
+
+@pytest.fixture(scope="module")
+def full_run(service):
+    return service.send_full_run()
 
 
 @pytest.fixture(params=ADDED, ids=lambda each: each.name)
@@ -75,7 +85,7 @@ def value_of(item, name):
     return (counts["observed"] - counts["unique"]) / counts["observed"]
 
 
-def test_it_has_a_history_batch_by_batch(address, full_run, added, bare_client):
+def test_it_has_a_history_batch_by_batch(full_run, added, bare_client):
     asked = {"run": full_run, "quantity": added.name, "strategy": "latest", "size": 20}
     shown = bare_client.get(HISTORY, params=asked).raise_for_status().json()
     page = {"run": full_run, "spacecraft": "XTE"}
@@ -113,8 +123,8 @@ def test_its_column_is_in_the_csv(full_run, added, bare_client):
     assert all(row[added.name] for row in rows)
 
 
-def test_the_command_writes_its_column(app, full_run, added, capsys):
-    where = ["--run", full_run, "--database", app.settings.database]
+def test_the_command_writes_its_column(service, full_run, added, capsys):
+    where = ["--run", full_run, "--database", service.app.settings.database]
     assert main(["history", "--spacecraft", "XTE", *where]) == 0
     rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
     assert len(rows) == 20
@@ -128,13 +138,13 @@ def test_it_has_limits(added, bare_client):
     assert bare_client.get(f"{LIMITS}/{added.name}").status_code == 200
 
 
-def test_limits_of_it_raise_an_alarm(added, bare_client, drawn):
+def test_limits_of_it_raise_an_alarm(added, bare_client, service):
     """Any value is above such a bound."""
     bound = {"critical": {"high": -1.0}, "minimum_count": 1, "duration_s": 0.0}
     body = {"settings": bound, "who": "test"}
     bare_client.put(f"{LIMITS}/{added.name}", json=body).raise_for_status()
     try:
-        batch = drawn("XTE", 1, seed=9)[0] | {"batch": f"alarm-{added.name}"}
+        batch = service.draw("XTE", 1, seed=9)[0] | {"batch": f"alarm-{added.name}"}
         bare_client.post("/api/v1/batches", json=batch).raise_for_status()
         raised = bare_client.get("/api/v1/alarms", params={"spacecraft": "XTE"}).json()["items"]
         assert added.name in {each["quantity"] for each in raised}

@@ -4,9 +4,9 @@ import pytest
 
 from service.app.factory import open_app
 from service.cli import main
-from service.settings import Settings
 from service.web.app import create_app
-from tests.web.serving import Server
+from tests.fresh_databases import sqlite_at
+from tests.web.serving import Server, in_process_settings
 
 SAMPLE = ["simulate", "telemetry", "--spacecraft", "XTE", "--batches", "160", "--seed"]
 
@@ -20,7 +20,7 @@ def file(tmp_path_factory):
 
 @pytest.fixture
 def app(tmp_path):
-    return open_app(Settings(database=f"sqlite:///{tmp_path / 'acquire.db'}"))
+    return open_app(in_process_settings(sqlite_at(tmp_path / "acquire.db")))
 
 
 def raised(app, run):
@@ -36,17 +36,16 @@ def test_through_a_server(app, file, way):
         assert "a_priori_angle_deg" in raised(app, "loud")
 
 
-def test_in_process(app, file, tmp_path):
-    app.close()
-    database = f"sqlite:///{tmp_path / 'acquire.db'}"
+def test_in_process(file, tmp_path):
+    database = sqlite_at(tmp_path / "acquire.db")
     asked = ["replay", str(file), "--in-process", "--database", database, "--run", "loud"]
     assert main([*asked, "--alarms"]) == 0
-    again = open_app(Settings(database=database))
+    again = open_app(in_process_settings(database))
     before = again.alarms.page(run="loud", state="all").items
     again.close()
     assert "a_priori_angle_deg" in {each.quantity for each in before}
     # A second time adds nothing, and raises nothing anew.
     assert main([*asked, "--alarms"]) == 0
-    again = open_app(Settings(database=database))
+    again = open_app(in_process_settings(database))
     assert again.alarms.page(run="loud", state="all").items == before
     again.close()

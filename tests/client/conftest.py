@@ -6,14 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from service.app.factory import open_app
 from service.client import Client
 from service.missions.mission import load_missions
-from service.settings import Settings
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
-from service.web.app import create_app
-from tests.web.serving import Server
+from tests.web.serving import serving_in_process
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "docs" / "example-batch.json"
@@ -26,15 +23,9 @@ def example():
 
 
 @pytest.fixture(scope="module")
-def app(chosen_database):
-    """The real operations over a new database; the server closes them."""
-    return open_app(Settings(database=chosen_database()))
-
-
-@pytest.fixture(scope="module")
-def address(app):
-    with Server(create_app(app)) as url:
-        yield url
+def address(chosen_database):
+    with serving_in_process(chosen_database()) as service:
+        yield service.url
 
 
 @pytest.fixture

@@ -34,7 +34,6 @@ from service.client import (
 from service.client._sync import alarms, batches, gyro, pages, replays, spacecraft
 from service.client._sync import client as whole
 from service.missions.mission import load_missions
-from service.settings import Settings
 from service.storage.recording import events as records
 from service.storage.recording.ids import Ulids
 from service.times import shifted, utc_now
@@ -42,7 +41,7 @@ from service.web import event_stream as live
 from service.web.app import create_app
 from tests.client.cutting_proxy import CuttingProxy
 from tests.tracks.drawn import conjunctions, draw
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 
 GYRO = {
     "block": "g1",
@@ -243,7 +242,7 @@ def test_a_missing_thing_is_named(client):
 
 
 def test_a_token_is_needed_and_sent(chosen_database):
-    app = open_app(Settings(database=chosen_database()))
+    app = open_app(in_process_settings(chosen_database()))
     secret, now = tokens.new_secret(), utc_now()
     reading = {"name": "reader", "scopes": ["read"], "spacecraft": None, "rate_per_s": None}
     app.store.writer.change(
@@ -383,7 +382,7 @@ def test_events_that_the_service_no_longer_keeps_are_an_error_with_the_place_to_
     monkeypatch.setattr(records, "KEPT", 3)
     monkeypatch.setattr(records, "PRUNED_EVERY", 1)
     monkeypatch.setattr(live, "HELD", 2)
-    settings = Settings(database=chosen_database())
+    settings = in_process_settings(chosen_database())
     sent = drawn(9)
     with Server(create_app(open_app(settings))) as url, Client(url) as client:
         for each in sent[:8]:

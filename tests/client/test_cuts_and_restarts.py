@@ -8,17 +8,17 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
-import httpx
 import pytest
 from sqlalchemy import select
 
 from service.app.factory import open_app
 from service.client import Client
-from service.settings import Settings
 from service.storage.sql.tables import batches
 from service.storage.sql.tables import events as recorded_events
 from tests.client.cutting_proxy import CuttingProxy
 from tests.scale import size
+from tests.waiting import wait_until
+from tests.web.serving import in_process_settings, is_ready
 
 CUTS, RESTARTS, EVENTS = 50, 10, 10_000
 PATIENCE_S = 300.0
@@ -39,14 +39,8 @@ class Service:
         self._process = subprocess.Popen(
             self._command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
-        while True:
-            assert self._process.poll() is None, "the service ended by itself"
-            try:
-                if httpx.get(f"http://127.0.0.1:{self.port}/readyz").status_code == 200:
-                    return
-            except httpx.TransportError:
-                pass
-            time.sleep(0.05)
+        url = f"http://127.0.0.1:{self.port}"
+        wait_until(lambda: is_ready(self._process, url), PATIENCE_S, every_s=0.05)
 
     def end(self, number):
         self._process.send_signal(number)
@@ -87,7 +81,7 @@ def test_a_stream_that_is_cut_and_a_service_that_is_killed_lose_and_double_nothi
     database, example, rng, figures
 ):
     """Batches go through the same cuts, and each is recorded and told once."""
-    cuts, restarts, wanted = size(CUTS), size(RESTARTS), size(EVENTS)
+    cuts, restarts, wanted = size(CUTS, 2), size(RESTARTS), size(EVENTS, 30)
     service = Service(database)
     at = rng.choice(wanted, cuts + restarts, replace=False)
     is_cut = rng.permutation([True] * cuts + [False] * restarts)
@@ -126,7 +120,7 @@ def test_a_stream_that_is_cut_and_a_service_that_is_killed_lose_and_double_nothi
 
     assert follower.error is None
     figures(cuts=cuts, restarts=restarts, events=len(follower.events), batches=wanted)
-    app = open_app(Settings(database=database))
+    app = open_app(in_process_settings(database))
     try:
         with app.store.reading() as connection:
             rows = connection.execute(select(recorded_events).order_by(recorded_events.c.id))

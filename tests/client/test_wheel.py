@@ -15,10 +15,9 @@ from packaging.requirements import Requirement
 import service
 from service.app.factory import open_app
 from service.client import __version__
-from service.settings import Settings
 from service.web.app import create_app
 from tests.client.conftest import ROOT
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 
 CLIENT = ROOT / "service" / "client"
 DOCUMENT = (ROOT / "docs" / "client.md").read_text(encoding="utf-8")
@@ -109,7 +108,7 @@ def test_the_quick_start_prints_what_is_shown(environment, chosen_database):
         for kind in ("python", "text")
     )
     assert len(lines.splitlines()) <= 20
-    with Server(create_app(open_app(Settings(database=chosen_database())))) as url:
+    with Server(create_app(open_app(in_process_settings(chosen_database())))) as url:
         assert run(environment, lines.replace("http://127.0.0.1:8000", url)) == shown
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from tests.fresh_databases import sqlite_at
 from tests.storage import samples
 from tests.web.serving import served
 
@@ -87,7 +88,7 @@ def prometheus(tmp_path_factory, sky, missions):
     folder = tmp_path_factory.mktemp("prometheus")
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    with served(f"sqlite:///{folder / 'acquire.db'}") as (_, url):
+    with served(sqlite_at(folder / "acquire.db")) as (_, url):
         _configure(folder, url)
         # A name that never resolves: nothing leaves this machine.
         hook = {"name": "night shift", "url": "https://receiver.invalid/hook"}

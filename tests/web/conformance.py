@@ -36,6 +36,12 @@ def validator(*place: str) -> Draft202012Validator:
     return Draft202012Validator({"$ref": f"{_URI}#/{pointer}"}, registry=_registry())
 
 
+def checked(client: httpx.Client) -> httpx.Client:
+    """A client every answer to which is held against the file."""
+    client.event_hooks = {"response": [check]}
+    return client
+
+
 def check(response: httpx.Response) -> None:
     """Fail where an answer is not as described: its status, its type, its headers, its shape."""
     request = response.request

@@ -2,7 +2,7 @@
 
 import json
 import resource
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -10,48 +10,34 @@ from typing import Any
 import httpx
 import pytest
 
-from service.app.factory import App, open_app
-from service.missions.mission import load_missions
-from service.settings import Settings
-from service.simulate.stretches import Pass
-from service.simulate.telemetry import draw_pass
-from service.web.app import create_app
-from tests.web.conformance import check
-from tests.web.serving import Server
+from service.app.factory import App
+from tests.web.conformance import checked
+from tests.web.serving import InProcess
 
 Json = dict[str, Any]
 
 
 @pytest.fixture(scope="session")
-def app(chosen_database: Callable[[], str]) -> App:
-    """The real operations over a new database; the server closes them."""
-    return open_app(Settings(database=chosen_database()))
+def app(shared_service: InProcess) -> App:
+    """The real operations behind the shared server."""
+    return shared_service.app
 
 
 @pytest.fixture(scope="session")
-def address(app: App) -> Iterator[str]:
-    with Server(create_app(app)) as url:
-        yield url
+def address(shared_service: InProcess) -> str:
+    return shared_service.url
 
 
 @pytest.fixture(scope="session")
-def client(address: str) -> Iterator[httpx.Client]:
+def client(shared_service: InProcess) -> httpx.Client:
     """Talks to the server; every answer it gets is held against openapi.yaml."""
-    hooks = {"response": [check]}
-    with httpx.Client(base_url=address, timeout=60, event_hooks=hooks) as client:
-        yield client
+    return checked(shared_service.client)
 
 
 @pytest.fixture(scope="session")
-def drawn(app: App) -> Callable[..., list[Json]]:
+def drawn(shared_service: InProcess) -> Callable[..., list[Json]]:
     """Batches of a pass over the real catalog."""
-
-    def draw(spacecraft: str, batches: int, **wanted: Any) -> list[Json]:
-        mission = load_missions()[spacecraft]
-        wanted_pass = Pass(batches=batches, **wanted)
-        return [each.batch for each in draw_pass(mission, app.sky, wanted_pass)]
-
-    return draw
+    return shared_service.draw
 
 
 _numbers = count(1)
@@ -70,16 +56,9 @@ def run() -> str:
 
 
 @pytest.fixture(scope="session")
-def full_run(client: httpx.Client, drawn: Callable[..., list[Json]]) -> str:
-    """A run with 20 batches of XTE and 20 of SOHO, stretches of trouble included.
-
-    Those of XTE by votes, which leave more stars ambiguous.
-    """
-    for spacecraft, options in (("XTE", {"identifier": "starid"}), ("SOHO", {})):
-        for each in drawn(spacecraft, 20, seed=4):
-            body = each | {"run": "full", "options": options}
-            client.post("/api/v1/batches", json=body).raise_for_status()
-    return "full"
+def full_run(shared_service: InProcess, client: httpx.Client) -> str:
+    """A run with 20 batches of XTE and 20 of SOHO, stretches of trouble included."""
+    return shared_service.send_full_run()
 
 
 @pytest.fixture

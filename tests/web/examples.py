@@ -18,7 +18,6 @@ from service.access.tokens import add_token, new_secret
 from service.app.factory import App, open_app
 from service.missions.live_filter import LiveFilterSettings
 from service.missions.mission import load_missions
-from service.settings import Settings
 from service.simulate.frame_files import frame_bytes
 from service.simulate.frames import FrameSettings, draw_frames
 from service.simulate.stretches import NO_TROUBLES, Pass
@@ -27,7 +26,8 @@ from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
 from service.web.app import create_app
-from tests.web.serving import Server, compile_kernels
+from tests.fresh_databases import sqlite_at
+from tests.web.serving import Server, compile_kernels, in_process_settings
 
 FILE = Path(__file__).parents[2] / "service" / "web" / "examples.json"
 API = "/api/v1"
@@ -381,7 +381,7 @@ def fresh_walk() -> Json:
         compile_kernels()
         kept_up = {"live_filter": LiveFilterSettings()}
         app = open_app(
-            Settings(database=f"sqlite:///{folder}/acquire.db"),
+            in_process_settings(sqlite_at(folder / "acquire.db")),
             load_missions()["SWAS"].model_copy(update=kept_up),
         )
         with (

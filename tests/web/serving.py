@@ -5,24 +5,30 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache
-from typing import IO, cast
+from typing import IO, Any, cast
 
 import httpx
 import uvicorn
 from fastapi import FastAPI
 
 from service.acquire.prewarm import prewarm_kernels
-from service.missions.mission import load_missions
+from service.app.factory import App, open_app
+from service.missions.mission import Mission, load_missions
+from service.settings import Settings
+from service.simulate.stretches import Pass
+from service.simulate.telemetry import draw_pass
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
+from service.web.app import create_app
 from service.web.connection_limits import Admission
 from service.web.server import Server as StreamingServer
 from service.web.slow_clients import Connection
+from tests.waiting import wait_until
 
 
 def _stop_streams_of(app: FastAPI) -> Callable[[], None]:
@@ -50,15 +56,62 @@ class Server:
 
     def __enter__(self) -> str:
         self._thread.start()
-        while not self._server.started:
+
+        def has_started() -> bool:
             assert self._thread.is_alive(), "the server did not start"
-            time.sleep(0.01)
+            return self._server.started
+
+        wait_until(has_started)
         port = self._server.servers[0].sockets[0].getsockname()[1]
         return f"http://127.0.0.1:{port}"
 
     def __exit__(self, *_: object) -> None:
         self._server.should_exit = True
         self._thread.join()
+
+
+@dataclass(frozen=True)
+class InProcess:
+    """A service in a thread of this process, and a client of it."""
+
+    app: App
+    url: str
+    client: httpx.Client
+
+    def draw(self, spacecraft: str, batches: int, **wanted: Any) -> list[dict[str, Any]]:
+        """Batches of a pass over the real catalog."""
+        wanted_pass = Pass(batches=batches, **wanted)
+        drawn = draw_pass(self.app.missions[spacecraft], self.app.sky, wanted_pass)
+        return [each.batch for each in drawn]
+
+    def send_full_run(self) -> str:
+        """Send 20 batches of XTE and 20 of SOHO, stretches of trouble included; their run.
+
+        Those of XTE by votes, which leave more stars ambiguous.
+        """
+        for spacecraft, options in (("XTE", {"identifier": "starid"}), ("SOHO", {})):
+            for batch in self.draw(spacecraft, 20, seed=4):
+                body = batch | {"run": "full", "options": options}
+                self.client.post("/api/v1/batches", json=body).raise_for_status()
+        return "full"
+
+
+def in_process_settings(database: str, **wanted: Any) -> Settings:
+    """Settings of a service for tests: replays are computed in its own process.
+
+    Two further processes take seconds to start, and the answers are the same.
+    """
+    return Settings(**({"database": database, "replay_processes": 0} | wanted))
+
+
+@contextmanager
+def serving_in_process(
+    database: str, mission: Mission | None = None, **wanted: Any
+) -> Iterator[InProcess]:
+    """A service with `in_process_settings`, from its start to its end."""
+    app = open_app(in_process_settings(database, **wanted), mission)
+    with Server(create_app(app)) as url, httpx.Client(base_url=url, timeout=120) as client:
+        yield InProcess(app, url, client)
 
 
 @contextmanager
@@ -83,12 +136,14 @@ def served(
 ) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
     """`serving`, ready for work."""
     with serving(database, stderr) as (process, url):
-        while True:
-            assert process.poll() is None
-            try:
-                if httpx.get(f"{url}/readyz").status_code == 200:
-                    break
-            except httpx.TransportError:
-                pass
-            time.sleep(0.1)
+        wait_until(lambda: is_ready(process, url), 600.0, every_s=0.1)
         yield process, url
+
+
+def is_ready(process: subprocess.Popen[bytes], url: str, probe: str = "readyz") -> bool:
+    """Whether a service that was started takes batches; fails where its process has ended."""
+    assert process.poll() is None, "the service ended by itself"
+    try:
+        return httpx.get(f"{url}/{probe}", timeout=60).status_code == 200
+    except httpx.TransportError:
+        return False

@@ -14,14 +14,13 @@ from sqlalchemy import text
 
 from service.access import tokens
 from service.app.factory import open_app
-from service.settings import Settings
 from service.storage.recording.ids import Ulids
 from service.times import shifted, utc_now
 from service.web import event_stream as live
 from service.web.app import bare_app, create_app
 from service.web.requests.access import COOKIE, POLICIES, authorize
 from tests.web.console_pages import console_addresses
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 from tests.web.test_bodies import raw
 
 PATH_PARAMETERS = {
@@ -42,7 +41,7 @@ class Guarded:
     """A service of its own with tokens of every kind."""
 
     def __init__(self, database):
-        self.settings = Settings(database=database)
+        self.settings = in_process_settings(database)
         self.app = open_app(self.settings)
         self._ids = Ulids()
 

@@ -9,11 +9,11 @@ import pytest
 from service.alarms.causes import CAUSES
 from service.alarms.quantities import QUANTITIES, limited_names
 from service.app.factory import open_app
-from service.settings import Settings
 from service.web.app import create_app
 from service.web.console.charts.alarm_trend import HEIGHT, alarm_trend
+from tests.fresh_databases import sqlite_at
 from tests.web import fleet
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 
 SIZE = 12
 OPERATORS = Path(__file__).parents[2] / "docs" / "operators.md"
@@ -23,7 +23,7 @@ OPERATORS = Path(__file__).parents[2] / "docs" / "operators.md"
 def fleet_client(tmp_path_factory):
     folder = tmp_path_factory.mktemp("fleet")
     missions = fleet.write_missions(folder / "missions", SIZE)
-    app = open_app(Settings(database=f"sqlite:///{folder}/acquire.db", missions=missions))
+    app = open_app(in_process_settings(sqlite_at(folder / "acquire.db"), missions=missions))
     fleet.fill(app, SIZE)
     with Server(create_app(app)) as address, httpx.Client(base_url=address) as client:
         yield client

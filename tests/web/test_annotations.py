@@ -6,10 +6,9 @@ import httpx
 import pytest
 
 from service.app.factory import open_app
-from service.settings import Settings
 from service.web.app import create_app
 from tests.web.markup import Markup
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 from tests.web.test_access import Guarded, shown
 
 HERE = "/api/v1/annotations"
@@ -131,7 +130,7 @@ def test_what_is_written_and_deleted_is_told_to_streams(client, address, note):
 
 
 def test_a_note_survives_a_restart_and_is_text_on_the_page(chosen_database, drawn):
-    settings = Settings(database=chosen_database())
+    settings = in_process_settings(chosen_database())
     with Server(create_app(open_app(settings))) as url:
         httpx.post(f"{url}/api/v1/batches", json=drawn("XTE", 1)[0]).raise_for_status()
         evil = "<script>alert(1)</script> & <b>bold</b>"

@@ -4,11 +4,11 @@ import httpx
 import pytest
 
 from service.app.factory import open_app
-from service.settings import Settings
 from service.web.app import create_app
+from tests.fresh_databases import sqlite_at
 from tests.web.browser import CHROMIUM, Browser
 from tests.web.fitting import faults
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
 
@@ -40,7 +40,7 @@ def other_browser(tmp_path_factory):
 @pytest.fixture
 def page(browser, other_browser, tmp_path, drawn):
     """The page of a spacecraft with ten batches, of a service of its own."""
-    app = open_app(Settings(database=f"sqlite:///{tmp_path}/acquire.db"))
+    app = open_app(in_process_settings(sqlite_at(tmp_path / "acquire.db")))
     with Server(create_app(app)) as address:
         for each in drawn("XTE", 10, cadence_s=600.0):
             httpx.post(f"{address}/api/v1/batches", json=each, timeout=60).raise_for_status()

@@ -11,12 +11,11 @@ import pytest
 from sqlalchemy import func, select
 
 from service.app.factory import open_app
-from service.settings import Settings
 from service.storage.sql.tables import batches, idempotency_keys, results
 from tests.scale import size
 from tests.storage import samples
 from tests.storage.whole import assert_whole
-from tests.web.serving import served
+from tests.web.serving import in_process_settings, served
 
 ROUNDS, CONNECTIONS = 1_000, 50
 LENGTH = re.compile(rb"\r\ncontent-length: (\d+)\r\n", re.IGNORECASE)
@@ -78,7 +77,7 @@ def request_of(body, key):
 def test_the_same_key_fifty_times_at_once_is_one_record_and_one_answer(
     database, sky, missions, seed, figures
 ):
-    rounds, draw = size(ROUNDS), random.Random(seed)
+    rounds, draw = size(ROUNDS, len(samples.KINDS)), random.Random(seed)
     acknowledged, repeated = {}, 0
     with served(database) as (_, url):
         connections = [Connection(httpx.URL(url).port) for _ in range(CONNECTIONS)]
@@ -102,7 +101,7 @@ def test_the_same_key_fifty_times_at_once_is_one_record_and_one_answer(
         for each in connections:
             each.close()
     assert len(acknowledged) == rounds
-    app = open_app(Settings(database=database))
+    app = open_app(in_process_settings(database))
     try:
         assert_whole(app, acknowledged)
         with app.store.reading() as connection:

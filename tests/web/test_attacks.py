@@ -9,6 +9,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from tests.fresh_databases import sqlite_at
 from tests.scale import size
 from tests.web.healthy import answers, resident_mb, tries
 from tests.web.serving import served
@@ -41,7 +42,7 @@ ATTACKS = {
 @pytest.fixture(scope="module")
 def server(tmp_path_factory):
     """A server in processes of its own, so that its memory is its own; ready for work."""
-    with served(f"sqlite:///{tmp_path_factory.mktemp('attacked') / 'acquire.db'}") as serving:
+    with served(sqlite_at(tmp_path_factory.mktemp("attacked") / "acquire.db")) as serving:
         yield serving
 
 

@@ -8,10 +8,9 @@ import httpx
 import pytest
 
 from service.app.factory import open_app
-from service.settings import Settings
 from service.web.app import create_app
 from service.web.requests.request_body import MAX_JSON_BYTES, BodyLimits
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 
 URL = "/api/v1/batches"
 HEADERS = {"Content-Type": "application/json"}
@@ -21,7 +20,7 @@ HEADERS = {"Content-Type": "application/json"}
 def impatient(tmp_path_factory):
     """A server that waits half a second for a body, and reads a kilobyte of a replay."""
     path = tmp_path_factory.mktemp("impatient") / "acquire.db"
-    app = open_app(Settings(database=f"sqlite:///{path}"))
+    app = open_app(in_process_settings(f"sqlite:///{path}"))
     limits = BodyLimits(replay_bytes=1024, pause_s=0.5, json_s=1.0)
     with Server(create_app(app, limits)) as address:
         yield address
@@ -31,7 +30,7 @@ def impatient(tmp_path_factory):
 def narrow(tmp_path_factory):
     """A server that has a hundred kilobytes for all bodies together."""
     path = tmp_path_factory.mktemp("narrow") / "acquire.db"
-    app = open_app(Settings(database=f"sqlite:///{path}"))
+    app = open_app(in_process_settings(f"sqlite:///{path}"))
     with Server(create_app(app, BodyLimits(budget_bytes=100_000))) as address:
         yield address
 

@@ -4,12 +4,12 @@ import httpx
 import pytest
 
 from service.app.factory import open_app
-from service.settings import Settings
 from service.web.app import create_app
 from tests.calibration.wrong_file import true_batches, with_true_file, write_mission_files
+from tests.fresh_databases import sqlite_at
 from tests.web.browser import CHROMIUM, Browser
 from tests.web.fitting import faults
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
 
@@ -49,7 +49,7 @@ def sent(address, batches):
 
 def test_calibrate_try_adopt_and_take_back(browser, folder):
     missions = folder / "assumed"
-    app = open_app(Settings(database=f"sqlite:///{folder}/acquire.db", missions=missions))
+    app = open_app(in_process_settings(sqlite_at(folder / "acquire.db"), missions=missions))
     batches = true_batches(app.sky, BEFORE + AFTER)
     true = with_true_file(app.sky, batches[BEFORE:])
     with Server(create_app(app)) as address:

@@ -8,7 +8,6 @@ import pytest
 
 from service.app.calibrations.estimates import CalibrationRequest
 from service.app.factory import open_app
-from service.settings import Settings
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
@@ -21,7 +20,7 @@ from tests.calibration.wrong_file import (
     write_mission_files,
 )
 from tests.web.conformance import check
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 from tests.webhooks.conftest import LOOPBACK, receiver
 
 __all__ = ["receiver"]
@@ -31,8 +30,8 @@ API = "/api/v1"
 
 
 def serve(folder):
-    missions, database = folder / "assumed", f"sqlite:///{folder}/acquire.db"
-    return open_app(Settings(database=database, missions=missions, webhook_networks=LOOPBACK))
+    missions, database = folder / "assumed", f"sqlite:///{folder / 'acquire.db'}"
+    return open_app(in_process_settings(database, missions=missions, webhook_networks=LOOPBACK))
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,9 @@ import httpx
 import pytest
 
 from service.app.factory import open_app
-from service.settings import Settings
 from service.web.app import create_app
 from tests.web.console_pages import console_addresses
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 
 PAGES = (
     *console_addresses(),
@@ -24,7 +23,7 @@ PAGES = (
 @pytest.mark.parametrize(("unix_s", "year"), [(5.0, "1970"), (4.2e9, "2103")])
 def test_every_page_works_whatever_the_year(chosen_database, drawn, monkeypatch, unix_s, year):
     """As on a machine without a battery: it begins in 1970 until somebody tells it the time."""
-    database = Settings(database=chosen_database())
+    database = in_process_settings(chosen_database())
     with monkeypatch.context() as clock:
         clock.setattr(time, "time", lambda: unix_s)
         clock.setattr(time, "time_ns", lambda: int(unix_s) * 10**9)

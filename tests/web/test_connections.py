@@ -9,10 +9,10 @@ import httpx
 import pytest
 
 from service.app.factory import open_app
-from service.settings import Settings
 from service.web.app import create_app
 from service.web.connection_limits import Admission
-from tests.web.serving import Server, served
+from tests.fresh_databases import sqlite_at
+from tests.web.serving import Server, in_process_settings, served
 
 GET = b"GET /livez HTTP/1.1\r\nHost: localhost\r\n\r\n"
 EVENTS = b"GET /api/v1/events HTTP/1.1\r\nHost: localhost\r\n\r\n"
@@ -24,7 +24,7 @@ PATIENCE_S = 20
 def crowded(tmp_path_factory):
     """A server for twenty connections, four of each address but 127.0.0.1."""
     path = tmp_path_factory.mktemp("crowded") / "acquire.db"
-    app = open_app(Settings(database=f"sqlite:///{path}"))
+    app = open_app(in_process_settings(f"sqlite:///{path}"))
     admission = Admission(MOST, SHARE, [ip_network("127.0.0.1")])
     with Server(create_app(app), admission=admission) as address:
         yield address
@@ -209,7 +209,7 @@ def free_port():
 def test_a_port_of_its_own_answers_probes_alone(tmp_path, monkeypatch):
     port = free_port()
     monkeypatch.setenv("ACQUIRE_PROBE_PORT", str(port))
-    with served(f"sqlite:///{tmp_path / 'acquire.db'}") as (_, url):
+    with served(sqlite_at(tmp_path / "acquire.db")) as (_, url):
         for path, status in (
             ("/livez", 200),
             ("/readyz", 200),

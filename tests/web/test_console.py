@@ -13,7 +13,6 @@ import pytest
 from service.app.factory import open_app
 from service.missions.mission import load_missions
 from service.observations.schema import submission_from_json
-from service.settings import Settings
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
 from service.vectors import angle_between_deg, matrix_from_quaternion
@@ -24,14 +23,14 @@ from service.web.console.charts.heat_map import packed
 from service.web.console.charts.sparkline import HEIGHT, PAD, WIDTH, common_top, sparkline
 from tests.web.console_pages import console_addresses
 from tests.web.markup import Markup
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 
 HOSTILE = "<script>alert(1)</script>\"'><img src=x onerror=alert(2)>{{7*7}}\u202e"
 
 
 @pytest.fixture(scope="module")
 def empty(chosen_database):
-    app = open_app(Settings(database=chosen_database()))
+    app = open_app(in_process_settings(chosen_database()))
     with Server(create_app(app)) as address, httpx.Client(base_url=address) as client:
         yield client
 

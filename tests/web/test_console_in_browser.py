@@ -9,11 +9,11 @@ import httpx
 import pytest
 
 from service.app.factory import open_app
-from service.settings import Settings
 from service.web.app import create_app
+from tests.fresh_databases import sqlite_at
 from tests.web.browser import CHROMIUM, Browser
 from tests.web.fitting import assert_fits, faults
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
 
@@ -197,7 +197,7 @@ def test_a_lost_connection_is_told_and_what_was_missed_is_caught_up(
     browser, address, client, drawn, tmp_path
 ):
     """The server goes away and comes back with batches that nobody heard of."""
-    settings = Settings(database=f"sqlite:///{tmp_path}/acquire.db")
+    settings = in_process_settings(sqlite_at(tmp_path / "acquire.db"))
     first, second, third = drawn("XTE", 3, seed=6)
     with Server(create_app(open_app(settings))) as own:
         port = int(own.rpartition(":")[2])

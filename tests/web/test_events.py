@@ -9,11 +9,10 @@ import httpx
 import pytest
 
 from service.app.factory import open_app
-from service.settings import Settings
 from service.storage.recording import events as records
 from service.web import event_stream as live
 from service.web.app import create_app
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 
 ROUTE = "/api/v1/events"
 
@@ -67,7 +66,7 @@ class Listener:
 
 @contextmanager
 def service(database):
-    with Server(create_app(open_app(Settings(database=database)))) as address:
+    with Server(create_app(open_app(in_process_settings(database)))) as address:
         yield address
 
 
@@ -129,7 +128,7 @@ def test_who_was_away_is_told_of_everything_in_between_and_of_nothing_twice(data
 def test_what_another_process_writes_is_told_of_too(database, drawn):
     with service(database) as address:
         listener = Listener(address)
-        other = open_app(Settings(database=database))
+        other = open_app(in_process_settings(database))
         try:
             lines = [json.dumps(each).encode() for each in drawn("SWAS", 3)]
             other.replays.start(lines, "elsewhere")

@@ -7,12 +7,12 @@ import httpx
 import pytest
 
 from service.app.factory import open_app
-from service.settings import Settings
 from service.web.app import create_app
+from tests.fresh_databases import sqlite_at
 from tests.web import fleet
 from tests.web.browser import CHROMIUM, Browser
 from tests.web.fitting import assert_fits, faults
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
 
@@ -33,7 +33,7 @@ def filled(request, browser, tmp_path_factory):
     """A service with so many spacecraft in trouble and out of it: how many, and its address."""
     folder = tmp_path_factory.mktemp("fleet")
     missions = fleet.write_missions(folder / "missions", request.param)
-    settings = Settings(database=f"sqlite:///{folder}/acquire.db", missions=missions)
+    settings = in_process_settings(sqlite_at(folder / "acquire.db"), missions=missions)
     app = open_app(settings)
     fleet.fill(app, request.param)
     with Server(create_app(app)) as address:

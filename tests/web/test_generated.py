@@ -152,10 +152,10 @@ def test_any_request_that_the_description_suggests(ready, answers, seed, figures
         send()
         return answers.counts.total() - before
 
-    left = size(REQUESTS)
+    left = size(REQUESTS, 2 * len(operations))
     try:
         for number, operation in enumerate(operations):
-            left -= tried(operation, -(-left // (len(operations) - number)))
+            left -= tried(operation, max(1, -(-left // (len(operations) - number))))
     finally:
         figures(operations=len(operations), **answers.told())
         answers.require_no_fault()
@@ -164,7 +164,7 @@ def test_any_request_that_the_description_suggests(ready, answers, seed, figures
 
 @pytest.mark.torture
 def test_any_sequence_of_requests(ready, answers, seed, figures):
-    sequences = Counter()
+    sequences, wanted = Counter(), size(SEQUENCES, 5)
 
     class Sequences(described.as_state_machine()):
         def teardown(self):
@@ -185,9 +185,9 @@ def test_any_sequence_of_requests(ready, answers, seed, figures):
 
     try:
         for another in range(ATTEMPTS):
-            if (left := size(SEQUENCES) - sequences["run"]) > 0:
+            if (left := wanted - sequences["run"]) > 0:
                 run(seed + another, left)
     finally:
         figures(sequences=sequences["run"], **answers.told())
         answers.require_no_fault()
-    assert sequences["run"] >= size(SEQUENCES)
+    assert sequences["run"] >= wanted

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from service.app.factory import open_app
-from service.settings import Settings
 from service.times import shifted
 from service.web.app import create_app
 from service.web.console.charts.grades.grades import grade_charts
 from service.web.console.charts.grades.panels import TimeAxis
 from tests.filtering.simulated import ARCSEC, attitudes_of, gyro_of, slews, truth_of
+from tests.fresh_databases import sqlite_at
 from tests.grades.passes import GYRO, MODEL, NOON, mission_with, recorded_of
 from tests.grades.records import put_pass
 from tests.web.browser import CHROMIUM, Browser
 from tests.web.fitting import assert_fits
 from tests.web.markup import Markup
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 
 PAGE = "/spacecraft/XTE/grades"
 ROUTE = "/api/v1/spacecraft/XTE/innovations"
@@ -48,9 +48,9 @@ def address(tmp_path_factory, missions):
     attitudes = one_turned(attitudes, WRONG, 300.0)
     kept = (truth.time_s < 600.0) | (truth.time_s > 660.0)
     recorded = recorded_of(gyro.tai_ns[kept], gyro.rate_rad_s[kept], attitudes)
-    database = f"sqlite:///{tmp_path_factory.mktemp('grades') / 'acquire.db'}"
+    database = sqlite_at(tmp_path_factory.mktemp("grades") / "acquire.db")
     mission = mission_with(missions["XTE"], gyro=GYRO)
-    app = open_app(Settings(database=database, replay_processes=0), mission)
+    app = open_app(in_process_settings(database), mission)
     for run in ("pass", "bare"):
         put_pass(app, recorded, run=run)
     app.grades.smooth("XTE", run="pass")
@@ -91,7 +91,7 @@ def test_the_scale_of_sigmas_is_that_of_good_attitudes(tmp_path, missions):
     gyro, _ = gyro_of(truth, MODEL, rng)
     attitudes = attitudes_of(truth, np.arange(0, 1801, 300), (6.0, 6.0, 40.0), rng)
     mission = mission_with(missions["XTE"], gyro=GYRO)
-    settings = Settings(database=f"sqlite:///{tmp_path / 'acquire.db'}", replay_processes=0)
+    settings = in_process_settings(sqlite_at(tmp_path / "acquire.db"))
     app = open_app(settings, mission)
     try:
         put_pass(app, recorded_of(gyro.tai_ns, gyro.rate_rad_s, attitudes))

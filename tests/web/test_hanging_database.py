@@ -17,13 +17,12 @@ import pytest
 from sqlalchemy import create_engine, make_url, select, text
 
 from service.app.factory import open_app
-from service.settings import Settings
 from service.storage.sql.engines import database_url
 from service.storage.sql.tables import batches, idempotency_keys
 from tests import scale
 from tests.storage import samples
 from tests.storage.whole import assert_whole
-from tests.web.serving import served
+from tests.web.serving import in_process_settings, served
 
 ANSWERED_S, PROBED_S = 15.0, 2.0
 SLOWEST_S = 0.5
@@ -232,7 +231,7 @@ def assert_in_time(clients, probes):
 
 
 def assert_each_recorded_once(database, clients):
-    app = open_app(Settings(database=database))
+    app = open_app(in_process_settings(database))
     try:
         with app.store.reading() as connection:
             held = dict(connection.execute(select(batches.c.batch, batches.c.id)).all())

@@ -4,12 +4,12 @@ import httpx
 import pytest
 
 from service.app.factory import open_app
-from service.settings import Settings
 from service.web.app import create_app
+from tests.fresh_databases import sqlite_at
 from tests.web import fleet
 from tests.web.browser import CHROMIUM, Browser
 from tests.web.fitting import faults
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
 
@@ -30,7 +30,7 @@ def fleet_address(browser, tmp_path_factory):
     """Eight spacecraft of two trackers, six of them in trouble."""
     folder = tmp_path_factory.mktemp("fleet")
     missions = fleet.write_missions(folder / "missions", 8)
-    app = open_app(Settings(database=f"sqlite:///{folder}/acquire.db", missions=missions))
+    app = open_app(in_process_settings(sqlite_at(folder / "acquire.db"), missions=missions))
     fleet.fill(app, 8)
     with Server(create_app(app)) as address:
         yield address

@@ -10,11 +10,10 @@ import pytest
 from sqlalchemy import select
 
 from service.app.factory import open_app
-from service.settings import Settings
 from service.storage.sql.tables import batches
 from service.storage.upkeep.verify import verify
 from tests.storage import samples
-from tests.web.serving import served
+from tests.web.serving import in_process_settings, served
 from tests.web.test_hanging_database import ready_again
 
 PARTS = ("", "-wal", "-shm")
@@ -54,7 +53,7 @@ def assert_told(url, answer):
 
 
 def names_in(file):
-    app = open_app(Settings(database=f"sqlite:///{file}"), create=False)
+    app = open_app(in_process_settings(f"sqlite:///{file}"), create=False)
     try:
         with app.context.reading() as connection:
             return set(connection.scalars(select(batches.c.batch)))

@@ -14,10 +14,10 @@ import pytest
 
 from service.app.factory import open_app
 from service.app.submissions import READ_HERE_BYTES
-from service.settings import Settings
+from tests.fresh_databases import sqlite_at
 from tests.storage import samples
 from tests.web.load import Load
-from tests.web.serving import served
+from tests.web.serving import in_process_settings, served
 
 JSON = {"Content-Type": "application/json"}
 
@@ -25,7 +25,7 @@ JSON = {"Content-Type": "application/json"}
 @pytest.fixture
 def service(tmp_path):
     """A service over its own database: its address."""
-    with served(f"sqlite:///{tmp_path / 'acquire.db'}") as (_, url):
+    with served(sqlite_at(tmp_path / "acquire.db")) as (_, url):
         yield url
 
 
@@ -35,7 +35,7 @@ def compiling(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     command = [sys.executable, "-m", "service.cli", "serve", "--port", str(port)]
-    command += ["--database", f"sqlite:///{tmp_path / 'acquire.db'}"]
+    command += ["--database", sqlite_at(tmp_path / "acquire.db")]
     nothing_compiled = {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
     with (tmp_path / "log").open("wb") as log:
         process = subprocess.Popen(command, stderr=log, env=os.environ | nothing_compiled)
@@ -157,7 +157,7 @@ def test_the_metrics_count_new_batches_repeats_and_zones(service, sky, missions)
 
 
 def test_told_to_stop_under_load_it_answers_what_it_took_and_ends_soon(tmp_path, sky, missions):
-    database = f"sqlite:///{tmp_path / 'acquire.db'}"
+    database = sqlite_at(tmp_path / "acquire.db")
     with served(database) as (process, url):
         template = samples.batch(sky, missions, "NAME")
         load = Load(httpx.URL(url).port, template)
@@ -172,7 +172,7 @@ def test_told_to_stop_under_load_it_answers_what_it_took_and_ends_soon(tmp_path,
                 assert time.monotonic() - began_s < 10.0
             finally:
                 load.give_up()
-    app = open_app(Settings(database=database))
+    app = open_app(in_process_settings(database))
     try:
         for id, _ in load.acknowledged.values():
             assert app.results.get(id).current

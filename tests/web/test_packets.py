@@ -15,13 +15,12 @@ from service.replay.bulk_upload import replay_in_bulk
 from service.replay.in_process import replay_in_process
 from service.replay.items import packet_items
 from service.replay.summary import ReplaySummary
-from service.settings import Settings
 from service.web.app import create_app
 from tests.packets.packing import ANGLES, TABLE, mission_of_pass, packed, packet, xtce
 from tests.packets.test_reader import reader_of
 from tests.storage.samples import without_accidents
 from tests.web.conformance import check
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 
 API = "/api/v1"
 HEADERS = {"Content-Type": "application/x-tar"}
@@ -37,7 +36,7 @@ def missions_folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def packet_app(chosen_database, missions_folder):
-    return open_app(Settings(database=chosen_database(), missions=missions_folder))
+    return open_app(in_process_settings(chosen_database(), missions=missions_folder))
 
 
 @pytest.fixture(scope="module")

@@ -4,13 +4,13 @@ import httpx
 import pytest
 
 from service.app.factory import open_app
-from service.settings import Settings
 from service.web.app import create_app
+from tests.fresh_databases import sqlite_at
 from tests.web import fleet
 from tests.web.browser import CHROMIUM, Browser
 from tests.web.console_pages import console_addresses
 from tests.web.fitting import assert_fits
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
 
@@ -30,7 +30,7 @@ def pages(request, browser, tmp_path, drawn):
     size, missions, name = request.param, None, "XTE"
     if size == 40:
         missions, name = fleet.write_missions(tmp_path / "missions", size), fleet.troubled(size)[0]
-    settings = Settings(database=f"sqlite:///{tmp_path}/acquire.db", missions=missions)
+    settings = in_process_settings(sqlite_at(tmp_path / "acquire.db"), missions=missions)
     app = open_app(settings)
     if size == 40:
         fleet.fill(app, size)

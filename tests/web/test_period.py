@@ -12,13 +12,13 @@ import httpx
 import pytest
 
 from service.app.factory import open_app
-from service.settings import Settings
 from service.web.app import create_app
+from tests.fresh_databases import sqlite_at
 from tests.storage.twin import FIRST, SECOND, batch, twin
 from tests.web.browser import CHROMIUM, Browser
 from tests.web.fitting import VIEWS, faults
 from tests.web.markup import Markup
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 
 QUICK = {"warning": {"high": 2.0}, "minimum_count": 3, "duration_s": 0}
 PAGE = "/spacecraft/XTE/period"
@@ -29,9 +29,9 @@ in_browser = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium o
 @pytest.fixture(scope="module")
 def address(tmp_path_factory, sky, missions):
     """A service with the batches: the second tracker is nine times as noisy for a while."""
-    database = f"sqlite:///{tmp_path_factory.mktemp('period') / 'acquire.db'}"
+    database = sqlite_at(tmp_path_factory.mktemp("period") / "acquire.db")
     mission = twin(missions)
-    app = create_app(open_app(Settings(database=database, replay_processes=0), mission))
+    app = create_app(open_app(in_process_settings(database), mission))
     with Server(app) as address, httpx.Client(base_url=address, timeout=120) as client:
         while client.get("/readyz").status_code != 200:
             time.sleep(0.1)

@@ -13,10 +13,10 @@ from sqlalchemy import text
 
 from service.app.factory import open_app
 from service.errors import Stopping
-from service.settings import Settings
 from service.web.app import create_app
 from service.web.warm_request import warm_request
-from tests.web.serving import Server
+from tests.fresh_databases import sqlite_at
+from tests.web.serving import Server, in_process_settings
 
 
 def samples(client):
@@ -77,7 +77,7 @@ def test_the_cache_of_zones_is_counted(client):
 
 
 def test_two_apps_share_no_counter(client, tmp_path):
-    app = open_app(Settings(database=f"sqlite:///{tmp_path}/other.db"))
+    app = open_app(in_process_settings(sqlite_at(tmp_path / "other.db")))
     with Server(create_app(app)) as address, httpx.Client(base_url=address) as other:
         assert stars(samples(other), "unique") == 0
 
@@ -85,7 +85,7 @@ def test_two_apps_share_no_counter(client, tmp_path):
 def test_the_warm_up_request_reaches_the_queue_and_is_not_counted(
     tmp_path,
 ):
-    app = open_app(Settings(database=f"sqlite:///{tmp_path}/rehearsed.db"))
+    app = open_app(in_process_settings(sqlite_at(tmp_path / "rehearsed.db")))
     web_app = create_app(app)
     try:
         assert asyncio.run(warm_request(web_app)) == 422
@@ -96,7 +96,7 @@ def test_the_warm_up_request_reaches_the_queue_and_is_not_counted(
 
 
 def test_an_ingest_thread_that_has_ended_is_told_by_the_probe_of_life(tmp_path):
-    app = open_app(Settings(database=f"sqlite:///{tmp_path}/ended.db"))
+    app = open_app(in_process_settings(sqlite_at(tmp_path / "ended.db")))
     with Server(create_app(app)) as address, httpx.Client(base_url=address) as client:
         assert client.get("/livez").status_code == 200
         app.submissions.ingest._queue._inbox.put(None)
@@ -105,7 +105,7 @@ def test_an_ingest_thread_that_has_ended_is_told_by_the_probe_of_life(tmp_path):
 
 
 def test_where_the_records_cannot_be_followed_it_does_not_start_and_ends(tmp_path, monkeypatch):
-    app = open_app(Settings(database=f"sqlite:///{tmp_path}/unread.db"))
+    app = open_app(in_process_settings(sqlite_at(tmp_path / "unread.db")))
     app.service.ready()
     web_app = create_app(app)
 
@@ -126,7 +126,7 @@ def test_where_the_records_cannot_be_followed_it_does_not_start_and_ends(tmp_pat
 
 
 def test_a_fault_of_ours_is_logged_and_says_nothing_of_what_is_inside(tmp_path, caplog):
-    app = open_app(Settings(database=f"sqlite:///{tmp_path}/gone.db"))
+    app = open_app(in_process_settings(sqlite_at(tmp_path / "gone.db")))
     with Server(create_app(app)) as address:
         rename = text("ALTER TABLE runs RENAME TO elsewhere")
         app.context.change(lambda connection: connection.execute(rename).close())
@@ -142,7 +142,7 @@ def test_a_fault_of_ours_is_logged_and_says_nothing_of_what_is_inside(tmp_path, 
 
 def test_with_every_handler_at_work_it_is_still_ready_and_still_stops(tmp_path, monkeypatch):
     """Probes and the way out have threads of their own."""
-    app = open_app(Settings(database=f"sqlite:///{tmp_path}/busy.db"))
+    app = open_app(in_process_settings(sqlite_at(tmp_path / "busy.db")))
     app.service.ready()
     monkeypatch.setattr("service.web.app.WORKER_THREADS", 2)
     go_on = threading.Event()

@@ -23,12 +23,12 @@ from service.products.formats import (
     attitude_formats,
     table_formats,
 )
-from service.settings import Settings
 from service.storage.recording.ids import unguessable_ulid
 from service.times import utc_now
 from service.web.app import bare_app, create_app
 from service.web.requests import exports
-from tests.web.serving import Server
+from tests.fresh_databases import sqlite_at
+from tests.web.serving import Server, in_process_settings
 
 ROUTE = "/api/v1/spacecraft/XTE/attitude"
 TABLES = "/api/v1/spacecraft/XTE/tables"
@@ -331,7 +331,7 @@ def test_a_token_may_have_two_exports_at_once_and_another_when_one_has_ended(
     tmp_path, slow_format, monkeypatch
 ):
     monkeypatch.setattr(exports, "MAX_EXPORTS", 3)
-    app = open_app(Settings(database=f"sqlite:///{tmp_path}/exports.db", replay_processes=0))
+    app = open_app(in_process_settings(sqlite_at(tmp_path / "exports.db")))
     secrets = {}
     for name in ("one", "other"):
         secrets[name] = new_secret()

@@ -10,15 +10,15 @@ from fastapi import Query as InQuery
 from service.app.factory import open_app
 from service.cli import main
 from service.products.formats import OUTPUT_FORMATS, OutputFormat, table_formats
-from service.settings import Settings
 from service.web.app import bare_app, create_app
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import PAGES, console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import POLICIES, Policy
 from service.web.requests.problem_types import ProblemType
+from tests.fresh_databases import sqlite_at
 from tests.web.console_pages import console_addresses
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 
 ROUTE = "/api/v1/spacecraft/XTE/history"
 NDJSON = "application/x-ndjson"
@@ -106,7 +106,7 @@ def test_an_unknown_format_is_refused_with_the_known_ones_named(client):
 
 
 def test_a_new_page_is_served_and_is_in_the_navigation_in_its_place(passes_page, tmp_path):
-    app = open_app(Settings(database=f"sqlite:///{tmp_path}/pages.db", replay_processes=0))
+    app = open_app(in_process_settings(sqlite_at(tmp_path / "pages.db")))
     with Server(create_app(app)) as url, httpx.Client(base_url=url) as client:
         page = client.get("/passes")
         assert page.status_code == 200

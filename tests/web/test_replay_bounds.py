@@ -17,11 +17,10 @@ from service.app.factory import open_app
 from service.ingest import replay_lines
 from service.ingest.replays import RunningReplay
 from service.observations.readers import decompress
-from service.settings import Settings
 from service.web.app import create_app
 from tests.waiting import wait_until
 from tests.web.browser import CHROMIUM, Browser
-from tests.web.serving import Server, served
+from tests.web.serving import Server, in_process_settings, served
 from tests.web.test_access import Guarded, shown
 
 API = "/api/v1"
@@ -133,7 +132,7 @@ def test_telemetry_that_packs_to_a_hundredth_is_taken(
 @pytest.fixture(scope="module")
 def hurried(chosen_database):
     """A service whose replays may take a second."""
-    settings = Settings(database=chosen_database(), replay_seconds=1, replay_processes=0)
+    settings = in_process_settings(chosen_database(), replay_seconds=1)
     with (
         Server(create_app(open_app(settings))) as url,
         httpx.Client(base_url=url, timeout=60) as client,
@@ -318,7 +317,7 @@ def test_a_bound_token_cancels_its_own_replays_only_and_it_is_noted(guarded, dra
 
 def test_a_replay_of_another_process_is_cancelled_through_the_database(chosen_database, drawn):
     database = chosen_database()
-    settings = Settings(database=database, replay_processes=0)
+    settings = in_process_settings(database)
     batch = drawn("XTE", 1)[0]
     with (
         Server(create_app(open_app(settings))) as one,

@@ -9,12 +9,11 @@ from msgspec import structs
 
 from service.app.factory import open_app
 from service.missions.mission import Mission
-from service.settings import Settings
 from service.storage.archive.reprocessing import Reprocessing, write_reprocessing
 from service.times import parse_utc, shifted, utc_now
 from service.web.app import create_app
 from tests.web.markup import Markup
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 from tests.web.test_access import Guarded, shown
 
 
@@ -26,7 +25,7 @@ def text_of(answer):
 @pytest.fixture(scope="module")
 def two_runs(chosen_database, drawn):
     """A service without live batches: the runs `votes` and `verified` have the same of XTE."""
-    app = open_app(Settings(database=chosen_database()))
+    app = open_app(in_process_settings(chosen_database()))
     with Server(create_app(app)) as url, httpx.Client(base_url=url, timeout=60) as client:
         for each in drawn("XTE", 60, seed=4):
             for run, identifier in (("votes", "starid"), ("verified", "verified")):
@@ -106,7 +105,7 @@ def test_the_rates_of_two_runs_count_all_batches_of_the_period(two_runs, minutes
 
 def test_rates_of_any_period_are_drawn_in_a_bounded_number_of_points(chosen_database, drawn):
     """Here of 127 years, by one batch at each end."""
-    app = open_app(Settings(database=chosen_database()))
+    app = open_app(in_process_settings(chosen_database()))
     early = drawn("XTE", 1, start="1972-01-05T00:00:00Z")
     late = drawn("XTE", 1, start="2099-06-01T00:00:00Z")
     with Server(create_app(app)) as url:
@@ -162,7 +161,7 @@ def test_a_bound_token_compares_the_runs_of_its_spacecraft(chosen_database, draw
 
 
 def test_a_mission_shows_what_changed_between_its_revisions(chosen_database, missions, drawn):
-    settings = Settings(database=chosen_database())
+    settings = in_process_settings(chosen_database())
     changed = missions["XTE"].model_dump(mode="json")
     changed["tolerances"]["separation_deg"] = 0.0132
     changed["tests"]["match_groups"] = True
@@ -212,7 +211,7 @@ def test_without_a_partner_options_are_offered_for_a_spacecraft_with_batches(two
 def test_the_runs_page_tells_how_far_a_reprocessing_into_the_archive_is(
     chosen_database, drawn, tmp_path
 ):
-    settings = Settings(database=chosen_database(), archive_folder=tmp_path, replay_processes=0)
+    settings = in_process_settings(chosen_database(), archive_folder=tmp_path)
     now = utc_now()
     begun = Reprocessing(
         run="wider",

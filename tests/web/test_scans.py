@@ -12,14 +12,13 @@ from service.missions.mission import read_mission
 from service.observations.focal_plane import measured_angles_deg, tracker_vectors
 from service.observations.scans.reduce import reduced
 from service.observations.schema import submission_from_json
-from service.settings import Settings
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
 from service.vectors import angle_between_deg, matrix_from_quaternion, rotate_about
 from service.web.app import create_app
 from tests.observations.test_scans import FILE, lines_of
 from tests.web.conformance import check
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 
 URL = "/api/v1/batches"
 
@@ -31,7 +30,7 @@ def scanner():
 
 @pytest.fixture(scope="module")
 def scan_app(scanner, chosen_database):
-    settings = Settings(database=chosen_database(), replay_processes=0)
+    settings = in_process_settings(chosen_database())
     return open_app(settings, scanner)
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from tests.fresh_databases import sqlite_at
 from tests.scale import size
 from tests.web.healthy import answers, resident_mb, tries
 from tests.web.serving import served
@@ -39,7 +40,7 @@ HEAD = (
 @pytest.fixture
 def server(tmp_path):
     """A server in processes of its own, so that its memory is its own; ready for work."""
-    with served(f"sqlite:///{tmp_path / 'acquire.db'}") as (process, url):
+    with served(sqlite_at(tmp_path / "acquire.db")) as (process, url):
         yield process, httpx.URL(url).port, url
 
 

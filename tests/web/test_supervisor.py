@@ -13,6 +13,7 @@ from sqlalchemy.pool import NullPool
 
 from service.storage.serving.writing_lock import WritingLock
 from service.storage.sql.engines import database_url
+from tests.fresh_databases import sqlite_at
 from tests.web.serving import served, serving
 
 
@@ -29,7 +30,7 @@ def heard(tmp_path, monkeypatch):
 
 
 def test_it_reports_ready_then_signs_of_life_then_that_it_stops(heard, tmp_path):
-    with served(f"sqlite:///{tmp_path / 'acquire.db'}") as (process, _):
+    with served(sqlite_at(tmp_path / "acquire.db")) as (process, _):
         assert heard().startswith("READY=1")
         assert [heard(), heard()] == ["WATCHDOG=1", "WATCHDOG=1"]
         process.terminate()
@@ -62,7 +63,7 @@ def standing_by(url):
 
 
 def test_a_process_that_stands_gives_no_sign_of_life(heard, tmp_path):
-    with served(f"sqlite:///{tmp_path / 'acquire.db'}") as (process, _):
+    with served(sqlite_at(tmp_path / "acquire.db")) as (process, _):
         assert heard().startswith("READY=1")
         assert heard() == "WATCHDOG=1"
         os.kill(process.pid, signal.SIGSTOP)

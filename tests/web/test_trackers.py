@@ -9,12 +9,12 @@ import httpx
 import pytest
 
 from service.app.factory import open_app
-from service.settings import Settings
 from service.web.app import create_app
+from tests.fresh_databases import sqlite_at
 from tests.storage.twin import FIRST, SECOND, batch, twin
 from tests.web.conformance import check
 from tests.web.markup import Markup
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 
 HISTORY = "/api/v1/spacecraft/XTE/history"
 WORST = "/api/v1/spacecraft/XTE/worst"
@@ -24,8 +24,8 @@ QUICK = {"warning": {"high": 2.0}, "minimum_count": 3, "duration_s": 0}
 
 @pytest.fixture(scope="module")
 def client(tmp_path_factory, missions):
-    database = f"sqlite:///{tmp_path_factory.mktemp('twin') / 'acquire.db'}"
-    app = create_app(open_app(Settings(database=database, replay_processes=0), twin(missions)))
+    database = sqlite_at(tmp_path_factory.mktemp("twin") / "acquire.db")
+    app = create_app(open_app(in_process_settings(database), twin(missions)))
     with (
         Server(app) as address,
         httpx.Client(base_url=address, timeout=120, event_hooks={"response": [check]}) as client,

@@ -12,13 +12,14 @@ import pytest
 from sqlalchemy import create_engine, select, text
 
 from service.app.factory import open_app
-from service.settings import Settings
 from service.storage.sql.engines import database_url
 from service.storage.sql.tables import batches
 from tests.scale import size
 from tests.storage import samples
 from tests.storage.whole import assert_whole
+from tests.waiting import wait_until
 from tests.web.load import Load
+from tests.web.serving import in_process_settings
 
 KILLS, TERMINATED = 100, 12
 ACKNOWLEDGED_A_ROUND = 1_000
@@ -68,11 +69,7 @@ class Service:
         return answer.json()["type"].removeprefix("/problems/")
 
     def wait_for(self, *states, seconds=120.0):
-        give_up = time.monotonic() + seconds
-        while (state := self.state()) not in states:
-            assert time.monotonic() < give_up, state
-            time.sleep(0.05)
-        return state
+        wait_until(lambda: self.state() in states, seconds, why=self.state, every_s=0.05)
 
     def kill(self):
         self._process.kill()
@@ -161,10 +158,10 @@ def test_a_writer_that_loses_its_session_writes_nothing_until_it_has_the_lock_ag
         return services
 
     def recover(services):
-        give_up = time.monotonic() + 30.0
-        while sorted(each.state() for each in services) != ["ready", "standby"]:
-            assert time.monotonic() < give_up
-            time.sleep(0.05)
+        def states():
+            return sorted(each.state() for each in services)
+
+        wait_until(lambda: states() == ["ready", "standby"], 60.0, why=states, every_s=0.05)
 
     times = max(3, size(TERMINATED))
     _under_load(database, sky, missions, rng, figures, times, terminate, recover)
@@ -174,7 +171,7 @@ def _under_load(database, sky, missions, rng, figures, times, disturb, recover):
     """Disturb two services so many times while clients post to whichever takes their batches."""
     template = samples.batch(sky, missions, "NAME")
     assert json.loads(template)["batch"] == "NAME"
-    a_round = size(ACKNOWLEDGED_A_ROUND)
+    a_round = size(ACKNOWLEDGED_A_ROUND, 50)
     took_over_s = []
     with asking(database) as at_database, two_services(database) as services:
         at_database.exec_driver_sql(NOTE_WRITERS)
@@ -205,7 +202,7 @@ def _under_load(database, sky, missions, rng, figures, times, disturb, recover):
     assert len(load.acknowledged) >= times * a_round
     assert all(each.holds_lock for each in writers)
     assert len(set(sessions)) == len(sessions) == times + 1
-    app = open_app(Settings(database=database))
+    app = open_app(in_process_settings(database))
     try:
         assert_whole(app, dict(load.acknowledged.values()))
         with app.store.reading() as connection:
@@ -217,10 +214,7 @@ def _under_load(database, sky, missions, rng, figures, times, disturb, recover):
 
 def _wait_for(load, acknowledged, seconds):
     wanted = len(load.acknowledged) + acknowledged
-    give_up = time.monotonic() + seconds
-    while len(load.acknowledged) < wanted:
-        assert time.monotonic() < give_up, dict(load.met)
-        time.sleep(0.005)
+    wait_until(lambda: len(load.acknowledged) >= wanted, seconds, why=lambda: dict(load.met))
 
 
 def _sessions_in_order(writers):

@@ -13,11 +13,10 @@ import httpx
 import pytest
 
 from service.app.factory import open_app
-from service.settings import Settings
 from service.times import parse_utc
 from service.web.app import create_app
 from service.webhooks import sender
-from tests.web.serving import Server
+from tests.web.serving import Server, in_process_settings
 
 HERE = "/api/v1/webhooks"
 LOOPBACK = "127.0.0.0/8"
@@ -144,7 +143,7 @@ class Service:
 
 @contextmanager
 def serving(database, allowed=LOOPBACK, **client):
-    app = open_app(Settings(database=database, webhook_networks=allowed, replay_processes=0))
+    app = open_app(in_process_settings(database, webhook_networks=allowed))
     with Server(create_app(app)) as url, httpx.Client(base_url=url, timeout=60, **client) as asking:
         yield Service(app, asking, url)
 

@@ -9,8 +9,8 @@ from collections import defaultdict
 import pytest
 
 from service.app.factory import open_app
-from service.settings import Settings
 from tests.scale import size
+from tests.web.serving import in_process_settings
 from tests.webhooks.conftest import HERE, LOOPBACK, NOON, serving, until
 
 EVENTS, KILLS = 1_000, 20
@@ -53,7 +53,7 @@ def killable(tmp_path, free_port):
 
 @pytest.mark.torture
 def test_all_events_arrive_at_a_receiver_that_is_killed(database, killable, rng, figures):
-    events, kills = size(EVENTS), size(KILLS)
+    events, kills = size(EVENTS, 30), size(KILLS)
     begun_s = time.monotonic()
     with serving(database) as service:
         hook = service.hook(f"http://127.0.0.1:{killable.port}/", **HOOK)
@@ -105,7 +105,7 @@ def test_events_recorded_while_the_service_was_down_arrive_after_its_start(
         hook = service.hook(f"http://127.0.0.1:{killable.port}/", **HOOK)
     killable.secret = hook["secret"]
     killable.start()
-    app = open_app(Settings(database=database, webhook_networks=LOOPBACK))
+    app = open_app(in_process_settings(database, webhook_networks=LOOPBACK))
     for number in range(3):
         app.annotations.add(f"n{number}", start=NOON, who="jb", spacecraft="XTE")
     app.close()
