@@ -111,10 +111,12 @@ def open_app(
     *,
     create: bool = True,
     serving: bool = False,
+    reads_only: bool = False,
 ) -> App:
     """Read missions and catalog, open the database, start writing.
 
     With `serving`, another service may write to the database: then this one stands by.
+    With `reads_only`, one may write to a SQLite file, too: nothing is recorded of this start.
 
     `mission`, where given, takes the place of the one of that name.  `create`
     and `serving` are about the database; see `Store`.
@@ -141,6 +143,8 @@ def open_app(
     def take_over() -> None:
         # Another service may have adopted a calibration in the meantime.
         app.adoptions.load(leave)
+        if reads_only:
+            return
         _register(app.context)
         if serving:
             # A command may run beside the service that computes one.

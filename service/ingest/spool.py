@@ -13,6 +13,7 @@ from typing import IO
 
 from service.errors import Busy
 from service.observations.readers.decompress import Coding
+from service.storage.sql.database_file import PRIVATE_FILE, PRIVATE_FOLDER
 
 PART, LINES, ABOUT = ".part", ".lines", ".json"
 RETRY_S = 30
@@ -46,7 +47,7 @@ class Spool:
     def new_file(self) -> IO[bytes]:
         """A file for an upload; raises `Busy` where none can be made."""
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
+            self._folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
             return tempfile.NamedTemporaryFile(dir=self._folder, suffix=PART, delete=False)
         except OSError as error:
             raise Busy(f"uploads cannot be stored now: {error.strerror}", RETRY_S) from None
@@ -57,7 +58,7 @@ class Spool:
             file.flush()
             os.fsync(file.fileno())
             place = self._folder / about.id
-            beside = self._held[about.id] = place.with_suffix(ABOUT).open("w", encoding="utf-8")
+            beside = self._held[about.id] = _private(place.with_suffix(ABOUT))
             fcntl.flock(beside, fcntl.LOCK_EX | fcntl.LOCK_NB)
             json.dump(asdict(about), beside)
             beside.flush()
@@ -113,3 +114,9 @@ class Spool:
             with suppress(OSError):
                 if place.stat().st_mtime < day_ago_s:
                     place.unlink()
+
+
+def _private(path: Path) -> IO[str]:
+    """A new text file that its owner alone can read, open for writing."""
+    flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
+    return os.fdopen(os.open(path, flags, PRIVATE_FILE), "w", encoding="utf-8")

@@ -17,8 +17,7 @@ from service import logs
 from service.app.factory import App, open_app
 from service.errors import BadConfiguration
 from service.settings import Settings, is_loopback, networks
-from service.storage.serving.served import hold_served
-from service.storage.sql.database import warn_of_old_sqlite
+from service.storage.sql.database_file import warn_of_readers
 from service.web.app import create_app
 from service.web.connection_limits import Admission
 from service.web.middleware import ProbesOnly
@@ -41,26 +40,24 @@ def serve(settings: Settings) -> None:
     Raises `BadConfiguration` for settings that cannot be used, and for a host other than
     a loopback address while there are no tokens: every client could submit there.
     """
-    with ExitStack() as held:
-        app, probes = _opened(settings, held)
-        sys.setswitchinterval(SWITCH_INTERVAL_S)
-        _run(settings, create_app(app), probes)
+    app, probes = _opened(settings)
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    _run(settings, create_app(app), probes)
 
 
-def _opened(settings: Settings, held: ExitStack) -> tuple[App, socket.socket | None]:
-    """The open app, and the socket for probes; the lock on the database goes to `held`."""
+def _opened(settings: Settings) -> tuple[App, socket.socket | None]:
+    """The open app, and the socket for probes."""
     with ExitStack() as on_failure:
         app = open_app(settings, serving=True)
         on_failure.callback(app.close)
-        lock = hold_served(settings.database)
-        if lock is not None:
-            held.enter_context(lock)
         if not is_loopback(settings.host) and not app.access.has_tokens():
             raise BadConfiguration(
                 f"ACQUIRE_HOST: {settings.host} is not a loopback address: create a token first, "
                 "with `acquire token create`"
             )
-        warn_of_old_sqlite(settings.database)
+        if app.store.file is not None:
+            warn_of_readers(app.store.file.path)
+        warn_of_readers(settings.spool_folder)
         probes = _listening(settings.host, settings.probe_port)
         on_failure.pop_all()
     return app, probes

@@ -9,7 +9,6 @@ from sqlalchemy import MetaData, create_engine, select, text
 from sqlalchemy.pool import NullPool
 
 from service.errors import BadConfiguration
-from service.storage.serving.served import hold_served
 from service.storage.sql import migrations
 from service.storage.sql.engines import database_url
 from service.storage.upkeep.backup import back_up
@@ -134,12 +133,14 @@ def test_files_that_are_no_backup_of_the_database_are_refused(database, tmp_path
     assert not (tmp_path / "new.db").exists()
 
 
-def test_a_file_that_a_service_uses_is_not_restored(tmp_path):
-    made, target = f"sqlite:///{tmp_path}/made.db", f"sqlite:///{tmp_path}/new.db"
+def test_a_file_that_a_service_makes_in_the_meantime_is_not_replaced(tmp_path):
+    made, target = f"sqlite:///{tmp_path}/made.db", tmp_path / "new.db"
     migrations.upgrade(made)
     back_up(made, tmp_path / "copy")
-    with hold_served(target), pytest.raises(BadConfiguration, match="a service is at work on it"):
-        restore(target, tmp_path / "copy")
+    with pytest.raises(BadConfiguration, match="exists already"):
+        restore(f"sqlite:///{target}", tmp_path / "copy", lambda *_: target.write_text("mine"))
+    assert target.read_text() == "mine"
+    assert not list(tmp_path.glob("*.part*"))
 
 
 def test_the_command_restores_and_says_what_to_do_next(acquire, tmp_path):

@@ -67,7 +67,7 @@ def run(parsed: Namespace) -> int:
     start, end = period_of(parsed)
     tolerances = tolerances_from_text(parsed.tolerance, "--try")
     mission = mission_named(load_missions(settings_of(parsed).missions), parsed.spacecraft)
-    app = open_app(settings_of_existing(parsed))
+    app = open_app(settings_of_existing(parsed), reads_only=True)
     try:
         with tqdm(
             total=None, unit=" batches", desc="running again", disable=parsed.quiet or None

@@ -78,7 +78,6 @@ def archive(parsed: Namespace) -> int:
     from tqdm import tqdm
 
     from service.extras import require_extra
-    from service.storage.serving.served import unserved
     from service.storage.sql.database import Store
     from service.times import parse_utc, utc_now
 
@@ -92,20 +91,18 @@ def archive(parsed: Namespace) -> int:
     from service.storage.archive import archiving
 
     settings = settings_of_existing(parsed)
-    with unserved(settings.database):
-        store = Store(settings.database, create=False)
-        try:
-            with tqdm(
-                total=None, unit=" batches", desc="archiving", disable=None, leave=False
-            ) as b:
+    store = Store(settings.database, create=False)
+    try:
+        store.require_writing()
+        with tqdm(total=None, unit=" batches", desc="archiving", disable=None, leave=False) as b:
 
-                def step(archived: archiving.Archived) -> None:
-                    b.total = archived.total
-                    b.update(archived.batches - b.n)
+            def step(archived: archiving.Archived) -> None:
+                b.total = archived.total
+                b.update(archived.batches - b.n)
 
-                done = archiving.archive(store, folder, before, step=step)
-        finally:
-            store.close()
+            done = archiving.archive(store, folder, before, step=step)
+    finally:
+        store.close()
     if parsed.json:
         print_json({"batches": done.batches, "files": done.parts, "bytes": done.bytes})
     else:
@@ -149,7 +146,6 @@ def restore(parsed: Namespace) -> int:
     from tqdm import tqdm
 
     from service.extras import require_extra
-    from service.storage.serving.served import unserved
     from service.storage.sql.database import Store
 
     folder = _folder(parsed.folder, "--archive")
@@ -159,20 +155,18 @@ def restore(parsed: Namespace) -> int:
     start, end = period_of(parsed)
     selected = restoring.PartFilter(parsed.spacecraft, parsed.run, start, end)
     settings = settings_of(parsed)
-    with unserved(settings.database):
-        store = Store(settings.database)
-        try:
-            with tqdm(
-                total=None, unit=" batches", desc="restoring", disable=None, leave=False
-            ) as b:
+    store = Store(settings.database)
+    try:
+        store.require_writing()
+        with tqdm(total=None, unit=" batches", desc="restoring", disable=None, leave=False) as b:
 
-                def step(restored: restoring.Restored) -> None:
-                    b.total = restored.total
-                    b.update(restored.batches - b.n)
+            def step(restored: restoring.Restored) -> None:
+                b.total = restored.total
+                b.update(restored.batches - b.n)
 
-                done = restoring.restore(store, folder, selected, step=step)
-        finally:
-            store.close()
+            done = restoring.restore(store, folder, selected, step=step)
+    finally:
+        store.close()
     if parsed.json:
         print_json({"batches": done.batches, "restored": done.restored})
     else:

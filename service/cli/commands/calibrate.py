@@ -106,7 +106,7 @@ def run(parsed: Namespace) -> int:
         time_tag=parsed.time_tag,
         sample=parsed.sample,
     )
-    app = open_app(settings_of_existing(parsed))
+    app = open_app(settings_of_existing(parsed), reads_only=not parsed.record)
     recorded = None
     try:
         mission = mission_named(app.missions, parsed.spacecraft)

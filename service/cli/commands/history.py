@@ -37,7 +37,7 @@ def run(parsed: Namespace) -> int:
     from service.app.history_table import batch_table
 
     start, end = period_of(parsed)
-    app = open_app(settings_of_existing(parsed))
+    app = open_app(settings_of_existing(parsed), reads_only=True)
     try:
         pages = app.spacecraft.every_batch(parsed.spacecraft, run=parsed.run, start=start, end=end)
         table = batch_table(pages)

@@ -94,7 +94,6 @@ def run(parsed: Namespace) -> int:
     from service.cli.run_comparison import comparison_text, progress_text
     from service.ingest.reprocess import ReprocessProgress, require_other_run
     from service.missions.mission import load_missions, mission_named, read_mission
-    from service.storage.serving.served import unserved
 
     start, end = period_of(parsed)
     mission = None if parsed.mission is None else read_mission(parsed.mission)
@@ -114,7 +113,6 @@ def run(parsed: Namespace) -> int:
     if parsed.archive is not None:
         settings = dataclasses.replace(settings, archive_folder=parsed.archive)
     with ExitStack() as held:
-        held.enter_context(unserved(settings.database))
         app = open_app(settings, mission)
         held.callback(app.close)
         with tqdm(

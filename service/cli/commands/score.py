@@ -54,7 +54,7 @@ def run(parsed: Namespace) -> int:
 
     start, end = period_of(parsed)
     truth = read_attitudes(parsed.truth, "FILE")
-    app = open_app(settings_of_existing(parsed))
+    app = open_app(settings_of_existing(parsed), reads_only=True)
     try:
         series = app.products.attitudes(
             parsed.spacecraft, run=parsed.run, start=start, end=end, status=parsed.status

@@ -45,12 +45,10 @@ def run(parsed: Namespace) -> int:
 
     from service.app.factory import open_app
     from service.app.telemetry.grades import SmoothProgress
-    from service.storage.serving.served import unserved
 
     start, end = period_of(parsed)
     settings = settings_of_existing(parsed)
     with ExitStack() as held:
-        held.enter_context(unserved(settings.database))
         app = open_app(settings)
         held.callback(app.close)
         with tqdm(total=None, unit=" days", desc="smoothing", disable=parsed.quiet or None) as bar:

@@ -1,1 +1,1 @@
-"""Which process serves a database: locks on a SQLite file, and on PostgreSQL."""
+"""Which process writes to a database: locks on a SQLite file, and on PostgreSQL."""

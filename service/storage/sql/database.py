@@ -1,7 +1,6 @@
 """An open database: one writer and many readers."""
 
 import logging
-import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +10,7 @@ from sqlalchemy.exc import DBAPIError, TimeoutError
 
 from service.errors import Busy
 from service.storage.archive.reading import Archive
+from service.storage.serving.file_lock import FileLock
 from service.storage.serving.writing_lock import WritingLock
 from service.storage.sql.connections import PersistentConnection
 from service.storage.sql.database_file import DatabaseFile
@@ -30,9 +30,6 @@ from service.storage.sql.transaction import may_pass
 from service.storage.sql.writer import RETRY_AFTER_S, Writer
 
 log = logging.getLogger(__name__)
-
-# Two connections that write and checkpoint at the same moment can lose a transaction.
-_WAL_RESET_BUG = (3, 7, 0), (3, 51, 2)
 
 
 class Readers:
@@ -118,8 +115,9 @@ class Store(Readers):
 
         Without `create` SQLite's file must be there.  Batches that left the database are read
         from the `archive_folder`.
-        `serving` bounds the waiting times, see `Readers`, and on PostgreSQL lets one service
-        alone write.
+        One process at a time writes to a SQLite file, from its first write on; with `serving`,
+        from the start.  `serving` bounds the waiting times, too, see `Readers`, and on PostgreSQL
+        lets one service alone write.
         Raises `BadConfiguration` with what to do.
         """
         self.archive = Archive(archive_folder)
@@ -128,20 +126,28 @@ class Store(Readers):
         if file is not None and not create:
             file.require_there()
         timeouts = TO_COMMIT if serving else None
+        self.file_lock = None if file is None else FileLock(file)
+        """Of a SQLite file."""
         self._writing = writing_engine(url, file=file, create=create, timeouts=timeouts)
         try:
-            if self._writing.dialect.name == "sqlite":
-                bring_up_to_date(self._writing)
-            else:
+            if self.file_lock is None:
                 require_up_to_date(self._writing)
+            else:
+                if serving:
+                    self.require_writing()
+                bring_up_to_date(self._writing, self.file_lock.take)
         except BaseException:
             self._writing.dispose()
+            if self.file_lock is not None:
+                self.file_lock.release()
             raise
         super().__init__(database, serving=serving, file=file)
         self.lock = WritingLock() if serving and file is None else None
         """Of PostgreSQL: nothing is written before it is taken."""
         wait_s = TURN_S if serving else None
-        self.writer = Writer(self._writing, file=file, wait_s=wait_s, lock=self.lock)
+        self.writer = Writer(
+            self._writing, file=file, wait_s=wait_s, lock=self.lock, file_lock=self.file_lock
+        )
 
     @contextmanager
     def reading_batch(self, id: str) -> Iterator[tuple[Connection, bool]]:
@@ -157,22 +163,16 @@ class Store(Readers):
         with opened.reading() as connection:
             yield connection, True
 
+    def require_writing(self) -> None:
+        """Take the lock of a SQLite file now; raises `BadConfiguration` while another has it."""
+        if self.file_lock is not None:
+            self.file_lock.take()
+
     def close(self) -> None:
         """Write what is queued, then let go of the database."""
         self.writer.close()
         # The writer goes last: the last connection to leave checkpoints the log.
         super().close()
         self._writing.dispose()
-
-
-def warn_of_old_sqlite(database: str) -> None:
-    """Log that a database's SQLite is one whose file two processes must not write to."""
-    first, last = _WAL_RESET_BUG
-    if database_url(database).drivername != "sqlite":
-        return
-    if first <= sqlite3.sqlite_version_info <= last:
-        log.warning(
-            "this SQLite (%s) has a known fault when two processes write to one file at the same "
-            "moment, mended in 3.51.3: let one process at a time use the database",
-            sqlite3.sqlite_version,
-        )
+        if self.file_lock is not None:
+            self.file_lock.release()

@@ -6,6 +6,7 @@ and these would be lost.
 
 import logging
 import os
+import stat
 from pathlib import Path
 
 from service.errors import BadConfiguration, Busy
@@ -14,6 +15,8 @@ FileIdentity = tuple[int, int]
 """Device and inode."""
 
 RETRY_S = 5
+PRIVATE_FILE, PRIVATE_FOLDER = 0o600, 0o700
+"""The modes of what holds secrets: those of webhooks, digests of tokens, telemetry."""
 
 log = logging.getLogger(__name__)
 
@@ -26,6 +29,19 @@ class DatabaseFile:
         self._log_path = f"{path}-wal"
         self.identity: FileIdentity | None = None
         self._told = False
+
+    def create(self) -> int:
+        """Open the file; one that is missing is made so that its owner alone can read it.
+
+        Returns the descriptor.  SQLite gives the files beside it the same mode.
+        Raises `BadConfiguration`.
+        """
+        try:
+            return os.open(self.path, os.O_RDONLY | os.O_CREAT, PRIVATE_FILE)
+        except OSError as error:
+            raise BadConfiguration(
+                f"ACQUIRE_DATABASE: {self.path}: cannot be opened: {error.strerror}"
+            ) from None
 
     def remember(self) -> None:
         """Note which file is there, unless that is known."""
@@ -69,3 +85,20 @@ def _identity(path: Path | str) -> FileIdentity | None:
     except OSError:
         return None
     return found.st_dev, found.st_ino
+
+
+def warn_of_readers(path: Path) -> None:
+    """Log that other users of the machine may read or write a file or a folder with secrets."""
+    try:
+        mode = stat.S_IMODE(path.stat().st_mode)
+    except OSError:
+        return
+    private = PRIVATE_FOLDER if path.is_dir() else PRIVATE_FILE
+    if mode & ~PRIVATE_FOLDER:
+        log.warning(
+            "other users may read %s (mode %o), which holds secrets: chmod %o %s",
+            path,
+            mode,
+            private,
+            path,
+        )

@@ -6,6 +6,7 @@ moment, and a deferred transaction that turns from reading to writing is
 refused at once, whatever the busy timeout.
 """
 
+import os
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -201,7 +202,9 @@ def _open_as_file(engine: Engine, file: DatabaseFile | None = None, create: bool
     def _connect(_dialect: Any, _record: Any, cargs: Any, cparams: Any) -> Any:
         nonlocal may_create
         place, *others = cargs
-        uri = f"{Path(place).absolute().as_uri()}?mode={'rwc' if may_create else 'rw'}"
+        if may_create:
+            os.close(DatabaseFile(Path(place).absolute()).create())
+        uri = f"{Path(place).absolute().as_uri()}?mode=rw"
         connection = sqlite3.connect(uri, *others, **(cparams | {"uri": True}))
         may_create = False
         if file is not None:

@@ -5,7 +5,7 @@ service that starts would wait for it.
 """
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +15,15 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service.errors import BadConfiguration
 from service.resources import shipped
+from service.storage.serving.file_lock import writing_alone
 from service.storage.sql.columns import metadata
-from service.storage.sql.engines import database_url, reading_engine, shown_url, writing_engine
+from service.storage.sql.engines import (
+    database_file,
+    database_url,
+    reading_engine,
+    shown_url,
+    writing_engine,
+)
 
 if TYPE_CHECKING:
     from alembic.config import Config
@@ -31,7 +38,8 @@ def upgrade(database: str) -> None:
     Raises `BadConfiguration` for a database that cannot be reached, is none,
     or was written by a newer version.
     """
-    with _disposed(writing_engine(database_url(database))) as engine:
+    url = database_url(database)
+    with writing_alone(database_file(url)), _disposed(writing_engine(url)) as engine:
         bring_up_to_date(engine)
 
 
@@ -108,11 +116,12 @@ def check_fresh() -> list[str]:
         return check(database)
 
 
-def bring_up_to_date(engine: Engine) -> None:
-    """Run the migrations that are missing, in one transaction."""
+def bring_up_to_date(engine: Engine, before: Callable[[], object] = lambda: None) -> None:
+    """Run the migrations that are missing, in one transaction; `before` is called first of all."""
     with reported(engine.url), engine.begin() as connection:
         if _revision(connection) == HEAD:
             return
+        before()
         from alembic import command
         from alembic.util import CommandError
 

@@ -21,6 +21,7 @@ from sqlalchemy.exc import DBAPIError
 
 from service.errors import Busy, Standby, Stopping
 from service.storage.recording.unsaved_result import UnsavedResult
+from service.storage.serving.file_lock import FileLock
 from service.storage.serving.writing_lock import Attempt, WritingLock
 from service.storage.sql.connections import PersistentConnection, RolledBack
 from service.storage.sql.database_file import DatabaseFile
@@ -64,13 +65,15 @@ class Writer:
         file: DatabaseFile | None = None,
         wait_s: float | None = None,
         lock: WritingLock | None = None,
+        file_lock: FileLock | None = None,
     ) -> None:
         """`file` is that of SQLite; `wait_s` bounds how long results wait to be written.
 
         Those of a bulk load, and other changes, wait as long as it takes.  With a `lock` nothing
-        is written but by the session that holds it; see `take_lock`.
+        is written but by the session that holds it; see `take_lock`.  `file_lock` is taken before
+        anything is queued.
         """
-        self._lock = lock
+        self._lock, self._file_lock = lock, file_lock
         self._connection = PersistentConnection(engine, TO_WRITE, file)
         self._max_queued = max_queued
         self._wait_s = wait_s
@@ -177,6 +180,8 @@ class Writer:
                 raise Stopping("the service is stopping")
             if self._lock is not None:
                 self._lock.require()
+            if self._file_lock is not None:
+                self._file_lock.take()
             # A job that alone is larger than the queue is still taken by an empty one.
             if self._queued and self._queued + job.weight > self._max_queued:
                 raise Busy(f"{self._queued} records are waiting to be written")

@@ -15,6 +15,7 @@ from pathlib import Path
 from sqlalchemy import URL
 
 from service.errors import BadConfiguration
+from service.storage.sql.database_file import PRIVATE_FILE
 from service.storage.sql.engines import (
     BUSY_TIMEOUT_MS,
     database_url,
@@ -46,7 +47,7 @@ def back_up(database: str, target: Path, step: Step = lambda left, total: None) 
     part.unlink(missing_ok=True)
     try:
         # It holds what access depends on, such as the secrets of webhooks.
-        part.touch(mode=0o600, exist_ok=False)
+        part.touch(mode=PRIVATE_FILE, exist_ok=False)
         if url.drivername == "sqlite":
             _copy_sqlite(Path(url.database or ""), part, step)
         else:

@@ -13,7 +13,7 @@ from pathlib import Path
 from sqlalchemy import URL, inspect
 
 from service.errors import BadConfiguration
-from service.storage.serving.served import unserved
+from service.storage.sql.database_file import PRIVATE_FILE
 from service.storage.sql.engines import database_url, reading_engine, shown_url
 from service.storage.sql.migrations import reported, revision_of
 from service.storage.upkeep.backup import (
@@ -40,8 +40,7 @@ def restore(database: str, source: Path, step: Step = lambda left, total: None) 
     url = database_url(database)
     _check_kind(source, url)
     if url.drivername == "sqlite":
-        with unserved(database):
-            return _restore_sqlite(source, Path(url.database or ""), step)
+        return _restore_sqlite(source, Path(url.database or ""), step)
     return _restore_postgresql(source, url)
 
 
@@ -70,6 +69,7 @@ def _restore_sqlite(source: Path, target: Path, step: Step) -> str:
     part = target.with_name(target.name + ".part")
     part.unlink(missing_ok=True)
     try:
+        part.touch(mode=PRIVATE_FILE, exist_ok=False)
         with (
             closing(sqlite3.connect(f"{source.absolute().as_uri()}?mode=ro", uri=True)) as reading,
             closing(sqlite3.connect(part)) as writing,
@@ -86,8 +86,11 @@ def _restore_sqlite(source: Path, target: Path, step: Step) -> str:
         revision = _revision(f"sqlite:///{part}", source)
         with part.open("rb") as file:
             os.fsync(file.fileno())
-        part.replace(target)
+        # Unlike `replace` this refuses a file that a service has made in the meantime.
+        os.link(part, target)
         sync_folder(target.absolute().parent)
+    except FileExistsError:
+        raise BadConfiguration(f"ACQUIRE_DATABASE: {target}: exists already") from None
     except sqlite3.Error as error:
         raise BadConfiguration(f"{source}: cannot be restored: {error}") from None
     finally:

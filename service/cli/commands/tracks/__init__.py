@@ -45,7 +45,7 @@ def run(parsed: Namespace) -> int:
     if parsed.output is not None and parsed.format != "tdm":
         raise BadInput(Fault("--output", "is for --format tdm alone"))
     start, end = period_of(parsed)
-    app = open_app(settings_of_existing(parsed))
+    app = open_app(settings_of_existing(parsed), reads_only=True)
     try:
         found = app.tracks.of_period(parsed.spacecraft, run=parsed.run, start=start, end=end)
         if parsed.format == "tdm":
