@@ -563,7 +563,7 @@ def test_what_writes_keeps_off_a_file_that_a_service_is_at_work_on(acquire, tmp_
     with served(f"sqlite:///{tmp_path / 'acquire.db'}") as (process, _):
         code, out, err = acquire(*again)
         assert (code, out) == (2, "")
-        assert "(acquire serve" in err
+        assert "(service.cli serve --port" in err
         assert acquire("smooth", "XTE", "--run", "r")[2] == err
         # Reading does no harm beside it.
         assert acquire("advise", "--spacecraft", "XTE", "--run", "r")[0] == 0

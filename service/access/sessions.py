@@ -158,6 +158,12 @@ class Access:
                 raise RateLimited(f"{caller.name} may send {rate:g} requests per second", wait_s)
             bucket.left -= count
 
+    def forget(self) -> None:
+        """Look callers up again from now on, because tokens have changed."""
+        with self._lock:
+            self._known.clear()
+            self._open_until_s = 0.0
+
     def sign_in(self, token: str) -> tuple[str, Caller]:
         """Begin a browser's session; returns the secret for its cookie, and the caller."""
         caller = self._holder("token", tokens.secret_digest(token))

@@ -10,12 +10,12 @@ import re
 import secrets
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import get_args
+from typing import Any, get_args
 
 from sqlalchemy import Connection, delete, insert, select, update
 
 from service.errors import BadInput, Conflict, Fault, Forbidden, NotFound, shown_value
-from service.storage.models.access import Scope
+from service.storage.models.access import Scope, Token, TokenState
 from service.storage.recording.identity import OwnKey
 from service.storage.sql.access_tables import access_sessions, access_tokens
 
@@ -50,20 +50,6 @@ class Caller:
         if not self.may_see(spacecraft):
             theirs = ", ".join(sorted(self.spacecraft or ()))
             raise Forbidden(f"{self.name} is bound to {theirs}, not to {spacecraft[:128]}")
-
-
-@dataclass(frozen=True)
-class TokenEntry:
-    """A token in the list of all tokens; times are UTC texts."""
-
-    name: str
-    scopes: list[str]
-    spacecraft: list[str] | None
-    """None: all."""
-    rate_per_s: float | None
-    created: str
-    expires: str
-    revoked: str | None
 
 
 def own_key(caller: Caller | None, key: str | None) -> OwnKey | None:
@@ -129,21 +115,33 @@ def add_token(
     )
 
 
-def list_tokens(connection: Connection) -> list[TokenEntry]:
-    """Every token without its digest, the oldest first."""
+def list_tokens(connection: Connection, now: str) -> list[Token]:
+    """Every token without its digest, the oldest first; states are those at a time."""
     query = select(access_tokens).order_by(access_tokens.c.id)
-    return [
-        TokenEntry(
-            name=row["name"],
-            scopes=json.loads(row["scopes"]),
-            spacecraft=row["spacecraft"] and json.loads(row["spacecraft"]),
-            rate_per_s=row["rate_per_s"],
-            created=row["created"],
-            expires=row["expires"],
-            revoked=row["revoked"],
-        )
-        for row in connection.execute(query).mappings()
-    ]
+    return [_token(row, now) for row in connection.execute(query).mappings()]
+
+
+def read_token(connection: Connection, name: str, now: str) -> Token:
+    """A token without its digest; raises `NotFound`."""
+    query = select(access_tokens).where(access_tokens.c.name == name)
+    row = connection.execute(query).mappings().first()
+    if row is None:
+        raise NotFound(f"there is no token named {shown_value(name)}")
+    return _token(row, now)
+
+
+def _token(row: Any, now: str) -> Token:
+    state: TokenState = "expired" if row["expires"] <= now else "good"
+    return Token(
+        name=row["name"],
+        scopes=json.loads(row["scopes"]),
+        spacecraft=row["spacecraft"] and json.loads(row["spacecraft"]),
+        rate_per_s=row["rate_per_s"],
+        created=row["created"],
+        expires=row["expires"],
+        revoked=row["revoked"],
+        state="revoked" if row["revoked"] else state,
+    )
 
 
 def revoke_token(connection: Connection, name: str, moment: str) -> None:
@@ -152,7 +150,7 @@ def revoke_token(connection: Connection, name: str, moment: str) -> None:
         select(access_tokens.c.id, access_tokens.c.revoked).where(access_tokens.c.name == name)
     ).first()
     if row is None:
-        raise NotFound(f"there is no token named {name!r}; see `acquire token list`")
+        raise NotFound(f"there is no token named {shown_value(name)}; see `acquire token list`")
     if row.revoked is None:
         connection.execute(
             update(access_tokens).where(access_tokens.c.id == row.id).values(revoked=moment)

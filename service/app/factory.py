@@ -25,6 +25,7 @@ from service.app.telemetry.grades import Grades
 from service.app.telemetry.gyro import Gyro
 from service.app.telemetry.live_filter import LiveFilter
 from service.app.telemetry.tracks import Tracks
+from service.app.tokens import Tokens
 from service.app.zones import Zones
 from service.missions.mission import Mission, load_missions
 from service.settings import Settings, is_loopback
@@ -56,6 +57,7 @@ class App:
         self.access = Access(
             context.reading, context.change, is_loopback(context.settings.host), utc_now
         )
+        self.tokens = Tokens(context, context.missions)
         self.submissions = Submissions(context, kernels)
         self.frames = Frames(context, self.submissions)
         self.results = Results(context, self.submissions)

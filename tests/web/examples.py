@@ -8,13 +8,12 @@ import gzip
 import json
 import tempfile
 import time
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import httpx
 
-from service.access.tokens import add_token, new_secret
 from service.app.factory import App, open_app
 from service.missions.live_filter import LiveFilterSettings
 from service.missions.mission import load_missions
@@ -153,7 +152,7 @@ def walk(client: httpx.Client, app: App) -> Json:
     _calibration(client, take)
     _measured(client, app, take)
     take("session", client.get(f"{API}/session"), "open_access")
-    _sign_in(client, app, take)
+    _sign_in(client, take)
     return found
 
 
@@ -322,23 +321,20 @@ def _webhook(client: httpx.Client, take: Any) -> None:
     take("get_webhook", client.get(webhook), "unknown")
 
 
-def _sign_in(client: httpx.Client, app: App, take: Any) -> None:
-    secret = new_secret()
-    app.context.change(
-        partial(
-            add_token,
-            id="01JD0000000000000000000001",
-            name="J. Operator",
-            secret=secret,
-            scopes=("read", "operate"),
-            spacecraft=None,
-            rate_per_s=None,
-            created="1999-03-01T12:00:00.000Z",
-            expires="2099-03-01T12:00:00.000Z",
-        )
-    )
-    # What is known of tokens is believed for a second.
-    time.sleep(1.2)
+def _sign_in(client: httpx.Client, take: Any) -> None:
+    operator = {"name": "J. Operator", "scopes": ["read", "operate"], "days": 90}
+    made = take("add_token", client.post(f"{API}/tokens", json=operator), "operator", operator)
+    secret = made["token"]
+    shown = {"Authorization": f"Bearer {secret}"}
+    pipeline = {"name": "pipeline", "scopes": ["submit"], "spacecraft": ["XTE"], "rate_per_s": 50}
+    asked = client.post(f"{API}/tokens", json=pipeline, headers=shown)
+    take("add_token", asked, "pipeline", pipeline)
+    again = client.post(f"{API}/tokens", json=pipeline, headers=shown)
+    take("add_token", again, "name_is_taken")
+    take("list_tokens", client.get(f"{API}/tokens", headers=shown), "two")
+    revoked = client.delete(f"{API}/tokens/pipeline", headers=shown)
+    take("revoke_token", revoked, "revoked")
+    take("revoke_token", client.delete(f"{API}/tokens/nobody", headers=shown), "unknown")
     asked = {"token": "acq_the-secret-that-was-printed-once"}
     take("list_runs", client.get(f"{API}/runs"), "no_token")
     take("sign_in", client.post(f"{API}/session", json=asked), "unknown", asked)

@@ -30,6 +30,7 @@ PATH_PARAMETERS = {
     "quantity": "ambiguous_share",
     "slug": "bad-input",
     "kind": "batches",
+    "token": "nobody",
 }
 OPEN_BESIDE_THE_ROUTES = {"/static", "/api/v1/openapi.json"}
 """What `docs/access.md` says is open, of what no policy is asked about."""
@@ -291,6 +292,73 @@ def test_revoking_a_token_holds_within_a_second(guarded, anybody):
     guarded.revoke("short lived")
     time.sleep(KNOWN_AGAIN_S)
     assert anybody.get("/api/v1/session", headers=shown(token)).status_code == 401
+
+
+def test_a_token_is_made_listed_and_revoked_at_once_by_who_operates(guarded, anybody):
+    """Without a pause of the service: the token that was just used is refused at once."""
+    operating = shown(guarded.of_scope["operate"])
+    asked = {"name": "new one", "scopes": ["read"], "spacecraft": ["XTE"], "days": 30}
+    made = anybody.post("/api/v1/tokens", json=asked, headers=operating)
+    assert (made.status_code, made.json()["state"]) == (201, "good")
+    secret = made.json()["token"]
+    assert anybody.post("/api/v1/tokens", json=asked, headers=operating).status_code == 409
+    session = anybody.get("/api/v1/session", headers=shown(secret)).json()
+    assert session == {"name": "new one", "scopes": ["read"], "spacecraft": ["XTE"]}
+
+    for path in ("/api/v1/tokens", "/tokens"):
+        listed = anybody.get(path, headers=operating)
+        assert "new one" in listed.text
+        assert secret not in listed.text
+    assert listed.text.count("data-revoke>") == listed.text.count('<details id="revoke-')
+
+    ended = anybody.delete("/api/v1/tokens/new%20one", headers=operating)
+    assert (ended.status_code, ended.json()["state"]) == (200, "revoked")
+    assert anybody.get("/api/v1/session", headers=shown(secret)).status_code == 401
+    assert anybody.delete("/api/v1/tokens/nobody", headers=operating).status_code == 404
+    audited = anybody.get("/api/v1/audit?limit=4", headers=shown(guarded.all))
+    assert [(each["action"], each["status"]) for each in audited.json()["items"]] == [
+        ("revoke_token", 404),
+        ("revoke_token", 200),
+        ("add_token", 409),
+        ("add_token", 201),
+    ]
+    assert secret not in audited.text
+
+
+def test_tokens_are_no_business_of_one_that_is_bound_or_does_not_operate(guarded, anybody):
+    bound = guarded.token("bound", "read", "submit", "operate", spacecraft=["XTE"])
+    asked = {"name": "mine", "scopes": ["operate"]}
+    for token in (bound, guarded.of_scope["read"], guarded.of_scope["submit"]):
+        headers = shown(token)
+        assert anybody.get("/api/v1/tokens", headers=headers).status_code == 403
+        assert anybody.get("/tokens", headers=headers).status_code == 403
+        assert anybody.post("/api/v1/tokens", json=asked, headers=headers).status_code == 403
+        assert anybody.delete("/api/v1/tokens/all", headers=headers).status_code == 403
+
+
+def test_the_command_goes_through_the_service_that_writes_to_the_file(
+    guarded, acquire, monkeypatch
+):
+    if not guarded.settings.database.startswith("sqlite"):
+        pytest.skip("a database server takes the command's own changes")
+    there = ("--database", guarded.settings.database, "--url", guarded.url)
+    create = ("token", "create", "by command", "--scope", "read", *there)
+    code, out, err = acquire(*create)
+    assert (code, out) == (2, "")
+    assert "set ACQUIRE_TOKEN to a token with the scope operate" in err
+    monkeypatch.setenv("ACQUIRE_TOKEN", guarded.of_scope["operate"])
+    code, out, err = acquire(*create)
+    # The token alone, so that a script can take it.
+    assert (code, out.strip().count("\n"), out[:4]) == (0, 0, "acq_")
+    assert "by command may read until" in err
+    assert httpx.get(f"{guarded.url}/api/v1/session", headers=shown(out.strip())).status_code == 200
+    assert acquire("token", "revoke", "by command", *there)[0] == 0
+    assert httpx.get(f"{guarded.url}/api/v1/session", headers=shown(out.strip())).status_code == 401
+    assert acquire("token", "revoke", "by command?", *there)[0] != 0
+    code, out, _ = acquire("token", "list", "--json", *there[:2])
+    assert {"by command": "revoked"}.items() <= {
+        e["name"]: e["state"] for e in json.loads(out)
+    }.items()
 
 
 def test_a_session_is_a_cookie_that_scripts_cannot_read_and_other_sites_cannot_use(guarded, batch):

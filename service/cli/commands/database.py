@@ -110,8 +110,8 @@ def _add_prune(group: Any) -> None:
         group,
         "prune",
         "Delete the batches before a time, with their results and their part in the trends, and "
-        "the gyro blocks and days of filtered attitudes that end before it.  On SQLite no service may "
-        "be running.  This cannot be undone: make a backup first.",
+        "the gyro blocks and days of filtered attitudes that end before it.  On SQLite no service "
+        "may be running.  This cannot be undone: make a backup first.",
         """
         acquire database prune --before 1996-01-01T00:00:00Z --dry-run
         acquire database prune --before 1996-001T00:00:00Z --run pass-7

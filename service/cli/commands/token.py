@@ -1,9 +1,9 @@
 """`acquire token`: who may use the service.
 
-The commands write straight into the database, also while a service is using it.
+The commands write into the database; where a service writes to its SQLite file, through that.
 """
 
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from typing import Any
 
 from service.cli.arguments import add_command, add_database, add_group, add_json, count
@@ -65,7 +65,7 @@ def add(commands: Any) -> None:
         metavar="N",
         help="maximum number of requests per second; default: no limit",
     )
-    add_database(parser)
+    add_service(parser)
     parser = add_command(
         group, "list", "Show every token, without its secret.", "acquire token list", show
     )
@@ -79,15 +79,33 @@ def add(commands: Any) -> None:
         revoke,
     )
     parser.add_argument("name", metavar="NAME")
+    add_service(parser)
+
+
+def add_service(parser: ArgumentParser) -> None:
+    """Declare the database, and the service that may be writing to it."""
+    parser.add_argument(
+        "--url",
+        help="the service that writes to the SQLite file, which then makes the change; default: "
+        "ACQUIRE_HOST and ACQUIRE_PORT, else http://127.0.0.1:8000",
+    )
     add_database(parser)
 
 
 def create(parsed: Namespace) -> int:
     """Make a token and print it."""
     from service.cli import tokens
+    from service.web.ports import url_of
 
+    settings = settings_of(parsed)
     return tokens.create(
-        settings_of(parsed), parsed.name, parsed.scope, parsed.spacecraft, parsed.days, parsed.rate
+        settings,
+        parsed.url or url_of(settings.host, settings.port),
+        parsed.name,
+        parsed.scope,
+        parsed.spacecraft,
+        parsed.days,
+        parsed.rate,
     )
 
 
@@ -101,5 +119,7 @@ def show(parsed: Namespace) -> int:
 def revoke(parsed: Namespace) -> int:
     """End a token."""
     from service.cli import tokens
+    from service.web.ports import url_of
 
-    return tokens.revoke(settings_of_existing(parsed), parsed.name)
+    settings = settings_of_existing(parsed)
+    return tokens.revoke(settings, parsed.url or url_of(settings.host, settings.port), parsed.name)

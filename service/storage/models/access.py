@@ -20,6 +20,39 @@ class Session(Record, frozen=True, kw_only=True):
     ]
 
 
+TokenState = Literal["good", "expired", "revoked"]
+
+
+class Token(Record, frozen=True, kw_only=True):
+    """A token without its secret, of which only a digest is stored."""
+
+    component: ClassVar[str] = "Token"
+    name: Annotated[str, doc("The audit list records changes under it; never used again.")]
+    scopes: list[Scope]
+    spacecraft: Annotated[
+        list[str] | None, doc("Spacecraft that the token is bound to; null: all.")
+    ]
+    rate_per_s: Annotated[float | None, doc("Requests per second; null: no limit.")]
+    created: Stamp
+    expires: Stamp
+    revoked: Stamp | None
+    state: TokenState
+
+
+class NewToken(Token, frozen=True, kw_only=True):
+    """A new token with its secret, which is shown this once."""
+
+    component: ClassVar[str] = "NewToken"
+    token: Annotated[str, doc("Sent as `Authorization: Bearer acq_...`.")]
+
+
+class TokenList(Record, frozen=True, kw_only=True):
+    """All tokens, the oldest first."""
+
+    component: ClassVar[str] = "TokenList"
+    items: list[Token]
+
+
 class AuditEntry(Record, frozen=True, kw_only=True):
     """One change."""
 

@@ -103,7 +103,7 @@ def _command(process: str) -> str:
     with suppress(OSError):
         words = Path("/proc", process, "cmdline").read_text(errors="replace").split("\0")
         if Path(words[0]).name.startswith("python"):
-            words = words[1:]
+            words = words[2:] if words[1:2] == ["-m"] else words[1:]
         shown = " ".join(" ".join([Path(words[0]).name, *words[1:]]).split())
         return f" ({shown[:MAX_SHOWN]})" if shown else ""
     return ""

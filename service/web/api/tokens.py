@@ -1,22 +1,23 @@
-"""Access: a token exchanged for a browser's session, and the list of what was changed."""
+"""Access: tokens, a token exchanged for a browser's session, and the list of what was changed."""
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Path
 from fastapi import Query as InQuery
-from pydantic import Field
+from pydantic import ConfigDict, Field
 from starlette.requests import Request
 from starlette.responses import Response
 
 from service.access.tokens import SESSION_H
+from service.app.tokens import DEFAULT_DAYS, MAX_DAYS
 from service.errors import Unauthenticated
-from service.observations.schema import Wire
-from service.storage.models.access import AuditPage, Session
+from service.observations.schema import Key, Wire
+from service.storage.models.access import AuditPage, NewToken, Scope, Session, Token, TokenList
 from service.web.openapi.route import LINK, ResponseDoc, route_docs
-from service.web.requests.access import COOKIE, CallerDep
+from service.web.requests.access import COOKIE, AuditDep, CallerDep
 from service.web.requests.dependencies import AppDep, json_response, page_response
 from service.web.requests.query_parameters import NO_QUERY, AuditQuery
-from service.web.requests.request_body import SessionBody, read_model
+from service.web.requests.request_body import JsonBody, SessionBody, read_model
 
 router = APIRouter(prefix="/api/v1", tags=["access"])
 
@@ -73,6 +74,75 @@ def sign_out(request: Request, app: AppDep) -> Response:
     response = json_response({"name": None, "scopes": [], "spacecraft": []})
     response.delete_cookie(COOKIE, httponly=True, samesite="strict")
     return response
+
+
+class TokenIn(Wire):
+    """A new token."""
+
+    component: ClassVar[str] = "TokenIn"
+    model_config = ConfigDict(title=component)
+
+    name: Annotated[
+        str,
+        Field(
+            pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._@+-]{0,63}$",
+            description="Of a program or a person. The audit list records changes under it.",
+            examples=["pipeline"],
+        ),
+    ]
+    scopes: Annotated[list[Scope], Field(min_length=1, max_length=3)]
+    spacecraft: Annotated[
+        list[Key] | None,
+        Field(min_length=1, max_length=200, description="Bind it to these; null: all."),
+    ] = None
+    days: Annotated[
+        int, Field(ge=1, le=MAX_DAYS, strict=True, description="Days until it expires.")
+    ] = DEFAULT_DAYS
+    rate_per_s: Annotated[
+        float | None, Field(ge=0.001, le=1e6, description="Requests per second; null: no limit.")
+    ] = None
+
+
+TokenName = Annotated[str, Path(max_length=64, description="The `name` of a token.")]
+
+
+@router.get(
+    "/tokens",
+    dependencies=[NO_QUERY],
+    **route_docs({200: ResponseDoc("All tokens, without their secrets.", TokenList)}),
+)
+def list_tokens(app: AppDep) -> Response:
+    """Every token, with its scopes, spacecraft, end and state."""
+    return json_response(TokenList(items=app.tokens.all()))
+
+
+@router.post(
+    "/tokens",
+    dependencies=[NO_QUERY],
+    **route_docs(
+        {201: ResponseDoc("The token, and its secret this once.", NewToken)},
+        body=TokenIn,
+        problems=(409, 503),
+    ),
+)
+def add_token(body: JsonBody, app: AppDep, audited: AuditDep) -> Response:
+    """Make a token; the first one ends open access."""
+    asked = read_model(TokenIn, body)
+    made = app.tokens.add(**asked.model_dump(), entry=audited.entry(201))
+    app.access.forget()
+    return json_response(made, 201)
+
+
+@router.delete(
+    "/tokens/{token}",
+    dependencies=[NO_QUERY],
+    **route_docs({200: ResponseDoc("The token that was revoked.", Token)}, problems=(404, 503)),
+)
+def revoke_token(token: TokenName, app: AppDep, audited: AuditDep) -> Response:
+    """Revoke a token at once, with the browser sessions that were begun with it."""
+    revoked = app.tokens.revoke(token, audited.entry())
+    app.access.forget()
+    return json_response(revoked)
 
 
 @router.get("/audit", **route_docs({200: ResponseDoc("A page of changes.", AuditPage, LINK)}))

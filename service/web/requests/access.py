@@ -130,6 +130,9 @@ POLICIES: dict[str, Policy] = {
     "get_overview": Policy("read", "nothing"),
     "events": Policy("read", "query"),
     "list_audit": OPERATE,
+    "list_tokens": OPERATE,
+    "add_token": OPERATE,
+    "revoke_token": OPERATE,
     # What a webhook sends is about every spacecraft, and its URL may be a secret.
     "list_webhooks": OPERATE,
     "get_webhook": OPERATE,
