@@ -1,6 +1,6 @@
 """The log of events that the records keep, and the audit list of changes."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 from service.access import audit
 from service.app.context import Context
@@ -16,10 +16,12 @@ class Events:
     def __init__(self, context: Context) -> None:
         self._context = context
 
-    def last(self) -> int:
-        """The number of the latest event."""
+    def last(self, spacecraft: Collection[str] | None = None) -> int:
+        """The number of the latest event; with `spacecraft`, of the latest about one of these."""
         with self._context.reading() as connection:
-            return events.last_event(connection)
+            if spacecraft is None:
+                return events.last_event(connection)
+            return events.last_event_about(connection, spacecraft)
 
     def after(self, last: int, limit: int) -> Sequence[Event] | None:
         """The events after a number, oldest first; None where some of them are no longer kept."""

@@ -34,10 +34,10 @@ class Runs:
     def __init__(self, context: Context) -> None:
         self._context = context
 
-    def all(self) -> list[Run]:
-        """Every run with batches."""
+    def all(self, spacecraft: Collection[str] | None = None) -> list[Run]:
+        """Every run with batches; with `spacecraft`, of these, as if there were no others."""
         with self._context.reading() as connection:
-            return histories.list_runs(connection)
+            return histories.list_runs(connection, spacecraft)
 
     def default(self) -> str:
         """The run to show first: live, or the newest while that is empty."""
@@ -108,7 +108,9 @@ class Runs:
 
         The first is `run`, or without one the live run or the newest.  None without such a pair.
         """
-        found = sorted(self.all(), key=lambda each: (each.run == LIVE, each.created), reverse=True)
+        found = sorted(
+            self.all(spacecraft), key=lambda each: (each.run == LIVE, each.created), reverse=True
+        )
         for one in found:
             if run is not None and one.run != run:
                 continue

@@ -3,6 +3,7 @@
 import gc
 import logging
 import threading
+from collections.abc import Collection
 
 from msgspec import structs
 
@@ -149,8 +150,8 @@ class Service:
                 # A batch that no longer runs must not prevent the start.
                 log.warning("the latest batch of a spacecraft could not be run again: %s", error)
 
-    def about(self) -> About:
-        """Version, catalog, missions and kind of database."""
+    def about(self, spacecraft: Collection[str] | None = None) -> About:
+        """Version, catalog, missions, of these spacecraft alone, and kind of database."""
         catalog = self._context.sky.catalog
         return About(
             version=__version__,
@@ -162,6 +163,7 @@ class Service:
             missions=[
                 MissionAbout(name=each.name, description=each.description, digest=each.digest)
                 for each in self._context.missions.values()
+                if spacecraft is None or each.name in spacecraft
             ],
             credits=list(CREDITS),
         )

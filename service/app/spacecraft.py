@@ -1,6 +1,6 @@
 """Spacecraft: their state, attitudes, star rates, histories and worst batches."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 from msgspec import UNSET, structs
@@ -36,17 +36,25 @@ class Spacecraft:
     def __init__(self, context: Context) -> None:
         self._context = context
 
-    def overview(self, run: str | None = None) -> Overview:
-        """Every spacecraft in a run at a glance; see `overview.overview`."""
+    def overview(
+        self, run: str | None = None, spacecraft: Collection[str] | None = None
+    ) -> Overview:
+        """Every spacecraft in a run at a glance, or some; see `overview.overview`."""
         with self._context.reading() as connection:
             missions = self._context.missions.values()
-            return overview.overview(connection, missions, run or LIVE, utc_now())
+            return overview.overview(connection, missions, run or LIVE, utc_now(), spacecraft)
 
-    def fleet(self, names: Sequence[str], run: str, period: fleet.Period) -> Fleet:
+    def fleet(
+        self,
+        names: Sequence[str],
+        run: str,
+        period: fleet.Period,
+        spacecraft: Collection[str] | None = None,
+    ) -> Fleet:
         """Some of the spacecraft in a run, for one page of all of them; see `fleet.fleet`."""
         missions = [self._context.missions[name] for name in names]
         with self._context.reading() as connection:
-            return fleet.fleet(connection, missions, run, period, utc_now())
+            return fleet.fleet(connection, missions, run, period, utc_now(), spacecraft)
 
     def states(self, run: str | None = None) -> list[SpacecraftRow]:
         """Every spacecraft that has a mission file, with its state in a run."""

@@ -1,7 +1,7 @@
 """The state of many spacecraft in a few queries, whose number does not grow with the fleet."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cache
 from typing import Any, Literal
 
@@ -23,7 +23,7 @@ from service.storage.queries.alarms import active_alarms, summary
 from service.storage.queries.future_dated import AHEAD_NS, LIVE
 from service.storage.queries.pages import PLACE
 from service.storage.queries.results import summary_of, summary_query
-from service.storage.queries.trends import latest_time
+from service.storage.queries.trends import latest_time_of
 from service.storage.recording.rollup_sql import SUMMED
 from service.storage.sql.rollup_tables import COUNTS, rollups_hourly
 from service.storage.sql.tables import batches, mission_uses, results, solutions, star_results
@@ -51,11 +51,19 @@ _Sums = Sequence[tuple[Any, ...]]
 
 
 def fleet(
-    connection: Connection, missions: Iterable[Mission], run: str, period: Period, now: Utc
+    connection: Connection,
+    missions: Iterable[Mission],
+    run: str,
+    period: Period,
+    now: Utc,
+    spacecraft: Collection[str] | None = None,
 ) -> Fleet:
-    """Every mission in a run; the last hour and the period end with the run's latest batch."""
+    """Every mission in a run; the last hour and the period end with the run's latest batch.
+
+    With `spacecraft`, that of these.
+    """
     named = {mission.name: mission for mission in missions}
-    as_of = latest_time(connection, run, now=now)
+    as_of = latest_time_of(connection, run, spacecraft, now=now)
     active = [each for each in active_alarms(connection, run, now.text) if each.spacecraft in named]
     if as_of is None:
         rows = tuple(_row(each, None, now, active) for each in named.values())

@@ -1,6 +1,7 @@
 """Histories: attitudes, the state of a spacecraft, its settings, and the runs there are."""
 
 import json
+from collections.abc import Collection
 from itertools import groupby
 from typing import Any
 
@@ -91,8 +92,11 @@ def mission_history(connection: Connection, spacecraft: str) -> list[MissionThen
     ]
 
 
-def list_runs(connection: Connection) -> list[Run]:
-    """Every run with its number of batches, its spacecraft and the days it covers."""
+def list_runs(connection: Connection, spacecraft: Collection[str] | None = None) -> list[Run]:
+    """Every run with its number of batches, its spacecraft and the days it covers.
+
+    With `spacecraft`, those of these alone.
+    """
     daily = rollups_daily.c
     query = select(
         daily.spacecraft,
@@ -101,6 +105,8 @@ def list_runs(connection: Connection) -> list[Run]:
         func.min(daily.bucket).label("first"),
         func.max(daily.bucket).label("last"),
     ).group_by(daily.run, daily.spacecraft)
+    if spacecraft is not None:
+        query = query.where(daily.spacecraft.in_(spacecraft))
     parts: dict[str, list[Any]] = {}
     for part in connection.execute(query.order_by(daily.run, daily.spacecraft)).mappings():
         parts.setdefault(part["run"], []).append(part)

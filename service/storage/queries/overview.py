@@ -1,7 +1,7 @@
 """All spacecraft of a run: state, recent observations, and time since the latest batch."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 from msgspec import structs
@@ -23,7 +23,7 @@ from service.storage.queries.time_buckets import (
     read_steps,
     totals,
 )
-from service.storage.queries.trends import latest_time
+from service.storage.queries.trends import latest_time_of
 from service.storage.sql.columns import Row
 from service.storage.sql.rollup_tables import COUNTS, rollups_daily
 from service.storage.sql.tables import runs
@@ -34,13 +34,26 @@ STEPS = {HOUR_S: 120, DAY_S: 1800}
 _TICK_S = 1e-6
 
 
-def overview(connection: Connection, missions: Iterable[Mission], run: str, now: Utc) -> Overview:
-    """Every mission in a run; the last hour and day end with the run's latest batch."""
-    as_of = latest_time(connection, run, now=now)
+def overview(
+    connection: Connection,
+    missions: Iterable[Mission],
+    run: str,
+    now: Utc,
+    spacecraft: Collection[str] | None = None,
+) -> Overview:
+    """Every mission in a run; the last hour and day end with the run's latest batch.
+
+    With `spacecraft`, runs and batches of others are as if they did not exist.
+    """
+    if spacecraft is not None:
+        missions = [each for each in missions if each.name in spacecraft]
+    as_of = latest_time_of(connection, run, spacecraft, now=now)
     found = active_alarms(connection, run, now.text)
+    if spacecraft is not None:
+        found = [each for each in found if each.spacecraft in spacecraft]
     return Overview(
         run=run,
-        default_run=default_run(connection),
+        default_run=default_run(connection, spacecraft),
         as_of=None if as_of is None else as_of.text,
         now=now.text,
         alarms=summary(found),
@@ -48,9 +61,15 @@ def overview(connection: Connection, missions: Iterable[Mission], run: str, now:
     )
 
 
-def default_run(connection: Connection) -> str:
-    """The run to look at first: live, or while that is empty the newest that holds batches."""
-    filled = select(rollups_daily.c.run).where(rollups_daily.c.run == runs.c.name).exists()
+def default_run(connection: Connection, spacecraft: Collection[str] | None = None) -> str:
+    """The run to look at first: live, or while that is empty the newest that holds batches.
+
+    With `spacecraft`, batches of these.
+    """
+    batches = select(rollups_daily.c.run).where(rollups_daily.c.run == runs.c.name)
+    if spacecraft is not None:
+        batches = batches.where(rollups_daily.c.spacecraft.in_(spacecraft))
+    filled = batches.exists()
     query = select(runs.c.name).where(filled)
     first = query.order_by(runs.c.name != LIVE, runs.c.created.desc(), runs.c.name).limit(1)
     return str(connection.execute(first).scalar() or LIVE)

@@ -1,6 +1,6 @@
 """Histories of quantities, thinned to the number of points that can be drawn, extremes kept."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -94,6 +94,16 @@ def latest_time(
     query = select(batches.c.time).join_from(results, batches, results.c.batch_id == batches.c.id)
     row = newest(connection, query, ResultFilter(run, spacecraft), now)
     return None if row is None else parse_utc(row["time"])
+
+
+def latest_time_of(
+    connection: Connection, run: str, spacecraft: Collection[str] | None, *, now: Utc
+) -> Utc | None:
+    """The time of the latest batch of some spacecraft in a run; None: of any."""
+    if spacecraft is None:
+        return latest_time(connection, run, now=now)
+    found = (latest_time(connection, run, name, now=now) for name in spacecraft)
+    return max(filter(None, found), key=lambda moment: moment.tai_ns, default=None)
 
 
 def _span(

@@ -113,6 +113,12 @@ def last_event(connection: Connection) -> int:
     return int(connection.execute(select(event_counter.c.last)).scalar_one())
 
 
+def last_event_about(connection: Connection, spacecraft: Collection[str]) -> int:
+    """The number of the latest event about one of these; none before those that are kept."""
+    found = select(func.max(events.c.id)).where(events.c.spacecraft.in_(spacecraft))
+    return max(connection.scalar(found) or 0, (first_event(connection) or 1) - 1)
+
+
 def events_after(connection: Connection, last: int, limit: int) -> Sequence[Event] | None:
     """The events after a number, oldest first; None if some of them are no longer kept.
 

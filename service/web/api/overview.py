@@ -4,11 +4,9 @@ from typing import Annotated
 
 from fastapi import APIRouter
 from fastapi import Query as InQuery
-from msgspec import structs
 from starlette.responses import Response
 
 from service.storage.models.overview import About, Overview
-from service.storage.queries.alarms import summary
 from service.web.openapi.route import ResponseDoc, route_docs
 from service.web.requests.access import CallerDep
 from service.web.requests.dependencies import AppDep, json_response
@@ -20,11 +18,7 @@ router = APIRouter(prefix="/api/v1", tags=["spacecraft"])
 @router.get("/overview", **route_docs({200: ResponseDoc("Every spacecraft in the run.", Overview)}))
 def get_overview(query: Annotated[RunQuery, InQuery()], app: AppDep, caller: CallerDep) -> Response:
     """Every spacecraft in a run: state, last attitude, the last hour and day, active alarms."""
-    found = app.spacecraft.overview(query.run)
-    items = [each for each in found.items if caller.may_see(each.name)]
-    alarms = summary([alarm for each in items for alarm in each.alarms])
-    found = structs.replace(found, items=items, alarms=alarms)
-    return json_response(found)
+    return json_response(app.spacecraft.overview(query.run, caller.spacecraft))
 
 
 @router.get(
@@ -32,6 +26,6 @@ def get_overview(query: Annotated[RunQuery, InQuery()], app: AppDep, caller: Cal
     dependencies=[NO_QUERY],
     **route_docs({200: ResponseDoc("The version of the service and its data.", About)}),
 )
-def get_about(app: AppDep) -> Response:
+def get_about(app: AppDep, caller: CallerDep) -> Response:
     """Version, catalog, missions, database and credits."""
-    return json_response(app.service.about())
+    return json_response(app.service.about(caller.spacecraft))

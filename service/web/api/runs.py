@@ -83,9 +83,9 @@ async def _telemetry(
 @router.get(
     "/runs", dependencies=[NO_QUERY], **route_docs({200: ResponseDoc("Every run.", RunList)})
 )
-def list_runs(app: AppDep) -> Response:
-    """Every run with batches."""
-    return json_response({"items": app.runs.all()})
+def list_runs(app: AppDep, caller: CallerDep) -> Response:
+    """Every run with batches; of a token that is bound to spacecraft, with theirs."""
+    return json_response({"items": app.runs.all(caller.spacecraft)})
 
 
 @router.put(

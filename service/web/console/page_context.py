@@ -116,11 +116,7 @@ class PageContext:
 
     def layout(self, run: str) -> Layout:
         """The layout of the page that shows a run."""
-        batches = {
-            each.run: each.batches
-            for each in self.app.runs.all()
-            if any(self.caller.may_see(name) for name in each.spacecraft)
-        }
+        batches = {each.run: each.batches for each in self.app.runs.all(self.caller.spacecraft)}
         active = self.app.alarms.active(run)
         alarms = summary([each for each in active if self.caller.may_see(each.spacecraft)])
         names = sorted({LIVE, run, *batches}, key=lambda name: (name != LIVE, name))
@@ -162,7 +158,10 @@ class PageContext:
     def filled_spacecraft(self, run: str) -> str:
         """The first spacecraft with batches in a run; without any, the first one."""
         found = {
-            name for each in self.app.runs.all() if each.run == run for name in each.spacecraft
+            name
+            for each in self.app.runs.all(self.caller.spacecraft)
+            if each.run == run
+            for name in each.spacecraft
         }
         return next((name for name in self.spacecraft if name in found), self.first_spacecraft)
 
@@ -170,7 +169,7 @@ class PageContext:
 def _page_context(request: Request, app: AppDep, caller: CallerDep) -> PageContext:
     page = PAGES[request.scope["route"].name]
     address = str(request.base_url).rstrip("/")
-    return PageContext(app, caller, page, app.events.last(), address)
+    return PageContext(app, caller, page, app.events.last(caller.spacecraft), address)
 
 
 ContextDep = Annotated[PageContext, Depends(_page_context)]

@@ -94,7 +94,7 @@ POLICIES: dict[str, Policy] = {
     "list_zones": READ,
     "warm_zones": Policy("operate", "body"),
     "drop_zones": Policy("operate", "query"),
-    "list_runs": READ,
+    "list_runs": Policy("read", "nothing"),
     "start_replay": Policy("submit", "body"),
     "list_replays": READ,
     # Its id is unguessable: only the client that started it and readers of everything know it.

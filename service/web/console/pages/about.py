@@ -3,7 +3,6 @@
 from typing import Annotated
 
 from fastapi import Query as InQuery
-from msgspec import structs
 from starlette.responses import Response
 
 from service.web.console.page_context import ContextDep, PageQuery
@@ -15,7 +14,5 @@ from service.web.requests.access import Policy
 @console_page("/about", "About", Policy("read", "nothing"), position=80)
 def about_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
     """Version, catalog, missions, database and credits."""
-    about = context.app.service.about()
-    missions = [each for each in about.missions if context.caller.may_see(each.name)]
-    about = structs.replace(about, missions=missions)
+    about = context.app.service.about(context.caller.spacecraft)
     return rendered("about.html.jinja", context.layout(query.run), about=about)

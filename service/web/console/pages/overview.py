@@ -109,7 +109,9 @@ class OverviewLine:
 @console_page("/", "Overview", Policy("read", "nothing"), position=10)
 def overview_page(query: Annotated[OverviewQuery, InQuery()], context: ContextDep) -> Response:
     """State, attitude, shares, alarms and age of every spacecraft in a run."""
-    fleet = context.app.spacecraft.fleet(context.spacecraft, query.run, query.period)
+    fleet = context.app.spacecraft.fleet(
+        context.spacecraft, query.run, query.period, context.caller.spacecraft
+    )
     shares = {} if fleet.cells is None else _shares(fleet.cells)
     top = common_top(
         max((_greatest(shares[name]) for name in SPARK_QUANTITIES if shares), default=0)

@@ -9,18 +9,23 @@ from service.times import utc_now
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
-from service.web.requests.access import READ
+from service.web.requests.access import READ, Policy
 
 
-@console_page("/runs", "Runs", READ, position=50)
+@console_page("/runs", "Runs", Policy("read", "nothing"), position=50)
 def runs_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
-    """Every run, and the replays and reprocessings with their progress."""
+    """Every run, and the replays and reprocessings with their progress.
+
+    A token that is bound to spacecraft sees the runs of these: a replay may be about any.
+    """
+    bound = context.caller.spacecraft is not None
     return rendered(
         "runs.html.jinja",
         context.layout(query.run),
-        runs=context.app.runs.all(),
-        reprocessings=context.app.runs.reprocessings(),
-        replays=context.app.replays.all(),
+        runs=context.app.runs.all(context.caller.spacecraft),
+        reprocessings=[] if bound else context.app.runs.reprocessings(),
+        replays=[] if bound else context.app.replays.all(),
+        bound=bound,
         now=utc_now(),
     )
 
