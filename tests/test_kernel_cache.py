@@ -8,8 +8,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numba
+import pytest
+from numba.core import caching
+
 import service
+from service.acquire.kernel_build import KernelBuild, mark_built
 from service.compiled.cache import SOURCES
+from service.compiled.inner import Kernel
 
 PACKAGE = Path(service.__file__).parent
 
@@ -75,6 +81,55 @@ def test_all_that_compiled_code_takes_in_is_part_of_the_state_of_the_source():
     }
     assert not outside
     assert all(place.exists() for place in watched)
+
+
+def doubled(value):
+    return 2 * value
+
+
+@pytest.fixture
+def cache(monkeypatch, tmp_path):
+    """An empty folder of compiled kernels, and a function that calls one through it."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    return tmp_path, lambda: Kernel(doubled)(21)
+
+
+def cut(content):
+    return content[: len(content) // 2]
+
+
+def flipped(content):
+    place = len(content) // 2
+    return content[:place] + bytes([content[place] ^ 4]) + content[place + 1 :]
+
+
+@pytest.mark.parametrize("damaged", [cut, flipped, lambda _: b"", lambda each: bytes(len(each))])
+@pytest.mark.parametrize("suffix", [".nbc", ".nbi"])
+def test_a_damaged_kernel_is_removed_and_compiled_again(cache, caplog, suffix, damaged):
+    folder, call = cache
+    assert call() == 42
+    mark_built()
+    assert not KernelBuild().is_needed
+    (file,) = folder.rglob(f"*{suffix}")
+    whole = file.read_bytes()
+    file.write_bytes(damaged(whole))
+    assert call() == 42
+    assert f"{file} is damaged" in caplog.text
+    assert len(file.read_bytes()) == len(whole)
+    caplog.clear()
+    assert call() == 42
+    assert not caplog.text
+    # The build notices it too, before a service calls itself ready.
+    file.write_bytes(damaged(whole))
+    assert KernelBuild().is_needed
+    assert not file.exists()
+
+
+def test_a_cache_that_cannot_be_written_is_an_error_that_names_the_setting(monkeypatch):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "/dev/null/kernels")
+    monkeypatch.setattr(caching.CacheImpl, "_locator_classes", [caching.UserProvidedCacheLocator])
+    with pytest.raises(OSError, match="name a folder that this user can write in NUMBA_CACHE_DIR"):
+        Kernel(doubled)
 
 
 def test_the_cache_is_set_too_where_numba_was_imported_first():

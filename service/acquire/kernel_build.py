@@ -19,6 +19,7 @@ import llvmlite.binding  # type: ignore[import-untyped]
 import numba
 
 from service.acquire.prewarm import prewarm_kernels
+from service.compiled.checked_file import count_whole
 from service.errors import Busy, Stopping
 from service.missions.identifiers import IDENTIFIERS, IdentifierEntry
 from service.missions.mission import Mission
@@ -49,7 +50,7 @@ class KernelBuild:
         self._lock = threading.Lock()
         self._children: list[SpawnProcess] = []
         self._cancelled = False
-        self.is_needed = not _marker().exists()
+        self.is_needed = not _is_complete()
         """Until a build has succeeded: an answer must not depend on what is compiled."""
         self._zones_needed = self.is_needed
 
@@ -114,7 +115,16 @@ def mark_built() -> None:
     """Note in the cache that it holds every kernel."""
     marker = _marker()
     marker.parent.mkdir(parents=True, exist_ok=True)
-    marker.touch()
+    marker.write_text(str(count_whole(marker.parent)), encoding="ascii")
+
+
+def _is_complete() -> bool:
+    """True if the cache holds every kernel, none of them damaged: a damaged one is removed."""
+    marker = _marker()
+    try:
+        return count_whole(marker.parent) >= int(marker.read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return False
 
 
 def end_with_parent(stop: connection.Connection | None = None) -> None:

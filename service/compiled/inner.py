@@ -6,7 +6,9 @@ half of the time of compiling.  Here a kernel that another one calls is only typ
 the one that Python calls is optimised as a whole, and it alone is kept in the cache on disk.
 """
 
+import errno
 import fcntl
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,8 @@ from numba.core.caching import FunctionCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.registry import CPUDispatcher
+
+from service.compiled.checked_file import CheckedFile
 
 
 class Kernel(CPUDispatcher):
@@ -26,7 +30,16 @@ class Kernel(CPUDispatcher):
     def __init__(self, function: Callable[..., Any], **options: Any) -> None:
         options["nopython"] = True
         super().__init__(function, targetoptions=options)
-        self._cache = _LockedCache(function)  # type: ignore[no-untyped-call]
+        try:
+            self._cache = _LockedCache(function)
+        except RuntimeError:
+            # numba found no place that can be written, and says so of the function.
+            raise OSError(
+                errno.EACCES,
+                "compiled kernels cannot be stored there: name a folder that this user can write "
+                "in NUMBA_CACHE_DIR",
+                os.environ.get("NUMBA_CACHE_DIR"),
+            ) from None
         without = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
         self._inner = CPUDispatcher(
             function, targetoptions=options | without, pipeline_class=_WithoutMachineCode
@@ -44,6 +57,12 @@ class _LockedCache(FunctionCache):
     numba reads the index, adds an entry and writes it again.  Two processes that save a kernel
     with different signatures at once choose the same file for both, and one entry is lost.
     """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)  # type: ignore[no-untyped-call]
+        self._cache_file = CheckedFile(
+            self._cache_path, self._impl.filename_base, self._impl.locator.get_source_stamp()
+        )
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Save a kernel while no other process saves one of the same folder."""

@@ -4,13 +4,13 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from sqlalchemy import func, insert, select, text
+from sqlalchemy import func, insert, inspect, select, text
 from sqlalchemy.exc import IntegrityError, OperationalError
 
 from service.errors import Busy, Stopping
 from service.storage.sql.database import Store
 from service.storage.sql.tables import results, runs
-from service.storage.sql.writer import Writer
+from service.storage.sql.writer import PROBE_TABLE, Writer
 from tests.storage.recount import assert_equal_to_a_recount
 
 
@@ -220,6 +220,44 @@ def test_a_full_disk_loses_nothing_acknowledged_and_writing_resumes_with_room(
         assert stored == len(acknowledged) + 1
         assert_equal_to_a_recount(connection)
         assert connection.exec_driver_sql("PRAGMA integrity_check").scalar() == "ok"
+
+
+@pytest.mark.parametrize("database", ["sqlite"], indirect=True)
+def test_it_is_ready_again_only_when_there_is_room_for_a_batch(app, make):
+    """A probe that changes a row succeeds on a full disk, where every post fails."""
+    writer = app.store.writer
+
+    def pages(most):
+        # SQLite's own bound, of the connection that writes.
+        command = f"PRAGMA max_page_count = {most}"
+        writer.change(lambda connection: connection.exec_driver_sql(command).scalar()).result()
+
+    def used():
+        with app.store.reading() as connection:
+            return connection.exec_driver_sql("PRAGMA page_count").scalar()
+
+    pages(used())
+    for index in range(40):
+        try:
+            app.submissions.submit(make(f"b{index}"))
+        except Busy:
+            break
+    assert not writer.state().succeeded
+    # A small change still finds room, and says nothing of posts.
+    writer.change(new_run("small")).result()
+    for _ in range(2):
+        with pytest.raises(Busy):
+            writer.require_written()
+        assert not writer.state().succeeded
+    with pytest.raises(Busy):
+        app.submissions.submit(make("still full"))
+
+    pages(1_000_000)
+    writer.require_written()
+    assert writer.state().succeeded
+    app.submissions.submit(make("at last"))
+    with app.store.reading() as connection:
+        assert not inspect(connection).has_table(PROBE_TABLE)
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")

@@ -27,7 +27,7 @@ from service.storage.sql.engines import (
 )
 from service.storage.sql.migrations import bring_up_to_date, require_up_to_date
 from service.storage.sql.transaction import may_pass
-from service.storage.sql.writer import RETRY_AFTER_S, Writer
+from service.storage.sql.writer import RETRY_AFTER_S, Writer, remove_probe
 
 log = logging.getLogger(__name__)
 
@@ -148,6 +148,9 @@ class Store(Readers):
         self.writer = Writer(
             self._writing, file=file, wait_s=wait_s, lock=self.lock, file_lock=self.file_lock
         )
+
+        if serving and self.file_lock is not None:
+            self.writer.change(remove_probe).result()
 
     @contextmanager
     def reading_batch(self, id: str) -> Iterator[tuple[Connection, bool]]:

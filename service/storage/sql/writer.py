@@ -37,6 +37,9 @@ MAX_QUEUED = 10_000
 """Results that may wait: a matter of seconds."""
 MAX_ATTEMPTS = 5
 RETRY_AFTER_S = 5
+PROBE_BYTES = 1 << 20
+"""What readiness writes after a write that failed: as much as a batch of many stars."""
+PROBE_TABLE = "probe_of_room"
 
 # PostgreSQL's codes for two writers that crossed; it stopped one, which begins again.
 _CROSSED = ("40001", "40P01")
@@ -151,13 +154,18 @@ class Writer:
             self._is_failing = True
 
     def require_written(self) -> None:
-        """Raise `Busy` where the last write failed, and one that is tried now fails too.
+        """Raise `Busy` where the last write failed, and one of a batch's size fails now, too.
 
         Otherwise only the next client's batch could show that the database can be
         written again.
         """
-        if self._is_failing:
-            self.change(_try_to_write).result()
+        if not self._is_failing:
+            return
+        before = self._failures
+        self.change(_write_as_a_batch).result()
+        self.change(remove_probe).result()
+        with self._changed:
+            self._is_failing = self._is_failing and self._failures != before
 
     def state(self) -> WriterState:
         """The state of the writes and of their queue."""
@@ -240,8 +248,9 @@ class Writer:
             if not isinstance(error, Exception):
                 raise
             return
-        # Read first: the lock is for the rare case that something changes.
-        if self._is_failing:
+        # Read first: the lock is for the rare case that something changes.  A small change that
+        # succeeds says nothing of room for a batch.
+        if self._is_failing and any(job.unsaved_results for job in jobs):
             with self._changed:
                 self._is_failing = False
         for job, outcome in zip(jobs, outcomes, strict=True):
@@ -318,14 +327,27 @@ def _settling(done: "Future[Any]") -> Callable[[Any], None]:
     return settle
 
 
-def _try_to_write(connection: Connection) -> None:
-    """Take the locks that a post takes, and write a row as it is."""
+def _write_as_a_batch(connection: Connection) -> None:
+    """Take the locks that a post takes, and write as much as a large batch does."""
     if connection.dialect.name == "postgresql":
         names = ", ".join(sorted(table.name for table in WRITTEN_BY_POSTS))
         connection.exec_driver_sql(f"LOCK TABLE {names} IN ROW EXCLUSIVE MODE")
+        connection.exec_driver_sql(
+            f"SELECT pg_logical_emit_message(true, 'acquire', repeat('0', {PROBE_BYTES}))"
+        )
+    else:
+        # Of what is written and freed in one transaction SQLite writes nothing.
+        connection.exec_driver_sql(f"CREATE TABLE IF NOT EXISTS {PROBE_TABLE} (content BLOB)")
+        connection.exec_driver_sql(f"INSERT INTO {PROBE_TABLE} VALUES (zeroblob({PROBE_BYTES}))")
     # There and back: of a row that gets the value it has SQLite writes nothing.
     for step in (1, -1):
         connection.execute(update(event_counter).values(last=event_counter.c.last + step))
+
+
+def remove_probe(connection: Connection) -> None:
+    """Give back what a probe wrote on SQLite, also one of a process that was killed."""
+    if connection.dialect.name == "sqlite":
+        connection.exec_driver_sql(f"DROP TABLE IF EXISTS {PROBE_TABLE}")
 
 
 def _told(error: BaseException) -> Exception:

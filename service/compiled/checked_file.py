@@ -1,0 +1,69 @@
+"""numba's files of compiled kernels, each behind the digest of its content.
+
+A file that was cut, zeroed or changed would end in a traceback at each start, or in machine code
+that computes something else.  Such a file is removed, and its kernel compiled again.
+"""
+
+import hashlib
+import logging
+import pickle
+from pathlib import Path
+from typing import Any
+
+from numba.core.caching import IndexDataCacheFile
+
+SUFFIXES = (".nbi", ".nbc")
+_DIGEST = hashlib.sha256
+_BYTES = _DIGEST().digest_size
+
+log = logging.getLogger(__name__)
+
+
+class CheckedFile(IndexDataCacheFile):
+    """The index and the data of one kernel."""
+
+    def _load_index(self) -> Any:
+        try:
+            content = content_of(Path(self._index_path))
+        except FileNotFoundError:
+            return {}
+        version, stamp, overloads = pickle.loads(content)
+        return overloads if (version, stamp) == (self._version, self._source_stamp) else {}
+
+    def _save_index(self, overloads: Any) -> None:
+        self._write(self._index_path, (self._version, self._source_stamp, overloads))
+
+    def _load_data(self, name: str) -> Any:
+        return pickle.loads(content_of(Path(self._data_path(name))))
+
+    def _save_data(self, name: str, data: Any) -> None:
+        self._write(self._data_path(name), data)
+
+    def _write(self, path: str, value: Any) -> None:
+        content = self._dump(value)
+        with self._open_for_write(path) as file:
+            file.write(_DIGEST(content).digest() + content)
+
+
+def content_of(path: Path) -> bytes:
+    """The content of a file; one that is damaged is removed, and is not found."""
+    written = path.read_bytes()
+    digest, content = written[:_BYTES], written[_BYTES:]
+    if _DIGEST(content).digest() == digest:
+        return content
+    log.warning("%s is damaged: it is removed, and its kernel compiled again", path)
+    path.unlink(missing_ok=True)
+    raise FileNotFoundError(path)
+
+
+def count_whole(folder: Path) -> int:
+    """The number of files with kernels in a folder; damaged ones are removed."""
+    count = 0
+    for path in folder.rglob("*"):
+        if path.suffix in SUFFIXES:
+            try:
+                content_of(path)
+                count += 1
+            except FileNotFoundError:
+                pass
+    return count
