@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from service.csv_cells import neutralised
 from service.products.number_texts import number_texts
 
 Kind = Literal["number", "integer", "flag", "text"]
@@ -43,13 +44,18 @@ class Table:
 
 
 def write_csv(table: Table) -> Iterator[bytes]:
-    """Write CSV as RFC 4180 has it, a line for the names of the columns first."""
+    """Write CSV as RFC 4180 has it, a line for the names of the columns first.
+
+    A text that a spreadsheet would take for a formula has an apostrophe before it.
+    """
     yield f"{','.join(_csv_texts(table.names))}\r\n".encode()
     for page in table.pages:
         columns = [
             number_texts(values, unknown="")
             if column.kind in ("number", "integer")
-            else _csv_texts(values)
+            else _csv_texts(
+                [value if value is None else neutralised(str(value)) for value in values]
+            )
             for column, values in zip(table.columns, page, strict=True)
         ]
         lines = map(",".join, zip(*columns, strict=True))

@@ -98,9 +98,9 @@ def test_the_name_tells_the_form(tmp_path: Path) -> None:
     assert batches(list(read_lines(path))) == [(2, "a", 1)]
 
 
-def test_consecutive_rows_of_one_batch_form_it() -> None:
+def test_rows_of_one_batch_form_it_though_others_lie_between() -> None:
     lines = csv(HEADER, row("a"), row("a"), "", row("b"), row("a"))
-    assert batches(lines) == [(2, "a", 2), (5, "b", 1), (6, "a", 1)]
+    assert batches(lines) == [(2, "a", 3), (5, "b", 1)]
 
 
 def test_a_batch_of_rows_is_the_batch_of_json() -> None:

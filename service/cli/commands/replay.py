@@ -22,8 +22,9 @@ if TYPE_CHECKING:
 
 DEFAULT_CONCURRENCY = 4
 CSV_HELP = """\
-CSV files have a header and one star per row; consecutive rows with the same
-(spacecraft, run, batch) form a batch.  Cells may be empty.  Columns, as in the JSON:
+CSV files have a header and one star per row; the rows with the same (spacecraft, run, batch)
+form a batch, in whatever order they are.  Commas, semicolons (also with decimal commas), tabs or
+bars separate the cells, which may be empty.  Columns, as in the JSON:
   spacecraft batch run time frame aberration options
   q1 q2 q3 qc boresight_ra_deg boresight_dec_deg sun_pointed sun_counts a_priori_from
   rate_x_deg_per_s rate_y_deg_per_s rate_z_deg_per_s
@@ -44,8 +45,8 @@ def add(commands: Any) -> None:
     parser = add_command(
         commands,
         "replay",
-        "Send files of batches and gyro blocks (NDJSON, or CSV if the name ends in .csv) to the "
-        "service.  You can send a file twice: what is already recorded is not recorded again.",
+        "Send files of batches and gyro blocks (NDJSON, or CSV if the name ends in .csv or .tsv) "
+        "to the service.  You can send a file twice: what is already recorded is not recorded again.",
         """
         acquire replay pass.ndjson
         acquire replay pass.csv --in-process --run trial --results answers.ndjson
@@ -60,7 +61,7 @@ def add(commands: Any) -> None:
         CSV_HELP,
     )
     parser.add_argument(
-        "files", nargs="*", type=Path, metavar="FILE", help=".csv is CSV, else NDJSON"
+        "files", nargs="*", type=Path, metavar="FILE", help=".csv and .tsv are CSV, else NDJSON"
     )
     _add_packets(parser)
     way = parser.add_mutually_exclusive_group()

@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from service.errors import BadFile, Fault, shown_value
+from service.observations.readers.csv_table import CsvRow
 from service.observations.schema import (
     BatchIn,
     BoresightIn,
@@ -58,8 +59,6 @@ VERBATIM = (*TEXTS, "tracker")
 """Columns whose cells are taken with their spaces; around other cells spaces do no harm."""
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-
-CsvRow = dict[str, str]
 
 
 class BadCell(Exception):

@@ -1,7 +1,7 @@
 """Batches as rows of comma-separated values, one star a row, and back.
 
-Consecutive rows of one (spacecraft, run, batch) form a batch; a row whose star
-cells are all empty stands for a tracker that saw none.  What the rows give is
+The rows of one (spacecraft, run, batch) form a batch; `CsvTable` gives them together.  A row
+whose star cells are all empty stands for a tracker that saw none.  What the rows give is
 the same JSON as that of an NDJSON file, so that the same checks hold for it.
 """
 
@@ -10,7 +10,8 @@ import json
 from collections.abc import Iterable, Iterator
 from typing import Any, TextIO
 
-from service.errors import BadFile, Fault, shown_value
+from service.csv_cells import neutralised
+from service.errors import Fault
 from service.observations.batch import MAX_STARS_PER_TRACKER, MAX_TRACKERS
 from service.observations.readers.csv_columns import (
     BATCH_COLUMNS,
@@ -19,9 +20,9 @@ from service.observations.readers.csv_columns import (
     KEY,
     STAR_COLUMNS,
     STAR_NUMBERS,
+    TEXTS,
     VERBATIM,
     BadCell,
-    CsvRow,
     batch_cells,
     batch_fields,
     checked_header,
@@ -30,11 +31,20 @@ from service.observations.readers.csv_columns import (
     number_cells,
     star_of,
 )
-from service.observations.readers.csv_split import split_row
+from service.observations.readers.csv_table import CsvRow, Row, RowKind
 from service.observations.readers.lines import Line
 from service.observations.schema import BatchIn
 
 MAX_ROWS = MAX_STARS_PER_TRACKER * MAX_TRACKERS
+BATCH_ROWS = RowKind(
+    "batch",
+    KEY,
+    COLUMNS,
+    texts=frozenset((*TEXTS, "tracker", "options", "sun_pointed", "a_priori_from")),
+    verbatim=frozenset(VERBATIM),
+    check_header=checked_header,
+    ordered_by_time=False,
+)
 
 
 class _BatchRows:
@@ -93,72 +103,34 @@ class _BatchRows:
         return Line(self.number, json.dumps(body, separators=(",", ":")).encode())
 
 
-def batches_of_rows(lines: Iterator[Line]) -> Iterator[Line]:
-    """The batches of a CSV file, given its lines, the header first.
+def batches_of_rows(rows: Iterator[Row]) -> Iterator[Line]:
+    """The batches of the rows of a CSV file.
 
     A batch with a bad cell is refused whole, by the line and column of the
     first such cell.  A row too damaged to tell whose it is refuses the batches
-    on both sides of it: one of them lacks a star.  Raises `BadFile` for the
-    header.
+    on both sides of it: one of them lacks a star.
     """
-    header = _header(next(lines, None))
     batch: _BatchRows | None = None
     stray: int | None = None
-    for line in lines:
-        cells, fault = _cells(line, header)
-        if cells is None:
+    for row in rows:
+        if row.cells is None:
             if batch is not None:
-                batch.refuse(line.number, _beside(batch.number, line.number))
+                batch.refuse(row.number, _beside(batch.number, row.number))
                 yield batch.line()
-            yield Line(line.number, None, fault)
-            batch, stray = None, line.number
+            yield Line(row.number, None, row.fault)
+            batch, stray = None, row.number
             continue
-        key = tuple(cells.get(column, "") for column in KEY)
+        key = tuple(row.cells.get(column, "") for column in KEY)
         if batch is None or key != batch.key:
             if batch is not None:
                 yield batch.line()
-            beside = None if stray is None else _beside(line.number, stray)
-            batch, stray = _BatchRows(line.number, key, beside), None
-        if fault is not None:
-            batch.refuse(line.number, fault)
-        batch.add(line.number, cells)
+            beside = None if stray is None else _beside(row.number, stray)
+            batch, stray = _BatchRows(row.number, key, beside), None
+        if row.fault is not None:
+            batch.refuse(row.number, row.fault)
+        batch.add(row.number, row.cells)
     if batch is not None:
         yield batch.line()
-
-
-def _header(line: Line | None) -> list[str]:
-    if line is None or line.body is None:
-        raise BadFile(line.fault if line and line.fault else Fault("line 1", "there is no header"))
-    where = f"line {line.number}"
-    names = split_row(line.body)
-    if names is None:
-        raise BadFile(
-            Fault(where, "is not a row of comma-separated values", shown_value(line.body))
-        )
-    names = [name.strip() for name in names]
-    checked_header(names, where)
-    return names
-
-
-def _cells(line: Line, header: list[str]) -> tuple[CsvRow | None, Fault | None]:
-    """The cells of a row by column, None where it cannot be told whose they are."""
-    if line.body is None:
-        return None, line.fault
-    cells = split_row(line.body)
-    if cells is None:
-        shown = shown_value(line.body)
-        return None, Fault(f"line {line.number}", "is not a row of comma-separated values", shown)
-    fault = None
-    if len(cells) != len(header):
-        message = f"has {len(cells)} cells; the header has {len(header)}"
-        fault = Fault(f"line {line.number}", message)
-    row = {
-        name: cell if name in VERBATIM else cell.strip()
-        for name, cell in zip(header, cells, strict=False)
-    }
-    if any(name in header and name not in row for name in KEY):
-        return None, fault
-    return row, fault
 
 
 def _beside(batch: int, damaged: int) -> Fault:
@@ -175,11 +147,11 @@ def write_batches_csv(batches: Iterable[BatchIn], stream: TextIO) -> None:
     writer = csv.DictWriter(stream, COLUMNS, restval="", lineterminator="\n")
     writer.writeheader()
     for batch in batches:
-        common = batch_cells(batch)
+        common = _neutralised(batch_cells(batch))
         if batch.measurement is not None:
             writer.writerow(common)
         for tracker in batch.observations:
-            here = {**common, "tracker": tracker.tracker}
+            here = {**common, "tracker": neutralised(tracker.tracker)}
             if not tracker.stars:
                 writer.writerow({**here, **list_cells(tracker)})
             for star in tracker.stars:
@@ -187,3 +159,8 @@ def write_batches_csv(batches: Iterable[BatchIn], stream: TextIO) -> None:
                 direction = zip(DIRECTION, star.vector or (), strict=False)
                 cells = {**number_cells(direction), **number_cells(numbers.items())}
                 writer.writerow({**here, **cells, **list_cells(star)})
+
+
+def _neutralised(cells: CsvRow) -> CsvRow:
+    """Cells whose texts no spreadsheet takes for formulas."""
+    return {name: neutralised(cell) if name in VERBATIM else cell for name, cell in cells.items()}

@@ -1,7 +1,7 @@
 """Gyro blocks as rows of comma-separated values, one sample a row.
 
-Consecutive rows of one (spacecraft, run, block) form a block.  What the rows give is the same
-JSON as that of an NDJSON file, so that the same checks hold for it.
+The rows of one (spacecraft, run, block) form a block; `CsvTable` gives them together.  What the
+rows give is the same JSON as that of an NDJSON file, so that the same checks hold for it.
 """
 
 import json
@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from service.errors import BadFile, BadInput, Fault
-from service.observations.readers.csv_columns import BadCell, CsvRow, number_cell
-from service.observations.readers.csv_split import split_row
+from service.observations.readers.csv_columns import BadCell, number_cell
+from service.observations.readers.csv_table import CsvRow, Row, RowKind
 from service.observations.readers.lines import Line
 from service.times import parse_utc
 
@@ -19,12 +19,6 @@ RATES = ("rate_1_rad_per_s", "rate_2_rad_per_s", "rate_3_rad_per_s")
 REQUIRED = ("spacecraft", "block", "time", *RATES)
 COLUMNS = (*KEY, "time", *RATES)
 MAX_ROWS = 10_000
-
-
-def is_gyro_header(line: Line | None) -> bool:
-    """Whether the first line of a CSV file is the header of gyro samples."""
-    names = None if line is None or line.body is None else split_row(line.body)
-    return names is not None and any(name.strip() in RATES for name in names)
 
 
 class _BlockRows:
@@ -67,41 +61,35 @@ class _BlockRows:
         return Line(self.number, json.dumps(body, separators=(",", ":")).encode())
 
 
-def blocks_of_rows(lines: Iterator[Line]) -> Iterator[Line]:
-    """The blocks of a CSV file, given its lines, the header first.
+def blocks_of_rows(rows: Iterator[Row]) -> Iterator[Line]:
+    """The blocks of the rows of a CSV file.
 
     A block with a bad cell is refused whole, by the line and column of the first such cell.  A
-    row too damaged to tell whose it is refuses the blocks on both sides of it: one of them
-    lacks a sample.  Raises `BadFile` for the header.
+    damaged row refuses the blocks on both sides of it: one of them lacks a sample.
     """
-    header = _header(next(lines))
     block: _BlockRows | None = None
     stray: int | None = None
-    for line in lines:
-        cells = None if line.body is None else split_row(line.body)
-        if cells is None or len(cells) != len(header):
-            beside = Fault(f"line {line.number}", "is not a row like the header", None)
+    for row in rows:
+        if row.cells is None or row.fault is not None:
             if block is not None:
-                block.refuse(line.number, _beside(block.number, line.number))
+                block.refuse(row.number, _beside(block.number, row.number))
                 yield block.line()
-            yield Line(line.number, None, line.fault or beside)
-            block, stray = None, line.number
+            yield Line(row.number, None, row.fault)
+            block, stray = None, row.number
             continue
-        row = {name: cell.strip() for name, cell in zip(header, cells, strict=True)}
-        key = tuple(row.get(column, "") for column in KEY)
+        key = tuple(row.cells.get(column, "") for column in KEY)
         if block is None or key != block.key:
             if block is not None:
                 yield block.line()
-            fault = None if stray is None else _beside(line.number, stray)
-            block, stray = _BlockRows(line.number, key, fault), None
-        block.add(line.number, row)
+            fault = None if stray is None else _beside(row.number, stray)
+            block, stray = _BlockRows(row.number, key, fault), None
+        block.add(row.number, row.cells)
     if block is not None:
         yield block.line()
 
 
-def _header(line: Line) -> list[str]:
-    names = [name.strip() for name in split_row(line.body or b"") or ()]
-    where = f"line {line.number}"
+def _check_header(names: list[str], where: str) -> None:
+    """Raise `BadFile` for a column that is unknown, missing or there twice."""
     there_are = f"there is no such column; there are {', '.join(COLUMNS)}"
     faults = [
         Fault(f"{where}, column {name or '(empty)'}", there_are)
@@ -117,7 +105,17 @@ def _header(line: Line) -> list[str]:
     ]
     if faults:
         raise BadFile(faults)
-    return names
+
+
+GYRO_ROWS = RowKind(
+    "block",
+    KEY,
+    COLUMNS,
+    texts=frozenset((*KEY, "time")),
+    verbatim=frozenset(),
+    check_header=_check_header,
+    ordered_by_time=True,
+)
 
 
 def _beside(block: int, damaged: int) -> Fault:

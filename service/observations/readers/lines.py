@@ -23,12 +23,12 @@ class Line:
     fault: Fault | None = None
 
 
-def physical_lines(stream: BinaryIO) -> Iterator[Line]:
-    """The lines of a stream without their ends; blank ones are counted and left out.
+def physical_lines(stream: BinaryIO, number: int = 0) -> Iterator[Line]:
+    """The lines of a stream without their ends, after the first `number` that were read already.
 
-    A line beyond `MAX_LINE_BYTES` is passed over without being held.
+    Blank lines are counted and left out.  A line beyond `MAX_LINE_BYTES` is passed
+    over without being held.
     """
-    number = 0
     while raw := stream.readline(MAX_LINE_BYTES + 1):
         number += 1
         if number == 1:

@@ -1,22 +1,25 @@
 """Telemetry files as numbered lines, each holding one batch or one gyro block as JSON.
 
 Two forms are read, both in bounded memory: NDJSON, one of them a line, and CSV, one star or
-one gyro sample a row (`csv_rows`, `gyro_rows`).  A line that cannot be read is
+one gyro sample a row (`csv_table`, `csv_rows`, `gyro_rows`).  A line that cannot be read is
 handed on with its fault, and the next lines follow: what to make of it is the
 caller's choice.  A file that makes no sense as a whole raises `BadFile`.
 """
 
 import codecs
+import io
+import re
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import chain
 from pathlib import Path
 from typing import BinaryIO, Literal
 
 from service.errors import BadFile, Fault, shown_value
 from service.observations.readers.csv_columns import COLUMNS
-from service.observations.readers.csv_rows import batches_of_rows
-from service.observations.readers.gyro_rows import blocks_of_rows, is_gyro_header
+from service.observations.readers.csv_rows import BATCH_ROWS, batches_of_rows
+from service.observations.readers.csv_table import SEPARATORS, CsvTable
+from service.observations.readers.gyro_rows import GYRO_ROWS, blocks_of_rows
 from service.observations.readers.lines import Line, physical_lines
 
 TelemetryFormat = Literal["ndjson", "csv"]
@@ -27,23 +30,23 @@ _SHOWN_BYTES = 40
 
 
 def telemetry_format(path: Path) -> TelemetryFormat:
-    """The form of a file by its name: `.csv` is CSV, all else NDJSON."""
-    return "csv" if path.suffix.lower() == ".csv" else "ndjson"
+    """The form of a file by its name: `.csv` and `.tsv` are CSV, all else NDJSON."""
+    return "csv" if path.suffix.lower() in (".csv", ".tsv") else "ndjson"
 
 
 def read_lines(source: Path | BinaryIO, form: TelemetryFormat | None = None) -> Iterator[Line]:
     """The batches and gyro blocks of a file or of a binary stream, in order.
 
     The form is told by the file's name where it is not given; a stream without
-    one is NDJSON.  Raises `BadFile` for a file that cannot be opened and for a
-    CSV header with unknown or missing columns.
+    one is NDJSON, and one with CSV is seekable.  Raises `BadFile` for a file that cannot be
+    opened, and for a CSV file that `CsvTable` refuses, before the first of them.
     """
-    with _opened(source) as stream:
-        if (form or (telemetry_format(source) if isinstance(source, Path) else "ndjson")) == "csv":
-            lines = physical_lines(stream)
-            first = next(lines, None)
-            every = lines if first is None else chain([first], lines)
-            yield from blocks_of_rows(every) if is_gyro_header(first) else batches_of_rows(every)
+    form = form or (telemetry_format(source) if isinstance(source, Path) else "ndjson")
+    with _opened(source, form) as stream:
+        if form == "csv":
+            table = CsvTable(stream, (BATCH_ROWS, GYRO_ROWS))
+            of_rows = blocks_of_rows if table.kind is GYRO_ROWS else batches_of_rows
+            yield from of_rows(table.rows())
         else:
             yield from physical_lines(stream)
 
@@ -53,9 +56,9 @@ def require_telemetry(path: Path) -> None:
 
     That is told by its first bytes.  Single bad lines are no matter of this.
     """
-    with _opened(path) as stream:
-        start = stream.read(_LOOKED_AT_BYTES).removeprefix(codecs.BOM_UTF8)
     form = telemetry_format(path)
+    with _opened(path, form) as stream:
+        start = stream.read(_LOOKED_AT_BYTES).removeprefix(codecs.BOM_UTF8)
     message = _not_telemetry(start, form)
     if message is not None:
         shown = shown_value(start[:_SHOWN_BYTES]) if start.strip() else None
@@ -87,13 +90,15 @@ def _not_telemetry(start: bytes, form: TelemetryFormat) -> str | None:
         return "is JSON, but not NDJSON, which has one batch a line and nothing around them"
     if any(line.startswith(b"{") for line in lines):
         return None
-    if len(set(lines[0].decode("utf-8", "replace").split(",")) & set(COLUMNS)) > 1:
+    names = re.split('[{}"]+'.format("".join(SEPARATORS)), lines[0].decode("utf-8", "replace"))
+    if len({name.strip().lower() for name in names} & {*COLUMNS, *GYRO_ROWS.columns}) > 1:
         return "is no NDJSON but looks like CSV: name it .csv"
     return "is no NDJSON, which has one batch a line as a JSON object"
 
 
 @contextmanager
-def _opened(source: Path | BinaryIO) -> Iterator[BinaryIO]:
+def _opened(source: Path | BinaryIO, form: TelemetryFormat) -> Iterator[BinaryIO]:
+    """The file as UTF-8 with line feeds; one that has others is copied to a temporary file."""
     if not isinstance(source, Path):
         yield source
         return
@@ -103,4 +108,22 @@ def _opened(source: Path | BinaryIO) -> Iterator[BinaryIO]:
         reason = error.strerror or str(error)
         raise BadFile(Fault(str(source), f"cannot be opened: {reason}")) from None
     with stream:
-        yield stream
+        if not stream.seekable():
+            yield stream
+            return
+        start = stream.read(_LOOKED_AT_BYTES)
+        stream.seek(0)
+        is_utf16 = start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        if not is_utf16 and not (form == "csv" and b"\r" in start and b"\n" not in start):
+            yield stream
+            return
+        with tempfile.TemporaryFile() as copy:
+            # Without `newline` every kind of line end becomes a line feed.
+            text = io.TextIOWrapper(stream, "utf-16" if is_utf16 else "utf-8", "surrogateescape")
+            try:
+                while piece := text.read(_LOOKED_AT_BYTES):
+                    copy.write(piece.encode("utf-8", "surrogateescape"))
+            except UnicodeError as error:
+                raise BadFile(Fault(str(source), f"is damaged UTF-16: {error}")) from None
+            copy.seek(0)
+            yield copy

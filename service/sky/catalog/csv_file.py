@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from service.csv_cells import original
 from service.errors import BadFile, Fault, shown_value
 
 FAULTS_SHOWN = 20
@@ -70,7 +71,7 @@ def read_csv_catalog(path: Path) -> dict[str, npt.NDArray[Any]]:
             faults.append(Fault(f"line {line}", expected, str(len(cells))))
             continue
         row = dict(zip(header, (cell.strip() for cell in cells), strict=True))
-        label = " ".join(row["id"].split())
+        label = " ".join(original(row["id"]).split())
         fault = _label_fault(label, seen)
         if fault:
             faults.append(Fault(f"line {line}, column id", fault, shown_value(row["id"])))

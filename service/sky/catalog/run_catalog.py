@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from service.csv_cells import neutralised
 from service.missions.mission import RunCatalogSettings
 from service.sky.catalog.blending import Rows, combined, merged_into
 from service.sky.catalog.proper_motion import moved
@@ -139,7 +140,7 @@ def instrument_magnitude(catalog: Catalog, color_polynomial_mag: Sequence[float]
 def export_csv(run_catalog: RunCatalog, path: Path) -> None:
     """Writes `id,ra_deg,dec_deg,magnitude` in index order, numbers that read back exactly."""
     rows = zip(
-        run_catalog.star_id,
+        map(neutralised, run_catalog.star_id),
         run_catalog.ra_deg.tolist(),
         run_catalog.dec_deg.tolist(),
         run_catalog.magnitude_mag.tolist(),
@@ -156,4 +157,4 @@ def export_rejected_csv(run_catalog: RunCatalog, path: Path) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["id", "reason"])
-        writer.writerows((one.star_id, one.reason) for one in run_catalog.rejected)
+        writer.writerows((neutralised(one.star_id), one.reason) for one in run_catalog.rejected)
