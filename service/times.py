@@ -1,7 +1,7 @@
 """UTC text to a two-part Julian date and back.
 
 Calendar (`1996-01-10T12:00:00.000Z`) and day-of-year (`1996-010T12:00:00Z`)
-forms are read; a leap second (`23:59:60`) is a time like any other; digits
+forms are read, also with the offset of a time zone (`+01:00`), which is converted; a leap second (`23:59:60`) is a time like any other; digits
 below the microsecond are kept (CCSDS 301.0-B, ASCII codes A and B).
 
 ERFA does the arithmetic.  Its bare ufuncs are called because pyerfa's wrappers
@@ -38,7 +38,8 @@ _TT_LESS_TAI_D = 32.184 / DAY_S
 _UNIX_J2000_S = 946_728_000
 _TEXT = re.compile(
     r"(?P<year>\d{4})-(?:(?P<month>\d{2})-(?P<day>\d{2})|(?P<doy>\d{3}))"
-    r"T(?P<hour>\d{2}):(?P<minute>\d{2}):(?P<second>\d{2})(?P<fraction>\.\d{1,9})?Z?",
+    r"T(?P<hour>\d{2}):(?P<minute>\d{2}):(?P<second>\d{2})(?P<fraction>\.\d{1,9})?"
+    r"(?:Z|(?P<zone>[+-])(?P<zone_hour>\d{2})(?::?(?P<zone_minute>\d{2}))?)?",
     re.ASCII,
 )
 _TWO_DIGITS = [f"{number:02d}" for number in range(61)]
@@ -226,7 +227,7 @@ def _read(text: str, first_year: int, last_year: int) -> Utc:
     match = _TEXT.fullmatch(text)
     if match is None:
         raise ValueError(f"must be {_FORMS}")
-    years, months, days, days_of_year, hours, minutes, seconds, fraction = match.groups("")
+    years, months, days, days_of_year, hours, minutes, seconds, fraction, *zone = match.groups("")
     year, hour, minute, second = int(years), int(hours), int(minutes), int(seconds)
     if not first_year <= year <= last_year:
         raise ValueError(f"the year must be from {first_year} to {last_year}")
@@ -241,6 +242,8 @@ def _read(text: str, first_year: int, last_year: int) -> Utc:
         raise ValueError("there is no such day") from None
     if day.year != year:
         raise ValueError("there is no such day of the year")
+    if zone[0]:
+        day, hour, minute = _in_utc(day, hour, minute, *zone)
     if second == 60 and not ((hour, minute) == (23, 59) and _length_s(day) > DAY_S):
         raise ValueError("there is no leap second at that time")
     moment = _from_fields(day, hour, minute, second + float(fraction or 0.0))
@@ -248,6 +251,20 @@ def _read(text: str, first_year: int, last_year: int) -> Utc:
     nanoseconds = int(fraction[1:].ljust(9, "0"))
     vars(moment)["_fields"] = day, hour, minute, second, nanoseconds
     return moment
+
+
+def _in_utc(
+    day: date, hour: int, minute: int, sign: str, zone_hours: str, zone_minutes: str
+) -> tuple[date, int, int]:
+    """Day, hour and minute of UTC for those of a time zone; raises `ValueError`."""
+    ahead_min = 60 * int(zone_hours) + int(zone_minutes or 0)
+    if int(zone_hours) > 23 or int(zone_minutes or 0) > 59:
+        raise ValueError("there is no such time zone")
+    days, minutes = divmod(60 * hour + minute + (-ahead_min if sign == "+" else ahead_min), 24 * 60)
+    try:
+        return day + timedelta(days=days), *divmod(minutes, 60)
+    except OverflowError:
+        raise ValueError("there is no such day") from None
 
 
 @lru_cache(maxsize=1024)

@@ -108,7 +108,14 @@ def test_a_leap_second_belongs_to_the_hour_that_it_ends():
         ("2100-01-01T00:00:00Z", "year"),
         ("9999-12-31T00:00:00Z", "year"),
         ("1996-01-10 12:00:00Z", "must be UTC"),
-        ("1996-01-10T12:00:00+00:00", "must be UTC"),
+        ("1996-01-10T12:00:00+1:00", "must be UTC"),
+        ("1996-01-10T12:00:00Z+01:00", "must be UTC"),
+        ("1996-01-10T12:00:00 +01:00", "must be UTC"),
+        ("1996-01-10T12:00:00+01:00:00", "must be UTC"),
+        ("1996-01-10T12:00:00CET", "must be UTC"),
+        ("1996-01-10T12:00:00+24:00", "no such time zone"),
+        ("1996-01-10T12:00:00+01:60", "no such time zone"),
+        ("2016-12-31T23:59:60+01:00", "no leap second"),
         ("1996-01-10T12:00:00.1234567890Z", "must be UTC"),
         ("١٩٩٦-01-10T12:00:00Z", "must be UTC"),
         ("", "must be UTC"),
@@ -120,6 +127,27 @@ def test_a_time_that_does_not_exist_is_refused_with_its_reason(text, why):
     with pytest.raises(BadInput, match=why) as refusal:
         parse_utc(text, "observations.0.time")
     assert refusal.value.faults[0].field == "observations.0.time"
+
+
+@pytest.mark.parametrize(
+    ("text", "utc"),
+    [
+        ("1996-01-10T12:54:30+00:00", "1996-01-10T12:54:30.000Z"),
+        ("1996-01-10T12:54:30-00:00", "1996-01-10T12:54:30.000Z"),
+        ("1996-01-10T12:54:30.25+01:00", "1996-01-10T11:54:30.250Z"),
+        ("1996-01-10T00:30:00+0530", "1996-01-09T19:00:00.000Z"),
+        ("1996-01-10T23:30:00-08", "1996-01-11T07:30:00.000Z"),
+        ("1997-001T00:15:00+00:45", "1996-12-31T23:30:00.000Z"),
+        ("1996-366T23:59:59.999999999-14:00", "1997-01-01T13:59:59.999999999Z"),
+        ("2017-01-01T00:59:60.5+01:00", "2016-12-31T23:59:60.500Z"),
+        ("2016-12-31T18:59:60-05:00", "2016-12-31T23:59:60.000Z"),
+    ],
+)
+def test_the_offset_of_a_time_zone_is_converted(text, utc):
+    moment = parse_utc(text)
+    assert moment.text == utc
+    assert moment == parse_utc(utc)
+    assert moment.tai_ns == parse_utc(utc).tai_ns
 
 
 def test_moments_hash_alike_where_they_are_equal():

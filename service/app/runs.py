@@ -5,6 +5,8 @@ import os
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
+from sqlalchemy import Connection
+
 from service.access.audit import Entry
 from service.app.context import Context, checked_run_name
 from service.errors import BadBatch, Fault
@@ -14,13 +16,14 @@ from service.ingest.worker_process import WorkerConfig
 from service.missions.mission import Mission, mission_named
 from service.storage.archive.reprocessing import Reprocessing, reprocessings
 from service.storage.models.compare import RatesOfRuns, RunChange, RunComparison
-from service.storage.models.runs import Run, RunState
+from service.storage.models.runs import Forgotten, Run, RunState
 from service.storage.queries import histories, overview
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.runs.comparison import changed_batches, compare_runs
 from service.storage.queries.runs.rates import run_rates
 from service.storage.recording.results import set_run_alarms
+from service.storage.upkeep.forget import ForgetFilter, forget, found
 from service.times import Utc, utc_now
 
 MOST_COMPARED = 2_000
@@ -53,6 +56,24 @@ class Runs:
             lambda connection: set_run_alarms(connection, name, alarms, utc_now().text), entry
         )
         return RunState(run=name, alarms=alarms)
+
+    def forget(self, selected: ForgetFilter, entry: Entry | None = None) -> Forgotten:
+        """Remove a run, or some of its batches and gyro blocks; see `upkeep.forget`."""
+        checked_run_name(selected.run)
+
+        def note(connection: Connection, total: Forgotten) -> None:
+            if entry is not None:
+                entry.add_to(connection)
+
+        return forget(
+            self._context.store, selected, self._context.settings.archive_folder, note=note
+        )
+
+    def would_forget(self, selected: ForgetFilter) -> Forgotten:
+        """What `forget` would remove."""
+        checked_run_name(selected.run)
+        with self._context.reading() as connection:
+            return found(connection, selected)
 
     def compare(
         self,

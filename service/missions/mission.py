@@ -367,7 +367,7 @@ def parse_mission(text: str, file: str) -> Mission:
 def read_mission(path: Path) -> Mission:
     """The mission of a file; raises `BadConfiguration` naming the file and what is wrong."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise BadConfiguration(f"{path}: cannot be read: {error}") from None
     return parse_mission(text, str(path))

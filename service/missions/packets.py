@@ -284,6 +284,14 @@ class Packets(Strict):
     """The container of the XTCE file that every packet is read as."""
     prefix_bytes: int = Field(default=0, ge=0, le=4096)
     """Bytes before each packet in a file, which are skipped."""
+    sequence_flags: Literal["segments", "groups"] = Field(
+        default="segments", exclude_if=lambda meaning: meaning == "segments"
+    )
+    """Whether they tell segments, which are joined, or group whole packets."""
+    segment_header_bytes: int = Field(
+        default=0, ge=0, le=4096, exclude_if=lambda length: length == 0
+    )
+    """Of the secondary header that segments after the first one repeat, and that is skipped."""
     apids: tuple[Annotated[int, Field(ge=0, le=2047)], ...] = ()
     """Only packets of these APIDs are read, others are counted; empty: all that XTCE describes."""
     time: PacketTime

@@ -4,6 +4,7 @@ Every entrance reads batches here, so that all refuse the same things with the
 same words.  The pydantic models are also what `openapi.yaml` shows.
 """
 
+import codecs
 import hashlib
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal, Self
@@ -318,13 +319,20 @@ class Submission(Struct, frozen=True, eq=False):
     frame: FrameRecord | None = None
 
 
+def without_byte_order_mark(body: bytes | str) -> bytes | str:
+    """The text of a body; some editors put a mark before it."""
+    if isinstance(body, bytes):
+        return body.removeprefix(codecs.BOM_UTF8)
+    return body.removeprefix("\ufeff")
+
+
 def checked_from_json(body: bytes | str, run: str | None = None) -> Checked:
     """Check one batch; `run`, where given, takes the place of the batch's own.
 
     Raises `BadBatch` with every fault, each naming field and value.
     """
     try:
-        model = BatchIn.model_validate_json(body)
+        model = BatchIn.model_validate_json(without_byte_order_mark(body))
     except ValidationError as error:
         raise BadBatch(faults_of(error)) from None
     return checked_from_model(model if run is None else model.model_copy(update={"run": run}))

@@ -21,9 +21,16 @@ from service.packets.stream import (
     IDLE_APID,
     ApidCounts,
     EndOfPackets,
+    SegmentJoiner,
     SequenceCounter,
     SpacePacket,
     packets_in,
+)
+
+_OF_SEGMENTS = (
+    "; it is joined of {} segments: if each has a secondary header, set "
+    "packets.segment_header_bytes; if the sequence flags group whole packets, set "
+    'packets.sequence_flags = "groups"'
 )
 
 
@@ -45,6 +52,10 @@ class PacketTotals(Struct, kw_only=True):
     gaps: int = 0
     missing: int = 0
     backward: int = 0
+    joined: int = 0
+    """Packets that were joined of segments."""
+    incomplete: int = 0
+    """Segments of packets of which other segments are missing."""
     refused: int = 0
     apids: list[ApidCounts] = []
 
@@ -64,6 +75,7 @@ class PacketReader:
         self._gyro = GyroBlockMaker(mission, mapped) if mission.packets.gyro_blocks else None
         self._asked = frozenset(mission.packets.apids)
         self._sequence = SequenceCounter()
+        self._segments = SegmentJoiner(mission.packets.segment_header_bytes)
         self._totals = PacketTotals()
 
     def totals(self) -> PacketTotals:
@@ -90,6 +102,7 @@ class PacketReader:
         except EndOfPackets as fault:
             self._totals.refused += 1
             yield Line(fault.number, None, _fault_at(fault.number, fault.offset, fault, name))
+        yield from self._incomplete(self._segments.end(), name)
         yield from self._lines_of(self._maker.end(), name)
         if self._gyro is not None:
             yield from self._lines_of_blocks(self._gyro, self._gyro.end())
@@ -101,7 +114,9 @@ class PacketReader:
             for packet in packets_in(stream, self._table.prefix_bytes):
                 number, offset = packet.number, packet.offset
                 with suppress(UnknownPacket):
-                    found = self._maker.attitude(self._definition.read(packet.content))
+                    whole = self._whole(packet)[0]
+                    values = None if whole is None else self._definition.read(whole.content)
+                    found = None if values is None else self._maker.attitude(values)
                     if found is not None:
                         yield found
         except EndOfPackets as fault:
@@ -121,16 +136,52 @@ class PacketReader:
         if self._asked and packet.apid not in self._asked:
             totals.not_asked += 1
             return
+        whole, incomplete = self._whole(packet)
+        yield from self._incomplete(incomplete, name)
+        if whole is None:
+            return
+        packet = whole
+        totals.joined += packet.segments > 1
         try:
             values = self._definition.read(packet.content)
         except UnknownPacket:
             counts.described = False
-            totals.unknown += 1
+            totals.unknown += packet.segments
             return
+        except PacketFault as fault:
+            if packet.segments > 1:
+                fault.message += _OF_SEGMENTS.format(packet.segments)
+            raise
         yield from self._lines_of(self._maker.add(packet, values), name)
         yield from self._lines_of_measured(self._measured.add(packet, values), name)
         if self._gyro is not None:
             yield from self._lines_of_blocks(self._gyro, self._gyro.add(packet, values))
+
+    def _whole(self, packet: SpacePacket) -> tuple[SpacePacket | None, list[SpacePacket]]:
+        """The packet, or the one whose last segment it is; and segments that cannot be joined."""
+        if self._table.sequence_flags == "groups":
+            return packet, []
+        return self._segments.add(packet)
+
+    def _incomplete(self, segments: Iterable[SpacePacket], name: str) -> Iterator[Line]:
+        for segment in segments:
+            counts = self._sequence.apids[segment.apid]
+            with suppress(PacketFault):
+                try:
+                    self._definition.read(segment.content)
+                except UnknownPacket:
+                    counts.described = False
+                    self._totals.unknown += 1
+                    continue
+            counts.incomplete += 1
+            self._totals.incomplete += 1
+            message = (
+                f"is a segment of a packet of APID {segment.apid} whose other segments are "
+                "missing; if the sequence flags do not tell segments, set packets.sequence_flags "
+                '= "groups"'
+            )
+            flags = PacketFault("", message, f"sequence flags {segment.sequence_flags}")
+            yield self._refused(segment, flags, name)
 
     def _lines_of(self, batches: Iterable[StarBatch], name: str) -> Iterator[Line]:
         for batch in batches:

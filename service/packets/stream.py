@@ -13,6 +13,21 @@ from service.packets.definition import PacketFault
 
 HEADER_BYTES = 6
 IDLE_APID = 2047
+CONTINUATION, FIRST, LAST, WHOLE = range(4)
+"""The sequence flags."""
+MOST_BYTES = 1 << 20
+"""Of a packet that is joined of segments."""
+SYNC_MARKERS = {
+    bytes.fromhex(marker): f"{kind} {marker.upper()}"
+    for marker, kind in (
+        ("1acffc1d", "the attached sync marker"),
+        ("1dfccf1a", "the attached sync marker, bytes reversed,"),
+        ("e53003e2", "the attached sync marker, bits inverted,"),
+        ("352ef853", "the attached sync marker of a code block"),
+        ("034776c7", "the attached sync marker of a turbo code"),
+    )
+}
+"""Source: CCSDS 131.0-B, section 9; transfer frames begin with them."""
 SEQUENCE_COUNTS = 1 << 14
 
 
@@ -31,9 +46,17 @@ class SpacePacket:
         return ((self.content[0] & 0x07) << 8) | self.content[1]
 
     @property
+    def sequence_flags(self) -> int:
+        """Tells a segment of a packet from a whole one."""
+        return self.content[2] >> 6
+
+    @property
     def sequence_count(self) -> int:
         """The 14 bits that count the packets of an APID."""
         return ((self.content[2] & 0x3F) << 8) | self.content[3]
+
+    segments: int = 1
+    """How many packets of the file it is joined of."""
 
 
 class EndOfPackets(PacketFault):
@@ -62,6 +85,12 @@ def packets_in(stream: IO[bytes], prefix_bytes: int = 0) -> Iterator[SpacePacket
         offset += prefix_bytes
         if len(header) < HEADER_BYTES:
             message = f"the file ends after {len(start)} bytes, within the header of a packet"
+            raise EndOfPackets(number, offset, message)
+        if (marker := SYNC_MARKERS.get(header[:4])) is not None:
+            message = (
+                f"{marker} is where a packet should begin: these are transfer frames; extract the "
+                "space packets first, or set packets.prefix_bytes if each packet has such a prefix"
+            )
             raise EndOfPackets(number, offset, message)
         if header[0] >> 5:
             message = (
@@ -94,7 +123,60 @@ class ApidCounts(Struct, kw_only=True):
     """Packets that are missing in these places."""
     backward: int = 0
     """Places where the count repeats or goes back: a reset, or packets out of order."""
+    incomplete: int = 0
+    """Segments of packets of which other segments are missing."""
     refused: int = 0
+
+
+class SegmentJoiner:
+    """Joins the segments of packets, as CCSDS 133.0-B-2 has it in section 4.1.3.4.2.2.
+
+    The packets of an APID follow each other; those of others may lie between.
+    """
+
+    def __init__(self, header_bytes: int) -> None:
+        """`header_bytes`: of the secondary header that segments after the first one repeat."""
+        self._header_bytes = header_bytes
+        self._open: dict[int, list[SpacePacket]] = {}
+
+    def add(self, packet: SpacePacket) -> tuple[SpacePacket | None, list[SpacePacket]]:
+        """The packet that is complete now, if any, and the segments that cannot be joined."""
+        flags, apid = packet.sequence_flags, packet.apid
+        before = self._open.pop(apid, [])
+        if flags == WHOLE:
+            return packet, before
+        if flags == FIRST:
+            self._open[apid] = [packet]
+            return None, before
+        follows = (
+            before
+            and (packet.sequence_count - before[-1].sequence_count) % SEQUENCE_COUNTS == 1
+            and sum(len(each.content) for each in (*before, packet)) <= MOST_BYTES
+        )
+        if not follows:
+            return None, [*before, packet]
+        if flags == CONTINUATION:
+            self._open[apid] = [*before, packet]
+            return None, []
+        return self._joined([*before, packet]), []
+
+    def end(self) -> list[SpacePacket]:
+        """The segments whose packet has no end."""
+        left = [packet for segments in self._open.values() for packet in segments]
+        self._open.clear()
+        return left
+
+    def _joined(self, segments: list[SpacePacket]) -> SpacePacket:
+        first = segments[0]
+        begin = HEADER_BYTES + self._header_bytes
+        data = first.content[HEADER_BYTES:] + b"".join(
+            each.content[begin:] for each in segments[1:]
+        )
+        flags = bytes([first.content[2] | WHOLE << 6])
+        # A longer packet than the field can tell keeps the greatest length.
+        length = min(len(data) - 1, 0xFFFF).to_bytes(2, "big")
+        header = first.content[:2] + flags + first.content[3:4] + length
+        return SpacePacket(first.number, first.offset, header + data, len(segments))
 
 
 class SequenceCounter:

@@ -139,6 +139,8 @@ def walk(client: httpx.Client, app: App) -> Json:
     take("watch_run", client.put(f"{API}/runs/pass-7", json=asked), "watched", asked)
 
     take("list_audit", client.get(f"{API}/audit"), "two_changes")
+    asked = {"batches": [xte["batch"]], "confirm": False}
+    take("forget_run", client.post(f"{API}/runs/pass-7/forget", json=asked), "asked", asked)
     _annotation(client, take)
     _webhook(client, take)
     take("cancel_replay", client.delete(begun.headers["Location"]), "ended_already")

@@ -18,6 +18,7 @@ from service.storage.grades.live import LiveAttitude, live_attitude
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter, newest
 from service.storage.recording.events import last_event
+from service.storage.sql.access_tables import audit
 from service.storage.sql.gyro_tables import gyro_blocks
 from service.storage.sql.tables import batches, results
 from service.times import DAY_S, recorded_utc, utc_now
@@ -26,6 +27,7 @@ REST = 20.0
 """After a look the thread rests so many times as long as that took: it is at work 5 % at most."""
 
 _TIMES = select(batches.c.time).join_from(results, batches, results.c.batch_id == batches.c.id)
+_LAST_FORGOTTEN = select(func.max(audit.c.id)).where(audit.c.action == "forget_run")
 
 log = logging.getLogger(__name__)
 
@@ -36,6 +38,8 @@ class _Kept:
 
     filter: CarriedFilter = field(default_factory=CarriedFilter)
     version: tuple[int, str | None] | None = None
+    forgotten: str | None = None
+    """The last entry of the audit list about recorded batches or blocks that were removed."""
     attitude: LiveAttitude | None = None
 
 
@@ -120,6 +124,11 @@ class LiveFilter:
             with self._context.reading() as connection:
                 block = connection.scalar(select(func.max(gyro_blocks.c.id)))
                 version = last_event(connection), block
+                forgotten = connection.scalar(_LAST_FORGOTTEN)
+                if kept.forgotten != forgotten:
+                    # The filter holds what was computed from facts that are gone.
+                    kept.filter, kept.version = CarriedFilter(), None
+                    kept.forgotten = forgotten
                 if kept.version == version:
                     return kept
                 row = newest(connection, _TIMES, ResultFilter(LIVE, name), utc_now())

@@ -143,7 +143,7 @@ def _write_mission(parsed: Namespace, result: "CalibrationRun") -> None:
     if parsed.output.exists() and parsed.output.samefile(source):
         message = "is the mission file in use; name another file, and put it in its place later"
         raise BadInput(Fault("--output", message, shown_value(str(parsed.output))))
-    before = source.read_text(encoding="utf-8")
+    before = source.read_text(encoding="utf-8-sig")
     text = calibrated_mission_text(
         before, str(source), result.found, result.mission, result.calibrated_magnitudes
     )

@@ -8,6 +8,7 @@ from typing import Any
 
 from service.cli.arguments import add_command, add_database, add_group, add_json, print_json
 from service.cli.configuration import settings_of, settings_of_existing
+from service.cli.forget import add_forget
 
 MAX_PROBLEMS = 100
 
@@ -90,6 +91,7 @@ def add(commands: Any) -> None:
     add_database(parser)
     _add_split_trackers(group)
     _add_prune(group)
+    add_forget(group)
 
 
 def _add_split_trackers(group: Any) -> None:

@@ -140,7 +140,7 @@ def _known(parsed: Namespace, file: Path) -> dict[str, Any]:
     known: dict[str, Any] = {}
     beside = file.with_suffix(".json")
     if beside.is_file():
-        known = _object(beside.read_text(encoding="utf-8"), str(beside))
+        known = _object(beside.read_text(encoding="utf-8-sig"), str(beside))
     if parsed.a_priori is not None:
         known["a_priori"] = _json(parsed.a_priori, "--a-priori")
     for name in ("tracker", "time", "batch", "run", "centroid"):

@@ -46,7 +46,7 @@ def add(commands: Any) -> None:
         commands,
         "replay",
         "Send files of batches and gyro blocks (NDJSON, or CSV if the name ends in .csv or .tsv) "
-        "to the service.  You can send a file twice: what is already recorded is not recorded again.",
+        "to the service.  You can send a file twice: nothing is recorded twice.",
         """
         acquire replay pass.ndjson
         acquire replay pass.csv --in-process --run trial --results answers.ndjson

@@ -73,6 +73,7 @@ class ApidPackets(Model, frozen=True):
     missing: int
     backward: int
     refused: int
+    incomplete: int = 0
 
 
 class ReplayPackets(Model, frozen=True):
@@ -92,6 +93,8 @@ class ReplayPackets(Model, frozen=True):
     backward: int
     refused: int
     apids: Sequence[ApidPackets]
+    joined: int = 0
+    incomplete: int = 0
 
 
 class Replay(Model, frozen=True):

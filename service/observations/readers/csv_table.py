@@ -166,11 +166,10 @@ class CsvTable:
 
     def _key(self, found: Sequence[str]) -> tuple[str, ...] | None:
         """The texts that tell the batch of a row; None where it cannot be told."""
-        texts = tuple(
+        spacecraft, run, name = (
             "" if k is None else found[k] if k < len(found) else None for k in self._key_columns
         )
-        spacecraft, run, name = texts
-        return texts if spacecraft and run is not None and name else None
+        return (spacecraft, run, name) if spacecraft and run is not None and name else None
 
     def _row(self, line: Line) -> Row | None:
         """The row of a line; None for one without a cell, and for the header again."""

@@ -4,6 +4,7 @@ SGP4 gives states in the true equator and mean equinox of date (TEME).  ERFA's p
 and nutation of 1980, which belong to it, lead to the mean equator and equinox of J2000.
 """
 
+import codecs
 import math
 import re
 from dataclasses import dataclass
@@ -138,6 +139,8 @@ def _lines(source: Source, file: IO[bytes]) -> Any:
     number = 0
     while data := file.readline(MAX_LINE_BYTES + 1):
         number += 1
+        if number == 1:
+            data = data.removeprefix(codecs.BOM_UTF8)
         if len(data) > MAX_LINE_BYTES:
             raise source.bad(number, "line", f"must have at most {MAX_LINE_BYTES} bytes")
         try:

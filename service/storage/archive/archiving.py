@@ -197,7 +197,7 @@ def _archive(store: Store, folder: Path, day: _Day, batch_ids: Sequence[str]) ->
         if store.writer.change(take_out).result():
             return part
         # Changed since it was read, by a what-if for example: written again as it is now.
-        _remove(folder, manifest, part)
+        remove_part(folder, manifest, part)
     raise BadConfiguration(f"{path}: the record of these batches changes too often, or is damaged")
 
 
@@ -321,10 +321,10 @@ def _discard_unfinished(store: Store, folder: Path, day: _Day) -> None:
                 f"{folder / path}: the database has some of its batches and lacks others: restore "
                 "it with `acquire archive restore`, or move it away"
             )
-        manifest = _remove(folder, manifest, part)
+        manifest = remove_part(folder, manifest, part)
 
 
-def _remove(folder: Path, manifest: Manifest, part: Part) -> Manifest:
+def remove_part(folder: Path, manifest: Manifest, part: Part) -> Manifest:
     """Take a part out of the manifest, then delete its file."""
     left = [each for each in manifest.parts if each.file != part.file]
     manifest = msgspec.structs.replace(manifest, parts=left)

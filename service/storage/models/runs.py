@@ -31,6 +31,24 @@ class RunList(Record, frozen=True, kw_only=True):
     items: list[Run]
 
 
+class Forgotten(Record, frozen=True, kw_only=True):
+    """What is removed from a run."""
+
+    component: ClassVar[str] = "Forgotten"
+    run: str
+    spacecraft: Annotated[str | None, doc("null: of every spacecraft.")]
+    batches: Annotated[Count, doc("Batches in the database, with their results.")]
+    archived_batches: Annotated[Count, doc("Batches in the archive.")]
+    gyro_blocks: Count
+    graded_days: Annotated[
+        Count,
+        doc(
+            "Days of filtered and smoothed attitudes that were computed with them, every revision "
+            "counted. `acquire smooth` computes them again from what is left."
+        ),
+    ]
+
+
 class ReplayLines(Record, frozen=True, kw_only=True):
     """The lines of a replay."""
 
@@ -70,6 +88,7 @@ class ApidPackets(Record, frozen=True, kw_only=True):
         Count, doc("Places where the count repeats or goes back: a reset, or a changed order.")
     ]
     refused: Count
+    incomplete: Annotated[Count, doc("Segments of packets of which others are missing.")] = 0
 
 
 class ReplayPackets(Record, frozen=True, kw_only=True):
@@ -89,6 +108,10 @@ class ReplayPackets(Record, frozen=True, kw_only=True):
     missing: Count
     backward: Count
     refused: Annotated[Count, doc("Packets that could not be read.")]
+    joined: Annotated[Count, doc("Packets that were joined of segments.")] = 0
+    incomplete: Annotated[
+        Count, doc("Segments of packets of which others are missing; they are refused, too.")
+    ] = 0
     apids: Annotated[list[ApidPackets], doc("The hundred APIDs with the most packets.")]
 
 

@@ -93,9 +93,9 @@ def prune(
             deleted = store.writer.change(some).result()
             pruned.batches += deleted
             step(pruned)
-    while deleted := store.writer.change(partial(_delete_blocks, chosen=old_blocks)).result():
+    while deleted := store.writer.change(partial(delete_blocks, chosen=old_blocks)).result():
         pruned.gyro_blocks += deleted
-    while deleted := store.writer.change(partial(_delete_days, chosen=old_days)).result():
+    while deleted := store.writer.change(partial(delete_days, chosen=old_days)).result():
         pruned.graded_days += deleted
     return pruned
 
@@ -114,7 +114,7 @@ def _old_days(before: Utc, run: str | None) -> list[ColumnElement[bool]]:
     return chosen
 
 
-def _delete_days(connection: Connection, chosen: Sequence[ColumnElement[bool]]) -> int:
+def delete_days(connection: Connection, chosen: Sequence[ColumnElement[bool]]) -> int:
     """Delete some of the graded days that are chosen, with their samples; how many."""
     ids = list(connection.scalars(select(graded_days.c.id).where(*chosen).limit(_DAYS_AT_ONCE)))
     connection.execute(delete(graded_blocks).where(graded_blocks.c.day_id.in_(ids)))
@@ -122,7 +122,7 @@ def _delete_days(connection: Connection, chosen: Sequence[ColumnElement[bool]]) 
     return len(ids)
 
 
-def _delete_blocks(connection: Connection, chosen: Sequence[ColumnElement[bool]]) -> int:
+def delete_blocks(connection: Connection, chosen: Sequence[ColumnElement[bool]]) -> int:
     """Delete some of the blocks that are chosen; how many."""
     some = select(gyro_blocks.c.id).where(*chosen).limit(_BLOCKS_AT_ONCE)
     ids = list(connection.scalars(some))

@@ -13,7 +13,8 @@ from starlette.responses import Response
 from service.app.replays import UploadForm, discard_upload
 from service.errors import BadBatch, Fault, shown_value
 from service.observations.schema import BatchIn, Key, RunName, Wire
-from service.storage.models.runs import Replay, ReplayList, RunList, RunState
+from service.storage.models.runs import Forgotten, Replay, ReplayList, RunList, RunState
+from service.storage.upkeep.forget import MOST_NAMES, ForgetFilter
 from service.web.openapi.route import LOCATION, ResponseDoc, route_docs
 from service.web.requests.access import AuditDep, CallerDep, require_all_spacecraft
 from service.web.requests.dependencies import AppDep, json_response
@@ -39,6 +40,24 @@ class RunIn(Wire):
         StrictBool,
         Field(description="Whether its new batches can raise alarms. Live batches always can."),
     ]
+
+
+class ForgetIn(Wire):
+    """What is removed from a run."""
+
+    spacecraft: Annotated[Key | None, Field(description="Only of this one; null: of all.")] = None
+    batches: Annotated[
+        tuple[Key, ...],
+        Field(
+            max_length=MOST_NAMES,
+            description="Names of batches. Without batches and gyro blocks: the whole run.",
+        ),
+    ] = ()
+    gyro_blocks: Annotated[tuple[Key, ...], Field(max_length=MOST_NAMES)] = ()
+    confirm: Annotated[
+        StrictBool,
+        Field(description="false: answer what would be removed, and remove nothing."),
+    ] = False
 
 
 class _ReplayQuery(Query):
@@ -97,6 +116,34 @@ def watch_run(run: RunPath, body: JsonBody, app: AppDep, audited: AuditDep) -> R
     """Switch the alarms of a run on or off; creates the run if it does not exist."""
     asked = read_model(RunIn, body)
     return json_response(app.runs.watch(run, asked.alarms, audited.entry()))
+
+
+@router.post(
+    "/runs/{run}/forget",
+    dependencies=[NO_QUERY],
+    **route_docs(
+        {200: ResponseDoc("What is removed, or would be.", Forgotten)},
+        body=ForgetIn,
+        problems=(404,),
+    ),
+)
+def forget_run(
+    run: RunPath, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
+) -> Response:
+    """Remove what was recorded wrongly, with its trends and archived batches; it cannot be undone.
+
+    The same batches can be recorded again afterwards. Alarms, events, notes and the audit list
+    stay.
+    """
+    asked = read_model(ForgetIn, body)
+    if asked.spacecraft is None:
+        require_all_spacecraft(caller)
+    else:
+        caller.require(asked.spacecraft)
+    selected = ForgetFilter(run, asked.spacecraft, asked.batches, asked.gyro_blocks)
+    if not asked.confirm:
+        return json_response(app.runs.would_forget(selected))
+    return json_response(app.runs.forget(selected, audited.entry()))
 
 
 @router.get(

@@ -5,6 +5,7 @@ a dash, never a zero.
 """
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -193,7 +194,27 @@ def quantity(value: float | None, name: str) -> str:
     return share(value) if known.is_share else UNITS.get(known.unit, number)(value)
 
 
+_INVISIBLE = re.compile(
+    r"[\x00-\x1f\x7f-\x9f\u00ad\u034f\u061c\u115f\u1160\u17b4\u17b5\u180b-\u180f\u200b-\u200f"
+    r"\u2028-\u202e\u2060-\u206f\u2800\u3164\ufe00-\ufe0f\ufeff\uffa0\ufff0-\ufffb"
+    r"\U000e0000-\U000e0fff]"
+)
+"""Characters that show nothing, or that change the order of what is shown."""
+
+
+def name(text: str) -> str:
+    """A name with the code of each character that nobody would see: two names never look alike."""
+    if text.isspace() or text != text.strip():
+        text = re.sub(r"^\s+|\s+$", lambda found: "".join(map(_code, found[0])), text)
+    return _INVISIBLE.sub(lambda found: _code(found[0]), text)
+
+
+def _code(character: str) -> str:
+    return f"\u2039U+{ord(character):04X}\u203a"
+
+
 FILTERS: Mapping[str, Callable[..., Any]] = {
+    "name": name,
     "utc": utc,
     "utc_short": utc_short,
     "age": age,

@@ -102,6 +102,7 @@ POLICIES: dict[str, Policy] = {
     # Of tokens that are bound to spacecraft only the one that started it: see the handler.
     "cancel_replay": Policy("submit", "nothing", audited=True),
     "watch_run": Policy("submit", audited=True),
+    "forget_run": Policy("operate", "body"),
     "compare": Policy("read", "body"),
     "list_calibrations": Policy("read", "query"),
     "start_calibration": Policy("operate", "body"),

@@ -41,7 +41,7 @@ def _time(value: object) -> Utc:
 
 TIME_SCHEMA: dict[str, Any] = {
     "type": "string",
-    "pattern": r"^\d{4}-(\d\d-\d\d|\d{3})T\d\d:\d\d:\d\d(\.\d{1,9})?Z?$",
+    "pattern": r"^\d{4}-(\d\d-\d\d|\d{3})T\d\d:\d\d:\d\d(\.\d{1,9})?(Z|[+-]\d\d(:?\d\d)?)?$",
     "examples": ["1996-01-10T12:00:00.000Z", "1996-010T12:00:00Z"],
 }
 """UTC in calendar form or with the day of the year; `format: date-time` knows no leap second."""

@@ -1,0 +1,289 @@
+"""Removes what was recorded wrongly: a run, or named batches and gyro blocks of it.
+
+Trends, filtered attitudes and the archive follow.  Alarms, events, notes, replays and the audit
+list stay: they say what happened.  Batches go in portions, each in one transaction with its part
+in the trends; after an interruption the same call again goes on.
+"""
+
+from collections.abc import Callable, Collection
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import ColumnElement, Connection, Table, delete, exists, func, or_, select
+from sqlalchemy.exc import IntegrityError
+
+from service.errors import BadConfiguration, NotFound, shown_value
+from service.storage.archive.tables import (
+    archived_batches,
+    archived_hours,
+    archived_parts,
+    archived_what_ifs,
+)
+from service.storage.models.runs import Forgotten
+from service.storage.queries.future_dated import LIVE
+from service.storage.recording import rollups
+from service.storage.recording.archived_hours import forget_share
+from service.storage.sql.database import Store
+from service.storage.sql.grade_tables import graded_days
+from service.storage.sql.gyro_tables import gyro_blocks
+from service.storage.sql.tables import batches, runs
+from service.storage.upkeep.prune import delete_batches, delete_blocks, delete_days
+from service.times import DAY_S, HOUR_S, recorded_utc
+
+_AT_ONCE = 1_000
+"""Batches of one transaction: others that write wait for its end."""
+_DAY_NS = DAY_S * 10**9
+MOST_NAMES = 1_000
+"""Batches, or gyro blocks, that are named at once."""
+
+
+@dataclass(frozen=True)
+class ForgetFilter:
+    """What is forgotten of a run: all of it, or only the named batches and gyro blocks."""
+
+    run: str
+    spacecraft: str | None = None
+    batches: tuple[str, ...] = ()
+    gyro_blocks: tuple[str, ...] = ()
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether no batch and no block is named."""
+        return not (self.batches or self.gyro_blocks)
+
+    def of(self, table: Table, names: Collection[str] = (), name: str = "") -> list[Any]:
+        """The rows of a table that are selected, as SQL."""
+        chosen: list[ColumnElement[bool]] = [table.c.run == self.run]
+        if self.spacecraft is not None:
+            chosen.append(table.c.spacecraft == self.spacecraft)
+        if not self.is_whole and name:
+            chosen.append(table.c[name].in_(names))
+        return chosen
+
+    def of_batches(self, table: Table) -> list[Any]:
+        """The selected rows of `batches` or `archived_batches`."""
+        return self.of(table, self.batches, "batch")
+
+    def of_blocks(self) -> list[Any]:
+        """The selected rows of `gyro_blocks`."""
+        return self.of(gyro_blocks, self.gyro_blocks, "block")
+
+
+def found(connection: Connection, selected: ForgetFilter) -> Forgotten:
+    """What is selected; raises `NotFound` where nothing is, or a name is not there."""
+    _require_names(connection, selected)
+    counts = {
+        name: int(connection.scalar(select(func.count()).select_from(table).where(*chosen)) or 0)
+        for name, table, chosen in (
+            ("batches", batches, selected.of_batches(batches)),
+            ("archived_batches", archived_batches, selected.of_batches(archived_batches)),
+            ("gyro_blocks", gyro_blocks, selected.of_blocks()),
+            ("graded_days", graded_days, _of_days(selected)),
+        )
+    }
+    if not any(counts.values()):
+        raise NotFound(f"nothing is recorded in run {selected.run}{_of(selected)}")
+    return Forgotten(run=selected.run, spacecraft=selected.spacecraft, **counts)
+
+
+def forget(
+    store: Store,
+    selected: ForgetFilter,
+    archive: Path | None,
+    *,
+    note: Callable[[Connection, Forgotten], object] = lambda connection, total: None,
+    step: Callable[[int, Forgotten], object] = lambda done, total: None,
+) -> Forgotten:
+    """Remove what is selected; returns what it was.
+
+    `note` is called in the first transaction, and `step` with the number of batches that are
+    removed and the whole.  `archive` is the folder with the archived batches.  Raises `NotFound`
+    as `found` does, and `BadConfiguration` where archived batches are selected and `archive` is
+    not the folder that has them.
+    """
+    with store.reading() as connection:
+        total = found(connection, selected)
+    if total.archived_batches and archive is None:
+        raise BadConfiguration(
+            f"{total.archived_batches} of the batches are archived: name the folder of the archive"
+        )
+    # What is computed from the batches goes first: it is computed again from what is left.
+    days = partial(_forget_days, selected=selected, note=note, total=total)
+    store.writer.change(days).result()
+    done = 0
+    if total.archived_batches and archive is not None:
+        done += _forget_archived(store, archive, selected)
+        step(done, total)
+    while forgotten := store.writer.change(partial(_forget_batches, selected=selected)).result():
+        done += forgotten
+        step(done, total)
+    blocks = partial(delete_blocks, chosen=selected.of_blocks())
+    while total.gyro_blocks and store.writer.change(blocks).result():
+        pass
+    if selected.is_whole and selected.spacecraft is None and selected.run != LIVE:
+        _forget_run(store, selected.run)
+    return total
+
+
+def _require_names(connection: Connection, selected: ForgetFilter) -> None:
+    """Raise `NotFound` for the first name that no batch, or no gyro block, has."""
+    for what, names, columns in (
+        ("batch", selected.batches, (batches.c.batch, archived_batches.c.batch)),
+        ("gyro block", selected.gyro_blocks, (gyro_blocks.c.block,)),
+    ):
+        known: set[str] = set()
+        for column in columns if names else ():
+            chosen = selected.of(column.table, names, column.name)
+            known.update(connection.scalars(select(column).where(*chosen)))
+        for name in names:
+            if name not in known:
+                message = f"run {selected.run}{_of(selected)} has no {what} {shown_value(name)}"
+                raise NotFound(message)
+
+
+def _of(selected: ForgetFilter) -> str:
+    return "" if selected.spacecraft is None else f" of {selected.spacecraft}"
+
+
+def _of_days(selected: ForgetFilter) -> list[Any]:
+    """The days of filtered attitudes that were computed with what is selected, as SQL."""
+    chosen = selected.of(graded_days)
+    if selected.is_whole:
+        return chosen
+    # A day depends on less than a day before it and after it.
+    begin, end = (graded_days.c.start_ns - _DAY_NS, graded_days.c.end_ns + _DAY_NS)
+    overlapping: list[ColumnElement[bool]] = []
+    if selected.batches:
+        overlapping += [
+            exists().where(
+                *selected.of_batches(batches),
+                batches.c.spacecraft == graded_days.c.spacecraft,
+                batches.c.time_ns.between(begin, end),
+            ),
+            exists().where(
+                *selected.of_batches(archived_batches),
+                archived_batches.c.part_id == archived_parts.c.id,
+                archived_parts.c.spacecraft == graded_days.c.spacecraft,
+                archived_parts.c.last_ns >= begin,
+                archived_parts.c.first_ns <= end,
+            ),
+        ]
+    if selected.gyro_blocks:
+        overlapping.append(
+            exists().where(
+                *selected.of_blocks(),
+                gyro_blocks.c.spacecraft == graded_days.c.spacecraft,
+                gyro_blocks.c.end_ns >= begin,
+                gyro_blocks.c.start_ns <= end,
+            )
+        )
+    return [*chosen, or_(*overlapping)]
+
+
+def _forget_days(
+    connection: Connection,
+    selected: ForgetFilter,
+    note: Callable[[Connection, Forgotten], object],
+    total: Forgotten,
+) -> None:
+    chosen = _of_days(selected)
+    while delete_days(connection, chosen):
+        pass
+    note(connection, total)
+
+
+def _forget_batches(connection: Connection, selected: ForgetFilter) -> int:
+    """Delete some of the selected batches and count their hours anew; how many."""
+    if not selected.is_whole and not selected.batches:
+        return 0
+    query = select(batches.c.id, batches.c.spacecraft, batches.c.time)
+    rows = list(connection.execute(query.where(*selected.of_batches(batches)).limit(_AT_ONCE)))
+    delete_batches(connection, [row.id for row in rows])
+    hours = {(row.spacecraft, selected.run, _hour(row.time)) for row in rows}
+    rollups.renew(connection, hours)
+    return len(rows)
+
+
+def _hour(time: str) -> int:
+    return recorded_utc(time).bucket(HOUR_S)
+
+
+def _forget_archived(store: Store, folder: Path, selected: ForgetFilter) -> int:
+    """Remove the archived batches that are selected; how many.
+
+    Parts of which all batches are selected are deleted.  Of others all batches are recorded
+    again, from where the selected ones are then deleted; `acquire archive` archives the rest.
+    """
+    # Archives need pyarrow, which is an extra.
+    from service.storage.archive.archiving import remove_part
+    from service.storage.archive.folder import (
+        locked,
+        manifest_of,
+        manifests,
+        path_of,
+        read_partition,
+        whole_content,
+    )
+    from service.storage.archive.owner import claim
+    from service.storage.archive.restoring import put_back
+    from service.storage.archive.rows import from_partition
+
+    with locked(folder):
+        with store.reading() as connection:
+            claim(connection, folder)
+            chosen = selected.of_batches(archived_batches)
+            query = select(archived_batches.c.part_id, func.count()).where(*chosen)
+            counts = dict(connection.execute(query.group_by(archived_batches.c.part_id)).tuples())
+            parts = select(archived_parts).where(archived_parts.c.id.in_(counts))
+            known = {row["path"]: dict(row) for row in connection.execute(parts).mappings()}
+        named = {
+            path: (manifest, part)
+            for manifest in manifests(folder)
+            for part in manifest.parts
+            if (path := path_of(folder, manifest, part)) in known
+        }
+        if missing := sorted(set(known) - set(named)):
+            raise BadConfiguration(f"{folder / missing[0]}: no manifest of the archive names it")
+        for path, (manifest, part) in named.items():
+            row = known[path]
+            if counts[row["id"]] == row["batches"]:
+                store.writer.change(partial(_forget_part, row=row)).result()
+            else:
+                rows = from_partition(read_partition(whole_content(folder, path, part.sha256)))
+
+                def put_back_part(
+                    connection: Connection, part: Any = part, rows: Any = rows
+                ) -> int:
+                    put_back(connection, folder, part, rows)
+                    return _forget_batches(connection, selected)
+
+                store.writer.change(put_back_part).result()
+            # After the record: a file too many is named by `archive verify`, a missing one lost.
+            remove_part(folder, manifest_of(folder, manifest.spacecraft, manifest.day), part)
+    return sum(counts.values())
+
+
+def _forget_part(connection: Connection, row: dict[str, Any]) -> None:
+    """Delete what the database knows of a part, and its share in the trends."""
+    spacecraft, run, part_id = row["spacecraft"], row["run"], row["id"]
+    own = archived_hours.c.spacecraft == spacecraft, archived_hours.c.run == run
+    chosen = select(archived_hours.c.bucket).where(*own, archived_hours.c.part_id == part_id)
+    hours = {(spacecraft, run, hour) for hour in connection.scalars(chosen.distinct())}
+    rollups.lock(connection, hours)
+    forget_share(connection, part_id, spacecraft, run)
+    ids = select(archived_batches.c.id).where(archived_batches.c.part_id == part_id)
+    connection.execute(delete(archived_what_ifs).where(archived_what_ifs.c.batch_id.in_(ids)))
+    connection.execute(delete(archived_batches).where(archived_batches.c.part_id == part_id))
+    connection.execute(delete(archived_parts).where(archived_parts.c.id == part_id))
+    rollups.renew(connection, hours)
+
+
+def _forget_run(store: Store, run: str) -> None:
+    """Delete the settings of a run, unless something was recorded in it meanwhile."""
+    with suppress(IntegrityError):
+        store.writer.change(
+            lambda connection: connection.execute(delete(runs).where(runs.c.name == run))
+        ).result()

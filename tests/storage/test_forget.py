@@ -1,0 +1,149 @@
+"""Forgetting a run, or some of its batches: nothing of it is left, all else is as it was."""
+
+import pytest
+from sqlalchemy import func, select
+
+from service.errors import BadConfiguration, NotFound
+from service.storage.archive import archiving
+from service.storage.archive.restoring import verify_archive
+from service.storage.archive.tables import archived_batches, archived_parts
+from service.storage.sql.access_tables import audit
+from service.storage.sql.columns import metadata
+from service.storage.sql.grade_tables import graded_days
+from service.storage.sql.gyro_tables import gyro_blocks
+from service.storage.sql.rollup_tables import rollups_hourly
+from service.storage.sql.tables import batches, runs
+from service.storage.upkeep.forget import ForgetFilter, forget, found
+from service.storage.upkeep.verify import verify
+from service.times import shifted
+from tests.storage.recount import assert_equal_to_a_recount
+from tests.storage.samples import START
+
+KINDS = ("good", "suspect", "one_star", "spurious")
+LATER = shifted(START, 10 * 86_400.0)
+
+
+@pytest.fixture
+def place(tmp_path):
+    (tmp_path / "archive").mkdir()
+    return tmp_path / "archive"
+
+
+@pytest.fixture
+def app(opened, place):
+    return opened(archive_folder=place)
+
+
+@pytest.fixture
+def filled(app, make):
+    """Batches of every kind over two days in two runs."""
+    for k in range(8):
+        for run in ("live", "r"):
+            submission = make(f"b{k}", kind=KINDS[k % 4], run=run, after_s=k * 20_000.0)
+            app.submissions.submit(submission, f"key-{run}-{k}")
+    return app
+
+
+def names(app, run, table=batches):
+    with app.store.reading() as connection:
+        return sorted(connection.scalars(select(table.c.batch).where(table.c.run == run)))
+
+
+def count(app, table):
+    with app.store.reading() as connection:
+        return connection.scalar(select(func.count()).select_from(table))
+
+
+def rows_of_run(app, run):
+    """What each table with a column `run` has of it, except for what says what happened."""
+    happened = {"events", "replays", "alarms", "watches", "annotations"}
+    with app.store.reading() as connection:
+        return {
+            name: connection.scalar(select(func.count()).select_from(t).where(t.c.run == run))
+            for name, t in metadata.tables.items()
+            if "run" in t.c and name not in happened
+        }
+
+
+def test_a_run_is_forgotten_whole_and_can_be_recorded_again(filled, make, database, place):
+    live = rows_of_run(filled, "live")
+    done = []
+    total = forget(filled.store, ForgetFilter("r"), place, step=lambda n, total: done.append(n))
+    assert (total.batches, total.archived_batches, total.gyro_blocks) == (8, 0, 0)
+    assert done[-1] == 8
+    assert set(rows_of_run(filled, "r").values()) == {0}
+    assert rows_of_run(filled, "live") == live
+    with filled.store.reading() as connection:
+        assert list(connection.scalars(select(runs.c.name))) == ["live"]
+    assert_equal_to_a_recount(filled.store)
+    assert verify(database) == []
+    # Another body under a name that was poisoned, and a key that was used.
+    again = filled.submissions.submit(make("b0", kind="one_star", run="r"), "key-r-0")
+    assert not again.replayed
+    with pytest.raises(NotFound, match="nothing is recorded in run s"):
+        forget(filled.store, ForgetFilter("s"), place)
+
+
+def test_named_batches_are_forgotten_and_the_others_stay(filled, database, place):
+    selected = ForgetFilter("live", "XTE", ("b1", "b5"))
+    with filled.store.reading() as connection:
+        assert found(connection, selected).batches == 2
+    assert forget(filled.store, selected, place).batches == 2
+    assert names(filled, "live") == ["b0", "b2", "b3", "b4", "b6", "b7"]
+    assert len(names(filled, "r")) == 8
+    assert_equal_to_a_recount(filled.store)
+    assert verify(database) == []
+
+
+@pytest.mark.parametrize(
+    ("selected", "message"),
+    [
+        (ForgetFilter("live", None, ("b1", "b99")), "run live has no batch 'b99'"),
+        (ForgetFilter("live", "SOHO", ("b1",)), "run live of SOHO has no batch 'b1'"),
+        (ForgetFilter("r", None, (), ("g1",)), "run r has no gyro block 'g1'"),
+        (ForgetFilter("live", "SOHO"), "nothing is recorded in run live of SOHO"),
+    ],
+)
+def test_a_name_that_is_not_there_removes_nothing(filled, place, selected, message):
+    with pytest.raises(NotFound) as refusal:
+        forget(filled.store, selected, place)
+    assert str(refusal.value) == message
+    assert count(filled, batches) == 16
+
+
+def test_archived_batches_are_forgotten_with_their_files(filled, database, place):
+    """Whole parts go; of others what is not named is recorded again."""
+    archiving.archive(filled.store, place, LATER)
+    archived = names(filled, "r", archived_batches)
+    assert len(archived) > 3
+    files = len(list(place.glob("**/part-*.parquet")))
+    with pytest.raises(BadConfiguration, match="name the folder of the archive"):
+        forget(filled.store, ForgetFilter("r"), None)
+    one = forget(filled.store, ForgetFilter("r", "XTE", (archived[1],)), place)
+    assert (one.batches, one.archived_batches) == (0, 1)
+    assert sorted(names(filled, "r") + names(filled, "r", archived_batches)) == [
+        f"b{k}" for k in range(8) if f"b{k}" != archived[1]
+    ]
+    assert_equal_to_a_recount(filled.store)
+    assert verify(database) == []
+    assert list(verify_archive(place, {})) == []
+    assert len(list(place.glob("**/part-*.parquet"))) == files - 1
+    total = forget(filled.store, ForgetFilter("r"), place)
+    assert total.batches + total.archived_batches == 7
+    assert set(rows_of_run(filled, "r").values()) == {0}
+    with filled.store.reading() as connection:
+        assert set(connection.scalars(select(archived_parts.c.run))) == {"live"}
+    assert_equal_to_a_recount(filled.store)
+    assert list(verify_archive(place, {})) == []
+    assert count(filled, rollups_hourly) > 0
+
+
+def test_the_entry_of_the_audit_list_and_the_change_are_one(filled, place):
+    def fail(connection, total):
+        raise RuntimeError(total.batches)
+
+    with pytest.raises(RuntimeError, match="8"):
+        forget(filled.store, ForgetFilter("r"), place, note=fail)
+    assert len(names(filled, "r")) == 8
+    assert count(filled, audit) == 0
+    assert count(filled, gyro_blocks) == count(filled, graded_days) == 0
