@@ -16,6 +16,7 @@ from service.imaging.frames.preview import preview_png
 from service.imaging.submit import (
     FrameIn,
     batch_of_stars,
+    choices_of,
     submission_of_frame,
     time_of,
     with_exposure,
@@ -83,7 +84,7 @@ def _of_unknown_lens(
     done = perf_counter_ns()
     timings = {"read": (read - start) // 1000, "detect": (done - read) // 1000, "centroid": 0}
     record = _record(result, chosen, stars, camera, tracker.name, timings)
-    record = replace(record, remarks=[*record.remarks, *remarks])
+    record = replace(record, remarks=[*record.remarks, *remarks, *choices_of(result.frame)])
     submission = submission_from_model(model)
     return Submission(
         submission.batch, submission.text, known.fingerprint(mission.name, digest), record
@@ -101,9 +102,7 @@ def _unit(quaternion: Vector) -> list[float]:
 
 def _without_time(frame: Frame) -> Frame:
     """The same without its time: aberration is corrected once, where the batch is acquired."""
-    return Frame(
-        frame.counts, frame.file_format, frame.digest, frame.full_scale, None, frame.exposure_s
-    )
+    return replace(frame, time=None)
 
 
 def _chosen(result: PictureResult, most: int, limit_mag: float) -> list[int]:

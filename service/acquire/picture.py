@@ -25,6 +25,7 @@ from service.imaging.detection.points import (
     find_points,
 )
 from service.imaging.frames.frame import Frame, require_light
+from service.imaging.frames.orientation import is_by_rows, mirrored
 from service.imaging.sky_overlay import DrawnStar, SkyView, draw_sky
 from service.sky.catalog.proper_names import PROPER_NAMES
 from service.sky.catalog.star_catalog import Catalog
@@ -153,25 +154,49 @@ def solve_picture(
     """Find the attitude and the lens of a picture; `guess_px` is a rough focal length.
 
     Where what is told leads to nothing all other focal lengths are tried, and where the
-    clear candidates do, so are fainter ones.  Raises `BadFile` for a picture without light.
+    clear candidates do, so are fainter ones.  Where all of that leads to nothing, the mirror
+    image is tried: a result then is of the mirrored frame, which it holds.  Raises `BadFile`
+    for a picture without light.
     """
     require_light(frame, math.inf)
     side = max(frame.width_px, frame.height_px)
-    anything = FocalRange.of_fields(side, WIDEST_FIELD_DEG)
-    ranges = [anything]
+    ranges = [FocalRange.of_fields(side, WIDEST_FIELD_DEG)]
     if guess_px is not None:
         ranges.insert(0, FocalRange.about(guess_px, GUESS_SHARE))
+    tried: list[PointSources] = []
     for threshold in (FIRST_THRESHOLD, SECOND_THRESHOLD):
-        points = find_points(frame.counts, threshold)
-        places = places_of(points)
+        tried.append(find_points(frame.counts, threshold))
         for focal in ranges:
-            search = solver.solve(places, focal)
-            if search.found is not None:
-                found = solver.refined(search.found, places.first(REFINED_POINTS), focal)
-                attitude = _attitude(found, places, points, frame, sky)
-                remarks = remarks_on(attitude.lens, found, points, guess_px, GUESS_SHARE)
-                return PictureResult(frame, points, attitude, search, tuple(remarks))
-    return PictureResult(frame, points, None, search, tuple(advice_without_attitude(points)))
+            result = _solved(frame, tried[-1], sky, solver, focal, guess_px)
+            if result.attitude is not None:
+                return result
+    turned = mirrored(frame)
+    for points in tried:
+        flipped = points.mirrored(is_by_rows(frame))
+        for focal in ranges:
+            found = _solved(turned, flipped, sky, solver, focal, guess_px)
+            if found.attitude is not None:
+                return found
+    return replace(result, remarks=tuple(advice_without_attitude(points)))
+
+
+def _solved(
+    frame: Frame,
+    points: PointSources,
+    sky: BrightStars,
+    solver: BlindSolver,
+    focal: FocalRange,
+    guess_px: float | None,
+) -> PictureResult:
+    """The result of one range of focal lengths; without an attitude it has no remarks."""
+    places = places_of(points)
+    search = solver.solve(places, focal)
+    if search.found is None:
+        return PictureResult(frame, points, None, search, ())
+    found = solver.refined(search.found, places.first(REFINED_POINTS), focal)
+    attitude = _attitude(found, places, points, frame, sky)
+    remarks = remarks_on(attitude.lens, found, points, guess_px, GUESS_SHARE)
+    return PictureResult(frame, points, attitude, search, tuple(remarks))
 
 
 @lru_cache(maxsize=2)

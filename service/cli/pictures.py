@@ -91,7 +91,8 @@ def result_json(result: "PictureResult") -> dict[str, Any]:
         "psf_sigma_px": round(points.psf_sigma_px, 2),
         "noise_counts": round(points.noise_counts, 3),
         "attitude": None,
-        "remarks": list(result.remarks),
+        "orientation": result.frame.orientation,
+        "remarks": [*result.remarks, *result.frame.remarks],
     }
     if found is None:
         return told
@@ -153,6 +154,7 @@ def _summary(file: Path, told: dict[str, Any]) -> str:
             f"  RA {found['ra_deg']:.4f} deg  Dec {found['dec_deg']:+.4f} deg  roll "
             f"{found['roll_deg']:.3f} deg (of the upper edge, from north through east)"
         )
+        lines.append(f"  pixels {told['orientation']}")
         lines.append(
             f"  quaternion {q}  (ICRS to camera, scalar last: x right, y down, z to the sky)"
         )

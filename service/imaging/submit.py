@@ -138,7 +138,8 @@ def submission_of_frame(
             strict=True,
         )
     )
-    record = replace(_record(frame, found, stars, tracker, camera, known, steps), remarks=remarks)
+    record = _record(frame, found, stars, tracker, camera, known, steps)
+    record = replace(record, remarks=[*remarks, *choices_of(frame)])
     submission = submission_from_model(model)
     fingerprint = known.fingerprint(mission.name, digest)
     return Submission(submission.batch, submission.text, fingerprint, record)
@@ -154,10 +155,7 @@ def time_of(known: FrameIn, frame: Frame) -> tuple[str, list[str]]:
     if time is not None:
         return time, []
     if known.aberration != "ignore":
-        message = (
-            "must be given: the file has no time of exposure; it may be absent where aberration "
-            "is ignored"
-        )
+        message = f"must be given: {frame.no_time}; it may be absent where aberration is ignored"
         raise BadBatch(Fault("time", message))
     remark = (
         "time_unknown: the time of arrival stands for that of the exposure; aberration, up to 20 "
@@ -166,11 +164,15 @@ def time_of(known: FrameIn, frame: Frame) -> tuple[str, list[str]]:
     return utc_now().text, [remark]
 
 
+def choices_of(frame: Frame) -> list[str]:
+    """What was chosen of a file, and how its pixels were turned, where they were."""
+    turned = [f"orientation: {frame.orientation}"] if frame.is_turned else []
+    return [*turned, *frame.remarks]
+
+
 def with_exposure(frame: Frame, exposure_s: float) -> Frame:
     """The same frame, exposed for a time that its file does not tell."""
-    return Frame(
-        frame.counts, frame.file_format, frame.digest, frame.full_scale, frame.time, exposure_s
-    )
+    return replace(frame, exposure_s=exposure_s)
 
 
 def batch_of_stars(

@@ -9,10 +9,10 @@ SHORT, LONG = 3, 4
 
 
 def png_of_16_bits(values):
-    """A PNG of values (rows, columns, 3 or 4)."""
+    """A PNG of values (rows, columns, 2 to 4 samples): grey and opacity, or colours."""
     rows, columns, channels = values.shape
     lines = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
-    kind = {3: 2, 4: 6}[channels]
+    kind = {2: 4, 3: 2, 4: 6}[channels]
     return (
         b"\x89PNG\r\n\x1a\n"
         + _chunk(b"IHDR", struct.pack(">LLBBBBB", columns, rows, 16, kind, 0, 0, 0))

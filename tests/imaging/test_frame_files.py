@@ -74,7 +74,7 @@ def test_scales_blanks_and_images_behind_an_empty_unit_are_understood():
         ({"DATE-AVG": "2026-03-01T00:00:00.5"}, "2026-03-01T00:00:00.500Z"),
         ({"DATE-OBS": "2026-03-01T00:00:00", "EXPTIME": 0.5}, "2026-03-01T00:00:00.250Z"),
         ({"DATE-OBS": "2026-03-01T00:00:00"}, None),
-        ({"DATE-AVG": "2026-03-01T00:00:00", "TIMESYS": "TT"}, None),
+        ({"DATE-AVG": "2026-03-01T00:00:00", "TIMESYS": "TT"}, "2026-02-28T23:58:50.816Z"),
         ({"DATE-AVG": "noon"}, None),
     ],
 )

@@ -32,6 +32,7 @@ from service.imaging.frames.frame import Frame
 from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import Vector, attitude_error_arcsec
 
+MIRRORED = "answers to mirrored pictures that do not call them mirrored"
 OFF: tuple[float | None, ...] = (None, 0.0, 0.01, -0.01, 0.02, -0.02, 0.05, -0.05, 0.1, -0.1)
 WIDTH_PX, HEIGHT_PX = 1600, 1200
 COUNTS = (8, 12, 17, 25, 35, 60, 120, 250)
@@ -66,7 +67,8 @@ def measured(count: int, seed: int, folder: Path | None) -> Report:
         outcomes.update(zip(OFF, told, strict=True))
         lost += told[1] == "right" and told.count("right") < len(told)
         lost_told += told[1] == "right" and told[1:].count("right") < len(told) - 1
-        mirrored += solve_picture(_frame(counts[:, ::-1]), sky, solver).attitude is not None
+        result = solve_picture(_frame(counts[:, ::-1]), sky, solver)
+        mirrored += result.attitude is not None and not result.frame.is_mirrored
     figures: dict[str, Any] = {"pictures": len(real) + count}
     for off in OFF:
         label = "not told" if off is None else f"off by {100 * off:+.0f} %" if off else "exact"
@@ -75,9 +77,9 @@ def measured(count: int, seed: int, folder: Path | None) -> Report:
         )
     wrong = sum(number for (_, each), number in outcomes.items() if each == "wrong")
     figures["right with the exact focal length, lost with another or none"] = lost
-    figures["answers to mirrored pictures"] = mirrored
+    figures[MIRRORED] = mirrored
     bounds = [at_most("wrong", wrong, 0), at_most("lost with another", lost_told, 0)]
-    bounds.append(at_most("answers to mirrored pictures", mirrored, 0))
+    bounds.append(at_most(MIRRORED, mirrored, 0))
     rng = np.random.default_rng((seed, 1))
     sets = max(count // 5, 3)
     for draw in SKYLESS:

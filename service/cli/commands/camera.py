@@ -100,6 +100,10 @@ def _solved(
             reason = "; ".join(result.remarks)
             print(f"acquire: {file}: no attitude: {reason}", file=sys.stderr)
             continue
+        if result.frame.is_mirrored:
+            reason = "a mission file describes no mirrored sensor; mirror the pictures first"
+            print(f"acquire: {file}: {result.frame.orientation}: {reason}", file=sys.stderr)
+            continue
         shape = (frame.height_px, frame.width_px)
         used.append(result)
         print(f"{file}: {len(result.attitude.stars)} stars, {result.attitude.rms_px:.2f} px rms")

@@ -6,7 +6,7 @@ place is compared with the noise of its own neighbourhood behind the same filter
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -71,6 +71,14 @@ class PointSources:
     def count(self) -> int:
         """How many candidates there are."""
         return len(self.u_px)
+
+    def mirrored(self, by_rows: bool) -> "PointSources":
+        """The same on the picture with its rows, or else its columns, in reverse order."""
+        if by_rows:
+            v_px = read_only(self.height_px - 1 - self.v_px)
+            return replace(self, v_px=v_px, light=self.light[::-1])
+        u_px = read_only(self.width_px - 1 - self.u_px)
+        return replace(self, u_px=u_px, light=self.light[:, ::-1])
 
 
 def find_points(counts: CountArray, threshold: float = FIRST_THRESHOLD) -> PointSources:

@@ -5,18 +5,18 @@ number in the file.
 """
 
 import io
-import math
 import re
 import struct
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import IO, Any, NamedTuple
 
 from service.imaging.frames.frame import bad_frame
 
 MAX_EXIF_BYTES = 1 << 20
-_TYPE_BYTES = (8, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4)
+_TYPE_BYTES = (8, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 8, 8, 8, 8, 8)
 """By the number of the type, of which 0 is none."""
-_EXIF, _EXPOSURE, _TAKEN, _OFFSET = 0x8769, 33434, 36867, 36881
+_EXIF, _EXPOSURE, _TAKEN, _OFFSET, _FRACTION = 0x8769, 33434, 36867, 36881, 37521
 _LONGEST_EXPOSURE_S = 3600.0
 _TIME = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d):(\d\d):(\d\d)")
 _POINTERS = (_EXIF, 0x8825, 0xA005)
@@ -27,7 +27,7 @@ _BLOCK_BYTES = 1 << 20
 
 
 class Entry(NamedTuple):
-    """One tag of a directory of TIFF, with the four bytes that are its value or its place."""
+    """One tag of a directory of TIFF, with the bytes (4 or 8) that are its value or its place."""
 
     tag: int
     kind: int
@@ -42,27 +42,33 @@ class Entry(NamedTuple):
 
     def whole(self, order: str) -> int:
         """The value of a tag of one whole number."""
-        form = order + ("H2x" if self.kind == 3 else "L")
-        return int(struct.unpack(form, self.value)[0])
+        is_long = len(self.value) == 8 and self.kind not in (3, 4)
+        form = "H" if self.kind == 3 else "Q" if is_long else "L"
+        return int(struct.unpack_from(order + form, self.value)[0])
 
 
-def directory(file: IO[bytes], order: str, at: int) -> list[Entry]:
+def directory(file: IO[bytes], order: str, at: int, big: bool = False) -> list[Entry]:
     """The entries of a directory of TIFF; raises `struct.error` where the file ends before."""
     file.seek(at)
-    (count,) = struct.unpack(order + "H", file.read(2))
-    return [Entry(*struct.unpack(order + "HHL4s", file.read(12))) for _ in range(count)]
+    (count,) = struct.unpack(order + ("Q" if big else "H"), file.read(8 if big else 2))
+    form, size = (order + "HHQ8s", 20) if big else (order + "HHL4s", 12)
+    if count > 65535:
+        raise struct.error("no directory has so many entries")
+    return [Entry(*struct.unpack(form, file.read(size))) for _ in range(count)]
 
 
-def bytes_beyond(file: IO[bytes], order: str, entries: list[Entry], depth: int = 2) -> int:
+def bytes_beyond(
+    file: IO[bytes], order: str, entries: list[Entry], depth: int = 2, big: bool = False
+) -> int:
     """The size of all tags in the directories to which entries lead, and these in turn."""
     total = 0
     # The first of equal tags counts.
     for tag, entry in {entry.tag: entry for entry in reversed(entries)}.items():
         if tag in _POINTERS and entry.number == 1:
             with suppress(struct.error):
-                inside = directory(file, order, entry.whole(order))
+                inside = directory(file, order, entry.whole(order), big)
                 total += sum(each.size_bytes for each in inside)
-                total += bytes_beyond(file, order, inside, depth - 1) if depth > 1 else 0
+                total += bytes_beyond(file, order, inside, depth - 1, big) if depth > 1 else 0
     return total
 
 
@@ -81,38 +87,57 @@ def require_small_exif(file: IO[bytes]) -> None:
     file.seek(0)
 
 
+def exif_of(image: Any) -> Mapping[int, Any]:
+    """The tags of an image's EXIF; none where there are none, or too many."""
+    if not _is_small(image):
+        return {}
+    try:
+        exif: Mapping[int, Any] = image.getexif()
+    except Exception:
+        # Pillow raises many kinds of errors for broken EXIF. The picture is solved without it.
+        return {}
+    return exif
+
+
 def exposure_of(image: Any) -> tuple[str | None, float | None]:
     """The UTC of mid exposure and the exposure in seconds, each None where EXIF does not tell.
 
     A camera's clock without its offset from UTC tells no time.
     """
-    if not _is_small(image):
-        return None, None
     try:
-        exif = image.getexif().get_ifd(_EXIF)
+        exif = exif_of(image).get_ifd(_EXIF)  # type: ignore[attr-defined]
     except Exception:
-        # Pillow raises many kinds of errors for broken EXIF. The picture is solved without it.
         return None, None
+    return told_exposure(*(exif.get(tag) for tag in (_TAKEN, _OFFSET, _FRACTION, _EXPOSURE)))
+
+
+def told_exposure(
+    taken: object, offset: object, fraction: object, exposure: Any
+) -> tuple[str | None, float | None]:
+    """UTC of mid exposure and exposure in seconds from the values of four tags of EXIF."""
     exposure_s = None
     with suppress(TypeError, ValueError, ZeroDivisionError, OverflowError):
-        value = float(exif[_EXPOSURE]) if _EXPOSURE in exif else math.nan
+        pair = exposure if isinstance(exposure, tuple) else (exposure, 1)
+        value = float(pair[0]) / float(pair[1])
         exposure_s = value if 0.0 < value <= _LONGEST_EXPOSURE_S else None
-    return _utc(exif.get(_TAKEN), exif.get(_OFFSET), exposure_s or 0.0), exposure_s
+    return _utc(taken, offset, fraction, exposure_s), exposure_s
 
 
-def _utc(taken: object, offset: object, exposure_s: float) -> str | None:
+def _utc(taken: object, offset: object, fraction: object, exposure_s: float | None) -> str | None:
     from datetime import UTC, datetime, timedelta, timezone
 
     found = _TIME.match(taken) if isinstance(taken, str) else None
     zone = re.match(r"([+-])(\d\d):(\d\d)", offset) if isinstance(offset, str) else None
     if found is None or zone is None:
         return None
+    digits = re.match(r"\d{1,9}", fraction) if isinstance(fraction, str) else None
+    seconds = float(f"0.{digits[0]}") if digits else 0.0
     try:
         minutes = (60 * int(zone[2]) + int(zone[3])) * (-1 if zone[1] == "-" else 1)
         year, month, day, hour, minute, second = map(int, found.groups())
         offset_utc = timezone(timedelta(minutes=minutes))
         local = datetime(year, month, day, hour, minute, second, tzinfo=offset_utc)
-        middle = local.astimezone(UTC) + timedelta(seconds=0.5 * exposure_s)
+        middle = local.astimezone(UTC) + timedelta(seconds=seconds + 0.5 * (exposure_s or 0.0))
     except (ValueError, OverflowError):
         return None
     return middle.strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"

@@ -35,8 +35,6 @@ def read_frame(file: IO[bytes], limits: FrameLimits, digest: str | None = None) 
         if start.startswith(magics):
             file.seek(0)
             return reader(file, limits, digest)
-    if start.startswith((b"II+\0", b"MM\0+")):
-        raise bad_frame("is a BigTIFF file; a frame fits an ordinary one")
     raise bad_frame(f"is not {FORMATS}", f"its first bytes are {start[:8].hex(' ')}")
 
 
@@ -50,6 +48,12 @@ def _fits(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
     from service.imaging.frames.fits import read_fits
 
     return read_fits(file, limits, digest)
+
+
+def _tiff(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
+    from service.imaging.frames.tiff import read_tiff
+
+    return read_tiff(file, limits, digest)
 
 
 def _pictures(file_format: str) -> Reader:
@@ -69,9 +73,10 @@ def _npy(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
 
 _READERS: Mapping[tuple[bytes, ...], Reader] = {
     (b"SIMPLE  =",): _fits,
-    (b"II*\0", b"MM\0*"): _pictures("TIFF"),
+    (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"): _tiff,
     (b"\x89PNG\r\n\x1a\n",): _pictures("PNG"),
     (b"\xff\xd8\xff",): _pictures("JPEG"),
     (b"BM",): _pictures("BMP"),
+    (b"P2", b"P3", b"P5", b"P6"): _pictures("PGM"),
     (b"\x93NUMPY",): _npy,
 }

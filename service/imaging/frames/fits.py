@@ -1,42 +1,51 @@
-"""Frames from FITS files (FITS Standard 4.0), and to them: images, without tile compression.
+"""Frames from FITS files (FITS Standard 4.0), and to them.
 
-The first header unit that holds an image of two dimensions is taken.
+The first image of a file is taken, of three planes their sum, unless another is chosen.
 """
 
-import os
-from dataclasses import dataclass
-from typing import IO
+from collections.abc import Sequence
+from importlib.util import find_spec
+from typing import IO, Any
 
 import numpy as np
 
-from service.errors import BadInput
+from service.errors import BadFile
 from service.imaging.frames.arrays import as_counts, exactly
-from service.imaging.frames.frame import CountArray, Frame, FrameLimits, bad_frame
-from service.times import parse_utc, shifted
+from service.imaging.frames.fits_header import BLOCK, CARD, TYPES, Header, Unit, units_of
+from service.imaging.frames.fits_time import time_of_header
+from service.imaging.frames.frame import AS_STORED, CountArray, Frame, FrameLimits, bad_frame
 
-BLOCK, CARD = 2880, 80
-MAX_HEADER_BLOCKS = 64
-MAX_UNITS = 16
-
-TYPES = {8: ">u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
-
-Value = bool | int | float | str | None
+ABSENT = (
+    "is compressed by tiles, which needs the package astropy: install the extra `images` "
+    "(pip install '.[images]'), or unpack the file with funpack"
+)
+COLOURS = 3
+MAX_NAMED = 8
 
 
 def read_fits(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
     """The frame in a FITS file; raises `BadFile` with what is wrong with it."""
-    end = file.seek(0, os.SEEK_END)
-    file.seek(0)
-    for _ in range(MAX_UNITS):
-        if file.tell() >= end:
-            break
-        unit = _Unit(_read_header(file))
-        if unit.is_compressed:
-            raise bad_frame("is compressed by tiles; send the plain image", "ZIMAGE = T")
-        if unit.is_image:
-            return _image(file, unit, limits, digest)
-        file.seek(file.tell() + -(-unit.data_bytes // BLOCK) * BLOCK)
-    raise bad_frame("holds no image of two dimensions")
+    images, primary = _images(file)
+    unit, plane, remarks = _chosen(images, limits.image)
+    header = unit.header
+    planes, interleaved = _planes(header, plane)
+    width_px, height_px = header.image_axes[1:3] if interleaved else header.image_axes[:2]
+    limits.require(width_px, height_px)
+    reader = _Compressed(file, unit) if header.is_compressed else _Plain(file, unit)
+    counts = reader.interleaved() if interleaved else reader.plane(planes[0])
+    for number in [] if interleaved else planes[1:]:
+        counts = counts + reader.plane(number)
+    full_scale = _full_scale(header) * len(planes)
+    if len(planes) > 1:
+        remarks = (*remarks, "image: its three planes were summed as colours")
+    told = time_of_header(header, primary)
+    counts, orientation = _as_shown(counts, header.behind(primary))
+    return Frame(
+        *(counts, "FITS", digest, full_scale, told.time, told.exposure_s),
+        no_time=f"the file has no time of exposure: {told.reason}",
+        orientation=orientation,
+        remarks=remarks,
+    )
 
 
 def write_fits(
@@ -55,157 +64,173 @@ def write_fits(
     file.write(data.ljust(-(-len(data) // BLOCK) * BLOCK, b"\0"))
 
 
-@dataclass(frozen=True)
-class _Unit:
-    """One header of a file, by keyword."""
-
-    cards: dict[str, Value]
-
-    def whole(self, key: str, default: int | None = None, least: int = 0) -> int:
-        """A whole number of the header; raises `BadFile` for anything else."""
-        value = self.cards.get(key, default)
-        if not isinstance(value, int) or isinstance(value, bool) or not least <= value < 1 << 40:
-            raise bad_frame(f"has a FITS header with an impossible {key}", str(value)[:40])
-        return value
-
-    def number(self, key: str, default: float) -> float:
-        """A finite number of the header."""
-        value = self.cards.get(key, default)
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise bad_frame(f"has a FITS header with an impossible {key}", str(value)[:40])
-        if not abs(value) < 1e30:
-            raise bad_frame(f"has a FITS header with an impossible {key}", str(value)[:40])
-        return float(value)
-
-    @property
-    def axes(self) -> list[int]:
-        """The lengths of its axes, the fastest first."""
-        count = self.whole("NAXIS")
-        if count > 999:
-            raise bad_frame("has a FITS header with an impossible NAXIS", str(count))
-        return [self.whole(f"NAXIS{k + 1}") for k in range(count)]
-
-    @property
-    def bitpix(self) -> int:
-        """Bits of a number, negative for floating ones."""
-        value = self.whole("BITPIX", least=-64)
-        if value not in TYPES:
-            known = ", ".join(str(each) for each in TYPES)
-            raise bad_frame(f"has a FITS header whose BITPIX is none of {known}", str(value))
-        return value
-
-    @property
-    def is_image(self) -> bool:
-        """Whether it has two dimensions, further ones of length one aside."""
-        kind = self.cards.get("XTENSION", "IMAGE")
-        axes = self.axes
-        return kind == "IMAGE" and len(axes) >= 2 and all(length == 1 for length in axes[2:])
-
-    @property
-    def is_compressed(self) -> bool:
-        """Whether it is a table that holds an image in compressed tiles."""
-        return self.cards.get("ZIMAGE") is True
-
-    @property
-    def data_bytes(self) -> int:
-        """The length of its data (4.4.1.1)."""
-        axes = self.axes
-        if not axes:
-            return 0
-        numbers = 1
-        for length in axes:
-            # A product of absurd lengths need not be exact to be beyond the file.
-            numbers = min(numbers * length, 1 << 60)
-        numbers = self.whole("GCOUNT", 1) * (self.whole("PCOUNT", 0) + numbers)
-        return min(abs(self.bitpix) // 8 * numbers, 1 << 62)
+def _images(file: IO[bytes]) -> tuple[list[Unit], Header]:
+    """The units that hold images, and the primary header; raises `BadFile` where there is none."""
+    images: list[Unit] = []
+    primary: Header | None = None
+    try:
+        for unit in units_of(file):
+            primary = primary or unit.header
+            if unit.header.is_image:
+                images.append(unit)
+    except BadFile:
+        # What stands behind an image may be broken.
+        if not images:
+            raise
+    if not images or primary is None:
+        raise bad_frame("holds no image of two dimensions")
+    return images, primary
 
 
-def _image(file: IO[bytes], unit: _Unit, limits: FrameLimits, digest: str) -> Frame:
-    width_px, height_px = unit.axes[:2]
-    limits.require(width_px, height_px)
-    kind = np.dtype(TYPES[unit.bitpix])
-    zero, scale = unit.number("BZERO", 0.0), unit.number("BSCALE", 1.0)
+def _chosen(images: Sequence[Unit], choice: str | None) -> tuple[Unit, int | None, tuple[str, ...]]:
+    """The unit that was chosen, its plane if one was, and remarks where there are others."""
+    named = ", ".join(f"{each.number} {each.header.name}".strip() for each in images[:MAX_NAMED])
+    if choice is None:
+        if len(images) == 1:
+            return images[0], None, ()
+        taken = f"{images[0].number} {images[0].header.name}".strip()
+        return images[0], None, (f"image: {taken} was taken, the first of {named}",)
+    name, _, plane = choice.strip().partition(":")
+    if plane and not plane.isdecimal():
+        raise bad_frame("has planes that are chosen by number, from 1", choice[:40])
+    number = int(plane) if plane else None
+    for each in images:
+        is_number = name.isdecimal() and int(name) == each.number
+        if is_number or (name and name.upper() == each.header.name) or not name:
+            return each, number, (f"image: {choice[:40]} was chosen",)
+    raise bad_frame(f"holds the images {named}; choose one of them", choice[:40])
+
+
+def _planes(header: Header, plane: int | None) -> tuple[list[int], bool]:
+    """The planes of a unit to sum, from 0, and whether its colours stand pixel by pixel."""
+    axes = header.image_axes
+    count = 1
+    for length in axes[2:]:
+        count = min(count * length, 1 << 60)
+    if plane is not None:
+        if not 1 <= plane <= count:
+            raise bad_frame(f"has the planes 1 to {count}", str(plane)[:40])
+        return [plane - 1], False
+    if count == 1:
+        return [0], False
+    if len(axes) == 3 and axes[2] == COLOURS:
+        return list(range(COLOURS)), False
+    if len(axes) == 3 and axes[0] == COLOURS:
+        return list(range(COLOURS)), True
+    message = f"holds a cube of {count} planes; choose one, the first as image `:1`"
+    raise bad_frame(message, " x ".join(str(length) for length in axes[:6]))
+
+
+def _scaling(header: Header) -> tuple[float, float]:
+    scale = header.number("BSCALE", 1.0)
     if scale == 0.0:
         raise bad_frame("has a FITS header with an impossible BSCALE", "0")
-    data = exactly(file, width_px * height_px * kind.itemsize)
-    stored = np.frombuffer(data, kind).reshape(height_px, width_px)
-    counts = as_counts(stored)
-    if (scale, zero) != (1.0, 0.0):
-        counts = (counts * scale + zero).astype(counts.dtype, copy=False)
-    full_scale = np.inf
-    if kind.kind in "iu":
-        full_scale = max(float(np.iinfo(kind).max) * scale, float(np.iinfo(kind).min) * scale)
-        full_scale += zero
-        if "BLANK" in unit.cards:
-            counts[stored == unit.whole("BLANK", least=-(1 << 40))] = np.nan
-    time, exposure_s = _when(unit)
-    return Frame(counts, "FITS", digest, full_scale, time, exposure_s)
+    return scale, header.number("BZERO", 0.0)
 
 
-def _when(unit: _Unit) -> tuple[str | None, float | None]:
-    """Mid exposure in UTC and the exposure in seconds, each None where the header does not tell."""
-    exposure = unit.cards.get("XPOSURE", unit.cards.get("EXPTIME"))
-    exposure_s = None
-    if isinstance(exposure, (int, float)) and 0.0 < exposure <= 3600.0:
-        exposure_s = float(exposure)
-    if str(unit.cards.get("TIMESYS", "UTC")).strip().upper() != "UTC":
-        return None, exposure_s
-    try:
-        if isinstance(average := unit.cards.get("DATE-AVG"), str):
-            return parse_utc(_zulu(average)).text, exposure_s
-        if isinstance(start := unit.cards.get("DATE-OBS"), str) and exposure_s is not None:
-            return shifted(parse_utc(_zulu(start)), exposure_s / 2.0).text, exposure_s
-    except BadInput:
-        # What cannot be read is not there: the client is then asked for the time.
-        pass
-    return None, exposure_s
+class _Plain:
+    """The numbers of a unit that is not compressed."""
+
+    def __init__(self, file: IO[bytes], unit: Unit) -> None:
+        self._file, self._unit = file, unit
+        self._kind = np.dtype(TYPES[unit.header.bitpix])
+        self._scaling = _scaling(unit.header)
+
+    def plane(self, number: int) -> CountArray:
+        """One plane (rows, columns), from 0."""
+        width, height = self._unit.header.image_axes[:2]
+        return self._counts(self._read(number * width * height, width * height), (height, width))
+
+    def interleaved(self) -> CountArray:
+        """The sums of the colours of each pixel (rows, columns)."""
+        colours, width, height = self._unit.header.image_axes
+        stored = self._read(0, colours * width * height)
+        return np.asarray(self._counts(stored, (height, width, colours)).sum(axis=2))
+
+    def _read(self, first: int, count: int) -> Any:
+        self._file.seek(self._unit.start + first * self._kind.itemsize)
+        return np.frombuffer(exactly(self._file, count * self._kind.itemsize), self._kind)
+
+    def _counts(self, stored: Any, shape: tuple[int, ...]) -> CountArray:
+        scale, zero = self._scaling
+        header = self._unit.header
+        counts = as_counts(stored)
+        if (scale, zero) != (1.0, 0.0):
+            counts = (counts * scale + zero).astype(counts.dtype, copy=False)
+        if self._kind.kind in "iu" and "BLANK" in header.cards:
+            counts[stored == header.whole("BLANK", least=-(1 << 40))] = np.nan
+        return counts.reshape(shape)
 
 
-def _zulu(text: str) -> str:
-    text = text.strip()
-    return text if text.endswith("Z") else text + "Z"
+class _Compressed:
+    """The numbers of an image that is compressed by tiles, through astropy."""
+
+    def __init__(self, file: IO[bytes], unit: Unit) -> None:
+        if find_spec("astropy") is None:
+            raise bad_frame(ABSENT)
+        self._file, self._unit = file, unit
+        header = unit.header
+        exactly_there(file, unit)
+        axes = header.image_axes
+        tile = 1
+        for k, length in enumerate(header.image_axes):
+            side = header.whole(f"ZTILE{k + 1}", length if k == 0 else 1)
+            tile *= min(side, length) if side else length
+        pixels = axes[0] * axes[1] * min(axes[2] if len(axes) > 2 else 1, COLOURS)
+        if tile > pixels:
+            raise bad_frame("has compressed tiles of more pixels than a picture", str(tile)[:40])
+
+    def plane(self, number: int) -> CountArray:
+        """One plane (rows, columns), from 0."""
+        return self._section(number)
+
+    def interleaved(self) -> CountArray:
+        """The sums of the colours of each pixel (rows, columns)."""
+        return np.asarray(self._section(None).sum(axis=2))
+
+    def _section(self, number: int | None) -> CountArray:
+        from astropy.io import fits
+
+        axes = self._unit.header.image_axes
+        self._file.seek(0)
+        try:
+            with fits.open(self._file, memmap=False, lazy_load_hdus=True) as opened:
+                section = opened[self._unit.number].section
+                shape = tuple(reversed(axes[2:]))
+                place = () if number is None else np.unravel_index(number, shape) if shape else ()
+                extra = len(section.shape) - len(axes)
+                values = section[(0,) * extra + tuple(int(each) for each in place)]
+        except Exception as error:
+            # A decoder that stumbles over what it reads does so in many ways.
+            reason = str(error)[:200] or type(error).__name__
+            raise bad_frame(f"cannot be read as compressed FITS: {reason}") from None
+        return as_counts(np.asarray(values))
 
 
-def _read_header(file: IO[bytes]) -> dict[str, Value]:
-    """The cards of one header; the first of equal keywords counts."""
-    cards: dict[str, Value] = {}
-    for _ in range(MAX_HEADER_BLOCKS):
-        block = file.read(BLOCK)
-        if len(block) < BLOCK:
-            raise bad_frame("is cut off in its FITS header")
-        for at in range(0, BLOCK, CARD):
-            card = block[at : at + CARD].decode("latin-1")
-            key = card[:8].rstrip()
-            if key == "END":
-                return cards
-            if card[8:10] == "= ":
-                cards.setdefault(key, _value(card[10:]))
-    raise bad_frame(f"has a FITS header without END in its first {MAX_HEADER_BLOCKS} blocks")
+def exactly_there(file: IO[bytes], unit: Unit) -> None:
+    """Raise `BadFile` where a file ends before the data of a unit do."""
+    left = file.seek(0, 2) - unit.start
+    if unit.header.data_bytes > left:
+        declared = f"{max(left, 0)} bytes of data where {unit.header.data_bytes} are declared"
+        raise bad_frame("is cut off", declared)
 
 
-def _value(text: str) -> Value:
-    """The value of a card; None for what is no value."""
-    text = text.strip()
-    if text.startswith("'"):
-        inner, at = "", 1
-        while at < len(text):
-            if text[at] == "'":
-                if text[at + 1 : at + 2] != "'":
-                    break
-                at += 1
-            inner, at = inner + text[at], at + 1
-        return inner.rstrip()
-    word = text.partition("/")[0].strip()
-    if word in ("T", "F"):
-        return word == "T"
-    try:
-        return int(word)
-    except ValueError:
-        pass
-    try:
-        return float(word.replace("D", "E"))
-    except ValueError:
-        return None
+def _full_scale(header: Header) -> float:
+    """The largest count of a plane, infinite for floating numbers."""
+    kind = np.dtype(TYPES[header.bitpix])
+    if kind.kind not in "iu":
+        return float(np.inf)
+    scale, zero = _scaling(header)
+    return max(float(np.iinfo(kind).max) * scale, float(np.iinfo(kind).min) * scale) + zero
+
+
+def _as_shown(counts: CountArray, header: Header) -> tuple[CountArray, str]:
+    """The rows from the top down, by ROWORDER, and what was done."""
+    order = str(header.cards.get("ROWORDER") or "").strip().upper().replace("_", "-")
+    if order != "BOTTOM-UP":
+        return counts, AS_STORED
+    how = "as shown: rows in reverse order (ROWORDER = 'BOTTOM-UP')"
+    return np.ascontiguousarray(counts[::-1]), how
 
 
 def _card(key: str, value: bool | int | float | str) -> str:

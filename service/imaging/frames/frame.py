@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from service.errors import BadFile, Fault
 
+AS_STORED = "as stored"
 CountArray = npt.NDArray[Any]
 """(rows, columns), float32 or float64; NaN where a pixel holds no number."""
 
@@ -24,7 +25,9 @@ class Frame:
 
     `full_scale` is the largest count that the file's numbers can hold, infinite for
     floating ones.  `time` is the UTC of mid exposure as text and `exposure_s` the
-    exposure, each None where the file does not tell.
+    exposure, each None where the file does not tell; `no_time` is then the reason.
+    `orientation` is how the counts were turned from the order in which the file stores
+    them, and `remarks` name what else was chosen.
     """
 
     counts: CountArray
@@ -33,6 +36,16 @@ class Frame:
     full_scale: float = math.inf
     time: str | None = None
     exposure_s: float | None = None
+    no_time: str = "the file has no time of exposure"
+    orientation: str = AS_STORED
+    is_mirrored: bool = False
+    """True if the sky fits only the mirror image, which the counts then are."""
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def is_turned(self) -> bool:
+        """True if the counts are in another order than in the file."""
+        return self.orientation != AS_STORED
 
     @property
     def width_px(self) -> int:
@@ -52,6 +65,8 @@ class FrameLimits:
     max_pixels: int
     shape: tuple[int, int] | None = None
     whose: str = "the tracker"
+    image: str | None = None
+    """Which image of a file with several: `NAME`, `NUMBER`, or either with `:PLANE` of a cube."""
 
     def require(self, width_px: int, height_px: int) -> None:
         """Raise `BadFile` for a size that is not to be decoded; asked before anything is."""
@@ -61,8 +76,18 @@ class FrameLimits:
         if self.shape is not None and (height_px, width_px) != self.shape:
             rows, columns = self.shape
             raise bad_frame(f"must have the {columns} x {rows} px of {self.whose}", size)
+        self.require_pixels(width_px, height_px)
+
+    def require_pixels(self, width_px: int, height_px: int) -> None:
+        """Raise `BadFile` for more pixels than are allowed, whatever the sides."""
         if width_px * height_px > self.max_pixels:
+            size = f"{width_px} x {height_px} px"
             raise bad_frame(f"may have at most {self.max_pixels:,} pixels", size)
+
+    def require_either_way(self, width_px: int, height_px: int) -> None:
+        """Raise `BadFile` for a size that does not fit, even turned by a quarter."""
+        is_turned = self.shape == (width_px, height_px)
+        self.require(*((height_px, width_px) if is_turned else (width_px, height_px)))
 
 
 def bad_frame(message: str, value: str | None = None) -> BadFile:

@@ -1,36 +1,27 @@
-"""Frames from TIFF, PNG, JPEG and BMP files: grey of up to 32 bits, or colours of up to 16."""
+"""Frames from PNG, JPEG, BMP and PGM files: grey or colours of up to 16 bits."""
 
-import math
-import os
-import struct
 from typing import IO, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from service.errors import BadFile
-from service.imaging.frames.arrays import as_counts, full_scale_of
-from service.imaging.frames.deep_color import deep_light, is_deep
-from service.imaging.frames.exif import (
-    MAX_EXIF_BYTES,
-    bytes_beyond,
-    directory,
-    exposure_of,
-    require_small_exif,
+from service.imaging.frames.arrays import as_counts, exactly, full_scale_of
+from service.imaging.frames.deep_color import (
+    deep_grey,
+    deep_light,
+    is_deep,
+    is_deep_grey,
 )
+from service.imaging.frames.exif import exif_of, exposure_of, require_small_exif
 from service.imaging.frames.frame import Frame, FrameLimits, bad_frame
+from service.imaging.frames.orientation import TAG, as_shown
 
-GREY = ("L", "I;16", "I;16B", "I;16L", "I", "F")
+GREY = ("L", "I;16", "I;16B", "I;16L", "F")
 """Pillow's words for one channel of light."""
+_PILLOW_NAMES = {"PGM": "PPM"}
 COLORS = ("RGB", "RGBA", "RGBX", "LA", "P", "PA", "CMYK", "YCbCr")
 """Modes that are turned into red, green and blue; how opaque a pixel is is not looked at."""
-
-SEVERAL = "holds several images; send them one by one"
-
-MAX_TAGS = 256
-MAX_TAG_BYTES = 1 << 20
-MAX_TILE_PIXELS = 1 << 22
-_TILE_WIDTH, _TILE_LENGTH = 322, 323
 
 
 def read_picture(file: IO[bytes], file_format: str, limits: FrameLimits, digest: str) -> Frame:
@@ -38,75 +29,82 @@ def read_picture(file: IO[bytes], file_format: str, limits: FrameLimits, digest:
 
     Of a colour picture the counts are the sums of red, green and blue.
     """
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
-    if file_format == "TIFF":
-        _require_small_tags(file)
-    elif file_format == "JPEG":
+    if limits.image not in (None, "1"):
+        raise bad_frame("holds one image; there is none to choose", limits.image)
+    if file_format == "JPEG":
         require_small_exif(file)
     try:
-        with Image.open(file, formats=(file_format,)) as image:
-            limits.require(*image.size)
-            if file_format != "JPEG" and getattr(image, "n_frames", 1) > 1:
-                raise bad_frame(SEVERAL)
+        with Image.open(file, formats=(_PILLOW_NAMES.get(file_format, file_format),)) as image:
+            limits.require_either_way(*image.size)
+            if file_format == "PNG" and getattr(image, "is_animated", False):
+                raise bad_frame("is a moving picture; send one picture of it")
             # To look for EXIF may decode the picture, and takes the word of its depth away.
-            deep = is_deep(image)
-            told = exposure_of(image)
+            deep, grey, plain = is_deep(image), is_deep_grey(image), _is_plain(image)
+            tag = exif_of(image).get(TAG)
+            time, exposure_s = exposure_of(image)
+            values: npt.NDArray[Any]
             if deep:
                 values, full_scale = deep_light(image, file, file_format), 3.0 * 65535.0
+            elif grey:
+                values, full_scale = deep_grey(file, file_format), 65535.0
+            elif plain:
+                values, full_scale = _plain_light(image, file)
             else:
                 values, full_scale = _light(image)
     except BadFile:
         raise
+    except UnidentifiedImageError:
+        raise bad_frame(f"cannot be read as {file_format}: its header has no known form") from None
     except Exception as error:
         # A decoder that stumbles over what it reads does so in many ways.
         reason = str(error)[:200] or type(error).__name__
         raise bad_frame(f"cannot be read as {file_format}: {reason}") from None
-    return Frame(as_counts(values), file_format, digest, full_scale, *told)
+    counts, orientation = as_shown(as_counts(values), tag)
+    limits.require(counts.shape[1], counts.shape[0])
+    return Frame(counts, file_format, digest, full_scale, time, exposure_s, orientation=orientation)
+
+
+def _is_plain(image: Any) -> bool:
+    """True if an image is a binary PGM or PPM, which Pillow would scale to its own depths.
+
+    Raises `BadFile` for colours in text with more than 8 bits, of which Pillow keeps 8.
+    """
+    if image.format != "PPM" or not image.tile:
+        return False
+    decoder, _, _, arguments = image.tile[0]
+    if decoder == "ppm_plain" and image.mode == "RGB" and arguments[-1] > 255:
+        raise bad_frame("is a colour PPM in text of more than 8 bits; save it binary (P6)")
+    return decoder in ("raw", "ppm")
+
+
+def _plain_light(image: Any, file: IO[bytes]) -> tuple[npt.NDArray[Any], float]:
+    """The sums of the colours of a binary PGM or PPM, and the largest that there can be."""
+    _, _, at, arguments = image.tile[0]
+    is_tuple = isinstance(arguments, tuple)
+    mode, largest = (arguments[0], arguments[1]) if is_tuple else (arguments, 255)
+    if mode == "I;16B":
+        mode, largest = "L", 65535
+    if mode not in ("L", "RGB"):
+        raise bad_frame("is a portable map of a kind that is not read", str(mode)[:20])
+    colours, kind = (3 if mode == "RGB" else 1), np.dtype(">u2" if largest > 255 else "u1")
+    file.seek(at)
+    data = exactly(file, image.width * image.height * colours * kind.itemsize)
+    values = np.frombuffer(data, kind).reshape(image.height, image.width, colours)
+    return values.sum(axis=2, dtype=np.uint32), float(colours * largest)
 
 
 def _light(image: Any) -> tuple[npt.NDArray[Any], float]:
     """The counts of an image and the largest that there can be."""
     if image.mode in GREY:
         values = np.asarray(image)
-        # Pillow has one kind of integer beyond 16 bits; how full it can be is not known.
-        return values, math.inf if image.mode == "I" else full_scale_of(values.dtype)
+        return values, full_scale_of(values.dtype)
+    if image.mode == "I":
+        # A PGM in text, of more than 8 bits: Pillow scales it to 16.
+        return np.asarray(image), 65535.0
     if image.mode not in COLORS:
         raise bad_frame("must be grey or in colour, not of a bit a pixel", image.mode)
     channels = np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
     # Three bytes a pixel, summed into two.
     return channels.sum(axis=2, dtype=np.uint16), 3.0 * 255.0
-
-
-def _require_small_tags(file: IO[bytes]) -> None:
-    """Raise `BadFile` for a TIFF whose tags alone, or one tile, would take much memory.
-
-    Pillow reads every tag whole before anything can be asked of it; many tags may
-    point to the same bytes of a file.
-    """
-    start = file.read(8)
-    end = file.seek(0, os.SEEK_END)
-    order = "<" if start[:2] == b"II" else ">"
-    try:
-        (at,) = struct.unpack(order + "4xL", start)
-        entries = directory(file, order, at)
-        if len(entries) > MAX_TAGS:
-            raise bad_frame(f"has more than {MAX_TAGS} tags", str(len(entries)))
-        (following,) = struct.unpack(order + "L", file.read(4))
-        told_bytes = bytes_beyond(file, order, entries)
-    except struct.error:
-        raise bad_frame(f"is cut off: its TIFF directory lies beyond its {end} bytes") from None
-    if following:
-        raise bad_frame(SEVERAL)
-    if told_bytes > MAX_EXIF_BYTES:
-        raise bad_frame(f"has more than {MAX_EXIF_BYTES} bytes of EXIF", str(told_bytes))
-    tile = 1
-    for entry in entries:
-        if entry.size_bytes > MAX_TAG_BYTES:
-            message = f"has a TIFF tag of more than {MAX_TAG_BYTES} bytes"
-            raise bad_frame(message, f"tag {entry.tag}")
-        if entry.tag in (_TILE_WIDTH, _TILE_LENGTH):
-            tile *= entry.whole(order)
-    if tile > MAX_TILE_PIXELS:
-        raise bad_frame(f"has tiles of more than {MAX_TILE_PIXELS} pixels", str(tile))
-    file.seek(0)

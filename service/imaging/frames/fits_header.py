@@ -1,0 +1,173 @@
+"""Headers of FITS files (FITS Standard 4.0): their cards, and the images that they describe."""
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import IO
+
+from service.imaging.frames.frame import bad_frame
+
+BLOCK, CARD = 2880, 80
+MAX_HEADER_BLOCKS = 256
+MAX_UNITS = 256
+
+TYPES = {8: ">u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
+
+Value = bool | int | float | str | None
+
+
+@dataclass(frozen=True)
+class Header:
+    """The cards of one header, by keyword: values, and comments that are not empty."""
+
+    cards: dict[str, Value]
+    comments: dict[str, str] = field(default_factory=dict)
+
+    def whole(self, key: str, default: int | None = None, least: int = 0) -> int:
+        """A whole number of the header; raises `BadFile` for anything else."""
+        value = self.cards.get(key, default)
+        if not isinstance(value, int) or isinstance(value, bool) or not least <= value < 1 << 40:
+            raise bad_frame(f"has a FITS header with an impossible {key}", str(value)[:40])
+        return value
+
+    def number(self, key: str, default: float) -> float:
+        """A finite number of the header."""
+        value = self.cards.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise bad_frame(f"has a FITS header with an impossible {key}", str(value)[:40])
+        if not abs(value) < 1e30:
+            raise bad_frame(f"has a FITS header with an impossible {key}", str(value)[:40])
+        return float(value)
+
+    def behind(self, primary: "Header") -> "Header":
+        """The header with what it does not say itself from the primary one."""
+        return Header(primary.cards | self.cards, primary.comments | self.comments)
+
+    @property
+    def is_compressed(self) -> bool:
+        """True for a table that holds an image in compressed tiles."""
+        return self.cards.get("ZIMAGE") is True
+
+    @property
+    def axes(self) -> list[int]:
+        """The lengths of its axes, the fastest first."""
+        return self._axes("NAXIS")
+
+    @property
+    def image_axes(self) -> list[int]:
+        """The lengths of the axes of its image, without those of length one at the end."""
+        axes = self._axes("ZNAXIS" if self.is_compressed else "NAXIS")
+        while len(axes) > 2 and axes[-1] == 1:
+            axes.pop()
+        return axes
+
+    def _axes(self, key: str) -> list[int]:
+        count = self.whole(key)
+        if count > 999:
+            raise bad_frame(f"has a FITS header with an impossible {key}", str(count))
+        return [self.whole(f"{key}{k + 1}") for k in range(count)]
+
+    @property
+    def bitpix(self) -> int:
+        """Bits of a number of the image, negative for floating ones."""
+        value = self.whole("ZBITPIX" if self.is_compressed else "BITPIX", least=-64)
+        if value not in TYPES:
+            known = ", ".join(str(each) for each in TYPES)
+            raise bad_frame(f"has a FITS header whose BITPIX is none of {known}", str(value))
+        return value
+
+    @property
+    def is_image(self) -> bool:
+        """True for an image of two dimensions or more, compressed or not."""
+        kind = self.cards.get("XTENSION", "IMAGE")
+        if not self.is_compressed and (kind != "IMAGE" or self.cards.get("GROUPS") is True):
+            return False
+        return len(self.image_axes) >= 2 and 0 not in self.image_axes
+
+    @property
+    def name(self) -> str:
+        """The name of the unit, in capitals; empty without one."""
+        return str(self.cards.get("EXTNAME") or "").strip().upper()
+
+    @property
+    def data_bytes(self) -> int:
+        """The length of its data (4.4.1.1)."""
+        axes = self.axes
+        if not axes:
+            return 0
+        numbers = 1
+        for length in axes:
+            # A product of absurd lengths need not be exact to be beyond the file.
+            numbers = min(numbers * length, 1 << 60)
+        numbers = self.whole("GCOUNT", 1) * (self.whole("PCOUNT", 0) + numbers)
+        bits = self.whole("BITPIX", least=-64)
+        return min(abs(bits) // 8 * numbers, 1 << 62)
+
+
+@dataclass(frozen=True)
+class Unit:
+    """One header and data unit of a file: its number from 0, its header, where its data begin."""
+
+    number: int
+    header: Header
+    start: int
+
+
+def units_of(file: IO[bytes]) -> Iterator[Unit]:
+    """The units of a file one after another; raises `BadFile` for a broken header."""
+    end = file.seek(0, os.SEEK_END)
+    at = 0
+    for number in range(MAX_UNITS):
+        file.seek(at)
+        # What follows the last unit is none (3.5).
+        if at >= end or (number and file.read(8) != b"XTENSION"):
+            return
+        file.seek(at)
+        header = read_header(file)
+        unit = Unit(number, header, file.tell())
+        yield unit
+        at = unit.start + -(-header.data_bytes // BLOCK) * BLOCK
+
+
+def read_header(file: IO[bytes]) -> Header:
+    """The header that begins here; the first of equal keywords counts."""
+    header = Header({})
+    for _ in range(MAX_HEADER_BLOCKS):
+        block = file.read(BLOCK)
+        if len(block) < BLOCK:
+            raise bad_frame("is cut off in its FITS header")
+        for at in range(0, BLOCK, CARD):
+            card = block[at : at + CARD].decode("latin-1")
+            key = card[:8].rstrip()
+            if key == "END":
+                return header
+            if card[8:10] == "= " and key not in header.cards:
+                header.cards[key], comment = _value(card[10:])
+                if comment:
+                    header.comments[key] = comment
+    raise bad_frame(f"has a FITS header without END in its first {MAX_HEADER_BLOCKS} blocks")
+
+
+def _value(text: str) -> tuple[Value, str]:
+    """The value of a card, None for what is no value, and its comment."""
+    text = text.strip()
+    if text.startswith("'"):
+        inner, at = "", 1
+        while at < len(text):
+            if text[at] == "'":
+                if text[at + 1 : at + 2] != "'":
+                    break
+                at += 1
+            inner, at = inner + text[at], at + 1
+        return inner.rstrip(), text[at + 1 :].partition("/")[2].strip()
+    word, _, comment = (part.strip() for part in text.partition("/"))
+    if word in ("T", "F"):
+        return word == "T", comment
+    try:
+        return int(word), comment
+    except ValueError:
+        pass
+    try:
+        return float(word.upper().replace("D", "E")), comment
+    except ValueError:
+        return None, comment

@@ -1,0 +1,308 @@
+"""Frames from TIFF and BigTIFF files: grey or colour, of any layout of samples, strips and tiles.
+
+tifffile reads the tags and puts strips and tiles in their places.  libtiff, in Pillow, unpacks
+them: it writes no more bytes than asked for, whatever a file holds.
+"""
+
+import io
+import logging
+import math
+import os
+import struct
+from collections.abc import Iterator
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from service.errors import BadFile
+from service.imaging.frames.arrays import as_counts, full_scale_of
+from service.imaging.frames.exif import (
+    MAX_EXIF_BYTES,
+    Entry,
+    bytes_beyond,
+    directory,
+    told_exposure,
+)
+from service.imaging.frames.frame import CountArray, Frame, FrameLimits, bad_frame
+from service.imaging.frames.orientation import TAG, as_shown
+
+MAX_TAGS, MAX_PAGES = 256, 256
+MAX_TAG_BYTES = 1 << 20
+MAX_TILE_PIXELS = 1 << 22
+MAX_SAMPLES = 8
+_SUBFILE, _TILE_WIDTH, _TILE_LENGTH = 254, 322, 323
+_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _FILTER_PATTERN, _LINEAR_RAW = 0, 1, 2, 32803, 34892
+_GREYS = (_WHITE_IS_ZERO, _BLACK_IS_ZERO, _FILTER_PATTERN)
+_BY_PILLOW = {3: "palette", 5: "CMYK", 6: "YCbCr"}
+"""Photometric interpretations of 8 bits that Pillow turns into red, green and blue."""
+_PLAIN, _JPEG, _PACK_BITS = 1, 7, 32773
+_UNPACKED = {5, 8, _PACK_BITS, 32946, 34925, 50000}
+"""LZW, deflate, PackBits, deflate, LZMA, Zstandard."""
+_NO_PREDICTOR, _DIFFERENCES, _FLOAT_PREDICTOR = 1, 2, 3
+
+logging.getLogger("tifffile").setLevel(logging.CRITICAL)
+"""It logs what it finds wrong with a file; this module refuses such files in words."""
+
+
+def read_tiff(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
+    """The frame in a TIFF file; raises `BadFile` with what is wrong with it, or not read of it.
+
+    Of several samples a pixel the counts are the sums of the colours.
+    """
+    from tifffile import TiffFile
+
+    number, remarks = chosen_page(_subfiles(file), limits.image)
+    try:
+        file.seek(0)
+        with TiffFile(file, _multifile=False, is_ndpi=False) as opened:
+            page: Any = opened.pages[number]
+            _require_readable(page, limits)
+            tag = page.tags.valueof(TAG)
+            time, exposure_s = _told(page)
+            if page.photometric in _BY_PILLOW or page.compression == _JPEG:
+                # Pillow turns what it decodes by itself.
+                counts, full_scale = _by_pillow(file, page, number)
+                _, orientation = as_shown(np.zeros((1, 1)), tag)
+            else:
+                stored, full_scale = _light(page, file)
+                counts, orientation = as_shown(as_counts(stored), tag)
+    except BadFile:
+        raise
+    except Exception as error:
+        # A reader of tags that stumbles over what it reads does so in many ways.
+        reason = str(error)[:200] or type(error).__name__
+        raise bad_frame(f"cannot be read as TIFF: {reason}") from None
+    limits.require(counts.shape[1], counts.shape[0])
+    return Frame(
+        *(counts, "TIFF", digest, full_scale, time, exposure_s),
+        orientation=orientation,
+        remarks=remarks,
+    )
+
+
+class Subfile(NamedTuple):
+    """One directory of a TIFF: its size, and whether it is a smaller copy or a mask of another."""
+
+    width_px: int
+    height_px: int
+    is_auxiliary: bool
+
+
+def chosen_page(subfiles: list[Subfile], choice: str | None) -> tuple[int, tuple[str, ...]]:
+    """The number of the page that holds the frame, from 0, and remarks on the choice.
+
+    Raises `BadFile` where several may be meant and none is chosen; choices count from 1.
+    """
+    if choice is not None:
+        if choice.isdecimal() and 1 <= int(choice) <= len(subfiles):
+            return int(choice) - 1, (f"image: {choice} of {len(subfiles)} was chosen",)
+        raise bad_frame(f"holds the images 1 to {len(subfiles)}; choose one of them", choice[:40])
+    whole = [k for k, each in enumerate(subfiles) if not each.is_auxiliary] or [0]
+    if len(whole) > 1:
+        sizes = ", ".join(
+            f"{k + 1}: {subfiles[k].width_px} x {subfiles[k].height_px}" for k in whole
+        )
+        raise bad_frame(
+            f"holds several images; choose one by its number ({sizes[:120]})",
+            f"{len(whole)} images",
+        )
+    return whole[0], ()
+
+
+def _require_readable(page: Any, limits: FrameLimits) -> None:
+    """Raise `BadFile` for a page whose layout is not read, by its name, or that is too large."""
+    limits.require_either_way(page.imagewidth, page.imagelength)
+    bits, samples = page.bitspersample, page.samplesperpixel
+    if page.tags.valueof(262) is None:
+        raise bad_frame("has no photometric interpretation")
+    if bits == 1:
+        raise bad_frame("must be grey or in colour, not of a bit a pixel", "1 bit")
+    if bits not in (8, 16, 32, 64) or page.dtype is None or page.dtype.kind not in "uif":
+        kind = _word(page.sampleformat)
+        raise bad_frame("holds numbers of a kind that is not read", f"{kind} of {bits} bits"[:80])
+    if page.imagedepth != 1 or page.fillorder != 1 or page.planarconfig not in (1, 2):
+        raise bad_frame("has a depth, an order of bits or a planar configuration that is not read")
+    if not 1 <= samples <= MAX_SAMPLES:
+        raise bad_frame(f"may have 1 to {MAX_SAMPLES} samples a pixel", str(samples)[:40])
+    compression, photometric = _word(page.compression), _word(page.photometric)
+    simple = bits == 8 and (samples == 1 or page.planarconfig == 1)
+    if page.compression == _JPEG:
+        if not simple or page.photometric not in (_BLACK_IS_ZERO, _RGB, 6):
+            raise bad_frame("has a layout of JPEG data that is not read", photometric)
+    elif page.compression not in (_PLAIN, *_UNPACKED):
+        message = "is compressed in a way that is not read; save it uncompressed or deflated"
+        raise bad_frame(message, compression)
+    elif page.photometric in _BY_PILLOW:
+        if not simple:
+            raise bad_frame(f"has a layout of {photometric} that is not read", f"{bits} bits")
+    elif page.photometric not in (*_GREYS, _RGB, _LINEAR_RAW):
+        raise bad_frame("has colours that are not read; save it grey or in RGB", photometric)
+    elif page.photometric == _WHITE_IS_ZERO and page.dtype.kind != "u":
+        raise bad_frame("shows white as zero, in numbers without a largest one", str(page.dtype))
+    if page.predictor not in (_NO_PREDICTOR, _DIFFERENCES, _FLOAT_PREDICTOR):
+        raise bad_frame("has a predictor that is not read", _word(page.predictor))
+    if page.predictor != _NO_PREDICTOR and page.compression in (_PLAIN, _PACK_BITS):
+        # Some readers ignore it there, and some do not.
+        raise bad_frame("has a predictor with a compression that takes none", compression)
+
+
+def _word(value: Any) -> str:
+    return str(getattr(value, "name", value))[:60]
+
+
+def _light(page: Any, file: IO[bytes]) -> tuple[npt.NDArray[Any], float]:
+    """The sums of the colours (rows, columns) of a page in stored order, and the largest one."""
+    colours = _colours(page)
+    unpredict = page.predictor == _FLOAT_PREDICTOR
+    packed = page.compression if page.compression != _PLAIN else None
+    # What tifffile is handed is unpacked already.
+    page.compression = _PLAIN
+    page.predictor = _NO_PREDICTOR if unpredict else page.predictor
+    dtype = page.dtype
+    whole = dtype.newbyteorder("=")
+    if colours > 1:
+        # The sums of three numbers of 16 bits are exact in single precision's 24 bits too.
+        whole = np.dtype("i4" if dtype.kind in "ui" and dtype.itemsize < 4 else "f8")
+    light = np.zeros((page.imagelength, page.imagewidth), whole)
+    for index, data in _segments(page, file, packed):
+        plain = _undone(data, page) if unpredict else data
+        part, (plane, _, row, column, _), (_, rows, columns, _) = page.decode(plain, index)
+        rows = min(rows, light.shape[0] - row)
+        columns = min(columns, light.shape[1] - column)
+        if plane < colours:
+            part = part[0, :rows, :columns, :colours]
+            light[row : row + rows, column : column + columns] += part.sum(axis=2, dtype=whole)
+    full_scale = math.inf if dtype.itemsize > 2 else full_scale_of(dtype)
+    if page.photometric == _WHITE_IS_ZERO:
+        light = np.subtract(np.iinfo(dtype).max * colours, light, dtype=whole)
+    return light, colours * full_scale
+
+
+def _colours(page: Any) -> int:
+    """How many samples of a pixel, the first ones, are light: not how opaque it is."""
+    samples = int(page.samplesperpixel)
+    if page.photometric in (_RGB, _LINEAR_RAW):
+        if samples < 3:
+            raise bad_frame("has fewer samples a pixel than colours", str(samples))
+        return 3
+    if samples in (1, 2):
+        return 1
+    if samples == 3:
+        return 3
+    raise bad_frame("has samples that are not named as colours", f"{samples} samples a pixel")
+
+
+def _segments(page: Any, file: IO[bytes], packed: Any) -> Iterator[tuple[int, bytes]]:
+    """Each strip or tile by its number, unpacked; raises `BadFile` for one of another size."""
+    planes, _, rows, columns, contiguous = page.shaped
+    item = contiguous * page.dtype.itemsize
+    tiled = page.is_tiled
+    tall, wide = (page.tilelength, page.tilewidth) if tiled else (page.rowsperstrip, columns)
+    down, across = -(-rows // tall), -(-columns // wide)
+    offsets, sizes = page.dataoffsets, page.databytecounts
+    if not len(offsets) == len(sizes) == planes * down * across:
+        message = "has another number of strips or tiles than its size needs"
+        raise bad_frame(message, f"{len(offsets)} where {planes * down * across} are needed")
+    end = file.seek(0, os.SEEK_END)
+    for index, (at, size) in enumerate(zip(offsets, sizes, strict=True)):
+        high = tall if tiled else min(tall, rows - index % down * tall)
+        wanted = wide * high * item
+        if size < 1 or at < 8 or at + size > end:
+            raise bad_frame("is cut off, or has a strip or tile without data", f"number {index}")
+        if (size > 2 * wanted + 65536) if packed else not wanted <= size <= wanted + 3:
+            message = "has a strip or tile of another size than its pixels need"
+            raise bad_frame(message, f"{size} bytes where {wanted} are needed")
+        file.seek(at)
+        data = file.read(size)
+        yield index, data[:wanted] if packed is None else _unpacked(data, packed, wide * item, high)
+
+
+def _unpacked(data: bytes, compression: int, row_bytes: int, rows: int) -> bytes:
+    """The bytes of rows, which libtiff unpacks as a grey picture of 8 bits."""
+    from PIL import Image
+
+    entries = [(256, row_bytes), (257, rows), (258, 8), (259, int(compression)), (262, 1)]
+    entries += [(273, 8 + 2 + 9 * 12 + 4), (277, 1), (278, rows), (279, len(data))]
+    head = b"II*\0" + struct.pack("<LH", 8, len(entries))
+    head += b"".join(struct.pack("<HHLL", tag, 4, 1, value) for tag, value in entries) + bytes(4)
+    with Image.open(io.BytesIO(head + data), formats=("TIFF",)) as picture:
+        return picture.tobytes()
+
+
+def _undone(data: bytes, page: Any) -> bytes:
+    """The numbers of a strip or tile whose bytes were stored as differences, sign bytes first."""
+    item, contiguous = page.dtype.itemsize, page.shaped[4]
+    columns = page.tilewidth if page.is_tiled else page.shaped[3]
+    stored = np.frombuffer(data, np.uint8).reshape(-1, columns * item, contiguous)
+    summed = np.cumsum(stored, axis=1, dtype=np.uint8)
+    parts = summed.reshape(len(stored), item, columns * contiguous)
+    numbers = np.ascontiguousarray(parts.transpose(0, 2, 1)).view(f">f{item}")
+    return numbers.astype(page.parent.byteorder + f"f{item}").tobytes()
+
+
+def _by_pillow(file: IO[bytes], page: Any, number: int) -> tuple[CountArray, float]:
+    """The sums of red, green and blue of a page of 8 bits, turned by its orientation."""
+    from PIL import Image
+
+    file.seek(0)
+    with Image.open(file, formats=("TIFF",)) as image:
+        image.seek(number)
+        if image.mode == "L":
+            return as_counts(np.asarray(image)), 255.0
+        channels = np.asarray(image.convert("RGB"))
+    return as_counts(channels.sum(axis=2, dtype=np.uint16)), 3.0 * 255.0
+
+
+def _told(page: Any) -> tuple[str | None, float | None]:
+    """Time and exposure of a page's EXIF."""
+    exif = page.tags.valueof(34665)
+    exif = exif if isinstance(exif, dict) else {}
+    names = "DateTimeOriginal", "OffsetTimeOriginal", "SubsecTimeOriginal", "ExposureTime"
+    return told_exposure(*(exif.get(name) for name in names))
+
+
+def _subfiles(file: IO[bytes]) -> list[Subfile]:
+    """The directories of a TIFF; raises `BadFile` where tags alone would take much memory.
+
+    Every tag is read whole before anything can be asked of it; many tags may
+    point to the same bytes of a file.
+    """
+    file.seek(0)
+    start = file.read(16)
+    end = file.seek(0, os.SEEK_END)
+    order, big = "<" if start[:2] == b"II" else ">", start[2:4] in (b"+\0", b"\0+")
+    subfiles: list[Subfile] = []
+    try:
+        (at,) = struct.unpack_from(order + ("8xQ" if big else "4xL"), start)
+        while at:
+            if len(subfiles) == MAX_PAGES:
+                raise bad_frame(f"holds more than {MAX_PAGES} images, or its directories loop")
+            entries = directory(file, order, at, big)
+            _require_small(file, order, entries)
+            (at,) = struct.unpack(order + ("Q" if big else "L"), file.read(8 if big else 4))
+            values = {entry.tag: entry.whole(order) for entry in reversed(entries)}
+            subfiles.append(
+                Subfile(values.get(256, 0), values.get(257, 0), bool(values.get(_SUBFILE, 0) & 5))
+            )
+            if bytes_beyond(file, order, entries, big=big) > MAX_EXIF_BYTES:
+                raise bad_frame(f"has more than {MAX_EXIF_BYTES} bytes of EXIF")
+    except (struct.error, OverflowError):
+        kind = "BigTIFF" if big else "TIFF"
+        raise bad_frame(f"is cut off: its {kind} directory lies beyond its {end} bytes") from None
+    return subfiles
+
+
+def _require_small(file: IO[bytes], order: str, entries: list[Entry]) -> None:
+    """Raise `BadFile` for a directory of many or great tags, or with great tiles."""
+    if len(entries) > MAX_TAGS:
+        raise bad_frame(f"has more than {MAX_TAGS} tags", str(len(entries)))
+    tile = 1
+    for entry in entries:
+        if entry.size_bytes > MAX_TAG_BYTES:
+            message = f"has a TIFF tag of more than {MAX_TAG_BYTES} bytes"
+            raise bad_frame(message, f"tag {entry.tag}")
+        if entry.tag in (_TILE_WIDTH, _TILE_LENGTH):
+            tile *= entry.whole(order)
+    if tile > MAX_TILE_PIXELS:
+        raise bad_frame(f"has tiles of more than {MAX_TILE_PIXELS} pixels", str(tile))
