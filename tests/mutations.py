@@ -1,16 +1,20 @@
 """A process that reads mutated files, and may hold only so much memory.
 
-    python -m tests.mutations READER COUNT SEED
+    python -m tests.mutations BLACK_BOX
 
-Every reader must read a file or refuse it as its documentation says; anything
-else, also a lack of memory, ends the process with the file that did it.  Prints
-one JSON line: how many were read, how many refused, and the most memory held.
+Takes lines "READER COUNT SEED" from its input.  Every reader must read a file or refuse it
+as its documentation says; anything else, also a lack of memory, ends the process.  Prints
+one JSON line for each: how many were read, how many refused, and the most memory held.
+
+The file BLACK_BOX holds what is being read, so that it is known after a crash: `BlackBox.read`.
 """
 
+import faulthandler
 import gzip
 import importlib.util
 import io
 import json
+import mmap
 import random
 import re
 import resource
@@ -18,6 +22,7 @@ import struct
 import sys
 import tempfile
 import zlib
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -106,6 +111,7 @@ def with_right_sums(data):
     return bytes(data)
 
 
+@cache
 def pass_lines():
     sky = SkyModel(load_embedded(), LruCache(64 << 20))
     drawn = list(draw_pass(load_missions()["XTE"], sky, Pass(batches=3, seed=1)))
@@ -387,27 +393,66 @@ NAMES = tuple(
 )
 
 
-def main(name, count, seed):
-    draw = random.Random(int(seed))
-    with tempfile.TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None) as folder:
-        good, read = getattr(Readers(Path(folder)), name)()
-        read(good)
-        held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (held + MORE_MEMORY, resource.RLIM_INFINITY))
-        refused = 0
-        for _ in range(int(count)):
-            data = mutated(good, draw)
-            try:
-                read(data)
-            except (BadInput, BadConfiguration):
-                refused += 1
-            except BaseException:
-                sys.stderr.write(f"{name}: {data!r}\n"[:4000])
-                raise
+class BlackBox:
+    """A file in memory with the reader and the bytes at work; it outlives the process."""
+
+    SIZE = 4 << 20
+    LENGTHS = struct.Struct("<II")
+
+    def __init__(self, path):
+        with path.open("w+b") as file:
+            file.truncate(self.SIZE)
+            self._held = mmap.mmap(file.fileno(), self.SIZE)
+
+    def hold(self, name, data):
+        """Note what is read next."""
+        start = self.LENGTHS.size
+        self._held[: start + len(name) + len(data)] = (
+            self.LENGTHS.pack(len(name), len(data)) + name + data
+        )
+
+    @classmethod
+    def read(cls, path):
+        """The name of the reader and the bytes of a process that has ended; empty before both."""
+        content = path.read_bytes() if path.exists() else b""
+        if not content:
+            return "", b""
+        name, data = cls.LENGTHS.unpack_from(content)
+        start = cls.LENGTHS.size
+        return content[start : start + name].decode(), content[start + name :][:data]
+
+
+def read_mutations(name, count, seed, box, folder):
+    """Read so many mutated files; how many were read and refused, and the most memory held."""
+    draw = random.Random(seed)
+    good, read = getattr(Readers(folder), name)()
+    read(good)
+    held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (held + MORE_MEMORY, resource.RLIM_INFINITY))
+    # The readers before have left their peak.
+    Path("/proc/self/clear_refs").write_text("5")
+    refused, encoded = 0, name.encode()
+    for _ in range(count):
+        data = mutated(good, draw)
+        box.hold(encoded, data)
+        try:
+            read(data)
+        except (BadInput, BadConfiguration):
+            refused += 1
     # Not getrusage: its peak is that of the process which started this one, if that was larger.
     (peak,) = re.findall(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
-    most_mb = int(peak) // 1024
-    print(json.dumps({"read": int(count) - refused, "refused": refused, "most_mb": most_mb}))
+    resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    return {"read": count - refused, "refused": refused, "most_mb": int(peak) // 1024}
+
+
+def main(box):
+    faulthandler.enable()
+    held = BlackBox(Path(box))
+    with tempfile.TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None) as folder:
+        for line in sys.stdin:
+            name, count, seed = line.split()
+            counted = read_mutations(name, int(count), int(seed), held, Path(folder))
+            print(json.dumps(counted), flush=True)
 
 
 if __name__ == "__main__":
