@@ -59,7 +59,8 @@ def main(database, file, faults, seed):
         # A single call or a disk that stays so for a while: in a commit, at its end, or where a
         # checkpoint takes the log over into the file.
         error = draw.choice((errno.ENOSPC, errno.EIO))
-        kind, within = draw.choice(tuple(enumerate(WITHIN)))
+        # The first is one that the sender notices: in the log.
+        kind, within = draw.choice(tuple(enumerate(WITHIN))) if kinds else (0, WITHIN[0])
         disk.faulty_fail(kind, draw.randrange(within), draw.choice((1, 1, 3, 25)), error)
         while disk.faulty_failed() == before:
             chunk = list(islice(waiting, 3))
