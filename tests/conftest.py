@@ -8,8 +8,8 @@ pytest --torture          tests of kills, failing disks and odd input at full si
 
 Every test that asks for `database` runs on SQLite. It runs on PostgreSQL too if
 TEST_POSTGRESQL_URL names a database to be used for tests, and if what the two do
-differs there: in `tests/storage`, where a test has the mark `both_databases`, and
-everywhere under --full.
+differs there: where the test or its file has the mark `both_databases`, and everywhere
+under --full.
 """
 
 import faulthandler
@@ -18,7 +18,6 @@ import logging
 import os
 import tomllib
 from contextlib import ExitStack
-from pathlib import Path
 
 import hypothesis
 import numpy as np
@@ -37,7 +36,6 @@ from tests.torture import FIGURES
 DEFAULT_SEED = 19941026
 DEFAULT_BATCHES = 240
 TORTURE_TIMEOUT_S = 6 * 3600
-STORAGE = Path(__file__).parent / "storage"
 OTHER_DATABASE = "needs no database of its choice"
 LEFT_OUT, LEFT_OUT_BY_WORKERS = pytest.StashKey(), pytest.StashKey()
 
@@ -123,7 +121,7 @@ def _is_repeated_over_postgresql(item):
     call = getattr(item, "callspec", None)
     if call is None or "postgresql" not in call.params.values():
         return False
-    if item.get_closest_marker("both_databases") or item.path.is_relative_to(STORAGE):
+    if item.get_closest_marker("both_databases"):
         return False
     # A test that names PostgreSQL itself is not a repetition.
     return not any("database" in mark.args[0] for mark in item.iter_markers("parametrize"))

@@ -9,6 +9,10 @@ Another share of `size` is given in the environment, such as TEST_TORTURE=0.3.
 """
 
 import os
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
 
 FULL_SHARE = 1 / 50
 VARIABLE = "TEST_TORTURE"
@@ -28,6 +32,15 @@ def draws(sitting: int, full: int) -> int:
     Only for a promise whose bound a wrong build still fails with the smaller number.
     """
     return full if is_full() else sitting
+
+
+def some_in_a_sitting(values: Sequence[Any]) -> list[Any]:
+    """Parameters of which `make test` takes the first, the middle and the last."""
+    chosen = {0, len(values) // 2, len(values) - 1}
+    return [
+        value if index in chosen else pytest.param(value, marks=pytest.mark.slow)
+        for index, value in enumerate(values)
+    ]
 
 
 def is_full() -> bool:

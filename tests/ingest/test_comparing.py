@@ -36,6 +36,7 @@ def test_equal_options_change_nothing(filled):
         assert getattr(found.a, name) == getattr(recorded, name)
 
 
+@pytest.mark.both_databases
 def test_what_changes_is_what_a_what_if_of_each_batch_says(filled):
     found = filled.comparisons.of_options("XTE", VOTES, TIGHT)
     counted = {"unique": 0, "ambiguous": 0, "unmatched": 0}

@@ -74,6 +74,7 @@ def recorded(app, noisy):
     return noisy
 
 
+@pytest.mark.both_databases
 def test_with_the_same_settings_everything_comes_out_alike(app, recorded):
     progress, compared = app.runs.reprocess("again", processes=1)
     assert (progress.total, progress.before, progress.recorded, progress.refused) == (

@@ -48,6 +48,7 @@ def rows(app):
         ]
 
 
+@pytest.mark.both_databases
 def test_a_sample_has_as_many_batches_as_were_asked_for_and_none_twice(app, recorded):
     """Also where it is most of them, so that the parts are shorter than two batches."""
     for size in range(1, BATCHES + 3):
@@ -96,6 +97,7 @@ def test_of_a_batch_with_an_adopted_what_if_the_current_options_hold(app, make):
     assert batch.options.tolerances == {"separation_deg": 0.01}
 
 
+@pytest.mark.both_databases
 def test_the_advice_is_that_of_the_batches_themselves_and_changes_nothing(
     app, recorded, missions, sky
 ):

@@ -2,7 +2,6 @@
 
 import math
 import threading
-import time
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 import pyarrow as pa
@@ -33,6 +32,8 @@ from service.storage.sql.tables import (
 from service.storage.upkeep.prune import prune
 from service.storage.upkeep.verify import verify
 from service.times import shifted
+from tests.fresh_databases import sqlite_at
+from tests.ingest.test_replays import finished
 from tests.storage import twin
 from tests.storage.recount import assert_equal_to_a_recount
 from tests.storage.samples import START
@@ -95,6 +96,7 @@ def filled(app, make):
     return app
 
 
+@pytest.mark.both_databases
 def test_what_is_archived_and_restored_is_the_same_byte_for_byte(filled, place, database):
     before, trends = rows_of(filled.store, OF_BATCHES), trends_of(filled.store)
     steps = []
@@ -119,7 +121,7 @@ def test_an_archive_is_restored_into_an_empty_database(filled, place, tmp_path, 
     before, trends = rows_of(filled.store, OF_BATCHES), trends_of(filled.store)
     archiving.archive(filled.store, place, LATER)
     kept = {row["id"] for row in rows_of(filled.store, OF_BATCHES)["batches"]}
-    other = Store(f"sqlite:///{tmp_path / 'again.db'}")
+    other = Store(sqlite_at(tmp_path / "again.db"))
     try:
         restore(other, place, PartFilter(run="live"))
         found = rows_of(other, [batches, results])
@@ -188,14 +190,13 @@ def test_without_its_archive_a_replay_refuses_the_line_and_goes_on(filled, place
     place.rename(place.with_name("away"))
     sent = [make("b1", kind="suspect", after_s=20_000.0, run="r"), make("new", run="r")]
     id = filled.replays.start([each.text.encode() + b"\n" for each in sent], "r")
-    give_up = time.monotonic() + 60
-    while (replay := filled.replays.get(id)).finished is None and time.monotonic() < give_up:
-        time.sleep(0.01)
+    replay = finished(filled, id)
     assert (replay.state, replay.counts.new) == ("done", 1)
     assert [each.line for each in replay.errors] == [1]
     assert "archive" in replay.errors[0].problem.detail
 
 
+@pytest.mark.both_databases
 def test_a_batch_that_is_archived_between_look_up_and_insert_is_not_recorded_again(
     filled, place, make, monkeypatch
 ):
@@ -291,6 +292,7 @@ def meanwhile(opened, place, database):
         yield does
 
 
+@pytest.mark.both_databases
 def test_a_what_if_that_a_service_records_meanwhile_is_not_lost(
     meanwhile, filled, place, monkeypatch
 ):
@@ -310,6 +312,7 @@ def test_a_what_if_that_a_service_records_meanwhile_is_not_lost(
         assert filled.results.get(told[0].result().id).archived
 
 
+@pytest.mark.both_databases
 @pytest.mark.parametrize("work", ["archive", "restore"])
 def test_trends_that_a_service_counts_meanwhile_have_each_batch_once(
     meanwhile, filled, place, make, monkeypatch, work
@@ -429,6 +432,7 @@ def test_a_part_of_an_earlier_version_has_no_values_of_later_quantities(
     assert not set(later) & set(read.column_names)
 
 
+@pytest.mark.both_databases
 def test_a_history_over_archived_time_counts_every_batch(filled, place):
     span = {"start": START, "end": shifted(START, 12 * 20_000.0)}
     wanted = filled.spacecraft.history("XTE", size=1_500, **span)

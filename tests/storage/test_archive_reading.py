@@ -95,6 +95,7 @@ def without_mark(items):
     return [structs.replace(each, archived=False) for each in items]
 
 
+@pytest.mark.both_databases
 def test_lists_are_the_same_before_and_after_archiving(filled, place, monkeypatch):
     before = [pages_of(filled, 100, **selected) for selected in FILTERS]
     archiving.archive(filled.store, place, LATER)
@@ -203,6 +204,7 @@ def compared_of(app):
     )
 
 
+@pytest.mark.both_databases
 def test_comparisons_are_the_same_wherever_the_batches_are(filled, place, monkeypatch):
     before = compared_of(filled)
     assert before[0].changed_batches > 0
@@ -213,6 +215,7 @@ def test_comparisons_are_the_same_wherever_the_batches_are(filled, place, monkey
     assert compared_of(filled) == before
 
 
+@pytest.mark.both_databases
 def test_runs_in_the_archive_are_joined_by_the_indexes_of_the_record(filled, place):
     """Without them a comparison of two thousand batches took a minute."""
     archiving.archive(filled.store, place, LATER)

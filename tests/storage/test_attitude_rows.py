@@ -14,6 +14,8 @@ from service.storage.queries.pages import ResultFilter
 from service.storage.queries.with_archive.rows import count
 from tests.storage.samples import KINDS, batch
 
+pytestmark = pytest.mark.both_databases
+
 
 @pytest.fixture
 def app(database, sky, missions):

@@ -18,6 +18,8 @@ from service.storage.sql.engines import database_url, writing_engine
 from service.storage.sql.prepared import execute
 from service.storage.sql.tables import batches
 
+pytestmark = pytest.mark.both_databases
+
 
 def test_the_migrations_make_what_the_tables_say(empty_database):
     if empty_database.startswith("sqlite"):

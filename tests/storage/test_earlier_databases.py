@@ -7,7 +7,6 @@ in the interface's description and in the app, so that new ones are read as well
 
 import json
 import re
-import time
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -30,8 +29,12 @@ from service.storage.upkeep.verify import verify
 from service.web.app import create_app
 from service.web.requests.problem_types import types_with_pages
 from tests.databases.make import FOLDER, restore_postgresql, restore_sqlite
+from tests.scale import some_in_a_sitting
+from tests.waiting import wait_until
 from tests.web.conformance import check, reference
 from tests.web.serving import Server
+
+pytestmark = pytest.mark.both_databases
 
 API = "/api/v1"
 REVISIONS = sorted(file.name.partition(".")[0] for file in FOLDER.glob("*.sqlite.gz"))
@@ -97,7 +100,7 @@ def new_schemas():
     return {}
 
 
-@pytest.fixture(scope="module", params=REVISIONS)
+@pytest.fixture(scope="module", params=some_in_a_sitting(REVISIONS))
 def earlier(request, new_database):
     revision = request.param
     with new_database() as url:
@@ -116,8 +119,7 @@ def earlier(request, new_database):
                 base_url=address, timeout=60, headers=headers, event_hooks=hooks
             ) as client,
         ):
-            while client.get("/readyz").status_code != 200:
-                time.sleep(0.1)
+            wait_until(lambda: client.get("/readyz").status_code == 200, why="it is not ready")
             yield Earlier(url, before, after, schema, problems, client, app)
         assert verify(url) == []
 

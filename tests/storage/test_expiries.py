@@ -9,13 +9,14 @@ from service.settings import Settings
 from service.storage.upkeep.expiries import ExpiryDates, leap_seconds_end
 from service.times import parse_utc
 from service.web.requests.metrics import Metrics
+from tests.fresh_databases import sqlite_at
 
 NOW = "2027-01-01T00:00:00.000Z"
 
 
 @pytest.fixture
 def opened(tmp_path):
-    app = open_app(Settings(database=f"sqlite:///{tmp_path}/a.db", replay_processes=0))
+    app = open_app(Settings(database=sqlite_at(tmp_path / "a.db"), replay_processes=0))
     yield app
     app.close()
 

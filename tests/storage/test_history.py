@@ -13,6 +13,8 @@ from service.storage.queries import time_buckets, trends
 from service.times import parse_utc, shifted, unix_seconds, utc_of_unix
 from tests.storage.bulk import put, result_row
 
+pytestmark = pytest.mark.both_databases
+
 # Examples share a database: each has a run of its own.
 RUNS = count()
 START = parse_utc("2016-12-31T20:30:00Z")

@@ -18,6 +18,8 @@ from service.storage.upkeep.prune import prune
 from service.times import utc_now
 from tests.storage.recount import assert_equal_to_a_recount
 
+pytestmark = pytest.mark.both_databases
+
 REPEATS = 50
 
 

@@ -6,6 +6,8 @@ from service.observations.schema import submission_from_json
 from service.times import parse_utc, shifted, utc_now
 from tests.storage.bulk import put, result_row
 
+pytestmark = pytest.mark.both_databases
+
 START = parse_utc("1999-03-01T00:00:00Z")
 
 

@@ -16,6 +16,8 @@ from service.times import parse_utc, shifted
 from service.vectors import angle_between_deg, from_ra_dec
 from tests.storage.bulk import put, result_row
 
+pytestmark = pytest.mark.both_databases
+
 BATCHES = 60
 WHOLE = {"start": parse_utc("1990-01-01T00:00:00Z"), "end": parse_utc("2010-01-01T00:00:00Z")}
 

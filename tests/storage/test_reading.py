@@ -17,6 +17,8 @@ from service.storage.sql.tables import solutions
 from service.times import parse_utc
 from tests.storage.samples import KINDS
 
+pytestmark = pytest.mark.both_databases
+
 HOUR = 3600.0
 
 

@@ -17,7 +17,6 @@ from service.storage.upkeep.verify import verify
 from tests.databases.make import FOLDER, restore_postgresql, restore_sqlite
 
 EARLIER = sorted(file.name.partition(".")[0] for file in FOLDER.glob("*.sqlite.gz"))
-OF_INTEREST = (EARLIER[0], EARLIER[-1])
 
 
 def rows_of(url):
@@ -65,7 +64,10 @@ def clear(url):
     engine.dispose()
 
 
-@pytest.mark.parametrize("revision", OF_INTEREST)
+@pytest.mark.both_databases
+@pytest.mark.parametrize(
+    "revision", [pytest.param(EARLIER[0], marks=pytest.mark.slow), EARLIER[-1]]
+)
 def test_an_upgrade_is_taken_back_with_the_backup_made_before_it(
     empty_database, tmp_path, revision
 ):
@@ -82,6 +84,7 @@ def test_an_upgrade_is_taken_back_with_the_backup_made_before_it(
     assert verify(empty_database) == []
 
 
+@pytest.mark.both_databases
 def test_a_restored_database_is_never_put_over_another(database, tmp_path):
     back_up(database, tmp_path / "copy")
     before = rows_of(database)
@@ -115,6 +118,7 @@ def test_a_backup_that_is_cut_short_leaves_nothing(database, tmp_path):
         assert rows_of(database) == {}
 
 
+@pytest.mark.both_databases
 def test_files_that_are_no_backup_of_the_database_are_refused(database, tmp_path):
     target = f"sqlite:///{tmp_path}/new.db"
     with pytest.raises(BadConfiguration, match="none: cannot be read: No such file"):

@@ -18,6 +18,8 @@ from service.storage.sql.tables import MEASURED
 from service.times import parse_utc
 from tests.storage.samples import KINDS, submission
 
+pytestmark = pytest.mark.both_databases
+
 N = 11
 
 

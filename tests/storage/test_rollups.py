@@ -11,6 +11,8 @@ from service.times import parse_utc
 from tests.storage.recount import assert_equal_to_a_recount
 from tests.storage.samples import KINDS
 
+pytestmark = pytest.mark.both_databases
+
 TIGHT = OptionsIn.model_validate({"identifier": "starid", "tolerances": {"separation_deg": 1e-5}})
 WIDE = OptionsIn.model_validate({"tolerances": {"separation_deg": 0.05}})
 

@@ -22,6 +22,8 @@ from service.storage.upkeep.verify import verify
 from service.times import parse_utc
 from tests.storage.twin import FIRST, SECOND, lone, submission, twin
 
+pytestmark = pytest.mark.both_databases
+
 TIGHT = OptionsIn.model_validate({"identifier": "starid", "tolerances": {"separation_deg": 1e-5}})
 OF_TRACKERS = (tracker_values, tracker_rollups_hourly, tracker_rollups_daily)
 ALL = {"start": parse_utc("1996-01-01T00:00:00Z"), "end": parse_utc("1996-02-01T00:00:00Z")}

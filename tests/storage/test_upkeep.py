@@ -65,6 +65,7 @@ def change(app, statement):
 # ---- verify ------------------------------------------------------------------------------------
 
 
+@pytest.mark.both_databases
 def test_of_a_sound_database_nothing_is_wrong(filled, database):
     steps = []
     assert verify(database, lambda *step: steps.append(step)) == []
@@ -191,6 +192,7 @@ def restored(database, dump, tmp_path):
     return database
 
 
+@pytest.mark.both_databases
 def test_a_backup_is_whole_and_serves_in_the_place_of_the_database(
     filled, database, tmp_path, make
 ):
@@ -209,6 +211,7 @@ def test_a_backup_is_whole_and_serves_in_the_place_of_the_database(
         app.close()
 
 
+@pytest.mark.both_databases
 def test_a_backup_while_batches_are_recorded_is_of_one_moment(opened, make, database, tmp_path):
     """Every batch in it is whole, those acknowledged before it are in, and it ends."""
     app = opened()
@@ -282,6 +285,7 @@ def test_a_backup_never_writes_over_anything_and_leaves_no_half_of_one(database,
 # ---- prune -------------------------------------------------------------------------------------
 
 
+@pytest.mark.both_databases
 def test_what_is_before_is_gone_and_what_is_after_is_as_it_was(filled, database, make):
     """Cut within an hour: the trends are those of what is left."""
     cut = shifted(START, 5 * 14_000.0 + 1.0)
@@ -345,6 +349,7 @@ def test_stopped_it_has_taken_out_whole_hours_and_goes_on(filled, database):
     assert counts(filled) == dict.fromkeys(counts(filled), 0)
 
 
+@pytest.mark.both_databases
 def test_a_dense_hour_goes_in_parts_and_between_them_the_trends_are_right(
     app, make, database, monkeypatch
 ):
@@ -364,6 +369,7 @@ def test_a_dense_hour_goes_in_parts_and_between_them_the_trends_are_right(
     assert seen[:4] == [(0, 10, "b0"), (3, 7, "b3"), (6, 4, "b6"), (9, 1, "b9")]
 
 
+@pytest.mark.both_databases
 def test_while_it_prunes_batches_are_recorded(opened, make, database):
     """Another connection prunes the first hour while the second is filled."""
     app = opened()
@@ -394,6 +400,7 @@ def test_of_whatever_refers_to_a_batch_nothing_is_left_hanging():
         assert refer == set(pruned)
 
 
+@pytest.mark.both_databases
 def test_what_refers_to_a_result_is_found_without_reading_every_row(app):
     """Deleting a result asks for its keys and its what-ifs."""
     questions = {

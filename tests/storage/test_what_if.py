@@ -30,6 +30,7 @@ def test_one_that_is_not_kept_answers_and_leaves_nothing(app, make):
     assert app.results.get(first.id).what_ifs == []
 
 
+@pytest.mark.both_databases
 def test_one_that_is_kept_names_its_parent_and_changes_nothing_else(app, make):
     first = app.submissions.submit(make(kind="suspect"))
     listed = app.results.page().items
@@ -58,6 +59,7 @@ def test_one_that_is_adopted_is_what_everything_shows_and_both_are_kept(app, mak
     assert to_builtins(app.results.get(first.id).answer) == json.loads(first.body)
 
 
+@pytest.mark.both_databases
 def test_of_several_adopted_the_last_is_current(app, make):
     first = app.submissions.submit(make())
     adopted = [app.results.what_if(first.id, TIGHT, adopt=True).id for _ in range(3)]

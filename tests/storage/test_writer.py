@@ -13,6 +13,8 @@ from service.storage.sql.tables import results, runs
 from service.storage.sql.writer import PROBE_TABLE, Writer
 from tests.storage.recount import assert_equal_to_a_recount
 
+pytestmark = pytest.mark.both_databases
+
 
 @pytest.fixture
 def store(database):

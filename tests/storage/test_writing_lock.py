@@ -7,6 +7,8 @@ import pytest
 from service.errors import Busy, Standby
 from service.storage.sql.database import Store
 
+pytestmark = pytest.mark.both_databases
+
 pytestmark = pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 
 

@@ -38,6 +38,7 @@ def again(app, place, run="again", **wanted):
     return app.runs.reprocess_into_archive(run, place, **({"processes": 1} | wanted))
 
 
+@pytest.mark.both_databases
 def test_archived_and_recorded_batches_are_run_again_into_the_archive(archived, place, database):
     steps = []
     progress = again(archived, place, step=lambda p: steps.append(p.partitions_done))
