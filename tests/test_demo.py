@@ -7,6 +7,8 @@ import signal
 import socket
 import subprocess
 import sys
+from itertools import takewhile
+from pathlib import Path
 
 import httpx
 import numba
@@ -17,27 +19,81 @@ from service.acquire.kernel_build import mark_built
 from service.cli import main
 from service.demo import MISSIONS
 from service.ingest.kernel_progress import KERNEL_BYTES
+from service.settings import Settings
 from service.simulate.files import read_objects, truth_path
 from service.simulate.score import Score, score
 from service.simulate.score_table import table
+from tests.scale import draws, is_full
+
+BATCHES = draws(100, 300)
+"""Of each mission, a fifth of them with serious trouble; 300 unless it is told otherwise."""
+NAMED_PORTS = range(20_000, 32_000)
+"""Below those that outgoing connections are given."""
+TAKEN = "Address already in use"
 
 
-def free_port():
-    """A port for later; below those that outgoing connections are given meanwhile."""
-    while True:
-        port = random.randrange(20_000, 32_000)
-        with socket.socket() as probe:
+def a_port():
+    """A port that a server will have to itself, unless another process takes it meanwhile."""
+    return str(random.choice(NAMED_PORTS))
+
+
+class Demonstration:
+    """`acquire demo` in a process that ignores SIGINT, as one that a script starts with & does.
+
+    It serves until it is told to stop by a signal.
+    """
+
+    def __init__(self, folder, told, ignored, *arguments):
+        self.folder, self.port = folder, a_port()
+        command = [sys.executable, "-m", "service.cli", "demo", "--folder", str(folder)]
+        command += ["--port", self.port, *map(str, arguments)]
+        trap = "trap '' INT" if ignored else "trap - INT"
+        command = ["sh", "-c", f'{trap}; exec "$@"', "sh", *command]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        with subprocess.Popen(command, **pipes) as running:
+            lines = iter(running.stdout.readline, "")
+            ready = f"Serving on http://127.0.0.1:{self.port} until Ctrl-C.\n"
+            self.told = "".join(takewhile(lambda line: line != ready, lines))
             try:
-                probe.bind(("127.0.0.1", port))
-            except OSError:
-                continue
-            return port
+                self.live = running.poll() is None and self.is_live()
+                running.send_signal(told)
+                self.last_words, self.complaints = running.communicate(timeout=60)
+            finally:
+                running.kill()
+        self.exit_code = running.returncode
+
+    def is_live(self):
+        address = f"http://127.0.0.1:{self.port}/livez"
+        return httpx.get(address, trust_env=False).status_code == 200
+
+    @property
+    def run(self):
+        return re.search(r"run=(demo-\w+)", self.told)[1]
 
 
-def demo(folder, *arguments, port=None):
-    command = [sys.executable, "-m", "service.cli", "demo", "--folder", str(folder), "--once"]
-    command += ["--port", str(port or free_port()), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=200)
+def demonstration_of(folder, told, ignored, *arguments):
+    """Another one, where its port was taken."""
+    while TAKEN in (done := Demonstration(folder, told, ignored, *arguments)).complaints:
+        pass
+    return done
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory):
+    """The demonstration as a newcomer runs it."""
+    options = () if is_full() else ("--batches", BATCHES)
+    return demonstration_of(tmp_path_factory.mktemp("demo"), signal.SIGINT, True, *options)
+
+
+@pytest.fixture
+def demo(acquire):
+    """Runs `acquire demo --once` in this process; its exit code, output and complaints."""
+
+    def run(folder, *arguments):
+        done = acquire("demo", "--folder", folder, "--once", "--port", a_port(), *arguments)
+        return run(folder, *arguments) if TAKEN in done[2] else done
+
+    return run
 
 
 def rows(printed):
@@ -46,110 +102,116 @@ def rows(printed):
     return {(name, stretch): [float(each) for each in numbers] for name, stretch, *numbers in lines}
 
 
-@pytest.mark.parametrize("chosen", [1, None])
-def test_nominal_stretches_are_identified_and_the_errors_are_as_predicted(
-    tmp_path, seed, chosen, capsys
-):
-    """Misidentified at most 0.1 %, unique at least 99 %: over all three, whatever the seed."""
-    done = demo(tmp_path, "--seed", chosen or seed)
-    assert done.returncode == 0, done.stderr
-    found = rows(done.stdout)
+def assert_as_predicted(printed, folder):
+    """Misidentified at most 0.1 %, unique at least 99 %: over all three missions."""
+    found = rows(printed)
     assert list(found) == [(name, kind) for name in MISSIONS for kind in ("nominal", "serious")]
     nominal = [found[name, "nominal"] for name in MISSIONS]
     stars = sum(each[1] for each in nominal)
     assert sum(each[1] * each[2] for each in nominal) / stars >= 99.0
     assert sum(each[1] * each[5] for each in nominal) / stars <= 0.1
     for batches, _, _, _, _, _, attitudes, error, sigma, within, *_ in nominal:
-        assert batches == 240
+        assert batches == BATCHES * 4 // 5
         assert attitudes >= 0.98 * batches
         assert error == pytest.approx(sigma, rel=0.35)
         assert within >= 98.0
     # What the table says is what the files say.
     for name in MISSIONS:
-        results = list(read_objects(tmp_path / f"{name.lower()}.results.ndjson"))
-        truths = list(read_objects(truth_path(tmp_path / f"{name.lower()}.ndjson")))
+        results = list(read_objects(folder / f"{name.lower()}.results.ndjson"))
+        truths = list(read_objects(truth_path(folder / f"{name.lower()}.ndjson")))
         # Beside the batches there are gyro blocks of a thousand samples, 10 s apart.
         blocks = [each for each in results if "block" in each]
         assert [each["samples"] for each in blocks] == [1000] * 7 + [177]
         results = [each for each in results if "block" not in each]
-        assert len(results) == len(truths) == 300
+        assert len(results) == len(truths) == BATCHES
         counted = score(results, truths)["nominal"]
         assert counted.percent("unique") == pytest.approx(found[name, "nominal"][2], abs=0.006)
-    # Nothing serves any more: the way to the records comes before their address.
-    serve, page = (done.stdout.index(each) for each in ("acquire serve --database", "/?run=demo-"))
-    assert serve < page
-    assert "curl" not in done.stdout
-    assert "docs/quickstart.md" in done.stdout
+
+
+def test_nominal_stretches_are_identified_and_the_errors_are_as_predicted(first, capsys):
+    assert first.live, first.complaints
+    assert_as_predicted(first.told, first.folder)
     # The passes can be filtered with their gyros as they are.
-    (words,) = re.findall(r"^ +acquire (smooth XTE --run .*)$", done.stdout, re.MULTILINE)
+    (words,) = re.findall(r"acquire (smooth XTE --run .*)$", first.told, re.MULTILINE)
     assert main([*words.split(), "--quiet"]) == 0
     assert re.search(r"19:56:00.000Z: gyro, 7177 samples", capsys.readouterr().out)
 
 
-def test_all_missions_fly_on_one_day_and_the_figures_come_as_json_too(tmp_path):
-    done = demo(tmp_path, "--batches", 12, "--json")
-    assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert [(row["spacecraft"], row["kind"]) for row in told["scores"]] == [
-        (name, kind) for name in MISSIONS for kind in ("nominal", "serious")
-    ]
-    assert all(row["batches"] in (2, 10) for row in told["scores"])
-    assert told["run"].startswith("demo-")
+@pytest.mark.slow
+def test_so_they_are_with_other_samples(tmp_path, seed, demo):
+    code, told, complaints = demo(tmp_path / "demo", "--seed", seed, "--batches", BATCHES)
+    assert code == 0, complaints
+    assert_as_predicted(told, tmp_path / "demo")
+
+
+def test_it_keeps_serving_until_it_is_told_to_stop_and_takes_its_server_with_it(first):
+    assert_served_and_stopped(first)
+
+
+def assert_served_and_stopped(done):
+    assert done.live, (done.told, done.complaints)
+    assert "curl -s 'http://127.0.0.1:" in done.told
+    assert (done.last_words, done.exit_code) == ("stopped\n", 0)
+    with pytest.raises(httpx.ConnectError):
+        done.is_live()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ignored", [False, True])
+@pytest.mark.parametrize("told", [signal.SIGINT, signal.SIGTERM])
+def test_each_signal_stops_it(tmp_path, told, ignored):
+    """Also where it has come to ignore SIGINT by being started in the background."""
+    assert_served_and_stopped(demonstration_of(tmp_path, told, ignored, "--batches", 3))
+
+
+def test_a_second_time_nothing_is_new_and_the_figures_are_the_same_as_json_too(first, demo):
+    code, printed, complaints = demo(first.folder, "--batches", BATCHES, "--json")
+    assert code == 0, complaints
+    told = json.loads(printed)
+    assert told["run"] == first.run
+    found = {(row["spacecraft"], row["kind"]): row for row in told["scores"]}
+    shown = rows(first.told)
+    assert found.keys() == shown.keys()
+    names = ("batches", "stars", "unique_percent", "ambiguous_percent", "unmatched_percent")
+    names += ("wrong_percent", "attitudes", "error_arcsec", "sigma_arcsec", "within_percent")
+    for key, row in found.items():
+        # The table has two digits of what the figures are.
+        assert [row[name] for name in names] == pytest.approx(shown[key][: len(names)], abs=0.006)
+
+
+def test_all_missions_fly_on_the_day_that_the_console_shows_first(first):
     times = [
         [
             each["time"]
-            for each in read_objects(tmp_path / f"{name.lower()}.ndjson")
+            for each in read_objects(first.folder / f"{name.lower()}.ndjson")
             if "block" not in each
         ]
         for name in MISSIONS
     ]
     assert times[0] == times[1] == times[2]
-    # Within the day that the console shows first.
     assert times[0][0][:10] == times[0][-1][:10]
 
 
-def test_a_second_time_nothing_is_new_and_the_table_is_the_same(tmp_path):
-    first, second = (demo(tmp_path, "--batches", 12) for _ in range(2))
-    assert first.returncode == second.returncode == 0
-    assert rows(first.stdout) == rows(second.stdout) != {}
-    # Other samples go into a run of their own, beside the first.
-    third = demo(tmp_path, "--batches", 12, "--seed", 2)
-    assert third.returncode == 0
-    assert rows(third.stdout) != rows(first.stdout)
+def test_when_nothing_serves_any_more_the_way_to_the_records_comes_before_their_address():
+    told = dict(demonstration._where_next("http://h:1", "demo-1", Path("f"), Settings(), True))
+    places = [place.strip() for place in told]
+    serve, page = (f"acquire serve --database {Settings().database}", "http://h:1/?run=demo-1")
+    assert places.index(serve) < places.index(page)
+    assert not [each for each in places if each.startswith("curl")]
+    assert "docs/quickstart.md" in places
 
 
-@pytest.mark.parametrize("ignored", [False, True])
-@pytest.mark.parametrize("told", [signal.SIGINT, signal.SIGTERM])
-def test_it_keeps_serving_until_it_is_told_to_stop_and_takes_its_server_with_it(
-    tmp_path, told, ignored
-):
-    """Also where a script has started it with &, and it has come to ignore SIGINT by that."""
-    port = free_port()
-    command = [sys.executable, "-m", "service.cli", "demo", "--folder", str(tmp_path)]
-    command += ["--port", str(port), "--batches", "3"]
-    trap = "trap '' INT" if ignored else "trap - INT"
-    command = ["sh", "-c", f'{trap}; exec "$@"', "sh", *command]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as running:
-        assert running.stdout is not None
-        told_so_far = []
-        for line in running.stdout:
-            told_so_far.append(line)
-            if line == f"Serving on http://127.0.0.1:{port} until Ctrl-C.\n":
-                break
-        else:
-            # It has ended: to wait for more would be to wait for ever.
-            pytest.fail(f"it ended by itself: {running.wait()}, after {told_so_far}")
-        assert any("curl -s 'http://127.0.0.1:" in line for line in told_so_far)
-        url = f"http://127.0.0.1:{port}"
-        assert httpx.get(f"{url}/livez", trust_env=False).status_code == 200
-        running.send_signal(told)
-        try:
-            assert running.communicate(timeout=30)[0] == "stopped\n"
-        finally:
-            running.kill()
-        assert running.wait() == 0
-    with pytest.raises(httpx.ConnectError):
-        httpx.get(f"{url}/livez", trust_env=False)
+@pytest.mark.slow
+def test_other_samples_go_into_a_run_of_their_own_and_the_same_do_not(tmp_path, demo):
+    words = ("--batches", 12)
+    first, second, other = (
+        demo(tmp_path / "demo", *words, *more) for more in ((), (), ("--seed", 2))
+    )
+    assert [each[0] for each in (first, second, other)] == [0, 0, 0]
+    assert rows(first[1]) == rows(second[1]) != {}
+    assert rows(other[1]) != rows(first[1])
+    assert first[1].index("acquire serve --database") < first[1].index("/?run=demo-")
+    assert "curl" not in first[1]
 
 
 def test_a_long_start_is_told_on_a_moving_line_or_now_and_then(monkeypatch, capsys, tmp_path):
@@ -177,15 +239,15 @@ def test_a_long_start_is_told_on_a_moving_line_or_now_and_then(monkeypatch, caps
     assert moving.endswith(" \r")
 
 
-def test_a_port_that_is_taken_is_said_at_once(tmp_path):
+def test_a_port_that_is_taken_is_said_at_once(acquire, tmp_path):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        done = demo(tmp_path, port=port)
-    assert done.returncode == 2
-    assert f"acquire: http://127.0.0.1:{port}: Address already in use" in done.stderr
-    assert "--port" in done.stderr
+        code, _, complaint = acquire("demo", "--folder", tmp_path, "--port", port)
+    assert code == 2
+    assert f"acquire: http://127.0.0.1:{port}: {TAKEN}" in complaint
+    assert "--port" in complaint
 
 
 def test_a_score_counts_wrong_names_and_compares_errors_with_their_sigma():

@@ -26,6 +26,7 @@ from service.simulate.stretches import Pass, Trouble, Troubles
 from service.simulate.telemetry import draw_pass
 from service.storage.queries.replays import mark_interrupted
 from service.web.app import create_app
+from tests.fresh_databases import sqlite_at
 from tests.web.serving import Server
 
 SERIOUS = Troubles(Trouble(0.2), Trouble(0.2, 2), Trouble(0.2, 0.5), Trouble(0.2, 12.0))
@@ -48,7 +49,9 @@ ACCEPTED = {
 
 
 def opened(folder, name="acquire.db"):
-    return open_app(Settings(database=f"sqlite:///{folder / name}"))
+    file = folder / name
+    url = f"sqlite:///{file}" if file.exists() else sqlite_at(file)
+    return open_app(Settings(database=url))
 
 
 @pytest.fixture(scope="module")
@@ -220,14 +223,12 @@ def test_who_may_not_follow_a_replay_is_told_so_at_once(status, kind, run, tmp_p
 
     with ThreadingHTTPServer(("127.0.0.1", 0), Refusing) as server:
         threading.Thread(target=server.serve_forever).start()
-        began = time.monotonic()
         url, files = f"http://127.0.0.1:{server.server_port}", [written(tmp_path / "a", [{}])]
         try:
             with pytest.raises(kind, match="in its own words"):
                 replay_in_bulk(url, files, run, print, print)
         finally:
             server.shutdown()
-    assert time.monotonic() - began < 10
 
 
 def test_bad_lines_are_told_by_number_and_field_and_the_rest_goes_on(
@@ -415,23 +416,29 @@ def test_a_replay_that_was_cut_off_goes_on_where_it_stopped(batches, run, tmp_pa
 
 
 def test_batches_are_sent_at_their_own_times_sped_up(app, address, missions, sky, tmp_path):
-    """Five batches a second apart, at four times the speed, take a second."""
+    """Five batches a second apart, at twenty times the speed, are sent within a fifth of one."""
     drawn = list(draw_pass(missions["XTE"], sky, Pass(5, 9, cadence_s=1.0)))
     path = written(tmp_path / "pass.ndjson", [each.batch for each in drawn])
+    pace = Pace(20.0)
+    due_s = [pace.wait_s(item, 100.0) for item in items_of([path], "run")]
+    assert due_s == pytest.approx([0.0, 0.05, 0.1, 0.15, 0.2], abs=1e-6)
+    assert pace.wait_s(next(items_of([path], "run")), 101.0) == 0.0
     for run, where in (("paced-1", {"app": app}), ("paced-2", {"url": address})):
         start = time.monotonic()
-        replayed(path, run, tmp_path / "out", pace=Pace(4.0), **where)
-        assert 1.0 <= time.monotonic() - start < 3.0
+        replayed(path, run, tmp_path / "out", pace=Pace(20.0), **where)
+        # Never earlier; how much later depends on the machine.
+        assert time.monotonic() - start >= 0.2
 
 
 def test_where_no_service_answers_it_is_said_at_once(tmp_path, batches):
     path = written(tmp_path / "pass.ndjson", batches)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        url = f"http://127.0.0.1:{free.getsockname()[1]}"
     (tmp_path / "out").write_text("of an earlier run")
-    with pytest.raises(Busy, match=f"no service answers at {url}") as refusal:
-        replayed(path, "run", tmp_path / "out", url=url)
+    with socket.socket() as silent:
+        # Nobody listens, and nobody else can take the port meanwhile.
+        silent.bind(("127.0.0.1", 0))
+        url = f"http://127.0.0.1:{silent.getsockname()[1]}"
+        with pytest.raises(Busy, match=f"no service answers at {url}") as refusal:
+            replayed(path, "run", tmp_path / "out", url=url)
     assert "acquire serve" in str(refusal.value)
     assert (tmp_path / "out").read_text() == "of an earlier run"
 

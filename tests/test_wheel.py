@@ -45,8 +45,7 @@ def installed(wheel, tmp_path_factory):
             check=True,
         ).stdout
 
-    assert str(site) in run("-c", "import service; print(service.__file__)")
-    return run
+    return site, run
 
 
 def test_the_wheel_holds_every_file_of_the_package_and_the_shipped_data(wheel):
@@ -76,15 +75,22 @@ def test_the_wheel_the_service_and_the_client_have_one_version(wheel):
     assert service.__version__ == acquire_client.__version__ == wheel.name.split("-")[1]
 
 
+COMMANDS = """
+import service
+from service.cli import main
+
+print(service.__file__)
+print(service.__version__)
+assert main(["database", "check", "--fresh"]) == 0
+assert main("catalog export --spacecraft XTE --epoch 2000 run.csv".split()) == 0
+print(sum(1 for line in open("run.csv")))
+"""
+
+
 def test_its_commands_find_migrations_and_star_catalog_in_the_wheel(installed):
-    version = installed("-m", "service.cli", "--version")
-    assert (
-        version.split()[-1] == installed("-c", "import service; print(service.__version__)").strip()
-    )
-    assert "the schema is that of the code" in installed(
-        "-m", "service.cli", "database", "check", "--fresh"
-    )
-    export = ("catalog", "export", "--spacecraft", "XTE", "--epoch", "2000", "run.csv")
-    installed("-m", "service.cli", *export)
-    rows = installed("-c", "print(sum(1 for line in open('run.csv')))")
+    site, run = installed
+    place, version, *told, rows = run("-c", COMMANDS).splitlines()
+    assert place.startswith(str(site))
+    assert run("-m", "service.cli", "--version").split()[-1] == version
+    assert "the schema is that of the code" in "\n".join(told)
     assert int(rows) > 1_000
