@@ -3,6 +3,9 @@
 Each has missions and a sky of its own and never sees the database.  A child that dies
 breaks an executor whole: another takes its place, and what was unfinished is handed
 in again, one chunk at a time, so that a chunk that ends its process is known by name.
+
+The processes are forked from the standard library's fork server, which has imported the
+modules once and does nothing else: no thread, no database, no kernel.
 """
 
 import logging
@@ -19,13 +22,14 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
-from multiprocessing import resource_tracker
+from multiprocessing import forkserver, resource_tracker, util
 from multiprocessing.connection import Connection
 from typing import Any, Generic, TypeVar
 
 from service import logs
 from service.acquire.kernel_build import SIGNALS
 from service.errors import Stopping
+from service.ingest import worker_process
 from service.ingest.worker_process import Work, WorkerConfig, begin, compute, ready_pid
 
 PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0
@@ -92,6 +96,7 @@ class LocalWorkers(Generic[Input, Output]):
         self._pause_s = PAUSE_S
         self._not_before_s = 0.0
         self._used_s = 0.0
+        self._idle_check: threading.Timer | None = None
         self._closing = False
 
     @property
@@ -160,7 +165,10 @@ class LocalWorkers(Generic[Input, Output]):
 
     def _open(self) -> "_Processes[Input, Output]":
         """Start the processes; raises `OSError` where that cannot be done."""
-        context = multiprocessing.get_context("spawn")
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload([worker_process.__name__])
+        # Python 3.11.0 would have the server listen where every local user can connect.
+        util.abstract_sockets_supported = False  # type: ignore[misc]
         there, stop = context.Pipe(duplex=False)
         executor = ProcessPoolExecutor(
             self.count,
@@ -172,9 +180,11 @@ class LocalWorkers(Generic[Input, Output]):
         ready: list[Future[int]] = []
         try:
             resource_tracker.ensure_running()  # it would unblock the signals
-            # The processes are started now; each hears no signal until it ignores them.
+            # The processes are started now, and their server, unless it runs.  It keeps the
+            # signals blocked; each process hears none until it ignores them.
             before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
             try:
+                forkserver.ensure_running()
                 ready.extend(executor.submit(ready_pid) for _ in range(self.count))
             except BrokenProcessPool:
                 # One has died already, which `_see_the_end` finds out, too.
@@ -195,6 +205,9 @@ class LocalWorkers(Generic[Input, Output]):
     def _end_processes(self) -> "_Processes[Input, Output] | None":
         """Have the processes exit; gives them, for their executor is to be shut down."""
         processes, self._processes = self._processes, None
+        if self._idle_check is not None:
+            # Its thread would keep these workers in memory.
+            self._idle_check.cancel()
         if processes is not None:
             processes.told_to_end = True
             processes.end()
@@ -338,9 +351,9 @@ class LocalWorkers(Generic[Input, Output]):
                     self._hand_in(self._one_by_one[0])
 
     def _check_idle_after(self, seconds: float) -> None:
-        timer = threading.Timer(seconds, self._check_idle, (self._processes,))
-        timer.daemon = True
-        timer.start()
+        self._idle_check = threading.Timer(seconds, self._check_idle, (self._processes,))
+        self._idle_check.daemon = True
+        self._idle_check.start()
 
     def _check_idle(self, processes: "_Processes[Input, Output]") -> None:
         with self._lock:

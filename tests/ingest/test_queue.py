@@ -5,6 +5,7 @@ import json
 import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 
 import pytest
 
@@ -13,6 +14,7 @@ from service.ingest import queue
 from service.ingest import solver_pool as pools
 from service.ingest.solver_pool import SolverPool, SolverTask, TurnQueue, may_take_long
 from service.observations.schema import submission_from_json
+from tests.waiting import wait_until
 
 PATIENCE_S = 20.0
 
@@ -69,6 +71,7 @@ def test_a_repeat_of_what_is_computed_waits_for_it_and_gets_its_answer(send, mak
     assert held.computed.count("same") == 1
 
 
+@pytest.mark.both_databases
 def test_what_could_not_be_recorded_is_tried_again_by_its_repeat(send, make, monkeypatch):
     failing = [ZeroDivisionError("inside")]
     held = Held(monkeypatch, "same")
@@ -102,20 +105,21 @@ def test_those_that_are_too_many_are_refused_at_once(send, make, monkeypatch):
 
 
 def test_what_waited_too_long_may_come_again(app, send, make, monkeypatch):
-    begun = threading.Event()
+    begun, go_on = threading.Event(), threading.Event()
     look_up = app.submissions.ingest._queue._look_up
 
     def slowly(group):
         begun.set()
-        time.sleep(0.3)
+        go_on.wait(PATIENCE_S)
         return look_up(group)
 
     monkeypatch.setattr(app.submissions.ingest._queue, "_look_up", slowly)
     first = send(make("b1"))
     assert begun.wait(PATIENCE_S)
     late = app.submissions.ingest.submit_made(
-        ("XTE", "live", "b2"), "f", None, None, None, Future(), is_long=False, wait_s=0.1
+        ("XTE", "live", "b2"), "f", None, None, None, Future(), is_long=False, wait_s=0.0
     )
+    go_on.set()
     assert isinstance(late.exception(PATIENCE_S), Busy)
     assert not first.result(PATIENCE_S).replayed
     assert not app.submissions.submit(make("b2")).replayed
@@ -207,8 +211,7 @@ def test_closing_finishes_what_has_begun_and_refuses_what_has_not():
         first = threads.submit(pool.call, work, "a", is_long=True)
         assert begun.wait(PATIENCE_S)
         second = threads.submit(pool.call, work, "b", is_long=True)
-        while not pool._long:
-            time.sleep(0.001)
+        wait_until(lambda: pool._long, why="the second task is not queued")
         closing = threads.submit(pool.close)
         assert isinstance(second.exception(PATIENCE_S), Stopping)
         go_on.set()
@@ -220,7 +223,14 @@ def test_closing_finishes_what_has_begun_and_refuses_what_has_not():
 
 def test_an_ingest_thread_that_ended_or_stalls_is_noticed(app, make, monkeypatch):
     service = app.submissions.ingest
-    service.require_alive()
+
+    def is_alive():
+        with suppress(Stopping):
+            service.require_alive()
+            return True
+        return False
+
+    assert is_alive()
     monkeypatch.setattr(queue, "HEARTBEAT_S", 0.05)
     monkeypatch.setattr(queue, "STALLED_S", 0.5)
     go_on = threading.Event()
@@ -229,13 +239,12 @@ def test_an_ingest_thread_that_ended_or_stalls_is_noticed(app, make, monkeypatch
         service._queue, "_look_up", lambda group: (go_on.wait(PATIENCE_S), look_up(group))[1]
     )
     stalled = service.submit(make("b1"), None, None, Future())
-    time.sleep(0.8)
+    wait_until(lambda: not is_alive(), why="the stalled thread is not noticed")
     with pytest.raises(Stopping, match="restart"):
         service.require_alive()
     go_on.set()
     stalled.exception(PATIENCE_S)
-    time.sleep(0.1)
-    service.require_alive()
+    wait_until(is_alive, why="the thread counts as stalled though it goes on")
     service._queue._inbox.put(None)
     service._queue._thread.join(PATIENCE_S)
     with pytest.raises(Stopping, match="restart"):

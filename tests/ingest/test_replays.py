@@ -3,7 +3,6 @@
 import io
 import json
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import msgspec
@@ -14,13 +13,15 @@ from sqlalchemy import update
 from service.errors import BadBatch, Busy, Stopping
 from service.storage.sql.tables import replays
 from service.storage.sql.writer import Writer
+from tests.waiting import wait_until
 
 
 def finished(app, id, seconds=60):
-    give_up = time.monotonic() + seconds
-    while (replay := app.replays.get(id)).finished is None and time.monotonic() < give_up:
-        time.sleep(0.01)
-    return replay
+    """The state of a replay when it is over."""
+    wait_until(
+        lambda: app.replays.get(id).finished is not None, seconds, why="the replay does not end"
+    )
+    return app.replays.get(id)
 
 
 @pytest.fixture
@@ -28,6 +29,7 @@ def lines(make):
     return [make(f"b{index}", after_s=60.0 * index).text.encode() + b"\n" for index in range(10)]
 
 
+@pytest.mark.both_databases
 def test_every_line_is_recorded_in_the_run_and_none_in_live(app, lines):
     replay = finished(app, app.replays.start(lines, "pass-1", name="pass-1.ndjson"))
     assert replay.state == "done"
@@ -53,6 +55,7 @@ def test_a_bad_line_is_reported_with_its_number_and_the_rest_goes_on(app, lines,
     assert len(app.results.page(run="pass-1").items) == 7
 
 
+@pytest.mark.both_databases
 def test_a_replay_is_safe_to_run_twice(app, lines):
     for _ in range(2):
         replay = finished(app, app.replays.start(lines, "pass-1"))
@@ -125,9 +128,7 @@ def test_closing_interrupts_a_replay_and_keeps_what_it_recorded(opened, make):
 
     app = opened()
     id = app.replays.start(endless(), "endless")
-    give_up = time.monotonic() + 60
-    while app.replays.get(id).lines.done == 0 and time.monotonic() < give_up:
-        time.sleep(0.01)
+    wait_until(lambda: app.replays.get(id).lines.done, 60, why="no line is recorded")
     app.close()
     later = opened()
     replay = later.replays.get(id)

@@ -1,15 +1,16 @@
 """Replays computed by processes of their own: the same answers, whatever becomes of a process."""
 
 import json
-import multiprocessing.connection
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
 import threading
-import time
 from collections import Counter
+from functools import partial
+from multiprocessing import forkserver
 from pathlib import Path
 
 import httpx
@@ -17,9 +18,11 @@ import msgspec
 import pytest
 from sqlalchemy import select
 
+from service.acquire.kernel_build import SIGNALS
 from service.app.factory import open_app
 from service.errors import AcquisitionError, BadBatch, BadConfiguration, BadInput
 from service.ingest.local_workers import (
+    MOST_DEATHS,
     ChunkEndsWorkers,
     LocalWorkers,
     WorkerLost,
@@ -29,25 +32,26 @@ from service.ingest.worker_process import WorkerConfig
 from service.observations.schema import submission_from_json
 from service.settings import Settings
 from service.storage.sql.tables import batches
+from tests import waiting
+from tests.fresh_databases import sqlite_at
+from tests.ingest.partitions.processes import children_of
 from tests.ingest.test_replays import finished
+from tests.ingest.worker_tasks import double, half_sent, settings_once_there, unreadable
+from tests.scale import draws
 from tests.storage import samples
 from tests.storage.samples import without_accidents
 
 GIVE_UP_S = 120.0
+wait_until = partial(waiting.wait_until, seconds=GIVE_UP_S)
 
 
-def wait_until(is_so, what):
-    give_up = time.monotonic() + GIVE_UP_S
-    while not is_so():
-        assert time.monotonic() < give_up, what
-        time.sleep(0.01)
+def server_pid():
+    """The process that forks workers; None before the first."""
+    return forkserver._forkserver._forkserver_pid
 
 
-def children_of(pid):
-    """Processes that a process has started, and those that these have."""
-    files = Path(f"/proc/{pid}/task").glob("*/children")
-    found = {int(child) for each in files for child in each.read_text().split()}
-    return found.union(*map(children_of, found))
+def is_there(pid):
+    return Path(f"/proc/{pid}").exists()
 
 
 def workers_of(app):
@@ -57,7 +61,7 @@ def workers_of(app):
 def with_workers(app, count=1):
     """The operations, once so many workers are ready."""
     app.replays.bulk.workers.start()
-    wait_until(lambda: app.replays.processes() == count, "no worker is ready")
+    wait_until(lambda: app.replays.processes() == count, why="no worker is ready")
     return app
 
 
@@ -138,7 +142,7 @@ def test_observers_hear_of_what_workers_computed(opened, lines):
 
 def test_workers_that_are_killed_again_and_again_cost_and_double_nothing(opened, make):
     app = with_workers(opened(replay_processes=2), 2)
-    killed, wanted = [], 2000
+    killed, wanted = [], draws(1000, 2000)
     over = threading.Event()
 
     def numbered():
@@ -166,10 +170,10 @@ def test_closing_ends_workers_and_replays_at_once(opened, make):
     others = set(threading.enumerate())
     app = with_workers(opened(replay_processes=1))
     id = app.replays.start(endless(make().text), "endless")
-    wait_until(lambda: app.replays.get(id).lines.done > 100, "nothing is recorded")
+    wait_until(lambda: app.replays.get(id).lines.done > 100, why="nothing is recorded")
     (pid,) = workers_of(app)
     app.close()
-    assert not Path(f"/proc/{pid}").exists()
+    assert not is_there(pid)
     left = set(threading.enumerate()) - others
     assert not [each for each in left if each.name.startswith("worker-")]
     later = opened()
@@ -178,37 +182,71 @@ def test_closing_ends_workers_and_replays_at_once(opened, make):
     assert len(names_in(later, "endless")) == replay.lines.done
 
 
-def test_workers_that_are_still_starting_are_ended_as_well(opened):
-    app = opened(replay_processes=1)
-    before = children_of(os.getpid())
-    app.replays.bulk.workers.start()
-    wait_until(lambda: children_of(os.getpid()) - before, "no worker is started")
-    assert not workers_of(app)
-    started = children_of(os.getpid()) - before
-    app.close()
-    wait_until(lambda: not children_of(os.getpid()) & started, "a worker is left behind")
+@pytest.fixture
+def local_workers(sky):
+    """Makes workers, by default without missions; all are ended.
+
+    They load only the kernels that depend on no mission.
+    """
+    made = []
+
+    def make_workers(work, count=1, missions=None, catalog=None):
+        config = WorkerConfig(missions or {}, catalog, sky.catalog.digest, 1 << 20)
+        made.append(LocalWorkers(config, work, count))
+        return made[-1]
+
+    yield make_workers
+    for each in made:
+        closing = threading.Thread(target=each.close, daemon=True)
+        closing.start()
+        closing.join(GIVE_UP_S)
+        assert not closing.is_alive()
 
 
-def double(solver, number):
-    """What a worker makes of a number; of 13 it ends its process."""
-    if number == 13:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return [2 * number]
+def test_workers_that_are_still_starting_are_ended_as_well(local_workers, tmp_path):
+    never_read = tmp_path / "catalog.npz"
+    os.mkfifo(never_read)
+    before = children_of(server_pid()) if server_pid() else set()
+    workers = local_workers(double, catalog=never_read)
+    workers.start()
+    started = wait_until(lambda: children_of(server_pid()) - before, why="no worker is started")
+    workers.close()
+    assert not workers.pids
+    wait_until(lambda: not children_of(server_pid()) & started, why="a worker is left behind")
 
 
-def test_a_chunk_that_ends_its_processes_is_named_and_costs_no_other(missions, sky):
-    config = WorkerConfig(missions, None, sky.catalog.digest, 1 << 20)
-    workers = LocalWorkers(config, double, 2)
-    try:
-        futures = {number: workers.submit(number) for number in (1, 2, 13, 4, 5)}
-        for number, future in futures.items():
-            if number == 13:
-                assert isinstance(future.exception(GIVE_UP_S), ChunkEndsWorkers)
-            else:
-                assert future.result(GIVE_UP_S) == [2 * number]
-        assert workers.submit(6).result(GIVE_UP_S) == [12]
-    finally:
-        workers.close()
+def assert_13_is_lost(futures, error=WorkerLost):
+    for number, future in futures.items():
+        if number == 13:
+            assert isinstance(future.exception(GIVE_UP_S), error)
+        else:
+            assert future.result(GIVE_UP_S) == [2 * number]
+
+
+def test_a_chunk_that_ends_its_processes_is_named_and_costs_no_other(local_workers):
+    workers = local_workers(double, 2)
+    futures = {number: workers.submit(number) for number in (1, 2, 13, 4, 5)}
+    assert_13_is_lost(futures, ChunkEndsWorkers)
+    assert workers.submit(6).result(GIVE_UP_S) == [12]
+
+
+def test_the_server_of_workers_is_idle_and_its_death_costs_no_chunk(local_workers):
+    """It has no thread and no database that a fork could tear; a stop signal does not reach it."""
+    workers = local_workers(double)
+    assert workers.submit(1).result(GIVE_UP_S) == [2]
+    process = Path(f"/proc/{server_pid()}")
+    assert len(list((process / "task").iterdir())) == 1
+    opened = [os.readlink(each) for each in (process / "fd").iterdir()]
+    assert not [each for each in opened if ".db" in each]
+    blocked = int(re.search(r"SigBlk:\s+(\w+)", (process / "status").read_text())[1], 16)
+    assert all(blocked >> (each - 1) & 1 for each in SIGNALS)
+    before = workers.pids
+    os.kill(server_pid(), signal.SIGKILL)
+    # By a worker that does not know yet, or by its successor.
+    assert workers.submit(2).result(GIVE_UP_S) == [4]
+    wait_until(lambda: not any(map(is_there, before)), why="a worker is left behind")
+    assert workers.submit(3).result(GIVE_UP_S) == [6]
+    assert not workers.pids & before
 
 
 @pytest.fixture
@@ -224,7 +262,7 @@ def dies_at_start(monkeypatch):
             (workers,) = WATCHED
             child, *_ = workers._processes.executor._processes.values()
             child.kill()
-            wait_until(lambda: workers._processes.executor._broken, "nobody has noticed")
+            wait_until(lambda: workers._processes.executor._broken, why="nobody has noticed")
         return found
 
     monkeypatch.setattr(signal, "pthread_sigmask", after_a_start)
@@ -236,137 +274,78 @@ WATCHED = []
 
 
 @pytest.mark.parametrize("starts", [1, 2])
-def test_a_process_that_dies_at_its_start_costs_no_chunk(missions, sky, dies_at_start, starts):
-    config = WorkerConfig(missions, None, sky.catalog.digest, 1 << 20)
-    workers = LocalWorkers(config, double, 2)
+def test_a_process_that_dies_at_its_start_costs_no_chunk(local_workers, dies_at_start, starts):
+    workers = local_workers(double, 2)
     WATCHED.append(workers)
-    try:
-        assert workers.submit(1).result(GIVE_UP_S) == [2]
-        # Those that take the place of the one that dies over 13 die at their start.
-        dies_at_start(starts)
-        futures = {number: workers.submit(number) for number in (2, 13, 4, 5, 6)}
-        for number, future in futures.items():
-            if number == 13:
-                assert isinstance(future.exception(GIVE_UP_S), WorkerLost)
-            else:
-                assert future.result(GIVE_UP_S) == [2 * number]
-    finally:
-        workers.close()
+    assert workers.submit(1).result(GIVE_UP_S) == [2]
+    # Those that take the place of the one that dies over 13 die at their start.
+    dies_at_start(starts)
+    assert_13_is_lost({number: workers.submit(number) for number in (2, 13, 4, 5, 6)})
 
 
-def test_a_process_that_dies_while_others_are_started_is_replaced(missions, sky, dies_at_start):
+def test_a_process_that_dies_while_others_are_started_is_replaced(local_workers, dies_at_start):
     """Though no chunk is handed in: a replay hands none in before processes are ready."""
-    config = WorkerConfig(missions, None, sky.catalog.digest, 1 << 20)
-    workers = LocalWorkers(config, double, 2)
+    workers = local_workers(double, 2)
     WATCHED.append(workers)
-    try:
-        dies_at_start(1)
+    dies_at_start(1)
+    workers.start()
+
+    def are_up():
         workers.start()
+        return workers.up == 2
 
-        def are_up():
-            workers.start()
-            return workers.up == 2
-
-        wait_until(are_up, "the processes have no successors")
-    finally:
-        workers.close()
+    wait_until(are_up, why="the processes have no successors")
 
 
-class Unreadable(Exception):
-    """Of two arguments, of which the exception keeps one: it cannot be read from a pickle."""
-
-    def __init__(self, one, other):
-        super().__init__(one)
-
-
-def slow_or_unreadable(solver, number):
-    """Half a second of work; of 13 a result that cannot be read."""
-    time.sleep(0.5)
-    return [Unreadable(1, 2) if number == 13 else number]
+def test_a_result_that_cannot_be_read_is_told(local_workers):
+    workers = local_workers(unreadable)
+    assert isinstance(workers.submit(13).exception(GIVE_UP_S), WorkerLost)
+    assert workers.submit(1).result(GIVE_UP_S) == [1]
 
 
-def test_a_result_that_cannot_be_read_is_told(missions, sky):
-    config = WorkerConfig(missions, None, sky.catalog.digest, 1 << 20)
-    workers = LocalWorkers(config, slow_or_unreadable, 1)
-    try:
-        assert isinstance(workers.submit(13).exception(GIVE_UP_S), WorkerLost)
-        assert workers.submit(1).result(GIVE_UP_S) == [1]
-    finally:
-        workers.close()
-
-
-def test_processes_that_are_replaced_on_purpose_are_not_held_against_a_chunk(missions, sky):
-    config = WorkerConfig(missions, None, sky.catalog.digest, 1 << 20)
-    workers = LocalWorkers(config, slow_or_unreadable, 1)
-    try:
-        future = workers.submit(1)
-        for _ in range(4):
-            before = workers.pids
-            wait_until(lambda before=before: workers.pids - before, "no worker is ready")
-            assert not future.done()
-            workers.restart()
-        assert future.result(GIVE_UP_S) == [1]
-    finally:
-        workers.close()
-
-
-def half_sent(solver, number):
-    """A result of a megabyte; of 13 the process dies when it has sent a half of it."""
-    if number == 13:
-
-        def send_half(connection, content):
-            os.write(connection.fileno(), bytes(content[: len(content) // 2]))
-            os.kill(os.getpid(), signal.SIGKILL)
-
-        multiprocessing.connection.Connection._send = send_half
-    return [bytes(1 << 20)]
-
-
-def test_a_process_that_dies_while_it_sends_a_result_costs_no_other_chunk(missions, sky):
-    config = WorkerConfig(missions, None, sky.catalog.digest, 1 << 20)
-    workers = LocalWorkers(config, half_sent, 2)
-    futures = {number: workers.submit(number) for number in (1, 13, 2, 3)}
-    try:
-        for number, future in futures.items():
-            if number == 13:
-                assert isinstance(future.exception(GIVE_UP_S), ChunkEndsWorkers)
-            else:
-                assert future.result(GIVE_UP_S) == [bytes(1 << 20)]
-    finally:
-        closing = threading.Thread(target=workers.close, daemon=True)
-        closing.start()
-        closing.join(GIVE_UP_S)
-    assert not closing.is_alive()
-
-
-def settings_after(solver, seconds):
-    """The settings of XTE that a worker has, told after a while."""
-    time.sleep(seconds)
-    return [solver.missions["XTE"].digest]
-
-
-def test_restarted_workers_have_the_settings_of_now_and_lose_no_chunk(missions, sky):
-    used = dict(missions)
-    config = WorkerConfig(used, None, sky.catalog.digest, 1 << 20)
-    workers = LocalWorkers(config, settings_after, 1)
-    try:
-        assert workers.submit(0.0).result(GIVE_UP_S) == [missions["XTE"].digest]
-        pending = [workers.submit(0.2) for _ in range(4)]
-        used["XTE"] = missions["XTE"].within_zones
+def test_processes_that_are_replaced_on_purpose_are_not_held_against_a_chunk(
+    local_workers, tmp_path
+):
+    workers = local_workers(settings_once_there)
+    future = workers.submit(str(tmp_path / "go-on"))
+    for _ in range(MOST_DEATHS + 1):
+        before = workers.pids
+        wait_until(lambda before=before: workers.pids - before, why="no worker is ready")
+        assert not future.done()
         workers.restart()
-        told = [each.result(GIVE_UP_S)[0] for each in pending]
-        assert set(told) <= {missions["XTE"].digest, used["XTE"].digest}
-        assert told[-1] == used["XTE"].digest
-        assert workers.submit(0.0).result(GIVE_UP_S) == [used["XTE"].digest]
-    finally:
-        workers.close()
+    (tmp_path / "go-on").touch()
+    assert future.result(GIVE_UP_S) == []
+
+
+def test_a_process_that_dies_while_it_sends_a_result_costs_no_other_chunk(local_workers):
+    workers = local_workers(half_sent, 2)
+    futures = {number: workers.submit(number) for number in (1, 13, 2, 3)}
+    for number, future in futures.items():
+        if number == 13:
+            assert isinstance(future.exception(GIVE_UP_S), ChunkEndsWorkers)
+        else:
+            assert future.result(GIVE_UP_S) == [bytes(1 << 20)]
+
+
+def test_restarted_workers_have_the_settings_of_now_and_lose_no_chunk(
+    local_workers, missions, tmp_path
+):
+    used = {"XTE": missions["XTE"]}
+    workers = local_workers(settings_once_there, missions=used)
+    assert workers.submit(str(tmp_path)).result(GIVE_UP_S) == [missions["XTE"].digest]
+    pending = [workers.submit(str(tmp_path / "go-on")) for _ in range(4)]
+    used["XTE"] = missions["XTE"].within_zones
+    assert used["XTE"].digest != missions["XTE"].digest
+    workers.restart()
+    (tmp_path / "go-on").touch()
+    assert [each.result(GIVE_UP_S) for each in pending] == [[used["XTE"].digest]] * 4
 
 
 class Served:
     """`acquire serve` in a process group of its own, with one worker at work on a replay."""
 
     def __init__(self, folder, lines):
-        self.database = f"sqlite:///{folder / 'acquire.db'}"
+        self.database = sqlite_at(folder / "acquire.db")
         self._said = folder / "said"
         command = [sys.executable, "-m", "service.cli", "serve", "--port", "0"]
         environment = os.environ | {"ACQUIRE_REPLAY_PROCESSES": "1"}
@@ -378,10 +357,10 @@ class Served:
                 env=environment,
                 start_new_session=True,
             )
-        wait_until(lambda: "running on http" in self.said, "the service did not start")
+        wait_until(lambda: "running on http" in self.said, why="the service did not start")
         address = self.said.partition("running on ")[2].split()[0]
         with httpx.Client(base_url=address, timeout=60) as client:
-            wait_until(lambda: client.get("/readyz").status_code == 200, "it is not ready")
+            wait_until(lambda: client.get("/readyz").status_code == 200, why="it is not ready")
             head = {"Content-Type": "application/x-ndjson"}
 
             def send(content, run):
@@ -392,13 +371,13 @@ class Served:
                 return "\nstarid_replay_processes 1.0" in client.get("/metrics").text
 
             send(lines[0], "first")
-            wait_until(is_up, "no worker is ready")
+            wait_until(is_up, why="no worker is ready")
             assert 'run="named",spacecraft="XTE"} 1.0' in client.get("/metrics").text
             self.children = children_of(self.process.pid)
             send(b"\n".join(lines), "bulk")
             wait_until(
                 lambda: client.get("/api/v1/batches?run=bulk&limit=1").json()["items"],
-                "nothing is recorded",
+                why="nothing is recorded",
             )
 
     @property
@@ -406,7 +385,7 @@ class Served:
         return self._said.read_text()
 
     def left(self):
-        return {each for each in self.children if Path(f"/proc/{each}").exists()}
+        return set(filter(is_there, self.children))
 
 
 @pytest.fixture
@@ -419,16 +398,20 @@ def test_no_worker_outlives_a_service_that_is_killed(tmp_path, long_replay):
     assert served.children
     served.process.kill()
     served.process.wait()
-    wait_until(lambda: not served.left(), "a worker is left behind")
+    wait_until(lambda: not served.left(), why="a worker is left behind")
 
 
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM], ids=lambda each: each.name)
+@pytest.mark.parametrize(
+    "stop",
+    [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM],
+    ids=lambda each: each.name,
+)
 def test_whoever_stops_the_whole_group_stops_it_in_order(tmp_path, long_replay, stop):
     """As Ctrl-C does, and systemd."""
     served = Served(tmp_path, long_replay)
     os.killpg(served.process.pid, stop)
     assert served.process.wait(60) in (0, -stop)
-    wait_until(lambda: not served.left(), "a worker is left behind")
+    wait_until(lambda: not served.left(), why="a worker is left behind")
     assert "Traceback" not in served.said
     assert "a worker ended" not in served.said
     app = open_app(Settings(database=served.database))

@@ -4,9 +4,10 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from tests.waiting import wait_until
 
 CHECKOUT = Path(__file__).parents[3]
 WAIT_S = 120.0
@@ -39,39 +40,37 @@ def end(process):
 
 
 def children_of(pid):
-    """The processes that compute for another one."""
-    found = []
-    for place in Path("/proc").glob("[0-9]*"):
-        try:
-            parent = int((place / "stat").read_text().rpartition(")")[2].split()[1])
-            command = (place / "cmdline").read_bytes()
-        except (OSError, ValueError, IndexError):
-            continue
-        if parent == pid and b"spawn_main" in command:
-            found.append(int(place.name))
-    return found
+    """The processes that a process has started, and those that these have."""
+    found = set()
+    # A process may end while it is looked at.
+    with suppress(OSError):
+        for file in Path(f"/proc/{pid}/task").glob("*/children"):
+            found.update(map(int, file.read_text().split()))
+    return found.union(*map(children_of, found))
+
+
+def workers_of(pid):
+    """The processes that compute for another one: forked by its fork server."""
+    servers = [each for each in children_of(pid) if b"forkserver" in _command(each)]
+    # Those that are forked have its command line.
+    return {child for each in servers for child in children_of(each)}
+
+
+def _command(pid):
+    with suppress(OSError):
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
+    return b""
 
 
 def kill_a_child(pid, rng):
     """Kill one of the processes that compute for another one; whether there was one."""
-    found = sorted(children_of(pid))
+    found = sorted(workers_of(pid))
     if not found:
         return False
     try:
         os.kill(int(rng.choice(found)), signal.SIGKILL)
     except ProcessLookupError:
         return False
-    return True
-
-
-def wait_until(true, process=None, within_s=WAIT_S):
-    """Wait for something; False: the process ended before."""
-    give_up = time.monotonic() + within_s
-    while not true():
-        if process is not None and process.poll() is not None:
-            return False
-        assert time.monotonic() < give_up, "nothing came of it"
-        time.sleep(0.02)
     return True
 
 
@@ -103,8 +102,11 @@ def scheduler(folder):
     # Workers are killed here on purpose.
     often = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1000"}
     with dask_process("scheduler", *words, environment=often):
-        wait_until(file.exists)
-        wait_until(lambda: file.read_text().endswith("}"))
+        wait_until(
+            lambda: file.exists() and file.read_text().endswith("}"),
+            WAIT_S,
+            why="the scheduler has not started",
+        )
         yield json.loads(file.read_text())["address"]
 
 

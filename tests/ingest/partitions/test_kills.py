@@ -8,35 +8,34 @@ from contextlib import ExitStack
 import pytest
 
 from service.errors import BadConfiguration
+from service.ingest.partitions import plan
 from service.storage.archive.folder import manifests
+from tests.fresh_databases import sqlite_at
 from tests.ingest.partitions.checks import assert_whole, files_of
 from tests.ingest.partitions.processes import (
     CHECKOUT,
+    WAIT_S,
     begin_command,
     dask_worker,
     end,
     kill_a_child,
     run_command,
     scheduler,
-    wait_until,
 )
 from tests.scale import size
 from tests.storage.test_faulty_disk import faulty_disk
+from tests.waiting import wait_until
 
 __all__ = ["faulty_disk"]
 
 WORKER_KILLS, COORDINATOR_KILLS, FAULTS = 200, 20, 50
+MOST_BATCHES = plan.MOST_BATCHES
 
 
 @pytest.fixture
-def database(empty_database):
-    """With SQLite alone: another process works on it."""
-    if not empty_database.startswith("sqlite"):
-        pytest.skip("workers never see the database: SQLite shows the same")
-    from service.storage.sql.migrations import upgrade
-
-    upgrade(empty_database)
-    return empty_database
+def database(tmp_path):
+    """On SQLite alone: workers never see the database."""
+    return sqlite_at(tmp_path / "acquire.db")
 
 
 @pytest.fixture
@@ -59,10 +58,13 @@ def folders(archived, place, tmp_path, database):
 
 
 @pytest.fixture
-def undisturbed(folders):
-    """The parts that a single process makes of all."""
+def undisturbed(folders, opened, monkeypatch):
+    """The parts that a single process makes of all, as large as the commands make them."""
     database, place = folders()
-    run_command(database, place, processes=1)
+    monkeypatch.setattr(plan, "MOST_BATCHES", MOST_BATCHES)
+    app = opened(database=database, archive_folder=place)
+    app.runs.reprocess_into_archive("again", place, processes=1)
+    app.close()
     return files_of(place, "again")
 
 
@@ -83,7 +85,12 @@ def named(place):
 
 
 def wait_for_parts(place, count, process):
-    wait_until(lambda: named(place) >= count, process)
+    """Wait for so many parts of the run, or for the end of the process."""
+    wait_until(
+        lambda: named(place) >= count or process.poll() is not None,
+        WAIT_S,
+        why=f"there are not {count} parts",
+    )
 
 
 def test_a_dask_scheduler_whose_workers_come_and_go_makes_the_same_bytes(
@@ -104,6 +111,7 @@ def test_a_dask_scheduler_whose_workers_come_and_go_makes_the_same_bytes(
     check(database, place, undisturbed)
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_goes_is_told_and_the_rest_is_done_without(
     folders, undisturbed, check, tmp_path
 ):
@@ -134,6 +142,7 @@ def test_a_worker_of_another_version_is_refused(archived, place, missions, packa
         dask_workers._solver_of(pickle.dumps(config))
 
 
+@pytest.mark.slow
 @pytest.mark.torture
 def test_after_every_kill_of_a_worker_each_partition_is_there_once(
     folders, undisturbed, check, rng, figures
@@ -156,6 +165,7 @@ def test_after_every_kill_of_a_worker_each_partition_is_there_once(
     figures(kills=kills, rounds=rounds)
 
 
+@pytest.mark.slow
 @pytest.mark.torture
 def test_after_every_kill_of_the_command_each_partition_is_there_once(
     folders, undisturbed, check, rng, figures
@@ -173,6 +183,7 @@ def test_after_every_kill_of_the_command_each_partition_is_there_once(
     figures(kills=kills)
 
 
+@pytest.mark.slow
 @pytest.mark.torture
 def test_a_full_disk_stops_it_with_a_message_and_it_goes_on(
     folders, undisturbed, check, faulty_disk, rng, figures
