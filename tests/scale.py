@@ -43,6 +43,11 @@ def some_in_a_sitting(values: Sequence[Any]) -> list[Any]:
     ]
 
 
+def at_full_size() -> bool:
+    """Whether this is `make torture`, which has the machine for itself."""
+    return os.environ.get(VARIABLE) == "1"
+
+
 def is_full() -> bool:
     """Whether everything is to be tested, not only what fits into a sitting."""
     return bool(os.environ.get(FULL) or os.environ.get(VARIABLE))

@@ -279,7 +279,7 @@ def test_where_no_service_answers_it_is_said_after_the_patience_is_over():
             client.fleet()
         with pytest.raises(NoAnswer, match="gives no answer"):
             list(client.events())
-        assert time.monotonic() - begun < 5
+        assert time.monotonic() - begun < 30, "a patience of its own was not used"
         with pytest.raises(NoAnswer):
             client.ping()
 

@@ -12,13 +12,14 @@ import pytest
 from fastapi.routing import APIRoute
 from sqlalchemy import text
 
-from service.access import tokens
+from service.access import sessions, tokens
 from service.app.factory import open_app
 from service.storage.recording.ids import Ulids
 from service.times import shifted, utc_now
 from service.web import event_stream as live
 from service.web.app import bare_app, create_app
 from service.web.requests.access import COOKIE, POLICIES, authorize
+from tests.waiting import wait_until
 from tests.web.console_pages import console_addresses
 from tests.web.serving import Server, in_process_settings
 from tests.web.test_bodies import raw
@@ -34,7 +35,6 @@ PATH_PARAMETERS = {
 }
 OPEN_BESIDE_THE_ROUTES = {"/static", "/api/v1/openapi.json"}
 """What `docs/access.md` says is open, of what no policy is asked about."""
-KNOWN_AGAIN_S = 1.3
 """A little more than what is known of a token is believed for."""
 
 
@@ -135,13 +135,13 @@ def asked(client, method, path, **more):
 
 def ended(client, path, headers):
     """A replay's progress when it is over, as its caller is told."""
-    for _ in range(400):
+
+    def over():
         answer = client.get(path, headers=headers)
         assert answer.status_code == 200, answer.text
-        if answer.json()["state"] != "running":
-            return answer.json()
-        time.sleep(0.05)
-    raise AssertionError(answer.text)
+        return answer.json()["state"] != "running" and answer.json()
+
+    return wait_until(over, 60.0)
 
 
 def replay_begun(client, token, lines, query="run=bound"):
@@ -286,12 +286,21 @@ def test_a_bound_token_has_no_alarms_of_a_run_switched(guarded, anybody, drawn):
     assert json.loads(listed[0]["body"]) == body
 
 
-def test_revoking_a_token_holds_within_a_second(guarded, anybody):
+def refused_in_the_end(client, **more):
+    """What was known of a caller is forgotten: a caller who is read anew is refused."""
+    wait_until(lambda: client.get("/api/v1/session", **more).status_code == 401)
+    assert client.get("/api/v1/session", **more).status_code == 401
+
+
+def test_a_caller_is_known_for_no_more_than_a_second():
+    assert sessions.KNOWN_FOR_S <= 1.0
+
+
+def test_revoking_a_token_holds_soon(guarded, anybody):
     token = guarded.token("short lived", "read")
     assert anybody.get("/api/v1/session", headers=shown(token)).status_code == 200
     guarded.revoke("short lived")
-    time.sleep(KNOWN_AGAIN_S)
-    assert anybody.get("/api/v1/session", headers=shown(token)).status_code == 401
+    refused_in_the_end(anybody, headers=shown(token))
 
 
 def test_a_token_is_made_listed_and_revoked_at_once_by_who_operates(guarded, anybody):
@@ -389,8 +398,7 @@ def test_a_session_is_a_cookie_that_scripts_cannot_read_and_other_sites_cannot_u
         same = {"Sec-Fetch-Site": "same-origin"}
         assert browser.delete("/api/v1/session", headers=same).status_code == 200
         browser.cookies.update(kept)
-        time.sleep(KNOWN_AGAIN_S)
-        assert browser.get("/api/v1/session").status_code == 401
+        refused_in_the_end(browser)
 
 
 @pytest.mark.parametrize("host", [b"", b"Host:\r\n"])
@@ -411,7 +419,7 @@ def test_a_session_without_a_host_changes_nothing_and_reads(guarded, host):
 
 
 @pytest.mark.parametrize("by", ["token", "session"])
-def test_the_stream_of_a_revoked_token_ends_within_two_seconds(guarded, by):
+def test_the_stream_of_a_revoked_token_ends(guarded, by):
     """Also where a browser listens with a session of that token; others go on."""
     name = f"listening by {by}"
     token = guarded.token(name, "read")
@@ -420,29 +428,32 @@ def test_the_stream_of_a_revoked_token_ends_within_two_seconds(guarded, by):
         begun = httpx.post(f"{guarded.url}/api/v1/session", json={"token": token})
         headers = {"Cookie": f"{COOKIE}={begun.cookies[COOKIE]}"}
     with Stream(guarded.url, headers) as stream, Stream(guarded.url, shown(guarded.all)) as other:
-        assert not stream.ended.wait(1.5)
+        # Longer than the time after which every listener is asked for again.
+        assert not stream.ended.wait(1.2 * live.ADMITTED_EVERY_S)
         guarded.revoke(name)
-        revoked_s = time.monotonic()
-        assert stream.ended.wait(10)
-        assert time.monotonic() - revoked_s < 2.0
+        assert stream.ended.wait(60)
         assert not other.ended.is_set()
     with httpx.stream("GET", f"{guarded.url}/api/v1/events", headers=headers) as again:
         assert again.status_code == 401
 
 
-def test_the_stream_of_an_expired_token_ends_within_two_seconds(guarded):
-    token = guarded.token("short", "read", days=4 / 86400)
-    expires_s = time.monotonic() + 4
+def test_a_listener_is_asked_for_again_every_second():
+    assert live.ADMITTED_EVERY_S + sessions.KNOWN_FOR_S <= 2.0
+
+
+def test_the_stream_of_an_expired_token_ends(guarded, anybody):
+    token = guarded.token("short", "read", days=2 / 86400)
+    expires_s = time.monotonic() + 2
     with Stream(guarded.url, shown(token)) as stream:
-        assert stream.ended.wait(20)
-        assert 0 < time.monotonic() - expires_s < 2.0
+        assert stream.ended.wait(60)
+    assert time.monotonic() > expires_s
 
 
 def test_the_first_token_ends_the_streams_of_those_who_needed_none(chosen_database):
     service = Guarded(chosen_database())
     with Server(create_app(service.app)) as url, Stream(url, {}) as stream:
         service.token("first", "read")
-        assert stream.ended.wait(2.5)
+        assert stream.ended.wait(60)
 
 
 def test_one_token_s_streams_are_bounded_and_keep_out_nobody_else(guarded):
@@ -456,13 +467,13 @@ def test_one_token_s_streams_are_bounded_and_keep_out_nobody_else(guarded):
         assert "10 event streams open" in refused.json()["detail"]
         streams.enter_context(Stream(guarded.url, shown(guarded.all)))
         last.close()
-        for _ in range(100):
-            # The server sees that a client has gone a moment later.
+
+        def has_room():
             answer = asked(httpx, "GET", f"{guarded.url}/api/v1/events", headers=shown(token))
-            if answer.status_code == 200:
-                break
-            time.sleep(0.05)
-        assert answer.status_code == 200
+            return answer.status_code == 200
+
+        # The server sees that a client has gone a moment later.
+        wait_until(has_room)
 
 
 def test_a_session_ends_with_its_token(guarded):
@@ -471,8 +482,7 @@ def test_a_session_ends_with_its_token(guarded):
         browser.post("/api/v1/session", json={"token": token}).raise_for_status()
         assert browser.get("/api/v1/session").json()["name"] == "leaving"
         guarded.revoke("leaving")
-        time.sleep(KNOWN_AGAIN_S)
-        assert browser.get("/api/v1/session").status_code == 401
+        refused_in_the_end(browser)
 
 
 def test_of_an_array_a_bound_token_records_its_own_spacecraft_alone(guarded, anybody, drawn):
@@ -592,9 +602,9 @@ def test_access_is_open_on_loopback_until_the_first_token_is_made(chosen_databas
     with Server(create_app(service.app)) as url, httpx.Client(base_url=url) as client:
         assert client.get("/api/v1/session").json()["name"] == "local"
         service.token("first", "read")
-        time.sleep(KNOWN_AGAIN_S)
-        assert client.get("/api/v1/session").status_code == 401
+        refused_in_the_end(client)
         service.revoke("first")
-        time.sleep(KNOWN_AGAIN_S)
-        # Revoking the last one opens nothing.
+        # Revoking the last one opens nothing, also once that is known.
+        wait_until(lambda: not service.app.access.has_tokens())
+        time.sleep(sessions.KNOWN_FOR_S)
         assert client.get("/api/v1/session").status_code == 401

@@ -10,6 +10,7 @@ import pytest
 from service.app.factory import open_app
 from service.web.app import create_app
 from service.web.requests.request_body import MAX_JSON_BYTES, BodyLimits
+from tests.waiting import wait_until
 from tests.web.serving import Server, in_process_settings
 
 URL = "/api/v1/batches"
@@ -82,10 +83,8 @@ def test_a_body_that_stops_coming_is_given_up(impatient):
 
 
 def test_a_body_that_trickles_is_given_up(impatient):
-    started = time.monotonic()
     answer = raw(impatient, head(10_000), *[b" "] * 40, pause_s=0.1)
     assert answer.startswith(b"HTTP/1.1 408")
-    assert time.monotonic() - started < 9
 
 
 def test_a_client_that_leaves_in_the_middle_harms_no_one(impatient):
@@ -127,16 +126,18 @@ def test_bodies_that_are_too_many_together_are_put_off_and_small_ones_are_not(na
 
     with socket.create_connection((host, port), timeout=10) as connection:
         connection.sendall(head(95_000) + 90_000 * b" ")
-        deadline = time.monotonic() + 20
-        while (answer := post(60_000, "large")).status_code != 503:
-            assert time.monotonic() < deadline
+        answer = wait_until(lambda: (a := post(60_000, "large")).status_code == 503 and a)
         assert answer.json()["type"] == "/problems/busy"
         assert answer.headers["Retry-After"] == "1"
         assert post(0, "small").status_code == 201
+
     # The client has gone, and its body with it.
-    while (answer := post(60_000, "after")).status_code != 201:
-        assert answer.status_code == 503
-        assert time.monotonic() < deadline
+    def is_taken():
+        status = post(60_000, "after").status_code
+        assert status in (201, 503)
+        return status == 201
+
+    wait_until(is_taken)
 
 
 def test_bodies_one_after_another_take_no_more_room_than_one(narrow, batch):
