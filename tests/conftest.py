@@ -287,6 +287,23 @@ def shared_service(chosen_database):
         yield service
 
 
+@pytest.fixture(scope="session")
+def chromium(tmp_path_factory):
+    """A browser for all tests; each module opens pages of its own in it."""
+    from tests.web.browser import chromium
+
+    with chromium(tmp_path_factory.mktemp("profile")) as socket:
+        yield socket
+
+
+@pytest.fixture(scope="module")
+def browser(chromium):
+    from tests.web.browser import Browser
+
+    with Browser(chromium) as browser:
+        yield browser
+
+
 @pytest.fixture
 def acquire(capsys, tmp_path, monkeypatch):
     """Run a command in an empty folder with nothing set; its exit code, output and complaints."""

@@ -5,14 +5,16 @@ import json
 import shutil
 import subprocess
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from itertools import count
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import httpx
 from websockets.sync.client import connect
+
+from tests.waiting import wait_until
 
 _NAMES = ("chromium", "chromium-browser", "google-chrome")
 CHROMIUM = next(filter(None, map(shutil.which, _NAMES)), None)
@@ -41,36 +43,44 @@ class PageLeft(Exception):
     """Another page was loaded while an expression was evaluated in this one."""
 
 
-class Browser:
-    """One page in a browser of its own; `complaints` holds what its console says."""
+@contextmanager
+def chromium(folder: Path) -> Iterator[str]:
+    """A browser with its profile in a folder: the URL of its DevTools socket."""
+    assert CHROMIUM is not None
+    command = [CHROMIUM, *_FLAGS, f"--user-data-dir={folder}", "about:blank"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        try:
+            noted = folder / "DevToolsActivePort"
+            wait_until(lambda: noted.exists() and noted.read_text().count("\n") >= 1, 60.0)
+            port, path = noted.read_text().split("\n")
+            yield f"ws://127.0.0.1:{port}{path}"
+        finally:
+            process.terminate()
 
-    def __init__(self, folder: Path) -> None:
+
+class Browser:
+    """One page with cookies and a storage of its own; `complaints` holds what its console says."""
+
+    def __init__(self, chromium: str) -> None:
         self.complaints: list[str] = []
-        self._folder = folder
+        self._chromium = chromium
         self._numbers = count(1)
         self._stack = ExitStack()
 
     def __enter__(self) -> "Browser":
         try:
-            self._start()
+            self._open_page()
         except BaseException:
             self._stack.close()
             raise
         return self
 
-    def _start(self) -> None:
-        assert CHROMIUM is not None
-        command = [CHROMIUM, *_FLAGS, f"--user-data-dir={self._folder}", "about:blank"]
-        process = self._stack.enter_context(
-            subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        )
-        self._stack.callback(process.terminate)
-        noted = self._folder / "DevToolsActivePort"
-        self.wait(lambda: noted.exists() and noted.read_text().count("\n") >= 1)
-        port = noted.read_text().split("\n")[0]
-        listed = httpx.get(f"http://127.0.0.1:{port}/json").json()
-        (url,) = [each["webSocketDebuggerUrl"] for each in listed if each["type"] == "page"]
-        self._socket = self._stack.enter_context(connect(url, max_size=None))
+    def _open_page(self) -> None:
+        self._socket = self._stack.enter_context(connect(self._chromium, max_size=None))
+        context = self.call("Target.createBrowserContext", disposeOnDetach=True)
+        target = self.call("Target.createTarget", url="about:blank", **context)["targetId"]
+        page = f"{self._chromium.partition('/devtools/')[0]}/devtools/page/{target}"
+        self._socket = self._stack.enter_context(connect(page, max_size=None))
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
 

@@ -147,3 +147,20 @@ def is_ready(process: subprocess.Popen[bytes], url: str, probe: str = "readyz") 
         return httpx.get(f"{url}/{probe}", timeout=60).status_code == 200
     except httpx.TransportError:
         return False
+
+
+def ended(client: httpx.Client, begun: httpx.Response | str, **more: Any) -> dict[str, Any]:
+    """A replay or a calibration when it is over: of the answer that began it, or of its address."""
+    if isinstance(begun, httpx.Response):
+        assert begun.status_code == 202, begun.text
+        begun = begun.headers["Location"]
+
+    def over() -> dict[str, Any] | None:
+        answer = client.get(begun, **more)
+        assert answer.status_code == 200, answer.text
+        found: dict[str, Any] = answer.json()
+        return None if found["state"] in ("queued", "running") else found
+
+    found = wait_until(over, 300.0)
+    assert found is not None
+    return found

@@ -21,7 +21,7 @@ from service.web.app import bare_app, create_app
 from service.web.requests.access import COOKIE, POLICIES, authorize
 from tests.waiting import wait_until
 from tests.web.console_pages import console_addresses
-from tests.web.serving import Server, in_process_settings
+from tests.web.serving import Server, ended, in_process_settings
 from tests.web.test_bodies import raw
 
 PATH_PARAMETERS = {
@@ -133,17 +133,6 @@ def asked(client, method, path, **more):
         return response
 
 
-def ended(client, path, headers):
-    """A replay's progress when it is over, as its caller is told."""
-
-    def over():
-        answer = client.get(path, headers=headers)
-        assert answer.status_code == 200, answer.text
-        return answer.json()["state"] != "running" and answer.json()
-
-    return wait_until(over, 60.0)
-
-
 def replay_begun(client, token, lines, query="run=bound"):
     headers = shown(token) | {"Content-Type": "application/x-ndjson"}
     content = "\n".join(json.dumps(each) for each in lines)
@@ -246,7 +235,7 @@ def test_a_bound_token_submits_reads_and_replays_its_own_spacecraft_alone(guarde
 
     begun = replay_begun(anybody, guarded.swas, (swas, xte, swas | {"batch": "another"}))
     assert begun.status_code == 202
-    state = ended(anybody, begun.headers["Location"], shown(guarded.swas))
+    state = ended(anybody, begun, headers=shown(guarded.swas))
     assert (state["lines"]["done"], state["lines"]["refused"]) == (3, 1)
     assert [each["line"] for each in state["errors"]] == [2]
     assert "SWAS, not to XTE" in state["errors"][0]["problem"]["detail"]
@@ -256,7 +245,7 @@ def test_whoever_may_start_a_replay_may_follow_it(guarded, anybody, drawn):
     """With `submit` alone too; the list of all replays is not theirs to read."""
     submitting = guarded.of_scope["submit"]
     begun = replay_begun(anybody, submitting, drawn("XTE", 2), "run=followed")
-    assert ended(anybody, begun.headers["Location"], shown(submitting))["counts"]["new"] == 2
+    assert ended(anybody, begun, headers=shown(submitting))["counts"]["new"] == 2
     assert anybody.get("/api/v1/replays", headers=shown(submitting)).status_code == 403
     assert anybody.get("/api/v1/replays", headers=shown(guarded.swas)).status_code == 403
     operating = shown(guarded.of_scope["operate"])
@@ -275,7 +264,7 @@ def test_a_bound_token_has_no_alarms_of_a_run_switched(guarded, anybody, drawn):
     assert (refused.status_code, "all of them" in refused.json()["detail"]) == (403, True)
 
     begun = replay_begun(anybody, guarded.of_scope["submit"], batches, "run=all&alarms=true")
-    ended(anybody, begun.headers["Location"], unbound)
+    ended(anybody, begun, headers=unbound)
     body = {"alarms": False}
     assert anybody.put("/api/v1/runs/all", json=body, headers=unbound).status_code == 200
     listed = anybody.get("/api/v1/audit?limit=2", headers=shown(guarded.all)).json()["items"]

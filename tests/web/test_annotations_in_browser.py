@@ -26,14 +26,8 @@ INK = """(canvas => { const all = canvas.getContext('2d')
 
 
 @pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    with Browser(tmp_path_factory.mktemp("profile")) as browser:
-        yield browser
-
-
-@pytest.fixture(scope="module")
-def other_browser(tmp_path_factory):
-    with Browser(tmp_path_factory.mktemp("other")) as browser:
+def other_browser(chromium):
+    with Browser(chromium) as browser:
         yield browser
 
 

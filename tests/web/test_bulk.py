@@ -4,12 +4,12 @@ import copy
 import gzip
 import io
 import json
-import time
 
 import pytest
 import zstandard
 
 from tests.storage.samples import without_accidents
+from tests.web.serving import ended
 from tests.web.test_bad_input import WRONG, changed
 
 API = "/api/v1"
@@ -24,12 +24,7 @@ PACKED = {
 def replayed(client, run, data, coding="identity"):
     headers = {"Content-Type": "application/x-ndjson", "Content-Encoding": coding}
     begun = client.post(f"{API}/replays?run={run}", content=data, headers=headers)
-    assert begun.status_code == 202, begun.text
-    give_up = time.monotonic() + 120
-    while (state := client.get(begun.headers["Location"]).json())["state"] == "running":
-        assert time.monotonic() < give_up
-        time.sleep(0.02)
-    return state
+    return ended(client, begun)
 
 
 def test_both_paths_take_and_refuse_the_same_lines_for_the_same_reasons(client, drawn, run):

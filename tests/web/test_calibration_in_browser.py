@@ -7,7 +7,7 @@ from service.app.factory import open_app
 from service.web.app import create_app
 from tests.calibration.wrong_file import true_batches, with_true_file, write_mission_files
 from tests.fresh_databases import sqlite_at
-from tests.web.browser import CHROMIUM, Browser
+from tests.web.browser import CHROMIUM
 from tests.web.fitting import faults
 from tests.web.serving import Server, in_process_settings
 
@@ -17,12 +17,6 @@ BEFORE, AFTER = 40, 20
 COLUMN = """[...document.querySelectorAll("td[data-name={}]")].map((each) => each.innerText)"""
 CELLS = """[...document.querySelectorAll("#trial tbody tr:nth-child({}) td")]
     .map((each) => parseInt(each.innerText))"""
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    with Browser(tmp_path_factory.mktemp("profile")) as browser:
-        yield browser
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,6 @@
 """Calibrations over HTTP: estimated beside other work, tried, adopted, taken back, remembered."""
 
 import json
-import time
 
 import httpx
 import pytest
@@ -20,7 +19,7 @@ from tests.calibration.wrong_file import (
     write_mission_files,
 )
 from tests.web.conformance import check
-from tests.web.serving import Server, in_process_settings
+from tests.web.serving import Server, ended, in_process_settings
 from tests.webhooks.conftest import LOOPBACK, receiver
 
 __all__ = ["receiver"]
@@ -62,22 +61,13 @@ def client(folder, batches):
         yield client
 
 
-def ended(client, location):
-    for _ in range(600):
-        found = client.get(location).json()
-        if found["state"] not in ("queued", "running"):
-            return found
-        time.sleep(0.05)
-    raise AssertionError(found)
-
-
 @pytest.fixture(scope="module")
 def calibrated(client):
     asked = {"spacecraft": "TWO", "who": "J. Operator"}
     begun = client.post(f"{API}/calibrations", json=asked)
     assert begun.status_code == 202
     assert begun.json()["state"] in ("queued", "running")
-    return ended(client, begun.headers["Location"])
+    return ended(client, begun)
 
 
 def test_a_calibration_is_a_versioned_record_of_all_that_was_found(client, calibrated):

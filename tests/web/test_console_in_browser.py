@@ -23,12 +23,6 @@ DRAWN = "document.getElementById('charts')?.dataset.drawn !== undefined"
 _numbers = count(1)
 
 
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    with Browser(tmp_path_factory.mktemp("profile")) as browser:
-        yield browser
-
-
 @pytest.fixture
 def online_again(browser):
     """Whatever a test found, the browser is online for the next one."""
@@ -38,8 +32,8 @@ def online_again(browser):
 
 
 @pytest.fixture(scope="module")
-def other_browser(tmp_path_factory):
-    with Browser(tmp_path_factory.mktemp("other")) as browser:
+def other_browser(chromium):
+    with Browser(chromium) as browser:
         yield browser
 
 

@@ -10,7 +10,7 @@ from service.app.factory import open_app
 from service.web.app import create_app
 from tests.fresh_databases import sqlite_at
 from tests.web import fleet
-from tests.web.browser import CHROMIUM, Browser
+from tests.web.browser import CHROMIUM
 from tests.web.fitting import assert_fits, faults
 from tests.web.serving import Server, in_process_settings
 
@@ -20,12 +20,6 @@ ROWS = "[...document.querySelectorAll('.fleet tbody tr')]"
 NAMES = f"{ROWS}.map(row => row.querySelector('th').innerText)"
 DRAWN = "document.getElementById('heat').dataset.drawn"
 MOST_BYTES = 300_000
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    with Browser(tmp_path_factory.mktemp("profile")) as browser:
-        yield browser
 
 
 @pytest.fixture(scope="module", params=(40, 200))

@@ -86,7 +86,7 @@ def test_what_waits_is_counted_with_its_age(database, sky, missions):
                 }
                 depths.append(found["starid_queue_depth", "posts"])
                 ages.append(found["starid_queue_oldest_seconds", "posts"])
-                time.sleep(0.1)
+                time.sleep(0.02)
         assert {each.result().status_code for each in waiting} == {503}
         assert max(depths) == 3
         assert max(ages) > 0.5

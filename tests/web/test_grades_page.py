@@ -17,7 +17,7 @@ from tests.filtering.simulated import ARCSEC, attitudes_of, gyro_of, slews, trut
 from tests.fresh_databases import sqlite_at
 from tests.grades.passes import GYRO, MODEL, NOON, mission_with, recorded_of
 from tests.grades.records import put_pass
-from tests.web.browser import CHROMIUM, Browser
+from tests.web.browser import CHROMIUM
 from tests.web.fitting import assert_fits
 from tests.web.markup import Markup
 from tests.web.serving import Server, in_process_settings
@@ -195,8 +195,7 @@ def test_the_route_names_what_is_wrong(address, asked, status, named):
 
 @in_browser
 @pytest.mark.parametrize("run", ["pass", "bare"])
-def test_it_fits_and_axe_finds_no_fault(address, run, tmp_path):
-    with Browser(tmp_path) as browser:
-        assert_fits(browser, f"{address}{PAGE}?run={run}")
-        assert browser.complaints == []
-        browser.call("Page.navigate", url="about:blank")
+def test_it_fits_and_axe_finds_no_fault(address, run, browser):
+    assert_fits(browser, f"{address}{PAGE}?run={run}")
+    assert browser.complaints == []
+    browser.call("Page.navigate", url="about:blank")

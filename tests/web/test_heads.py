@@ -184,5 +184,5 @@ def test_a_body_that_comes_slowly_is_read_whole(connection, batch):
     send(connection, head.encode())
     for begin in range(0, len(body), 2 * KIB):
         send(connection, body[begin : begin + 2 * KIB])
-        time.sleep(0.05)
+        time.sleep(0.005)
     assert received(connection).startswith(b"HTTP/1.1 201 ")

@@ -3,11 +3,11 @@
 import csv
 import io
 import json
-import time
 
 import pytest
 
 from service.times import parse_utc, shifted
+from tests.web.serving import ended
 
 ROUTE = "/api/v1/spacecraft/XTE/history"
 
@@ -57,11 +57,7 @@ def day(client, drawn):
     content = "\n".join(json.dumps(each) for each in lines)
     headers = {"Content-Type": "application/x-ndjson"}
     begun = client.post("/api/v1/replays?run=whole-day", content=content, headers=headers)
-    give_up = time.monotonic() + 300
-    while (state := client.get(begun.headers["Location"]).json())["state"] == "running":
-        assert time.monotonic() < give_up
-        time.sleep(0.1)
-    assert state["counts"]["new"] == 2880
+    assert ended(client, begun)["counts"]["new"] == 2880
     return "whole-day"
 
 

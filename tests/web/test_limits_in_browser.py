@@ -7,7 +7,7 @@ from service.app.factory import open_app
 from service.web.app import create_app
 from tests.fresh_databases import sqlite_at
 from tests.web import fleet
-from tests.web.browser import CHROMIUM, Browser
+from tests.web.browser import CHROMIUM
 from tests.web.fitting import faults
 from tests.web.serving import Server, in_process_settings
 
@@ -17,12 +17,6 @@ CONNECTED = "document.getElementById('connection').dataset.state === 'live'"
 FORM = "document.querySelector('[data-limit={}]')"
 PREVIEW = "document.getElementById('preview-{}').innerText"
 SECOND = "STARTRACKER_2"
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    with Browser(tmp_path_factory.mktemp("profile")) as browser:
-        yield browser
 
 
 @pytest.fixture(scope="module")

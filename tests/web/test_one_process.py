@@ -16,8 +16,9 @@ from service.app.factory import open_app
 from service.app.submissions import READ_HERE_BYTES
 from tests.fresh_databases import sqlite_at
 from tests.storage import samples
+from tests.waiting import wait_until
 from tests.web.load import Load
-from tests.web.serving import in_process_settings, served
+from tests.web.serving import in_process_settings, is_ready, served
 
 JSON = {"Content-Type": "application/json"}
 
@@ -41,23 +42,11 @@ def compiling(tmp_path):
         process = subprocess.Popen(command, stderr=log, env=os.environ | nothing_compiled)
     url = f"http://127.0.0.1:{port}"
     try:
-        _until(lambda: httpx.get(f"{url}/livez").status_code == 200)
+        wait_until(lambda: is_ready(process, url, "livez"), every_s=0.05)
         yield process, url
     finally:
         process.kill()
         process.wait()
-
-
-def _until(holds, seconds=60):
-    give_up = time.monotonic() + seconds
-    while time.monotonic() < give_up:
-        try:
-            if holds():
-                return
-        except httpx.TransportError:
-            pass
-        time.sleep(0.05)
-    raise AssertionError("it did not come to pass")
 
 
 def _children(process):
@@ -85,11 +74,11 @@ def test_while_it_compiles_posts_are_told_to_come_again(compiling, sky, missions
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are listed in /proc")
 def test_killed_while_it_compiles_it_leaves_no_process(compiling):
     process, _ = compiling
-    _until(lambda: _children(process))
+    wait_until(lambda: _children(process))
     children = _children(process)
     process.kill()
     process.wait()
-    _until(lambda: not any(_is_running(pid) for pid in children))
+    wait_until(lambda: not any(_is_running(pid) for pid in children))
 
 
 def _is_running(pid):
@@ -165,7 +154,7 @@ def test_told_to_stop_under_load_it_answers_what_it_took_and_ends_soon(tmp_path,
             events = stream.iter_lines()
             assert next(events).startswith("retry:")
             try:
-                _until(lambda: len(load.acknowledged) > 50)
+                wait_until(lambda: len(load.acknowledged) > 50)
                 process.terminate()
                 assert process.wait(60) in (0, -signal.SIGTERM)
             finally:

@@ -3,7 +3,6 @@
 import io
 import json
 import tarfile
-import time
 
 import httpx
 import pytest
@@ -20,7 +19,7 @@ from tests.packets.packing import ANGLES, TABLE, mission_of_pass, packed, packet
 from tests.packets.test_reader import reader_of
 from tests.storage.samples import without_accidents
 from tests.web.conformance import check
-from tests.web.serving import Server, in_process_settings
+from tests.web.serving import Server, ended, in_process_settings
 
 API = "/api/v1"
 HEADERS = {"Content-Type": "application/x-tar"}
@@ -74,21 +73,12 @@ def archive(**files):
     return found.getvalue()
 
 
-def finished(client, begun):
-    assert begun.status_code == 202, begun.text
-    give_up = time.monotonic() + 120
-    while (state := client.get(begun.headers["Location"]).json())["state"] == "running":
-        assert time.monotonic() < give_up
-        time.sleep(0.02)
-    return state
-
-
 def test_an_archive_gives_the_results_of_the_same_batches_and_counts_its_packets(
     packet_client, packet_app, batches, content, run
 ):
     data = archive(test_xml=xtce(), pass_dat=content)
     begun = packet_client.post(f"{API}/replays?run={run}", content=data, headers=HEADERS)
-    state = finished(packet_client, begun)
+    state = ended(packet_client, begun)
     assert state["state"] == "done"
     assert state["counts"]["new"] == 12
     packets = state["packets"]
@@ -104,7 +94,7 @@ def test_an_archive_gives_the_results_of_the_same_batches_and_counts_its_packets
     lines = b"\n".join(json.dumps(each).encode() for each in batches)
     ndjson = {"Content-Type": "application/x-ndjson"}
     again = packet_client.post(f"{API}/replays?run={run}", content=lines, headers=ndjson)
-    state = finished(packet_client, again)
+    state = ended(packet_client, again)
     assert state["packets"] is None
     assert (state["counts"]["repeated"], state["counts"]["new"]) == (12, 0)
 
@@ -112,7 +102,7 @@ def test_an_archive_gives_the_results_of_the_same_batches_and_counts_its_packets
 def test_the_page_of_the_replay_shows_gaps_and_unknown_apids(packet_client, content, run):
     data = archive(test_xml=xtce(), pass_dat=content)
     begun = packet_client.post(f"{API}/replays?run={run}", content=data, headers=HEADERS)
-    state = finished(packet_client, begun)
+    state = ended(packet_client, begun)
     page = packet_client.get(f"/replays/{state['id']}").text
     assert "Packets by APID" in page
     assert "missing packets" in page
@@ -124,7 +114,7 @@ def test_a_replay_of_lines_shows_no_packets(packet_client, batches, run):
     ndjson = {"Content-Type": "application/x-ndjson"}
     body = json.dumps(batches[0])
     begun = packet_client.post(f"{API}/replays?run={run}", content=body, headers=ndjson)
-    page = packet_client.get(f"/replays/{finished(packet_client, begun)['id']}").text
+    page = packet_client.get(f"/replays/{ended(packet_client, begun)['id']}").text
     assert "APID" not in page
     assert "No line was refused" in page
 
@@ -226,6 +216,6 @@ def test_a_spacecraft_goes_with_packets_alone(packet_client, batches, run):
 def test_a_file_that_ends_within_a_packet_is_recorded_up_to_there(packet_client, batches, run):
     data = archive(test_xml=xtce(), pass_dat=packed(batches[:4])[:-30])
     begun = packet_client.post(f"{API}/replays?run={run}", content=data, headers=HEADERS)
-    state = finished(packet_client, begun)
+    state = ended(packet_client, begun)
     assert (state["state"], state["counts"]["new"]) == ("done", 3)
     assert "packet 4 at byte" in state["errors"][0]["problem"]["detail"]

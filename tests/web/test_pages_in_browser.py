@@ -7,7 +7,7 @@ from service.app.factory import open_app
 from service.web.app import create_app
 from tests.fresh_databases import sqlite_at
 from tests.web import fleet
-from tests.web.browser import CHROMIUM, Browser
+from tests.web.browser import CHROMIUM
 from tests.web.console_pages import console_addresses
 from tests.web.fitting import assert_fits
 from tests.web.serving import Server, in_process_settings
@@ -16,12 +16,6 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium o
 
 BATCHES = 12
 ANNOTATION = {"start": "1999-03-01T00:10:00Z", "text": "Wheel 2 unloaded; " * 20, "who": "jb"}
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    with Browser(tmp_path_factory.mktemp("profile")) as browser:
-        yield browser
 
 
 @pytest.fixture(params=(0, 1, 40))

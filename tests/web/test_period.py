@@ -6,7 +6,6 @@ A spacecraft with two trackers, of which the second becomes noisy and recovers.
 import html
 import json
 import re
-import time
 
 import httpx
 import pytest
@@ -15,7 +14,7 @@ from service.app.factory import open_app
 from service.web.app import create_app
 from tests.fresh_databases import sqlite_at
 from tests.storage.twin import FIRST, SECOND, batch, twin
-from tests.web.browser import CHROMIUM, Browser
+from tests.web.browser import CHROMIUM
 from tests.web.fitting import VIEWS, faults
 from tests.web.markup import Markup
 from tests.web.serving import Server, in_process_settings
@@ -33,8 +32,6 @@ def address(tmp_path_factory, sky, missions):
     mission = twin(missions)
     app = create_app(open_app(in_process_settings(database), mission))
     with Server(app) as address, httpx.Client(base_url=address, timeout=120) as client:
-        while client.get("/readyz").status_code != 200:
-            time.sleep(0.1)
         limits = {"settings": QUICK, "who": "J. Operator"}
         path = "/api/v1/spacecraft/XTE/limits/residual_ratio"
         client.put(path, json=limits).raise_for_status()
@@ -44,14 +41,6 @@ def address(tmp_path_factory, sky, missions):
             headers = {"Content-Type": "application/json"}
             client.post("/api/v1/batches", content=text, headers=headers).raise_for_status()
         yield address
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory, address):
-    with Browser(tmp_path_factory.mktemp("profile")) as browser:
-        yield browser
-        # So that it does not look for the service that ends.
-        browser.call("Page.navigate", url="about:blank")
 
 
 def text_of(page):

@@ -1,9 +1,11 @@
 """Probes and metrics; the answer to a fault of ours."""
 
 import asyncio
+import gc
 import math
 import threading
 import time
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 
 import httpx
@@ -16,6 +18,7 @@ from service.errors import Stopping
 from service.web.app import create_app
 from service.web.warm_request import warm_request
 from tests.fresh_databases import sqlite_at
+from tests.waiting import wait_until
 from tests.web.serving import Server, in_process_settings
 
 
@@ -34,12 +37,13 @@ def stars(found, outcome):
 
 def test_it_lives_and_becomes_ready(client):
     assert client.get("/livez").status_code == 200
-    for _ in range(600):
-        if (answer := client.get("/readyz")).status_code == 200:
-            return
-        assert (answer.status_code, "Retry-After" in answer.headers) == (503, True)
-        time.sleep(0.1)
-    raise AssertionError(answer.text)
+
+    def is_ready():
+        answer = client.get("/readyz")
+        assert answer.status_code == 200 or "Retry-After" in answer.headers
+        return answer.status_code == 200
+
+    wait_until(is_ready)
 
 
 def test_live_stars_are_counted_once_by_outcome(client, post, batch, run):
@@ -153,3 +157,30 @@ def test_with_every_handler_at_work_it_is_still_ready_and_still_stops(tmp_path, 
         time.sleep(0.3)
         assert httpx.get(f"{address}/readyz", timeout=10).status_code == 200
         go_on.set()
+
+
+def opened_and_closed(database, serves):
+    """Open a service, let it serve where wanted, close it; what must not be left of it."""
+    app = open_app(in_process_settings(database))
+    web_app = create_app(app)
+    if serves:
+        with Server(web_app) as address:
+            wait_until(lambda: httpx.get(f"{address}/readyz").status_code == 200)
+            assert httpx.get(f"{address}/metrics").status_code == 200
+    else:
+        app.close()
+    return weakref.ref(app), weakref.ref(web_app)
+
+
+def test_closed_services_leave_no_memory_and_no_thread(tmp_path, resident_mb):
+    """A service that is ready keeps its objects from the garbage collector, until it is closed."""
+    databases = (sqlite_at(tmp_path / f"{number}.db") for number in range(22))
+    # The first ones fill caches that the process keeps.
+    references = [opened_and_closed(next(databases), serves=True) for _ in range(2)]
+    gc.collect()
+    before_mb, threads = resident_mb(), set(threading.enumerate())
+    references += [opened_and_closed(each, n % 7 == 0) for n, each in enumerate(databases)]
+    gc.collect()
+    assert [each() for pair in references for each in pair] == [None] * 44
+    assert set(threading.enumerate()) <= threads
+    assert resident_mb() - before_mb < 40

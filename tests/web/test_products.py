@@ -7,7 +7,6 @@ import io
 import json
 import re
 import threading
-import time
 
 import httpx
 import pyarrow.parquet
@@ -28,6 +27,7 @@ from service.times import utc_now
 from service.web.app import bare_app, create_app
 from service.web.requests import exports
 from tests.fresh_databases import sqlite_at
+from tests.waiting import wait_until
 from tests.web.serving import Server, in_process_settings
 
 ROUTE = "/api/v1/spacecraft/XTE/attitude"
@@ -363,10 +363,9 @@ def test_a_token_may_have_two_exports_at_once_and_another_when_one_has_ended(
                 with stream(client, "other") as one_too_many:
                     assert one_too_many.status_code == 503
             slow_format.set()
-        deadline = time.monotonic() + 10
-        while time.monotonic() < deadline:
+
+        def has_room():
             with stream(client, "one") as again:
-                if again.status_code == 200:
-                    break
-            time.sleep(0.1)
-        assert again.status_code == 200
+                return again.status_code == 200
+
+        wait_until(has_room)

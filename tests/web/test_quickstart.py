@@ -10,8 +10,10 @@ import sys
 import time
 from pathlib import Path
 
-import httpx
 import pytest
+
+from tests.waiting import wait_until
+from tests.web.serving import is_ready
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "quickstart.md").read_text(encoding="utf-8")
@@ -45,13 +47,7 @@ def server(folder, port):
     (folder / "outside").mkdir()
     command = ["bash", "-c", "exec " + moved(start, folder, port).strip()]
     process = subprocess.Popen(command, cwd=folder)
-    for _ in range(1200):
-        try:
-            httpx.get(f"http://127.0.0.1:{port}/livez")
-            break
-        except httpx.TransportError:
-            assert process.poll() is None, "the server did not start"
-            time.sleep(0.05)
+    wait_until(lambda: is_ready(process, f"http://127.0.0.1:{port}", "livez"), 60.0, every_s=0.05)
     yield
     process.send_signal(signal.SIGTERM)
     process.wait(timeout=60)

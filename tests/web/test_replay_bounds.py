@@ -19,8 +19,8 @@ from service.ingest.replays import RunningReplay
 from service.observations.readers import decompress
 from service.web.app import create_app
 from tests.waiting import wait_until
-from tests.web.browser import CHROMIUM, Browser
-from tests.web.serving import Server, in_process_settings, served
+from tests.web.browser import CHROMIUM
+from tests.web.serving import Server, ended, in_process_settings, served
 from tests.web.test_access import Guarded, shown
 
 API = "/api/v1"
@@ -35,16 +35,6 @@ def begun(client, run, data, coding="identity", **headers):
     answer = client.post(f"{API}/replays?run={run}", content=data, headers=headers)
     assert answer.status_code == 202, answer.text
     return answer.headers["Location"]
-
-
-def followed(client, place, **more):
-    """The state in which a replay ends."""
-
-    def ended():
-        state = client.get(place, **more).json()
-        return None if state["state"] == "running" else state
-
-    return wait_until(ended, 120)
 
 
 # ---- bounds ------------------------------------------------------------------------------------
@@ -73,18 +63,18 @@ def test_newlines_without_end_are_refused_and_leave_room_for_other_replays(
     assert len(data) < 6 << 20
     places = [begun(client, run, data, coding) for _ in range(8)]
     for place in places:
-        state = followed(client, place)
+        state = ended(client, place)
         assert state["state"] == "failed"
         (error,) = state["errors"]
         assert f"has more than {few_blank_lines} blank lines" in error["problem"]["detail"]
         assert error["line"] == few_blank_lines + 1
-    good = followed(client, begun(client, run, json.dumps(batch).encode()))
+    good = ended(client, begun(client, run, json.dumps(batch).encode()))
     assert (good["state"], good["counts"]["new"]) == ("done", 1)
 
 
 def test_blank_lines_are_bounded_where_nothing_is_packed_too(client, batch, run):
     line = json.dumps(batch).encode() + b"\n"
-    state = followed(client, begun(client, run, line + b"\n" * 1_000_001))
+    state = ended(client, begun(client, run, line + b"\n" * 1_000_001))
     assert (state["state"], state["counts"]["new"]) == ("failed", 1)
     assert "has more than 1000000 blank lines" in state["errors"][0]["problem"]["detail"]
 
@@ -93,7 +83,7 @@ def test_blank_lines_between_batches_and_at_the_end_are_passed_over(client, batc
     lines = b"\n\r\n  \n".join(
         json.dumps(batch | {"batch": f"{run}-{index}"}).encode() + b"\n" for index in range(5)
     )
-    state = followed(client, begun(client, run, lines + b"\n" * 1000))
+    state = ended(client, begun(client, run, lines + b"\n" * 1000))
     assert (state["state"], state["counts"]["new"]) == ("done", 5)
     assert state["lines"]["done"] == state["lines"]["total"] == 5 + 4 * 3 + 1000
 
@@ -105,7 +95,7 @@ def test_a_body_that_unpacks_to_too_much_of_its_size_says_which_bound_and_what_s
     """Spaces behind a good line; several members or frames change nothing."""
     pack = PACKERS[coding]
     data = pack(json.dumps(batch).encode() + b"\n") + pack(b" " * (1 << 20)) * 32
-    state = followed(client, begun(client, run, data, coding))
+    state = ended(client, begun(client, run, data, coding))
     assert (state["state"], state["counts"]["new"]) == ("failed", 1)
     detail = state["errors"][-1]["problem"]["detail"]
     allowed = max(free_bytes, 200 * len(data))
@@ -124,7 +114,7 @@ def test_telemetry_that_packs_to_a_hundredth_is_taken(
     data = PACKERS[coding](lines) * again
     assert again * len(lines) > free_bytes
     figures(ratio=round(again * len(lines) / len(data)))
-    state = followed(client, begun(client, run, data, coding))
+    state = ended(client, begun(client, run, data, coding))
     assert (state["state"], state["lines"]["refused"]) == ("done", 0)
     assert (state["counts"]["new"], state["counts"]["repeated"]) == (200, 200 * (again - 1))
 
@@ -176,7 +166,7 @@ def test_a_replay_that_takes_too_long_ends_and_names_the_setting(hurried, hold_a
     hold_at(READS)
     places = [begun(hurried, "long", data, coding) for coding, data in INPUTS.values()]
     for place in places:
-        state = followed(hurried, place)
+        state = ended(hurried, place)
         assert state["state"] == "failed"
         detail = state["errors"][-1]["problem"]["detail"]
         assert "took longer than 1 s (ACQUIRE_REPLAY_SECONDS)" in detail
@@ -241,7 +231,7 @@ def test_what_listens_for_events_is_told_of_a_cancelled_replay(client, address, 
 
 def test_a_replay_that_has_ended_cannot_be_cancelled_nor_one_that_is_not_there(client, batch, run):
     place = begun(client, run, json.dumps(batch).encode())
-    followed(client, place)
+    ended(client, place)
     answer = client.delete(place)
     assert answer.status_code == 409
     assert "its state is done" in answer.json()["detail"]
@@ -374,31 +364,28 @@ def test_a_service_in_two_processes_cancels_too(chosen_database, drawn):
         assert client.delete(f"{API}/replays/01JD0000000000000000000000").status_code == 404
         # Its place is free, and so are the processes that compute.
         batch = drawn("XTE", 2)[1]
-        state = followed(client, begun(client, "s", json.dumps(batch).encode()))
+        state = ended(client, begun(client, "s", json.dumps(batch).encode()))
         assert (state["state"], state["counts"]["new"]) == ("done", 1)
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
 def test_the_page_of_a_running_replay_has_a_button_that_cancels_it(
-    client, address, running, tmp_path
+    client, address, running, browser
 ):
     page = f"{address}{running.removeprefix('/api/v1')}"
     button = "document.querySelector('[data-cancel]')"
-    with Browser(tmp_path) as browser:
-        browser.open(page)
-        browser.wait(lambda: browser.run(f"{button} !== null"))
-        browser.run(f"{button}.click()")
-        browser.wait(
-            lambda: browser.run("document.getElementById('message').innerText") != "Working…"
-        )
-        assert browser.run("document.getElementById('message').innerText") == "Cancelled."
-        browser.wait(lambda: browser.run(f"{button} === null"))
-        assert "cancelled" in browser.run("document.getElementById('replay').innerText")
-        assert browser.complaints == []
+    browser.open(page)
+    browser.wait(lambda: browser.run(f"{button} !== null"))
+    browser.run(f"{button}.click()")
+    browser.wait(lambda: browser.run("document.getElementById('message').innerText") != "Working…")
+    assert browser.run("document.getElementById('message').innerText") == "Cancelled."
+    browser.wait(lambda: browser.run(f"{button} === null"))
+    assert "cancelled" in browser.run("document.getElementById('replay').innerText")
+    assert browser.complaints == []
     assert client.get(running).json()["state"] == "cancelled"
 
 
 def test_the_page_of_a_replay_that_has_ended_has_no_such_button(client, batch, run):
     place = begun(client, run, json.dumps(batch).encode())
-    followed(client, place)
+    ended(client, place)
     assert "data-cancel" not in client.get(place.removeprefix("/api/v1")).text

@@ -1,15 +1,15 @@
 """Spacecraft, zones, runs and replays over HTTP."""
 
 import json
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import httpx
 import pytest
 
+from tests.web.serving import ended
+
 API = "/api/v1"
 NDJSON = {"Content-Type": "application/x-ndjson"}
-
 
 # ---- spacecraft ----------------------------------------------------------------------------------
 
@@ -101,22 +101,13 @@ def test_fifty_first_requests_at_once_build_the_zone_once(client, address, batch
 # ---- runs and replays ----------------------------------------------------------------------------
 
 
-def finished(client, location):
-    for _ in range(600):
-        state = client.get(location).json()
-        if state["state"] != "running":
-            return state
-        time.sleep(0.05)
-    raise AssertionError(state)
-
-
 def test_a_replay_goes_on_after_a_bad_line_and_reports_its_number(client, drawn, run):
     lines = [json.dumps(each) for each in drawn("XTE", 4)]
     lines[1:1] = ['{"truncated', "", json.dumps(drawn("XTE", 1)[0] | {"spacecraft": "NOPE"})]
     content = "\n".join(lines).encode()
     answer = client.post(f"{API}/replays?run={run}", content=content, headers=NDJSON)
     assert answer.status_code == 202
-    state = finished(client, answer.headers["Location"])
+    state = ended(client, answer)
     assert (state["state"], state["lines"]["done"], state["lines"]["refused"]) == ("done", 7, 2)
     assert [each["line"] for each in state["errors"]] == [2, 4]
     assert len(client.get(f"{API}/batches?run={run}").json()["items"]) == 4
@@ -128,7 +119,7 @@ def test_a_replay_run_twice_records_once(client, drawn, run):
     content = "\n".join(json.dumps(each) for each in drawn("SOHO", 3)).encode()
     for _ in range(2):
         answer = client.post(f"{API}/replays?run={run}", content=content, headers=NDJSON)
-        state = finished(client, answer.headers["Location"])
+        state = ended(client, answer)
         assert (state["lines"]["done"], state["lines"]["refused"]) == (3, 0)
     assert len(client.get(f"{API}/batches?run={run}").json()["items"]) == 3
 
@@ -139,14 +130,14 @@ def test_a_replay_can_be_sent_as_plain_bytes(client, drawn, run):
     headers = {"Content-Type": "application/octet-stream"}
     answer = client.post(f"{API}/replays?run={run}", content=content, headers=headers)
     assert answer.status_code == 202
-    assert finished(client, answer.headers["Location"])["lines"]["done"] == 2
+    assert ended(client, answer)["lines"]["done"] == 2
 
 
 def test_a_line_without_end_is_one_bad_line(client, drawn, run):
     good = json.dumps(drawn("XTE", 1)[0]).encode()
     content = b"\n".join([good, b'{"a": "' + b"x" * 5_000_000, good])
     answer = client.post(f"{API}/replays?run={run}", content=content, headers=NDJSON)
-    state = finished(client, answer.headers["Location"])
+    state = ended(client, answer)
     assert [each["line"] for each in state["errors"]] == [2]
     assert state["lines"]["done"] == 3
 
@@ -171,7 +162,7 @@ def test_a_replay_that_cannot_begin_is_refused(client, query, content, headers, 
 def test_a_file_that_is_no_telemetry_is_refused_line_by_line(client, run):
     content = b"\x00\xff\xfe\nnot json\n\xef\xbb\xbf{}\n[1, 2]\n"
     answer = client.post(f"{API}/replays?run={run}", content=content, headers=NDJSON)
-    state = finished(client, answer.headers["Location"])
+    state = ended(client, answer)
     assert [each["line"] for each in state["errors"]] == [1, 2, 3, 4]
 
 
@@ -182,6 +173,4 @@ def test_the_lines_of_a_replay_are_counted_beforehand(client, run, body, lines):
     headers = {"Content-Type": "application/x-ndjson"}
     begun = client.post(f"{API}/replays?run={run}", content=body, headers=headers)
     assert begun.json()["lines"]["total"] == lines
-    while (replay := client.get(begun.headers["Location"]).json())["state"] == "running":
-        time.sleep(0.02)
-    assert replay["lines"]["done"] == lines
+    assert ended(client, begun)["lines"]["done"] == lines

@@ -5,7 +5,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 
 import httpx
 import pytest
@@ -13,6 +12,8 @@ import pytest
 from service.errors import BadConfiguration
 from service.settings import Settings, is_loopback
 from service.web.server import _connections, serve
+from tests.waiting import wait_until
+from tests.web.serving import is_ready
 
 SERVE = """
 import sys
@@ -34,14 +35,8 @@ def process(tmp_path):
         command = [sys.executable, "-c", SERVE, database, str(port)]
         begun.append(subprocess.Popen(command))
         address = f"http://127.0.0.1:{port}"
-        for _ in range(600):
-            try:
-                httpx.get(f"{address}/livez").raise_for_status()
-                return address, begun[-1]
-            except httpx.TransportError:
-                assert begun[-1].poll() is None
-                time.sleep(0.05)
-        raise AssertionError("the server does not answer")
+        wait_until(lambda: is_ready(begun[-1], address, "livez"), 60.0, every_s=0.05)
+        return address, begun[-1]
 
     yield start
     for each in begun:

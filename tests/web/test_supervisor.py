@@ -3,7 +3,6 @@
 import os
 import signal
 import socket
-import time
 from contextlib import suppress
 
 import httpx
@@ -14,6 +13,7 @@ from sqlalchemy.pool import NullPool
 from service.storage.serving.writing_lock import WritingLock
 from service.storage.sql.engines import database_url
 from tests.fresh_databases import sqlite_at
+from tests.waiting import wait_until
 from tests.web.serving import served, serving
 
 
@@ -47,8 +47,7 @@ def test_a_service_that_stands_by_has_started(heard, database):
     with engine.connect() as other:
         assert WritingLock().take(other) == "taken"
         with serving(database) as (_, url):
-            while not standing_by(url):
-                time.sleep(0.1)
+            wait_until(lambda: standing_by(url))
             assert heard() == "READY=1\nSTATUS=standing by"
             other.close()
             while (told := heard()) != "STATUS=ready":

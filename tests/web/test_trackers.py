@@ -3,7 +3,6 @@
 import html
 import json
 import re
-import time
 
 import httpx
 import pytest
@@ -30,8 +29,6 @@ def client(tmp_path_factory, missions):
         Server(app) as address,
         httpx.Client(base_url=address, timeout=120, event_hooks={"response": [check]}) as client,
     ):
-        while client.get("/readyz").status_code != 200:
-            time.sleep(0.1)
         yield client
 
 

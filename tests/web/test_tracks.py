@@ -9,7 +9,7 @@ import pytest
 from service.cli import main
 from service.vectors import from_ra_dec, unit
 from tests.tracks.drawn import conjunctions, draw
-from tests.web.browser import CHROMIUM, Browser
+from tests.web.browser import CHROMIUM
 from tests.web.fitting import assert_fits
 
 ROUTE = "/api/v1/spacecraft/XTE/tracks"
@@ -139,9 +139,8 @@ def test_the_command_says_the_same(app, found, capsys, tmp_path):
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
-def test_the_tables_fit_and_axe_finds_no_fault(address, posted, tmp_path):
-    with Browser(tmp_path) as browser:
-        for path in ("/spacecraft/XTE/period", f"/batches/{posted[15]}"):
-            assert_fits(browser, f"{address}{path}?run={RUN}")
-            assert browser.run("document.querySelector('[aria-labelledby=tracks] td') !== null")
-        browser.call("Page.navigate", url="about:blank")
+def test_the_tables_fit_and_axe_finds_no_fault(address, posted, browser):
+    for path in ("/spacecraft/XTE/period", f"/batches/{posted[15]}"):
+        assert_fits(browser, f"{address}{path}?run={RUN}")
+        assert browser.run("document.querySelector('[aria-labelledby=tracks] td') !== null")
+    browser.call("Page.navigate", url="about:blank")

@@ -3,7 +3,6 @@
 import queue
 import socket
 import threading
-import time
 from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -22,15 +21,6 @@ HERE = "/api/v1/webhooks"
 LOOPBACK = "127.0.0.0/8"
 NOON = parse_utc("1999-03-01T12:00:00Z")
 WAIT_S = 20.0
-
-
-def until(condition, wait_s=WAIT_S):
-    """What a condition gives once it holds; fails after a while."""
-    give_up_s = time.monotonic() + wait_s
-    while not (found := condition()):
-        assert time.monotonic() < give_up_s, "it never came true"
-        time.sleep(0.02)
-    return found
 
 
 @dataclass

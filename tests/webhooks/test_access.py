@@ -11,9 +11,10 @@ from service.storage.recording.ids import Ulids
 from service.storage.sql.access_tables import audit
 from service.storage.sql.webhook_tables import webhooks
 from service.storage.webhooks.sender import read_sender
+from tests.waiting import wait_until
 from tests.web.conformance import check
 from tests.web.test_access import Guarded, shown
-from tests.webhooks.conftest import HERE, serving, until
+from tests.webhooks.conftest import HERE, serving
 
 SETTINGS = {"name": "pager", "url": "https://receiver.example/"}
 
@@ -29,7 +30,7 @@ def test_a_webhook_ends_with_its_token_and_goes_on_with_another(service, receive
     tokens = Tokens(service.app)
     headers = shown(tokens.token("first", "read", "operate"))
     settings = {"name": "mine", "url": receiver.url}
-    until(lambda: not service.app.access.is_open)
+    wait_until(lambda: not service.app.access.is_open)
     made = service.client.post(HERE, json=settings, headers=headers).json()
     assert made["who"] == "first"
     service.note("seen")
@@ -55,7 +56,7 @@ def test_a_webhook_ends_with_its_token_and_goes_on_with_another(service, receive
 def test_a_webhook_of_open_access_is_paused_by_the_first_token(service, receiver):
     hook = service.hook(receiver.url)
     headers = shown(Tokens(service.app).token("op", "read", "operate"))
-    until(lambda: not service.app.access.is_open)
+    wait_until(lambda: not service.app.access.is_open)
     state = service.client.get(f"{HERE}/{hook['id']}", headers=headers).json()
     assert (state["state"], "without a token" in state["reason"]) == ("paused", True)
 
@@ -64,7 +65,7 @@ def test_a_token_that_may_not_read_or_is_bound_makes_none(service):
     tokens = Tokens(service.app)
     without_read = shown(tokens.token("op", "operate"))
     bound = shown(tokens.token("bound", "read", "operate", spacecraft=["XTE"]))
-    until(lambda: not service.app.access.is_open)
+    wait_until(lambda: not service.app.access.is_open)
     for headers in (without_read, bound):
         answer = service.client.post(HERE, json=SETTINGS, headers=headers)
         assert answer.status_code == 403
@@ -144,7 +145,7 @@ def test_an_unknown_webhook_is_not_found_and_answers_are_as_described(service, r
     hook = service.hook(receiver.url)
     for number in range(5):
         service.note(f"n{number}")
-    until(lambda: service.read(hook)["waiting"] == 5 and service.read(hook)["last_fault"])
+    wait_until(lambda: service.read(hook)["waiting"] == 5 and service.read(hook)["last_fault"])
     first = service.client.get(f"{HERE}/{hook['id']}/deliveries", params={"limit": 3})
     rest = service.client.get(first.links["next"]["url"])
     numbers = [each["event"] for each in first.json()["items"] + rest.json()["items"]]
@@ -167,7 +168,7 @@ def test_metrics_tell_what_waits_and_what_came_of_attempts(service, receiver):
     receiver.answer = lambda handler, _: handler.say(500)
     hook = service.hook(receiver.url, name="pager")
     service.note("x")
-    until(lambda: service.read(hook)["last_fault"])
+    wait_until(lambda: service.read(hook)["last_fault"])
     told = service.client.get("/metrics").text
     labels = f'{{name="pager",webhook="{hook["id"]}"}}'
     assert f"starid_webhook_waiting{labels} 1.0" in told

@@ -11,7 +11,8 @@ from standardwebhooks.webhooks import Webhook, WebhookVerificationError
 from service.storage.recording import events
 from service.webhooks import sender
 from service.webhooks.sender import retry_delay_s
-from tests.webhooks.conftest import HERE, receiving, serving, until
+from tests.waiting import wait_until
+from tests.webhooks.conftest import HERE, receiving, serving
 
 
 def texts(receiver):
@@ -41,7 +42,7 @@ def test_an_event_arrives_signed_as_the_standard_says(service, receiver):
     assert abs(int(request.headers["webhook-timestamp"]) - time.time()) < 60
     with pytest.raises(WebhookVerificationError):
         Webhook(hook["secret"]).verify(request.body + b" ", request.headers)
-    until(lambda: service.read(hook)["last_delivered"])
+    wait_until(lambda: service.read(hook)["last_delivered"])
     assert service.read(hook)["waiting"] == 0
 
 
@@ -70,12 +71,12 @@ def test_a_failure_holds_back_its_spacecraft_alone_and_order_is_kept(service, re
         service.note(text)
     for text in ("s1", "s2"):
         service.note(text, "SWAS")
-    until(lambda: "s2" in texts(receiver) and texts(receiver).count("x1") > 1)
+    wait_until(lambda: "s2" in texts(receiver) and texts(receiver).count("x1") > 1)
     assert "x2" not in texts(receiver)
     state = service.read(hook)
     assert state["last_fault"] == "status 500" or state["failing_since"] is None
     receiver.answer.refused.clear()
-    until(lambda: "x3" in texts(receiver))
+    wait_until(lambda: "x3" in texts(receiver))
     assert list(dict.fromkeys(each for each in texts(receiver) if each[0] == "x")) == [
         "x1",
         "x2",
@@ -102,7 +103,7 @@ def test_retry_after_is_heeded_for_the_whole_webhook(service, receiver, soon, as
     service.note("first")
     receiver.next()
     begun_s = time.monotonic()
-    until(lambda: service.read(hook)["last_status"] == 429)
+    wait_until(lambda: service.read(hook)["last_status"] == 429)
     service.note("other", "SWAS")
     receiver.next()
     assert time.monotonic() - begun_s > 0.9
@@ -112,7 +113,7 @@ def test_410_disables_a_webhook_until_it_is_changed(service, receiver, soon):
     receiver.answer = failing_for("XTE", status=410)
     hook = service.hook(receiver.url)
     service.note("gone")
-    state = until(lambda: (r := service.read(hook))["state"] == "disabled" and r)
+    state = wait_until(lambda: (r := service.read(hook))["state"] == "disabled" and r)
     assert "410" in state["reason"]
     service.note("later")
     time.sleep(0.5)
@@ -121,7 +122,7 @@ def test_410_disables_a_webhook_until_it_is_changed(service, receiver, soon):
     settings = {"name": "test", "url": receiver.url}
     changed = service.client.put(f"{HERE}/{hook['id']}", json=settings).json()
     assert (changed["state"], changed["reason"]) == ("active", None)
-    until(lambda: texts(receiver) == ["gone", "gone", "later"])
+    wait_until(lambda: texts(receiver) == ["gone", "gone", "later"])
 
 
 def test_after_a_day_an_event_is_a_dead_letter_and_is_sent_again_on_request(
@@ -132,7 +133,7 @@ def test_after_a_day_an_event_is_a_dead_letter_and_is_sent_again_on_request(
     hook = service.hook(receiver.url)
     service.note("dead")
     service.note("alive", "SWAS")
-    until(lambda: service.read(hook)["dead"] == 1)
+    wait_until(lambda: service.read(hook)["dead"] == 1)
     address = f"{HERE}/{hook['id']}/deliveries"
     (letter,) = service.client.get(address, params={"state": "dead"}).json()["items"]
     assert letter["spacecraft"] == "XTE"
@@ -141,7 +142,7 @@ def test_after_a_day_an_event_is_a_dead_letter_and_is_sent_again_on_request(
     receiver.answer.refused.clear()
     assert service.ask(hook, "retry", events=[letter["event"] + 1]).json() == {"queued": 0}
     assert service.ask(hook, "retry", events=[letter["event"]]).json() == {"queued": 1}
-    until(lambda: service.read(hook)["dead"] == 0 and service.read(hook)["waiting"] == 0)
+    wait_until(lambda: service.read(hook)["dead"] == 0 and service.read(hook)["waiting"] == 0)
     sent = [each.headers["webhook-id"] for each in receiver.requests]
     assert sent.count(letter["message_id"]) == letter["attempts"] + 1
 
@@ -152,13 +153,13 @@ def test_what_waits_is_sent_after_a_restart_once_it_is_due(chosen_database, rece
     with serving(database) as service:
         hook = service.hook(receiver.url)
         service.note("before")
-        until(lambda: service.read(hook)["last_fault"])
+        wait_until(lambda: service.read(hook)["last_fault"])
     receiver.answer.refused.clear()
     begun = len(receiver.requests)
     with serving(database) as service:
-        until(lambda: len(receiver.requests) > begun)
+        wait_until(lambda: len(receiver.requests) > begun)
         service.note("after")
-        until(lambda: texts(receiver)[-1] == "after")
+        wait_until(lambda: texts(receiver)[-1] == "after")
         assert service.read(hook)["waiting"] == 0
     assert texts(receiver)[begun:] == ["before", "after"]
 
@@ -167,13 +168,13 @@ def test_a_period_is_sent_again_with_the_same_ids(service, receiver):
     hook = service.hook(receiver.url, kinds=["annotation"])
     for text in ("a", "b"):
         service.note(text)
-    until(lambda: len(receiver.requests) == 2)
-    until(lambda: service.read(hook)["waiting"] == 0)
+    wait_until(lambda: len(receiver.requests) == 2)
+    wait_until(lambda: service.read(hook)["waiting"] == 0)
     first = [each.headers["webhook-id"] for each in receiver.requests]
     bodies = [each.body for each in receiver.requests]
     replayed = service.ask(hook, "replay", since=hook["created"])
     assert replayed.json() == {"queued": 2}
-    until(lambda: len(receiver.requests) == 4)
+    wait_until(lambda: len(receiver.requests) == 4)
     assert [each.headers["webhook-id"] for each in receiver.requests[2:]] == first
     assert [each.body for each in receiver.requests[2:]] == bodies
     none = service.ask(hook, "replay", since="1999-01-01T00:00:00Z", until="1999-01-02T00:00:00Z")
@@ -193,7 +194,7 @@ def test_filters_choose_by_kind_spacecraft_run_and_severity(service, receiver):
     add("alarm", {"severity": "critical", "n": 3}, run="pass-7", spacecraft="XTE")
     add("alarm", {"severity": "warning", "n": 4}, **live)
     add("alarm", {"severity": "critical", "n": 5}, **live)
-    until(lambda: len(receiver.requests) == 2)
+    wait_until(lambda: len(receiver.requests) == 2)
     assert [json.loads(each.body)["data"]["n"] for each in receiver.requests] == [4, 5]
 
 
@@ -223,7 +224,7 @@ def test_a_receiver_that_hangs_or_drips_holds_up_no_other_and_no_request(
         # Both hold their requests still.
         assert service.client.get("/livez").status_code == 200
         for hook in hooks:
-            fault = until(lambda hook=hook: service.read(hook)["last_fault"])
+            fault = wait_until(lambda hook=hook: service.read(hook)["last_fault"])
             assert fault == "no complete answer within 1 s"
         release.set()
 
@@ -244,7 +245,7 @@ def test_of_a_long_answer_no_more_than_64_kib_are_read(service, receiver):
     receiver.answer = pour
     hook = service.hook(receiver.url)
     service.note("long")
-    until(lambda: service.read(hook)["last_delivered"])
+    wait_until(lambda: service.read(hook)["last_delivered"])
     # What the kernel's buffers took besides is no more than some megabytes.
     assert sum(sent) < 32 << 20
 
@@ -255,7 +256,7 @@ def test_of_two_services_on_one_database_one_delivers(chosen_database, receiver)
         one.hook(receiver.url)
         for n in range(20):
             (one, other)[n % 2].note(f"n{n}")
-        until(lambda: len(receiver.requests) >= 20)
+        wait_until(lambda: len(receiver.requests) >= 20)
         time.sleep(0.5)
     assert texts(receiver) == [f"n{n}" for n in range(20)]
 
@@ -267,7 +268,7 @@ def test_events_that_were_deleted_before_their_turn_are_counted(service, receive
     for n in range(40):
         service.note(f"n{n}")
     service.client.put(f"{HERE}/{hook['id']}", json={"name": "t", "url": receiver.url})
-    until(lambda: texts(receiver)[-1:] == ["n39"])
+    wait_until(lambda: texts(receiver)[-1:] == ["n39"])
     assert service.read(hook)["missed"] + len(receiver.requests) == 40
 
 
@@ -290,8 +291,8 @@ def test_a_backlog_is_bounded_and_the_rest_comes_later(service, receiver, monkey
     hook = service.hook(receiver.url)
     for n in range(20):
         service.note(f"n{n}")
-    until(lambda: service.read(hook)["last_fault"])
+    wait_until(lambda: service.read(hook)["last_fault"])
     assert service.read(hook)["waiting"] <= 10
     receiver.answer.refused.clear()
-    until(lambda: texts(receiver)[-1] == "n19")
+    wait_until(lambda: texts(receiver)[-1] == "n19")
     assert list(dict.fromkeys(texts(receiver))) == [f"n{n}" for n in range(20)]

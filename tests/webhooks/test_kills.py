@@ -10,8 +10,9 @@ import pytest
 
 from service.app.factory import open_app
 from tests.scale import size
+from tests.waiting import wait_until
 from tests.web.serving import in_process_settings
-from tests.webhooks.conftest import HERE, LOOPBACK, NOON, serving, until
+from tests.webhooks.conftest import HERE, LOOPBACK, NOON, serving
 
 EVENTS, KILLS = 1_000, 20
 SPACECRAFT = ("XTE", "SWAS", "SOHO")
@@ -66,13 +67,13 @@ def test_all_events_arrive_at_a_receiver_that_is_killed(database, killable, rng,
                 written += 1
             # Not while the service pauses after the kill before: that would interrupt nothing.
             before = len(killable.lines())
-            until(lambda before=before: len(killable.lines()) > before, ALL_ARRIVE_S)
+            wait_until(lambda before=before: len(killable.lines()) > before, ALL_ARRIVE_S)
             time.sleep(float(rng.uniform(0.0, 0.1)))
             killable.kill()
             time.sleep(float(rng.uniform(0.0, 0.3)))
             killable.start()
-        until(lambda: len({each["id"] for each in killable.lines()}) >= events, ALL_ARRIVE_S)
-        until(lambda: service.read(hook)["waiting"] == 0)
+        wait_until(lambda: len({each["id"] for each in killable.lines()}) >= events, ALL_ARRIVE_S)
+        wait_until(lambda: service.read(hook)["waiting"] == 0)
         assert service.read(hook)["dead"] == 0
 
     received = killable.lines()
@@ -110,6 +111,6 @@ def test_events_recorded_while_the_service_was_down_arrive_after_its_start(
         app.annotations.add(f"n{number}", start=NOON, who="jb", spacecraft="XTE")
     app.close()
     with serving(database) as service:
-        until(lambda: len(killable.lines()) == 3)
+        wait_until(lambda: len(killable.lines()) == 3)
         assert service.client.get(HERE).json()["items"][0]["missed"] == 0
     assert [each["told"]["data"]["text"] for each in killable.lines()] == ["n0", "n1", "n2"]

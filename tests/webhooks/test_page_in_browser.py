@@ -2,9 +2,10 @@
 
 import pytest
 
-from tests.web.browser import CHROMIUM, Browser
+from tests.waiting import wait_until
+from tests.web.browser import CHROMIUM
 from tests.web.fitting import faults
-from tests.webhooks.conftest import HERE, until
+from tests.webhooks.conftest import HERE
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
 
@@ -12,12 +13,6 @@ STATUS = "document.getElementById('message').textContent"
 SHOWN = "[...document.querySelectorAll('[data-webhook] h2')].map(each => each.textContent)"
 FILL = "document.querySelector('#new-webhook [name={}]').value = {!r}"
 CLICK = "document.querySelector('[data-do={}]').click()"
-
-
-@pytest.fixture
-def browser(tmp_path):
-    with Browser(tmp_path) as browser:
-        yield browser
 
 
 def test_a_webhook_is_made_tried_paused_and_deleted_on_its_page(service, receiver, browser):
@@ -37,7 +32,7 @@ def test_a_webhook_is_made_tried_paused_and_deleted_on_its_page(service, receive
     browser.wait(lambda: browser.run(STATUS).startswith("The receiver answered 204"))
     receiver.answer = lambda handler, _: handler.say(500)
     service.note("fails")
-    until(lambda: service.read(made)["last_fault"])
+    wait_until(lambda: service.read(made)["last_fault"])
     browser.open(f"{service.url}/webhooks", dark=True)
     assert "status 500" in browser.run("document.querySelector('[data-webhook]').innerText")
     assert faults(browser) == []

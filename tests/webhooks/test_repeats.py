@@ -10,7 +10,8 @@ from service.errors import Busy
 from service.storage.recording import events
 from service.storage.webhooks import deliveries
 from service.webhooks import posts
-from tests.webhooks.conftest import HERE, LOOPBACK, receiving, serving, until
+from tests.waiting import wait_until
+from tests.webhooks.conftest import HERE, LOOPBACK, receiving, serving
 
 
 def texts(receiver):
@@ -32,8 +33,8 @@ def test_events_that_are_recorded_while_others_are_queued_are_sent_once(
 
     monkeypatch.setattr(sender, "_last_and_waiting", look_then_write)
     hook = service.hook(receiver.url)
-    until(lambda: not left and "n11" in texts(receiver))
-    until(lambda: service.read(hook)["waiting"] == 0)
+    wait_until(lambda: not left and "n11" in texts(receiver))
+    wait_until(lambda: service.read(hook)["waiting"] == 0)
     time.sleep(0.5)
     assert texts(receiver) == [f"n{n}" for n in range(12)]
 
@@ -52,7 +53,7 @@ def test_what_was_taken_is_not_sent_again_while_it_cannot_be_noted(service, rece
     monkeypatch.setattr(writer, "change", full_at_first)
     hook = service.hook(receiver.url)
     service.note("once")
-    until(lambda: service.read(hook)["last_delivered"])
+    wait_until(lambda: service.read(hook)["last_delivered"])
     assert len(refused) == 3
     assert service.read(hook)["waiting"] == 0
     assert texts(receiver) == ["once"]
@@ -73,8 +74,8 @@ def test_an_attempt_under_way_when_the_service_stops_is_awaited(chosen_database,
         assert begun.wait(20)
     with serving(database) as service:
         service.note("after")
-        until(lambda: "after" in texts(receiver))
-        until(lambda: service.read(hook)["waiting"] == 0)
+        wait_until(lambda: "after" in texts(receiver))
+        wait_until(lambda: service.read(hook)["waiting"] == 0)
     assert texts(receiver) == ["slow", "after"]
 
 
@@ -100,9 +101,9 @@ def test_a_failure_of_another_spacecraft_does_not_end_the_pause_that_was_asked_f
             events.add_event(connection, "annotation", about, spacecraft=spacecraft)
 
     service.app.context.change(note_both)
-    until(lambda: service.read(hook)["last_status"] == 429)
+    wait_until(lambda: service.read(hook)["last_status"] == 429)
     first_is_noted.set()
-    until(lambda: service.read(hook)["last_status"] == 500)
+    wait_until(lambda: service.read(hook)["last_status"] == 500)
     service.note("not now", "SOHO")
     time.sleep(1.5)
     assert len(receiver.requests) == 2
@@ -118,7 +119,7 @@ def test_a_period_is_sent_again_to_its_end_however_many_events_others_wanted(
         service.note(f"s{n}", "SWAS")
     service.note("wanted")
     receiver.next()
-    until(lambda: service.read(hook)["waiting"] == 0)
+    wait_until(lambda: service.read(hook)["waiting"] == 0)
     assert service.ask(hook, "replay", since=hook["created"]).json() == {"queued": 1}
     receiver.next()
     assert texts(receiver) == ["wanted", "wanted"]

@@ -10,7 +10,8 @@ import pytest
 from service.errors import BadInput
 from service.settings import networks
 from service.webhooks.addresses import Refused, require_reachable, require_url
-from tests.webhooks.conftest import HERE, receiving, serving, until
+from tests.waiting import wait_until
+from tests.webhooks.conftest import HERE, receiving, serving
 
 LITERALS = [
     "https://127.0.0.1/",
@@ -235,4 +236,4 @@ def test_the_certificate_must_be_that_of_the_name(certificate, names, monkeypatc
         fault = service.ask(other, "test").json()["fault"]
         assert "certificate" in fault
         assert len(world.requests) == 1
-        assert until(lambda: service.read(other))["last_fault"] is None
+        assert wait_until(lambda: service.read(other))["last_fault"] is None
