@@ -457,7 +457,10 @@ def submitted(app, spacecraft, run, wanted):
     return [(each, stretches[each.raised.time]) for each in found]
 
 
-@pytest.mark.parametrize("spacecraft", ["XTE", "SWAS", "SOHO"])
+@pytest.mark.parametrize(
+    "spacecraft",
+    ["XTE", *(pytest.param(name, marks=pytest.mark.slow) for name in ("SWAS", "SOHO"))],
+)
 @pytest.mark.parametrize("database", ["sqlite"], indirect=True)
 def test_the_sample_raises_an_alarm_in_its_growing_attitude_error(opened, spacecraft, seed):
     """And none in what comes before, nor for good."""

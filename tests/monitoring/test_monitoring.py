@@ -13,7 +13,7 @@ import pytest
 
 from tests.fresh_databases import sqlite_at
 from tests.storage import samples
-from tests.web.serving import served
+from tests.web.serving import serving_in_process
 
 HERE = Path(__file__).parent
 DOCKER = HERE.parents[1] / "docker"
@@ -88,7 +88,8 @@ def prometheus(tmp_path_factory, sky, missions):
     folder = tmp_path_factory.mktemp("prometheus")
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    with served(sqlite_at(folder / "acquire.db")) as (_, url):
+    with serving_in_process(sqlite_at(folder / "acquire.db")) as service:
+        url = service.url
         _configure(folder, url)
         # A name that never resolves: nothing leaves this machine.
         hook = {"name": "night shift", "url": "https://receiver.invalid/hook"}

@@ -8,13 +8,14 @@ from urllib.parse import quote
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tests.scale import draws
 from tests.web.conformance import reference
 
 URL = "/api/v1/batches"
 JSON = {"Content-Type": "application/json"}
 
 many = settings(
-    max_examples=150,
+    max_examples=draws(30, 150),
     deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],

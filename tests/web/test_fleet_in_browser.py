@@ -22,7 +22,7 @@ DRAWN = "document.getElementById('heat').dataset.drawn"
 MOST_BYTES = 300_000
 
 
-@pytest.fixture(scope="module", params=(40, 200))
+@pytest.fixture(scope="module", params=(40, pytest.param(200, marks=pytest.mark.slow)))
 def filled(request, browser, tmp_path_factory):
     """A service with so many spacecraft in trouble and out of it: how many, and its address."""
     folder = tmp_path_factory.mktemp("fleet")

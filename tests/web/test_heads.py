@@ -3,6 +3,7 @@
 import json
 import socket
 import time
+from contextlib import ExitStack
 
 import httpx
 import pytest
@@ -16,14 +17,26 @@ CHUNKED = (
 )
 FIELDS = b"".join(b"X-%d: %d\r\n" % (number, number) for number in range(200))
 PATIENCE_S = 20
+PIECES = (7, 1000, 50_000, None)
 
 
 @pytest.fixture
-def connection(address):
+def connect(address):
+    """Opens connections, which are closed at the end."""
     url = httpx.URL(address)
-    with socket.create_connection((url.host, url.port), timeout=PATIENCE_S) as connection:
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        yield connection
+    with ExitStack() as opened:
+
+        def connect():
+            connection = socket.create_connection((url.host, url.port), timeout=PATIENCE_S)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            return opened.enter_context(connection)
+
+        yield connect
+
+
+@pytest.fixture
+def connection(connect):
+    return connect()
 
 
 def send(connection, sent, piece=None):
@@ -56,7 +69,6 @@ def is_closed(connection):
     return True
 
 
-@pytest.mark.parametrize("piece", [7, 1000, 50_000, None], ids=lambda piece: f"pieces of {piece}")
 @pytest.mark.parametrize(
     "sent",
     [
@@ -86,14 +98,18 @@ def is_closed(connection):
         "endless blank lines",
     ],
 )
-def test_what_is_too_long_or_too_many_is_refused_and_the_connection_closed(connection, sent, piece):
-    send(connection, sent, piece)
-    answer = received(connection, b"}")
-    assert answer.startswith(REFUSED)
-    head, _, body = answer.partition(b"\r\n\r\n")
-    assert b"application/problem+json" in head
-    assert json.loads(body)["status"] == 431
-    assert is_closed(connection)
+def test_what_is_too_long_or_too_many_is_refused_and_the_connection_closed(connect, sent):
+    """Sent in pieces of a few bytes, in larger ones, and whole."""
+    connections = [connect() for _ in PIECES]
+    for connection, piece in zip(connections, PIECES, strict=True):
+        send(connection, sent, piece)
+        answer = received(connection, b"}")
+        assert answer.startswith(REFUSED), piece
+        head, _, body = answer.partition(b"\r\n\r\n")
+        assert b"application/problem+json" in head
+        assert json.loads(body)["status"] == 431
+    # They linger for the same second.
+    assert all(is_closed(connection) for connection in connections)
 
 
 @pytest.mark.parametrize("sent", [GET + b"X-Long: " + 90 * KIB * b"x", GET + FIELDS])

@@ -18,7 +18,10 @@ BATCHES = 12
 ANNOTATION = {"start": "1999-03-01T00:10:00Z", "text": "Wheel 2 unloaded; " * 20, "who": "jb"}
 
 
-@pytest.fixture(params=(0, 1, 40))
+# Of nothing, `test_console` reads every page; of a fleet, `test_fleet_in_browser` the first one.
+@pytest.fixture(
+    params=(1, pytest.param(0, marks=pytest.mark.slow), pytest.param(40, marks=pytest.mark.slow))
+)
 def pages(request, browser, tmp_path, drawn):
     """The addresses of every page of a service with data of so many spacecraft."""
     size, missions, name = request.param, None, "XTE"
