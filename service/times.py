@@ -1,8 +1,9 @@
 """UTC text to a two-part Julian date and back.
 
 Calendar (`1996-01-10T12:00:00.000Z`) and day-of-year (`1996-010T12:00:00Z`)
-forms are read, also with the offset of a time zone (`+01:00`), which is converted; a leap second (`23:59:60`) is a time like any other; digits
-below the microsecond are kept (CCSDS 301.0-B, ASCII codes A and B).
+forms are read, also with the offset of a time zone (`+01:00`), which is
+converted; a leap second (`23:59:60`) is a time like any other; digits below
+the microsecond are kept (CCSDS 301.0-B, ASCII codes A and B).
 
 ERFA does the arithmetic.  Its bare ufuncs are called because pyerfa's wrappers
 warn of every year beyond the leap-second table, and silencing a warning is not

@@ -95,10 +95,7 @@ class PacketReader:
         """
         try:
             for packet in packets_in(stream, self._table.prefix_bytes):
-                try:
-                    yield from self._read(packet, name)
-                except PacketFault as fault:
-                    yield self._refused(packet, fault, name)
+                yield from self._read(packet, name)
         except EndOfPackets as fault:
             self._totals.refused += 1
             yield Line(fault.number, None, _fault_at(fault.number, fault.offset, fault, name))
@@ -125,7 +122,7 @@ class PacketReader:
             raise BadFile(_fault_at(number, offset, fault, "packets")) from None
 
     def _read(self, packet: SpacePacket, name: str) -> Iterator[Line]:
-        """The lines that are complete with a packet; raises `PacketFault`."""
+        """The lines that are complete with a packet."""
         totals = self._totals
         totals.packets += 1
         totals.bytes += len(packet.content)
@@ -140,14 +137,22 @@ class PacketReader:
         yield from self._incomplete(incomplete, name)
         if whole is None:
             return
-        packet = whole
-        totals.joined += packet.segments > 1
+        totals.joined += whole.segments > 1
         try:
-            values = self._definition.read(packet.content)
+            yield from self._lines_of_packet(whole, name)
         except UnknownPacket:
             counts.described = False
-            totals.unknown += packet.segments
-            return
+            totals.unknown += whole.segments
+        except PacketFault as fault:
+            yield self._refused(whole, fault, name)
+
+    def _lines_of_packet(self, packet: SpacePacket, name: str) -> Iterator[Line]:
+        """The lines that are complete with a whole packet.
+
+        Raises `UnknownPacket`, and `PacketFault` for one that cannot be read.
+        """
+        try:
+            values = self._definition.read(packet.content)
         except PacketFault as fault:
             if packet.segments > 1:
                 fault.message += _OF_SEGMENTS.format(packet.segments)

@@ -25,9 +25,10 @@ SYNC_MARKERS = {
         ("e53003e2", "the attached sync marker, bits inverted,"),
         ("352ef853", "the attached sync marker of a code block"),
         ("034776c7", "the attached sync marker of a turbo code"),
+        ("eb90", "the start sequence"),
     )
 }
-"""Source: CCSDS 131.0-B, section 9; transfer frames begin with them."""
+"""Source: CCSDS 131.0-B, section 9, and 231.0-B; transfer frames begin with them."""
 SEQUENCE_COUNTS = 1 << 14
 
 
@@ -86,7 +87,7 @@ def packets_in(stream: IO[bytes], prefix_bytes: int = 0) -> Iterator[SpacePacket
         if len(header) < HEADER_BYTES:
             message = f"the file ends after {len(start)} bytes, within the header of a packet"
             raise EndOfPackets(number, offset, message)
-        if (marker := SYNC_MARKERS.get(header[:4])) is not None:
+        if marker := SYNC_MARKERS.get(header[:4]) or SYNC_MARKERS.get(header[:2]):
             message = (
                 f"{marker} is where a packet should begin: these are transfer frames; extract the "
                 "space packets first, or set packets.prefix_bytes if each packet has such a prefix"
@@ -168,10 +169,11 @@ class SegmentJoiner:
 
     def _joined(self, segments: list[SpacePacket]) -> SpacePacket:
         first = segments[0]
-        begin = HEADER_BYTES + self._header_bytes
-        data = first.content[HEADER_BYTES:] + b"".join(
-            each.content[begin:] for each in segments[1:]
-        )
+        data = first.content[HEADER_BYTES:]
+        for segment in segments[1:]:
+            # The flag of a secondary header: later segments may come without one.
+            has_header = segment.content[0] & 0x08
+            data += segment.content[HEADER_BYTES + (self._header_bytes if has_header else 0) :]
         flags = bytes([first.content[2] | WHOLE << 6])
         # A longer packet than the field can tell keeps the greatest length.
         length = min(len(data) - 1, 0xFFFF).to_bytes(2, "big")

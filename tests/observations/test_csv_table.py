@@ -189,6 +189,13 @@ def dialect(separator: str, decimal: str = ".") -> str:
         file_of([",".join(f'"{cell}"' for cell in each.split(",")) for each in ROWS]),
         file_of([each.replace(",0,", ",'0,") for each in ROWS]),
         file_of(ROWS, end="\r\n"),
+        file_of(
+            [
+                ",".join(f'"{c}"' for c in each.replace(".", ";").split(",")).replace(";", ",")
+                for each in ROWS
+            ]
+        ),
+        f"# made by a spreadsheet\n#,of stars\n{file_of(ROWS)}",
     ],
     ids=[
         "semicolons",
@@ -208,6 +215,8 @@ def dialect(separator: str, decimal: str = ".") -> str:
         "every cell in quotes",
         "numbers marked as texts",
         "CR LF",
+        "commas, decimal commas in quotes",
+        "comments before the header",
     ],
 )
 def test_every_dialect_is_read_as_the_plain_file(text: str) -> None:

@@ -24,9 +24,15 @@ def batches(missions, sky):
     return drawn(missions, sky)[:3]
 
 
-def segment(data, flags, count, apid=APID):
+def segment(data, flags, count, apid=APID, secondary=0):
     return bytes(
-        create_ccsds_packet(data, apid=apid, sequence_flags=flags, sequence_count=count % 16384)
+        create_ccsds_packet(
+            data,
+            apid=apid,
+            sequence_flags=flags,
+            sequence_count=count % 16384,
+            secondary_header_flag=secondary,
+        )
     )
 
 
@@ -39,7 +45,9 @@ def segmented(data, sizes, count, repeated=b"", apid=APID):
     parts.append(data[begin:])
     flags = [FIRST, *[CONTINUATION] * (len(parts) - 2), LAST]
     return [
-        segment((repeated if k else b"") + part, flags[k], count + k, apid)
+        segment(
+            (repeated if k else b"") + part, flags[k], count + k, apid, secondary=bool(repeated)
+        )
         for k, part in enumerate(parts)
     ]
 
@@ -116,8 +124,18 @@ def test_a_secondary_header_in_each_segment_is_skipped(batches):
     pieces = segmented(fields(batches[0]), (50, 50), 0, repeated=b"\x01" * 6)
     assert bodies(read(b"".join(pieces), reader_of(mission))) == canonical(batches[:1])
     (line,) = read(b"".join(pieces))
-    assert "bytes; it is joined of 3 segments" in str(line.fault)
+    assert "it is joined of 3 segments" in str(line.fault)
     assert "packets.segment_header_bytes" in str(line.fault)
+
+
+def test_later_segments_without_a_secondary_header_lose_nothing(batches):
+    text = TABLE.format(directions=ANGLES)
+    mission = mission_with(
+        text.replace("\n[packets.time]", "\nsegment_header_bytes = 6\n[packets.time]")
+    )
+    data = fields(batches[0])
+    pieces = [segment(data[:50], FIRST, 0, secondary=1), segment(data[50:], LAST, 1)]
+    assert bodies(read(b"".join(pieces), reader_of(mission))) == canonical(batches[:1])
 
 
 def test_flags_that_group_whole_packets_are_taken_so_where_the_mission_says_it(batches):
@@ -156,6 +174,7 @@ def test_a_packet_without_end_is_not_held():
         ("1dfccf1a", "bytes reversed, 1DFCCF1A"),
         ("e53003e2", "bits inverted, E53003E2"),
         ("034776c7272895b0", "of a turbo code 034776C7"),
+        ("eb90", "the start sequence EB90"),
     ],
 )
 def test_transfer_frames_are_told_by_their_sync_marker(batches, marker, kind):

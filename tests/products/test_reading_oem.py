@@ -245,3 +245,40 @@ def test_a_file_that_cannot_be_opened_is_named(tmp_path):
     with pytest.raises(BadInput, match="--ephemeris: cannot be read: No such file") as refusal:
         read_ephemeris(tmp_path / "none.oem", "--ephemeris")
     assert "none.oem" in str(refusal.value)
+
+
+def test_tabs_orders_of_keywords_and_comments_of_several_lines_change_nothing():
+    """As anise wrote its files, and as figure 5-1 of CCSDS 502.0-B has its comments."""
+    text = oem_text(STEPS)
+    head, _, rest = text.partition("META_START\n")
+    metadata, _, states = rest.partition("META_STOP\n")
+    lines = metadata.replace(" = ", "\t=\t").splitlines()[::-1]
+    metadata = "".join(f"\t{line}\n" for line in lines)
+    comments = "COMMENT made by hand, 1996NOV 04. It is\nCOMMENT to be used = for tests only.\n"
+    states = states.replace(" ", "\t").replace("COMMENT\tstates\n", comments)
+    other = f"\ufeff{head}META_START\n{metadata}META_STOP\n{comments}{states}"
+    np.testing.assert_array_equal(at(read(other), [70.0]), at(read(text), [70.0]))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("REF_FRAME", "TEME"),
+        ("REF_FRAME", "ITRF2000"),
+        ("CENTER_NAME", "MARS BARYCENTER"),
+        ("TIME_SYSTEM", "UT1"),
+    ],
+)
+def test_what_a_state_cannot_be_taken_from_is_refused_by_its_keyword(name, value):
+    with pytest.raises(BadFile, match=name):
+        read(oem_text(STEPS, **{name: value}))
+
+
+@pytest.mark.parametrize("rows", [["1.0"], ["EPOCH = 2022-01-17T12:00:00", *["1 2 3 4 5 6 7"] * 9]])
+def test_a_covariance_of_another_shape_changes_no_state(rows):
+    text = oem_text(STEPS, extra=["COVARIANCE_START", *rows, "COVARIANCE_STOP"])
+    try:
+        known = read(text)
+    except BadFile:
+        return
+    np.testing.assert_array_equal(at(known, [70.0]), at(read(oem_text(STEPS)), [70.0]))

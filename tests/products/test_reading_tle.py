@@ -192,3 +192,46 @@ def test_without_sgp4_the_command_that_installs_it_is_named(monkeypatch, tmp_pat
     file.write_text("\n".join(ISS))
     with pytest.raises(NotAvailable, match=r"pip install 'attitude-acquisition\[tle\]'"):
         read_ephemeris(file, "--ephemeris")
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        b"\xef\xbb\xbf" + "\n".join(ISS).encode(),
+        b"\xef\xbb\xbf" + "\r\n".join(["ISS (ZARYA)", *ISS]).encode(),
+        "\n".join(["made by hand", "", "0 ISS", *ISS, "end"]).encode(),
+        "\n".join(f"{line}   " for line in ISS).encode(),
+    ],
+    ids=["byte order mark", "mark before a name", "text around the set", "spaces at the ends"],
+)
+def test_what_is_around_a_set_changes_nothing(lines):
+    np.testing.assert_array_equal(read(lines).at(ISS_EPOCH), read(ISS).at(ISS_EPOCH))
+
+
+@pytest.mark.parametrize(
+    ("line", "field", "padded"),
+    [
+        (1, "0006817", "   6817"),
+        (1, " 60.2000", "060.2000"),
+        (0, "22017.5", "22 17.5"),
+        (0, "98067A  ", "        "),
+        (0, " .00006000", "+.00006000"),
+        (0, " 11466-3", "+11466-3"),
+    ],
+)
+def test_numbers_padded_with_spaces_or_zeros_are_the_same_set(line, field, padded):
+    """As CelesTrak describes the format, and as catalogs of several sites write it."""
+    lines = list(ISS)
+    assert field in lines[line]
+    lines[line] = with_checksum(lines[line].replace(field, padded, 1))
+    np.testing.assert_array_equal(read(lines).at(ISS_EPOCH), read(ISS).at(ISS_EPOCH))
+
+
+def test_a_satellite_number_padded_with_spaces_is_read():
+    lines = [with_checksum(line.replace("25544", "  511")) for line in ISS]
+    np.testing.assert_array_equal(read(lines).at(ISS_EPOCH), read(ISS).at(ISS_EPOCH))
+
+
+def test_a_set_without_checksums_is_refused_by_its_length():
+    with pytest.raises(BadFile, match="must have 69 characters; it has 68"):
+        read([line[:68].replace("  999", " 9990") for line in ISS])

@@ -111,8 +111,10 @@ class CsvTable:
                 yield row
 
     def _header(self, kinds: Sequence[RowKind]) -> list[str]:
-        """The names of the columns; finds the separator."""
-        lines = physical_lines(self._stream)
+        """The names of the columns, after comments that begin with `#`; finds the separator."""
+        lines = (
+            line for line in physical_lines(self._stream) if not (line.body or b"").startswith(b"#")
+        )
         line = next(lines, None)
         text = "" if line is None or line.body is None else line.body.decode("utf-8", "replace")
         declared = _SEPARATOR_LINE.fullmatch(text)
@@ -204,7 +206,7 @@ class CsvTable:
             found = self._cells(line)
             if isinstance(found, Fault) or not found:
                 continue
-            if self._separator != "," and len(marks) < 2:
+            if len(marks) < 2:
                 for k in self._number_columns:
                     for mark in ",.":
                         if k < len(found) and mark in found[k]:
@@ -217,7 +219,7 @@ class CsvTable:
                 if len(keys) > MOST_GROUPS:
                     message = f"is beyond {MOST_GROUPS:,} groups of rows: split the file"
                     raise BadFile(Fault(f"line {line.number}", message))
-        if len(marks) == 2:
+        if len(marks) == 2 and self._separator != ",":
             first, second = marks
             names = {",": "a decimal comma", ".": "a decimal point"}
             message = (
@@ -225,7 +227,8 @@ class CsvTable:
                 f"{names[first]}: thousands separators are not read"
             )
             raise BadFile(Fault(f"line {marks[second]}", message))
-        self._decimal_comma = "," in marks
+        # Between commas a cell with both is refused by itself: its comma separates thousands.
+        self._decimal_comma = list(marks) == [","]
         _, begun = np.unique(np.array(keys), return_index=True)
         again = np.ones(len(keys), bool)
         again[begun] = False

@@ -45,7 +45,7 @@ _FIELDS: dict[int, tuple[tuple[str, int, int, str], ...]] = {
         ("satellite number", 2, 7, _NUMBER),
         ("inclination", 8, 16, _ANGLE),
         ("right ascension of the node", 17, 25, _ANGLE),
-        ("eccentricity", 26, 33, r"\d{7}"),
+        ("eccentricity", 26, 33, r" *\d+"),
         ("argument of perigee", 34, 42, _ANGLE),
         ("mean anomaly", 43, 51, _ANGLE),
         ("mean motion", 52, 63, r" *\d+\.\d{8}"),

@@ -236,7 +236,8 @@ def _forget_archived(store: Store, folder: Path, selected: ForgetFilter) -> int:
             claim(connection, folder)
             chosen = selected.of_batches(archived_batches)
             query = select(archived_batches.c.part_id, func.count()).where(*chosen)
-            counts = dict(connection.execute(query.group_by(archived_batches.c.part_id)).tuples())
+            grouped = connection.execute(query.group_by(archived_batches.c.part_id))
+            counts: dict[int, int] = dict(grouped)
             parts = select(archived_parts).where(archived_parts.c.id.in_(counts))
             known = {row["path"]: dict(row) for row in connection.execute(parts).mappings()}
         named = {
