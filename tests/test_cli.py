@@ -50,6 +50,7 @@ COMMANDS = [
     "database restore",
     "database verify",
     "database prune",
+    "database forget",
     "archive",
     "archive verify",
     "archive restore",
@@ -636,3 +637,30 @@ def test_what_is_read_back_is_json_one_object_a_line(acquire, tmp_path):
     path = telemetry(acquire, tmp_path / "x.ndjson", "SWAS", 3)
     for line in path.read_text().splitlines():
         assert json.loads(line)["spacecraft"] == "SWAS"
+
+
+def test_a_run_that_was_recorded_wrongly_is_forgotten_once_its_name_is_typed(
+    acquire, tmp_path, monkeypatch
+):
+    path = telemetry(acquire, tmp_path / "night.ndjson")
+    acquire("replay", path, "--in-process", "--run", "wrong")
+    monkeypatch.setattr("builtins.input", lambda asked: "another")
+    code, out, err = acquire("database", "forget", "--run", "wrong")
+    assert (code, err.strip()) == (1, "nothing was removed")
+    assert "from run wrong will be removed:\n  6 batches with their results" in out
+    monkeypatch.setattr("builtins.input", lambda asked: "wrong")
+    code, out, _ = acquire("database", "forget", "--run", "wrong")
+    assert (code, out.splitlines()[-1]) == (0, "it was removed")
+    code, _, err = acquire("database", "forget", "--run", "wrong", "--yes")
+    assert (code, "nothing is recorded in run wrong" in err) == (2, True)
+    code, out, _ = acquire("replay", path, "--in-process", "--run", "wrong")
+    assert "  new               6" in out
+    code, out, _ = acquire(
+        "database", "forget", "--run", "wrong", "--batch", "1999-060-0001", "--yes", "--json"
+    )
+    assert json.loads(out)["batches"] == 1
+    with closing(sqlite3.connect(tmp_path / "acquire.db")) as database:
+        entries = database.execute("SELECT who, action, about FROM audit ORDER BY id").fetchall()
+    assert [(who.partition(":")[0], *rest) for who, *rest in entries] == [
+        ("command", "forget_run", "wrong")
+    ] * 2

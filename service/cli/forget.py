@@ -56,7 +56,6 @@ def forget(parsed: Namespace) -> int:
     """Show what is removed, ask, and remove it."""
     from tqdm import tqdm
 
-    from service.storage.serving.served import unserved
     from service.storage.sql.database import Store
     from service.storage.upkeep import forget as forgetting
 
@@ -65,24 +64,23 @@ def forget(parsed: Namespace) -> int:
         parsed.run, parsed.spacecraft, tuple(parsed.batch), tuple(parsed.gyro_block)
     )
     folder = parsed.archive or settings.archive_folder
-    with unserved(settings.database):
-        store = Store(settings.database, create=False)
-        try:
-            with store.reading() as connection:
-                total = forgetting.found(connection, selected)
-            print(_told(total), file=sys.stderr if parsed.json else sys.stdout)
-            if not parsed.yes and not _is_confirmed(parsed.run):
-                print("nothing was removed", file=sys.stderr)
-                return 1
-            with tqdm(total=None, unit=" batches", desc="removing", disable=None, leave=False) as b:
+    store = Store(settings.database, create=False)
+    try:
+        with store.reading() as connection:
+            total = forgetting.found(connection, selected)
+        print(_told(total), file=sys.stderr if parsed.json else sys.stdout)
+        if not parsed.yes and not _is_confirmed(parsed.run):
+            print("nothing was removed", file=sys.stderr)
+            return 1
+        with tqdm(total=None, unit=" batches", desc="removing", disable=None, leave=False) as b:
 
-                def step(done: int, whole: "Forgotten") -> None:
-                    b.total = whole.batches + whole.archived_batches
-                    b.update(done - b.n)
+            def step(done: int, whole: "Forgotten") -> None:
+                b.total = whole.batches + whole.archived_batches
+                b.update(done - b.n)
 
-                forgetting.forget(store, selected, folder, note=_note(parsed), step=step)
-        finally:
-            store.close()
+            forgetting.forget(store, selected, folder, note=_note(parsed), step=step)
+    finally:
+        store.close()
     if parsed.json:
         from msgspec import to_builtins
 

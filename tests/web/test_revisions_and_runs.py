@@ -235,3 +235,33 @@ def test_the_runs_page_tells_how_far_a_reprocessing_into_the_archive_is(
     assert "wider live ▸ running 73 of 365 19 990 100 13 min 20 s 10" in page
     assert "tight live ‖ interrupted" in page
     assert "again live ● done 365 of 365" in page
+
+
+def test_what_was_recorded_wrongly_is_forgotten_by_name_and_can_be_recorded_anew(
+    client, post, batch, run
+):
+    """Nothing is removed before it is confirmed; the audit list says what was asked."""
+    wrong, kept = batch | {"run": run}, batch | {"run": run, "batch": "kept"}
+    for each in (wrong, kept):
+        post(each).raise_for_status()
+    right = wrong | {"body_rates_deg_per_s": [0.0, 0.0, 0.001]}
+    assert post(right).status_code == 409
+    address = f"/api/v1/runs/{run}/forget"
+    asked = {"spacecraft": "XTE", "batches": [batch["batch"]]}
+    counts = {"batches": 1, "archived_batches": 0, "gyro_blocks": 0, "graded_days": 0}
+    told = client.post(address, json=asked).raise_for_status().json()
+    assert told == {"run": run, "spacecraft": "XTE"} | counts
+    assert post(wrong).headers["Replayed"] == "true"
+    assert client.post(address, json=asked | {"confirm": True}).json() == told
+    assert client.post(address, json=asked).status_code == 404
+    assert post(right).status_code == 201
+    listed = client.get("/api/v1/batches", params={"run": run}).json()["items"]
+    assert {each["batch"] for each in listed} == {batch["batch"], "kept"}
+    entries = client.get("/api/v1/audit?limit=4").json()["items"]
+    (entry,) = [
+        each for each in entries if '"confirm":true' in (each["body"] or "").replace(" ", "")
+    ]
+    assert (entry["action"], entry["about"], entry["status"]) == ("forget_run", address, 200)
+    whole = client.post(address, json={"confirm": True}).raise_for_status().json()
+    assert whole["batches"] == 2
+    assert run not in {each["run"] for each in client.get("/api/v1/runs").json()["items"]}
