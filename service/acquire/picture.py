@@ -164,20 +164,27 @@ def solve_picture(
     if guess_px is not None:
         ranges.insert(0, FocalRange.about(guess_px, GUESS_SHARE))
     tried: list[PointSources] = []
-    for threshold in (FIRST_THRESHOLD, SECOND_THRESHOLD):
-        tried.append(find_points(frame.counts, threshold))
+    for threshold, keep_hot in (
+        (FIRST_THRESHOLD, False),
+        (SECOND_THRESHOLD, False),
+        # Of a lens whose images of stars are much smaller than a pixel.
+        (FIRST_THRESHOLD, True),
+    ):
+        if keep_hot and not tried[0].hot_pixels:
+            break
+        tried.append(find_points(frame.counts, threshold, keep_hot))
         for focal in ranges:
             result = _solved(frame, tried[-1], sky, solver, focal, guess_px)
             if result.attitude is not None:
                 return result
     turned = mirrored(frame)
-    for points in tried:
+    for points in tried[:2]:
         flipped = points.mirrored(is_by_rows(frame))
         for focal in ranges:
             found = _solved(turned, flipped, sky, solver, focal, guess_px)
             if found.attitude is not None:
                 return found
-    return replace(result, remarks=tuple(advice_without_attitude(points)))
+    return replace(result, points=points, remarks=tuple(advice_without_attitude(points)))
 
 
 def _solved(

@@ -10,6 +10,7 @@ from service.imaging.detection.points import MAX_POINTS, PointSources
 CLIPPED_SHARE = 0.5
 BLURRED_PX = 3.5
 FEW_POINTS = 6
+NOTABLE_HOT = 20
 NOTABLE_BEND = 0.003
 NOTABLE_FOCAL = 0.005
 
@@ -54,14 +55,19 @@ def advice_without_attitude(points: PointSources) -> Iterator[str]:
         yield f"few_points: {points.count} points of light hardly tell one field from another"
     elif points.count >= MAX_POINTS:
         yield (
-            f"clutter: {MAX_POINTS} candidates and more: crop what is no sky, or use a shorter "
-            "exposure with less noise"
+            f"clutter: {MAX_POINTS} candidates and more: crop what is no sky, take off hot pixels "
+            "with a dark frame (--dark FILE), or use a shorter exposure with less noise"
         )
     yield from _light(points)
     yield "try_next: tell the field of view (--fov DEG), if it is known within a quarter"
 
 
 def _light(points: PointSources) -> Iterator[str]:
+    if points.hot_pixels > NOTABLE_HOT:
+        yield (
+            f"hot_pixels: {points.hot_pixels} single bright pixels were taken for no stars; a dark "
+            "frame (--dark FILE) takes off all of them"
+        )
     if points.clipped_share > CLIPPED_SHARE:
         yield (
             f"clipped: {points.clipped_share:.0%} of the pixels are clipped to black: faint stars "

@@ -33,6 +33,9 @@ MAX_POINTS = 300
 FIRST_THRESHOLD, SECOND_THRESHOLD = 5.0, 3.5
 FULL_SHARE = 0.9
 """Of the largest count: images with a higher peak may be cut off, and tell no width."""
+HOT_SHARE = 0.25
+"""Light of the four neighbours over that of the brightest pixel: a star has more down to an image
+of a third of a pixel, one standard deviation."""
 PLACE_NOISE = 1.34
 """The error of a place times the signal to noise, in widths of a star's image.
 
@@ -66,6 +69,8 @@ class PointSources:
     binning: int
     width_px: int
     height_px: int
+    hot_pixels: int = 0
+    """Single bright pixels, which no star makes."""
 
     @property
     def count(self) -> int:
@@ -81,8 +86,13 @@ class PointSources:
         return replace(self, u_px=u_px, light=self.light[:, ::-1])
 
 
-def find_points(counts: CountArray, threshold: float = FIRST_THRESHOLD) -> PointSources:
-    """The candidates on a picture (rows, columns); their images are measured on it first."""
+def find_points(
+    counts: CountArray, threshold: float = FIRST_THRESHOLD, keep_hot: bool = False
+) -> PointSources:
+    """The candidates on a picture (rows, columns); their images are measured on it first.
+
+    Single bright pixels are hot ones, not stars, and are left out unless `keep_hot`.
+    """
     height, width = counts.shape
     binning = max(1, math.ceil(math.sqrt(counts.size / MAX_WORKING_PIXELS)))
     working = _filled(_binned(counts, binning))
@@ -92,6 +102,10 @@ def find_points(counts: CountArray, threshold: float = FIRST_THRESHOLD) -> Point
     light = working
     background.subfrom(light)
     peaks = _peaks(light, GUESSED_PSF_PX, threshold, step)
+    hot = _is_hot(light, *peaks[:2])
+    if hot.any() and not keep_hot:
+        _fill(light, peaks[0][hot], peaks[1][hot])
+        peaks = _peaks(light, GUESSED_PSF_PX, threshold, step)
     psf = _measured_psf(light, *peaks)
     if not 1.0 / LIKE_PSF < psf / GUESSED_PSF_PX < LIKE_PSF:
         peaks = _peaks(light, psf, threshold, step)
@@ -116,6 +130,7 @@ def find_points(counts: CountArray, threshold: float = FIRST_THRESHOLD) -> Point
         binning=binning,
         width_px=width,
         height_px=height,
+        hot_pixels=int(np.count_nonzero(hot)),
     )
 
 
@@ -146,6 +161,27 @@ def _filled(counts: CountArray) -> CountArray:
     if unknown.any():
         counts[unknown] = np.median(counts[~unknown]) if not unknown.all() else 0.0
     return counts
+
+
+def _is_hot(
+    light: CountArray, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64]
+) -> npt.NDArray[np.bool_]:
+    """True for peaks (n,) that are one bright pixel: its four neighbours hold hardly any light."""
+    beside = sum(_beside(light, u, v))
+    brightest = np.maximum.reduce([light[v, u], *_beside(light, u, v)])
+    return np.asarray((light[v, u] == brightest) & (beside < HOT_SHARE * brightest))
+
+
+def _fill(light: CountArray, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64]) -> None:
+    """Replace pixels by the median of their four neighbours."""
+    light[v, u] = np.median(_beside(light, u, v), axis=0)
+
+
+def _beside(
+    light: CountArray, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64]
+) -> list[CountArray]:
+    """The light of the neighbours of pixels that are not on the edge, each (n,)."""
+    return [light[v + down, u + across] for down, across in ((-1, 0), (1, 0), (0, -1), (0, 1))]
 
 
 def _measured_psf(
