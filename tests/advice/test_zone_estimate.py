@@ -41,7 +41,7 @@ def test_pairs_and_memory_are_predicted_within_15_percent(sky, missions, rng, na
     off, memory = [], []
     first = region_of(mission, random_axis(rng))
     shape = shape_of(first.least_deg, first.most_deg, limit_deg)
-    for _ in range(size(1000)):
+    for _ in range(size(1000, 10)):
         region = region_of(mission, random_axis(rng))
         zone = build_zone(mission.name, run_catalog, region, limit_deg)
         stars, pairs = predicted(neighbours, shape, region.axis)

@@ -21,7 +21,7 @@ from tests.filtering.simulated import (
 from tests.grades.passes import GYRO, MODEL, NOON_NS, graded, mission_with, recorded_of
 from tests.scale import size
 
-PASSES, ATTITUDES, LASTS_S, EVERY_S = 1000, 10, 1200.0, 8
+PASSES, FEW_PASSES, ATTITUDES, LASTS_S, EVERY_S = 1000, 20, 10, 1200.0, 8
 SIGMA_RAD = 6.0 * ARCSEC
 LIMIT, SHARE_BEYOND = 9.0, 0.035
 """Of chi-square with three degrees of freedom 2.9 % lie beyond 9."""
@@ -53,7 +53,7 @@ def test_few_filtered_attitudes_from_one_star_are_off_by_more_than_three_sigmas(
 ):
     mission = mission_with(missions["XTE"], gyro=GYRO)
     rng = np.random.default_rng(seed)
-    passes = size(PASSES)
+    passes = size(PASSES, FEW_PASSES)
     truth = truth_of(slews, LASTS_S)
     rows = np.arange(0, int(LASTS_S) + 1, EVERY_S)
     first, alone = rows[:ATTITUDES], rows[ATTITUDES:]
@@ -78,7 +78,7 @@ def test_few_filtered_attitudes_from_one_star_are_off_by_more_than_three_sigmas(
     # Errors of one pass go together: passes are what is counted.
     spread = float(np.std(shares) / math.sqrt(passes))
     figures(passes=passes, share_beyond=share, spread=spread, sigma_across_arcsec=across[0])
-    assert share <= SHARE_BEYOND + 3.0 * spread * (passes < PASSES)
+    assert share <= SHARE_BEYOND + 5.0 * spread * (passes < PASSES)
     # A star beyond the gate, one in 10,000, makes the next attitudes doubtful.
     assert np.mean(good) > 0.98
     # The stars are used: without them the gyro alone drifts away.

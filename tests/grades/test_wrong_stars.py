@@ -9,11 +9,12 @@ from service.attitude.solve import solve_attitude
 from service.filtering.samples import AttitudeMeasurements
 from service.filtering.state import Status
 from service.vectors import ARCSEC_PER_RADIAN, unit
+from tests.chance import at_least, at_most
 from tests.filtering.simulated import ARCSEC, gyro_of, slews, squares, truth_of
 from tests.grades.passes import GYRO, MODEL, NOON_NS, graded, mission_with, recorded_of
 from tests.scale import size
 
-PASSES, BATCHES, EVERY_S, STARS = 1000, 100, 8, 5
+PASSES, FEW_PASSES, BATCHES, EVERY_S, STARS = 1000, 10, 100, 8, 5
 SIGMA_RAD = 6.0 * ARCSEC
 WRONG_STARS, WRONG_ATTITUDES = 0.01, 0.01
 LIMIT = 36.0
@@ -65,7 +66,7 @@ def measured(truth, rows, rng):
 def test_wrong_stars_and_wrong_attitudes_make_no_good_attitude_wrong(missions, seed, figures):
     mission = mission_with(missions["XTE"], gyro=GYRO)
     rng = np.random.default_rng(seed)
-    passes = size(PASSES)
+    passes = size(PASSES, FEW_PASSES)
     truth = truth_of(slews, EVERY_S * (BATCHES - 1.0))
     rows = np.arange(BATCHES) * EVERY_S
     told = dict.fromkeys(("wrong", "filtered_bad", "smoothed_bad", "diverged", "rejected"), 0)
@@ -91,8 +92,11 @@ def test_wrong_stars_and_wrong_attitudes_make_no_good_attitude_wrong(missions, s
             # A doubt at the end, after a wrong attitude, is part of the covariance.
             told["diverged"] += int(squared[-1] > LIMIT)
     figures(passes=passes, batches=passes * BATCHES, largest=largest, good=good, **told)
-    assert told["wrong"] > 0.03 * passes * BATCHES
+    batches = passes * BATCHES
+    assert told["wrong"] >= at_least(batches, STARS * WRONG_STARS)
+    # One of 100,000; of fewer there may be more by chance.
+    allowed = 1 if passes >= PASSES else at_most(batches, 1e-5)
     for grade, count in good.items():
-        assert count > 0.9 * passes * BATCHES
-        assert told[f"{grade}_bad"] * 100_000 <= passes * BATCHES, (grade, told, largest)
+        assert count > 0.9 * batches
+        assert told[f"{grade}_bad"] <= allowed, (grade, told, largest)
     assert told["diverged"] == 0

@@ -55,7 +55,7 @@ def apart(one, other):
 
 @pytest.mark.torture
 def test_random_attitudes_are_read_by_orekit_and_brahe(save, orekit, rng):
-    n = scale.size(100_000)
+    n = scale.size(100_000, 200)
     q = random_quaternions(rng, n)
     half = n // 2
     file = save(rows(q[:half]), rows(q[half:], "1997-01-11T00:00:00Z"))

@@ -75,7 +75,7 @@ def test_thirty_degrees_about_z_is_the_rotation_of_the_frame(read):
 
 @pytest.mark.torture
 def test_random_attitudes_are_read_at_their_records(read, rng):
-    page = rows(random_quaternions(rng, scale.size(100_000)))
+    page = rows(random_quaternions(rng, scale.size(100_000, 200)))
     block = whole(page)
     found = read(page, ticks=ticks_of(block))["found"]
     a = np.array([each[0] for each in found])

@@ -136,7 +136,7 @@ def test_a_kernel_without_its_clock_is_refused_with_what_it_needs(tmp_path):
 
 def test_a_kernel_that_was_cut_short_is_refused(tmp_path):
     file = unpacked(tmp_path, *PAGES)
-    for size in (8, 900, 1024, 2000, 3000):
+    for size in (8, 900, 1024, 2000, 3000) if scale.is_full() else (900, 3000):
         file.write_bytes(file.read_bytes()[:size])
         with pytest.raises(BadFile, match=r"xte\.bc: "):
             read_attitudes(file, "FILE")
@@ -152,14 +152,15 @@ def test_a_mutated_kernel_is_read_or_refused(form, seed, tmp_path):
     changed = tmp_path / f"xte.{form}"
     good = written("ck", *PAGES) if form == "zip" else changed.read_bytes()
     draw = random.Random(seed)
-    refused = 0
-    for _ in range(scale.size(1_000)):
+    refused, count = 0, scale.size(1_000)
+    for _ in range(count):
         changed.write_bytes(mutated(good, draw))
         try:
             read_attitudes(changed if form == "zip" else tmp_path / "xte.bc", "FILE")
         except BadInput:
             refused += 1
-    assert refused
+    # One that was changed may be read.
+    assert refused or count == 1
 
 
 @pytest.mark.parametrize("record", [b"PK\x01\x02", b"PK\x03\x04"])
