@@ -115,7 +115,9 @@ def test_errors_are_as_large_as_their_sigmas_say():
     assert 0.93 < np.sqrt(np.mean(np.square(errors))) < 1.07
 
 
-@pytest.mark.parametrize(("batches", "most_arcsec"), [(500, 0.35), (2000, 0.17)])
+@pytest.mark.parametrize(
+    ("batches", "most_arcsec"), [(500, 0.35), pytest.param(2000, 0.17, marks=pytest.mark.slow)]
+)
 def test_distortion_of_ten_arcsec_is_found(batches, most_arcsec):
     """Over both trackers and some seeds, with radial errors of 6 arcsec."""
     squares = []

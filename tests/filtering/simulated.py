@@ -7,6 +7,7 @@ seconds from the beginning; the rates are of the body axes.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from service.filtering.gyro import GyroModel
 from service.filtering.result import AttitudeHistory
 from service.filtering.samples import AttitudeMeasurements, DirectionMeasurements, GyroSamples
+from service.vectors import read_only
 
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64]
@@ -57,10 +59,14 @@ def slews(time_s: Array) -> Array:
     return np.asarray(math.radians(0.12) * ramp[:, None] * axes[turn % 3])
 
 
+@lru_cache(maxsize=16)
 def truth_of(
     rate: Callable[[Array], Array], duration_s: float, step_s: float = 1.0, start: Any = None
 ) -> Truth:
-    """The motion whose rate (n, 3) is `rate` of times (n,), integrated in small steps."""
+    """The motion whose rate (n, 3) is `rate` of times (n,), integrated in small steps.
+
+    Tests of one motion share it.
+    """
     time_s: Array = np.arange(round(duration_s / step_s) + 1, dtype=np.float64) * step_s
     small_s = step_s / SUBSTEPS
     middles: Array = np.arange((len(time_s) - 1) * SUBSTEPS, dtype=np.float64) + 0.5
@@ -79,7 +85,7 @@ def truth_of(
         reach *= 2
     attitude = Rotation.from_quat(np.vstack([[0.0, 0.0, 0.0, 1.0], turned]))
     rates = np.vstack([np.zeros(3), parts.mean(axis=1)])
-    return Truth(time_s, (start or Rotation.identity()) * attitude, rates)
+    return Truth(read_only(time_s), (start or Rotation.identity()) * attitude, read_only(rates))
 
 
 def gyro_of(

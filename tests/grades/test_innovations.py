@@ -72,7 +72,7 @@ def test_differences_from_the_smoothed_attitude_scatter_as_their_sigmas_say(foun
     share = found.difference_arcsec[used] / found.difference_sigma_arcsec[used]
     # One sigma of the rms of so many independent values.
     scatter = 1.0 / np.sqrt(2.0 * share.size)
-    assert np.sqrt(np.mean(share**2)) == pytest.approx(1.0, abs=4.0 * scatter)
+    assert np.sqrt(np.mean(share**2)) == pytest.approx(1.0, abs=5.0 * scatter)
 
 
 def test_packing_keeps_times_and_outcomes_and_seven_digits(found):

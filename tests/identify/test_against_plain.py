@@ -8,8 +8,15 @@ import pytest
 from tests.reference import batches
 from tests.reference.compare import Judge, plain_view
 from tests.reference.plain_starid import prior_attitude
+from tests.scale import draws
 
 NAMES = ("XTE", "SWAS", "SOHO")
+
+
+@pytest.fixture
+def count(request):
+    """Batches of a mission."""
+    return request.config.getoption("--batches") or draws(80, 240)
 
 
 def agreed(comparison, at_least):
@@ -19,9 +26,8 @@ def agreed(comparison, at_least):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_batches_of_every_kind_agree(name, seed, mission_files, sky, request):
+def test_batches_of_every_kind_agree(name, seed, mission_files, sky, count):
     """Priors, switches, tolerances, grids, noise, errors, spurious stars and rates are random."""
-    count = request.config.getoption("--batches")
     # XTE and SWAS would otherwise be given the same batches.
     rng = np.random.default_rng([seed, *name.encode()])
     outcomes = agreed(Judge(mission_files[name], sky).hold_many(rng, count), count)
@@ -30,9 +36,9 @@ def test_batches_of_every_kind_agree(name, seed, mission_files, sky, request):
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("switch", ["fov_rotation", "match_groups"])
-def test_van_bezooijen_s_tests_agree(name, switch, rng, mission_files, sky, request):
+def test_van_bezooijen_s_tests_agree(name, switch, rng, mission_files, sky, count):
     """Each by itself, with all other tests as the mission has them; and it does change answers."""
-    count = request.config.getoption("--batches") // 3
+    count //= 3
     states = rng.bit_generator.state
     on, off = Judge(mission_files[name], sky), Judge(mission_files[name], sky)
     said = {"tolerances": {"fov_rotation_deg": 2.0}}
@@ -43,15 +49,15 @@ def test_van_bezooijen_s_tests_agree(name, switch, rng, mission_files, sky, requ
 
 
 @pytest.mark.parametrize("name", ["XTE", "SOHO"])
-def test_several_trackers_agree_each_in_its_own_zone(name, rng, mission_files, sky, request):
-    count = request.config.getoption("--batches") // 6
+def test_several_trackers_agree_each_in_its_own_zone(name, rng, mission_files, sky, count):
+    count //= 6
     mission = batches.with_trackers(mission_files[name], 3)
     agreed(Judge(mission, sky).hold_many(rng, count), 2 * count)
 
 
 @pytest.mark.parametrize("name", ["XTE", "SOHO"])
-def test_serious_errors_agree(name, rng, mission_files, sky, request):
-    count = request.config.getoption("--batches") // 6
+def test_serious_errors_agree(name, rng, mission_files, sky, count):
+    count //= 6
     agreed(
         Judge(mission_files[name], sky).hold_many(
             rng, count, error_deg=170.0, noise_arcsec=60.0, magnitude_noise=1.0, spurious=2
@@ -130,9 +136,9 @@ def test_the_paper_s_world_agrees_with_the_geometry_tests_off(name, rng, mission
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("tests", [{}, {"match_groups": True}, {"fov_rotation": True}])
-def test_cross_product_tolerances_above_90_deg_agree(name, tests, rng, mission_files, sky, request):
+def test_cross_product_tolerances_above_90_deg_agree(name, tests, rng, mission_files, sky, count):
     """Where both orders of a pair pass, it votes for both pairings; groups are made of either."""
-    count = request.config.getoption("--batches") // 12
+    count //= 12
     judge = Judge(mission_files[name], sky)
     for tolerance_deg in (91.0, 120.0, 180.0):
         options = {"tests": tests, "tolerances": {"cross_product_deg": tolerance_deg}}

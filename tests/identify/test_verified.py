@@ -24,8 +24,10 @@ from service.sky.geometry.star_voxels import build_star_voxels
 from service.studies.paper_1994.printed import the_paper
 from service.studies.paper_1994.views import EPOCH, batch_of, draw_zone
 from service.vectors import ARCSEC_PER_RADIAN, from_ra_dec, unit
+from tests.chance import at_least, at_most
+from tests.scale import draws
 
-VIEWS = 60
+VIEWS = draws(40, 60)
 
 
 def identified(sky, rng, table, run_name, views=VIEWS, spoil=None):
@@ -48,8 +50,11 @@ def identified(sky, rng, table, run_name, views=VIEWS, spoil=None):
     return found
 
 
-def tally(found):
-    """Of the real stars the shares right, wrong; of the spurious ones the share named."""
+def assert_named(found, least=0.96, most_spurious=1.0):
+    """Hold the shares of real stars that are right and of spurious ones that are named.
+
+    A star is named from a probability of .999: one of 1,000 may be another one.
+    """
     right = wrong = real = named = spurious = 0
     for identification, truth in found:
         unique = identification.outcome == Outcome.UNIQUE
@@ -59,7 +64,9 @@ def tally(found):
         right += (unique & is_real & (identification.star == truth)).sum()
         wrong += (unique & is_real & (identification.star != truth)).sum()
         named += (unique & ~is_real).sum()
-    return right / real, wrong / real, named / max(spurious, 1)
+    assert wrong <= at_most(int(real), 0.001)
+    assert right >= at_least(int(real), least)
+    assert named <= at_most(int(spurious), most_spurious)
 
 
 @pytest.mark.parametrize(
@@ -67,9 +74,7 @@ def tally(found):
     [(2, "psi100"), (3, "5,5,270"), (4, "sm1.0"), (5, "sm1.0"), (7, "so12"), (9, "phi100")],
 )
 def test_where_votes_fail_it_names_the_stars_and_none_wrongly(sky, rng, table, run):
-    right, wrong, _ = tally(identified(sky, rng, table, run))
-    assert wrong == 0
-    assert right > 0.96
+    assert_named(identified(sky, rng, table, run))
 
 
 @pytest.mark.parametrize(("table", "run"), [(2, "phi100"), (7, "so12"), (10, "nominal")])
@@ -181,19 +186,14 @@ def spurious(count):
 @pytest.mark.parametrize("table", [2, 8])
 def test_a_spurious_star_is_named_by_hardly_any_and_spoils_no_other(sky, rng, table):
     run = the_paper().runs_of([table])[0].run
-    right, wrong, named = tally(identified(sky, rng, table, run, spoil=spurious(1)))
-    assert wrong == 0
-    assert right > 0.96
-    assert named < 0.05
+    assert_named(identified(sky, rng, table, run, spoil=spurious(1)), most_spurious=0.05)
 
 
 def test_two_real_stars_of_five_are_named_where_the_a_priori_attitude_is_close(sky, rng):
     """No mirror image of the field, whose boresight would lie elsewhere, keeps their names back."""
-    drawn = identified(sky, rng, 2, the_paper().runs_of([2])[0].run, 200, spurious(3))
-    right, wrong, named = tally(drawn)
-    assert wrong == 0
-    assert right > 0.985
-    assert named < 0.01
+    views = draws(80, 200)
+    drawn = identified(sky, rng, 2, the_paper().runs_of([2])[0].run, views, spurious(3))
+    assert_named(drawn, least=0.985, most_spurious=0.01)
 
 
 def test_the_weight_of_magnitudes_is_that_of_normal_distributions(rng):

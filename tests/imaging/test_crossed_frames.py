@@ -16,6 +16,7 @@ from service.imaging.detection.star_images import MOST_IMAGES
 from service.imaging.frames.frame import Frame
 from service.missions.camera import Camera
 from service.simulate.frames import FrameSettings, draw_frames
+from tests.chance import assert_chi_square
 
 FOUND_PX = 2.0
 
@@ -83,9 +84,7 @@ def test_places_scatter_as_they_say(method, frames, crossed):
                     errors.append((record.u_px - u[k]) / record.sigma_u_px)
                     errors.append((record.v_px - v[k]) / record.sigma_v_px)
     assert len(errors) > 40
-    # Four standard deviations of the mean of so many squares.
-    slack = 4.0 * np.sqrt(2.0 / len(errors))
-    assert np.mean(np.square(errors)) == pytest.approx(1.0, abs=slack)
+    assert_chi_square(np.square(errors), 1)
 
 
 def test_rings_of_an_aperture_are_no_stars(sky, missions):

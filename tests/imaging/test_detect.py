@@ -15,6 +15,7 @@ from service.imaging.detection.shapes import is_sharp
 from service.imaging.frames.frame import Frame
 from service.simulate.frames import FrameSettings, draw_frames
 from service.studies.star_image_report.windows import draw_window
+from tests.chance import assert_chi_square
 
 
 @pytest.fixture(scope="module")
@@ -82,9 +83,7 @@ def test_places_scatter_as_they_say(frames, camera, missions):
                     normalised.append((star.record.u_px - u[k]) / star.record.sigma_u_px)
                     normalised.append((star.record.v_px - v[k]) / star.record.sigma_v_px)
     assert len(normalised) > 60
-    # Four standard deviations of the mean of so many squares.
-    slack = 4.0 * np.sqrt(2.0 / len(normalised))
-    assert np.mean(np.square(normalised)) == pytest.approx(1.0, abs=slack)
+    assert_chi_square(np.square(normalised), 1)
 
 
 @pytest.mark.parametrize("sigma_px", [0.7, 0.9, 1.5])

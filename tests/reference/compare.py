@@ -3,7 +3,7 @@
 import json
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
@@ -16,7 +16,7 @@ from service.sky.model import SkyModel
 from service.storage.recording.answer import answer_of
 from service.times import parse_utc
 from tests.reference import batches
-from tests.reference.plain_starid import PlainCatalog, PlainOutcome, identify
+from tests.reference.plain_starid import PlainCatalog, PlainOutcome, PlainZone, identify
 
 Json = dict[str, Any]
 
@@ -57,30 +57,39 @@ def plain_view(answer: Json) -> list[list[PlainOutcome]]:
     ]
 
 
+MOST_ZONES = 30
+"""Kept of one catalog; a band takes some megabytes."""
+
+
 class Judge:
-    """Holds the service against the plain implementation, for one mission; keeps its zones."""
+    """Holds the service against the plain implementation, for one mission.
+
+    Judges share catalogs and zones: those of one seed meet the same a priori attitudes.
+    """
+
+    _catalogs: ClassVar[dict[tuple[str, float], PlainCatalog]] = {}
+    _zones: ClassVar[dict[int, dict[Any, PlainZone]]] = {}
 
     def __init__(self, toml: Json, sky: SkyModel) -> None:
         self.toml, self.sky = toml, sky
         self.mission = Mission.model_validate(toml)
         self.comparison = Comparison()
-        self._catalogs: dict[float, PlainCatalog] = {}
-        self._zones: dict[int, dict[Any, Any]] = {}
 
     def catalog(self, time: str) -> PlainCatalog:
         """The run catalog of a time, as it would be exported."""
         run = self.sky.run_catalog(self.mission, parse_utc(time))
-        if run.epoch_year not in self._catalogs:
-            self._catalogs[run.epoch_year] = PlainCatalog(
+        key = (json.dumps(self.toml["catalog"]), run.epoch_year)
+        if key not in self._catalogs:
+            self._catalogs[key] = PlainCatalog(
                 list(run.star_id), run.ra_deg, run.dec_deg, run.magnitude_mag
             )
-        return self._catalogs[run.epoch_year]
+        return self._catalogs[key]
 
     def hold(self, batch: Json) -> Json:
         """Compare one batch; what differs is noted.  Gives back the service's answer."""
         catalog = self.catalog(batch["time"])
         zones = self._zones.setdefault(id(catalog), {})
-        if len(zones) > 200:
+        if len(zones) > MOST_ZONES:
             zones.clear()
         expected = identify(batch, self.toml, catalog, zones)
         answer = answered(batch, self.mission, self.sky)

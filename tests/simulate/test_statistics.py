@@ -18,8 +18,10 @@ from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
 from service.sky.ephemeris import apparent, observer_velocity
 from service.vectors import angle_between_deg, attitude_error_arcsec, matrix_from_quaternion
+from tests.chance import assert_chi_square, at_least, at_most
+from tests.scale import draws
 
-WHOLE_PASS = int(os.environ.get("TEST_PASS", "2000"))
+WHOLE_PASS = int(os.environ.get("TEST_PASS") or draws(600, 2000))
 SHORT_PASS = WHOLE_PASS // 4
 ALL = ("XTE", "SWAS", "SOHO")
 ALL_OVER_S = 3000.0
@@ -66,12 +68,6 @@ def solved(results):
     return [each for each in results if each.acquisition.solution is not None]
 
 
-def limits(count):
-    """2.8 to 3.2 for 2,000 batches: four sigma of the mean, which shorter passes widen."""
-    margin = 0.2 * np.sqrt(2000 / count)
-    return 3.0 - margin, 3.0 + margin
-
-
 @pytest.mark.parametrize("name", ALL)
 def test_over_a_nominal_pass_errors_are_what_the_covariance_predicts(missions, sky, name, seed):
     """The mean of e^T P^-1 e is 3, and few are beyond its 99.73 % point.
@@ -84,19 +80,18 @@ def test_over_a_nominal_pass_errors_are_what_the_covariance_predicts(missions, s
     observed = sum(each.acquisition.counts["observed"] for each in results)
     unique = sum(each.acquisition.counts["unique"] for each in results)
     wrong = sum(each.wrong for each in results)
-    assert unique / observed >= 0.99
-    assert wrong / observed <= 0.001
+    assert unique >= at_least(observed, 0.99)
+    assert wrong <= at_most(observed, 0.001)
     for each in solved(results):
         if each.wrong and each.acquisition.counts["unique"] > 2:
             assert each.acquisition.solution.suspect
     right = np.array([each.chi_square for each in solved(results) if not each.wrong])
-    assert len(right) >= 0.98 * WHOLE_PASS
-    low, high = limits(len(right))
-    assert low <= right.mean() <= high
-    assert np.mean(right > CHI_SQUARE_997) <= 0.006 * max(1.0, np.sqrt(2000 / len(right)))
+    assert len(right) >= at_least(WHOLE_PASS, 0.98)
+    assert_chi_square(right, 3)
+    assert np.sum(right > CHI_SQUARE_997) <= at_most(len(right), 0.0027)
     # The wrong ones are few enough to change little.
     every = np.array([each.chi_square for each in solved(results)])
-    assert np.mean(every > CHI_SQUARE_997) <= 0.01 * max(1.0, np.sqrt(2000 / len(every)))
+    assert np.sum(every > CHI_SQUARE_997) <= at_most(len(every), 0.005)
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -104,9 +99,7 @@ def test_directions_that_were_corrected_upstream_give_the_same_statistics(
     missions, sky, name, seed
 ):
     results = flown(missions, sky, name, seed, SHORT_PASS, "applied_upstream")
-    right = np.array([each.chi_square for each in solved(results) if not each.wrong])
-    low, high = limits(len(right))
-    assert low <= right.mean() <= high
+    assert_chi_square([each.chi_square for each in solved(results) if not each.wrong], 3)
 
 
 @pytest.mark.parametrize("name", ALL)

@@ -152,8 +152,8 @@ def test_stars_miss_their_place_by_the_trackers_noise_alone(missions, sky, name,
     misses = np.concatenate([misses_arcsec(one, missions, sky) for one in quiet])
     sigma = missions[name].trackers[0].sigma_arcsec
     # One sigma of the spread of n draws is sigma / sqrt(2 n).
-    assert misses.std(axis=0) == pytest.approx([sigma, sigma], rel=4 / np.sqrt(2 * len(misses)))
-    assert misses.mean(axis=0) == pytest.approx([0, 0], abs=4 * sigma / np.sqrt(len(misses)))
+    assert misses.std(axis=0) == pytest.approx([sigma, sigma], rel=5 / np.sqrt(2 * len(misses)))
+    assert misses.mean(axis=0) == pytest.approx([0, 0], abs=5 * sigma / np.sqrt(len(misses)))
 
 
 @pytest.mark.parametrize("name", ["XTE", "SOHO"])

@@ -34,6 +34,8 @@ from service.studies.paper_1994.views import (
     rotation,
 )
 from service.vectors import angle_between_deg, matrix_from_quaternion
+from tests.chance import at_most
+from tests.scale import draws, is_full
 
 
 def run_named(table, name):
@@ -211,7 +213,7 @@ RUNS = [
 
 def test_rates_are_those_of_the_reference(seed):
     """One experiment a run, within six standard deviations, and a little for rare outcomes."""
-    runs = [run_named(*name) for name in RUNS]
+    runs = [run_named(*name) for name in (RUNS if is_full() else RUNS[::3])]
     for tally in run_experiments(runs, 1, [seed], processes=1):
         ours, reference = spread(tally), tally.run.reference
         assert ours.stars == pytest.approx(tally.run.printed.stars, rel=0.1)
@@ -235,7 +237,8 @@ def test_at_psi_100_a_cap_of_120_deg_gives_what_geometry_off_gives(sky, rng):
     off = {"tests": {"cross_product": False}}
     wide = {"tolerances": {"cross_product_deg": 120.0}}
     counts = np.zeros((3, 3), int)
-    for number in range(40):
+    zones = draws(16, 40)
+    for number in range(zones):
         for view in draw_zone(paper.worlds[run.world], number, mission, catalog, rng):
             batch = batch_of(view, run, mission, "starid")
             for k, chosen in enumerate((off, wide, {})):
@@ -245,13 +248,13 @@ def test_at_psi_100_a_cap_of_120_deg_gives_what_geometry_off_gives(sky, rng):
                 star = tracker.identification.star
                 counts[k] += (star < 0).sum(), (star == view.star).sum(), (star >= 0).sum()
     total = counts[0, 0] + counts[0, 2]
-    assert total > 1500
-    unidentified, right, named = (counts / total).T
+    assert total > 38 * zones
+    unidentified, right, named = counts.T
     # The reference, Table 2 run 6: 0.75 % not identified, 0.06 % misidentified.
-    assert unidentified[:2] == pytest.approx(0.0, abs=0.015)
-    assert named[:2] - right[:2] == pytest.approx(0.0, abs=0.004)
-    assert unidentified[1] <= unidentified[0] + 0.002
-    assert right[2] < 0.1
+    assert (unidentified[:2] <= at_most(total, 0.01)).all()
+    assert (named[:2] - right[:2] <= at_most(total, 0.001)).all()
+    assert unidentified[1] <= unidentified[0] + at_most(total, 0.001)
+    assert right[2] < 0.1 * total
 
 
 def test_the_same_seed_gives_the_same_counts_however_the_work_is_shared(seed):
@@ -266,9 +269,9 @@ def test_the_same_seed_gives_the_same_counts_however_the_work_is_shared(seed):
 
 def test_the_command_prints_a_table_and_writes_its_rows(tmp_path, seed):
     out, path = io.StringIO(), tmp_path / "rows.json"
-    run_paper(9, 1, [seed], path, ["starid"], processes=1, plots=tmp_path, out=out)
+    run_paper(8, 1, [seed], path, ["starid"], processes=1, plots=tmp_path, out=out)
     rows = json.loads(path.read_text(encoding="utf-8"))
-    asked = [run for run in the_paper().runs if run.number == 9]
+    asked = [run for run in the_paper().runs if run.number == 8]
     assert [(row["table"], row["run"]) for row in rows] == [(run.table, run.run) for run in asked]
     for row in rows:
         assert set(row) == {
@@ -279,8 +282,8 @@ def test_the_command_prints_a_table_and_writes_its_rows(tmp_path, seed):
         outcomes = ("ambiguous", "unmatched", "correct", "misidentified")
         assert sum(row[name] for name in outcomes) == row["stars"]
     text = out.getvalue()
-    assert "### Table 9." in text
-    assert "of 12" in text
+    assert "### Table 8." in text
+    assert "of 4" in text
     assert (tmp_path / "paper-places.svg").stat().st_size > 0
 
 
