@@ -189,6 +189,7 @@ def test_alarms_and_limits_outlive_the_process(opened, make):
     assert third.limits.all("XTE")[1].comment == "kept"
 
 
+@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 def test_two_processes_look_at_one_spacecraft_in_turn(opened, make):
     one, two = opened(), opened()
     one.limits.set("XTE", "unmatched_share", TIGHT, who="jb")

@@ -207,7 +207,9 @@ def test_what_is_asked_after_closing_is_busy(opened, make):
 
 
 def test_what_was_recorded_is_there_when_opened_again(opened, make):
-    first = opened().submissions.submit(make())
+    app = opened()
+    first = app.submissions.submit(make())
+    app.close()
     again = opened().submissions.submit(make())
     assert (again.replayed, again.body) == (True, first.body)
 

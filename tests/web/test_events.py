@@ -122,6 +122,7 @@ def test_who_was_away_is_told_of_everything_in_between_and_of_nothing_twice(data
         assert told_batches(returned.wait_for(6)) == [each["batch"] for each in others]
 
 
+@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 def test_what_another_process_writes_is_told_of_too(database, drawn):
     with service(database) as address:
         listener = Listener(address)

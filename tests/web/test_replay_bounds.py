@@ -305,8 +305,8 @@ def test_a_bound_token_cancels_its_own_replays_only_and_it_is_noted(guarded, dra
     assert ("operator", two, 200) in told
 
 
-def test_a_replay_of_another_process_is_cancelled_through_the_database(chosen_database, drawn):
-    database = chosen_database()
+@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
+def test_a_replay_of_another_process_is_cancelled_through_the_database(database, drawn):
     settings = in_process_settings(database)
     batch = drawn("XTE", 1)[0]
     with (

@@ -250,8 +250,8 @@ def test_of_a_long_answer_no_more_than_64_kib_are_read(service, receiver):
     assert sum(sent) < 32 << 20
 
 
-def test_of_two_services_on_one_database_one_delivers(chosen_database, receiver):
-    database = chosen_database()
+@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
+def test_of_two_services_on_one_database_one_delivers(database, receiver):
     with serving(database) as one, serving(database) as other:
         one.hook(receiver.url)
         for n in range(20):
