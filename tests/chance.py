@@ -5,6 +5,7 @@ promises: then a right build passes with any seed, and a wrong one is beyond the
 """
 
 import numpy as np
+import numpy.typing as npt
 from scipy.stats import binom, chi2
 
 TAIL = 1e-5
@@ -20,7 +21,7 @@ def at_least(tries: int, share: float) -> int:
     return int(binom.ppf(TAIL, tries, share))
 
 
-def assert_chi_square(values: object, degrees: int) -> None:
+def assert_chi_square(values: npt.ArrayLike, degrees: int) -> None:
     """Hold the sum of independent values of chi-square against its distribution."""
-    n = degrees * np.size(values)  # type: ignore[arg-type]
-    assert chi2.ppf(TAIL, n) < np.sum(values) < chi2.isf(TAIL, n)  # type: ignore[arg-type]
+    n = degrees * np.size(values)
+    assert chi2.ppf(TAIL, n) < np.sum(values) < chi2.isf(TAIL, n)
