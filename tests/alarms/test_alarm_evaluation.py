@@ -104,6 +104,7 @@ def test_a_batch_is_looked_at_once_however_often_it_comes(tight, make):
     assert actions(tight, only(tight)) == ["raised"]
 
 
+@pytest.mark.both_databases
 def test_many_at_once_raise_what_they_would_raise_one_by_one(opened, tight, make):
     kinds = ["good", "spurious", "spurious", "good", "good", "spurious", "spurious"]
     tight.runs.watch("bulk")
@@ -174,6 +175,7 @@ def test_alarms_watch_live_batches_and_a_run_when_asked(tight, make):
     }
 
 
+@pytest.mark.both_databases
 def test_alarms_and_limits_outlive_the_process(opened, make):
     first = opened()
     first.limits.set("XTE", "unmatched_share", TIGHT, who="jb", comment="kept")
@@ -221,6 +223,7 @@ def test_a_shelf_has_an_end(tight, make, monkeypatch):
     assert not tight.alarms.evaluate_by_clock()
 
 
+@pytest.mark.both_databases
 def test_who_comes_late_to_an_alarm_is_told_so(tight, make):
     send(tight, make, ["spurious"] * 2)
     id = only(tight).id
@@ -296,6 +299,7 @@ def test_a_what_if_that_is_adopted_raises_nothing(tight, make):
     assert tight.alarms.page().items == []
 
 
+@pytest.mark.both_databases
 def test_every_limit_that_was_set_stays_in_the_history(app):
     shipped = app.limits.get("XTE", "unmatched_share")
     assert shipped.limit.is_default

@@ -28,6 +28,7 @@ def told(outcome):
     return outcome.replayed, without_accidents(json.loads(outcome.body))
 
 
+@pytest.mark.both_databases
 def test_many_at_once_give_what_each_by_itself_gives(app, make):
     """The bulk path is the single path repeated: answers, refusals and repeats alike."""
     wrong = json.loads(make("b4").text)
@@ -243,6 +244,7 @@ def test_a_catalog_that_cannot_be_read_is_a_mistake_in_the_configuration(tmp_pat
         open_app(Settings(database=database, catalog=tmp_path / name))
 
 
+@pytest.mark.both_databases
 def test_no_moment_of_the_database_is_held_while_many_are_worked_on(app, make):
     held = []
     solver = app.submissions.ingest.solver

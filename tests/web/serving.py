@@ -108,9 +108,11 @@ def in_process_settings(database: str, **wanted: Any) -> Settings:
 def serving_in_process(
     database: str, mission: Mission | None = None, **wanted: Any
 ) -> Iterator[InProcess]:
-    """A service with `in_process_settings`, from its start to its end."""
+    """A service with `in_process_settings`, ready for work, until its end."""
     app = open_app(in_process_settings(database, **wanted), mission)
     with Server(create_app(app)) as url, httpx.Client(base_url=url, timeout=120) as client:
+        # Its warm-up builds zones, which tests count.
+        wait_until(lambda: client.get("/readyz").status_code == 200, 600.0)
         yield InProcess(app, url, client)
 
 

@@ -1,6 +1,8 @@
 """Calibrations over HTTP: estimated beside other work, tried, adopted, taken back, remembered."""
 
 import json
+import sqlite3
+from contextlib import closing
 
 import httpx
 import pytest
@@ -28,9 +30,21 @@ BEFORE, AFTER = 40, 20
 API = "/api/v1"
 
 
-def serve(folder):
-    missions, database = folder / "assumed", f"sqlite:///{folder / 'acquire.db'}"
+def serve(folder, database=None):
+    missions, database = folder / "assumed", f"sqlite:///{database or folder / 'acquire.db'}"
     return open_app(in_process_settings(database, missions=missions, webhook_networks=LOOPBACK))
+
+
+@pytest.fixture
+def copy(client, folder, tmp_path):
+    """A copy of the database, for one service after another: the original is being written to."""
+    path = tmp_path / "copy.db"
+    with (
+        closing(sqlite3.connect(folder / "acquire.db")) as source,
+        closing(sqlite3.connect(path)) as target,
+    ):
+        source.backup(target)
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -161,9 +175,9 @@ def test_new_batches_are_as_good_as_with_the_true_file_until_it_is_taken_back(
     assert actions.count("adopt_calibration") == 3  # two were refused
 
 
-def test_it_holds_after_a_restart_until_the_file_is_changed(client, calibrated, folder):
+def test_it_holds_after_a_restart_until_the_file_is_changed(client, calibrated, copy, folder):
     in_force = client.get(f"{API}/spacecraft/TWO/calibration").json()
-    app = serve(folder)
+    app = serve(folder, copy)
     try:
         assert app.missions["TWO"].digest == in_force["mission"]
     finally:
@@ -174,12 +188,12 @@ def test_it_holds_after_a_restart_until_the_file_is_changed(client, calibrated, 
         file.write_text(
             text.replace("pair_separation", "# other tolerances\npair_separation"), "utf-8"
         )
-        app = serve(folder)
+        app = serve(folder, copy)
         digest = app.missions["TWO"].digest
         app.close()
         assert digest == in_force["mission"]
         file.write_text(text + CALIBRATION, "utf-8")
-        app = serve(folder)
+        app = serve(folder, copy)
         changed, file_holds = app.missions["TWO"].digest, app.adoptions.in_force("TWO")
         app.close()
         assert changed not in (in_force["mission"], calibrated["mission"])
@@ -219,11 +233,11 @@ def test_too_few_stars_end_it_as_failed_and_it_cannot_be_adopted(client):
     assert client.post(f"{location}/trial", json={}).status_code == 409
 
 
-def test_a_stopping_service_leaves_none_that_looks_unfinished(client, folder):
-    app = serve(folder)
+def test_a_stopping_service_leaves_none_that_looks_unfinished(copy, folder):
+    app = serve(folder, copy)
     begun = app.calibrations.start(CalibrationRequest("TWO"), "J. Operator")
     app.close()
-    app = serve(folder)
+    app = serve(folder, copy)
     app.calibrations.interrupt()
     left = app.calibrations.get(begun.id)
     app.close()

@@ -102,6 +102,7 @@ def test_a_batch_is_told_of_when_it_is_recorded(database, drawn):
         }
 
 
+@pytest.mark.both_databases
 def test_who_was_away_is_told_of_everything_in_between_and_of_nothing_twice(database, drawn):
     first, *others = drawn("XTE", 6)
     with service(database) as address:
@@ -171,6 +172,7 @@ def test_of_replays_nobody_hears_who_asks_for_one_spacecraft(database, drawn):
         assert [kind for kind, _, _ in xte.wait_for(2)] == ["hello", "batches"]
 
 
+@pytest.mark.both_databases
 def test_a_gap_longer_than_what_is_kept_says_reset(database, drawn, monkeypatch):
     monkeypatch.setattr(records, "KEPT", 3)
     monkeypatch.setattr(records, "PRUNED_EVERY", 1)

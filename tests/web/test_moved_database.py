@@ -13,7 +13,7 @@ from service.app.factory import open_app
 from service.storage.sql.tables import batches
 from service.storage.upkeep.verify import verify
 from tests.storage import samples
-from tests.web.serving import in_process_settings, served
+from tests.web.serving import in_process_settings, served, serving_in_process
 from tests.web.test_hanging_database import ready_again
 
 PARTS = ("", "-wal", "-shm")
@@ -61,7 +61,9 @@ def names_in(file):
         app.close()
 
 
-@pytest.mark.parametrize("parts", [PARTS, ("",)], ids=["with its log", "alone"])
+@pytest.mark.parametrize(
+    "parts", [PARTS, pytest.param(("",), marks=pytest.mark.slow)], ids=["with its log", "alone"]
+)
 def test_moved_away_nothing_is_acknowledged_and_moved_back_all_is_there(
     file, tmp_path, post, parts
 ):
@@ -80,11 +82,12 @@ def test_moved_away_nothing_is_acknowledged_and_moved_back_all_is_there(
 
 
 def test_replaced_by_another_file_neither_is_written_to(file, tmp_path, post):
-    with served(f"sqlite:///{file}") as (_, url):
-        assert post(url, "before").status_code == 201
+    with serving_in_process(f"sqlite:///{file}") as service:
+        assert post(service.url, "before").status_code == 201
     copy = tmp_path / "copy.db"
     shutil.copy(file, copy)
-    with served(f"sqlite:///{file}") as (_, url):
+    with serving_in_process(f"sqlite:///{file}") as service:
+        url = service.url
         assert post(url, "between").status_code == 201
         moved(file, tmp_path / "away")
         copy.rename(file)
@@ -94,7 +97,8 @@ def test_replaced_by_another_file_neither_is_written_to(file, tmp_path, post):
 
 
 def test_deleted_nothing_is_acknowledged_and_no_file_is_made(file, post):
-    with served(f"sqlite:///{file}") as (_, url):
+    with serving_in_process(f"sqlite:///{file}") as service:
+        url = service.url
         assert post(url, "before").status_code == 201
         for part in PARTS:
             file.with_name(file.name + part).unlink(missing_ok=True)

@@ -6,7 +6,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import httpx
@@ -14,19 +13,21 @@ import pytest
 
 from service.app.factory import open_app
 from service.app.submissions import READ_HERE_BYTES
+from service.web.app import create_app
 from tests.fresh_databases import sqlite_at
 from tests.storage import samples
 from tests.waiting import wait_until
 from tests.web.load import Load
-from tests.web.serving import in_process_settings, is_ready, served
+from tests.web.serving import Server, in_process_settings, is_ready, served
+from tests.web.test_access import Guarded, shown
 
 JSON = {"Content-Type": "application/json"}
 
 
-@pytest.fixture
-def service(tmp_path):
+@pytest.fixture(scope="module")
+def service(tmp_path_factory):
     """A service over its own database: its address."""
-    with served(sqlite_at(tmp_path / "acquire.db")) as (_, url):
+    with served(sqlite_at(tmp_path_factory.mktemp("one") / "acquire.db")) as (_, url):
         yield url
 
 
@@ -42,7 +43,7 @@ def compiling(tmp_path):
         process = subprocess.Popen(command, stderr=log, env=os.environ | nothing_compiled)
     url = f"http://127.0.0.1:{port}"
     try:
-        wait_until(lambda: is_ready(process, url, "livez"), every_s=0.05)
+        wait_until(lambda: is_ready(process, url, "livez"), 600.0, every_s=0.05)
         yield process, url
     finally:
         process.kill()
@@ -54,27 +55,24 @@ def _children(process):
     return [int(pid) for task in tasks for pid in task.read_text().split()]
 
 
-def test_told_to_stop_while_it_compiles_it_stops(compiling, tmp_path):
+def test_while_it_compiles_posts_are_told_to_come_again_and_told_to_stop_it_stops(
+    compiling, tmp_path, sky, missions
+):
     """As at the first start after an installation, which takes minutes."""
     process, url = compiling
     assert httpx.get(f"{url}/readyz").status_code == 503
+    early = samples.batch(sky, missions, "early")
+    answer = httpx.post(f"{url}/api/v1/batches", content=early, headers=JSON)
+    assert (answer.status_code, int(answer.headers["Retry-After"]) > 0) == (503, True)
     process.terminate()
     assert process.wait(30) in (0, -signal.SIGTERM)
     assert "Traceback" not in (tmp_path / "log").read_text()
 
 
-def test_while_it_compiles_posts_are_told_to_come_again(compiling, sky, missions):
-    _, url = compiling
-    answer = httpx.post(
-        f"{url}/api/v1/batches", content=samples.batch(sky, missions, "early"), headers=JSON
-    )
-    assert (answer.status_code, int(answer.headers["Retry-After"]) > 0) == (503, True)
-
-
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are listed in /proc")
 def test_killed_while_it_compiles_it_leaves_no_process(compiling):
     process, _ = compiling
-    wait_until(lambda: _children(process))
+    wait_until(lambda: _children(process), 120.0)
     children = _children(process)
     process.kill()
     process.wait()
@@ -104,33 +102,24 @@ def test_small_and_large_batches_are_refused_in_the_same_words(service, sky, mis
     assert faults(wrong) == faults(large)
 
 
-def test_a_key_is_that_of_the_token_it_came_with(service, sky, missions, tmp_path):
+def test_a_key_is_that_of_the_token_it_came_with(chosen_database, sky, missions):
     """Two clients with tokens of their own use the same key for batches of their own."""
-    database = f"sqlite:///{tmp_path / 'acquire.db'}"
-    command = [sys.executable, "-m", "service.cli", "token", "create"]
-    tokens = [
-        subprocess.run(
-            [*command, name, "--scope", "submit", "--database", database],
-            check=True,
-            capture_output=True,
-            text=True,
-        ).stdout.split()[0]
-        for name in ("one", "other")
-    ]
-    time.sleep(1.1)
+    guarded = Guarded(chosen_database())
+    tokens = [guarded.token(name, "submit") for name in ("one", "other")]
     sent = [samples.batch(sky, missions, name) for name in ("a", "b")]
+    with Server(create_app(guarded.app)) as url, httpx.Client(base_url=url, timeout=60) as client:
 
-    def post(token, body):
-        headers = JSON | {"Authorization": f"Bearer {token}", "Idempotency-Key": "same"}
-        return httpx.post(f"{service}/api/v1/batches", content=body, headers=headers, timeout=60)
+        def post(token, body):
+            headers = JSON | shown(token) | {"Idempotency-Key": "same"}
+            return client.post("/api/v1/batches", content=body, headers=headers)
 
-    firsts = [post(token, body) for token, body in zip(tokens, sent, strict=True)]
-    assert [answer.status_code for answer in firsts] == [201, 201]
-    for token, body, first, others in zip(tokens, sent, firsts, reversed(sent), strict=True):
-        again = post(token, body)
-        assert (again.status_code, again.content) == (200, first.content)
-        refused = post(token, others)
-        assert (refused.status_code, refused.json()["type"]) == (422, "/problems/key-reused")
+        firsts = [post(token, body) for token, body in zip(tokens, sent, strict=True)]
+        assert [answer.status_code for answer in firsts] == [201, 201]
+        for token, body, first, others in zip(tokens, sent, firsts, reversed(sent), strict=True):
+            again = post(token, body)
+            assert (again.status_code, again.content) == (200, first.content)
+            refused = post(token, others)
+            assert (refused.status_code, refused.json()["type"]) == (422, "/problems/key-reused")
 
 
 def test_the_metrics_count_new_batches_repeats_and_zones(service, sky, missions):

@@ -47,7 +47,7 @@ def server(folder, port):
     (folder / "outside").mkdir()
     command = ["bash", "-c", "exec " + moved(start, folder, port).strip()]
     process = subprocess.Popen(command, cwd=folder)
-    wait_until(lambda: is_ready(process, f"http://127.0.0.1:{port}", "livez"), 60.0, every_s=0.05)
+    wait_until(lambda: is_ready(process, f"http://127.0.0.1:{port}", "livez"), 600.0, every_s=0.05)
     yield
     process.send_signal(signal.SIGTERM)
     process.wait(timeout=60)

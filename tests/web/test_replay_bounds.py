@@ -352,7 +352,8 @@ def replays(client):
     return client.get(f"{API}/replays").json()["items"]
 
 
-def test_a_service_in_two_processes_cancels_too(chosen_database, drawn):
+@pytest.mark.slow
+def test_a_service_with_processes_for_replays_cancels_too(chosen_database, drawn):
     with (
         served(chosen_database()) as (_, url),
         httpx.Client(base_url=url, timeout=60) as client,

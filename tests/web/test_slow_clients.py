@@ -37,10 +37,10 @@ HEAD = (
 )
 
 
-@pytest.fixture
-def server(tmp_path):
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
     """A server in processes of its own, so that its memory is its own; ready for work."""
-    with served(sqlite_at(tmp_path / "acquire.db")) as (process, url):
+    with served(sqlite_at(tmp_path_factory.mktemp("slow") / "acquire.db")) as (process, url):
         yield process, httpx.URL(url).port, url
 
 
@@ -52,7 +52,7 @@ def connected(port):
 def test_a_thousand_slow_connections_harm_nobody(server, batch, figures):
     """Some stop in the middle of the head or the body, some trickle, some do not read an answer."""
     process, port, url = server
-    names = iter(f"healthy-{number}" for number in range(1_000_000))
+    names = iter(f"beside-slow-{number}" for number in range(1_000_000))
 
     def while_slow(client):
         slow = [connected(port) for _ in range(SLOW)]
@@ -89,7 +89,7 @@ def test_a_thousand_slow_connections_harm_nobody(server, batch, figures):
 @pytest.mark.parametrize("how", ["declared", "chunked"])
 def test_bodies_of_300_megabytes_are_refused_without_being_held(server, batch, how, figures):
     process, port, url = server
-    names = iter(f"healthy-{number}" for number in range(1_000_000))
+    names = iter(f"beside-{how}-{number}" for number in range(1_000_000))
     told, passed = [], []
 
     def while_flooded(client):
