@@ -1,5 +1,6 @@
 """The demonstration: from nothing to a table against truth, the same the second time."""
 
+import hashlib
 import json
 import random
 import re
@@ -27,6 +28,9 @@ from tests.scale import draws, is_full
 
 BATCHES = draws(100, 300)
 """Of each mission, a fifth of them with serious trouble; 300 unless it is told otherwise."""
+SAMPLES = 7_200 * (BATCHES - 1) // BATCHES + 1
+"""Of the gyro beside a pass, every 10 s from the first batch to the last."""
+LAST_MIN = 20 * 60 * (BATCHES - 1) // BATCHES
 NAMED_PORTS = range(20_000, 32_000)
 """Below those that outgoing connections are given."""
 TAKEN = "Address already in use"
@@ -102,7 +106,7 @@ def rows(printed):
     return {(name, stretch): [float(each) for each in numbers] for name, stretch, *numbers in lines}
 
 
-def assert_as_predicted(printed, folder):
+def assert_as_predicted(printed, folder, least_within=98.0):
     """Misidentified at most 0.1 %, unique at least 99 %: over all three missions."""
     found = rows(printed)
     assert list(found) == [(name, kind) for name in MISSIONS for kind in ("nominal", "serious")]
@@ -114,14 +118,14 @@ def assert_as_predicted(printed, folder):
         assert batches == BATCHES * 4 // 5
         assert attitudes >= 0.98 * batches
         assert error == pytest.approx(sigma, rel=0.35)
-        assert within >= 98.0
+        assert within >= least_within
     # What the table says is what the files say.
     for name in MISSIONS:
         results = list(read_objects(folder / f"{name.lower()}.results.ndjson"))
         truths = list(read_objects(truth_path(folder / f"{name.lower()}.ndjson")))
-        # Beside the batches there are gyro blocks of a thousand samples, 10 s apart.
+        # Beside the batches there are gyro blocks of a thousand samples.
         blocks = [each for each in results if "block" in each]
-        assert [each["samples"] for each in blocks] == [1000] * 7 + [177]
+        assert [each["samples"] for each in blocks] == [1000] * 7 + [SAMPLES - 7_000]
         results = [each for each in results if "block" not in each]
         assert len(results) == len(truths) == BATCHES
         counted = score(results, truths)["nominal"]
@@ -134,14 +138,16 @@ def test_nominal_stretches_are_identified_and_the_errors_are_as_predicted(first,
     # The passes can be filtered with their gyros as they are.
     (words,) = re.findall(r"acquire (smooth XTE --run .*)$", first.told, re.MULTILINE)
     assert main([*words.split(), "--quiet"]) == 0
-    assert re.search(r"19:56:00.000Z: gyro, 7177 samples", capsys.readouterr().out)
+    last = f"{LAST_MIN // 60}:{LAST_MIN % 60:02d}:00.000Z"
+    assert f"{last}: gyro, {SAMPLES} samples" in capsys.readouterr().out
 
 
 @pytest.mark.slow
 def test_so_they_are_with_other_samples(tmp_path, seed, demo):
     code, told, complaints = demo(tmp_path / "demo", "--seed", seed, "--batches", BATCHES)
     assert code == 0, complaints
-    assert_as_predicted(told, tmp_path / "demo")
+    # Of 240 attitudes one is expected outside, five come once in four hundred seeds.
+    assert_as_predicted(told, tmp_path / "demo", least_within=97.0)
 
 
 def test_it_keeps_serving_until_it_is_told_to_stop_and_takes_its_server_with_it(first):
@@ -218,7 +224,9 @@ def test_a_long_start_is_told_on_a_moving_line_or_now_and_then(monkeypatch, caps
     # A cache in which compiling has begun.
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
     (tmp_path / "hypotheses_1").mkdir()
-    (tmp_path / "hypotheses_1" / "search.1.nbc").write_bytes(bytes(KERNEL_BYTES // 4))
+    content = bytes(KERNEL_BYTES // 4 - hashlib.sha256().digest_size)
+    whole = hashlib.sha256(content).digest() + content
+    (tmp_path / "hypotheses_1" / "search.1.nbc").write_bytes(whole)
 
     def said(terminal):
         monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
