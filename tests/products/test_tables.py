@@ -10,8 +10,10 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 
+from service.errors import NotAvailable
 from service.products.attitude_table import COLUMNS
 from service.products.fits_file import write_fits
+from service.products.formats import OUTPUT_FORMATS
 from service.products.parquet import write_parquet
 from service.products.tables import Column, Table, write_csv
 from service.times import parse_utc
@@ -149,3 +151,15 @@ def test_a_table_without_rows_is_a_file(tmp_path, name):
         assert len(astropy.io.fits.getdata(file, 1)) == 0
     else:
         assert pyarrow.parquet.read_table(file).num_rows == 0
+
+
+def test_a_format_without_its_package_names_the_command_that_installs_it(monkeypatch):
+    extras = {"parquet": "tables", "fits": "tables", "ck": "spice"}
+    for name in OUTPUT_FORMATS:
+        OUTPUT_FORMATS[name].require(name)
+    monkeypatch.setattr("service.extras.find_spec", lambda package: None)
+    for name in OUTPUT_FORMATS.keys() - extras:
+        OUTPUT_FORMATS[name].require(name)
+    for name, extra in extras.items():
+        with pytest.raises(NotAvailable, match=rf"pip install 'attitude-acquisition\[{extra}\]'"):
+            OUTPUT_FORMATS[name].require(name)

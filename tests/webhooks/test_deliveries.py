@@ -284,6 +284,18 @@ def test_a_test_event_is_sent_at_once_and_its_outcome_told(service, receiver):
     assert service.ask(hook, "test").json()["fault"] == "status 503"
 
 
+def test_a_status_of_2xx_alone_delivers(service, receiver):
+    hook = service.hook(receiver.url)
+    redirected = "redirects are not followed"
+    for status, fault in [(200, None), (299, None), (300, redirected), (399, redirected)]:
+        receiver.answer = lambda handler, request, status=status: handler.say(status)
+        outcome = service.ask(hook, "test").json()
+        assert (outcome["status"], outcome["delivered"]) == (status, fault is None)
+        assert outcome["fault"] == (fault and f"status {status}: {fault}")
+    receiver.answer = lambda handler, request: handler.say(400)
+    assert service.ask(hook, "test").json()["fault"] == "status 400"
+
+
 def test_a_backlog_is_bounded_and_the_rest_comes_later(service, receiver, monkeypatch, soon):
     monkeypatch.setattr(sender, "MAX_WAITING", 5)
     monkeypatch.setattr(sender, "READ_AT_ONCE", 5)

@@ -9,7 +9,7 @@ import pytest
 
 from service.errors import BadInput
 from service.settings import networks
-from service.webhooks.addresses import Refused, require_reachable, require_url
+from service.webhooks.addresses import MAX_URL, Refused, require_reachable, require_url
 from tests.waiting import wait_until
 from tests.webhooks.conftest import HERE, receiving, serving
 
@@ -55,6 +55,7 @@ FORMS = [
     ("https://user:hunter2@receiver.example/", "user name"),
     ("https://receiver.example:22/", "port"),
     ("https://receiver.example:25/", "port"),
+    ("https://receiver.example:1023/", "port"),
     ("https://receiver.example:6000/", "port"),
     ("https://receiver.example:6667/", "port"),
     ("https://receiver.example/#part", "fragment"),
@@ -65,6 +66,7 @@ FORMS = [
     ("https://0177.0.0.1/", "URL"),
     ("https://xn--a.example/", "URL"),
     ("https://xn--/", "URL"),
+    ("https://receiver.example/".ljust(MAX_URL + 1, "a"), "characters"),
 ]
 
 NAMES = [
@@ -87,7 +89,7 @@ def test_an_address_that_is_not_public_is_refused(url):
     assert [fault.field for fault in refused.value.faults] == ["url"]
 
 
-@pytest.mark.parametrize(("url", "said"), FORMS)
+@pytest.mark.parametrize(("url", "said"), FORMS, ids=[url[:40] for url, _ in FORMS])
 def test_another_form_of_url_is_refused(url, said):
     with pytest.raises(BadInput, match=said) as refused:
         require_url(url, ())
@@ -95,9 +97,13 @@ def test_another_form_of_url_is_refused(url, said):
     assert "hunter2" not in str(refused.value)
 
 
-@pytest.mark.parametrize("url", ["https://8.8.8.8/", "https://[2606:4700::1111]/", "https://x.y/"])
+@pytest.mark.parametrize(
+    "url",
+    ["https://8.8.8.8/", "https://[2606:4700::1111]/", "https://x.y/", "https://x.y:1024/"],
+)
 def test_public_addresses_and_names_are_accepted(url):
     require_url(url, ())
+    require_url(url.ljust(MAX_URL, "a"), ())
 
 
 def test_a_setting_allows_networks_but_never_metadata():
