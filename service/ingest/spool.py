@@ -17,6 +17,8 @@ from service.storage.sql.database_file import PRIVATE_FILE, PRIVATE_FOLDER
 
 PART, LINES, ABOUT = ".part", ".lines", ".json"
 RETRY_S = 30
+UNLOCKED_S = 60.0
+"""An upload without a lock is left over after this: until then it may be about to be locked."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,7 @@ class Spool:
     def left(self) -> Iterator[SpooledReplay]:
         """The replays that no process is at work on, the oldest first; they are this one's now.
 
-        Uploads that were broken off a day ago are removed.
+        Uploads that were broken off are removed.
         """
         if not self._folder.is_dir():
             return
@@ -109,10 +111,14 @@ class Spool:
                 yield SpooledReplay(**json.load(beside))
             else:
                 self.drop(place.stem)
-        day_ago_s = time.time() - 86_400
+        self._remove_left_over()
+
+    def _remove_left_over(self) -> None:
+        """Remove uploads that no process is receiving any more."""
         for place in self._folder.glob(f"*{PART}"):
-            with suppress(OSError):
-                if place.stat().st_mtime < day_ago_s:
+            with suppress(OSError), place.open("rb") as file:
+                if place.stat().st_mtime < time.time() - UNLOCKED_S:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     place.unlink()
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import msgspec
+from sqlalchemy.exc import SQLAlchemyError
 
 from service.app.calibrations.estimates import CalibrationRequest, CalibrationRun, Estimator
 from service.app.calibrations.findings import result_of
@@ -32,6 +33,7 @@ class BackgroundCalibrations:
         self._lock = threading.Lock()
         self._unfinished = 0
         self._closing = False
+        self._closed = threading.Event()
 
     def compute(
         self,
@@ -61,6 +63,7 @@ class BackgroundCalibrations:
         """End the calibration that is computed, and those that wait."""
         with self._lock:
             self._closing = True
+        self._closed.set()
         self._thread.shutdown(cancel_futures=True)
 
     def _compute(self, id: str, wanted: CalibrationRequest, mission: Mission) -> None:
@@ -78,7 +81,16 @@ class BackgroundCalibrations:
             ended = {"state": "failed", "fault": fault}
         finally:
             self._over()
-        progress.save(ended | {"ended": utc_now().text})
+        ended |= {"ended": utc_now().text}
+        while True:
+            try:
+                progress.save(ended)
+                return
+            except (AcquisitionError, SQLAlchemyError) as error:
+                log.warning("the end of calibration %s cannot be recorded yet: %s", id, error)
+            # After this the next service that writes records it as interrupted.
+            if self._closed.wait(SAVED_EVERY_S):
+                return
 
     def _over(self) -> None:
         with self._lock:

@@ -50,7 +50,7 @@ from service.storage.recording.archived_hours import keep_share
 from service.storage.sql.database import Store
 from service.storage.sql.rollup_tables import rollups_daily, rollups_hourly
 from service.storage.sql.statements import insert_all
-from service.storage.sql.tables import catalogs, missions, results
+from service.storage.sql.tables import catalogs, missions, results, runs
 from service.storage.upkeep.prune import delete_batches
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, utc_now
 
@@ -185,9 +185,11 @@ def _archive(store: Store, folder: Path, day: _Day, batch_ids: Sequence[str]) ->
                 pc.unique(made[f"{kind}_digest"]).to_pylist() for kind in ("mission", "catalog")
             )
             keep_settings(connection, folder, *used)
+            tracked = connection.scalar(select(runs.c.tracked).where(runs.c.name == day.run))
         file = _new_file(day_folder(folder, day.spacecraft, day.text))
         content = write_partition(file, to_partition(rows))
         part = described(file.name, day.run, rows, content)
+        part = msgspec.structs.replace(part, tracked=bool(tracked))
         manifest = manifest_of(folder, day.spacecraft, day.text)
         manifest = msgspec.structs.replace(manifest, parts=[*manifest.parts, part])
         write_manifest(folder, manifest)

@@ -34,6 +34,7 @@ T = TypeVar("T")
 
 MANIFEST = "manifest.json"
 OWNER = "archive.json"
+LOCK = "archive.lock"
 UNFINISHED = ".part"
 """The end of the name of a file that is being written."""
 COMPRESSION_LEVEL = 1
@@ -63,6 +64,8 @@ class Part(Struct, frozen=True, kw_only=True):
     catalogs: list[str]
     source: str | None = None
     """Of a reprocessed partition: the digest of what it was made from."""
+    tracked: bool = False
+    """Whether its run was reprocessed with tracking; see `runs`."""
 
 
 class Manifest(Struct, frozen=True, kw_only=True):
@@ -93,12 +96,26 @@ def locked(folder: Path) -> Iterator[None]:
     """Have a folder to oneself; raises `BadConfiguration` while another command works on it."""
     if not folder.is_dir():
         raise BadConfiguration(f"{folder}: there is no such folder")
-    with (folder / "archive.lock").open("ab") as lock:
+    with (folder / LOCK).open("ab") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise BadConfiguration(f"{folder}: another command is working on it") from None
         yield
+
+
+def is_locked(folder: Path) -> bool:
+    """True while a command works on a folder."""
+    try:
+        lock = (folder / LOCK).open("rb")
+    except OSError:
+        return False
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
 
 
 def day_folder(folder: Path, spacecraft: str, day: str) -> Path:

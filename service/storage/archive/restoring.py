@@ -18,6 +18,7 @@ from service.storage.archive.folder import (
     Part,
     day_folder,
     day_folders,
+    is_locked,
     locked,
     manifests,
     path_of,
@@ -116,7 +117,7 @@ def put_back(connection: Connection, folder: Path, part: Part, rows: Rows) -> bo
     for digests, table in ((part.missions, missions), (part.catalogs, catalogs)):
         insert_missing(connection, table, [read_settings(folder, each).row for each in digests])
     created = pc.min(rows["batches"]["received"]).as_py()
-    insert_runs(connection, {part.run: created})
+    insert_runs(connection, {part.run: created}, tracked=part.tracked)
     if part_id is not None:
         spacecraft = rows["batches"]["spacecraft"][0].as_py()
         # As where they are archived.
@@ -174,8 +175,10 @@ def verify_archive(
                 yield str(error)
             done += part.batches
             step(done)
-    for day, files in named.items():
-        yield from _unnamed(day, files)
+    # Another command may be writing parts: what it has not named yet is not left over.
+    if not is_locked(folder):
+        for day, files in named.items():
+            yield from _unnamed(day, files)
     for path, sha256 in needed.items():
         if whole.get(path) != sha256:
             yield f"{folder / path}: the database has batches in it, and no manifest names it so"

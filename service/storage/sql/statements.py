@@ -55,10 +55,14 @@ def insert_missing(connection: Connection, table: Table, rows: Sequence[Row]) ->
 
 
 def insert_runs(
-    connection: Connection, created: Mapping[str, str], *, alarms: bool = False
+    connection: Connection,
+    created: Mapping[str, str],
+    *,
+    alarms: bool = False,
+    tracked: bool = False,
 ) -> None:
     """Note runs by the moments when they were made; known ones stay as they are."""
-    others = {"alarms": alarms, "tracked": False}
+    others = {"alarms": alarms, "tracked": tracked}
     rows = [{"name": name, "created": moment} | others for name, moment in created.items()]
     insert_missing(connection, runs, rows)
 

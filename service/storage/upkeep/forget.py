@@ -235,9 +235,9 @@ def _forget_archived(store: Store, folder: Path, selected: ForgetFilter) -> int:
         with store.reading() as connection:
             claim(connection, folder)
             chosen = selected.of_batches(archived_batches)
-            query = select(archived_batches.c.part_id, func.count()).where(*chosen)
+            query = select(archived_batches.c.part_id, func.count().label("batches")).where(*chosen)
             grouped = connection.execute(query.group_by(archived_batches.c.part_id))
-            counts: dict[int, int] = dict(grouped)
+            counts = {row.part_id: int(row.batches) for row in grouped}
             parts = select(archived_parts).where(archived_parts.c.id.in_(counts))
             known = {row["path"]: dict(row) for row in connection.execute(parts).mappings()}
         named = {
