@@ -34,7 +34,7 @@ COMPARED_EVERY, FEW = 3, 3
 def test_flips_and_gaps_leave_nothing_wrong(
     name, identifier, dense, share, sky, tmp_path, seed, rng, figures
 ):
-    batches = scale.size(10_000, 120) // len(CASES)
+    batches = scale.size(10_000, 200) // len(CASES)
     mission = tracked(load_missions()[name]).model_copy(update={"identifier": identifier})
     app = open_app(Settings(database=f"sqlite:///{tmp_path / 'a.db'}", replay_processes=0), mission)
     flips = {batches // 3, batches * 2 // 3}
