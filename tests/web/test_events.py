@@ -102,7 +102,6 @@ def test_a_batch_is_told_of_when_it_is_recorded(database, drawn):
         }
 
 
-@pytest.mark.both_databases
 def test_who_was_away_is_told_of_everything_in_between_and_of_nothing_twice(database, drawn):
     first, *others = drawn("XTE", 6)
     with service(database) as address:
@@ -123,9 +122,9 @@ def test_who_was_away_is_told_of_everything_in_between_and_of_nothing_twice(data
         assert told_batches(returned.wait_for(6)) == [each["batch"] for each in others]
 
 
-@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
-def test_what_another_process_writes_is_told_of_too(database, drawn):
-    with service(database) as address:
+def test_what_another_process_writes_is_told_of_too(postgresql_schemas, drawn):
+    """Over PostgreSQL: one process alone writes to a SQLite file."""
+    with postgresql_schemas.fresh() as database, service(database) as address:
         listener = Listener(address)
         other = open_app(in_process_settings(database))
         try:
@@ -172,7 +171,6 @@ def test_of_replays_nobody_hears_who_asks_for_one_spacecraft(database, drawn):
         assert [kind for kind, _, _ in xte.wait_for(2)] == ["hello", "batches"]
 
 
-@pytest.mark.both_databases
 def test_a_gap_longer_than_what_is_kept_says_reset(database, drawn, monkeypatch):
     monkeypatch.setattr(records, "KEPT", 3)
     monkeypatch.setattr(records, "PRUNED_EVERY", 1)
