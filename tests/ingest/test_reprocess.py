@@ -22,13 +22,6 @@ BATCHES, CHUNK = 46, 20
 """More than two transactions' worth, of the size that they have here."""
 
 
-def noisy_pass(missions, sky, spacecraft="XTE", count=BATCHES, seed=1):
-    """A pass with so much noise that votes lose many stars; the attitudes are good a priori."""
-    troubles = Troubles(Trouble(), Trouble(), Trouble(), Trouble(1.0, 12.0))
-    wanted = Pass(count, seed, stars=4, troubles=troubles)
-    return [each.batch for each in draw_pass(missions[spacecraft], sky, wanted)]
-
-
 @pytest.fixture(autouse=True)
 def _short_transactions(monkeypatch):
     monkeypatch.setattr("service.ingest.reprocess.CHUNK", CHUNK)
@@ -36,8 +29,13 @@ def _short_transactions(monkeypatch):
 
 @pytest.fixture(scope="module")
 def noisy(missions, sky):
-    """A pass of XTE, drawn once."""
-    return noisy_pass(missions, sky)
+    """A pass of XTE, drawn once.
+
+    It has so much noise that votes lose many stars; the attitudes are good a priori.
+    """
+    troubles = Troubles(Trouble(), Trouble(), Trouble(), Trouble(1.0, 12.0))
+    wanted = Pass(BATCHES, 1, stars=4, troubles=troubles)
+    return [each.batch for each in draw_pass(missions["XTE"], sky, wanted)]
 
 
 def record(app, bodies):
@@ -181,9 +179,10 @@ def test_many_workers_record_what_one_does(app, recorded):
         assert plain == spread
 
 
-def test_only_the_stretch_and_the_spacecraft_that_were_asked_for(app, missions, sky):
-    xte, soho = noisy_pass(missions, sky, count=12), noisy_pass(missions, sky, "SOHO", 3)
-    record(app, [*xte, *soho])
+def test_only_the_stretch_and_the_spacecraft_that_were_asked_for(app, noisy, make):
+    xte = noisy[:12]
+    soho = [make(f"soho-{k}", spacecraft="SOHO", after_s=60.0 * k).text for k in range(3)]
+    record(app, [*xte, *map(json.loads, soho)])
     start, end = parse_utc(xte[3]["time"]), parse_utc(xte[7]["time"])
     app.runs.reprocess("part", spacecraft="XTE", start=start, end=end, processes=1)
     assert sorted(answers_of(app, "part")) == [body["batch"] for body in xte[3:7]]

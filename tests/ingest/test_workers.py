@@ -142,12 +142,12 @@ def test_observers_hear_of_what_workers_computed(opened, lines):
 
 def test_workers_that_are_killed_again_and_again_cost_and_double_nothing(opened, make):
     app = with_workers(opened(replay_processes=2), 2)
-    killed, wanted = [], draws(1000, 2000)
+    killed, wanted, between = [], draws(500, 2000), draws(250, 500)
     over = threading.Event()
 
     def numbered():
         for number, text in zip(range(wanted), endless(make().text), strict=False):
-            if number % 500 == 250:
+            if number % between == between // 2:
                 killed.extend(workers_of(app))
                 for pid in workers_of(app):
                     os.kill(pid, signal.SIGKILL)

@@ -36,7 +36,9 @@ def test_a_fresh_database_is_checked_without_leaving_one_behind(tmp_path, monkey
 
 
 def test_upgrading_again_changes_nothing(opened, database, make):
-    answered = opened().submissions.submit(make())
+    app = opened()
+    answered = app.submissions.submit(make())
+    app.close()
     migrations.upgrade(database)
     assert opened().results.get(answered.id).answer.id == answered.id
 

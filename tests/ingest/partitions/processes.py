@@ -10,7 +10,7 @@ from pathlib import Path
 from tests.waiting import wait_until
 
 CHECKOUT = Path(__file__).parents[3]
-WAIT_S = 120.0
+WAIT_S = 240.0
 
 
 def begin_command(database, place, run="again", **options):

@@ -128,7 +128,7 @@ def test_a_scheduler_that_goes_is_told_and_the_rest_is_done_without(
 
 
 @pytest.mark.parametrize("package", ["attitude-acquisition", "numba", "numpy", "pyarrow"])
-def test_a_worker_of_another_version_is_refused(archived, place, missions, package):
+def test_a_worker_of_another_version_is_refused(missions, package):
     from service.ingest.partitions import dask_workers
     from service.ingest.worker_process import WorkerConfig
 
