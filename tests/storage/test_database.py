@@ -98,7 +98,7 @@ def test_a_damaged_database_is_refused(tmp_path):
         ("sqlite:///no/such/folder/acquire.db", "there is no folder"),
         ("sqlite:///.", "is a folder"),
         ("sqlite:////dev/null/acquire.db", "there is no folder"),
-        ("sqlite:////proc/acquire.db", "unable to open"),
+        ("sqlite:////proc/acquire.db", "cannot be opened"),
         ("sqlite://", "needs a file"),
         ("sqlite:///:memory:", "needs a file"),
         ("acquire.db", "must be sqlite:///FILE or postgresql://"),
