@@ -10,17 +10,18 @@ It decides whether `make test` became weaker than `make full`:
 1. It copies the tree to a folder of its own under the folder for temporary files, and compiles the
    kernels there.  Every place that a fault may have asks there whether the fault is on.
 2. One run of the suite with no fault on notes which test reaches which place, in all processes that
-   the tests start: as long as the suite takes.  A test that fails here or that fails without the
-   fault later is left out and named.
-3. With each fault on, the tests that reached its place run, the quick ones first, then the others
-   of their files, until one of them fails: that test kills the fault, if it passes without.  A test
-   that hangs kills it, too.  A fault that a whole import or collection fails of is drawn anew.
-4. What the sitting (`make test`) did not kill is tried with everything (`make full`), again after a
-   run of the suite.  Exit status 1 if that kills one: its test has to come back into the sitting.
+   the tests start.  It takes as long as the suite.
+3. With each fault on, the tests that reached its place run, quick ones first, then the others of
+   their files, until one of them fails or hangs: that test kills the fault.  A fault with which the
+   tests cannot be imported is replaced by another one.
+4. After every ten faults the tests that killed them run with no fault on.  A test that fails there,
+   or in the first run, kills nothing: it is named, and left out from then on.
+5. What the sitting (`make test`) did not kill is tried with everything (`make full`), after a run
+   of that suite as in 2.  Exit status 1 if a test kills one: it has to come back into the sitting.
 
 Places are within functions, and not where kernels are compiled.  Faults that change nothing stand
-in tests/mutants/equivalent.toml with the reason.  A second run over PostgreSQL, as `make`
-does it, is not part of either suite; tests over both databases are, if TEST_POSTGRESQL_URL is set.
+in tests/mutants/equivalent.toml with the reason.  The second run of `make` over PostgreSQL is not
+part of either suite; tests over both databases are, if TEST_POSTGRESQL_URL is set.
 Results are in .mutants as JSON lines.  A run that was stopped goes on where it was, if nothing in
 service/ and tests/ changed since; remove .mutants for a new one.
 """
@@ -177,9 +178,6 @@ def main(
     results = Results(root / ".mutants", given)
     suites = list(SUITES) if parsed.suite == "both" else [parsed.suite]
     with closing(Tree(root, faults)) as tree:
-        print(
-            "== compiling the kernels of the copy, minutes after a change of the core", flush=True
-        )
         tree.compile_kernels()
         for number in range(len(suites)):
             judge_all(tree, faults, suites[: number + 1], parsed, results)

@@ -109,7 +109,10 @@ class Tree:
             aside.replace(kernels)
 
     def compile_kernels(self) -> None:
-        self._python("-m", "service.acquire.prewarm")
+        """Compile them before the tests, which would wait for them; minutes, if they changed."""
+        if (self._folder / "service" / "acquire" / "prewarm.py").exists():
+            print("== compiling the kernels of the copy", flush=True)
+            self._python("-m", "service.acquire.prewarm")
 
     def run_suite(self, arguments: Sequence[str]) -> tuple[list[Any], list[dict[str, Any]]]:
         """Run tests with no fault on; pairs of a place and a test that reaches it, and outcomes."""
