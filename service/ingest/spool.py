@@ -50,7 +50,11 @@ class Spool:
         """A file for an upload; raises `Busy` where none can be made."""
         try:
             self._folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
-            return tempfile.NamedTemporaryFile(dir=self._folder, suffix=PART, delete=False)
+            self._remove_left_over()
+            file = tempfile.NamedTemporaryFile(dir=self._folder, suffix=PART, delete=False)
+            # The lock ends with the process, however that ends.
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return file
         except OSError as error:
             raise Busy(f"uploads cannot be stored now: {error.strerror}", RETRY_S) from None
 

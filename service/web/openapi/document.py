@@ -26,8 +26,8 @@ from service.web.api.calibrations import (
 )
 from service.web.api.compare import CompareIn
 from service.web.api.events import EVENT_STREAM
-from service.web.api.runs import RunIn
-from service.web.api.tokens import SignIn
+from service.web.api.runs import ForgetIn, RunIn
+from service.web.api.tokens import SignIn, TokenIn
 from service.web.api.webhooks import ReplayEventsIn, RetryIn, SecretIn, WebhookIn
 from service.web.api.zones import WarmIn
 from service.web.conditional import API
@@ -131,6 +131,7 @@ REQUESTS: Sequence[type[BaseModel]] = (
     WhatIfIn,
     WarmIn,
     RunIn,
+    ForgetIn,
     CompareIn,
     StatementIn,
     ShelveIn,
@@ -140,6 +141,7 @@ REQUESTS: Sequence[type[BaseModel]] = (
     LimitIn,
     LimitTrialIn,
     SignIn,
+    TokenIn,
     WebhookIn,
     SecretIn,
     RetryIn,
