@@ -51,10 +51,7 @@ class Spool:
         try:
             self._folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
             self._remove_left_over()
-            file = tempfile.NamedTemporaryFile(dir=self._folder, suffix=PART, delete=False)
-            # The lock ends with the process, however that ends.
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return file
+            return _locked(tempfile.NamedTemporaryFile(dir=self._folder, suffix=PART, delete=False))
         except OSError as error:
             raise Busy(f"uploads cannot be stored now: {error.strerror}", RETRY_S) from None
 
@@ -130,3 +127,9 @@ def _private(path: Path) -> IO[str]:
     """A new text file that its owner alone can read, open for writing."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
     return os.fdopen(os.open(path, flags, PRIVATE_FILE), "w", encoding="utf-8")
+
+
+def _locked(file: IO[bytes]) -> IO[bytes]:
+    """The file with a lock that ends with the process, however that ends."""
+    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    return file

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 from itertools import count
 
 import httpx
@@ -12,6 +13,7 @@ from sqlalchemy import func, select
 from service.access.tokens import Caller
 from service.app import replays as app_replays
 from service.errors import Busy, Forbidden
+from service.ingest.spool import UNLOCKED_S, Spool
 from service.storage.sql.tables import batches
 from tests.ingest.test_replays import finished
 from tests.waiting import wait_until
@@ -126,3 +128,28 @@ def test_a_killed_service_goes_on_with_an_upload_when_it_is_started_again(tmp_pa
         state = httpx.get(url + place).json()
     assert (state["state"], state["lines"]["done"]) == ("done", LINES)
     assert state["counts"]["new"] + state["counts"]["repeated"] == LINES
+
+
+def aged(path):
+    old = time.time() - UNLOCKED_S - 1.0
+    os.utime(path, (old, old))
+    return path
+
+
+def test_an_upload_that_was_broken_off_is_removed_by_the_next_one(tmp_path):
+    """A process that was killed leaves its file, whose lock has ended with it."""
+    left = tmp_path / "killed.part"
+    left.write_bytes(b"{")
+    aged(left)
+    young = tmp_path / "young.part"
+    young.write_bytes(b"{")
+    spool = Spool(tmp_path)
+    receiving = spool.new_file()
+    aged(receiving.name)
+    with spool.new_file() as another:
+        parts = {each.name for each in tmp_path.glob("*.part")}
+        names = {os.path.basename(each.name) for each in (receiving, another)}
+        assert parts == names | {"young.part"}
+    receiving.close()
+    assert list(spool.left()) == []
+    assert not os.path.exists(receiving.name)

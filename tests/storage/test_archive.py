@@ -7,7 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from sqlalchemy import func, select
+from sqlalchemy import func, select, update
 
 from service.errors import BadConfiguration, Busy, Conflict
 from service.ingest import submit
@@ -25,6 +25,7 @@ from service.storage.sql.tables import (
     frames,
     idempotency_keys,
     results,
+    runs,
     solutions,
     star_results,
     tracker_values,
@@ -454,3 +455,27 @@ def test_numbers_are_compared_bit_by_bit():
     assert rows.differing(table(math.nan, None), table(math.nan, None)) is None
     assert rows.differing(table(1.0), table(math.nextafter(1.0, 2.0))) == "t"
     assert rows.differing(table(None), table(0.0)) == "t"
+
+
+def test_a_restored_run_is_still_tracked(filled, place, opened, tmp_path):
+    """Else it could be continued without tracking, and would mix both."""
+    noted = update(runs).where(runs.c.name == "r").values(tracked=True)
+    filled.store.writer.change(lambda connection: connection.execute(noted)).result()
+    archiving.archive(filled.store, place, LATER)
+    again = Store(f"sqlite:///{tmp_path / 'again.db'}")
+    try:
+        restore(again, place, PartFilter())
+        with again.reading() as connection:
+            found = dict(connection.execute(select(runs.c.name, runs.c.tracked)).all())
+    finally:
+        again.close()
+    assert found == {"live": False, "r": True}
+
+
+def test_what_a_running_command_writes_is_not_reported_as_left_over(filled, place):
+    archiving.archive(filled.store, place, LATER)
+    (day, *_) = folder.day_folders(place)
+    (day / "part-9.parquet.part").write_bytes(b"")
+    with folder.locked(place):
+        assert list(verify_archive(place, {})) == []
+    assert [each for each in verify_archive(place, {}) if "was not written to its end" in each]
