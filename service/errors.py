@@ -120,8 +120,16 @@ class Busy(AcquisitionError):
 class Standby(Busy):
     """Another service writes to the database; this one takes over where that ends."""
 
-    def __init__(self) -> None:
-        super().__init__("another service writes to the database; this one stands by", 2)
+    def __init__(self, is_known: bool = True) -> None:
+        """`is_known` False: the connection was lost, and no other service may have taken over."""
+        if is_known:
+            super().__init__("another service writes to the database; this one stands by", 2)
+        else:
+            super().__init__(
+                "the connection that writes to the database was lost; this service takes it up "
+                "again, unless another one has",
+                2,
+            )
 
 
 class Stopping(Busy):

@@ -43,10 +43,12 @@ def test_a_session_that_the_server_ends_writes_nothing_more(opened):
     pid = run(first, "SELECT pg_backend_pid()")
     with second.reading() as connection:
         connection.exec_driver_sql(f"SELECT pg_terminate_backend({pid}, 5000)")
-    with pytest.raises(Standby):
+    with pytest.raises(Standby, match="the connection that writes to the database was lost"):
         run(first, "SELECT 1")
     assert second.writer.take_lock() == "taken"
     assert first.writer.take_lock() == "refused"
+    with pytest.raises(Standby, match="another service writes"):
+        run(first, "SELECT 1")
     assert run(second, "SELECT 1") == 1
 
 
@@ -56,10 +58,12 @@ def test_a_lock_that_is_given_back_is_there_for_another(opened):
     second.writer.give_lock()
     assert second.writer.take_lock() == "refused"
     first.writer.give_lock()
-    with pytest.raises(Standby):
+    with pytest.raises(Standby, match="the connection that writes to the database was lost"):
         run(first, "SELECT 1")
     assert second.writer.take_lock() == "taken"
     assert first.writer.take_lock() == "refused"
+    with pytest.raises(Standby, match="another service writes"):
+        run(first, "SELECT 1")
 
 
 def test_an_error_that_the_server_has_rolled_back_costs_no_lock(opened):

@@ -28,20 +28,22 @@ class WritingLock:
     def __init__(self) -> None:
         self._session: object | None = None
         """The driver's connection that holds the lock."""
+        self._is_refused = True
+        """False after the lock was held, until another session is known to have it."""
         self.lost = threading.Event()
         """Set where a transaction found that its session does not hold the lock."""
 
     def require(self) -> None:
         """Raise `Standby` unless the lock is held, as far as is known without asking."""
         if self._session is None:
-            raise Standby()
+            raise Standby(self._is_refused)
 
     def require_in(self, connection: Connection) -> None:
         """Raise `Standby` unless the session of a transaction is the one that holds the lock."""
         if self._session is None or _session(connection) is not self._session:
             self._session = None
             self.lost.set()
-            raise Standby()
+            raise Standby(self._is_refused)
 
     def take(self, connection: Connection) -> Attempt:
         """Take the lock for a session, unless that has it already or another session has."""
@@ -50,6 +52,7 @@ class WritingLock:
             return "kept"
         taken = connection.exec_driver_sql(_TAKE).scalar_one()
         self._session = session if taken else None
+        self._is_refused = not taken
         return "taken" if taken else "refused"
 
     def give(self, connection: Connection) -> None:
