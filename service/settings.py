@@ -15,6 +15,7 @@ from service.logs import FORMATS, LEVELS, LogSettings
 PREFIX = "ACQUIRE_"
 MOST_USEFUL_PROCESSES = 4
 """One process writes: it takes no more than so many can compute."""
+_TOKEN = re.compile(r"[!-~]+")
 _HOST = re.compile(r"[A-Za-z0-9.:_-]{1,253}", re.ASCII)
 
 
@@ -91,6 +92,11 @@ class Settings:
             except ValueError:
                 message = "must be addresses or networks, such as 127.0.0.1,10.0.0.0/8"
                 raise _refusal(name, message, getattr(self, name)) from None
+        if self.token is not None and not _TOKEN.fullmatch(self.token.strip()):
+            # The value is a secret.
+            raise BadConfiguration(
+                f"{PREFIX}TOKEN: must be printable ASCII characters without a space"
+            )
         if not _HOST.fullmatch(self.host):
             raise _refusal("host", "must be an address or a name, such as 127.0.0.1", self.host)
 
@@ -126,6 +132,7 @@ class Settings:
 
 
 _READERS: dict[str, Callable[[str], Any]] = {
+    "token": str.strip,
     "missions": Path,
     "catalog": Path,
     "spool": Path,

@@ -27,6 +27,7 @@ from service.app.telemetry.live_filter import LiveFilter
 from service.app.telemetry.tracks import Tracks
 from service.app.tokens import Tokens
 from service.app.zones import Zones
+from service.ingest.spool import Spool
 from service.missions.mission import Mission, load_missions
 from service.settings import Settings, is_loopback
 from service.sky.cache import LruCache
@@ -175,4 +176,5 @@ def _register(context: Context) -> None:
     catalog = context.sky.catalog
     catalog_row = {"digest": catalog.digest, "name": catalog.name, "first_used": moment}
     context.change(lambda connection: register(connection, mission_rows, catalog_row))
-    context.change(lambda connection: mark_interrupted(connection, moment))
+    stored = Spool(context.settings.spool_folder).ids()
+    context.change(lambda connection: mark_interrupted(connection, moment, stored))

@@ -5,6 +5,7 @@ import threading
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import IO, TypedDict, Unpack
 
@@ -24,6 +25,8 @@ from service.observations.readers.decompress import Coding, unpacked_lines
 from service.packets.upload import PacketLines
 from service.storage.models.runs import Replay, ReplayCounts, ReplayLines
 from service.storage.queries.replays import (
+    UNFINISHED,
+    close_waiting,
     find_replay,
     list_replays,
     mark_cancelled,
@@ -159,11 +162,13 @@ class Replays:
             except (AcquisitionError, OSError) as error:
                 log.warning("replay %s is not continued: %s", about.id, error)
                 self._spool.release(about.id)
+                close = partial(close_waiting, id=about.id, now=utc_now().text)
+                self._context.change(close)
 
     def _resume(self, about: SpooledReplay) -> None:
         with self._context.reading() as connection:
             stored = find_replay(connection, about.id)
-        if stored is None or stored.state not in ("running", "interrupted"):
+        if stored is None or stored.state not in (*UNFINISHED, "interrupted"):
             self._spool.drop(about.id)
             return
         bound = None if about.spacecraft is None else frozenset(about.spacecraft)

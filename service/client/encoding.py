@@ -10,7 +10,7 @@ from urllib.parse import quote
 import httpx
 import msgspec
 
-from .errors import UnexpectedAnswer
+from .errors import InvalidArgument, UnexpectedAnswer
 
 Batch: TypeAlias = Mapping[str, Any] | str | bytes
 """A batch as the API has it: a mapping, which may hold numpy's arrays, or its JSON."""
@@ -24,17 +24,30 @@ PIECE_BYTES = 1 << 16
 
 
 def checked_address(url: str) -> httpx.URL:
-    """The address of a service; raises `ValueError` for one that is none."""
+    """The address of a service; raises `InvalidArgument` for one that is none."""
     try:
         parsed = httpx.URL(url)
         valid = parsed.scheme in ("http", "https") and bool(parsed.host)
     except httpx.InvalidURL:
         valid = False
     if not valid:
-        raise ValueError(
+        raise InvalidArgument(
             f"url must be the address of a service, such as http://127.0.0.1:8000 (got {url!r})"
         )
     return parsed
+
+
+def bearer_of(token: str | None) -> dict[str, str]:
+    """The header with a token; raises `InvalidArgument`, without the token, for one that is none.
+
+    A token that was read from a file may end in a newline.
+    """
+    if token is None:
+        return {}
+    secret = token.strip()
+    if not (secret and secret.isascii() and secret.isprintable() and " " not in secret):
+        raise InvalidArgument("token must be printable ASCII characters without a space")
+    return {"Authorization": f"Bearer {secret}"}
 
 
 def path_of(*parts: str) -> str:
@@ -50,8 +63,12 @@ def parameters_of(query: Query) -> dict[str, Any]:
 def _parameter(name: str, value: object) -> object:
     if not isinstance(value, datetime):
         return value
+    return _utc(name, value)
+
+
+def _utc(name: str, value: datetime) -> str:
     if value.tzinfo is None:
-        raise ValueError(f"{name} must have a time zone, or be text in UTC (got {value!r})")
+        raise InvalidArgument(f"{name} must have a time zone, or be text in UTC (got {value!r})")
     return value.astimezone(UTC).replace(tzinfo=None).isoformat() + "Z"
 
 
@@ -59,14 +76,22 @@ def json_of(body: Batch) -> bytes:
     """A body as JSON.  NaN stays NaN: the service refuses it and names the field."""
     if isinstance(body, bytes):
         return body
-    return (body if isinstance(body, str) else json.dumps(body, default=_plain)).encode()
+    try:
+        text = body if isinstance(body, str) else json.dumps(body, default=_plain)
+        return text.encode()
+    except (TypeError, ValueError) as error:
+        if isinstance(error, InvalidArgument):
+            raise
+        raise InvalidArgument(f"the body cannot be sent as JSON: {error}") from None
 
 
 def _plain(value: Any) -> Any:
     # Numpy's arrays and numbers have it.
     if hasattr(value, "tolist"):
         return value.tolist()
-    raise TypeError(f"JSON has no form for {value!r}")
+    if isinstance(value, datetime):
+        return _utc("a time", value)
+    raise InvalidArgument(f"JSON has no form for {value!r}")
 
 
 def decoded(response: httpx.Response, kind: Any) -> Any:

@@ -1,6 +1,7 @@
 """Every exception that the client raises, and the statuses of HTTP that they stand for.
 
     ClientError
+    ├── InvalidArgument         an argument that no request can carry
     ├── NoAnswer                no service answers, or none long enough
     ├── UnexpectedAnswer        something else than this service answers
     ├── EventsLost              the service no longer keeps events that were missed
@@ -49,6 +50,10 @@ class ProblemDocument(Model, frozen=True):
 
 class ClientError(Exception):
     """The base of every error that the client raises itself."""
+
+
+class InvalidArgument(ClientError, ValueError):
+    """An argument that no request can carry; the message holds no secret."""
 
 
 class NoAnswer(ClientError):
@@ -194,6 +199,9 @@ def problem_of(response: httpx.Response) -> Problem:
         # Not of the service but of a proxy before it, for example.
         status, text = response.status_code, response.text[:200].strip()
         detail = f"HTTP {status}: {text}" if text else f"HTTP {status}"
+        if place := response.headers.get("Location"):
+            leads = response.request.url.join(place)
+            detail = f"HTTP {status} leads to {leads}: give the client that address"
         path = response.request.url.path
         document = ProblemDocument("about:blank", response.reason_phrase, status, detail, path)
     kind = _BY_TYPE.get(document.type) or _BY_STATUS.get(response.status_code, ServiceFailed)

@@ -93,6 +93,10 @@ class Spool:
         """The file of a replay; raises `OSError` where it is gone."""
         return (self._folder / id).with_suffix(LINES).open("rb")
 
+    def ids(self) -> set[str]:
+        """The replays whose files are there."""
+        return {place.stem for place in self._folder.glob(f"*{LINES}")}
+
     def left(self) -> Iterator[SpooledReplay]:
         """The replays that no process is at work on, the oldest first; they are this one's now.
 

@@ -89,7 +89,7 @@ class ReplaySummary:
         self.packets = None if state.packets is None else msgspec.to_builtins(state.packets)
         self.stars = Counter({each: getattr(counts, each) for each in STARS})
         self._bar.update(lines.done - self._bar.n)
-        if state.state != "running":
+        if state.state not in ("running", "waiting"):
             # Refused lines with a known place are reported one by one.
             self.refused += lines.refused - len(state.errors)
 

@@ -11,8 +11,10 @@ from datetime import UTC, datetime, timedelta, timezone
 from email.utils import format_datetime
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
+import httpx
 import numpy as np
 import pytest
+from sqlalchemy import update
 
 from service.access import tokens
 from service.app.factory import open_app
@@ -21,8 +23,10 @@ from service.client import (
     BadInput,
     Busy,
     Client,
+    ClientError,
     Conflict,
     EventsLost,
+    InvalidArgument,
     NoAnswer,
     NotFound,
     Problem,
@@ -33,9 +37,12 @@ from service.client import (
 )
 from service.client._sync import alarms, batches, gyro, pages, replays, spacecraft
 from service.client._sync import client as whole
+from service.client.encoding import json_of
+from service.client.errors import problem_of
 from service.missions.mission import load_missions
 from service.storage.recording import events as records
 from service.storage.recording.ids import Ulids
+from service.storage.sql import tables
 from service.times import shifted, utc_now
 from service.web import event_stream as live
 from service.web.app import create_app
@@ -268,6 +275,53 @@ def test_an_address_that_is_none_is_refused():
     for url in ("", "127.0.0.1:8000", "ftp://127.0.0.1", "http://"):
         with pytest.raises(ValueError, match="must be the address of a service"):
             Client(url)
+
+
+@pytest.mark.parametrize("token", ["acq_secret\nX: y", "acq_secr\u00e9t", "acq_sec ret", " \n"])
+def test_a_token_that_no_header_can_carry_is_refused_and_not_shown(token):
+    with pytest.raises(InvalidArgument) as refusal:
+        Client("http://127.0.0.1:1", token)
+    assert isinstance(refusal.value, ClientError)
+    assert "sec" not in str(refusal.value)
+
+
+def test_a_token_from_a_file_may_end_in_a_newline():
+    with Client("http://127.0.0.1:1", "acq_secret\n") as client:
+        assert client._http.headers["Authorization"] == "Bearer acq_secret"
+
+
+def test_what_json_has_no_form_for_is_an_error_of_the_client(client, example):
+    moment = datetime(1996, 1, 10, 12, tzinfo=UTC)
+    answer = client.submit(example | {"batch": "a datetime", "time": moment})
+    assert answer.time == "1996-01-10T12:00:00.000Z"
+    for value in (moment.replace(tzinfo=None), object(), {1, 2}):
+        with pytest.raises(InvalidArgument):
+            client.submit(example | {"time": value})
+
+
+def test_a_redirect_says_where_it_leads():
+    request = httpx.Request("GET", "http://service.example/api/v1/runs")
+    moved = httpx.Response(302, headers={"Location": "https://new.example/"}, request=request)
+    assert "leads to https://new.example/" in str(problem_of(moved))
+
+
+def test_a_replay_that_waits_for_a_restart_is_followed_to_its_end(app, client, drawn):
+    """It reads `waiting` until the service resumes it, however long that takes."""
+    begun = client.start_replay(b"\n".join(map(json_of, drawn(2))), "waits")
+    states = list(client.follow_replay(begun.id))
+    assert states[-1].state == "done"
+
+    def set_state(**values):
+        change = update(tables.replays).where(tables.replays.c.id == begun.id).values(**values)
+        app.context.change(lambda connection: connection.execute(change))
+
+    set_state(state="waiting", finished=None)
+    seen = []
+    for state in client.follow_replay(begun.id, every_s=0.01):
+        seen.append(state.state)
+        if len(seen) == 3:
+            set_state(state="done")
+    assert seen == ["waiting", "waiting", "waiting", "done"]
 
 
 def test_where_no_service_answers_it_is_said_after_the_patience_is_over():

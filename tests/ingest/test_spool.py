@@ -72,7 +72,8 @@ def interrupted(opened, lines):
 def test_a_replay_goes_on_after_a_restart_where_it_was(opened, lines):
     later, id, run = interrupted(opened, [b"{\n", *lines[:400]])
     before = later.replays.get(id)
-    assert before.state == "interrupted"
+    # It will be continued: it has not ended.
+    assert (before.state, before.finished) == ("waiting", None)
     assert 64 <= before.lines.done < 401
     later.replays.resume()
     after = finished(later, id)
@@ -80,6 +81,21 @@ def test_a_replay_goes_on_after_a_restart_where_it_was(opened, lines):
     assert after.counts.new + after.counts.repeated == 400
     assert recorded(later, run) == (400, 400)
     assert [each.line for each in after.errors] == [1]
+
+
+def test_one_that_waits_can_be_cancelled_and_one_without_its_file_ends(opened, lines):
+    app = opened(replay_processes=0)
+    ids = [upload(app, lines[:300]) for _ in range(3)]
+    app.close()
+    for place in app.settings.spool_folder.glob(f"{ids[0]}*"):
+        place.unlink()
+    later = opened(replay_processes=0)
+    states = [later.replays.get(id).state for id in ids]
+    assert states == ["interrupted", "waiting", "waiting"]
+    assert later.replays.cancel(ids[1]).state == "cancelled"
+    later.replays.resume()
+    assert finished(later, ids[2]).state == "done"
+    assert later.replays.get(ids[1]).state == "cancelled"
 
 
 def test_what_a_token_is_bound_to_holds_after_a_restart(opened, lines):

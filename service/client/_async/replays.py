@@ -101,7 +101,7 @@ class AsyncReplays(AsyncConnection):
         while True:
             state = await self.get(Replay, path_of("replays", id))
             yield state
-            if state.state == "running":
+            if state.state in ("running", "waiting"):
                 running_s = time.monotonic()
             elif state.state != "interrupted" or time.monotonic() - running_s > INTERRUPTED_FOR_S:
                 return

@@ -20,8 +20,8 @@ class Client(Batches, Spacecraft, Alarms, Replays, Gyro, Calibrations):
     answer.  `trust_env` uses the proxies that the environment names; `verify` is the context of
     TLS, or False to trust every certificate.
 
-    Raises `ValueError` for an address that is none; every method raises `NoAnswer` and the
-    `Problem` of the service's answer.
+    Raises `InvalidArgument`, a `ValueError`, for an address or a token that is none; every method
+    raises `NoAnswer` and the `Problem` of the service's answer.
     """
 
     def session(self) -> Session:

@@ -8,7 +8,7 @@ from typing import Any, Self, TypeVar
 
 import httpx
 
-from ..encoding import Query, checked_address, decoded, json_of, parameters_of
+from ..encoding import Query, bearer_of, checked_address, decoded, json_of, parameters_of
 from ..errors import NoAnswer, UnexpectedAnswer, problem_of
 from ..retrying import Patience, Repeat, shown
 from .backend import sleep
@@ -36,7 +36,7 @@ class Connection:
         self.give_up_after_s = give_up_after_s
         self._http = httpx.Client(
             base_url=self.url,
-            headers={} if token is None else {"Authorization": f"Bearer {token}"},
+            headers=bearer_of(token),
             timeout=httpx.Timeout(timeout_s, connect=min(CONNECT_S, timeout_s)),
             # As many as are asked for at once: `at_once` is the bound.
             limits=httpx.Limits(max_connections=None, max_keepalive_connections=20),

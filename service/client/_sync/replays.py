@@ -99,7 +99,7 @@ class Replays(Connection):
         while True:
             state = self.get(Replay, path_of("replays", id))
             yield state
-            if state.state == "running":
+            if state.state in ("running", "waiting"):
                 running_s = time.monotonic()
             elif state.state != "interrupted" or time.monotonic() - running_s > INTERRUPTED_FOR_S:
                 return

@@ -100,7 +100,8 @@ class ReplayPackets(Model, frozen=True):
 class Replay(Model, frozen=True):
     """A replay and its progress.
 
-    `state` is running, done, interrupted, failed or cancelled.  `errors` has the first thousand
+    `state` is running, waiting, done, interrupted, failed or cancelled; one that is waiting goes
+    on by itself once the service is ready after a restart.  `errors` has the first thousand
     refused lines; the last error of a failed replay is the reason.
     """
 

@@ -8,7 +8,8 @@ from pydantic import Field
 from service.storage.models.base import Count, Id, Record, Stamp, doc
 from service.storage.models.problems import FieldFault
 
-ReplayStateName = Literal["running", "done", "interrupted", "failed", "cancelled"]
+ReplayStateName = Literal["running", "waiting", "done", "interrupted", "failed", "cancelled"]
+"""A replay that is `waiting` goes on by itself as soon as the service is ready after a restart."""
 
 
 class Run(Record, frozen=True, kw_only=True):

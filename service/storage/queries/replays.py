@@ -1,5 +1,6 @@
 """The table of replays: how far each is, and the end of those that this process does not run."""
 
+from collections.abc import Collection
 from typing import Any
 
 import msgspec
@@ -21,6 +22,7 @@ from service.storage.sql.tables import replays
 
 MAX_LISTED = 100
 CANCELLED: ReplayStateName = "cancelled"
+UNFINISHED: tuple[ReplayStateName, ...] = ("running", "waiting")
 _NO_GYRO = {"gyro_blocks": 0, "gyro_samples": 0}
 """Of packets that an earlier version counted."""
 _NO_COUNTS = dict.fromkeys(ReplayCounts.__struct_fields__, 0)
@@ -113,17 +115,23 @@ def is_cancelled(connection: Connection, id: str) -> bool:
     return connection.scalar(select(replays.c.state).where(replays.c.id == id)) == CANCELLED
 
 
-def mark_interrupted(connection: Connection, now: str) -> None:
-    """Close the replays that a stopped process left unfinished.
+def mark_interrupted(connection: Connection, now: str, stored: Collection[str] = ()) -> None:
+    """Close the replays that a stopped process left unfinished; those that are `stored` wait.
 
     If another process still runs one, that process sets its state to `running` again
     when it next stores its progress.
     """
-    connection.execute(
-        update(replays)
-        .where(replays.c.state == "running")
-        .values(state="interrupted", finished=now)
-    )
+    # A process that stopped in order has written `interrupted` itself.
+    waits = replays.c.id.in_(stored), replays.c.state.in_((*UNFINISHED, "interrupted"))
+    connection.execute(update(replays).where(*waits).values(state="waiting", finished=None))
+    ended = replays.c.id.not_in(stored), replays.c.state.in_(UNFINISHED)
+    connection.execute(update(replays).where(*ended).values(state="interrupted", finished=now))
+
+
+def close_waiting(connection: Connection, id: str, now: str) -> None:
+    """Close a replay that waited and cannot go on."""
+    waiting = replays.c.id == id, replays.c.state == "waiting"
+    connection.execute(update(replays).where(*waiting).values(state="interrupted", finished=now))
 
 
 def mark_cancelled(connection: Connection, id: str, now: str) -> None:
@@ -133,7 +141,7 @@ def mark_cancelled(connection: Connection, id: str, now: str) -> None:
     """
     replay = read_replay(connection, id)
     require_cancellable(replay.state)
-    if replay.state == "running":
+    if replay.state in UNFINISHED:
         ended = structs.replace(replay.progress(), state=CANCELLED, finished=now)
         update_replay(connection, ended, replay.packets, None)
         events.add_event(connection, "replay", ended, run=ended.run)
@@ -141,5 +149,5 @@ def mark_cancelled(connection: Connection, id: str, now: str) -> None:
 
 def require_cancellable(state: str) -> None:
     """Raise `WrongState` for the state of a replay that has ended otherwise."""
-    if state not in ("running", CANCELLED):
+    if state not in (*UNFINISHED, CANCELLED):
         raise WrongState(f"the replay has ended already, its state is {state}")

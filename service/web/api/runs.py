@@ -220,4 +220,4 @@ def get_replay(id: ReplayId, app: AppDep) -> Response:
 def cancel_replay(id: ReplayId, app: AppDep, caller: CallerDep) -> Response:
     """Cancel a replay; the batches that it recorded stay."""
     replay = app.replays.cancel(id, caller)
-    return json_response(replay, 202 if replay.state == "running" else 200)
+    return json_response(replay, 202 if replay.state in ("running", "waiting") else 200)

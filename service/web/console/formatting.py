@@ -33,6 +33,7 @@ STATES: Mapping[str, tuple[str, str]] = {
     "shelved": ("‖", "shelved"),
     "cleared": ("○", "cleared"),
     "running": ("▸", "running"),
+    "waiting": ("‖", "waits for the service to be ready"),
     "done": ("●", "done"),
     "interrupted": ("‖", "interrupted"),
     "cancelled": ("‖", "cancelled"),
