@@ -103,6 +103,22 @@ class Access:
         known = None if secret is None else self._known.get((kind, tokens.secret_digest(secret)))
         return known[0] if known is not None and clock_s < known[1] else None
 
+    def last_known_caller(self, token: str | None, session: str | None) -> Caller | None:
+        """The caller as it was at the last look-up, however long ago; None: never looked up.
+
+        For what must answer while the database does not.
+        """
+        if self.was_open:
+            return OPEN_CALLER
+        kind, secret = ("session", session) if token is None else ("token", token)
+        known = None if secret is None else self._known.get((kind, tokens.secret_digest(secret)))
+        return None if known is None else known[0]
+
+    @property
+    def was_open(self) -> bool:
+        """Whether access was open when that was last asked."""
+        return self._loopback and not self._closed and self._open_until_s > 0.0
+
     def caller(self, token: str | None, session: str | None) -> Caller:
         """The caller of a bearer token or a session; raises `Unauthenticated`."""
         if self.is_open:

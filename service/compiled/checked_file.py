@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from numba.core.caching import IndexDataCacheFile
+from numba.core.serialize import dumps
 
 SUFFIXES = (".nbi", ".nbc")
 _DIGEST = hashlib.sha256
@@ -34,14 +35,17 @@ class CheckedFile(IndexDataCacheFile):
         self._write(self._index_path, (self._version, self._source_stamp, overloads))
 
     def _load_data(self, name: str) -> Any:
-        return pickle.loads(content_of(Path(self._data_path(name))))
+        return pickle.loads(content_of(self._path(name)))
 
     def _save_data(self, name: str, data: Any) -> None:
-        self._write(self._data_path(name), data)
+        self._write(self._path(name), data)
 
-    def _write(self, path: str, value: Any) -> None:
-        content = self._dump(value)
-        with self._open_for_write(path) as file:
+    def _path(self, name: str) -> Path:
+        return Path(self._cache_path, name)
+
+    def _write(self, path: str | Path, value: Any) -> None:
+        content = dumps(value)  # type: ignore[no-untyped-call]
+        with self._open_for_write(str(path)) as file:
             file.write(_DIGEST(content).digest() + content)
 
 

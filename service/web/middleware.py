@@ -30,7 +30,7 @@ NOT_FOUND = ProblemType(404, "Not Found")
 log = logging.getLogger(__name__)
 requests = logging.getLogger("service.requests")
 
-_PROBES = ("/livez", "/readyz", "/metrics")
+PROBES = ("/livez", "/readyz", "/metrics")
 _MAX_PATH = 200
 _SANE_ID = re.compile(rb"[A-Za-z0-9][A-Za-z0-9._:=+/@-]{0,127}")
 
@@ -97,7 +97,8 @@ class AroundRequests:
         logs.request.set(about)
         try:
             host = _host(inner)
-            if host is not None and not is_loopback(host) and await is_open(self.access):
+            is_other = host is not None and not is_loopback(host)
+            if is_other and await self._is_open(inner["path"]):
                 details = {"detail": f"the host must be a name of this machine, not {host!r}"}
                 await problem_response(Request(inner), WRONG_HOST, details)(inner, receive, sent)
                 return
@@ -124,11 +125,20 @@ class AroundRequests:
                 self.metrics.count_request(inner, status, seconds)
                 self._log(scope, inner, status, seconds)
 
+    async def _is_open(self, path: str) -> bool:
+        """Whether access is open; of probes, while the database does not answer, whether it was."""
+        try:
+            return await is_open(self.access)
+        except Busy:
+            if path not in PROBES:
+                raise
+            return self.access.was_open
+
     def _log(self, scope: Scope, inner: Scope, status: int, seconds: float) -> None:
         """Log one line for a request, without query, headers and body."""
         method, path = scope["method"], scope["path"]
         usual = 200 <= status < 400 and (
-            path in _PROBES or path.startswith("/static/") or (inner["method"], path) in self.direct
+            path in PROBES or path.startswith("/static/") or (inner["method"], path) in self.direct
         )
         level = logging.DEBUG if usual else logging.INFO
         if not requests.isEnabledFor(level):
@@ -157,9 +167,6 @@ class AroundRequests:
         except Exception as error:
             # No record was changed: a failed entry must not replace the answer.
             log.error("%s by %s has no audit entry: %s", action, state["caller"].name, error)
-
-
-PROBES = ("/livez", "/readyz", "/metrics")
 
 
 class ProbesOnly:

@@ -33,6 +33,8 @@ NO_WEB_PORTS = frozenset(
 """Ports from 1024 on that browsers refuse too (WHATWG Fetch, "bad port")."""
 MAX_URL = 2_000
 MAX_ADDRESSES = 8
+RESOLVE_S = 3.0
+"""How long a name may take to resolve when a webhook is registered."""
 MAX_LOOK_UPS = 64
 """Of names at once; each has a thread, which a silent name server may hold for half a minute."""
 
@@ -80,6 +82,26 @@ def require_url(url: str, allowed: Sequence[Network]) -> None:
             require_reachable(address, allowed, only_allowed=parsed.scheme == "http")
         except Refused as error:
             raise fault(str(error)) from None
+
+
+def require_http_allowed(url: str, allowed: Sequence[Network]) -> None:
+    """Raise `BadInput` for plain http to a name that resolves to other networks now.
+
+    Each attempt would be refused.  A name that cannot be resolved now is accepted.
+    """
+    parsed = httpx.URL(url)
+    if parsed.scheme != "http":
+        return
+
+    async def resolve() -> None:
+        async with asyncio.timeout(RESOLVE_S):
+            await reachable_addresses(parsed.host, parsed.port or 80, allowed, only_allowed=True)
+
+    with suppress(OSError):
+        try:
+            asyncio.run(resolve())
+        except Refused as error:
+            raise BadInput(Fault("url", str(error), shown_value(parsed.host))) from None
 
 
 def require_reachable(

@@ -29,6 +29,7 @@ from service.storage.webhooks import deliveries
 from service.storage.webhooks.deliveries import Attempt, Queue, Waiting
 from service.storage.webhooks.registered import Registered, count_webhooks, registered_webhooks
 from service.times import DAY_S, recorded_utc, shifted, utc_now
+from service.webhooks.delivery_log import DeliveryLog
 from service.webhooks.messages import delivery_row, test_message, wants
 from service.webhooks.posts import GONE, TOO_MANY, TOTAL_S, UNAVAILABLE, Outcome, Poster
 from service.webhooks.signing import signed_headers
@@ -95,8 +96,7 @@ class WebhookSender:
         self._poster: Poster | None = None
         self._started = threading.Event()
         self._thread: threading.Thread | None = None
-        self.counts: Counter[str] = Counter(delivered=0, failed=0, dead=0)
-        """Attempts since the start by outcome."""
+        self.log = DeliveryLog()
 
     def start(self) -> None:
         """Begin to deliver, unless that has begun."""
@@ -196,6 +196,7 @@ class WebhookSender:
             changes = self._changes
             known = await self._read(self._list)
             self._webhooks = {webhook.id: webhook for webhook in known}
+            self.log.listed(known)
             # What changed meanwhile is perhaps not in the list.
             self._listed_s = now_s if changes == self._changes else -LISTED_FOR_S
         if not self._webhooks or not await self._turn.take(self._read):
@@ -273,12 +274,13 @@ class WebhookSender:
     async def _deliver(self, queue: Queue) -> None:
         begun_s = time.monotonic()
         done: list[int] = []
-        failed, outcome = None, None
+        failed, outcome, receiver = None, None, None
         try:
             for waiting in await self._read(self._next_of, queue):
                 webhook = self._receiver(queue.webhook_id)
                 if webhook is None:
                     break
+                receiver = webhook
                 outcome = await self._post(webhook, waiting.message_id, waiting.body.encode())
                 if not outcome.delivered:
                     failed = waiting
@@ -288,8 +290,8 @@ class WebhookSender:
                     break
         finally:
             # Also where the service stops meanwhile.
-            if outcome is not None:
-                attempt = self._attempt(queue, done, failed, outcome)
+            if receiver is not None and outcome is not None:
+                attempt = self._attempt(receiver, queue, done, failed, outcome)
                 await self._note(attempt)
                 if attempt.gone or attempt.held_until is not None:
                     self.changed()
@@ -313,15 +315,20 @@ class WebhookSender:
         return await self._poster.post(webhook.url, headers, body)
 
     def _attempt(
-        self, queue: Queue, done: Sequence[int], failed: Waiting | None, outcome: Outcome
+        self,
+        webhook: Registered,
+        queue: Queue,
+        done: Sequence[int],
+        failed: Waiting | None,
+        outcome: Outcome,
     ) -> Attempt:
         now = utc_now()
-        self.counts["delivered"] += len(done)
+        self.log.delivered(webhook, len(done))
         if failed is None:
             return Attempt(queue, now.text, done, status=outcome.status)
         end = shifted(recorded_utc(failed.queued), DEAD_AFTER_S).text
         is_dead = end <= now.text and outcome.status != GONE
-        self.counts["dead" if is_dead else "failed"] += 1
+        self.log.failed(webhook, failed.event_id, outcome.fault, is_dead)
         asked_s = min(outcome.retry_after_s or 0.0, DEAD_AFTER_S)
         delay_s = max(retry_delay_s(failed.attempts + 1, random.random()), asked_s)
         holds = asked_s > 0 and outcome.status in (TOO_MANY, UNAVAILABLE)

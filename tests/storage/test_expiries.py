@@ -58,21 +58,43 @@ def test_a_month_before_their_end_leap_seconds_are_warned_of(opened):
     assert "pyerfa" in said
 
 
+def test_a_token_for_a_month_is_warned_of_in_its_last_quarter(opened):
+    """Not for its whole life, as one for a year in its last 30 days."""
+    opened.context.change(
+        lambda connection: add_token(
+            connection,
+            id="01JD0000000000000000000005",
+            secret=new_secret(),
+            name="month-05",
+            scopes=("read",),
+            spacecraft=None,
+            rate_per_s=None,
+            created="2026-12-01T00:00:00.000Z",
+            expires="2026-12-31T00:00:00.000Z",
+        )
+    )
+    assert warnings_at(opened, "2026-12-20T00:00:00Z") == []
+    (said,) = warnings_at(opened, "2026-12-25T00:00:00Z")
+    assert "month-05" in said
+
+
 def test_the_first_token_that_ends_is_named_and_revoked_or_ended_ones_are_not(opened):
     token(opened, "ended-01", "2026-12-31T00:00:00.000Z")
     token(opened, "revoked-02", "2027-01-02T00:00:00.000Z")
     token(opened, "pipeline-03", "2027-01-20T00:00:00.000Z")
     token(opened, "later-04", "2027-01-25T00:00:00.000Z")
     opened.context.change(lambda connection: revoke_token(connection, "revoked-02", NOW))
-    (said,) = warnings_at(opened, NOW)
+    said, later = warnings_at(opened, NOW)
     assert "pipeline-03 expires at 2027-01-20" in said
-    assert warnings_at(opened, "2026-12-01T00:00:00Z") == [
+    assert "later-04 expires at 2027-01-25" in later
+    assert warnings_at(opened, "2026-12-01T12:00:00Z")[:1] == [
         "the token ended-01 expires at 2026-12-31T00:00:00.000Z: create another and revoke this one"
     ]
 
 
 def test_the_metrics_tell_both_as_posix_times(opened):
     token(opened, "pipeline-03", "2098-01-01T00:00:00.000Z")
+    token(opened, "another-04", "2097-01-01T00:00:00.000Z")
     text = Metrics(opened).text().decode()
     found = dict(
         line.split()
@@ -84,4 +106,5 @@ def test_the_metrics_tell_both_as_posix_times(opened):
     assert float(found["starid_leap_seconds_end_timestamp_seconds"]) == pytest.approx(
         days * 86400, abs=86400
     )
-    assert float(found["starid_token_end_timestamp_seconds"]) == 4039372800.0
+    assert float(found['starid_token_end_timestamp_seconds{token="pipeline-03"}']) == 4039372800.0
+    assert 'starid_token_end_timestamp_seconds{token="another-04"}' in found

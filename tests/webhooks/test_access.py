@@ -1,6 +1,7 @@
 """Whose events a webhook is sent, what is kept secret, and what a wrong request is told."""
 
 import queue
+import re
 import time
 
 import pytest
@@ -157,6 +158,10 @@ def test_an_unknown_webhook_is_not_found_and_answers_are_as_described(service, r
     numbers = [each["event"] for each in first.json()["items"] + rest.json()["items"]]
     assert numbers == sorted(numbers, reverse=True)
     assert len(numbers) == 5
+    oldest = {"limit": 3, "order": "oldest"}
+    first = service.client.get(f"{HERE}/{hook['id']}/deliveries", params=oldest)
+    rest = service.client.get(first.links["next"]["url"])
+    assert [e["event"] for e in first.json()["items"] + rest.json()["items"]] == numbers[::-1]
     bad = service.client.get(f"{HERE}/{hook['id']}/deliveries", params={"cursor": "x"})
     assert bad.json()["errors"][0]["field"] == "cursor"
 
@@ -179,7 +184,53 @@ def test_metrics_tell_what_waits_and_what_came_of_attempts(service, receiver):
     labels = f'{{name="pager",webhook="{hook["id"]}"}}'
     assert f"starid_webhook_waiting{labels} 1.0" in told
     assert f"starid_webhook_active{labels} 1.0" in told
-    assert 'starid_webhook_attempts_total{result="failed"} 1.0' in told
+    failed = labels.replace("webhook=", 'result="failed",webhook=')
+    assert f"starid_webhook_attempts_total{failed} 1.0" in told
+
+
+def test_a_paused_webhook_shows_how_long_events_wait_and_the_overview_says_it(service, receiver):
+    receiver.answer = lambda handler, _: handler.say(410)
+    hook = service.hook(receiver.url, name="pager")
+    service.note("x")
+    wait_until(lambda: service.read(hook)["state"] == "disabled")
+    time.sleep(0.02)
+    told = service.client.get("/metrics").text
+    labels = f'{{name="pager",webhook="{hook["id"]}"}}'
+    (oldest,) = re.findall(rf"starid_webhook_oldest_seconds{re.escape(labels)} (\S+)", told)
+    assert float(oldest) > 0.0
+    assert "pager is disabled, 1 events wait" in service.client.get("/").text
+
+
+def test_a_second_rotation_keeps_what_the_first_promised(service, receiver):
+    hook = service.hook(receiver.url, enabled=False)
+    # Every field has a default: the body may be left out.
+    first = service.client.post(f"{HERE}/{hook['id']}/secret")
+    assert first.status_code == 200, first.text
+    refused = service.ask(hook, "secret")
+    assert refused.status_code == 409
+    assert first.json()["previous_until"] in refused.json()["detail"]
+    assert service.read(hook)["previous_until"] == first.json()["previous_until"]
+    assert service.ask(hook, "secret", previous_hours=0).json()["previous_until"] is None
+    assert service.client.post(f"{HERE}/{hook['id']}/retry").json() == {"queued": 0}
+
+
+def test_what_can_never_be_sent_is_refused_when_it_is_asked(service, receiver):
+    hook = service.hook(receiver.url, enabled=False)
+    period = {"since": "1999-01-02T00:00:00Z", "until": "1999-01-01T00:00:00Z"}
+    for what, body, said in (
+        ("retry", {"events": [7]}, "must be dead letters"),
+        ("replay", period, "must be after since"),
+    ):
+        answer = service.ask(hook, what, **body)
+        assert (answer.status_code, said in answer.text) == (422, True), answer.text
+
+
+def test_plain_http_to_a_name_in_no_allowed_network_is_refused_at_once(chosen_database):
+    with serving(chosen_database(), allowed="10.20.0.0/16") as service:
+        settings = {"name": "test", "url": "http://localhost:8080/hook"}
+        answer = service.client.post(HERE, json=settings)
+        assert answer.status_code == 422
+        assert "ACQUIRE_WEBHOOK_NETWORKS" in answer.text
 
 
 def test_a_service_without_webhooks_writes_nothing_of_them(chosen_database):

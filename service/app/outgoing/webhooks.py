@@ -24,7 +24,7 @@ from service.storage.webhooks.models import (
     WebhookWithSecret,
 )
 from service.times import HOUR_S, Utc, shifted, utc_now
-from service.webhooks.addresses import require_url
+from service.webhooks.addresses import require_http_allowed, require_url
 from service.webhooks.messages import delivery_row, wants
 from service.webhooks.sender import WebhookSender
 from service.webhooks.signing import new_webhook_secret
@@ -111,12 +111,20 @@ class Webhooks:
         return deleted
 
     def rotate(self, id: str, hours: int, entry: Entry | None = None) -> WebhookWithSecret:
-        """Give a webhook a new secret; the one before signs too for so many hours."""
+        """Give a webhook a new secret; the one before signs too for so many hours.
+
+        Raises `WrongState` where an earlier secret was promised to sign still, except with 0 hours.
+        """
         known, now, is_open = _known(id), utc_now(), self._access.is_open
         secret, until = new_webhook_secret(), shifted(now, hours * HOUR_S).text
 
         def change(connection: Connection) -> Webhook:
             before = registered.registered_webhook(connection, known, now.text, is_open)
+            if hours and len(before.secrets(now.text)) > 1:
+                raise WrongState(
+                    f"the secret before the present one signs until {before.previous_until}: make "
+                    "a new one after that, or with `previous_hours` 0, which ends both at once"
+                )
             changes = {"secret": secret, "previous_secret": before.secret, "previous_until": until}
             registered.change_webhook(connection, known, changes)
             return registered.read_webhook(connection, known, now.text, is_open)
@@ -145,20 +153,34 @@ class Webhooks:
         )
 
     def deliveries(
-        self, id: str, dead: bool | None = None, limit: int = 100, cursor: str | None = None
+        self,
+        id: str,
+        dead: bool | None = None,
+        limit: int = 100,
+        cursor: str | None = None,
+        *,
+        oldest_first: bool = False,
     ) -> Page[WebhookDelivery]:
         """What waits for a webhook and its dead letters, or one of these; the latest first."""
         known, is_open = _known(id), self._access.is_open
         with self._context.reading() as connection:
             registered.read_webhook(connection, known, utc_now().text, is_open)
             return deliveries.list_deliveries(
-                connection, known, dead=dead, limit=limit, cursor=cursor
+                connection,
+                known,
+                dead=dead,
+                limit=limit,
+                cursor=cursor,
+                oldest_first=oldest_first,
             )
 
     def retry(
         self, id: str, numbers: Sequence[int] | None, entry: Entry | None = None
     ) -> WebhookQueued:
-        """Send dead letters again, those of some events or all."""
+        """Send dead letters again, those of some events or all.
+
+        Raises `BadInput` for an event that is no dead letter.
+        """
         known, now, is_open = _known(id), utc_now().text, self._access.is_open
 
         def change(connection: Connection) -> int:
@@ -190,6 +212,7 @@ class Webhooks:
 
     def _require(self, settings: Row) -> None:
         require_url(settings["url"], self._allowed)
+        require_http_allowed(settings["url"], self._allowed)
         for name in settings["spacecraft"] or ():
             mission_in_input(self._context.missions, name)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import ColumnElement, Connection, select
 
-from service.errors import AcquisitionError, Busy
+from service.errors import AcquisitionError, Busy, Fault, NotAvailable
 from service.extras import require_extra
 from service.sky.cache import LruCache
 from service.storage.archive.tables import archived_batches, archived_parts, archived_what_ifs
@@ -55,7 +55,7 @@ class Archive:
     """The folder with the parts of a database; None: none is set.
 
     Every method raises `Busy` where a file cannot be read, and `NotAvailable` without the
-    package that reads it.
+    folder, or without the package that reads it.
     """
 
     def __init__(self, folder: Path | None) -> None:
@@ -175,10 +175,12 @@ class Archive:
         import pyarrow as pa
 
         if self.folder is None:
-            raise Busy(
-                "the batches are archived, and this service knows no folder of an archive: set "
+            # A client that tries again changes nothing: only a start with the setting does.
+            message = (
+                "is archived, and this service knows no folder of an archive: set "
                 "ACQUIRE_ARCHIVE_FOLDER to it and start again"
             )
+            raise NotAvailable(Fault("batch", message))
         try:
             yield self.folder / path
         except (OSError, pa.ArrowException) as error:

@@ -165,7 +165,7 @@ class Writer:
         self.change(_write_as_a_batch).result()
         self.change(remove_probe).result()
         with self._changed:
-            self._is_failing = self._is_failing and self._failures != before
+            self._is_failing = self._failures != before
 
     def state(self) -> WriterState:
         """The state of the writes and of their queue."""

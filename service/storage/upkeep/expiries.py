@@ -10,7 +10,7 @@ from msgspec import Struct
 from sqlalchemy import Connection, select
 
 from service.storage.sql.access_tables import access_tokens
-from service.times import Utc, parse_utc, shifted, utc_now
+from service.times import Utc, parse_utc, recorded_utc, shifted, utc_now
 
 log = logging.getLogger(__name__)
 
@@ -20,17 +20,29 @@ DAY_S = 86_400.0
 _FIRST_YEAR, _LAST_YEAR = 2017, 2099
 
 
+class TokenTerm(Struct, frozen=True):
+    """When a token in force was made and when it expires: UTC texts."""
+
+    name: str
+    created: str
+    expires: str
+
+    def ends_soon(self, now: Utc) -> bool:
+        """True in its last `SOON_DAYS`, and of a token for less time in its last quarter."""
+        ends = recorded_utc(self.expires)
+        quarter_s = (ends.tai_ns - recorded_utc(self.created).tai_ns) / 4e9
+        return (ends.tai_ns - now.tai_ns) / 1e9 <= min(quarter_s, SOON_DAYS * DAY_S)
+
+
 class Expiries(Struct, frozen=True):
-    """When something ends: UTC texts.
+    """When something ends.
 
     `leap_seconds` is the moment from which the table no longer vouches for the difference
-    between TAI and UTC.  `token` is the name of the token in force that ends first and
-    `token_ends` when; None where there are no tokens.
+    between TAI and UTC, as UTC text.  `tokens` are those in force, the first to expire first.
     """
 
     leap_seconds: str
-    token: str | None = None
-    token_ends: str | None = None
+    tokens: tuple[TokenTerm, ...] = ()
 
 
 @cache
@@ -60,39 +72,35 @@ class ExpiryDates:
         self._now = now
 
     def dates(self) -> Expiries:
-        """What ends when; of the tokens the first."""
+        """What ends when."""
         with self._reading() as connection:
-            first = _first_token(connection, self._now().text)
-        token, ends = first if first is not None else (None, None)
-        return Expiries(leap_seconds_end().text, token, ends)
+            return Expiries(leap_seconds_end().text, _tokens(connection, self._now().text))
 
     def warn(self) -> list[str]:
-        """Log a warning about each thing that ends within `SOON_DAYS`, or has ended."""
-        found = self.dates()
-        soon = shifted(self._now(), SOON_DAYS * DAY_S).text
+        """Log a warning about each thing that ends soon, or has ended."""
+        found, now = self.dates(), self._now()
+        soon = shifted(now, SOON_DAYS * DAY_S).text
         said = []
         if found.leap_seconds <= soon:
             said.append(
                 f"the table of leap seconds is certain until {found.leap_seconds} only: "
                 "install a newer pyerfa"
             )
-        if found.token_ends is not None and found.token_ends <= soon:
-            said.append(
-                f"the token {found.token} expires at {found.token_ends}: "
-                "create another and revoke this one"
-            )
+        said += [
+            f"the token {each.name} expires at {each.expires}: create another and revoke this one"
+            for each in found.tokens
+            if each.ends_soon(now)
+        ]
         for each in said:
             log.warning(each)
         return said
 
 
-def _first_token(connection: Connection, moment: str) -> tuple[str, str] | None:
-    """The name and the end of the token in force that ends first."""
+def _tokens(connection: Connection, moment: str) -> tuple[TokenTerm, ...]:
+    """The tokens in force, the first to expire first."""
     query = (
-        select(access_tokens.c.name, access_tokens.c.expires)
+        select(access_tokens.c.name, access_tokens.c.created, access_tokens.c.expires)
         .where(access_tokens.c.revoked.is_(None), access_tokens.c.expires > moment)
         .order_by(access_tokens.c.expires, access_tokens.c.name)
-        .limit(1)
     )
-    row = connection.execute(query).first()
-    return None if row is None else (row.name, row.expires)
+    return tuple(TokenTerm(*row) for row in connection.execute(query))

@@ -10,7 +10,7 @@ from typing import Any
 
 from sqlalchemy import Connection, case, delete, func, select, tuple_, update
 
-from service.errors import BadBatch, Fault, shown_value
+from service.errors import BadBatch, BadInput, Fault, shown_value
 from service.storage.models.base import Page
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import insert_missing
@@ -106,10 +106,16 @@ def queue_again(connection: Connection, id: str, rows: Sequence[Row]) -> int:
 
 
 def retry_dead(connection: Connection, id: str, numbers: Sequence[int] | None, now: str) -> int:
-    """Queue dead letters again, some or all; returns how many."""
+    """Queue dead letters again, some or all; returns how many.
+
+    Raises `BadInput` for a number of another event.
+    """
     chosen = [_row.webhook_id == id, _row.dead]
     if numbers is not None:
         chosen.append(_row.event_id.in_(numbers))
+        dead = set(connection.scalars(select(_row.event_id).where(*chosen)))
+        if others := sorted(set(numbers) - dead):
+            raise BadInput(Fault("events", "must be dead letters", shown_value(others)))
     values = {"dead": False, "again": True, "attempts": 0, "queued": now, "due": now}
     return int(
         connection.execute(update(webhook_deliveries).where(*chosen).values(values)).rowcount
@@ -221,7 +227,13 @@ def _note_failure(connection: Connection, attempt: Attempt, failed: Waiting) -> 
 
 
 def list_deliveries(
-    connection: Connection, id: str, *, dead: bool | None, limit: int, cursor: str | None
+    connection: Connection,
+    id: str,
+    *,
+    dead: bool | None,
+    limit: int,
+    cursor: str | None,
+    oldest_first: bool = False,
 ) -> Page[WebhookDelivery]:
     """Deliveries of a webhook, the latest event first; a cursor is the last number shown."""
     query = select(webhook_deliveries).where(_row.webhook_id == id)
@@ -230,8 +242,10 @@ def list_deliveries(
     if cursor is not None:
         if not (cursor.isascii() and cursor.isdigit() and len(cursor) < 19):
             raise BadBatch(Fault("cursor", "is not a cursor of this list", shown_value(cursor)))
-        query = query.where(_row.event_id < int(cursor))
-    query = query.order_by(_row.event_id.desc()).limit(limit + 1)
+        last = int(cursor)
+        query = query.where(_row.event_id > last if oldest_first else _row.event_id < last)
+    order = _row.event_id if oldest_first else _row.event_id.desc()
+    query = query.order_by(order).limit(limit + 1)
     rows = [_shown(row) for row in connection.execute(query).mappings()]
     return Page(rows[:limit], str(rows[limit - 1].event) if len(rows) > limit else None)
 

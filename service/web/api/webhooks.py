@@ -1,10 +1,10 @@
 """Webhooks: events that the service sends to receivers."""
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from fastapi import APIRouter, Path
 from fastapi import Query as InQuery
-from pydantic import ConfigDict, Field, StringConstraints
+from pydantic import ConfigDict, Field, StringConstraints, model_validator
 from starlette.requests import Request
 from starlette.responses import Response
 
@@ -24,7 +24,7 @@ from service.web.openapi.route import LINK, LOCATION, ResponseDoc, route_docs
 from service.web.requests.access import AuditDep, CallerDep, require_scope
 from service.web.requests.dependencies import AppDep, json_response, page_response
 from service.web.requests.query_parameters import NO_QUERY, Cursor, PageLimit, Query, Time
-from service.web.requests.request_body import JsonBody, read_model
+from service.web.requests.request_body import JsonBody, OptionalJsonBody, read_model
 
 router = APIRouter(prefix="/api/v1", tags=["webhooks"])
 
@@ -108,6 +108,12 @@ class ReplayEventsIn(Wire):
     since: Annotated[Time, Field(description="By the service's clock, included.")]
     until: Annotated[Time | None, Field(description="Excluded; null: now.")] = None
 
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if self.until is not None and self.until.tai_ns <= self.since.tai_ns:
+            raise ValueError(f"until {self.until} must be after since {self.since}")
+        return self
+
 
 class DeliveryQuery(Query):
     """Which deliveries."""
@@ -115,6 +121,12 @@ class DeliveryQuery(Query):
     state: Annotated[
         Literal["waiting", "dead"] | None, Field(description="Only these; default: both.")
     ] = None
+    order: Annotated[
+        Literal["newest", "oldest"],
+        Field(
+            description="`oldest`: in the order of delivery, the one that others wait for first."
+        ),
+    ] = "newest"
     limit: PageLimit = 100
     cursor: Cursor = None
 
@@ -186,13 +198,17 @@ def delete_webhook(id: WebhookId, app: AppDep, audited: AuditDep) -> Response:
     **route_docs(
         {200: ResponseDoc("The webhook, and its new secret this once.", WebhookWithSecret)},
         body=SecretIn,
-        problems=(404, 503),
+        body_required=False,
+        problems=(404, 409, 503),
     ),
 )
 def rotate_webhook_secret(
-    id: WebhookId, body: JsonBody, app: AppDep, audited: AuditDep
+    id: WebhookId, body: OptionalJsonBody, app: AppDep, audited: AuditDep
 ) -> Response:
-    """Make a new secret; deliveries are signed by the previous one too for some hours."""
+    """Make a new secret; deliveries are signed by the previous one too for some hours.
+
+    A second time within these hours only with `previous_hours` 0, which ends both.
+    """
     asked = read_model(SecretIn, body)
     return json_response(app.webhooks.rotate(id, asked.previous_hours, audited.entry()))
 
@@ -218,9 +234,11 @@ def test_webhook(id: WebhookId, app: AppDep) -> Response:
 def list_webhook_deliveries(
     id: WebhookId, request: Request, query: Annotated[DeliveryQuery, InQuery()], app: AppDep
 ) -> Response:
-    """Events that wait for a webhook, and its dead letters; the latest event first."""
+    """Events that wait for a webhook, and its dead letters; by default the latest event first."""
     dead = None if query.state is None else query.state == "dead"
-    page = app.webhooks.deliveries(id, dead, query.limit, query.cursor)
+    page = app.webhooks.deliveries(
+        id, dead, query.limit, query.cursor, oldest_first=query.order == "oldest"
+    )
     return page_response(request, page)
 
 
@@ -230,10 +248,13 @@ def list_webhook_deliveries(
     **route_docs(
         {200: ResponseDoc("How many were queued.", WebhookQueued)},
         body=RetryIn,
+        body_required=False,
         problems=(404, 503),
     ),
 )
-def retry_dead_letters(id: WebhookId, body: JsonBody, app: AppDep, audited: AuditDep) -> Response:
+def retry_dead_letters(
+    id: WebhookId, body: OptionalJsonBody, app: AppDep, audited: AuditDep
+) -> Response:
     """Send dead letters again; new events of the spacecraft do not wait for them."""
     asked = read_model(RetryIn, body)
     return json_response(app.webhooks.retry(id, asked.events, audited.entry()))

@@ -113,6 +113,7 @@ def route_docs(
     answers: Mapping[int, ResponseDoc],
     *,
     body: type[BaseModel] | None = None,
+    body_required: bool = True,
     lines_of: type[BaseModel] | None = None,
     archive: str | None = None,
     array_of: tuple[type[BaseModel], int] | None = None,
@@ -122,12 +123,14 @@ def route_docs(
 ) -> dict[str, Any]:
     """The arguments for a route's decorator that describe it.
 
+    Without `body_required` the body may be left out: its fields all have defaults.
     `archive` says what an archive holds that can be sent in place of lines.
     `array_of` is the model of an array's elements, and how many there may be.
     """
     extra: dict[str, Any] = {}
     if body is not None:
-        extra["requestBody"] = {"required": True, "content": {JSON: {"schema": _ref(body)}}}
+        content = {JSON: {"schema": _ref(body)}}
+        extra["requestBody"] = {"required": body_required, "content": content}
         problems = (*problems, *READING_JSON)
     if array_of is not None:
         element, most = array_of

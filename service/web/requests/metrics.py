@@ -8,11 +8,21 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from itertools import product
 from typing import Any
 
-from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
+from prometheus_client import (
+    CollectorRegistry,
+    Counter,
+    GCCollector,
+    Histogram,
+    Info,
+    PlatformCollector,
+    ProcessCollector,
+    generate_latest,
+)
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 from starlette.types import Scope
 
+from service import __version__
 from service.alarms.limits import Severity
 from service.app.factory import App
 from service.ingest.outcomes import Recorded
@@ -22,7 +32,8 @@ from service.storage.models.zones import ZoneCache
 from service.storage.queries.future_dated import LIVE
 from service.storage.upkeep.expiries import Expiries
 from service.storage.webhooks.models import Webhook
-from service.times import parse_utc, recorded_utc, unix_seconds, utc_now
+from service.times import recorded_utc, unix_seconds, utc_now
+from service.webhooks.delivery_log import Result
 
 log = logging.getLogger(__name__)
 
@@ -111,7 +122,7 @@ class _GaugeCollector(Collector):
             "1 where another service writes to the database and this one stands by, else 0.",
             value=float(not self._app.single_writer.is_writing),
         )
-        yield _of_attempts(self._app.webhooks.sender.counts)
+        yield _of_attempts(self._app.webhooks.sender.log.counts)
 
 
 def _of_zones(cache: ZoneCache) -> Iterator[Metric]:
@@ -184,25 +195,26 @@ def _of_backlog(backlog: Backlog) -> Iterator[Metric]:
 
 
 def _of_expiries(dates: Expiries) -> Iterator[Metric]:
-    """When the leap seconds and the first of the tokens end."""
-    ends = [
-        (
-            "starid_leap_seconds_end_timestamp_seconds",
-            "Until when the table of leap seconds is certain.",
-            dates.leap_seconds,
-        )
-    ]
-    if dates.token_ends is not None:
-        ends.append(
-            (
-                "starid_token_end_timestamp_seconds",
-                "When the first of the tokens in force expires.",
-                dates.token_ends,
-            )
-        )
-    for name, about, moment in ends:
-        unix_s = float(unix_seconds(parse_utc(moment, name).tai_ns))
-        yield GaugeMetricFamily(name, about, value=unix_s)
+    """When the leap seconds and each of the tokens end."""
+    yield GaugeMetricFamily(
+        "starid_leap_seconds_end_timestamp_seconds",
+        "Until when the table of leap seconds is certain.",
+        value=_unix_s(dates.leap_seconds),
+    )
+    made = GaugeMetricFamily(
+        "starid_token_created_timestamp_seconds", "When a token was made.", labels=("token",)
+    )
+    ends = GaugeMetricFamily(
+        "starid_token_end_timestamp_seconds", "When a token in force expires.", labels=("token",)
+    )
+    for each in dates.tokens:
+        made.add_metric((each.name,), _unix_s(each.created))
+        ends.add_metric((each.name,), _unix_s(each.expires))
+    yield from (made, ends)
+
+
+def _unix_s(moment: str) -> float:
+    return float(unix_seconds(recorded_utc(moment).tai_ns))
 
 
 def _of_webhooks(webhooks: Sequence[Webhook]) -> Iterator[Metric]:
@@ -231,20 +243,20 @@ def _of_webhooks(webhooks: Sequence[Webhook]) -> Iterator[Metric]:
         if each.enabled:
             active.add_metric(names, float(each.state == "active"))
         waiting.add_metric(names, each.waiting)
-        oldest.add_metric(names, max(age_s, 0.0) if each.state == "active" else 0.0)
+        oldest.add_metric(names, max(age_s, 0.0))
         dead.add_metric(names, each.dead)
     yield from (active, waiting, oldest, dead)
 
 
-def _of_attempts(counts: Mapping[str, int]) -> Metric:
+def _of_attempts(counts: Mapping[tuple[str, str, Result], int]) -> Metric:
     """What came of the attempts to deliver."""
     family = CounterMetricFamily(
         "starid_webhook_attempts",
         "Attempts to deliver an event to a webhook; of dead ones it was the last.",
-        labels=("result",),
+        labels=("webhook", "name", "result"),
     )
-    for result, count in sorted(counts.items()):
-        family.add_metric((result,), count)
+    for labels, count in sorted(counts.items()):
+        family.add_metric(labels, count)
     return family
 
 
@@ -279,6 +291,11 @@ class Metrics:
         )
         # `Histogram.labels` checks its labels on every call.
         self._by_labels: dict[tuple[str, str, int], Histogram] = {}
+        # Memory, processor time, open files, the interpreter and its collections of garbage.
+        for collector in (ProcessCollector, PlatformCollector, GCCollector):
+            collector(registry=self.registry)
+        build = Info("starid_build", "The version of the service.", registry=self.registry)
+        build.info({"version": __version__})
         gauges = _GaugeCollector(app)
         self.close = gauges.close
         """Ends the threads that read gauges; to be called after the last scrape."""

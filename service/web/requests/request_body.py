@@ -287,5 +287,14 @@ def refused(body: bytes, refusal: BadInput) -> BadInput:
     return refusal
 
 
+async def optional_json_body(request: Request) -> bytes:
+    """`json_body` of an operation whose fields all have defaults: it may be absent."""
+    has_none = request.headers.get("content-length", "0") == "0"
+    if has_none and "transfer-encoding" not in request.headers:
+        return b""
+    return await json_body(request)
+
+
 JsonBody = Annotated[bytes, Depends(json_body)]
+OptionalJsonBody = Annotated[bytes, Depends(optional_json_body)]
 SessionBody = Annotated[bytes, Depends(session_body)]

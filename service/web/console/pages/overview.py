@@ -16,7 +16,7 @@ from service.times import DAY_S, parse_utc, shifted
 from service.vectors import Matrix
 from service.web.console.charts.heat_map import packed
 from service.web.console.charts.sparkline import SparklineDrawing, common_top, sparkline
-from service.web.console.page_context import ContextDep, PageQuery
+from service.web.console.page_context import ContextDep, PageContext, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
@@ -130,7 +130,23 @@ def overview_page(query: Annotated[OverviewQuery, InQuery()], context: ContextDe
         periods=list(PERIODS_S),
         shown=SHOWN,
         heat=_heat(fleet, lines, shares, query.period),
+        webhooks=_webhooks_in_trouble(context),
     )
+
+
+def _webhooks_in_trouble(context: PageContext) -> list[str]:
+    """The webhooks that do not deliver, in words, for who may see their page."""
+    if context.caller.spacecraft is not None or "operate" not in context.caller.scopes:
+        return []
+    found = []
+    for each in context.app.webhooks.all():
+        if each.state == "disabled" or (each.state == "paused" and each.waiting):
+            found.append(f"{each.name} is {each.state}, {each.waiting} events wait")
+        elif each.failing_since is not None:
+            found.append(f"{each.name} fails, {each.waiting} events wait")
+        if each.dead:
+            found.append(f"{each.name} has {each.dead} dead letters")
+    return found
 
 
 def _shares(cells: FleetCells) -> dict[str, Matrix]:

@@ -20,7 +20,9 @@ def webhooks_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -
     """Every webhook with what waits for it."""
     webhooks = context.app.webhooks.all()
     waiting = {
-        each.id: context.app.webhooks.deliveries(each.id, limit=SHOWN_DELIVERIES).items
+        each.id: context.app.webhooks.deliveries(
+            each.id, limit=SHOWN_DELIVERIES, oldest_first=True
+        ).items
         for each in webhooks
     }
     return rendered(
