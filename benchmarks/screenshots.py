@@ -79,7 +79,7 @@ def main() -> int:
             if asked.only:
                 pages = {name: pages[name] for name in asked.only.split(",")}
             asked.folder.mkdir(parents=True, exist_ok=True)
-            with Browser(Path(folder) / "profile") as browser:
+            with Browser(CHROMIUM) as browser:
                 total = look(browser, address, pages, asked.folder)
     if asked.folder == FOLDER and not asked.only:
         before, _, _ = DOCUMENT.read_text(encoding="utf-8").partition(HEADING)
