@@ -91,6 +91,12 @@ def test_a_run_that_is_asked_for_takes_the_place_of_the_batch_s():
     assert read({**BATCH, "run": "day"}).batch.run == "day"
 
 
+def test_a_byte_order_mark_before_a_batch_makes_no_other_batch():
+    text = json.dumps(BATCH)
+    for body in ("\ufeff" + text, b"\xef\xbb\xbf" + text.encode()):
+        assert submission_from_json(body).fingerprint == read(BATCH).fingerprint
+
+
 def test_vectors_within_a_thousandth_of_norm_one_are_normalised():
     for norm in (0.9991, 1.0009):
         star = read(changed(f"{STAR}.vector", [0.0, 0.0, norm])).batch.observations[0].vector[0]
