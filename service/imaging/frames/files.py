@@ -5,8 +5,12 @@ against the limits before anything is decoded; what is read is bounded by that s
 and by the file's own length.  Whatever is wrong raises `BadFile` with the reason.
 """
 
+import gzip
 import hashlib
-from collections.abc import Callable, Mapping
+import tempfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import IO
 
 from service.imaging.frames.frame import Frame, FrameLimits, bad_frame
@@ -14,8 +18,17 @@ from service.imaging.frames.raw import is_raw, read_raw
 
 Reader = Callable[[IO[bytes], FrameLimits, str], Frame]
 
-FORMATS = "FITS, TIFF, PNG, JPEG, BMP, a camera's raw file or a numpy array (.npy)"
+FORMATS = "FITS, TIFF, PNG, JPEG, BMP, PGM, a camera's raw file or a numpy array (.npy)"
+OTHERS: Mapping[bytes, str] = {
+    b"LUCAM-RECORDER": "a SER video; export one frame of it as FITS or TIFF",
+    b"XISF0100": "an XISF file; save it as FITS or TIFF of 16 bits",
+}
+"""Formats that are known by their first bytes, and not read."""
+MORE_BYTES, BYTES_PER_PIXEL = 64 << 20, 24
+"""What a compressed file may unfold into: three planes of 64 bits, and further units beside."""
+_BLOCK_BYTES = 1 << 20
 _LONGEST_MAGIC = 16
+_GZIP = b"\x1f\x8b"
 
 
 def read_frame(file: IO[bytes], limits: FrameLimits, digest: str | None = None) -> Frame:
@@ -28,6 +41,11 @@ def read_frame(file: IO[bytes], limits: FrameLimits, digest: str | None = None) 
     start = file.read(_LONGEST_MAGIC)
     if not start:
         raise bad_frame("is empty; it must hold a file: " + FORMATS)
+    if start.startswith(_GZIP):
+        with _unzipped(file, limits) as unzipped:
+            if unzipped.read(2) == _GZIP:
+                raise bad_frame("is compressed more than once")
+            return read_frame(unzipped, limits, digest)
     if is_raw(file, start):
         file.seek(0)
         return read_raw(file, limits, digest)
@@ -35,7 +53,29 @@ def read_frame(file: IO[bytes], limits: FrameLimits, digest: str | None = None) 
         if start.startswith(magics):
             file.seek(0)
             return reader(file, limits, digest)
+    for magic, words in OTHERS.items():
+        if start.startswith(magic):
+            raise bad_frame(f"is {words}")
     raise bad_frame(f"is not {FORMATS}", f"its first bytes are {start[:8].hex(' ')}")
+
+
+@contextmanager
+def _unzipped(file: IO[bytes], limits: FrameLimits) -> Iterator[IO[bytes]]:
+    """What a gzip file holds, in a temporary file; raises `BadFile` for more than a frame takes."""
+    rows, columns = limits.shape or (limits.max_pixels, 1)
+    most = MORE_BYTES + BYTES_PER_PIXEL * min(rows * columns, limits.max_pixels)
+    file.seek(0)
+    with tempfile.TemporaryFile() as target:
+        try:
+            with gzip.GzipFile(fileobj=file) as source:
+                while block := source.read(_BLOCK_BYTES):
+                    if target.tell() + len(block) > most:
+                        raise bad_frame(f"unfolds into more than {most >> 20} MB")
+                    target.write(block)
+        except (OSError, EOFError, zlib.error) as error:
+            raise bad_frame(f"cannot be read as gzip: {str(error)[:100]}") from None
+        target.seek(0)
+        yield target
 
 
 def frame_digest(file: IO[bytes]) -> str:

@@ -194,12 +194,15 @@ class _Compressed:
         axes = self._unit.header.image_axes
         self._file.seek(0)
         try:
-            with fits.open(self._file, memmap=False, lazy_load_hdus=True) as opened:
+            opened = fits.open(self._file, memmap=False, lazy_load_hdus=True)
+            try:
                 section = opened[self._unit.number].section
                 shape = tuple(reversed(axes[2:]))
                 place = () if number is None else np.unravel_index(number, shape) if shape else ()
                 extra = len(section.shape) - len(axes)
                 values = section[(0,) * extra + tuple(int(each) for each in place)]
+            finally:
+                opened.close(closed=False)
         except Exception as error:
             # A decoder that stumbles over what it reads does so in many ways.
             reason = str(error)[:200] or type(error).__name__

@@ -1,0 +1,228 @@
+"""FITS files of other writers: where the image is, which way up, and when it was taken."""
+
+import gzip
+import io
+import math
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from service.errors import BadBatch, BadFile
+from service.imaging.frames import files
+from service.imaging.frames.files import read_frame
+from service.imaging.frames.frame import FrameLimits
+from service.imaging.submit import FrameIn, time_of
+
+ROWS, COLUMNS = 24, 40
+NOON = "2026-03-01T12:00:00"
+
+
+def read(data, **limits):
+    return read_frame(io.BytesIO(data), FrameLimits(max_pixels=100_000, **limits))
+
+
+def written(*units):
+    file = io.BytesIO()
+    fits.HDUList(list(units)).writeto(file, output_verify="ignore")
+    return file.getvalue()
+
+
+def image(values, cards=(), kind=fits.ImageHDU, **more):
+    unit = kind(values, **more)
+    for key, value in dict(cards).items():
+        unit.header[key] = value
+    return unit
+
+
+def header_time(extension=None, primary=None):
+    """The frame of a file whose two headers hold some cards."""
+    first = image(None, primary or {}, fits.PrimaryHDU)
+    return read(written(first, image(np.zeros((3, 3), "u1"), extension or {})))
+
+
+@pytest.fixture
+def values(rng):
+    return rng.integers(0, 60000, (ROWS, COLUMNS)).astype(np.uint16)
+
+
+TIMES = {
+    "start and exposure in the primary header": ({}, {"DATE-OBS": NOON, "EXPTIME": 4.0}, 2.0),
+    "start in the extension": ({"DATE-OBS": NOON}, {"EXPTIME": 4.0}, 2.0),
+    "the extension's own start": (
+        {"DATE-OBS": NOON, "EXPTIME": 4.0},
+        {"DATE-AVG": "2026-03-01T18:00:00", "EXPTIME": 60.0},
+        2.0,
+    ),
+    "EXPOSURE": ({"DATE-OBS": NOON, "EXPOSURE": 4.0}, {}, 2.0),
+    "XPOSURE": ({"DATE-BEG": NOON, "XPOSURE": 4.0, "EXPTIME": 4.02}, {}, 2.0),
+    "exposure as text": ({"DATE-OBS": NOON, "EXPTIME": "4.0"}, {}, 2.0),
+    "exposure as text with its unit": ({"DATE-OBS": NOON, "EXPTIME": "4000 ms"}, {}, 2.0),
+    "exposure in a unit": ({"DATE-OBS": NOON, "EXPTIME": (4000, "[ms] shutter")}, {}, 2.0),
+    "exposure in brackets": ({"DATE-OBS": NOON, "EXPOSURE": (4.0, "(sec)")}, {}, 2.0),
+    "start and end": ({"DATE-BEG": NOON, "DATE-END": "2026-03-01T12:00:08"}, {}, 4.0),
+    "end and exposure": ({"DATE-END": "2026-03-01T12:00:08", "EXPTIME": 8.0}, {}, 4.0),
+    "the average": ({"DATE-AVG": NOON, "EXPTIME": 4.0}, {}, 0.0),
+    "MJD-OBS": ({"MJD-OBS": 61100.5, "EXPTIME": 4.0}, {}, 2.0),
+    "MJD-AVG": ({"MJD-AVG": 61100.5}, {}, 0.0),
+    "a date with TIME-OBS": (
+        {"DATE-OBS": "2026-03-01", "TIME-OBS": "12:00:00.5", "EXPTIME": 1.0},
+        {},
+        1.0,
+    ),
+    "DATE-OBS of mid exposure": (
+        {"DATE-OBS": (NOON, "UTC, middle of exposure"), "EXPTIME": 4.0},
+        {},
+        0.0,
+    ),
+    "DATE-OBS of the end": ({"DATE-OBS": (NOON, "end of exposure"), "EXPTIME": 4.0}, {}, -2.0),
+    "zone east": ({"DATE-AVG": "2026-03-01T13:00:00+01:00"}, {}, 0.0),
+    "zone west without colon": ({"DATE-AVG": "2026-03-01T06:30:00-0530"}, {}, 0.0),
+    "Z": ({"DATE-AVG": NOON + ".000Z"}, {}, 0.0),
+    "TAI": ({"DATE-AVG": "2026-03-01T12:00:37"}, {"TIMESYS": "TAI"}, 0.0),
+    "TT": ({"DATE-AVG": "2026-03-01T12:01:09.184", "TIMESYS": "TT"}, {}, 0.0),
+    "TT(BIPM)": ({"DATE-AVG": "2026-03-01T12:01:09.184", "TIMESYS": "TT(BIPM08)"}, {}, 0.0),
+    "GPS": ({"DATE-AVG": "2026-03-01T12:00:18", "TIMESYS": "GPS"}, {}, 0.0),
+    "MJD in TT": ({"MJD-AVG": 61100.5 + 69.184 / 86400, "TIMESYS": "TT"}, {}, 0.0),
+}
+
+
+@pytest.mark.parametrize("case", TIMES)
+def test_the_time_of_mid_exposure_follows_the_standard(case):
+    extension, primary, after_noon_s = TIMES[case]
+    frame = header_time(extension, primary)
+    second = 12 * 3600 + after_noon_s
+    hour, minute, second = int(second // 3600), int(second % 3600 // 60), second % 60
+    assert frame.time is not None, frame.no_time
+    read_s = float(frame.time[17:-1]) + 60 * int(frame.time[14:16]) + 3600 * int(frame.time[11:13])
+    assert frame.time.startswith("2026-03-01T")
+    assert read_s == pytest.approx(3600 * hour + 60 * minute + second, abs=2e-5)
+
+
+NO_TIMES = {
+    "nothing": ({}, "DATE-AVG, MJD-AVG, DATE-BEG, DATE-OBS"),
+    "start alone": ({"DATE-OBS": NOON}, "no exposure (XPOSURE, EXPTIME, EXPOSURE)"),
+    "a date without a time of day": ({"DATE-OBS": "2026-03-01", "EXPTIME": 1.0}, "time of day"),
+    "local time": ({"DATE-AVG": NOON, "TIMESYS": "LOCAL"}, "TIMESYS is LOCAL"),
+    "UT1": ({"DATE-AVG": NOON, "TIMESYS": "UT1"}, "TIMESYS is UT1"),
+    "TCB": ({"DATE-AVG": NOON, "TIMESYS": "TCB"}, "TIMESYS is TCB"),
+    "two starts": (
+        {"DATE-OBS": NOON, "MJD-OBS": 61100.25, "EXPTIME": 1.0},
+        "DATE-OBS and MJD-OBS lie",
+    ),
+    "two exposures": ({"DATE-OBS": NOON, "EXPTIME": 1.0, "EXPOSURE": 100.0}, "contradict"),
+    "end before start": ({"DATE-BEG": NOON, "DATE-END": "2026-03-01T11:00:00"}, "apart"),
+    "end far from start and exposure": (
+        {"DATE-BEG": NOON, "DATE-END": "2026-03-01T12:30:00", "EXPTIME": 10.0},
+        "apart",
+    ),
+    "average outside": (
+        {"DATE-AVG": NOON, "DATE-BEG": "2026-03-01T12:30:00", "EXPTIME": 1.0},
+        "not between",
+    ),
+    "exposure in furlongs": ({"DATE-OBS": NOON, "EXPTIME": (1.0, "[furlong]")}, "no exposure"),
+    "a day that is none": ({"DATE-AVG": "2026-02-30T12:00:00"}, "cannot be read"),
+}
+
+
+@pytest.mark.parametrize("case", NO_TIMES)
+def test_a_header_that_tells_no_time_for_certain_is_asked_for_by_what_it_lacks(case):
+    cards, word = NO_TIMES[case]
+    frame = header_time(cards)
+    assert frame.time is None
+    with pytest.raises(BadBatch) as refusal:
+        time_of(FrameIn(), frame)
+    assert word in str(refusal.value)
+
+
+def test_rows_from_the_bottom_up_are_turned_to_the_way_they_are_shown(values):
+    for order, truth in (
+        ("BOTTOM-UP", values[::-1]),
+        ("bottom_up", values[::-1]),
+        ("TOP-DOWN", values),
+        ("sideways", values),
+    ):
+        frame = read(written(image(values, {"ROWORDER": order}, fits.PrimaryHDU)))
+        assert np.array_equal(frame.counts, truth)
+        assert frame.is_turned == (truth is not values)
+    behind = written(
+        image(None, {"ROWORDER": "BOTTOM-UP"}, fits.PrimaryHDU),
+        image(values),
+    )
+    assert np.array_equal(read(behind).counts, values[::-1])
+    cube = np.stack([values // 4] * 3)
+    frame = read(written(image(cube, {"ROWORDER": "BOTTOM-UP"}, fits.PrimaryHDU)))
+    assert np.array_equal(frame.counts, cube.sum(axis=0)[::-1])
+
+
+@pytest.mark.parametrize("kind", ["u1", "i2", "u2", "f4"])
+def test_the_planes_of_a_colour_cube_are_summed(rng, kind):
+    cube = rng.integers(0, 200, (3, ROWS, COLUMNS)).astype(kind)
+    total = cube.astype(np.float64).sum(axis=0)
+    for written_as in (cube, np.moveaxis(cube, 0, 2), cube[None]):
+        frame = read(written(image(np.ascontiguousarray(written_as), kind=fits.PrimaryHDU)))
+        assert np.array_equal(frame.counts, total)
+        assert frame.full_scale == (math.inf if kind == "f4" else 3.0 * np.iinfo(kind).max)
+
+
+def test_of_a_cube_of_frames_one_is_chosen(rng):
+    cube = rng.integers(0, 200, (5, ROWS, COLUMNS)).astype("i2")
+    data = written(image(cube, kind=fits.PrimaryHDU))
+    for number in range(1, 6):
+        assert np.array_equal(read(data, image=f":{number}").counts, cube[number - 1])
+    for choice, word in ((None, "5 planes"), (":6", "planes 1 to 5"), (":x", "by number")):
+        with pytest.raises(BadFile, match=word):
+            read(data, image=choice)
+
+
+def test_of_several_images_the_first_is_taken_or_one_is_chosen(values):
+    others = image(values // 2, name="ERR"), image(values // 3, name="DQ")
+    data = written(image(None, kind=fits.PrimaryHDU), image(values, name="SCI"), *others)
+    first = read(data)
+    assert np.array_equal(first.counts, values)
+    assert first.remarks == ("image: 1 SCI was taken, the first of 1 SCI, 2 ERR, 3 DQ",)
+    for choice, number in (("SCI", 1), ("err", 2), ("3", 3), ("DQ:1", 3)):
+        assert np.array_equal(read(data, image=choice).counts, values // number)
+    with pytest.raises(BadFile, match="1 SCI, 2 ERR, 3 DQ"):
+        read(data, image="WHT")
+
+
+def test_a_gzipped_file_is_read_in_bounded_memory(values, monkeypatch):
+    monkeypatch.setattr(files, "MORE_BYTES", 1 << 20)
+    plain = written(image(values, {"DATE-AVG": NOON}, fits.PrimaryHDU))
+    frame = read(gzip.compress(plain))
+    assert np.array_equal(frame.counts, values)
+    assert frame.time == NOON + ".000Z"
+    for data, word in (
+        (gzip.compress(plain)[:-400], "gzip"),
+        (gzip.compress(plain + bytes(4 << 20), 1), "unfolds into more than"),
+        (gzip.compress(gzip.compress(plain)), "more than once"),
+        (gzip.compress(b"no frame"), "is not FITS"),
+    ):
+        with pytest.raises(BadFile, match=word):
+            read(data)
+
+
+@pytest.mark.parametrize("method", ["RICE_1", "GZIP_1", "GZIP_2", "HCOMPRESS_1"])
+@pytest.mark.parametrize("kind", ["u2", "i2", "i4", "f4"])
+def test_an_image_in_compressed_tiles_is_read_as_astropy_reads_it(rng, method, kind):
+    stored = rng.integers(0, 200, (ROWS, COLUMNS)).astype(kind)
+    cards = {"DATE-OBS": NOON, "EXPTIME": 2.0, "ROWORDER": "BOTTOM-UP"}
+    unit = image(stored, cards, fits.CompImageHDU, compression_type=method)
+    data = written(image(None, kind=fits.PrimaryHDU), unit)
+    with fits.open(io.BytesIO(data)) as opened:
+        truth = opened[1].data[::-1]
+    frame = read(data)
+    assert np.array_equal(frame.counts, truth)
+    assert frame.time == "2026-03-01T12:00:01.000Z"
+    with pytest.raises(BadFile, match="at most 100 pixels"):
+        read_frame(io.BytesIO(data), FrameLimits(max_pixels=100))
+    with pytest.raises(BadFile):
+        read(data[:-2880])
+
+
+def test_a_compressed_colour_cube_is_summed(rng):
+    cube = rng.integers(0, 200, (3, ROWS, COLUMNS)).astype("i2")
+    unit = fits.CompImageHDU(cube, compression_type="RICE_1")
+    frame = read(written(image(None, kind=fits.PrimaryHDU), unit))
+    assert np.array_equal(frame.counts, cube.sum(axis=0))
