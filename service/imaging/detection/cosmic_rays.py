@@ -43,9 +43,9 @@ class Behind:
 
 
 def stars_behind(
-    light: CountArray, u_px: Vector, v_px: Vector, psf_sigma_px: float, noise_counts: float
+    light: CountArray, u_px: Vector, v_px: Vector, psf_sigma_px: float, noise_counts: Vector
 ) -> Behind:
-    """What lies behind candidates (k,) that are sharper than a star.
+    """What lies behind candidates (k,) that are sharper than a star, each with its own noise.
 
     About each, pixel by pixel, what stands out from its four neighbours more than the
     middle of a star's image can is taken off, the brightest first, until nothing does.
@@ -53,7 +53,7 @@ def stars_behind(
     """
     core = GaussianPsf(psf_sigma_px).pixel(_CORE[None, :], _CORE[:, None])
     patches = patches_of(light, u_px, v_px, HALF_PX)
-    hot = _hot(patches, float(core[1, 1] / core[0, 1]), noise_counts)
+    hot = _hot(patches, float(core[1, 1] / core[0, 1]), noise_counts[:, None, None])
     left = np.where(hot, 0.0, patches)
     row, column, ratio = _best(left, core, noise_counts)
     struck = [
@@ -70,7 +70,7 @@ def stars_behind(
     return Behind(
         corner_u[struck] + column[struck],
         corner_v[struck] + row[struck],
-        ratio[struck] * noise_counts / np.sqrt((core**2).sum()),
+        ratio[struck] * noise_counts[struck] / np.sqrt((core**2).sum()),
         hot_u[inside],
         hot_v[inside],
     )
@@ -97,7 +97,7 @@ def hits_under(window: Window, psf: Psf, star: CentroidRecord) -> Mask:
 def _hot(
     patches: npt.NDArray[np.float64],
     peak_over_next: float,
-    noise_counts: float | npt.NDArray[np.float64],
+    noise_counts: npt.NDArray[np.float64],
 ) -> npt.NDArray[np.bool_]:
     """Pixels of (k, rows, columns) that stand out from their neighbours more than a star's can."""
     hot = np.zeros(patches.shape, dtype=np.bool_)
@@ -122,7 +122,7 @@ def _aside(padded: npt.NDArray[np.float64], rows: int, columns: int) -> npt.NDAr
 
 
 def _best(
-    patches: npt.NDArray[np.float64], core: npt.NDArray[np.float64], noise_counts: float
+    patches: npt.NDArray[np.float64], core: npt.NDArray[np.float64], noise_counts: Vector
 ) -> tuple[Vector, Vector, Vector]:
     """The place (row, column) in each patch of the most starlike light, and its ratio to noise."""
     size = patches.shape[1] - 2

@@ -7,6 +7,7 @@ threshold in the noise behind that filter, and deblending.
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,7 @@ import sep
 
 from service.imaging.centroids.psf import GaussianPsf
 from service.imaging.centroids.window import Detector
+from service.imaging.detection.background import take_background_off
 from service.imaging.detection.cosmic_rays import stars_behind
 from service.imaging.detection.shapes import is_sharp
 from service.imaging.detection.star_image import PsfAt, psf_of
@@ -22,12 +24,13 @@ from service.imaging.frames.frame import CountArray, Frame, bad_frame
 from service.missions.camera import Camera
 from service.vectors import Vector, read_only
 
-MESH_PX = 64
 LEAST_PIXELS = 3
 DEBLEND_LEVELS, DEBLEND_CONTRAST = 32, 0.005
 HOT_SIGMAS = 5.0
 TRACK_PIXELS = 9
 BEHIND_SIGMAS = 15.0
+EXTENDED_SIGMAS = 60.0
+"""The side of what is too wide for a star, in widths of a star's image."""
 _CLOSE_PX = 6.0
 
 
@@ -74,16 +77,20 @@ def detect(frame: Frame, camera: Camera, psf_at: PsfAt | None = None) -> Detecti
     mask = None if known.all() else ~known
     if mask is not None:
         light[mask] = 0.0
-    background = sep.Background(light, mask=mask, bw=MESH_PX, bh=MESH_PX)
-    noise = float(background.globalrms)
-    if not noise > 0.0:
-        # Most pixels are equal, as in a frame cut off at its background: a count is the least step.
-        noise = 1.0
-    level = background.back(dtype=light.dtype)
-    light -= level
+    level, noise_map = take_background_off(light, mask, camera.psf_sigma_px)
+    noise = float(np.median(noise_map[::8, ::8]))
     if camera.psf == "gaussian":
         images, left = None, light
-        found = _extracted(light, noise, mask, camera)
+        signal = light / noise_map
+        found = _extracted(signal, 1.0, mask, camera)
+        wide = found["npix"] > (EXTENDED_SIGMAS * camera.psf_sigma_px) ** 2
+        if wide.any():
+            # Its supposed wings would hide faint stars all over the frame.
+            known &= ~_footprint(signal, mask, camera, wide)
+            mask = ~known
+            found = _extracted(signal, 1.0, mask, camera)
+        for name in ("flux", "peak"):
+            found[name] *= noise_map[found["ypeak"], found["xpeak"]]
     else:
         detector = detector_of(frame, level, noise, camera)
         search = ImageSearch(
@@ -92,10 +99,11 @@ def detect(frame: Frame, camera: Camera, psf_at: PsfAt | None = None) -> Detecti
         images, found, left = search.taken_off()
     u, v = found["x"].astype(np.float64), found["y"].astype(np.float64)
     sharp = is_sharp(left, u, v, camera.psf_sigma_px)
-    good = _good(left, known, noise, found[~sharp], found[sharp])
+    good = _good(left, known, noise_map, found[~sharp], found[sharp])
     # Light beside the brightest pixel: without it no star can be behind.
-    dense = sharp & (found["flux"] - found["peak"] > BEHIND_SIGMAS * noise)
-    behind = stars_behind(left, u[dense], v[dense], camera.psf_sigma_px, noise)
+    local = noise_map[found["ypeak"], found["xpeak"]]
+    dense = sharp & (found["flux"] - found["peak"] > BEHIND_SIGMAS * local)
+    behind = stars_behind(left, u[dense], v[dense], camera.psf_sigma_px, local[dense])
     good[behind.hot_v_px, behind.hot_u_px] = False
     stars = np.concatenate(
         [
@@ -143,6 +151,38 @@ def detection_kernel(camera: Camera) -> npt.NDArray[np.float32]:
     return np.asarray(image, dtype=np.float32)
 
 
+def _footprint(
+    signal: CountArray,
+    mask: npt.NDArray[np.bool_] | None,
+    camera: Camera,
+    chosen: npt.NDArray[np.bool_],
+) -> npt.NDArray[np.bool_]:
+    """The pixels (rows, columns) of the chosen ones of the candidates that are extracted."""
+    _, segments = sep.extract(signal, err=1.0, segmentation_map=True, **_options(1.0, mask, camera))
+    return np.asarray(np.isin(segments, np.flatnonzero(chosen) + 1))
+
+
+def _options(
+    noise: float | CountArray, mask: npt.NDArray[np.bool_] | None, camera: Camera
+) -> dict[str, Any]:
+    """What SEP is asked for: the threshold is in the noise behind the filter.
+
+    SEP itself means the noise before it, unless it is given that of each pixel, with which it
+    takes three times as long.
+    """
+    kernel = detection_kernel(camera)
+    is_map = np.ndim(noise) > 0
+    share = 1.0 if is_map else float(np.sqrt((kernel**2).sum()) / np.abs(kernel).sum())
+    return {
+        "thresh": share * camera.threshold_sigma,
+        "mask": mask,
+        "minarea": LEAST_PIXELS,
+        "filter_kernel": kernel,
+        "deblend_nthresh": DEBLEND_LEVELS,
+        "deblend_cont": DEBLEND_CONTRAST,
+    }
+
+
 def _extracted(
     light: CountArray,
     noise: float | CountArray,
@@ -150,16 +190,7 @@ def _extracted(
     camera: Camera,
 ) -> npt.NDArray[np.void]:
     try:
-        found: npt.NDArray[np.void] = sep.extract(
-            light,
-            camera.threshold_sigma,
-            err=noise,
-            mask=mask,
-            minarea=LEAST_PIXELS,
-            filter_kernel=detection_kernel(camera),
-            deblend_nthresh=DEBLEND_LEVELS,
-            deblend_cont=DEBLEND_CONTRAST,
-        )
+        found: npt.NDArray[np.void] = sep.extract(light, err=noise, **_options(noise, mask, camera))
     except Exception as error:
         # SEP has one exception for all: its buffers are full of bright pixels.
         raise bad_frame(f"is bright nearly everywhere: {str(error)[:100]}") from None
@@ -169,7 +200,7 @@ def _extracted(
 def _good(
     light: CountArray,
     known: npt.NDArray[np.bool_],
-    noise: float,
+    noise: CountArray,
     stars: npt.NDArray[np.void],
     others: npt.NDArray[np.void],
 ) -> npt.NDArray[np.bool_]:
@@ -181,5 +212,5 @@ def _good(
     away = np.hypot(tracks["x"][:, None] - stars["x"], tracks["y"][:, None] - stars["y"])
     for each in tracks[away.min(axis=1, initial=np.inf) > _CLOSE_PX]:
         box = slice(each["ymin"], each["ymax"] + 1), slice(each["xmin"], each["xmax"] + 1)
-        good[box] &= light[box] < HOT_SIGMAS * noise
+        good[box] &= light[box] < HOT_SIGMAS * noise[box]
     return good

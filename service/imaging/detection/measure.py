@@ -11,8 +11,9 @@ from service.imaging.centroids.centroid import centroid
 from service.imaging.centroids.psf import Psf
 from service.imaging.centroids.record import CentroidRecord
 from service.imaging.centroids.window import Window, cutout
+from service.imaging.detection.background import MESH_PX
 from service.imaging.detection.cosmic_rays import hits_under
-from service.imaging.detection.detect import MESH_PX, Detections, detector_of
+from service.imaging.detection.detect import Detections, detector_of
 from service.imaging.detection.star_image import core_share, psf_of
 from service.imaging.frames.frame import Frame
 from service.missions.camera import Camera, CentroidMethod
