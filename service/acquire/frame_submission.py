@@ -63,7 +63,8 @@ def _of_unknown_lens(
 ) -> Submission:
     start = perf_counter_ns()
     tracker, camera = mission.camera_tracker(known.tracker, "tracker")
-    frame = read_frame(file, FrameLimits(max_pixels, camera.shape, tracker.name), digest)
+    limits = FrameLimits(max_pixels, camera.shape, tracker.name, known.image)
+    frame = read_frame(file, limits, digest)
     require_light(frame, camera.saturation_counts)
     time, remarks = time_of(known, frame)
     frame = with_exposure(frame, known.exposure_s or frame.exposure_s or camera.exposure_s)

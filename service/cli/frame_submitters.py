@@ -11,7 +11,7 @@ from service.errors import AcquisitionError, Busy, Unauthenticated
 from service.settings import Settings
 
 FRAME_TYPE = "application/octet-stream"
-TEXTS = ("batch", "time", "run", "tracker", "aberration", "centroid")
+TEXTS = ("batch", "time", "run", "tracker", "aberration", "centroid", "image")
 TIMEOUT_S = 120.0
 
 

@@ -26,7 +26,7 @@ def solve_pictures(parsed: Namespace, settings: Settings) -> int:
     from service.sky.catalog.star_catalog import open_catalog
 
     sky, solver = blind_sky(open_catalog(settings.catalog))
-    read = picture_reader(parsed.dark, settings)
+    read = picture_reader(parsed.dark, settings, parsed.image)
     failed = 0
     for file in parsed.files:
         try:
@@ -45,7 +45,7 @@ def solve_pictures(parsed: Namespace, settings: Settings) -> int:
 
 
 def picture_reader(
-    dark_file: Path | None, settings: Settings
+    dark_file: Path | None, settings: Settings, image: str | None = None
 ) -> "Callable[[Path, tuple[int, int] | None], Frame]":
     """A function that reads a picture, of a shape if one is given, less the dark frame."""
     from service.imaging.frames.dark import without_dark
@@ -55,8 +55,10 @@ def picture_reader(
     max_pixels = 1_000_000 * max(settings.frame_megapixels, LEAST_MEGAPIXELS)
 
     def read(file: Path, shape: tuple[int, int] | None) -> "Frame":
+        chosen = image if file != dark_file else None
+        limits = FrameLimits(max_pixels, shape, "the first picture", chosen)
         with file.open("rb") as opened:
-            frame = read_frame(opened, FrameLimits(max_pixels, shape, "the first picture"))
+            frame = read_frame(opened, limits)
         return frame if dark is None else without_dark(frame, dark)
 
     dark: Frame | None = None

@@ -70,11 +70,18 @@ class FrameIn(Wire):
     aberration: Aberration = "to_correct"
     exposure_s: Annotated[Number, Field(gt=0, le=3600)] | None = None
     centroid: CentroidMethod | None = None
+    image: Annotated[str, Field(min_length=1, max_length=80)] | None = None
+    """Which image of a file with several; see `FrameLimits`."""
     options: OptionsIn = OptionsIn()
 
     def batch_of(self, digest: str) -> str:
-        """The batch id: the one given, else a name made from the frame's digest."""
-        return self.batch or f"frame-{digest.removeprefix('sha256:')[:16]}"
+        """The batch id: the one given, else a name made from the digest and the image chosen."""
+        if self.batch is not None:
+            return self.batch
+        name = digest.removeprefix("sha256:")
+        if self.image is not None:
+            name = hashlib.sha256(f"{name}\n{self.image}".encode()).hexdigest()
+        return f"frame-{name[:16]}"
 
     def fingerprint(self, spacecraft: str, digest: str) -> str:
         """The digest of the frame and of all that is told of it."""
@@ -101,7 +108,8 @@ def submission_of_frame(
     """
     clock = [clock_ns()]
     tracker, camera = mission.camera_tracker(known.tracker, "tracker")
-    frame = read_frame(file, FrameLimits(max_pixels, camera.shape, tracker.name), digest)
+    limits = FrameLimits(max_pixels, camera.shape, tracker.name, known.image)
+    frame = read_frame(file, limits, digest)
     require_light(frame, camera.saturation_counts)
     time, remarks = time_of(known, frame)
     if known.exposure_s is not None:
@@ -185,7 +193,7 @@ def batch_of_stars(
 ) -> BatchIn:
     """The batch of a tracker's stars, with what is told of their frame."""
     told = json.loads(known.model_dump_json(exclude_defaults=True))
-    for name in ("tracker", "exposure_s", "centroid"):
+    for name in ("tracker", "exposure_s", "centroid", "image"):
         told.pop(name, None)
     whole = {
         "spacecraft": spacecraft,

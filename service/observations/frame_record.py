@@ -31,7 +31,8 @@ class FrameRecord:
     preview: bytes
     preview_step: int
     remarks: Sequence[str] = ()
-    """Of a camera without calibration: what was fitted, or why nothing was found."""
+    """What was fitted of a camera without calibration, or why nothing was found; which image of
+    a file was taken, and how its pixels were turned."""
 
     def summary(self) -> dict[str, Any]:
         """What the answer says of the frame."""

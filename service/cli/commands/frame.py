@@ -30,10 +30,10 @@ def add(commands: Any) -> None:
     parser = add_command(
         commands,
         "frame",
-        "Detect the stars in frames and pictures (FITS, TIFF, PNG, JPEG, BMP, raw, .npy), identify "
-        "them and solve for the attitude.  Frames of a spacecraft are recorded; one that is sent "
-        "again returns the first answer.  Without a spacecraft a picture may be from any camera: "
-        "its lens is fitted with the attitude, and nothing is recorded.",
+        "Detect the stars in frames and pictures (FITS, TIFF, PNG, JPEG, BMP, PGM, raw, .npy), "
+        "identify them and solve for the attitude.  Frames of a spacecraft are recorded; one that "
+        "is sent again returns the first answer.  Without a spacecraft a picture may be from any "
+        "camera: its lens is fitted with the attitude, and nothing is recorded.",
         """
         acquire frame holiday.jpg                    any camera, any lens
         acquire frame holiday.jpg --focal-mm 50 --pixel-um 4.8 --overlay stars.png
@@ -68,6 +68,12 @@ def add(commands: Any) -> None:
         "--centroid",
         choices=("window", "scan", "matched", "recursive"),
         help="default: the mission's method",
+    )
+    parser.add_argument(
+        "--image",
+        metavar="NAME",
+        help="which image of a file with several: name or number of a FITS unit, :2 for the second "
+        "plane of a cube, the number of a TIFF page",
     )
     way = parser.add_mutually_exclusive_group()
     way.add_argument("--url", default=LOCAL, help=f"the service; default {LOCAL}")
@@ -143,7 +149,7 @@ def _known(parsed: Namespace, file: Path) -> dict[str, Any]:
         known = _object(beside.read_text(encoding="utf-8-sig"), str(beside))
     if parsed.a_priori is not None:
         known["a_priori"] = _json(parsed.a_priori, "--a-priori")
-    for name in ("tracker", "time", "batch", "run", "centroid"):
+    for name in ("tracker", "time", "batch", "run", "centroid", "image"):
         if getattr(parsed, name) is not None:
             known[name] = getattr(parsed, name)
     return known

@@ -15,10 +15,14 @@ _HEADERS = {
     (2, 0): np.lib.format.read_array_header_2_0,
 }
 _MAX_HEADER = 4096
+COLOURS = 3
 
 
 def read_npy(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
-    """A frame from a .npy file of two dimensions, (rows, columns); raises `BadFile`."""
+    """A frame from a .npy file of (rows, columns), or of three colours first or last.
+
+    Of colours the counts are the sums.  Raises `BadFile`.
+    """
     try:
         version = np.lib.format.read_magic(file)
         if version not in _HEADERS:
@@ -31,14 +35,28 @@ def read_npy(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
         raise bad_frame(f"has no readable .npy header: {str(error)[:200]}") from None
     if dtype.kind not in "iuf" or dtype.itemsize > 8:
         raise bad_frame("must hold numbers of up to 64 bits", str(dtype)[:80])
-    if len(shape) != 2:
-        raise bad_frame("must have two dimensions, rows and columns", str(shape)[:80])
-    height_px, width_px = shape
+    colours = _colour_axis(shape)
+    height_px, width_px = (side for k, side in enumerate(shape) if k != colours)
     limits.require(width_px, height_px)
-    data = exactly(file, width_px * height_px * dtype.itemsize)
+    count = width_px * height_px * (1 if colours is None else COLOURS)
+    data = exactly(file, count * dtype.itemsize)
     order = "F" if by_column else "C"
-    values = np.frombuffer(data, dtype).reshape((height_px, width_px), order=order)  # type: ignore[call-overload]
-    return Frame(as_counts(values), "NPY", digest, full_scale_of(values.dtype))
+    values = np.frombuffer(data, dtype).reshape(shape, order=order)  # type: ignore[call-overload]
+    full_scale = full_scale_of(values.dtype)
+    if colours is not None:
+        wide = np.int64 if dtype.kind in "iu" and dtype.itemsize < 8 else np.float64
+        values, full_scale = values.sum(axis=colours, dtype=wide), COLOURS * full_scale
+    return Frame(as_counts(values), "NPY", digest, full_scale)
+
+
+def _colour_axis(shape: tuple[int, ...]) -> int | None:
+    """The axis of three colours, None without one; raises `BadFile` for another number of axes."""
+    if len(shape) == 2:
+        return None
+    if len(shape) == 3 and COLOURS in (shape[0], shape[2]):
+        return 2 if shape[2] == COLOURS else 0
+    message = "must have two dimensions, rows and columns, or a third of three colours"
+    raise bad_frame(message, str(shape)[:80])
 
 
 def exactly(file: IO[bytes], count: int) -> bytes:

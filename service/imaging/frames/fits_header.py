@@ -8,7 +8,7 @@ from typing import IO
 from service.imaging.frames.frame import bad_frame
 
 BLOCK, CARD = 2880, 80
-MAX_HEADER_BLOCKS = 256
+MAX_HEADER_BLOCKS = 128
 MAX_UNITS = 256
 
 TYPES = {8: ">u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}

@@ -38,7 +38,7 @@ class FrameQuery(Query):
     time: Annotated[
         str | None,
         Field(
-            description="UTC of mid exposure. Default: DATE-AVG, or DATE-OBS, of a FITS file.",
+            description="UTC of mid exposure. Default: of a FITS file's header, or EXIF.",
             examples=TIME_SCHEMA["examples"],
         ),
     ] = None
@@ -67,6 +67,15 @@ class FrameQuery(Query):
         str | None,
         Field(description="window, scan, matched or recursive. Default: the mission's method."),
     ] = None
+    image: Annotated[
+        str | None,
+        Field(
+            description="Which image of a file with several: the name or number of a FITS unit, "
+            "`:2` for the second plane of a cube, the number of a TIFF page from 1. Default: the "
+            "first of a FITS file; a TIFF with several is refused.",
+            examples=["SCI"],
+        ),
+    ] = None
     options: Annotated[str | None, Field(description="JSON, as in a batch.")] = None
 
     def known(self) -> FrameIn:
@@ -75,7 +84,7 @@ class FrameQuery(Query):
         return read_known({name: _value(name, text) for name, text in given.items()})
 
 
-_TEXTS = ("batch", "time", "run", "tracker", "aberration", "centroid")
+_TEXTS = ("batch", "time", "run", "tracker", "aberration", "centroid", "image")
 
 
 def _value(name: str, text: str) -> Any:

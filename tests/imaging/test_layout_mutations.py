@@ -1,0 +1,154 @@
+"""A file with a damaged layout gives its own pixels, a refusal, or no wrong attitude."""
+
+import io
+import struct
+from random import Random
+
+import numpy as np
+import pytest
+import tifffile
+from astropy.io import fits
+from PIL import Image
+
+from service.acquire.picture import blind_sky, solve_picture
+from service.errors import BadFile
+from service.identify.blind.lens import Lens
+from service.identify.blind.solver import focal_px_of
+from service.imaging.frames.files import read_frame
+from service.imaging.frames.frame import FrameLimits
+from service.sky.catalog.star_catalog import load_embedded
+from service.vectors import attitude_error_arcsec
+from tests.mutations import with_right_sums
+from tests.pictures.drawn import draw_picture, middle_attitude
+from tests.scale import size
+
+MUTATIONS = 1_000_000
+SITTING = 60
+"""Of each file in `make test`."""
+SOLVED = 2
+"""Of the pictures that came out different, so many are solved in `make test`."""
+LIMITS = FrameLimits(1_000_000)
+RIGHT_ARCSEC = 360.0
+FITS_WORDS = (
+    *(b"BITPIX", b"NAXIS1", b"NAXIS2", b"NAXIS3"),
+    *(b"BZERO", b"BSCALE", b"BLANK", b"ROWORDER"),
+)
+
+
+@pytest.fixture(scope="module")
+def blind():
+    return blind_sky(load_embedded(), 2020)
+
+
+@pytest.fixture(scope="module")
+def picture(blind):
+    lens = Lens(640, 480, focal_px_of(640, 14.0))
+    return draw_picture(np.random.default_rng(5), blind[0], stars=60, quality=None, lens=lens)
+
+
+def saved(counts, file_format, **more):
+    file = io.BytesIO()
+    Image.fromarray(counts).save(file, file_format, **more)
+    return file.getvalue()
+
+
+def tiff(counts, **layout):
+    file = io.BytesIO()
+    tifffile.imwrite(file, counts, metadata=None, **layout)
+    return file.getvalue()
+
+
+def fits_file(counts):
+    file = io.BytesIO()
+    fits.PrimaryHDU(counts.astype(np.uint16)).writeto(file)
+    return file.getvalue()
+
+
+FILES = {
+    "planar TIFF of 16 bits": lambda v: tiff(
+        np.stack([v.astype("u2")] * 3), photometric="rgb", planarconfig="separate"
+    ),
+    "big-endian TIFF in tiles": lambda v: tiff(
+        v.astype("u2"), byteorder=">", tile=(128, 128), compression="zlib", predictor=True
+    ),
+    "TIFF in strips": lambda v: tiff(v, photometric="minisblack", rowsperstrip=64),
+    "PNG": lambda v: saved(v, "PNG"),
+    "JPEG": lambda v: saved(v, "JPEG", quality=95),
+    "FITS": fits_file,
+}
+
+
+def mutated(data, name, draw):
+    """The file with one field of its layout replaced."""
+    data = bytearray(data)
+    if "TIFF" in name:
+        order = "<" if data[:2] == b"II" else ">"
+        (at,) = struct.unpack_from(order + "L", data, 4)
+        (count,) = struct.unpack_from(order + "H", data, at)
+        entry = at + 2 + 12 * draw.randrange(count)
+        place, form = draw.choice(((0, "H"), (2, "H"), (4, "L"), (8, "H"), (8, "L")))
+        struct.pack_into(order + form, data, entry + place, _number(draw, form))
+    elif name == "FITS":
+        word = draw.choice(FITS_WORDS)
+        at = data.find(word.ljust(8) + b"=")
+        at = data.index(b"END     ".rstrip() + b" " * 77) if at < 0 else at
+        values = (
+            "1",
+            "2",
+            "3",
+            "8",
+            "16",
+            "-32",
+            "639",
+            "T",
+            "'BOTTOM-UP'",
+            str(_number(draw, "L")),
+        )
+        data[at : at + 80] = f"{word.decode():<8}= {draw.choice(values):>20}".ljust(80).encode()
+    else:
+        end = min(len(data), 600) if name == "JPEG" else 33
+        data[draw.randrange(2, end)] = draw.randrange(256)
+        data = bytearray(with_right_sums(bytes(data))) if name == "PNG" else data
+    return bytes(data)
+
+
+def _number(draw, form):
+    largest = 1 << (16 if form == "H" else 32)
+    small = draw.choice((0, 1, 2, 3, 4, 5, 6, 8, 16, 32, 64, 255, 256, 257, 262, 284, 317, 640))
+    return draw.choice((small, small, draw.randrange(largest)))
+
+
+@pytest.mark.torture
+@pytest.mark.parametrize("name", FILES)
+def test_a_damaged_layout_gives_no_wrong_attitude(blind, picture, name, seed, figures):
+    data = FILES[name](picture.counts)
+    truth = read_frame(io.BytesIO(data), LIMITS).counts
+    draw = Random(seed)
+    count = size(MUTATIONS, SITTING)
+    same = refused = solved = 0
+    for _ in range(count):
+        try:
+            frame = read_frame(io.BytesIO(mutated(data, name, draw)), LIMITS)
+        except BadFile:
+            refused += 1
+            continue
+        if np.array_equal(frame.counts, truth):
+            same += 1
+        elif count > SITTING or solved < SOLVED:
+            solved += 1
+            _require_right_or_none(frame, blind, picture)
+    figures(mutations=count, same=same, refused=refused, solved=solved)
+    assert refused > 0
+    assert same > 0
+
+
+def _require_right_or_none(frame, blind, picture):
+    try:
+        result = solve_picture(frame, *blind, picture.lens.focal_px)
+    except BadFile:
+        return
+    if result.attitude is None or result.frame.is_turned:
+        # Where the damage is the orientation itself, the answer says so.
+        return
+    error = attitude_error_arcsec(result.attitude.attitude, middle_attitude(picture))
+    assert np.abs(error).max() < RIGHT_ARCSEC, error
