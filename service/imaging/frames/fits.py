@@ -19,6 +19,8 @@ ABSENT = (
     "is compressed by tiles, which needs the package astropy: install the extra `images` "
     "(pip install '.[images]'), or unpack the file with funpack"
 )
+SAFE_METHODS = ("RICE_1", "RICE_ONE", "GZIP_1", "GZIP_2", "NOCOMPRESS")
+"""Decoders that a damaged file does not harm: that of HCOMPRESS_1 writes beyond its memory."""
 COLOURS = 3
 MAX_NAMED = 8
 
@@ -170,6 +172,10 @@ class _Compressed:
             raise bad_frame(ABSENT)
         self._file, self._unit = file, unit
         header = unit.header
+        method = str(header.cards.get("ZCMPTYPE") or "").strip().upper()
+        if method not in SAFE_METHODS:
+            known = ", ".join(SAFE_METHODS)
+            raise bad_frame(f"is compressed by another method than {known}", method[:40])
         exactly_there(file, unit)
         axes = header.image_axes
         tile = 1
