@@ -124,12 +124,10 @@ def test_many_at_once_raise_what_they_would_raise_one_by_one(opened, tight, make
         assert getattr(one, which).value == getattr(many, which).value
 
 
-def test_back_in_limits_an_alarm_meets_the_latest_of_many_as_it_would_meet_each(
-    opened, tight, make
-):
+def test_back_in_limits_an_alarm_meets_the_latest_of_many_as_it_would_meet_each(tight, make):
     """Most alarms wait for somebody while all is well again, and then nothing is judged twice."""
     send(tight, make, ["spurious"] * 3 + ["good"] * 6)
-    together = opened()
+    together = tight
     together.limits.set("SWAS", "unmatched_share", TIGHT, who="jb", comment="the same")
     kinds = ["spurious"] * 3 + ["good"] * 6
     others = [

@@ -60,24 +60,28 @@ def test_a_second_run_over_the_same_record_changes_nothing(filled, opened, datab
     assert day.summary.measurements["accepted"] == 215
     kept = blocks_of(filled, day.id)
     assert {each["grade"] for each in kept} == {"filtered", "smoothed", "innovations"}
-    # Another process, another period.
-    again = opened().grades.smooth("XTE", start=parse_utc("1999-03-01T12:20:00Z"))
+    # Another service, another period.
+    filled.close()
+    reopened = opened()
+    again = reopened.grades.smooth("XTE", start=parse_utc("1999-03-01T12:20:00Z"))
     assert (again.days, again.new) == ([day], set())
-    assert blocks_of(filled, day.id) == kept
+    assert blocks_of(reopened, day.id) == kept
     assert faults(database) == []
 
 
 def test_the_same_record_gives_the_same_bytes(filled, opened):
     (day,) = filled.grades.smooth("XTE").days
     kept = {(each["grade"], each["position"]): each["packed"] for each in blocks_of(filled, day.id)}
-    # Forgotten and computed again by another process.
+    # Forgotten and computed again by another service.
     prune(filled.store, parse_utc("1999-02-01T00:00:00Z"))
     change = update(graded_days).values(inputs="sha256:" + "0" * 64)
     filled.context.change(lambda connection: connection.execute(change))
-    (again,) = opened().grades.smooth("XTE").days
+    filled.close()
+    reopened = opened()
+    (again,) = reopened.grades.smooth("XTE").days
     assert again.revision == 2
     assert again.digest == day.digest
-    new = blocks_of(filled, again.id)
+    new = blocks_of(reopened, again.id)
     assert {(each["grade"], each["position"]): each["packed"] for each in new} == kept
 
 
@@ -117,6 +121,7 @@ def test_suspect_attitudes_are_no_measurements(filled, half_hour):
 def test_other_settings_of_the_gyro_make_a_new_revision(filled, opened):
     (day,) = filled.grades.smooth("XTE").days
     noisier = {"sigma_v_rad_s0_5": 1e-6, "sigma_u_rad_s1_5": 1e-9}
+    filled.close()
     (new,) = opened(gyro=noisier).grades.smooth("XTE").days
     assert new.revision == 2
     assert new.digest != day.digest

@@ -119,6 +119,7 @@ def test_an_export_writes_the_samples(acquire, opened, database):
     assert len(out.splitlines()) == 4
 
 
+@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 def test_two_services_record_no_time_twice(opened, rng):
     """Both send blocks that may share a time at the same moment: each time is recorded once."""
     apps = [opened(), opened()]

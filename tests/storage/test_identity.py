@@ -251,6 +251,7 @@ def test_a_run_whose_making_was_taken_back_is_made_with_the_next_of_its_batches(
     assert [each.run for each in app.runs.all()] == ["another"]
 
 
+@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 def test_two_services_on_one_database_record_a_batch_once(opened, make):
     """The unique constraint decides between processes; whoever loses answers with the winner's."""
     services = [opened(), opened()]
@@ -273,7 +274,8 @@ def test_two_services_on_one_database_record_a_batch_once(opened, make):
     assert count(services[0], results) == len(sent)
 
 
-def test_two_services_that_write_the_same_file_at_once_record_each_batch_once(opened, make):
+@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
+def test_two_services_that_record_the_same_batches_at_once_record_each_once(opened, make):
     """Chunks large enough for COPY on PostgreSQL: the conflict rules are those of inserts."""
     services = [opened(), opened()]
     sent = [make(f"b{i}", after_s=60.0 * i) for i in range(2 * COPIED_FROM)]

@@ -174,18 +174,24 @@ def test_an_unknown_spacecraft_is_not_found_and_the_known_ones_are_named(app):
 
 
 def test_settings_that_change_leave_a_history(opened, tmp_path):
-    before = opened().missions["XTE"].digest
+    first = opened()
+    before = first.missions["XTE"].digest
+    first.close()
     shipped = (SHIPPED_FOLDER / "xte.toml").read_text(encoding="utf-8")
     (tmp_path / "site").mkdir()
     changed = shipped.replace("radius_deg = 10.66", "radius_deg = 11.0")
     (tmp_path / "site" / "xte.toml").write_text(changed, encoding="utf-8")
-    state = opened(missions=tmp_path / "site").spacecraft.state("XTE")
+    second = opened(missions=tmp_path / "site")
+    state = second.spacecraft.state("XTE")
+    second.close()
     assert [each.digest for each in state.history] == [before, state.mission.digest]
     assert state.history[1].settings["zone"]["radius_deg"] == 11.0
     assert state.mission.settings == state.history[1].settings
     # Who goes back to what was, and then begins again with it, used it twice and no more.
     for _ in range(2):
-        returned = opened().spacecraft.state("XTE").history
+        third = opened()
+        returned = third.spacecraft.state("XTE").history
+        third.close()
     assert [each.digest for each in returned] == [before, state.mission.digest, before]
 
 

@@ -207,6 +207,7 @@ def test_splitting_goes_on_where_it_was_stopped(opened, twins, sky, mission, mon
     assert_whole(again)
 
 
+@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 def test_two_processes_that_split_do_it_once(twins, opened, sky, mission, monkeypatch):
     monkeypatch.setattr(split_trackers, "AT_ONCE", 2)
     fill(twins, sky, mission, 5)

@@ -370,19 +370,14 @@ def test_a_dense_hour_goes_in_parts_and_between_them_the_trends_are_right(
 
 
 @pytest.mark.both_databases
-def test_while_it_prunes_batches_are_recorded(opened, make, database):
-    """Another connection prunes the first hour while the second is filled."""
-    app = opened()
+def test_while_it_prunes_batches_are_recorded(app, make, database):
+    """The first hour is pruned while the second is filled."""
     for k in range(20):
         app.submissions.submit(make(f"old{k}", after_s=float(k)))
-    store = Store(database)
-    try:
-        thread = threading.Thread(target=prune, args=(store, shifted(START, 3600.0)))
-        thread.start()
-        new = [app.submissions.submit(make(f"new{k}", after_s=7200.0 + k)).id for k in range(20)]
-        thread.join()
-    finally:
-        store.close()
+    thread = threading.Thread(target=prune, args=(app.store, shifted(START, 3600.0)))
+    thread.start()
+    new = [app.submissions.submit(make(f"new{k}", after_s=7200.0 + k)).id for k in range(20)]
+    thread.join()
     left = app.results.page(limit=500).items
     assert sorted(item.id for item in left) == sorted(new)
     assert verify(database) == []

@@ -4,7 +4,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from sqlalchemy import func, insert, inspect, select, text
+from sqlalchemy import Engine, event, func, insert, inspect, select, text
 from sqlalchemy.exc import IntegrityError, OperationalError
 
 from service.errors import Busy, Stopping
@@ -225,12 +225,20 @@ def test_a_full_disk_loses_nothing_acknowledged_and_writing_resumes_with_room(
 
 
 @pytest.mark.parametrize("database", ["sqlite"], indirect=True)
-def test_it_is_ready_again_only_when_there_is_room_for_a_batch(app, make):
+def test_it_is_ready_again_only_when_there_is_room_for_a_batch(app, make, request):
     """A probe that changes a row succeeds on a full disk, where every post fails."""
     writer = app.store.writer
+    bound = {"pages": 1_000_000}
+
+    def bounded(connection, _record):
+        connection.execute(f"PRAGMA max_page_count = {bound['pages']}")
+
+    # SQLite's own bound is one of a connection; after an error the service takes a new one.
+    event.listen(Engine, "connect", bounded)
+    request.addfinalizer(lambda: event.remove(Engine, "connect", bounded))
 
     def pages(most):
-        # SQLite's own bound, of the connection that writes.
+        bound["pages"] = most
         command = f"PRAGMA max_page_count = {most}"
         writer.change(lambda connection: connection.exec_driver_sql(command).scalar()).result()
 

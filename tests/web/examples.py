@@ -379,7 +379,7 @@ def fresh_walk() -> Json:
         compile_kernels()
         kept_up = {"live_filter": LiveFilterSettings()}
         app = open_app(
-            in_process_settings(sqlite_at(folder / "acquire.db")),
+            in_process_settings(sqlite_at(Path(folder) / "acquire.db")),
             load_missions()["SWAS"].model_copy(update=kept_up),
         )
         with (
