@@ -1,5 +1,6 @@
 """The app: every part of the service, put together in one place."""
 
+from service.access.administration import Tokens
 from service.access.sessions import Access
 from service.acquire.kernel_build import KernelBuild
 from service.app.advice import AdviceService
@@ -25,7 +26,6 @@ from service.app.telemetry.grades import Grades
 from service.app.telemetry.gyro import Gyro
 from service.app.telemetry.live_filter import LiveFilter
 from service.app.telemetry.tracks import Tracks
-from service.app.tokens import Tokens
 from service.app.zones import Zones
 from service.ingest.spool import Spool
 from service.missions.mission import Mission, load_missions

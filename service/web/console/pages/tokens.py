@@ -5,8 +5,8 @@ from typing import Annotated
 from fastapi import Query as InQuery
 from starlette.responses import Response
 
+from service.access.administration import MAX_DAYS
 from service.access.tokens import SCOPES
-from service.app.tokens import MAX_DAYS
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
