@@ -92,7 +92,7 @@ def test_commands_that_print_tables_are_known_to_have_json():
     with_json = {"advise", "database check", "database verify", "demo", "frame", "history"}
     with_json |= {"mission check", "replay", "reprocess", "simulate imaging", "simulate paper"}
     with_json |= {"mission estimate", "simulate mission", "token list", "calibrate", "smooth"}
-    with_json |= {"archive", "archive verify", "archive restore"}
+    with_json |= {"archive", "archive verify", "archive restore", "database forget"}
     found = {name for name in {*COMMANDS, "demo"} if "--json" in _options(name)}
     assert found == with_json
 

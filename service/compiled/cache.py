@@ -25,6 +25,7 @@ SOURCES = (
     "sky",
     "studies/ptp_2015/rivals",
     "tracks/extending.py",
+    "csv_cells.py",
     "errors.py",
     "resources.py",
     "times.py",

@@ -93,11 +93,13 @@ def test_a_tracker_has_the_limits_of_its_spacecraft_until_it_has_its_own(twins, 
     assert SECOND in of_ratio(twins)
 
 
-def test_limits_of_what_has_none_are_refused(twins, app):
+def test_limits_of_what_has_none_are_refused(twins, opened):
     with pytest.raises(BadInput, match="tracker: XTE has STARTRACKER_1, STARTRACKER_2"):
         twins.limits.all("XTE", "STARTRACKER_3")
     with pytest.raises(BadInput, match="tracker: a tracker has"):
         twins.limits.get("XTE", "silence_s", SECOND)
+    twins.close()
+    app = opened()
     (lone,) = app.missions["XTE"].trackers
     with pytest.raises(BadInput, match="tracker: XTE has one tracker"):
         app.limits.all("XTE", lone.name)

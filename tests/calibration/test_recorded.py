@@ -68,7 +68,9 @@ def test_each_change_is_in_force_at_once_after_a_restart_and_an_event(app, opene
     assert app.missions["TWO"].digest == adopted.mission != file
     with pytest.raises(WrongState):
         app.adoptions.adopt(found.id, WHO)
-    assert opened(missions=folder).missions["TWO"].digest == adopted.mission
+    app.close()
+    app = opened(missions=folder)
+    assert app.missions["TWO"].digest == adopted.mission
     back = app.adoptions.revert("TWO", None, WHO)
     assert app.missions["TWO"].digest == back.mission == file
     with pytest.raises(NotFound):

@@ -164,8 +164,9 @@ def test_it_answers_what_smooth_records_and_another_process_answers_the_same(
     assert np.diag(found.covariance_arcsec2) == pytest.approx(
         block.covariance_arcsec2[-1][[0, 3, 5]], rel=1e-6
     )
-    other = opened(live_filter={})
-    assert other.live_filter.latest("XTE") == found
+    live.close()
+    live = opened(live_filter={})
+    assert live.live_filter.latest("XTE") == found
     # Batches without stars are sound records, and come back from the archive.
     assert verify(database) == []
     archive(live.store, tmp_path, parse_utc("1999-03-01T12:10:00Z"))

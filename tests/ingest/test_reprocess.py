@@ -102,7 +102,9 @@ def test_another_mission_file_decides_and_the_comparison_counts_star_by_star(
     opened, missions, noisy
 ):
     """Held against both answers of each batch."""
-    record(opened(mission=by_votes(missions)), noisy)
+    first = opened(mission=by_votes(missions))
+    record(first, noisy)
+    first.close()
     app = opened(mission=wider(missions))
     _, compared = app.runs.reprocess("wider", processes=1)
     before, after = answers_of(app, "live"), answers_of(app, "wider")
@@ -205,12 +207,13 @@ def test_a_run_of_other_settings_is_not_mixed_with_these(opened, missions, make)
     first = opened()
     first.submissions.submit(make())
     first.runs.reprocess("again", processes=1)
-    with pytest.raises(BadBatch, match="run: holds results of XTE with another mission"):
-        opened(mission=wider(missions)).runs.reprocess("again", processes=1)
     with pytest.raises(BadBatch, match="must be another run"):
         first.runs.reprocess("live", processes=1)
     with pytest.raises(NotFound):
         first.runs.reprocess("again", spacecraft="NOPE")
+    first.close()
+    with pytest.raises(BadBatch, match="run: holds results of XTE with another mission"):
+        opened(mission=wider(missions)).runs.reprocess("again", processes=1)
 
 
 def test_a_run_of_another_catalog_is_not_mixed_with_this_one(opened, sky, tmp_path, make):
@@ -218,6 +221,7 @@ def test_a_run_of_another_catalog_is_not_mixed_with_this_one(opened, sky, tmp_pa
     first = opened()
     first.submissions.submit(make())
     first.runs.reprocess("again", processes=1)
+    first.close()
     file = tmp_path / "other.npz"
     save(sky.catalog, file)
     other = opened(catalog=file)
@@ -229,11 +233,14 @@ def test_a_run_of_another_catalog_is_not_mixed_with_this_one(opened, sky, tmp_pa
 
 def test_a_run_without_a_name_is_named_after_the_settings(opened, missions, make):
     """The same settings find it again, others do not."""
-    first, other = opened(), opened(mission=wider(missions))
+    first = opened()
     first.submissions.submit(make())
-    names = [each.runs.reprocess(None, processes=1)[0].run for each in (first, first, other)]
+    names = [first.runs.reprocess(None, processes=1)[0].run for _ in range(2)]
+    first.close()
+    other = opened(mission=wider(missions))
+    names.append(other.runs.reprocess(None, processes=1)[0].run)
     assert names[0] == names[1] != names[2]
-    assert len(answers_of(first, names[0])) == 1
+    assert len(answers_of(other, names[0])) == 1
 
 
 def test_a_batch_that_no_longer_fits_is_refused_by_name_and_the_rest_goes_on(
@@ -242,6 +249,7 @@ def test_a_batch_that_no_longer_fits_is_refused_by_name_and_the_rest_goes_on(
     first = opened()
     for name in ("b1", "b2"):
         first.submissions.submit(make(name))
+    first.close()
     settings = missions["XTE"].model_dump()
     settings["trackers"][0]["name"] = "OTHER"
     renamed = opened(mission=Mission.model_validate(settings))
@@ -249,5 +257,5 @@ def test_a_batch_that_no_longer_fits_is_refused_by_name_and_the_rest_goes_on(
     assert (progress.recorded, progress.refused) == (0, 2)
     assert progress.refusals[0].startswith("b1: observations.0.tracker: XTE has OTHER")
     assert compared.batches == 0
-    with first.store.reading() as connection:
+    with renamed.store.reading() as connection:
         assert connection.scalar(select(func.count()).select_from(batches)) == 2

@@ -114,14 +114,17 @@ def find_points(
     u, v, ratio = u[order], v[order], ratio[order]
     weight = max(psf, 1.0)
     shapes = _moments(light, u, v, weight)
+    # A place between two dark pixels may stand out behind the filter without any light of its own.
+    lit = shapes.weighted > 0.0
+    ratio = ratio[lit]
     sigma = np.maximum(PLACE_NOISE * psf / np.maximum(ratio, 1.0), _LEAST_SIGMA_PX)
     offset = 0.5 * (binning - 1)
     return PointSources(
-        u_px=read_only(shapes.u_px * binning + offset),
-        v_px=read_only(shapes.v_px * binning + offset),
+        u_px=read_only(shapes.u_px[lit] * binning + offset),
+        v_px=read_only(shapes.v_px[lit] * binning + offset),
         sigma_px=read_only(sigma * binning),
         signal_ratio=read_only(ratio),
-        flux_counts=read_only(shapes.weighted * (1.0 + (psf / weight) ** 2) * binning**2),
+        flux_counts=read_only(shapes.weighted[lit] * (1.0 + (psf / weight) ** 2) * binning**2),
         psf_sigma_px=psf * binning,
         noise_counts=max(float(background.globalrms), step / math.sqrt(12.0)),
         background_counts=float(background.globalback),

@@ -55,7 +55,7 @@ def read_tiff(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
     number, remarks = chosen_page(_subfiles(file), limits.image)
     try:
         file.seek(0)
-        with TiffFile(file, _multifile=False, is_ndpi=False) as opened:
+        with TiffFile(file, name="frame", _multifile=False, is_ndpi=False) as opened:
             page: Any = opened.pages[number]
             _require_readable(page, limits)
             tag = page.tags.valueof(TAG)

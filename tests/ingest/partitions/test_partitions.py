@@ -65,13 +65,15 @@ def test_with_the_same_settings_every_star_comes_out_alike_and_with_others_not(
     settings = missions["XTE"].model_dump()
     settings["identifier"] = "starid"
     settings["tolerances"]["separation_deg"] = 0.004
+    archived.close()
     other = opened(mission=Mission.model_validate(settings), archive_folder=place)
     again(other, place, "tight", spacecraft="XTE")
     compared = other.runs.compare("live", "tight", "XTE")
     assert compared.batches == BATCHES
     assert any(each.is_change for each in compared.stars.transitions)
+    other.close()
     with pytest.raises(BadBatch, match="holds results of XTE with another mission"):
-        again(archived, place, "tight", spacecraft="XTE")
+        again(opened(archive_folder=place), place, "tight", spacecraft="XTE")
 
 
 def test_trends_pages_and_lists_of_the_run_are_those_of_a_recorded_one(archived, place):
@@ -252,6 +254,7 @@ def test_a_batch_that_no_longer_fits_is_refused_by_name_and_the_rest_goes_on(
 ):
     settings = missions["SWAS"].model_dump()
     settings["trackers"][0]["name"] = "OTHER"
+    archived.close()
     renamed = opened(mission=Mission.model_validate(settings), archive_folder=place)
     progress = again(renamed, place)
     assert (progress.recorded, progress.refused) == (BATCHES, 12)
