@@ -118,7 +118,7 @@ def test_noise_heaped_in_a_corner_is_no_cluster_of_stars(blind):
     picture = draw_picture(np.random.default_rng((77, 12)), blind[0])
     result = solve_picture(frame_of(picture.counts), *blind, 0.9 * picture.lens.focal_px)
     heaped = (result.points.u_px < 100) & (result.points.v_px < 100)
-    assert heaped.mean() > 0.5
+    assert heaped.mean() >= 0.5, "the scene: at least half of the points lie in the corner"
     assert result.attitude is None
     assert result.search.best_log_odds < 0
 
