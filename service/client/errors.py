@@ -199,7 +199,7 @@ def problem_of(response: httpx.Response) -> Problem:
         # Not of the service but of a proxy before it, for example.
         status, text = response.status_code, response.text[:200].strip()
         detail = f"HTTP {status}: {text}" if text else f"HTTP {status}"
-        if place := response.headers.get("Location"):
+        if response.is_redirect and (place := response.headers.get("Location")):
             leads = response.request.url.join(place)
             detail = f"HTTP {status} leads to {leads}: give the client that address"
         path = response.request.url.path

@@ -38,6 +38,7 @@ IDLE_S = 600.0
 """After so long without a chunk the processes end, and give their memory back."""
 MOST_STARTS = 3
 """Of processes for one chunk, where they die before they have it."""
+SERVER_RETRY_S = 0.1
 MOST_DEATHS = 2
 """A chunk that was alone at work when so many processes died is given up."""
 
@@ -236,7 +237,11 @@ class LocalWorkers(Generic[Input, Output]):
                 processes = self._processes or self._open()
             except OSError as error:
                 reason = f"no process can be started: {error}"
-                break
+                if not isinstance(error, ConnectionError):
+                    break
+                # The server of the workers has died, and is not known to have done so yet.
+                time.sleep(SERVER_RETRY_S)
+                continue
             try:
                 future = processes.executor.submit(compute, self._work, chunk.task)
             except BrokenProcessPool:

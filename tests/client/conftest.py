@@ -23,9 +23,19 @@ def example():
 
 
 @pytest.fixture(scope="module")
-def address(chosen_database):
+def served(chosen_database):
     with serving_in_process(chosen_database()) as service:
-        yield service.url
+        yield service
+
+
+@pytest.fixture
+def app(served):
+    return served.app
+
+
+@pytest.fixture(scope="module")
+def address(served):
+    return served.url
 
 
 @pytest.fixture

@@ -417,7 +417,7 @@ def test_whoever_stops_the_whole_group_stops_it_in_order(tmp_path, long_replay, 
     app = open_app(Settings(database=served.database))
     try:
         newest, _ = app.replays.all()
-        assert newest.state == "interrupted"
+        assert newest.state == "waiting"
         names = names_in(app, "bulk")
         assert len(names) == newest.lines.done < len(long_replay)
         assert set(names) == {f"n{k}" for k in range(len(names))}

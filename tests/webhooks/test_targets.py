@@ -69,17 +69,16 @@ FORMS = [
     ("https://receiver.example/".ljust(MAX_URL + 1, "a"), "characters"),
 ]
 
+LOOPBACK = ["localhost", "2130706433", "0x7f000001", "127.1"]
+"""Plain http to them is refused when it is asked for."""
+
 NAMES = [
-    "localhost",
-    "2130706433",
-    "0x7f000001",
-    "127.1",
     "rebind.example",
     "mixed.example",
     "metadata.example",
     "mapped.example",
 ]
-"""They are refused when an attempt resolves them; the last four by a name server of ours."""
+"""They are refused when they are resolved, by a name server of ours."""
 
 
 @pytest.mark.parametrize("url", LITERALS)
@@ -133,7 +132,7 @@ def names(monkeypatch):
         "metadata.example": [["169.254.169.254"]],
         "mapped.example": [["::ffff:127.0.0.1"]],
         "mixed.example": [["127.0.0.2", "127.0.0.1"]],
-        "rebind.example": [["127.0.0.2"], ["127.0.0.1"]],
+        "rebind.example": [["127.0.0.2"], ["127.0.0.2"], ["127.0.0.1"]],
         "good.example": [["127.0.0.2"]],
         "xn--fa-hia.example": [["127.0.0.2"]],
     }
@@ -163,15 +162,23 @@ def guarded(chosen_database):
 
 def test_names_are_refused_on_the_address_that_they_resolve_to(guarded, names):
     with receiving("127.0.0.2") as world, receiving("127.0.0.1", world.port) as inside:
+        for name in LOOPBACK:
+            local = {"name": "local", "url": f"http://{name}:{world.port}/"}
+            assert guarded.client.post(HERE, json=local).status_code == 422, name
         for name in NAMES:
-            hook = guarded.hook(f"http://{name}:{world.port}/")
+            asked = {"name": name, "url": f"http://{name}:{world.port}/"}
+            answer = guarded.client.post(HERE, json=asked)
+            if answer.status_code == 422:
+                assert name != "rebind.example"
+                continue
+            hook = answer.json()
             told = guarded.ask(hook, "test").json()
             if name == "rebind.example":
-                # The first look-up is public, and the only one: it is where the request goes.
+                # One look-up for each attempt, and its address is where the request goes.
                 assert told["delivered"] is True
-                assert names.count(name) == 1
-                told = guarded.ask(hook, "test").json()
                 assert names.count(name) == 2
+                told = guarded.ask(hook, "test").json()
+                assert names.count(name) == 3
             assert told["delivered"] is False, name
             assert told["fault"].startswith("refused: "), (name, told)
         assert inside.requests == []
