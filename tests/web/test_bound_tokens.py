@@ -18,7 +18,7 @@ from tests.web.serving import Server
 
 SERVICE_TIME = re.compile(r"20[2-9]\d-\d\d-\d\d( \(\d+\))?[ T][\d:.]+Z?")
 VARIES = re.compile(
-    r'"(received_age_s|age_s|\w+_us)": ?[\d.e-]+|data-age="\d+">[^<]*|[\d.,]+\u202f[µm]s'
+    r'"(received_age_s|age_s|\w+_us)": ?[\d.e-]+|data-age="\d+">[^<]*|[\d.,\u202f]+[µm]s'
 )
 """Ages, and the times that computing took."""
 QUERIES = [
