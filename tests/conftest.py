@@ -29,6 +29,7 @@ from service.missions.mission import SHIPPED_FOLDER, load_missions
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
+from service.storage.projections import projector
 from tests import fresh_databases, scale
 from tests.fresh_databases import sqlite_at
 from tests.torture import FIGURES
@@ -186,6 +187,12 @@ def logging_as_before():
     ]
     root.setLevel(levels[0])
     service.setLevel(levels[1])
+
+
+@pytest.fixture(autouse=True)
+def projections_waited_for(monkeypatch):
+    """Readers wait for the projections as long as it takes, however busy the machine is."""
+    monkeypatch.setattr(projector, "WAIT_S", 60.0)
 
 
 @pytest.fixture

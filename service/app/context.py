@@ -35,8 +35,12 @@ class Context:
     store: Store
 
     def reading(self) -> AbstractContextManager[Connection]:
-        """A connection that sees one moment of the database; see `Readers.reading`."""
+        """A connection that sees one moment of the record and its projections; see `Store`."""
         return self.store.reading()
+
+    def reading_record(self) -> AbstractContextManager[Connection]:
+        """A connection for what reads no projection, and so waits for none."""
+        return self.store.reading_record()
 
     def reading_batch(self, id: str) -> AbstractContextManager[tuple[Connection, bool]]:
         """A connection that has the batch of a result; see `Store.reading_batch`."""

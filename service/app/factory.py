@@ -33,6 +33,7 @@ from service.settings import Settings, is_loopback
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import open_catalog
 from service.sky.model import SkyModel
+from service.storage.projections.projector import Projector
 from service.storage.queries.replays import mark_interrupted
 from service.storage.recording.results import register
 from service.storage.sql.database import Store
@@ -55,8 +56,9 @@ class App:
         self.sky = context.sky
         self.store = context.store
         self.single_writer = SingleWriter(context.store)
+        self.projector = Projector(context.store)
         self.access = Access(
-            context.reading, context.change, is_loopback(context.settings.host), utc_now
+            context.reading_record, context.change, is_loopback(context.settings.host), utc_now
         )
         self.tokens = Tokens(context, context.missions)
         self.submissions = Submissions(context, kernels)
@@ -80,7 +82,7 @@ class App:
         self.zones = Zones(context)
         self.events = Events(context)
         self.audit = Audit(context)
-        self.expiries = ExpiryDates(context.reading)
+        self.expiries = ExpiryDates(context.reading_record)
         self.webhooks = Webhooks(context, self.access)
         self.tracker_split = BackgroundSplit(
             TrackerSplitter(context.store, context.sky, context.missions)
@@ -96,7 +98,7 @@ class App:
         )
 
     def close(self) -> None:
-        """Stop the replays, write what is queued, and close the database."""
+        """Stop the replays, write and project what is queued, and close the database."""
         self.single_writer.stop()
         self.webhooks.sender.stop()
         self.replays.stop()
@@ -104,6 +106,7 @@ class App:
         self.live_filter.stop()
         self.tracker_split.stop()
         self.submissions.close()
+        self.projector.close()
         self.store.close()
         self.service.close()
 
@@ -155,6 +158,7 @@ def open_app(
 
     try:
         app.single_writer.start(take_over, lambda: app.adoptions.follow(leave))
+        app.projector.start()
     except BaseException:
         app.close()
         raise

@@ -166,7 +166,7 @@ class Replays:
                 self._context.change(close)
 
     def _resume(self, about: SpooledReplay) -> None:
-        with self._context.reading() as connection:
+        with self._context.reading_record() as connection:
             stored = find_replay(connection, about.id)
         if stored is None or stored.state not in (*UNFINISHED, "interrupted"):
             self._spool.drop(about.id)
@@ -254,12 +254,12 @@ class Replays:
 
     def all(self) -> list[Replay]:
         """The latest replays and their progress, newest first."""
-        with self._context.reading() as connection:
+        with self._context.reading_record() as connection:
             return list_replays(connection)
 
     def get(self, id: str) -> Replay:
         """A replay and how far it is, with the lines that were refused."""
-        with self._context.reading() as connection:
+        with self._context.reading_record() as connection:
             return read_replay(connection, known_id(id, "replay"))
 
     def processes(self) -> int:

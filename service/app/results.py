@@ -49,7 +49,7 @@ class Results:
         run = run or LIVE
         mission_named(self._context.missions, spacecraft)
         selected = ResultFilter(run, spacecraft)
-        with self._context.reading() as connection:
+        with self._context.reading_record() as connection:
             id = results.newest_id(connection, selected, utc_now())
             if id is None:
                 raise NotFound(f"{spacecraft} has no batch in the run {run}")
@@ -75,7 +75,7 @@ class Results:
         Raises `BadBatch` for a spacecraft that has neither batches nor a mission.
         """
         stretch = ResultFilter(None if run == ALL_RUNS else run or LIVE, spacecraft, start, end)
-        with self._context.reading() as connection:
+        with self._context.reading_record() as connection:
             page = results.list_batches(
                 connection,
                 self._context.store.archive,
@@ -95,7 +95,7 @@ class Results:
         """The results before and after one in time: `earlier` and `later`, or None."""
         with self._context.reading_batch(known_id(id, "batch")) as (connection, _):
             here = here_of(connection, id)
-        with self._context.reading() as connection:
+        with self._context.reading_record() as connection:
             return neighbours(connection, self._context.store.archive, here)
 
     def star_field(self, id: str, answer: Answer | None = None) -> StarField:
@@ -133,7 +133,7 @@ class Results:
         """
         mission_named(self._context.missions, spacecraft)
         span = BucketFilter(spacecraft, run or LIVE, start, end)
-        with self._context.reading() as connection:
+        with self._context.reading_record() as connection:
             sample = sample_period(connection, span)
         return period_stars(sample, self._context.sky)
 
@@ -147,7 +147,7 @@ class Results:
         """The spacecraft that a recorded result belongs to; None where there is no such result."""
         if not is_ulid(id):
             return None
-        with self._context.reading() as connection:
+        with self._context.reading_record() as connection:
             return results.spacecraft_of(connection, id)
 
     def what_if(

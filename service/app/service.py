@@ -19,7 +19,7 @@ from service.ingest.kernel_progress import progress_logged
 from service.missions.identifiers import IDENTIFIERS
 from service.observations.schema import submission_from_json
 from service.storage.models.overview import About, CatalogAbout, MissionAbout
-from service.storage.recording.alarm_evaluation import latest_inputs
+from service.storage.projections.alarms import latest_inputs
 from service.storage.recording.ids import Ulids
 from service.storage.upkeep.expiries import ExpiryDates
 from service.storage.upkeep.split_trackers import BackgroundSplit
@@ -85,7 +85,7 @@ class Service:
         self._single_writer.require()
         self._context.store.writer.require()
         self._context.store.writer.require_written()
-        with self._context.reading() as connection:
+        with self._context.reading_record() as connection:
             connection.exec_driver_sql("SELECT 1")
 
     def _prepare(self) -> None:
@@ -136,7 +136,7 @@ class Service:
         The latest batch of each is processed again under a new id and rolled back; if there
         are few, several times, because code runs slowly at first.
         """
-        with self._context.reading() as connection:
+        with self._context.reading_record() as connection:
             inputs = latest_inputs(connection)
         for text in inputs:
             try:

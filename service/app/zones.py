@@ -57,7 +57,7 @@ class Zones:
         """
         mission = mission_named(self._context.missions, name)
         place = ResultFilter(run or LIVE, name)
-        with self._context.reading() as connection:
+        with self._context.reading_record() as connection:
             time = latest_time(connection, place, utc_now())
             _, samples = latest_samples(connection, place, "a_priori_angle_deg", MOST_ERRORS)
         run_catalog = self._context.sky.run_catalog(mission, time or utc_now())

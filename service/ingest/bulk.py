@@ -120,7 +120,7 @@ class Bulk:
         self.workers.start()
         self._submissions.yield_to_interactive()
         named = [identity_in(text, run) for text in texts]
-        with self._store.reading() as connection:
+        with self._store.reading_record() as connection:
             registry = look_up(connection, {each for each in named if each is not None})
             ids = {each.result_id for each in registry.identities.values()}
             stored = self._store.archive.answers_or_faults(connection, ids)

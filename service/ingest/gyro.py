@@ -33,7 +33,7 @@ class GyroIntake:
         require_rates_within(block, largest_rate_deg_per_s(mission.gyro))
         row = row_of(block, self._ids.new(), utc_now())
         # Looked up here as well: an error in the writer's transaction would make it begin anew.
-        with self._store.reading() as connection:
+        with self._store.reading_record() as connection:
             found = find_block(connection, block, row)
         if found is not None:
             recorded = Recorded(found, replayed=True)

@@ -138,7 +138,7 @@ def require_same_settings(store: Store, plan: ReprocessPlan, catalog_digest: str
     made_with = select(
         results.c.spacecraft, results.c.mission_digest, results.c.catalog_digest
     ).where(results.c.run == plan.run, results.c.current)
-    with store.reading() as connection:
+    with store.reading_record() as connection:
         for spacecraft, mission, catalog in connection.execute(made_with.distinct()):
             if spacecraft not in plan.missions:
                 continue
@@ -198,7 +198,7 @@ def _counted(store: Store, plan: ReprocessPlan) -> ReprocessProgress:
     joined = (
         select(func.count()).select_from(results).join(batches, results.c.batch_id == batches.c.id)
     )
-    with store.reading() as connection:
+    with store.reading_record() as connection:
         total = connection.scalar(joined.where(*_conditions(plan))) or 0
         left = connection.scalar(joined.where(*_conditions(plan), not_yet(plan.run))) or 0
     return ReprocessProgress(plan.run, int(total), int(total) - int(left))
@@ -216,7 +216,7 @@ def _chunks(store: Store, plan: ReprocessPlan) -> Iterator[list[StoredBatch]]:
     )
     while True:
         beyond = query if place is None else query.where(after_place(place))
-        with store.reading() as connection:
+        with store.reading_record() as connection:
             rows = connection.execute(beyond).all()
         if not rows:
             return
@@ -235,6 +235,7 @@ def _record(
 ) -> None:
     unsaved_results = [each for each in found if isinstance(each, UnsavedResult)]
     refused = [each for each in found if isinstance(each, RefusedBatch)]
+    store.hold_back()
     outcomes = store.writer.record(unsaved_results).result() if unsaved_results else []
     for unsaved, outcome in zip(unsaved_results, outcomes, strict=True):
         if isinstance(outcome, Answered):
@@ -261,7 +262,7 @@ def _track(
             mission = plan.missions[submission.batch.spacecraft]
             found: UnsavedResult | RefusedBatch
             try:
-                with store.reading() as connection:
+                with store.reading_record() as connection:
                     submission = tracked_again(
                         connection, submission, mission, plan.stretch.run or LIVE
                     )

@@ -161,7 +161,7 @@ class SubmissionService:
         return outcome
 
     def _submit_together(self, submissions: Sequence[Submission]) -> Answers:
-        with self._store.reading() as connection:
+        with self._store.reading_record() as connection:
             registry = look_up(connection, {identity_of(each.batch) for each in submissions})
             holders = [
                 holder_of(registry, identity_of(each.batch), None, each.fingerprint)
@@ -272,6 +272,7 @@ class SubmissionService:
         """Queue many results for a transaction; to call what it gives waits for the answers."""
         if not unsaved_results:
             return list
+        self._store.hold_back()
         note_handed_over(unsaved_results)
         future = self._store.writer.record(unsaved_results, low_priority=True)
 
@@ -313,7 +314,7 @@ class SubmissionService:
         submission = pending.make()
         if self.solver.asks_for_last(submission.batch):
             mission = self.solver.missions[submission.batch.spacecraft]
-            with self._store.reading() as connection:
+            with self._store.reading_record() as connection:
                 submission = with_prediction(connection, submission, mission)
         unsaved = self.solver.solve(submission, pending.received, pending.key)
         note_handed_over([unsaved])
@@ -335,7 +336,7 @@ class SubmissionService:
         repeats = {each.result_id for each in holders if isinstance(each, ExistingResult)}
         stored: Mapping[str, bytes | AcquisitionError] = {}
         if repeats:
-            with self._store.reading() as connection:
+            with self._store.reading_record() as connection:
                 stored = self._store.archive.answers_or_faults(connection, repeats)
         return [
             self._repeat(pending, holder, stored, registry)

@@ -353,20 +353,20 @@ class WebhookSender:
         return await asyncio.wrap_future(self._store.writer.change(change))
 
     def _list(self) -> Sequence[Registered]:
-        with self._store.reading() as connection:
+        with self._store.reading_record() as connection:
             if not count_webhooks(connection):
                 return ()
         is_open = self._is_open()
-        with self._store.reading() as connection:
+        with self._store.reading_record() as connection:
             return registered_webhooks(connection, utc_now().text, is_open)
 
     def _last_and_waiting(self) -> tuple[int, dict[str, int]]:
-        with self._store.reading() as connection:
+        with self._store.reading_record() as connection:
             return last_event(connection), deliveries.count_waiting(connection)
 
     def _after(self, position: int) -> tuple[Sequence[Event], int]:
         """The next events, and how many are no longer kept; none where the position is unknown."""
-        with self._store.reading() as connection:
+        with self._store.reading_record() as connection:
             found = events_after(connection, position, READ_AT_ONCE)
             if found is not None:
                 return found, 0
@@ -377,9 +377,9 @@ class WebhookSender:
             return kept or (), first - 1 - position
 
     def _heads(self) -> list[tuple[Queue, str]]:
-        with self._store.reading() as connection:
+        with self._store.reading_record() as connection:
             return deliveries.heads(connection)
 
     def _next_of(self, queue: Queue) -> list[Waiting]:
-        with self._store.reading() as connection:
+        with self._store.reading_record() as connection:
             return deliveries.next_of(connection, queue, DELIVERED_AT_ONCE)

@@ -65,5 +65,5 @@ class Turn:
         return True
 
     def _read(self) -> tuple[str | None, int]:
-        with self._store.reading() as connection:
+        with self._store.reading_record() as connection:
             return read_sender(connection)

@@ -1,11 +1,10 @@
 """Many results at once, through the writer's own statements, without their stars."""
 
-from service.storage.recording import rollups
+from service.storage.projections import rollups
 from service.storage.recording.ids import Ulids
-from service.storage.recording.unsaved_result import Buckets
 from service.storage.sql.statements import insert_all, insert_runs
 from service.storage.sql.tables import batches, results
-from service.times import DAY_S, HOUR_S, parse_utc
+from service.times import HOUR_S, parse_utc
 
 
 def result_row(app, time, *, spacecraft="XTE", run="live", name="b", **values):
@@ -28,6 +27,7 @@ def result_row(app, time, *, spacecraft="XTE", run="live", name="b", **values):
         "batch_id": id,
         "parent_id": None,
         "current": True,
+        "seq": 0,
         "created": time.text,
         "spacecraft": spacecraft,
         "run": run,
@@ -54,18 +54,17 @@ def result_row(app, time, *, spacecraft="XTE", run="live", name="b", **values):
 
 
 def put(app, rows):
-    """Record the rows as the writer would, trends included."""
+    """Record the rows as if they were projected already: their part in the trends included."""
 
     def write(connection):
         names = {batch["run"]: batch["received"] for batch, _ in rows}
         insert_runs(connection, names)
         insert_all(connection, batches, [batch for batch, _ in rows])
         insert_all(connection, results, [result for _, result in rows])
-        rollups.add(connection, [(_buckets(batch), result) for batch, result in rows])
+        rollups.add(connection, [(_hour(batch), result) for batch, result in rows])
 
     app.store.writer.change(write).result()
 
 
-def _buckets(batch):
-    time = parse_utc(batch["time"])
-    return Buckets(batch["spacecraft"], batch["run"], time.bucket(HOUR_S), time.bucket(DAY_S))
+def _hour(batch):
+    return batch["spacecraft"], batch["run"], parse_utc(batch["time"]).bucket(HOUR_S)

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from service.storage.recording import rollups
+from service.storage.projections import rollups
 
 
 def assert_equal_to_a_recount(connection):

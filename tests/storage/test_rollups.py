@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from service.errors import BadInput
 from service.observations.schema import OptionsIn
-from service.storage.recording import rollups
+from service.storage.projections import rollups
 from service.times import parse_utc
 from tests.storage.recount import assert_equal_to_a_recount
 from tests.storage.samples import KINDS

@@ -9,7 +9,7 @@ from sqlalchemy import delete, insert, select
 from service.cli import main
 from service.errors import BadInput
 from service.observations.schema import OptionsIn
-from service.storage.recording import rollups
+from service.storage.projections import rollups
 from service.storage.sql.rollup_tables import (
     tracker_rollups_daily,
     tracker_rollups_hourly,
@@ -43,7 +43,10 @@ def fill(app, sky, mission, count=12, **wanted):
     """Batches over nine hours, whose second tracker is noisy."""
     given = {"noise_arcsec": (1.0, 9.0), "offset_mag": 0.15} | wanted
     made = [submission(sky, mission, f"b{k}", after_s=3000.0 * k, **given) for k in range(count)]
-    return [each.id for each in app.submissions.submit_many(made)]
+    answered = app.submissions.submit_many(made)
+    with app.store.reading():
+        """All is projected."""
+    return [each.id for each in answered]
 
 
 def rows_of(app):

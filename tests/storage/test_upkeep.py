@@ -16,7 +16,7 @@ from service.observations.schema import OptionsIn
 from service.settings import Settings
 from service.simulate.frame_files import frame_bytes
 from service.simulate.frames import FrameSettings, draw_frames
-from service.storage.recording import rollups
+from service.storage.projections import rollups
 from service.storage.sql.columns import metadata
 from service.storage.sql.database import Store
 from service.storage.sql.engines import database_url

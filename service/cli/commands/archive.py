@@ -89,9 +89,12 @@ def archive(parsed: Namespace) -> int:
     folder = _folder(parsed.to, "--to")
     require_extra("tables", "pyarrow", "--to", str(folder))
     from service.storage.archive import archiving
+    from service.storage.projections.projector import Projector
 
     settings = settings_of_existing(parsed)
     store = Store(settings.database, create=False)
+    projector = Projector(store)
+    projector.start()
     try:
         store.require_writing()
         with tqdm(total=None, unit=" batches", desc="archiving", disable=None, leave=False) as b:
@@ -102,6 +105,7 @@ def archive(parsed: Namespace) -> int:
 
             done = archiving.archive(store, folder, before, step=step)
     finally:
+        projector.close()
         store.close()
     if parsed.json:
         print_json({"batches": done.batches, "files": done.parts, "bytes": done.bytes})

@@ -238,6 +238,7 @@ def prune(parsed: Namespace) -> int:
     """Delete old batches."""
     from tqdm import tqdm
 
+    from service.storage.projections.projector import Projector
     from service.storage.sql.database import Store
     from service.storage.upkeep.prune import Pruned
     from service.storage.upkeep.prune import prune as prune_records
@@ -245,6 +246,8 @@ def prune(parsed: Namespace) -> int:
 
     before = parse_utc(parsed.before, "--before")
     store = Store(settings_of_existing(parsed).database, create=False)
+    projector = Projector(store)
+    projector.start()
     try:
         with tqdm(total=None, unit=" batches", desc="deleting", disable=None, leave=False) as bar:
 
@@ -254,6 +257,7 @@ def prune(parsed: Namespace) -> int:
 
             pruned = prune_records(store, before, parsed.run, dry_run=parsed.dry_run, step=step)
     finally:
+        projector.close()
         store.close()
     if parsed.dry_run:
         more = _beside(pruned.total_gyro_blocks, pruned.total_graded_days)

@@ -91,7 +91,7 @@ def reprocess_partitions(
         require_same_settings(store, plan, catalog_digest)
         planner = Planner(store, folder, plan, catalog_digest)
         planner.require_same_settings()
-        with store.reading() as connection:
+        with store.reading_record() as connection:
             claim(connection, folder)
             digests = [each.digest for each in plan.missions.values()]
             keep_settings(connection, folder, digests, [catalog_digest])

@@ -44,8 +44,8 @@ from service.storage.archive.rows import (
     to_partition,
 )
 from service.storage.archive.tables import archived_batches, archived_parts, archived_what_ifs
+from service.storage.projections import rollups
 from service.storage.queries.tracker_splits import is_waiting
-from service.storage.recording import rollups
 from service.storage.recording.archived_hours import keep_share
 from service.storage.sql.database import Store
 from service.storage.sql.rollup_tables import rollups_daily, rollups_hourly
@@ -275,9 +275,12 @@ def _take_out(connection: Connection, day: _Day, part: Part, path: str, written:
     insert_all(connection, archived_what_ifs, further.to_pylist())
     of_hour = _by_hour(day, written)
     # Who counts an hour anew reads its results, then its shares: all of it before, or after.
-    rollups.lock(connection, ((day.spacecraft, day.run, hour) for hour in of_hour))
+    position = rollups.lock_position(connection)
     keep_share(connection, number, day.spacecraft, day.run, of_hour)
     delete_batches(connection, ids)
+    if pc.max(made["seq"]).as_py() > position:
+        # The projector will not find them any more.
+        rollups.renew(connection, ((day.spacecraft, day.run, hour) for hour in of_hour))
     return True
 
 

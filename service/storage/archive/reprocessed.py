@@ -30,17 +30,18 @@ from service.storage.archive.folder import (
 from service.storage.archive.restoring import put_back
 from service.storage.archive.rows import Rows, from_partition
 from service.storage.archive.tables import archived_batches, archived_parts
-from service.storage.recording import events, rollups
-from service.storage.recording.alarm_evaluation import evaluate_limits, runs_with_alarms
+from service.storage.projections import alarms, rollups
+from service.storage.projections.recorded import RecordedResult
+from service.storage.recording import events
 from service.storage.recording.archived_hours import WHOLE, insert_share
 from service.storage.recording.identity import look_up
 from service.storage.recording.result_metrics import rolled_up
-from service.storage.recording.unsaved_result import STARS, Buckets, UnsavedResult
+from service.storage.recording.unsaved_result import STARS
 from service.storage.sql.columns import Row
 from service.storage.sql.database import Store
 from service.storage.sql.rollup_tables import rollups_hourly
 from service.storage.sql.tables import batches, runs
-from service.times import DAY_S, HOUR_S, bucket_start, parse_utc, recorded_utc
+from service.times import DAY_S, HOUR_S, bucket_start, parse_utc
 
 IDENTITY = ("id", "spacecraft", "run", "batch", "fingerprint")
 """The columns of a batch that stay in the database."""
@@ -80,7 +81,7 @@ def run_part(name: str, source: str, rows: Rows, content: bytes) -> RunPart:
 
 
 def _latest(rows: Rows) -> Row:
-    """As `results._note_events` has it."""
+    """As `projections.states` has it."""
     batch = rows["batches"].slice(len(rows["batches"]) - 1).to_pylist()[0]
     (result,) = (
         rows["results"].filter(pc.equal(rows["results"]["batch_id"], batch["id"])).to_pylist()
@@ -141,10 +142,10 @@ def _merge(connection: Connection, folder: Path, path: str, made: RunPart) -> No
     # Whoever counts an hour anew locks its rollup and then reads the shares.
     rollups.add_shares(connection, spacecraft, run, made.shares)
     insert_share(connection, number, spacecraft, run, made.shares)
-    if runs_with_alarms(connection, {run}):
+    if alarms.runs_with_alarms(connection, {run}):
         content = whole_content(folder, path, made.part.sha256)
-        for unsaved_results in _as_recorded(from_partition(read_partition(content))):
-            evaluate_limits(connection, unsaved_results)
+        for some_results in _as_recorded(from_partition(read_partition(content))):
+            alarms.apply(connection, some_results)
     told = {"spacecraft": spacecraft, "run": run, "batches": made.part.batches}
     told |= {"latest": made.latest}
     events.add_event(connection, "batches", told, run=run, spacecraft=spacecraft)
@@ -157,32 +158,16 @@ def _taken(made: RunPart, what: str) -> BadConfiguration:
     )
 
 
-def _as_recorded(rows: Rows) -> Iterator[Sequence[UnsavedResult]]:
+def _as_recorded(rows: Rows) -> Iterator[Sequence[RecordedResult]]:
     """The results of a part as they would have been recorded, in order of time, some at a time."""
     made = {row["batch_id"]: row for row in rows["results"].drop_columns(["answer"]).to_pylist()}
     trackers: dict[str, list[Row]] = {}
     for row in rows["tracker_values"].to_pylist():
         trackers.setdefault(row["batch_id"], []).append(row)
-    found = []
-    for batch in rows["batches"].to_pylist():
-        time = parse_utc(batch["time"])
-        found.append(
-            UnsavedResult(
-                mission=None,
-                identity=(batch["spacecraft"], batch["run"], batch["batch"]),
-                answer=b"",
-                batch=batch,
-                result=made[batch["id"]],
-                stars=[],
-                solution=None,
-                buckets=Buckets(
-                    batch["spacecraft"], batch["run"], time.bucket(HOUR_S), time.bucket(DAY_S)
-                ),
-                key=None,
-                received_ns=recorded_utc(batch["received"]).tai_ns,
-                trackers=trackers.get(batch["id"], ()),
-            )
-        )
+    own = rows["batches"].select(["id", "batch", "time", "received"]).to_pylist()
+    found = [
+        RecordedResult(made[batch["id"]] | batch, trackers.get(batch["id"], ())) for batch in own
+    ]
     for first in range(0, len(found), _AT_ONCE):
         yield found[first : first + _AT_ONCE]
 

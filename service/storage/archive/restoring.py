@@ -6,6 +6,7 @@ from functools import partial
 from itertools import chain
 from pathlib import Path
 
+import pyarrow as pa
 import pyarrow.compute as pc
 from sqlalchemy import Connection, delete, select
 from sqlalchemy.exc import IntegrityError
@@ -28,13 +29,12 @@ from service.storage.archive.folder import (
 )
 from service.storage.archive.rows import Rows, from_partition, insert_rows
 from service.storage.archive.tables import archived_batches, archived_parts, archived_what_ifs
-from service.storage.recording import rollups
+from service.storage.projections import rollups
 from service.storage.recording.archived_hours import forget_share
-from service.storage.recording.unsaved_result import Buckets
 from service.storage.sql.database import Store
 from service.storage.sql.statements import insert_missing, insert_runs
 from service.storage.sql.tables import batches, catalogs, missions
-from service.times import DAY_S, HOUR_S, Utc, parse_utc
+from service.times import HOUR_S, Utc, parse_utc
 
 _AT_ONCE = 1_000
 
@@ -120,34 +120,39 @@ def put_back(connection: Connection, folder: Path, part: Part, rows: Rows) -> bo
     insert_runs(connection, {part.run: created}, tracked=part.tracked)
     if part_id is not None:
         spacecraft = rows["batches"]["spacecraft"][0].as_py()
-        # As where they are archived.
-        hours = {parse_utc(time).bucket(HOUR_S) for time in rows["batches"]["time"].to_pylist()}
-        rollups.lock(connection, ((spacecraft, part.run, hour) for hour in hours))
         forget_share(connection, part_id, spacecraft, part.run)
         for first in range(0, len(ids), _AT_ONCE):
             some_ids = ids[first : first + _AT_ONCE]
             for table, column in ((archived_batches, "id"), (archived_what_ifs, "batch_id")):
                 connection.execute(delete(table).where(table.c[column].in_(some_ids)))
         connection.execute(delete(archived_parts).where(archived_parts.c.id == part_id))
-    insert_rows(connection, rows)
+    position = rollups.lock_position(connection)
+    insert_rows(connection, _placed(rows, 0 if part_id is None else position))
     if part_id is None:
         # The trends have the share of a part that the database knows.
         _add_to_trends(connection, rows)
     return True
 
 
+def _placed(rows: Rows, position: int) -> Rows:
+    """The rows with their places in the record where these are not after `position`, else none.
+
+    The projector passes over them: what they add to the trends is there, or is added here.
+    """
+    made = rows["results"]
+    places = pc.fill_null(made["seq"], 0)
+    places = pc.if_else(pc.less_equal(places, position), places, pa.scalar(0, pa.int64()))
+    return rows | {"results": made.set_column(made.column_names.index("seq"), "seq", places)}
+
+
 def _add_to_trends(connection: Connection, rows: Rows) -> None:
     times = zip(*(rows["batches"][name].to_pylist() for name in ("id", "time")), strict=True)
-    moments = {id: parse_utc(time) for id, time in times}
+    hours = {id: parse_utc(time).bucket(HOUR_S) for id, time in times}
     current = {row["batch_id"]: row for row in rows["results"].to_pylist() if row["current"]}
-    buckets = {
-        id: Buckets(row["spacecraft"], row["run"], at.bucket(HOUR_S), at.bucket(DAY_S))
-        for id, at in moments.items()
-        for row in [current[id]]
-    }
-    rollups.add(connection, [(buckets[id], row) for id, row in current.items()])
+    keys = {id: (row["spacecraft"], row["run"], hours[id]) for id, row in current.items()}
+    rollups.add(connection, ((keys[id], row) for id, row in current.items()))
     of_trackers = rows["tracker_values"].to_pylist()
-    rollups.add_trackers(connection, [(buckets[row["batch_id"]], row) for row in of_trackers])
+    rollups.add_trackers(connection, ((keys[row["batch_id"]], row) for row in of_trackers))
 
 
 def verify_archive(

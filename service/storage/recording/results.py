@@ -7,8 +7,7 @@ from sqlalchemy import Connection, and_, delete, insert, select, update
 
 from service.errors import AcquisitionError, Busy
 from service.storage.queries.tracker_splits import split_anew
-from service.storage.recording import events, rollups
-from service.storage.recording.alarm_evaluation import evaluate_limits
+from service.storage.recording import events
 from service.storage.recording.identity import (
     ExistingResult,
     Registry,
@@ -17,10 +16,10 @@ from service.storage.recording.identity import (
     require_not_archived,
     stored_answers,
 )
-from service.storage.recording.tracking import note_states
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.sql.access_tables import audit
 from service.storage.sql.columns import Row
+from service.storage.sql.prepared import execute
 from service.storage.sql.statements import insert_all, insert_missing, insert_runs
 from service.storage.sql.tables import (
     batches,
@@ -176,48 +175,16 @@ def _insert(
     require_not_archived(connection, [unsaved.identity for unsaved, _ in firsts])
     insert_all(connection, frames, [unsaved.frame for unsaved, _ in firsts if unsaved.frame])
     _insert_results(connection, firsts)
-    rollups.add(connection, ((unsaved.buckets, unsaved.result) for unsaved, _ in firsts))
-    split = [(unsaved.buckets, row) for unsaved, _ in firsts for row in unsaved.trackers]
-    insert_all(connection, tracker_values, [row for _, row in split])
-    rollups.add_trackers(connection, split)
+    insert_all(connection, tracker_values, [row for each, _ in firsts for row in each.trackers])
     # What-ifs go one by one: of two that are adopted, the second supersedes the first.
-    adopted = []
     for unsaved, body in fresh:
         if unsaved.batch is None:
             if unsaved.result["current"]:
                 _supersede(connection, unsaved)
-                where = unsaved.buckets
-                adopted.append((where.spacecraft, where.run, where.hour))
             _insert_results(connection, [(unsaved, body)])
-    rollups.renew(connection, adopted)
     insert_all(
         connection, audit, [unsaved.audit for unsaved, _ in fresh if unsaved.audit is not None]
     )
-    evaluate_limits(connection, [unsaved for unsaved, _ in firsts])
-    _note_events(connection, [unsaved for unsaved, _ in fresh])
-
-
-def _note_events(connection: Connection, fresh: Sequence[UnsavedResult]) -> None:
-    """Note what came: new batches once for each spacecraft and run, adopted results each."""
-    new: dict[tuple[str, str], list[UnsavedResult]] = {}
-    for unsaved in fresh:
-        spacecraft, run, _ = unsaved.identity
-        if unsaved.batch is not None:
-            new.setdefault((run, spacecraft), []).append(unsaved)
-        elif unsaved.result["current"]:
-            about = {"spacecraft": spacecraft, "run": run, "id": unsaved.id}
-            about["batch_id"] = unsaved.result["batch_id"]
-            events.add_event(connection, "adopted", about, run=run, spacecraft=spacecraft)
-    for (run, spacecraft), unsaved_results in new.items():
-        latest = max(unsaved_results, key=lambda unsaved: int(unsaved.result["time_ns"]))
-        assert latest.batch is not None
-        newest: Row = {name: latest.batch[name] for name in ("id", "batch", "time")}
-        newest |= {name: latest.result[name] for name in ("status", "reason")}
-        newest["counts"] = latest.counts
-        note: Row = {"spacecraft": spacecraft, "run": run, "batches": len(unsaved_results)}
-        note["latest"] = newest
-        events.add_event(connection, "batches", note, run=run, spacecraft=spacecraft)
-        note_states(connection, spacecraft, run, unsaved_results)
 
 
 def _insert_results(
@@ -225,7 +192,11 @@ def _insert_results(
 ) -> None:
     # In order of their ids, which rise: each goes to the end of its table.
     in_order = sorted(unsaved_results, key=lambda each: each[0].id)
-    rows = [unsaved.result | {"answer": body.decode()} for unsaved, body in in_order]
+    places = next_places(connection, len(in_order))
+    rows = [
+        unsaved.result | {"answer": body.decode(), "seq": seq}
+        for (unsaved, body), seq in zip(in_order, places, strict=True)
+    ]
     insert_all(connection, results, rows)
     insert_all(connection, star_results, [row for unsaved, _ in in_order for row in unsaved.stars])
     insert_all(connection, solutions, [d.solution for d, _ in in_order if d.solution is not None])
@@ -240,3 +211,32 @@ def _supersede(connection: Connection, unsaved: UnsavedResult) -> None:
     connection.execute(update(results).where(current).values(current=False))
     connection.execute(delete(tracker_values).where(tracker_values.c.batch_id == batch_id))
     insert_all(connection, tracker_values, unsaved.trackers)
+    spacecraft, run, _ = unsaved.identity
+    about = {"spacecraft": spacecraft, "run": run, "id": unsaved.id, "batch_id": batch_id}
+    events.add_event(connection, "adopted", about, run=run, spacecraft=spacecraft)
+
+
+def next_places(connection: Connection, count: int) -> list[int]:
+    """The next places in the record's order, for so many results of this transaction.
+
+    On PostgreSQL a transaction may commit after one with later places.  It has its number before
+    it takes places: whoever sees a later place, and finds that no transaction of that moment is
+    left, knows that the missing ones will not come.
+    """
+    rows = execute(connection, _PLACES[connection.dialect.name], {"count": count})
+    return [int(place) for *_, place in rows]
+
+
+_PLACES = {
+    # Of results that were deleted before they were projected nothing is left to tell.
+    "sqlite": """
+        WITH RECURSIVE next(seq, n) AS (
+            SELECT max(ifnull((SELECT max(seq) FROM results), 0), (SELECT seq FROM projector)), 0
+            UNION ALL SELECT seq + 1, n + 1 FROM next WHERE n < :count
+        ) SELECT seq FROM next WHERE n > 0
+    """,
+    "postgresql": """
+        SELECT pg_current_xact_id()::text, nextval('results_seq')
+        FROM generate_series(1, %(count)s)
+    """,
+}

@@ -9,13 +9,11 @@ objects.
 import json
 import time
 from collections.abc import Sequence
-from typing import Any
 
 import msgspec
 from msgspec import UNSET, Struct, structs
 
 from service.acquire import Acquisition
-from service.missions.mission import Mission
 from service.observations.frame_record import FrameRecord
 from service.observations.schema import Submission
 from service.storage.models.answers import Answer
@@ -25,7 +23,7 @@ from service.storage.recording.answer import answer_of, rows_of_stars
 from service.storage.recording.result_metrics import metrics_of
 from service.storage.recording.tracker_values import values_of_trackers
 from service.storage.sql.columns import Row
-from service.times import DAY_S, HOUR_S, Utc
+from service.times import Utc
 
 STARS = ("observed", "unique", "ambiguous", "unmatched")
 """The counts of a result's stars."""
@@ -44,24 +42,13 @@ class Answered(Struct, frozen=True):
     replayed: bool
 
 
-class Buckets(Struct, frozen=True):
-    """Where in the trends a result counts: spacecraft, run, and the hour and day of its batch."""
-
-    spacecraft: str
-    run: str
-    hour: int
-    day: int
-
-
 class UnsavedResult(Struct, eq=False):
     """A result that is computed and not yet recorded.
 
     `batch` is the row of a first submission and None for a what-if.  `answer` is JSON
-    and lacks the time that recording took.  `mission` is None where another process
-    made the unsaved result.
+    and lacks the time that recording took.
     """
 
-    mission: Mission | None
     identity: tuple[str, str, str]
     """(spacecraft, run, batch): what is unique among submissions."""
     answer: bytes
@@ -69,26 +56,14 @@ class UnsavedResult(Struct, eq=False):
     result: Row
     stars: list[Row]
     solution: Row | None
-    buckets: Buckets
     key: tuple[str, str] | None
-    received_ns: int
-    """When it came, as `Utc.tai_ns`."""
     frame: Row | None = None
-    is_ahead: bool = False
-    """Of a live batch: dated so far ahead that its time cannot be believed."""
     handed_over_ns: int | None = None
     """When it was handed to the writer, on the clock of `time.perf_counter_ns`."""
     trackers: Sequence[Row] = ()
     """The values of each tracker, of a mission with several (`tracker_values`)."""
     audit: Row | None = None
     """The entry of the audit list that is stored with a recorded what-if."""
-
-    tracking: str | None = None
-    """The state that the batch leaves its spacecraft in; None: it asks for no last attitude."""
-
-    def __reduce__(self) -> tuple[type["UnsavedResult"], tuple[Any, ...]]:
-        # To another process without what stands first, the settings of its mission: they are many.
-        return UnsavedResult, (None, *structs.astuple(self)[1:])
 
     @property
     def id(self) -> str:
@@ -149,8 +124,7 @@ def unsaved_submission(
     result = _result_row(
         acquisition, answer, batch_id=id, parent=None, current=True, created=received
     )
-    unsaved = _unsaved_result(acquisition, answer, row, result, key, received)
-    unsaved.is_ahead, unsaved.tracking = is_ahead, acquisition.tracking_state
+    unsaved = _unsaved_result(acquisition, answer, row, result, key)
     if submission.frame is not None:
         unsaved.frame = _frame_row(submission.frame, id)
     return unsaved
@@ -170,7 +144,7 @@ def unsaved_what_if(
     result = _result_row(
         acquisition, answer, batch_id=batch_id, parent=parent, current=adopt, created=created
     )
-    return _unsaved_result(acquisition, answer, None, result, None, created)
+    return _unsaved_result(acquisition, answer, None, result, None)
 
 
 def _unsaved_result(
@@ -179,25 +153,18 @@ def _unsaved_result(
     batch_row: Row | None,
     result: Row,
     key: tuple[str, str] | None,
-    received: Utc,
 ) -> UnsavedResult:
     batch = acquisition.batch
     stars = rows_of_stars(answer)
-    buckets = Buckets(
-        batch.spacecraft, batch.run, batch.time.bucket(HOUR_S), batch.time.bucket(DAY_S)
-    )
     solution = _solution_row(acquisition, answer, result["id"])
     return UnsavedResult(
-        acquisition.mission,
         (batch.spacecraft, batch.run, batch.batch),
         msgspec.json.encode(answer),
         batch_row,
         result,
         stars,
         solution,
-        buckets,
         key,
-        received.tai_ns,
         trackers=values_of_trackers(acquisition, answer, result["batch_id"]),
     )
 
@@ -235,6 +202,7 @@ def _result_row(
         "batch_id": batch_id,
         "parent_id": parent,
         "current": current,
+        "seq": 0,
         "created": created.text,
         "spacecraft": batch.spacecraft,
         "run": batch.run,

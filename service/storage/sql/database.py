@@ -1,8 +1,8 @@
 """An open database: one writer and many readers."""
 
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 from sqlalchemy import Connection
@@ -148,9 +148,26 @@ class Store(Readers):
         self.writer = Writer(
             self._writing, file=file, wait_s=wait_s, lock=self.lock, file_lock=self.file_lock
         )
-
+        self.before_reading: Callable[[], object] = lambda: None
+        """Waits for the projections."""
+        self.hold_back: Callable[[], object] = lambda: None
+        """Waits while too much is to be projected; called before much is recorded at once."""
         if serving and self.file_lock is not None:
             self.writer.change(remove_probe).result()
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """A connection whose snapshot has the projections of what is recorded now.
+
+        They are waited for, at most a second: see `Projector.wait`.
+        """
+        self.before_reading()
+        with self.reading_record() as connection:
+            yield connection
+
+    def reading_record(self) -> AbstractContextManager[Connection]:
+        """A connection for what reads no projection, and so waits for none."""
+        return super().reading()
 
     @contextmanager
     def reading_batch(self, id: str) -> Iterator[tuple[Connection, bool]]:
@@ -158,7 +175,7 @@ class Store(Readers):
 
         Where there is no such result the connection is that of the database.
         """
-        with self.reading() as connection:
+        with self.reading_record() as connection:
             opened = self.archive.batch(connection, id)
             if opened is None:
                 yield connection, False

@@ -28,7 +28,7 @@ from service.storage.sql.engines import (
 if TYPE_CHECKING:
     from alembic.config import Config
 
-HEAD = "0016"
+HEAD = "0017"
 """The latest revision of `migrations/`."""
 
 

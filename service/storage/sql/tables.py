@@ -8,6 +8,7 @@
     mission_uses ── missions                       from when each settings were in use
     tracker_values ── batches                      its current result, tracker by tracker
     rollups_hourly, rollups_daily                  of current results (rollup_tables.py)
+    projector                                      how far projections have come
     limits, watches, alarms ── alarm_actions       limits and alarms (alarm_tables.py)
     annotations                                    notes of people (alarm_tables.py)
     archived_parts, archived_batches, ...          batches that left it (archive/tables.py)
@@ -134,6 +135,8 @@ results = Table(
     Column("batch_id", Id, ForeignKey(batches.c.id), nullable=False),
     Column("parent_id", Id, ForeignKey("results.id")),
     Column("current", Boolean, nullable=False),
+    # The order in which results were recorded; zero: before there was one, or from an archive.
+    Column("seq", BigInteger, nullable=False, server_default=text("0")),
     Column("created", Moment, nullable=False),
     Column("spacecraft", Name, nullable=False),
     Column("run", RunName, nullable=False),
@@ -194,6 +197,9 @@ Index(
     sqlite_where=results.c.parent_id.is_not(None),
     postgresql_where=results.c.parent_id.is_not(None),
 )
+
+# The projector takes results in their order.
+Index("ix_results_seq", results.c.seq)
 
 # Deleting a batch checks the foreign key of its results, and finds them.
 Index("ix_results_batch_id", results.c.batch_id)
@@ -273,6 +279,14 @@ replays = Table(
     Column("counts", Text),
     Column("started", Moment, nullable=False),
     Column("finished", Moment),
+)
+
+projector = Table(
+    "projector",
+    metadata,
+    # One row: every result up to this one is in the projections, and none after it.
+    Column("id", SmallInteger, primary_key=True, autoincrement=False),
+    Column("seq", BigInteger, nullable=False),
 )
 
 events = Table(

@@ -46,6 +46,11 @@ class QueuedJob:
         """How much there is to write."""
         return len(self.unsaved_results) or 1
 
+    @property
+    def is_projection(self) -> bool:
+        """True for a step of the projector, which is alone in its transaction."""
+        return self.low_priority and self.change is not None
+
 
 def transact(connection: Connection, jobs: Sequence[QueuedJob], careful: bool) -> list[Any]:
     """One outcome for each job: what comes of it, or the error that concerns it alone.

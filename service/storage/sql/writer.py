@@ -88,6 +88,8 @@ class Writer:
         self._queued = 0
         self._closing = False
         self._changed = threading.Condition()
+        self.commits = 0
+        """Transactions that were committed, without those of the projector."""
         self.after_commit: list[Callable[[], object]] = []
         """Called by the writer's thread, which waits for it, after each transaction."""
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
@@ -120,6 +122,15 @@ class Writer:
         """Queue another change, which is kept whole or not at all, and may be made twice over."""
         done: Future[T] = Future()
         self._put(QueuedJob(_settling(done), change=change))
+        return done
+
+    def project(self, step: Callable[[Connection], T]) -> "Future[T]":
+        """Queue a step of the projector: a change with a transaction of its own.
+
+        Posts go first, and the queue is never too full for it.
+        """
+        done: Future[T] = Future()
+        self._put(QueuedJob(_settling(done), change=step, low_priority=True))
         return done
 
     def take_lock(self) -> Attempt:
@@ -191,7 +202,8 @@ class Writer:
             if self._file_lock is not None:
                 self._file_lock.take()
             # A job that alone is larger than the queue is still taken by an empty one.
-            if self._queued and self._queued + job.weight > self._max_queued:
+            is_full = self._queued and self._queued + job.weight > self._max_queued
+            if is_full and not job.is_projection:
                 raise Busy(f"{self._queued} records are waiting to be written")
             (self._low_priority if job.low_priority else self._queue).append(job)
             self._queued += job.weight
@@ -241,7 +253,8 @@ class Writer:
             cause = error.orig if isinstance(error, DBAPIError) else repr(error)
             log.error("%d pieces of work could not be written: %s", len(jobs), cause)
             told = _told(error)
-            if isinstance(told, Busy) and not isinstance(told, Standby | Stopping):
+            is_trouble = isinstance(told, Busy) and not isinstance(told, Standby | Stopping)
+            if is_trouble and not jobs[0].is_projection:
                 self.note_failure(sum(job.weight for job in jobs))
             for job in jobs:
                 job.settle(told)
@@ -253,6 +266,8 @@ class Writer:
         if self._is_failing and any(job.unsaved_results for job in jobs):
             with self._changed:
                 self._is_failing = False
+        if not jobs[0].is_projection:
+            self.commits += 1
         for job, outcome in zip(jobs, outcomes, strict=True):
             job.settle(outcome)
 

@@ -23,8 +23,8 @@ from service.storage.archive.tables import (
     archived_what_ifs,
 )
 from service.storage.models.runs import Forgotten
+from service.storage.projections import rollups
 from service.storage.queries.future_dated import LIVE
-from service.storage.recording import rollups
 from service.storage.recording.archived_hours import forget_share
 from service.storage.sql.database import Store
 from service.storage.sql.grade_tables import graded_days
@@ -273,7 +273,7 @@ def _forget_part(connection: Connection, row: dict[str, Any]) -> None:
     own = archived_hours.c.spacecraft == spacecraft, archived_hours.c.run == run
     chosen = select(archived_hours.c.bucket).where(*own, archived_hours.c.part_id == part_id)
     hours = {(spacecraft, run, hour) for hour in connection.scalars(chosen.distinct())}
-    rollups.lock(connection, hours)
+    rollups.lock_position(connection)
     forget_share(connection, part_id, spacecraft, run)
     ids = select(archived_batches.c.id).where(archived_batches.c.part_id == part_id)
     connection.execute(delete(archived_what_ifs).where(archived_what_ifs.c.batch_id.in_(ids)))

@@ -10,7 +10,7 @@ from functools import partial
 
 from sqlalchemy import ColumnElement, Connection, delete, func, select
 
-from service.storage.recording import rollups
+from service.storage.projections import rollups
 from service.storage.sql.database import Store
 from service.storage.sql.grade_tables import graded_blocks, graded_days
 from service.storage.sql.gyro_tables import gyro_blocks

@@ -23,18 +23,17 @@ from service.observations.schema import submission_from_json
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.model import SkyModel
 from service.storage.models.answers import Answer
+from service.storage.projections import rollups
 from service.storage.queries.pages import PLACE, newest_first
 from service.storage.queries.recorded_batch import recorded_mission
 from service.storage.queries.results import answer_from_json
-from service.storage.recording import rollups
 from service.storage.recording.tracker_values import catalog_rows, tracker_rows
-from service.storage.recording.unsaved_result import Buckets
 from service.storage.sql.columns import Row
 from service.storage.sql.database import Store
 from service.storage.sql.rollup_tables import tracker_splits
 from service.storage.sql.statements import insert_all
 from service.storage.sql.tables import batches, results, tracker_values
-from service.times import DAY_S, HOUR_S, parse_utc
+from service.times import HOUR_S, parse_utc
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +62,7 @@ class TrackerSplitter:
         several = [each.name for each in self.missions.values() if len(each.trackers) > 1]
         columns = tracker_splits.c.spacecraft, tracker_splits.c.run
         query = select(*columns).where(tracker_splits.c.spacecraft.in_(several))
-        with self.store.reading() as connection:
+        with self.store.reading_record() as connection:
             return [(row[0], row[1]) for row in connection.execute(query.order_by(*columns))]
 
     def split(
@@ -88,7 +87,7 @@ class TrackerSplitter:
 
     def _step(self, owner: Owner) -> int:
         """Split the next batches of a run; 0 when it is done."""
-        with self.store.reading() as connection:
+        with self.store.reading_record() as connection:
             place = _place(connection, owner)
             if place is None:
                 return 0
@@ -207,20 +206,21 @@ def _write(
         connection.execute(deleted(tracker_splits).where(_is(owner)))
         return
     hours = {row["id"]: parse_utc(row["time"]).bucket(HOUR_S) for row in rows}
-    rollups.lock(connection, ((*owner, hour) for hour in hours.values()))
+    position = rollups.lock_position(connection)
     ids = [row["id"] for row in rows]
-    current = set(
-        connection.scalars(select(results.c.id).where(results.c.id.in_(ids), results.c.current))
-    )
+    query = select(results.c.id, results.c.seq).where(results.c.id.in_(ids), results.c.current)
+    current = dict(map(tuple, connection.execute(query)))
     of_batches = tracker_values.c.batch_id.in_([row["batch_id"] for row in rows])
     there = set(connection.scalars(select(tracker_values.c.batch_id).where(of_batches)))
     new = [
-        (Buckets(*owner, hours[row["id"]], parse_utc(row["time"]).bucket(DAY_S)), values)
+        (row["id"], values)
         for row in rows
         if row["id"] in current and row["batch_id"] not in there
         for values in split[row["id"]]
     ]
     insert_all(connection, tracker_values, [values for _, values in new])
-    rollups.add_trackers(connection, new)
+    # The projector adds those that it has not come to yet.
+    passed = [(id, values) for id, values in new if current[id] <= position]
+    rollups.add_trackers(connection, (((*owner, hours[id]), values) for id, values in passed))
     last = {"time_ns": rows[-1]["time_ns"], "batch_id": rows[-1]["batch_id"]}
     connection.execute(update(tracker_splits).where(_is(owner)).values(last))

@@ -22,10 +22,10 @@ from service.alarms.quantities import QuantityName, RankedName, trend_names
 from service.errors import BadBatch, BadInput, Fault, shown_value
 from service.observations.schema import Key, RunName
 from service.products.formats import JSON_FORMAT, table_formats
+from service.storage.projections.rollups import Bucket
 from service.storage.queries.alarms import StateFilter
 from service.storage.queries.results import OutcomeName, StatusName
 from service.storage.queries.trends import MAX_SIZE, Strategy
-from service.storage.recording.rollups import Bucket
 from service.times import Utc, parse_utc
 from service.web.requests.statements import Comment, Who
 

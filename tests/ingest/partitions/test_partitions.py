@@ -14,7 +14,7 @@ from service.ingest.partitions import coordinator
 from service.missions.mission import Mission
 from service.observations.schema import submission_from_json
 from service.storage.archive import archiving, folder, reprocessed
-from service.storage.recording import rollups
+from service.storage.projections import rollups
 from service.storage.recording.unsaved_result import Answered
 from service.storage.sql.tables import batches
 from service.storage.upkeep.prune import prune

@@ -1,7 +1,6 @@
-"""Evaluating limits against batches as they are recorded, each batch exactly once.
+"""Evaluating limits against batches in the order of the record, each batch exactly once.
 
-The evaluation is part of the transaction that records the batches: a batch that
-is sent again is not new and is not evaluated again, and after a crash either
+The evaluation is part of the transaction that moves the projector on: after a crash either
 both are stored or neither.  The row in `watches` is locked, so that several
 processes evaluate one after the other.
 """
@@ -17,11 +16,11 @@ from service.alarms.quantities import SILENCE
 from service.alarms.subjects import Subject, sampler
 from service.alarms.window import BatchRef, Point, Sample, SampleWindow
 from service.missions.mission import Mission
+from service.storage.projections.recorded import RecordedResult
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.limits import limits_of
 from service.storage.recording.active_alarms import ActiveAlarms
 from service.storage.recording.silence import silence_severity
-from service.storage.recording.unsaved_result import UnsavedResult
 from service.storage.sql.alarm_tables import watches
 from service.storage.sql.columns import Row
 from service.storage.sql.prepared import prepared
@@ -41,20 +40,16 @@ _SAVE = prepared(
 )
 
 
-def evaluate_limits(connection: Connection, new: Sequence[UnsavedResult]) -> None:
+def apply(connection: Connection, new: Sequence[RecordedResult]) -> None:
     """Evaluate the limits against new batches of the live run and of runs with alarms."""
-    groups: dict[tuple[str, str], list[UnsavedResult]] = {}
-    for unsaved in new:
-        spacecraft, run, _ = unsaved.identity
-        if unsaved.batch is not None and not unsaved.is_ahead:
-            groups.setdefault((run, spacecraft), []).append(unsaved)
+    groups: dict[tuple[str, str], list[RecordedResult]] = {}
+    for each in new:
+        if each.is_first and not each.is_ahead:
+            groups.setdefault(each.owner, []).append(each)
     evaluated = runs_with_alarms(connection, {run for run, _ in groups})
     for run, spacecraft in sorted(groups):
         if run in evaluated:
-            unsaved_results = sorted(
-                groups[run, spacecraft], key=lambda each: each.result["time_ns"]
-            )
-            LimitEvaluator(connection, spacecraft, run, unsaved_results).evaluate()
+            LimitEvaluator(connection, spacecraft, run, groups[run, spacecraft]).evaluate()
 
 
 def runs_with_alarms(connection: Connection, names: set[str]) -> set[str]:
@@ -76,21 +71,16 @@ class LimitEvaluator:
     """Evaluates new batches of one spacecraft in one run; its row in `watches` is locked."""
 
     def __init__(
-        self,
-        connection: Connection,
-        spacecraft: str,
-        run: str,
-        unsaved_results: Sequence[UnsavedResult],
+        self, connection: Connection, spacecraft: str, run: str, new: Sequence[RecordedResult]
     ) -> None:
         self._connection = connection
         self._spacecraft, self._run = spacecraft, run
-        self._new = unsaved_results
-        self._limits = limits_of(connection, _mission(connection, unsaved_results[0]))
+        self._new = new
+        self._limits = limits_of(connection, _mission(connection, new[0]))
         row = self._locked()
         if row is None:
-            assert unsaved_results[0].batch is not None
             first = {"spacecraft": spacecraft, "run": run, "state": "{}"}
-            insert_missing(connection, watches, [first | _columns_of(unsaved_results[0].batch)])
+            insert_missing(connection, watches, [first | _columns_of(new[0].result)])
             row = self._locked()
         assert row is not None
         self._row = row
@@ -99,26 +89,25 @@ class LimitEvaluator:
         self._active = ActiveAlarms(connection, spacecraft, run)
 
     def evaluate(self) -> None:
-        """Evaluate every batch in order of time and save the state of the windows."""
+        """Evaluate every batch in the order of the record and save the state of the windows."""
         due = self._due()
         row, newest = self._row, None
         latest_ns, received = row["time_ns"], row["received"]
         received_ns = recorded_utc(received).tai_ns
-        for unsaved in self._new:
-            batch = unsaved.batch
-            assert batch is not None
+        for each in self._new:
+            batch = each.result
             gap_ns = batch["time_ns"] - latest_ns
             if gap_ns >= 0:
                 newest, latest_ns = batch, batch["time_ns"]
             # In another run an older batch that comes late ends no silence.
             if self._run == LIVE or gap_ns >= 0:
-                since_ns = unsaved.received_ns - received_ns if self._run == LIVE else gap_ns
+                since_ns = each.received_ns - received_ns if self._run == LIVE else gap_ns
                 latest = _reference(newest) if newest else (row["time"], row["batch_id"])
                 self._check_silence(since_ns * 1e-9, latest, batch["received"])
             if due:
-                self._evaluate_batch(unsaved, due)
-            if unsaved.received_ns > received_ns:
-                received, received_ns = batch["received"], unsaved.received_ns
+                self._evaluate_batch(each, due)
+            if each.received_ns > received_ns:
+                received, received_ns = batch["received"], each.received_ns
         self._save(newest, received)
         self._active.save()
 
@@ -162,21 +151,17 @@ class LimitEvaluator:
 
     def _latest_with(self, name: Subject) -> Row:
         """The latest new batch that has a value of a subject."""
-        latest_first = self._new[::-1]
+        latest_first = sorted(self._new, key=lambda each: -each.result["time_ns"])
         samples = self._samples(name, latest_first)
         return next(
-            unsaved.batch
-            for unsaved, sample in zip(latest_first, samples, strict=True)
-            if unsaved.batch and sample
+            each.result for each, sample in zip(latest_first, samples, strict=True) if sample
         )
 
     @staticmethod
-    def _samples(
-        subject: Subject, unsaved_results: Sequence[UnsavedResult]
-    ) -> Iterator[Sample | None]:
+    def _samples(subject: Subject, new: Sequence[RecordedResult]) -> Iterator[Sample | None]:
         """What each of the results adds to the value of a subject; None: nothing."""
         sample_of = sampler(subject)
-        for each in unsaved_results:
+        for each in new:
             trackers = each.trackers and _by_tracker(each)
             yield sample_of(each.result, trackers or {})
 
@@ -201,20 +186,19 @@ class LimitEvaluator:
         return (found[0], found[1]) if found else _reference(batch)
 
     def _evaluate_batch(
-        self, unsaved: UnsavedResult, due: Sequence[tuple[Subject, LimitSettings]]
+        self, new: RecordedResult, due: Sequence[tuple[Subject, LimitSettings]]
     ) -> None:
-        assert unsaved.batch is not None
         for name, limits in due:
-            (sample,) = self._samples(name, [unsaved])
+            (sample,) = self._samples(name, [new])
             if sample is None:
                 continue
             window = self._windows[name]
             latest_ns = window.samples[-1][0] if window.samples else 0
-            latest = self._latest_in_window(unsaved.batch, latest_ns)
+            latest = self._latest_in_window(new.result, latest_ns)
             found = window.add(sample, limits, latest)
             if found and (found.severity is not None or self._active.has(name)):
                 point = Point(found.value, *latest)
-                now = unsaved.batch["received"]
+                now = new.result["received"]
                 self._active.observe(name, found.severity, limits, point, now, found.worst)
 
     def _locked(self) -> Row | None:
@@ -255,18 +239,26 @@ _LAST_SAVED: dict[tuple[str, str], _SavedWindows] = {}
 _MAX_SAVED = 64
 
 
-def _by_tracker(unsaved: UnsavedResult) -> Mapping[str, Row]:
+def _by_tracker(new: RecordedResult) -> Mapping[str, Row]:
     """The values of each tracker of a result as those of a result of its own."""
-    time_ns = {"time_ns": unsaved.result["time_ns"]}
-    return {row["tracker"]: row | time_ns for row in unsaved.trackers}
+    time_ns = {"time_ns": new.result["time_ns"]}
+    return {row["tracker"]: row | time_ns for row in new.trackers}
 
 
-def _mission(connection: Connection, unsaved: UnsavedResult) -> Mission:
-    """The mission of an unsaved result; one from another process has its digest alone."""
-    if unsaved.mission is not None:
-        return unsaved.mission
-    query = select(missions.c.settings).where(missions.c.digest == unsaved.result["mission_digest"])
-    return Mission.model_validate_json(connection.execute(query).scalar_one())
+def _mission(connection: Connection, new: RecordedResult) -> Mission:
+    """The mission that a result was computed with; what a digest stands for never changes."""
+    digest = new.result["mission_digest"]
+    mission = _MISSIONS.get(digest)
+    if mission is None:
+        query = select(missions.c.settings).where(missions.c.digest == digest)
+        mission = Mission.model_validate_json(connection.execute(query).scalar_one())
+        if len(_MISSIONS) >= _MAX_SAVED:
+            _MISSIONS.clear()
+        _MISSIONS[digest] = mission
+    return mission
+
+
+_MISSIONS: dict[str, Mission] = {}
 
 
 def _columns_of(batch: Row) -> Row:

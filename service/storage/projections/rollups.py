@@ -2,21 +2,21 @@
 
 Of spacecraft with several trackers also per tracker.
 
-They are changed in the transaction that records a result or adopts one, and so
-are at every moment what a count of the current results would give.
+They are at every moment what a count of the current results would give up to the place in the
+record that the projector has come to.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import ColumnElement, Connection, Select, Table, and_, delete, select, update
+from sqlalchemy import ColumnElement, Connection, Select, Table, and_, delete, select
 
 from service.errors import BadInput, Fault
+from service.storage.projections.recorded import RecordedResult
 from service.storage.recording.archived_hours import WHOLE, every_share, shares_of_hour
 from service.storage.recording.result_metrics import merge, rolled_up
 from service.storage.recording.rollup_sql import OF_TRACKERS, SUMMED, SUMMED_OF_TRACKERS
-from service.storage.recording.unsaved_result import Buckets
 from service.storage.sql.columns import Row
 from service.storage.sql.rollup_tables import (
     COUNTS,
@@ -26,7 +26,7 @@ from service.storage.sql.rollup_tables import (
     tracker_rollups_hourly,
 )
 from service.storage.sql.statements import add_rollups, insert_all
-from service.storage.sql.tables import batches, results, tracker_values
+from service.storage.sql.tables import batches, projector, results, tracker_values
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, parse_utc
 
 Bucket = Literal["hour", "day"]
@@ -55,24 +55,31 @@ _TRENDS: dict[Bucket, _Trend] = {
 }
 
 
-def add(connection: Connection, new: Iterable[tuple[Buckets, Row]]) -> None:
-    """Add new current results, rows of theirs, to the hours and days that they belong to."""
+def apply(connection: Connection, new: Sequence[RecordedResult]) -> None:
+    """Add new batches to their hours and days, and count anew the hours of adopted what-ifs.
+
+    A batch whose first result is superseded already comes with the what-if that is current.
+    """
+    current = [each for each in new if each.result["current"]]
+    firsts = [each for each in current if each.is_first]
+    add(connection, ((each.hour, each.result) for each in firsts))
+    add_trackers(connection, ((each.hour, row) for each in firsts for row in each.trackers))
+    renew(connection, [each.hour for each in current if not each.is_first])
+
+
+def add(connection: Connection, new: Iterable[tuple[BucketKey, Row]]) -> None:
+    """Add current results, each with its spacecraft, run and hour, to their hours and days."""
     of_hour: dict[BucketKey, list[Row]] = {}
-    for buckets, result in new:
-        of_hour.setdefault((buckets.spacecraft, buckets.run, buckets.hour), []).append(result)
+    for key, result in new:
+        of_hour.setdefault(key, []).append(result)
     _add(connection, of_hour, (rollups_hourly, rollups_daily), _KEY)
 
 
-def add_trackers(connection: Connection, new: Iterable[tuple[Buckets, Row]]) -> None:
-    """Add rows of `tracker_values` to the hours and days of their trackers.
-
-    The rows of `rollups_hourly` and `rollups_daily` for these hours and days must be
-    locked: whoever changes them (`add`, `renew`) may also change those of trackers.
-    """
+def add_trackers(connection: Connection, new: Iterable[tuple[BucketKey, Row]]) -> None:
+    """Add rows of `tracker_values` to the hours and days of their trackers."""
     of_hour: dict[TrackerKey, list[Row]] = {}
-    for buckets, row in new:
-        key = buckets.spacecraft, buckets.run, row["tracker"], buckets.hour
-        of_hour.setdefault(key, []).append(row)
+    for (spacecraft, run, hour), row in new:
+        of_hour.setdefault((spacecraft, run, row["tracker"], hour), []).append(row)
     _add(connection, of_hour, (tracker_rollups_hourly, tracker_rollups_daily), _TRACKER_KEY)
 
 
@@ -80,6 +87,7 @@ def add_shares(
     connection: Connection, spacecraft: str, run: str, of_hour: Mapping[int, Mapping[str, Row]]
 ) -> None:
     """Add rollups that are there already, by hour and by tracker; `WHOLE` is the spacecraft's."""
+    lock_position(connection)
     whole: Rollups = {}
     of_trackers: Rollups = {}
     for hour, shares in of_hour.items():
@@ -93,13 +101,13 @@ def add_shares(
     _add_hours(connection, of_trackers, tables, _TRACKER_KEY)
 
 
-def lock(connection: Connection, hours: Iterable[BucketKey]) -> None:
-    """Lock the hours of spacecraft, and their days, so that only this transaction changes them."""
-    keys = sorted(set(hours))
-    for key in keys:
-        _lock(connection, rollups_hourly, key)
-    for key in sorted({(*key[:2], key[2] // 24) for key in keys}):
-        _lock(connection, rollups_daily, key)
+def lock_position(connection: Connection) -> int:
+    """Lock the projector's place in the record, and with it all rollups; returns the place.
+
+    Every change of a rollup begins with this.
+    """
+    query = select(projector.c.seq).with_for_update()
+    return int(connection.execute(query).scalar_one())
 
 
 def _add(
@@ -118,20 +126,21 @@ def _add_hours(
     for (*owner, hour), row in hourly.items():
         _put(daily, (*owner, hour // 24), row)
     for table, found in zip(tables, (hourly, daily), strict=True):
-        # In one order everywhere, so that two writers wait for each other but never cross.
-        rows = [dict(zip(names, key, strict=True)) | found[key] for key in sorted(found)]
+        rows = [dict(zip(names, key, strict=True)) | row for key, row in found.items()]
         add_rollups(connection, table, rows)
 
 
 def renew(connection: Connection, hours: Iterable[BucketKey]) -> None:
     """Count hours anew in which a current result was replaced or taken out, and their days.
 
-    An extreme that is gone cannot be subtracted.  A row is locked before what it
-    is made of is read: what another process adds is then either in both or comes
-    after.  Where nothing is left of an hour or a day, its row goes too.
+    An extreme that is gone cannot be subtracted.  The projector's place in the record is
+    locked before anything is read: what comes after it will be added, and is not counted here.
+    Where nothing is left of an hour or a day, its row goes too.
     """
-    # Hours before days, and each in order: as `add` does it.
     changed = sorted(set(hours))
+    if not changed:
+        return
+    lock_position(connection)
     for key in changed:
         _put_back(connection, rollups_hourly, key, _of_hour(connection, key))
     for spacecraft, run, day in sorted({(key[0], key[1], key[2] // 24) for key in changed}):
@@ -174,7 +183,6 @@ def _replace(
 
 def _of_hour(connection: Connection, key: BucketKey) -> Row | None:
     """The rollup of the current results of an hour, archived ones included."""
-    _lock(connection, rollups_hourly, key)
     query = _within_hour(select(*SUMMED.values()), key)
     row = dict(connection.execute(query).mappings().one())
     archived = shares_of_hour(connection, *key).get(WHOLE)
@@ -188,6 +196,7 @@ def _within_hour(query: Select[Any], key: BucketKey) -> Select[Any]:
     spacecraft, run, hour = key
     return query.where(
         results.c.current,
+        results.c.seq <= select(projector.c.seq).scalar_subquery(),
         results.c.spacecraft == spacecraft,
         results.c.run == run,
         results.c.time_ns >= bucket_start(hour, HOUR_S).tai_ns,
@@ -197,7 +206,6 @@ def _within_hour(query: Select[Any], key: BucketKey) -> Select[Any]:
 
 def _of_day(connection: Connection, key: BucketKey) -> Row | None:
     """The rollup of the hours of a day."""
-    _lock(connection, rollups_daily, key)
     found: Rollups = {}
     for row in _hours_of_day(connection, rollups_hourly, key):
         _put(found, key, {name: row[name] for name in row if name not in _KEY})
@@ -216,15 +224,11 @@ def _hours_of_day(connection: Connection, table: Table, key: BucketKey) -> list[
     return [dict(row) for row in connection.execute(query.order_by(table.c.bucket)).mappings()]
 
 
-def _lock(connection: Connection, table: Table, key: BucketKey) -> None:
-    connection.execute(select(table.c.bucket).where(_place(table, key)).with_for_update())
-
-
 def _put_back(connection: Connection, table: Table, key: BucketKey, row: Row | None) -> None:
-    place = _place(table, key)
-    connection.execute(
-        delete(table).where(place) if row is None else update(table).where(place).values(row)
-    )
+    # The row may be missing: that of a first result that was superseded at once.
+    connection.execute(delete(table).where(_place(table, key)))
+    if row is not None:
+        insert_all(connection, table, [row | dict(zip(_KEY, key, strict=True))])
 
 
 def _put(found: Rollups, key: Any, row: Row) -> None:
@@ -296,7 +300,9 @@ def recount(connection: Connection, bucket: Bucket, *, of_trackers: bool = False
     Of archived batches, from what was kept of them when they were archived.
     """
     place = results.c.spacecraft, results.c.run, batches.c.time
-    query = select(results, batches.c.time).join_from(results, batches)
+    query = select(results, batches.c.time).join_from(
+        results, batches, results.c.batch_id == batches.c.id
+    )
     if of_trackers:
         source = OF_TRACKERS.join(batches, batches.c.id == results.c.batch_id)
         query = select(tracker_values, *place).select_from(source)
@@ -312,3 +318,16 @@ def recount(connection: Connection, bucket: Bucket, *, of_trackers: bool = False
             owner = (spacecraft, run, name) if of_trackers else (spacecraft, run)
             _put(found, (*owner, hour * HOUR_S // width_s), share)
     return found
+
+
+def waiting(connection: Connection, bucket: Bucket) -> set[BucketKey]:
+    """The hours or days of results that the projector has not come to."""
+    query = select(results.c.spacecraft, results.c.run, batches.c.time).join_from(
+        results, batches, results.c.batch_id == batches.c.id
+    )
+    query = query.where(results.c.seq > select(projector.c.seq).scalar_subquery())
+    width_s = _TRENDS[bucket].width_s
+    return {
+        (spacecraft, run, parse_utc(time).bucket(width_s))
+        for spacecraft, run, time in connection.execute(query)
+    }

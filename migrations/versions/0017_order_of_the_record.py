@@ -1,0 +1,34 @@
+"""The order of results, and how far the projector has come in it."""
+
+import sqlalchemy as sa
+from alembic import op
+
+revision = "0017"
+down_revision = "0016"
+branch_labels = None
+depends_on = None
+
+
+def upgrade() -> None:
+    # What was recorded before is projected already and has no place in the order: zero.
+    op.add_column(
+        "results", sa.Column("seq", sa.BigInteger(), server_default=sa.text("0"), nullable=False)
+    )
+    op.create_index("ix_results_seq", "results", ["seq"])
+    position = op.create_table(
+        "projector",
+        sa.Column("id", sa.SmallInteger(), autoincrement=False, nullable=False),
+        sa.Column("seq", sa.BigInteger(), nullable=False),
+        sa.PrimaryKeyConstraint("id"),
+    )
+    op.bulk_insert(position, [{"id": 1, "seq": 0}])
+    if op.get_bind().dialect.name == "postgresql":
+        op.execute("CREATE SEQUENCE results_seq")
+
+
+def downgrade() -> None:
+    if op.get_bind().dialect.name == "postgresql":
+        op.execute("DROP SEQUENCE results_seq")
+    op.drop_table("projector")
+    op.drop_index("ix_results_seq", "results")
+    op.drop_column("results", "seq")

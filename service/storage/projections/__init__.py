@@ -1,0 +1,1 @@
+"""Projections: what follows from the record of batches and results, made after the answer."""

@@ -1,0 +1,262 @@
+"""The projector: brings the projections up to date with the record, after the answers.
+
+    record ──► projector ──► rollups, alarms, events        one transaction, with its position
+
+It takes results in the order of the record, many at a time, and notes how far it came in the
+same transaction: after a crash it goes on from there, and no result is projected twice or not
+at all.  Several processes may project one database; the row with the position is locked, so
+that they take turns.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from sqlalchemy import Connection, func, select, update
+
+from service.errors import BadConfiguration, Busy
+from service.storage.projections import alarms, rollups, states
+from service.storage.projections.recorded import RecordedResult, recorded_after
+from service.storage.projections.rollups import lock_position
+from service.storage.sql.database import Store
+from service.storage.sql.prepared import execute, prepared
+from service.storage.sql.tables import projector, results
+
+log = logging.getLogger(__name__)
+
+PROJECTIONS: Sequence[Callable[[Connection, Sequence[RecordedResult]], None]] = (
+    rollups.apply,
+    states.apply,
+    alarms.apply,
+)
+"""Each adds new results, in the order of the record, to tables that it alone fills."""
+MOST_AT_ONCE = 500
+LONGEST_S = 0.05
+"""Of one transaction; the next one takes fewer results where this one took longer."""
+EVERY_S = 0.1
+"""Between the beginnings of two transactions, unless a reader waits."""
+LOOK_S = 1.0
+"""Between two looks for what other processes recorded."""
+WAIT_S = 1.0
+"""The longest wait of a reader for the projections."""
+MOST_BEHIND = 20_000
+"""Results; bulk loads, replays and reprocessing wait while there are more."""
+CLOSE_S = 5.0
+"""The longest time that is spent on what is left when the service stops."""
+
+_BEHIND = "SELECT count(*) FROM results WHERE seq > (SELECT seq FROM projector)"
+_NEWEST = prepared(select(func.max(results.c.seq).label("seq")))
+
+
+@dataclass(frozen=True)
+class _Step:
+    """What a transaction of the projector came to."""
+
+    position: int
+    is_all: bool
+    """Nothing was left that could be projected."""
+    has_time: bool
+    """The next one may wait until there is more."""
+
+
+@dataclass(frozen=True)
+class _Gap:
+    """Results that were missing between two places, and the number of the next transaction then."""
+
+    before: int
+    after: int
+    next: int
+
+
+@dataclass(frozen=True)
+class Lag:
+    """How far the projections are behind the record: results, and seconds since they were not."""
+
+    results: int
+    seconds: float
+
+
+class Projector:
+    """A thread that projects what the writer records."""
+
+    def __init__(self, store: Store) -> None:
+        """Readers of the store wait for the projections once the thread is started."""
+        self._store, self._writer = store, store.writer
+        self._is_closing = False
+        self._changed = threading.Condition()
+        self._position = 0
+        self._readers = 0
+        self._most = MOST_AT_ONCE
+        self._projected = -1
+        """The writer's count of transactions up to which all is projected."""
+        self._up_to_date_s = time.monotonic()
+        self._gap: _Gap | None = None
+        self._is_projecting, self._is_idle = True, False
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Keep the projections up from now on."""
+        self._thread = threading.Thread(target=self._run, name="projector", daemon=True)
+        self._thread.start()
+        self._writer.after_commit.append(self._wake)
+        self._store.before_reading, self._store.hold_back = self.wait, self._hold_back
+
+    def wait(self) -> None:
+        """Return when all that is recorded now is projected, or after `WAIT_S`."""
+        if self._projected >= self._writer.commits or not self._is_projecting:
+            return
+        commits, newest = self._writer.commits, self._newest()
+
+        def has_passed() -> bool:
+            is_passed = self._position >= newest or self._projected >= commits
+            return is_passed or self._is_closing or not self._is_projecting
+
+        with self._changed:
+            self._readers += 1
+            self._changed.notify_all()
+            self._changed.wait_for(has_passed, WAIT_S)
+            self._readers -= 1
+
+    def _hold_back(self) -> None:
+        """Wait while more than `MOST_BEHIND` results are to be projected."""
+        while self.lag().results > MOST_BEHIND and self._is_projecting:
+            self.wait()
+
+    def lag(self) -> Lag:
+        """How far behind the projections are."""
+        if self._projected >= self._writer.commits:
+            return Lag(0, 0.0)
+        with self._store.lookup() as connection:
+            ((behind,),) = execute(connection, _BEHIND)
+        return Lag(behind, time.monotonic() - self._up_to_date_s if behind else 0.0)
+
+    def close(self) -> None:
+        """Project what is recorded, and end the thread."""
+        with self._changed:
+            self._is_closing = True
+            self._changed.notify_all()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _newest(self) -> int:
+        """The place of the newest result in the record."""
+        with self._store.lookup() as connection:
+            (row,) = _NEWEST.read(connection, {})
+        return row["seq"] or 0
+
+    # ---- the projector's thread --------------------------------------------------------------
+
+    def _wake(self) -> None:
+        # To wake a thread that then waits on is expensive.
+        if self._is_idle:
+            with self._changed:
+                self._changed.notify_all()
+
+    def _run(self) -> None:
+        closing_s = float("inf")
+        while True:
+            begun_s = time.monotonic()
+            commits = self._writer.commits
+            step = self._try_step()
+            with self._changed:
+                self._is_projecting = step is not None
+                if step is not None:
+                    self._position = step.position
+                    if step.is_all:
+                        self._projected, self._up_to_date_s = commits, time.monotonic()
+                self._changed.notify_all()
+                if self._is_closing:
+                    closing_s = min(closing_s, begun_s + CLOSE_S)
+                    if step is None or step.is_all or time.monotonic() > closing_s:
+                        return
+                    continue
+                if step is None or step.is_all:
+                    self._is_idle = True
+                    self._changed.wait_for(self._has_work, LOOK_S)
+                    self._is_idle = False
+                pause_s = begun_s + EVERY_S - time.monotonic()
+                if pause_s > 0.0 and (step is None or step.has_time):
+                    self._changed.wait_for(lambda: self._readers or self._is_closing, pause_s)
+
+    def _has_work(self) -> bool:
+        is_behind = self._projected < self._writer.commits
+        return self._is_closing or (self._is_projecting and is_behind)
+
+    def _try_step(self) -> _Step | None:
+        """Project some results; None where nothing can be written now."""
+        try:
+            return self._writer.project(self._step).result()
+        except (Busy, BadConfiguration):
+            # The writer has logged it, or another process writes.
+            return None
+        except Exception:
+            if self._most > 1:
+                self._most = 1
+                return _Step(self._position, is_all=False, has_time=False)
+            log.exception("a result could not be projected, and is passed over")
+        try:
+            return self._writer.project(self._pass_over).result()
+        except (Busy, BadConfiguration):
+            return None
+
+    def _step(self, connection: Connection) -> _Step:
+        """Project some results in the writer's transaction."""
+        begun_s, most = time.monotonic(), self._most
+        position = lock_position(connection)
+        # Before the results are read: those of older transactions are among them.
+        is_shared = connection.dialect.name == "postgresql"
+        oldest = _transaction(connection, "xmin") if is_shared else None
+        new = recorded_after(connection, position, most)
+        is_all = len(new) < most
+        if oldest is not None:
+            whole = self._without_gaps(connection, position, new, oldest)
+            is_all, new = is_all and len(whole) == len(new), whole
+        if new:
+            position = new[-1].seq
+            connection.execute(update(projector).values(seq=position))
+            for apply in PROJECTIONS:
+                apply(connection, new)
+            took_s = time.monotonic() - begun_s
+            self._most = max(1, min(MOST_AT_ONCE, int(2 * len(new) * LONGEST_S / took_s)))
+        return _Step(position, is_all, has_time=is_all)
+
+    def _without_gaps(
+        self, connection: Connection, position: int, new: list[RecordedResult], oldest: int
+    ) -> list[RecordedResult]:
+        """The first of the results before which none is missing that may still be committed.
+
+        A transaction has its number before it takes places in the record.  Where none of the
+        transactions that there were when a later place was seen is left, the missing ones were
+        rolled back, or deleted.
+        """
+        for k, each in enumerate(new):
+            if each.seq != position + 1 and not self._is_final(
+                connection, position, each.seq, oldest
+            ):
+                return new[:k]
+            position = each.seq
+        return new
+
+    def _is_final(self, connection: Connection, before: int, after: int, oldest: int) -> bool:
+        """True if no result between two places will come any more."""
+        gap = self._gap
+        if gap is None or gap.before != before or gap.after < after:
+            self._gap = _Gap(before, after, _transaction(connection, "xmax"))
+            return False
+        return oldest >= gap.next
+
+    def _pass_over(self, connection: Connection) -> _Step:
+        """Move on by one result without projecting it."""
+        position = lock_position(connection)
+        for each in recorded_after(connection, position, 1):
+            position = each.seq
+            connection.execute(update(projector).values(seq=position))
+        return _Step(position, is_all=False, has_time=False)
+
+
+def _transaction(connection: Connection, which: str) -> int:
+    """A number of PostgreSQL's snapshot: `xmin`, the oldest left, or `xmax`, the next to come."""
+    ((number,),) = execute(connection, f"SELECT pg_snapshot_{which}(pg_current_snapshot())::text")
+    return int(number)
