@@ -51,7 +51,12 @@ class Context:
         return self.store.writer.change(change).result()
 
     def change_audited(self, change: Callable[[Connection], T], entry: Entry | None) -> T:
-        """`change` with its entry in the audit list, in one transaction."""
+        """`change` with its entry in the audit list, in one transaction.
+
+        What was recorded before is projected first: somebody acts on alarms as they were shown,
+        and a limit holds from the next batch on.
+        """
+        self.store.before_reading()
 
         def audited(connection: Connection) -> T:
             changed = change(connection)

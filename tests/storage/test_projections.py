@@ -200,8 +200,9 @@ def test_a_transaction_that_commits_late_is_neither_left_out_nor_projected_twice
     slow = other.writer.change(record_slowly)
     assert sleeping.wait(30)
     app.submissions.submit_many([make(f"b{k}", after_s=60.0 * k) for k in range(3)])
+    # Three looks of the projector, at least, at what it can see of the record.
     time.sleep(0.3)
-    assert app.projector.lag().results == 4
+    assert app.projector.lag().results == 3
     go_on.set()
     slow.result(30)
     other.close()
