@@ -35,6 +35,8 @@ class RequestContext:
     id: str
     caller: str | None = None
     run: str | None = None
+    behind_s: float = 0.0
+    """How far the trends and alarms in the answer are behind the record, where it is much."""
 
 
 request: ContextVar[RequestContext | None] = ContextVar("request", default=None)

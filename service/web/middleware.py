@@ -85,6 +85,8 @@ class AroundRequests:
                 status = message["status"]
                 await self._audit(inner, status)
                 headers = [*message["headers"], _NO_SNIFF, (b"x-request-id", about.id.encode())]
+                if about.behind_s:
+                    headers.append((b"x-behind-seconds", b"%.1f" % about.behind_s))
                 message = {**message, "headers": headers}
             elif is_head:
                 message = {**message, "body": b""}

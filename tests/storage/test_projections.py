@@ -5,7 +5,7 @@ import threading
 import time
 
 import pytest
-from sqlalchemy import func, insert, select
+from sqlalchemy import delete, func, insert, select, update
 
 from service.alarms.limits import LimitSettings
 from service.app.factory import open_app
@@ -15,10 +15,11 @@ from service.settings import Settings
 from service.storage.archive.archiving import archive
 from service.storage.archive.restoring import PartFilter, restore
 from service.storage.projections import projector as projecting
-from service.storage.projections.projector import Projector
+from service.storage.projections.projector import Projector, rebuild_trends
 from service.storage.recording.results import next_places
 from service.storage.sql.alarm_tables import alarm_actions, alarms, limits, watches
 from service.storage.sql.database import Store
+from service.storage.sql.rollup_tables import rollups_daily, rollups_hourly
 from service.storage.sql.tables import (
     batches,
     catalogs,
@@ -148,6 +149,15 @@ def test_they_equal_a_rebuild_after_each_kind_of_change(
     forget(watched.store, ForgetFilter("r"), place)
     assert_right(watched, "forgotten", alarms_again=False)
     assert alarms_of(watched.store) == before
+
+    def spoil(connection):
+        connection.execute(update(rollups_hourly).values(batches=7))
+        connection.execute(delete(rollups_daily))
+
+    watched.store.writer.change(spoil).result()
+    assert verify(url) != []
+    rebuild_trends(watched.store, lambda done, total: None)
+    assert_right(watched, "counted anew", alarms_again=False)
 
 
 def assert_passed(connection):

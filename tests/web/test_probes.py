@@ -14,7 +14,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from sqlalchemy import text
 
 from service.app.factory import open_app
-from service.errors import Stopping
+from service.errors import Busy, Stopping
+from service.storage.projections import projector
 from service.web.app import create_app
 from service.web.warm_request import warm_request
 from tests.fresh_databases import sqlite_at
@@ -44,6 +45,37 @@ def test_it_lives_and_becomes_ready(client):
         return answer.status_code == 200
 
     wait_until(is_ready)
+
+
+def test_answers_say_how_far_trends_are_behind_the_record(client, post, batch, monkeypatch):
+    """They come within a second of a held-up projector, and are right once it goes on."""
+    go_on = threading.Event()
+
+    def held_up(connection, new):
+        if not go_on.is_set():
+            raise Busy("held up")
+
+    def depth():
+        return samples(client)["starid_queue_depth", ("queue", "projections")]
+
+    monkeypatch.setattr(projector, "PROJECTIONS", (held_up, *projector.PROJECTIONS))
+    monkeypatch.setattr(projector, "WAIT_S", 0.2)
+    trends = "/api/v1/spacecraft/XTE/rates"
+    before = sum(each["batches"] for each in client.get(trends).json()["items"])
+    post(batch)
+    late = client.get(trends)
+    assert sum(each["batches"] for each in late.json()["items"]) == before
+    assert float(late.headers["X-Behind-Seconds"]) > 0.1
+    assert "behind the batches" in client.get("/spacecraft/XTE").text
+    assert depth() == 1
+    assert "X-Behind-Seconds" not in client.get("/api/v1/batches").headers
+    wait_until(lambda: "1 results" in client.get("/readyz").text)
+    go_on.set()
+    wait_until(lambda: depth() == 0)
+    caught_up = client.get(trends)
+    assert sum(each["batches"] for each in caught_up.json()["items"]) == before + 1
+    assert "X-Behind-Seconds" not in caught_up.headers
+    assert client.get("/readyz").text == "ready\n"
 
 
 def test_live_stars_are_counted_once_by_outcome(client, post, batch, run):

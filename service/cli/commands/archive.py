@@ -89,15 +89,16 @@ def archive(parsed: Namespace) -> int:
     folder = _folder(parsed.to, "--to")
     require_extra("tables", "pyarrow", "--to", str(folder))
     from service.storage.archive import archiving
-    from service.storage.projections.projector import Projector
+    from service.storage.projections.projector import projected
 
     settings = settings_of_existing(parsed)
     store = Store(settings.database, create=False)
-    projector = Projector(store)
-    projector.start()
     try:
         store.require_writing()
-        with tqdm(total=None, unit=" batches", desc="archiving", disable=None, leave=False) as b:
+        with (
+            projected(store),
+            tqdm(total=None, unit=" batches", desc="archiving", disable=None, leave=False) as b,
+        ):
 
             def step(archived: archiving.Archived) -> None:
                 b.total = archived.total
@@ -105,7 +106,6 @@ def archive(parsed: Namespace) -> int:
 
             done = archiving.archive(store, folder, before, step=step)
     finally:
-        projector.close()
         store.close()
     if parsed.json:
         print_json({"batches": done.batches, "files": done.parts, "bytes": done.bytes})

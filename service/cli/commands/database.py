@@ -89,6 +89,16 @@ def add(commands: Any) -> None:
     )
     add_json(parser, "the faults")
     add_database(parser)
+    parser = add_command(
+        group,
+        "rebuild",
+        "Count the trends anew from the recorded batches.  They are kept up by themselves: this is "
+        "for a database whose `verify` reports wrong trends.  Alarms and events stay: they hold "
+        "what people did, and the limits of their time.  On SQLite no service may be running.",
+        "acquire database rebuild",
+        rebuild,
+    )
+    add_database(parser)
     _add_split_trackers(group)
     _add_prune(group)
     add_forget(group)
@@ -218,6 +228,31 @@ def verify(parsed: Namespace) -> int:
     return 1 if problems else 0
 
 
+def rebuild(parsed: Namespace) -> int:
+    """Count the trends anew."""
+    from tqdm import tqdm
+
+    from service.storage.projections.projector import projected, rebuild_trends
+    from service.storage.sql.database import Store
+
+    store = Store(settings_of_existing(parsed).database, create=False)
+    try:
+        with (
+            projected(store),
+            tqdm(total=None, unit=" hours", desc="counting", disable=None, leave=False) as bar,
+        ):
+
+            def step(done: int, total: int) -> None:
+                bar.total = total
+                bar.update(done - bar.n)
+
+            hours = rebuild_trends(store, step)
+    finally:
+        store.close()
+    print(f"the trends of {hours} hours were counted anew")
+    return 0
+
+
 def split_trackers(parsed: Namespace) -> int:
     """Split older batches by tracker."""
     from tqdm import tqdm
@@ -238,7 +273,7 @@ def prune(parsed: Namespace) -> int:
     """Delete old batches."""
     from tqdm import tqdm
 
-    from service.storage.projections.projector import Projector
+    from service.storage.projections.projector import projected
     from service.storage.sql.database import Store
     from service.storage.upkeep.prune import Pruned
     from service.storage.upkeep.prune import prune as prune_records
@@ -246,10 +281,11 @@ def prune(parsed: Namespace) -> int:
 
     before = parse_utc(parsed.before, "--before")
     store = Store(settings_of_existing(parsed).database, create=False)
-    projector = Projector(store)
-    projector.start()
     try:
-        with tqdm(total=None, unit=" batches", desc="deleting", disable=None, leave=False) as bar:
+        with (
+            projected(store),
+            tqdm(total=None, unit=" batches", desc="deleting", disable=None, leave=False) as bar,
+        ):
 
             def step(pruned: Pruned) -> None:
                 bar.total = pruned.total
@@ -257,7 +293,6 @@ def prune(parsed: Namespace) -> int:
 
             pruned = prune_records(store, before, parsed.run, dry_run=parsed.dry_run, step=step)
     finally:
-        projector.close()
         store.close()
     if parsed.dry_run:
         more = _beside(pruned.total_gyro_blocks, pruned.total_graded_days)

@@ -11,12 +11,14 @@ that they take turns.
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 
 from sqlalchemy import Connection, func, select, update
 
-from service.errors import BadConfiguration, Busy
+from service.errors import BadConfiguration, Busy, Standby
 from service.storage.projections import alarms, rollups, states
 from service.storage.projections.recorded import RecordedResult, recorded_after
 from service.storage.projections.rollups import lock_position
@@ -43,6 +45,8 @@ WAIT_S = 1.0
 """The longest wait of a reader for the projections."""
 MOST_BEHIND = 20_000
 """Results; bulk loads, replays and reprocessing wait while there are more."""
+HOURS_AT_ONCE = 24
+"""Of trends that are counted anew, in one transaction."""
 CLOSE_S = 5.0
 """The longest time that is spent on what is left when the service stops."""
 
@@ -101,12 +105,18 @@ class Projector:
         self._thread = threading.Thread(target=self._run, name="projector", daemon=True)
         self._thread.start()
         self._writer.after_commit.append(self._wake)
-        self._store.before_reading, self._store.hold_back = self.wait, self._hold_back
+        self._store.before_reading, self._store.hold_back = (
+            self.wait,
+            partial(self.catch_up, MOST_BEHIND),
+        )
 
-    def wait(self) -> None:
-        """Return when all that is recorded now is projected, or after `WAIT_S`."""
+    def wait(self) -> float:
+        """Return when all that is recorded now is projected, or after `WAIT_S`.
+
+        The seconds that the projections are behind then; zero where they are not.
+        """
         if self._projected >= self._writer.commits or not self._is_projecting:
-            return
+            return 0.0
         commits, newest = self._writer.commits, self._newest()
 
         def has_passed() -> bool:
@@ -116,12 +126,13 @@ class Projector:
         with self._changed:
             self._readers += 1
             self._changed.notify_all()
-            self._changed.wait_for(has_passed, WAIT_S)
+            is_passed = self._changed.wait_for(has_passed, WAIT_S)
             self._readers -= 1
+            return 0.0 if is_passed else time.monotonic() - self._up_to_date_s
 
-    def _hold_back(self) -> None:
-        """Wait while more than `MOST_BEHIND` results are to be projected."""
-        while self.lag().results > MOST_BEHIND and self._is_projecting:
+    def catch_up(self, most: int = 0) -> None:
+        """Wait while more than so many results are to be projected."""
+        while self._is_projecting and not self._is_closing and self.lag().results > most:
             self.wait()
 
     def lag(self) -> Lag:
@@ -161,7 +172,6 @@ class Projector:
             commits = self._writer.commits
             step = self._try_step()
             with self._changed:
-                self._is_projecting = step is not None
                 if step is not None:
                     self._position = step.position
                     if step.is_all:
@@ -187,19 +197,26 @@ class Projector:
     def _try_step(self) -> _Step | None:
         """Project some results; None where nothing can be written now."""
         try:
-            return self._writer.project(self._step).result()
-        except (Busy, BadConfiguration):
-            # The writer has logged it, or another process writes.
-            return None
+            return self._write(self._step)
         except Exception:
             if self._most > 1:
                 self._most = 1
                 return _Step(self._position, is_all=False, has_time=False)
             log.exception("a result could not be projected, and is passed over")
+        return self._write(self._pass_over)
+
+    def _write(self, step: Callable[[Connection], _Step]) -> _Step | None:
         try:
-            return self._writer.project(self._pass_over).result()
-        except (Busy, BadConfiguration):
+            done = self._writer.project(step).result()
+        except (Standby, BadConfiguration):
+            # Another process writes, and projects.
+            self._is_projecting = False
             return None
+        except Busy:
+            # The writer has logged it.
+            return None
+        self._is_projecting = True
+        return done
 
     def _step(self, connection: Connection) -> _Step:
         """Project some results in the writer's transaction."""
@@ -254,6 +271,32 @@ class Projector:
             position = each.seq
             connection.execute(update(projector).values(seq=position))
         return _Step(position, is_all=False, has_time=False)
+
+
+@contextmanager
+def projected(store: Store) -> Iterator[None]:
+    """Project all that is recorded, and what the block records or deletes: for commands."""
+    projector = Projector(store)
+    projector.start()
+    try:
+        projector.catch_up()
+        yield
+    finally:
+        projector.close()
+
+
+def rebuild_trends(store: Store, step: Callable[[int, int], object]) -> int:
+    """Count all trends anew, some hours at a time; how many hours there are.
+
+    `step` is called with the hours done and all hours.  Interrupted, it has left right trends.
+    """
+    with store.reading_record() as connection:
+        hours = sorted(rollups.hours_of_all(connection))
+    for first in range(0, len(hours), HOURS_AT_ONCE):
+        some = hours[first : first + HOURS_AT_ONCE]
+        store.writer.change(partial(rollups.renew, hours=some)).result()
+        step(first + len(some), len(hours))
+    return len(hours)
 
 
 def _transaction(connection: Connection, which: str) -> int:

@@ -10,9 +10,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import ColumnElement, Connection, Select, Table, and_, delete, select
+from sqlalchemy import ColumnElement, Connection, Select, Table, and_, delete, func, select
 
 from service.errors import BadInput, Fault
+from service.storage.archive.tables import archived_hours
 from service.storage.projections.recorded import RecordedResult
 from service.storage.recording.archived_hours import WHOLE, every_share, shares_of_hour
 from service.storage.recording.result_metrics import merge, rolled_up
@@ -27,7 +28,7 @@ from service.storage.sql.rollup_tables import (
 )
 from service.storage.sql.statements import add_rollups, insert_all
 from service.storage.sql.tables import batches, projector, results, tracker_values
-from service.times import DAY_S, HOUR_S, Utc, bucket_start, parse_utc
+from service.times import DAY_S, HOUR_S, Utc, bucket_start, parse_utc, recorded_utc
 
 Bucket = Literal["hour", "day"]
 BucketKey = tuple[str, str, int]
@@ -317,6 +318,21 @@ def recount(connection: Connection, bucket: Bucket, *, of_trackers: bool = False
         if (name != WHOLE) == of_trackers:
             owner = (spacecraft, run, name) if of_trackers else (spacecraft, run)
             _put(found, (*owner, hour * HOUR_S // width_s), share)
+    return found
+
+
+def hours_of_all(connection: Connection) -> set[BucketKey]:
+    """Every hour with batches, recorded or archived, and every hour that has a trend."""
+    hour = func.substr(batches.c.time, 1, len("2026-11-27T12"))
+    columns = batches.c.spacecraft, batches.c.run
+    query = select(*columns, func.min(batches.c.time)).group_by(*columns, hour)
+    found = {
+        (spacecraft, run, recorded_utc(time).bucket(HOUR_S))
+        for spacecraft, run, time in connection.execute(query)
+    }
+    for table in (rollups_hourly, archived_hours):
+        query = select(*(table.c[name] for name in _KEY)).distinct()
+        found.update((row[0], row[1], row[2]) for row in connection.execute(query))
     return found
 
 

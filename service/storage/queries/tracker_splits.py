@@ -3,6 +3,7 @@
 from sqlalchemy import Connection, delete, insert, select
 
 from service.storage.sql.rollup_tables import rollups_daily, tracker_splits
+from service.storage.sql.tables import results
 
 
 def is_waiting(connection: Connection, spacecraft: str, run: str) -> bool:
@@ -16,6 +17,10 @@ def is_waiting(connection: Connection, spacecraft: str, run: str) -> bool:
 def split_anew(connection: Connection, spacecraft: str) -> None:
     """Have all batches of a spacecraft looked at: from now on it has several trackers."""
     connection.execute(delete(tracker_splits).where(tracker_splits.c.spacecraft == spacecraft))
-    daily = rollups_daily.c
-    runs = select(daily.spacecraft, daily.run).where(daily.spacecraft == spacecraft).distinct()
+    recorded, trends = (
+        select(table.c.spacecraft, table.c.run).where(table.c.spacecraft == spacecraft)
+        for table in (results, rollups_daily)
+    )
+    # Archived batches are in the trends alone, and the latest ones in the record alone.
+    runs = recorded.union(trends)
     connection.execute(insert(tracker_splits).from_select(["spacecraft", "run"], runs))

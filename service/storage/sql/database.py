@@ -8,6 +8,7 @@ from pathlib import Path
 from sqlalchemy import Connection
 from sqlalchemy.exc import DBAPIError, TimeoutError
 
+from service import logs
 from service.errors import Busy
 from service.storage.archive.reading import Archive
 from service.storage.serving.file_lock import FileLock
@@ -148,8 +149,8 @@ class Store(Readers):
         self.writer = Writer(
             self._writing, file=file, wait_s=wait_s, lock=self.lock, file_lock=self.file_lock
         )
-        self.before_reading: Callable[[], object] = lambda: None
-        """Waits for the projections."""
+        self.before_reading: Callable[[], float] = lambda: 0.0
+        """Waits for the projections, and tells by how many seconds they are still behind."""
         self.hold_back: Callable[[], object] = lambda: None
         """Waits while too much is to be projected; called before much is recorded at once."""
         if serving and self.file_lock is not None:
@@ -159,9 +160,12 @@ class Store(Readers):
     def reading(self) -> Iterator[Connection]:
         """A connection whose snapshot has the projections of what is recorded now.
 
-        They are waited for, at most a second: see `Projector.wait`.
+        They are waited for, at most a second: see `Projector.wait`.  What they then still are
+        behind is noted for the answer of the request.
         """
-        self.before_reading()
+        behind_s = self.before_reading()
+        if behind_s and (request := logs.request.get()) is not None:
+            request.behind_s = behind_s
         with self.reading_record() as connection:
             yield connection
 

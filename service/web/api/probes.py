@@ -9,7 +9,9 @@ from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 
+from service.app.factory import App
 from service.errors import Busy
+from service.storage.projections.projector import WAIT_S, Lag
 from service.web.openapi.route import ResponseDoc, route_docs
 from service.web.requests.dependencies import AppDep, MetricsDep
 from service.web.requests.query_parameters import NO_QUERY
@@ -37,7 +39,7 @@ async def readyz(request: Request, app: AppDep) -> Response:
     if getattr(state, "getting_ready", None) is None or state.getting_ready.done():
         # A thread apart from those of handlers, which may all be busy; one for all probes:
         # while the database does not answer, threads would pile up.
-        ready = anyio.to_thread.run_sync(app.service.ready, limiter=anyio.CapacityLimiter(1))
+        ready = anyio.to_thread.run_sync(_ready, app, limiter=anyio.CapacityLimiter(1))
         state.getting_ready = asyncio.ensure_future(ready)
         # Every waiting probe may have given up by then.
         state.getting_ready.add_done_callback(lambda done: done.cancelled() or done.exception())
@@ -45,13 +47,20 @@ async def readyz(request: Request, app: AppDep) -> Response:
     if not done:
         raise Busy("the service is starting, or the database does not answer", 5)
     try:
-        state.getting_ready.result()
+        lag: Lag = state.getting_ready.result()
     except Busy:
         raise
     except Exception as error:
         log.warning("not ready: %s", error)
         raise Busy("the service is not ready; its log says why", retry_after_s=5) from None
-    return PlainTextResponse("ready\n")
+    behind = f"; trends and alarms are {lag.results} results, {lag.seconds:.0f} s behind the record"
+    return PlainTextResponse(f"ready{behind if lag.seconds > WAIT_S else ''}\n")
+
+
+def _ready(app: App) -> Lag:
+    """How far projections are behind, once the service is ready."""
+    app.service.ready()
+    return app.projector.lag()
 
 
 @router.get("/metrics", **route_docs({200: ResponseDoc("The counters.", media_type=TEXT)}))

@@ -7,6 +7,7 @@ from fastapi import Depends
 from pydantic import Field
 from starlette.requests import Request
 
+from service import logs
 from service.access.tokens import Caller
 from service.app.factory import App
 from service.observations.schema import RunName
@@ -64,6 +65,8 @@ class Layout:
     worst_alarm: str | None = None
     stands_by: bool = False
     """Whether another service writes to the database."""
+    behind_s: float = 0.0
+    """How far trends and alarms are behind the record, where they could not be waited for."""
 
     @property
     def is_live(self) -> bool:
@@ -134,6 +137,7 @@ class PageContext:
             open_alarms=alarms.open,
             worst_alarm=alarms.worst,
             stands_by=not self.app.single_writer.is_writing,
+            behind_s=request.behind_s if (request := logs.request.get()) is not None else 0.0,
         )
 
     def _stream(self) -> str | None:

@@ -29,6 +29,7 @@ from service.ingest.outcomes import Recorded
 from service.ingest.queue import Backlog
 from service.storage.models.alarms import Alarm
 from service.storage.models.zones import ZoneCache
+from service.storage.projections.projector import Lag
 from service.storage.queries.future_dated import LIVE
 from service.storage.upkeep.expiries import Expiries
 from service.storage.webhooks.models import Webhook
@@ -94,6 +95,7 @@ class _GaugeCollector(Collector):
             processes=app.replays.processes,
             alarms=app.alarms.active,
             backlog=app.submissions.backlog,
+            lag=app.projector.lag,
             expiries=app.expiries.dates,
             webhooks=app.webhooks.all,
         )
@@ -112,7 +114,7 @@ class _GaugeCollector(Collector):
         if "alarms" in found:
             yield _of_alarms(self._app, found["alarms"])
         if "backlog" in found:
-            yield from _of_backlog(found["backlog"])
+            yield from _of_backlog(found["backlog"], found.get("lag"))
         if "expiries" in found:
             yield from _of_expiries(found["expiries"])
         if "webhooks" in found:
@@ -165,7 +167,7 @@ def _of_alarms(app: App, active: Sequence[Alarm]) -> Metric:
     return family
 
 
-def _of_backlog(backlog: Backlog) -> Iterator[Metric]:
+def _of_backlog(backlog: Backlog, lag: Lag | None) -> Iterator[Metric]:
     """The queues, and the state of the writes."""
     posts, writes = backlog.posts, backlog.writes
     yield CounterMetricFamily(
@@ -180,7 +182,8 @@ def _of_backlog(backlog: Backlog) -> Iterator[Metric]:
     )
     depth = GaugeMetricFamily(
         "starid_queue_depth",
-        "Posted batches that are not answered yet, and records that wait to be written.",
+        "Posted batches that are not answered yet, records that wait to be written, and results "
+        "that trends and alarms do not have yet.",
         labels=("queue",),
     )
     age = GaugeMetricFamily(
@@ -190,6 +193,9 @@ def _of_backlog(backlog: Backlog) -> Iterator[Metric]:
     depth.add_metric(("writes",), writes.queued)
     age.add_metric(("posts",), posts.oldest_s)
     age.add_metric(("writes",), writes.oldest_s)
+    if lag is not None:
+        depth.add_metric(("projections",), lag.results)
+        age.add_metric(("projections",), lag.seconds)
     yield depth
     yield age
 
