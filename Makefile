@@ -22,7 +22,7 @@ ALL_OVER_POSTGRESQL = tests/web \
 	$(addprefix --ignore tests/web/test_,bad_input.py any_input.py console_in_browser.py)
 # What asks the database in a way of its own.
 SITTING_OVER_POSTGRESQL = $(addprefix tests/web/test_,batches.py bulk.py events.py history.py \
-	many_batches.py period.py trackers.py)
+	many_batches.py period.py revisions_and_runs.py trackers.py)
 OVER_POSTGRESQL = [ -z "$$TEST_POSTGRESQL_URL" ] || \
 	$(TEST) --database postgresql -m "not torture"
 # From the environment: TEST_POSTGRESQL_URL, a scratch database for the PostgreSQL tests, which

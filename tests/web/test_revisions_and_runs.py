@@ -113,7 +113,7 @@ def test_rates_of_any_period_are_drawn_in_a_bounded_number_of_points(chosen_data
             for number, each in enumerate(early + late):
                 body = each | {"run": run, "batch": f"b{number}"}
                 httpx.post(f"{url}/api/v1/batches", json=body, timeout=60).raise_for_status()
-    rates = app.runs.rates("one", "two", "XTE", parse_utc("1972-01-01T00:00:00Z", "start"))
+        rates = app.runs.rates("one", "two", "XTE", parse_utc("1972-01-01T00:00:00Z", "start"))
     assert rates.start.text == "1972-01-05T00:00:00.000Z"
     for each in rates.runs:
         assert each.totals["batches"] == 2
