@@ -15,6 +15,21 @@ def upgrade() -> None:
         "results", sa.Column("seq", sa.BigInteger(), server_default=sa.text("0"), nullable=False)
     )
     op.create_index("ix_results_seq", "results", ["seq"])
+    op.add_column("results", sa.Column("digest", sa.BigInteger()))
+    op.create_table(
+        "seals",
+        sa.Column("spacecraft", sa.String(128), nullable=False),
+        sa.Column("run", sa.String(64), nullable=False),
+        sa.Column("hour", sa.BigInteger(), autoincrement=False, nullable=False),
+        sa.Column("results", sa.Integer(), nullable=False),
+        sa.Column("digests", sa.BigInteger(), nullable=False),
+        sa.PrimaryKeyConstraint("spacecraft", "run", "hour"),
+        sqlite_with_rowid=False,
+    )
+    op.execute(
+        "INSERT INTO seals SELECT spacecraft, run, time_ns / 3600000000000, count(*), 0 "
+        "FROM results GROUP BY 1, 2, 3"
+    )
     position = op.create_table(
         "projector",
         sa.Column("id", sa.SmallInteger(), autoincrement=False, nullable=False),
@@ -30,5 +45,7 @@ def downgrade() -> None:
     if op.get_bind().dialect.name == "postgresql":
         op.execute("DROP SEQUENCE results_seq")
     op.drop_table("projector")
+    op.drop_table("seals")
+    op.drop_column("results", "digest")
     op.drop_index("ix_results_seq", "results")
     op.drop_column("results", "seq")

@@ -28,6 +28,7 @@ def result_row(app, time, *, spacecraft="XTE", run="live", name="b", **values):
         "parent_id": None,
         "current": True,
         "seq": 0,
+        "digest": None,
         "created": time.text,
         "spacecraft": spacecraft,
         "run": run,

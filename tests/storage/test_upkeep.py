@@ -1,13 +1,27 @@
 """Backup, verify and prune: copies of one moment, every fault named, nothing left hanging."""
 
 import io
+import math
+import random
 import sqlite3
 import subprocess
 import threading
 from pathlib import Path
 
 import pytest
-from sqlalchemy import create_engine, delete, func, make_url, select, text, update
+from sqlalchemy import (
+    Double,
+    String,
+    and_,
+    create_engine,
+    delete,
+    func,
+    insert,
+    make_url,
+    select,
+    text,
+    update,
+)
 
 from service.app.factory import open_app
 from service.errors import BadConfiguration
@@ -17,6 +31,7 @@ from service.settings import Settings
 from service.simulate.frame_files import frame_bytes
 from service.simulate.frames import FrameSettings, draw_frames
 from service.storage.projections import rollups
+from service.storage.recording.digests import digest_of
 from service.storage.sql.columns import metadata
 from service.storage.sql.database import Store
 from service.storage.sql.engines import database_url
@@ -33,6 +48,7 @@ from service.storage.upkeep.backup import back_up
 from service.storage.upkeep.prune import OF_A_BATCH, OF_A_RESULT, prune
 from service.storage.upkeep.verify import verify
 from service.times import shifted
+from tests.scale import draws
 from tests.storage.samples import START
 
 TIGHT = OptionsIn.model_validate({"tolerances": {"separation_deg": 1e-5}})
@@ -115,6 +131,70 @@ def test_every_kind_of_damage_is_named(app, make, database, fault, told):
     assert verify(database) == []
     change(app, fault(id))
     assert any(told in problem for problem in verify(database))
+
+
+def altered(value, kind, rng):
+    """Another value of a column: one letter of a text, the next double, the next whole number."""
+    if isinstance(kind, Double):
+        next_one = math.nextafter(value or 0.0, math.inf)
+        return 0.5 if value is None else rng.choice([-value or 1.0, next_one])
+    if isinstance(kind, String):
+        text = value or "?"
+        place = rng.randrange(len(text))
+        return text[:place] + ("~" if text[place] != "~" else "!") + text[place + 1 :]
+    return (value or 0) + 1
+
+
+def content_of(table):
+    """The columns that hold what was recorded, and are no key."""
+    left_out = {"current", "seq", "digest", "run"}
+    return [
+        each
+        for each in table.columns
+        if not each.primary_key and not each.foreign_keys and each.name not in left_out
+    ]
+
+
+@pytest.mark.both_databases
+def test_any_changed_value_of_the_record_is_found_and_named(filled, database, seed):
+    rng = random.Random(seed)
+    owner = {batches: "id", results: "batch_id", star_results: "result_id", solutions: "result_id"}
+    with filled.store.reading() as connection:
+        rows = {t: [dict(r) for r in connection.execute(select(t)).mappings()] for t in owner}
+        batch_of = dict(map(tuple, connection.execute(select(results.c.id, results.c.batch_id))))
+    for _ in range(draws(12, 200)):
+        table = rng.choice(list(owner))
+        row, column = rng.choice(rows[table]), rng.choice(content_of(table))
+        place = and_(*(key == row[key.name] for key in table.primary_key))
+        changed = {column.name: altered(row[column.name], column.type, rng)}
+        change(filled, update(table).where(place).values(changed))
+        batch = batch_of.get(row[owner[table]], row[owner[table]])
+        found = verify(database)
+        assert any(batch in each for each in found), (table.name, column.name, changed, found)
+        change(filled, update(table).where(place).values({column.name: row[column.name]}))
+    assert verify(database) == []
+
+
+@pytest.mark.both_databases
+def test_results_that_were_removed_or_added_are_found(filled, database):
+    with filled.store.reading() as connection:
+        what_if = select(results.c.id).where(~results.c.current, results.c.parent_id.is_not(None))
+        removed = connection.scalar(what_if)
+        whole = select(results).where(results.c.id == removed)
+        row = dict(connection.execute(whole).mappings().one())
+
+    def remove(connection):
+        for table in (star_results, solutions):
+            connection.execute(delete(table).where(table.c.result_id == removed))
+        connection.execute(delete(results).where(results.c.id == removed))
+
+    filled.store.writer.change(remove).result()
+    (found,) = verify(database)
+    assert "results were removed, added or exchanged" in found
+    exchanged = row | {"id": "0" * 26}
+    exchanged["digest"] = digest_of(exchanged, [], None)
+    change(filled, insert(results).values(exchanged))
+    assert any("removed, added or exchanged" in each for each in verify(database))
 
 
 @pytest.fixture

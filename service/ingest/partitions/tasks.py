@@ -174,9 +174,7 @@ def _rows_of(found: Sequence[UnsavedResult]) -> Rows:
     }
     rows = {
         "batches": _table(batches, [each.batch for each in in_order]),
-        "results": _table(
-            results, [each.result | {"answer": each.answer.decode()} for each in in_order]
-        ),
+        "results": _table(results, [each.result_row(each.answer) for each in in_order]),
     }
     for name, (table, _, _) in CHILDREN.items():
         rows[table.name] = _table(table, [row for some in children[name] for row in some])

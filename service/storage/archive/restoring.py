@@ -29,11 +29,11 @@ from service.storage.archive.folder import (
 )
 from service.storage.archive.rows import Rows, from_partition, insert_rows
 from service.storage.archive.tables import archived_batches, archived_parts, archived_what_ifs
-from service.storage.projections import rollups
+from service.storage.projections import rollups, seals
 from service.storage.recording.archived_hours import forget_share
 from service.storage.sql.database import Store
 from service.storage.sql.statements import insert_missing, insert_runs
-from service.storage.sql.tables import batches, catalogs, missions
+from service.storage.sql.tables import batches, catalogs, missions, results
 from service.times import HOUR_S, Utc, parse_utc
 
 _AT_ONCE = 1_000
@@ -128,6 +128,8 @@ def put_back(connection: Connection, folder: Path, part: Part, rows: Rows) -> bo
         connection.execute(delete(archived_parts).where(archived_parts.c.id == part_id))
     position = rollups.lock_position(connection)
     insert_rows(connection, _placed(rows, 0 if part_id is None else position))
+    for first in range(0, len(ids), _AT_ONCE):
+        seals.add(connection, results.c.batch_id.in_(ids[first : first + _AT_ONCE]))
     if part_id is None:
         # The trends have the share of a part that the database knows.
         _add_to_trends(connection, rows)

@@ -19,7 +19,7 @@ from functools import partial
 from sqlalchemy import Connection, func, select, update
 
 from service.errors import BadConfiguration, Busy, Standby
-from service.storage.projections import alarms, rollups, states
+from service.storage.projections import alarms, rollups, seals, states
 from service.storage.projections.recorded import RecordedResult, recorded_after
 from service.storage.projections.rollups import lock_position
 from service.storage.sql.database import Store
@@ -29,6 +29,7 @@ from service.storage.sql.tables import projector, results
 log = logging.getLogger(__name__)
 
 PROJECTIONS: Sequence[Callable[[Connection, Sequence[RecordedResult]], None]] = (
+    seals.apply,
     rollups.apply,
     states.apply,
     alarms.apply,
@@ -270,6 +271,7 @@ class Projector:
         for each in recorded_after(connection, position, 1):
             position = each.seq
             connection.execute(update(projector).values(seq=position))
+            seals.apply(connection, [each])
         return _Step(position, is_all=False, has_time=False)
 
 

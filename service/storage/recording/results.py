@@ -194,8 +194,7 @@ def _insert_results(
     in_order = sorted(unsaved_results, key=lambda each: each[0].id)
     places = next_places(connection, len(in_order))
     rows = [
-        unsaved.result | {"answer": body.decode(), "seq": seq}
-        for (unsaved, body), seq in zip(in_order, places, strict=True)
+        unsaved.result_row(body, seq) for (unsaved, body), seq in zip(in_order, places, strict=True)
     ]
     insert_all(connection, results, rows)
     insert_all(connection, star_results, [row for unsaved, _ in in_order for row in unsaved.stars])

@@ -20,6 +20,7 @@ from service.storage.models.answers import Answer
 from service.storage.models.frames import FrameSummary, FrameTimings
 from service.storage.queries.future_dated import AHEAD_NS, LIVE
 from service.storage.recording.answer import answer_of, rows_of_stars
+from service.storage.recording.digests import digest_of
 from service.storage.recording.result_metrics import metrics_of
 from service.storage.recording.tracker_values import values_of_trackers
 from service.storage.sql.columns import Row
@@ -87,6 +88,12 @@ class UnsavedResult(Struct, eq=False):
         head, _, tail = self.answer.rpartition(_NOT_RECORDED)
         assert head
         return b"%b%b%d%b" % (head, _RECORD, waited_ns // (1000 * together), tail)
+
+    def result_row(self, body: bytes, seq: int = 0) -> Row:
+        """The row of `results`, with the answer, its place in the record and its digest."""
+        row = self.result | {"answer": body.decode(), "seq": seq}
+        row["digest"] = digest_of(row, self.stars, self.solution, self.batch, self.frame)
+        return row
 
 
 def unsaved_submission(
@@ -202,7 +209,6 @@ def _result_row(
         "batch_id": batch_id,
         "parent_id": parent,
         "current": current,
-        "seq": 0,
         "created": created.text,
         "spacecraft": batch.spacecraft,
         "run": batch.run,

@@ -153,6 +153,8 @@ results = Table(
     *(Column(name, Double) for name in MEASURED),
     # The answer's JSON, byte for byte as it was sent.
     Column("answer", Text, nullable=False),
+    # Of all that is kept of the result; null: an earlier version recorded it.
+    Column("digest", BigInteger),
 )
 
 # Lists, histories and trends look at current results alone, newest or oldest first; what they
@@ -279,6 +281,18 @@ replays = Table(
     Column("counts", Text),
     Column("started", Moment, nullable=False),
     Column("finished", Moment),
+)
+
+# Of each hour of TAI, up to the projector's position; see `projections.seals`.
+seals = Table(
+    "seals",
+    metadata,
+    Column("spacecraft", Name, primary_key=True),
+    Column("run", RunName, primary_key=True),
+    Column("hour", BigInteger, primary_key=True, autoincrement=False),
+    Column("results", Integer, nullable=False),
+    Column("digests", BigInteger, nullable=False),
+    sqlite_with_rowid=False,
 )
 
 projector = Table(

@@ -10,7 +10,7 @@ from functools import partial
 
 from sqlalchemy import ColumnElement, Connection, delete, func, select
 
-from service.storage.projections import rollups
+from service.storage.projections import rollups, seals
 from service.storage.sql.database import Store
 from service.storage.sql.grade_tables import graded_blocks, graded_days
 from service.storage.sql.gyro_tables import gyro_blocks
@@ -156,6 +156,7 @@ def delete_batches(connection: Connection, batch_ids: Sequence[str]) -> None:
     """Delete batches with all that was made of them, what refers to others first."""
     for first in range(0, len(batch_ids), _AT_ONCE):
         ids = batch_ids[first : first + _AT_ONCE]
+        seals.take_out(connection, ids)
         made = list(connection.scalars(select(results.c.id).where(results.c.batch_id.in_(ids))))
         for table in OF_A_RESULT:
             connection.execute(delete(table).where(table.c.result_id.in_(made)))

@@ -6,19 +6,20 @@ done while the database is being served.
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import product
-from typing import Any, get_args
+from typing import get_args
 
 import msgspec
-from sqlalchemy import Connection, Engine, func, select
+from sqlalchemy import ColumnElement, Connection, Engine, Table, func, select
 from sqlalchemy.exc import DatabaseError
 
 from service.errors import BadInput
 from service.observations.batch import ObservationBatch
 from service.observations.schema import fingerprint_of, submission_from_json
-from service.storage.projections import rollups
+from service.storage.projections import rollups, seals
 from service.storage.queries.tracker_splits import is_waiting
+from service.storage.recording.digests import digest_of
 from service.storage.sql.columns import Row
 from service.storage.sql.engines import database_url, reading_engine
 from service.storage.sql.migrations import check, reported
@@ -33,6 +34,7 @@ from service.storage.sql.tables import (
 from service.storage.upkeep.verify_archived import of_the_archived
 from service.storage.upkeep.verify_grades import of_the_grades
 from service.storage.upkeep.verify_gyro import of_the_gyro_blocks
+from service.times import unix_seconds, utc_of_unix
 
 AT_ONCE = 500
 OUTCOMES = ("unique", "ambiguous", "unmatched")
@@ -61,6 +63,7 @@ def verify(database: str, step: Step = lambda done, total: None) -> list[str]:
             # The content of a damaged file is not evidence of what was written.
             if not found:
                 found += _of_the_batches(engine, step)
+                found += _of_the_seals(engine)
                 found += _of_the_trends(engine)
                 found += of_the_gyro_blocks(engine)
                 found += of_the_archived(engine)
@@ -116,25 +119,13 @@ def _of_a_chunk(connection: Connection, chunk: Mapping[str, Row]) -> Iterator[st
         ).mappings()
     ]
     ids = [row["id"] for row in made]
-    stars: dict[str, Counter[str]] = {}
-    counted = (
-        select(star_results.c.result_id, star_results.c.outcome, func.count())
-        .where(star_results.c.result_id.in_(ids))
-        .group_by(star_results.c.result_id, star_results.c.outcome)
-    )
-    for id, outcome, count in connection.execute(counted):
-        stars.setdefault(id, Counter())[outcome] += count
-    solved = set(
-        connection.scalars(select(solutions.c.result_id).where(solutions.c.result_id.in_(ids)))
-    )
-    framed = {
-        row["batch_id"]: dict(row)
-        for row in connection.execute(
-            select(frames.c.batch_id, frames.c.digest, frames.c.detections).where(
-                frames.c.batch_id.in_(chunk)
-            )
-        ).mappings()
-    }
+    stars: dict[str, list[Row]] = {id: [] for id in ids}
+    for row in _rows(connection, star_results, star_results.c.result_id, ids):
+        stars[row["result_id"]].append(row)
+    found = _rows(connection, solutions, solutions.c.result_id, ids)
+    solved = {row["result_id"]: row for row in found}
+    found = _rows(connection, frames, frames.c.batch_id, chunk)
+    framed = {row["batch_id"]: row for row in found}
     of_batch: dict[str, list[Row]] = {id: [] for id in chunk}
     for row in made:
         of_batch[row["batch_id"]].append(row)
@@ -142,7 +133,19 @@ def _of_a_chunk(connection: Connection, chunk: Mapping[str, Row]) -> Iterator[st
     for id, batch in chunk.items():
         yield from _of_a_batch(batch, of_batch[id], framed.get(id))
         for row in of_batch[id]:
-            yield from _of_a_result(row, batch, stars.get(row["id"], Counter()), solved)
+            of_row, solution = stars[row["id"]], solved.get(row["id"])
+            outcomes = Counter(each["outcome"] for each in of_row)
+            yield from _of_a_result(row, batch, outcomes, solution is not None)
+            own = (batch, framed.get(id)) if row["id"] == id else ()
+            if row["digest"] not in (None, digest_of(row, of_row, solution, *own)):
+                yield f"result {row['id']} of batch {id}: it is not what was recorded"
+
+
+def _rows(
+    connection: Connection, table: Table, owner: ColumnElement[str], ids: Iterable[str]
+) -> list[Row]:
+    query = select(table).where(owner.in_(ids))
+    return [dict(row) for row in connection.execute(query).mappings()]
 
 
 def _of_the_trackers(
@@ -227,7 +230,7 @@ def _frame_digest(answer: str) -> object:
         return None
 
 
-def _of_a_result(row: Row, batch: Row, stars: "Counter[str]", solved: set[Any]) -> Iterator[str]:
+def _of_a_result(row: Row, batch: Row, stars: "Counter[str]", is_solved: bool) -> Iterator[str]:
     name = f"result {row['id']}"
     copied = ("spacecraft", "run", "time_ns")
     if any(row[key] != batch[key] for key in copied):
@@ -237,7 +240,7 @@ def _of_a_result(row: Row, batch: Row, stars: "Counter[str]", solved: set[Any]) 
         yield f"{name}: its counts are not those of its stars"
     if row["observed"] != sum(counts.values()):
         yield f"{name}: the outcomes of its stars do not add up"
-    if (row["id"] in solved) != (row["status"] is not None):
+    if is_solved != (row["status"] is not None):
         yield f"{name}: its attitude is missing, or there is one that its status denies"
     try:
         answer = msgspec.json.decode(row["answer"])
@@ -267,6 +270,19 @@ def _of_the_trends(engine: Engine) -> Iterator[str]:
             if not is_waiting and not _alike(stored.get(key), counted.get(key)):
                 of = ", ".join([f"trends of {spacecraft}, run {run}", *tracker])
                 yield f"{of}, {bucket} {number}: not those of the results"
+
+
+def _of_the_seals(engine: Engine) -> Iterator[str]:
+    with engine.begin() as connection:
+        stored, counted = seals.stored(connection), seals.counted(connection)
+    for key in sorted(stored.keys() | counted.keys()):
+        if (sealed := stored.get(key, (0, 0))) != (found := counted.get(key, (0, 0))):
+            spacecraft, run, hour = key
+            start = utc_of_unix(float(unix_seconds(hour * seals.HOUR_NS))).text
+            yield (
+                f"{spacecraft}, run {run}, the hour from {start}: results were removed, added or "
+                f"exchanged; {sealed[0]} were recorded, {found[0]} are there"
+            )
 
 
 def _alike(one: Row | None, other: Row | None) -> bool:

@@ -1,0 +1,64 @@
+"""Seals: how many results there are of each hour, and the sum of their digests.
+
+A result that was removed, added or exchanged by anybody but the service does not agree with
+them.  Whoever records or deletes results changes their seals in the same transaction, or the
+projector does it later.
+"""
+
+from collections.abc import Sequence
+
+from sqlalchemy import BigInteger, ColumnElement, Connection, delete, func, select
+from sqlalchemy.dialects import postgresql, sqlite
+
+from service.storage.projections.recorded import RecordedResult
+from service.storage.projections.rollups import lock_position
+from service.storage.sql.tables import projector, results, seals
+
+HOUR_NS = 3_600_000_000_000
+SUMMED_BITS = (1 << 40) - 1
+"""Of each digest: eight million of them add up within 63 bits."""
+
+Seal = tuple[str, str, int]
+"""(spacecraft, run, hour of TAI)."""
+_OWN = (results.c.spacecraft, results.c.run, (results.c.time_ns / HOUR_NS).cast(BigInteger))
+
+
+def apply(connection: Connection, new: Sequence[RecordedResult]) -> None:
+    """Add new results."""
+    add(connection, results.c.seq.between(new[0].seq, new[-1].seq))
+
+
+def add(connection: Connection, chosen: ColumnElement[bool], sign: int = 1) -> None:
+    """Add results to the seals of their hours, or take them out with a `sign` of -1."""
+    dialect = postgresql if connection.dialect.name == "postgresql" else sqlite
+    summed = select(*_OWN, *(sign * each for each in _sums())).where(chosen).group_by(*_OWN)
+    statement = dialect.insert(seals).from_select([each.name for each in seals.columns], summed)
+    merged = {name: seals.c[name] + statement.excluded[name] for name in ("results", "digests")}
+    connection.execute(
+        statement.on_conflict_do_update(index_elements=list(seals.primary_key), set_=merged)
+    )
+
+
+def take_out(connection: Connection, batch_ids: Sequence[str]) -> None:
+    """Take out the results of batches that are to be deleted, if they are in the seals yet."""
+    passed = results.c.seq <= lock_position(connection)
+    add(connection, results.c.batch_id.in_(batch_ids) & passed, -1)
+    connection.execute(delete(seals).where(seals.c.results == 0))
+
+
+def stored(connection: Connection) -> dict[Seal, tuple[int, int]]:
+    """Number and sum of digests of each hour, as they are kept."""
+    return {(s, r, hour): (n, sum) for s, r, hour, n, sum in connection.execute(select(seals))}
+
+
+def counted(connection: Connection) -> dict[Seal, tuple[int, int]]:
+    """The same of the results that the projector has come to."""
+    passed = results.c.seq <= select(projector.c.seq).scalar_subquery()
+    query = select(*_OWN, *_sums()).where(passed).group_by(*_OWN)
+    return {(s, r, hour): (n, sum) for s, r, hour, n, sum in connection.execute(query)}
+
+
+def _sums() -> tuple[ColumnElement[int], ColumnElement[int]]:
+    bits = results.c.digest.op("&")(SUMMED_BITS)
+    # PostgreSQL's sum of integers is a decimal number.
+    return func.count(), func.coalesce(func.sum(bits), 0).cast(BigInteger)
