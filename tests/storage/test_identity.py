@@ -225,7 +225,7 @@ def test_what_was_recorded_between_look_and_transaction_is_found(app, make):
 
 def test_a_repeat_of_what_is_pruned_at_the_same_moment_is_recorded_anew(app, make, monkeypatch):
     store = app.store
-    reading = store.reading
+    reading = store.reading_record
     first = app.submissions.submit(make("b1"))
 
     def after_pruning():
@@ -233,7 +233,7 @@ def test_a_repeat_of_what_is_pruned_at_the_same_moment_is_recorded_anew(app, mak
         prune(store, utc_now())
         return reading()
 
-    monkeypatch.setattr(store, "reading", after_pruning)
+    monkeypatch.setattr(store, "reading_record", after_pruning)
     again = app.submissions.submit(make("b1"))
     assert (again.replayed, again.id == first.id) == (False, False)
     assert count(app, results) == 1
