@@ -302,7 +302,9 @@ def test_a_batch_was_received_before_it_was_worked_on_however_long_that_took(
     made += [solver.solve_one_of_many(make(name)) for name in ("one", "other")]
     app.submissions.submit(make("in the queue"))
     (told,) = (each for each in app.results.page().items if each.batch == "in the queue")
-    received = [each.received_ns for each in made] + [parse_utc(told.received).tai_ns]
+    received = [parse_utc(each.batch["received"]).tai_ns for each in made] + [
+        parse_utc(told.received).tai_ns
+    ]
     assert all(came <= later for came, later in zip(received, begun, strict=True))
 
 

@@ -89,6 +89,13 @@ def add(commands: Any) -> None:
     )
     add_json(parser, "the faults")
     add_database(parser)
+    _add_rebuild(group)
+    _add_split_trackers(group)
+    _add_prune(group)
+    add_forget(group)
+
+
+def _add_rebuild(group: Any) -> None:
     parser = add_command(
         group,
         "rebuild",
@@ -99,9 +106,6 @@ def add(commands: Any) -> None:
         rebuild,
     )
     add_database(parser)
-    _add_split_trackers(group)
-    _add_prune(group)
-    add_forget(group)
 
 
 def _add_split_trackers(group: Any) -> None:
