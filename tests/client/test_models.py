@@ -1,17 +1,15 @@
 """The models are those of openapi.yaml: every field, its type, and whether it may be absent."""
 
 import inspect
-from pathlib import Path
 
 import msgspec
 import pytest
-import yaml
 
 from service.client import errors, models
 from service.client.base import FieldFault, Model
+from tests.web.conformance import reference
 
-OPENAPI = yaml.safe_load((Path(__file__).parents[2] / "openapi.yaml").read_text(encoding="utf-8"))
-SCHEMAS = OPENAPI["components"]["schemas"]
+SCHEMAS = reference()["components"]["schemas"]
 NAMES = {
     "Acted": "ActedOut",
     "Alarm": "AlarmOut",

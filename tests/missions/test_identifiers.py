@@ -14,7 +14,6 @@ ROOT = Path(__file__).parents[2]
 
 FROM_OUTSIDE = """
 import json
-import yaml
 from service.missions.identifiers import IdentifierEntry, register
 
 def identify_nothing(sighting):
@@ -37,9 +36,8 @@ from service.settings import Settings
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
-from service.web.app import create_app
+from service.web.app import bare_app, create_app
 from service.web.console.options import fields_of
-from service.web.openapi.text import openapi_yaml
 from tests.observations.example import BATCH
 from tests.web.serving import Server
 
@@ -48,7 +46,7 @@ mission = parse_mission(text.replace('identifier = "verified"', 'identifier = "n
 body = json.dumps(BATCH | {"options": {"identifier": "nothing", "zone_grid_deg": 0.0}})
 batch = submission_from_json(body).batch
 acquisition = acquire(batch, mission, SkyModel(load_embedded(), LruCache(1 << 26)))
-shapes = yaml.safe_load(openapi_yaml())["components"]["schemas"]
+shapes = bare_app().openapi()["components"]["schemas"]
 arguments = ["simulate", "paper", "--identifier", "nothing", "verified"]
 
 database = f"sqlite:///{sys.argv[1]}/acquire.db"

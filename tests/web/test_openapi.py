@@ -26,6 +26,7 @@ def test_the_committed_file_is_what_the_app_says_of_itself(client):
     assert client.get("/api/v1/openapi.json").json() == reference()
 
 
+@pytest.mark.slow
 def test_it_is_made_the_same_twice():
     assert openapi_yaml() == openapi_yaml()
 

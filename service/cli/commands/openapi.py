@@ -35,12 +35,13 @@ def run(parsed: Namespace) -> int:
     """Print, write or check the API's description."""
     from service.web.openapi.text import openapi_yaml
 
+    checked = None if parsed.check is None else parsed.check.read_text(encoding="utf-8")
     text = openapi_yaml()
     if parsed.output is not None:
         parsed.output.write_text(text, encoding="utf-8")
-    elif parsed.check is None:
+    elif checked is None:
         print(text, end="")
-    elif parsed.check.read_text(encoding="utf-8") != text:
+    elif checked != text:
         print(f"{parsed.check} is not what the service describes: run `make openapi`")
         return 1
     return 0
