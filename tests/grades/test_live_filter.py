@@ -296,6 +296,7 @@ def test_a_mission_without_the_table_has_none(app):
         app.live_filter.latest("XTE")
 
 
+@pytest.mark.slow
 def test_a_service_that_is_killed_and_started_again_gives_the_same_state(
     database, tmp_path, half_hour, missions, monkeypatch
 ):

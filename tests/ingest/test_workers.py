@@ -96,7 +96,10 @@ def endless(text):
 
 
 def test_workers_answer_what_single_posts_are_answered(opened, sent, lines, make):
-    """Bad lines, repeats and conflicts included; the serving process computes none of it."""
+    """Bad lines, repeats and conflicts included; the serving process computes none of it.
+
+    Observers hear of it all the same.
+    """
     app = opened(replay_processes=1)
     for each in sent:
         app.submissions.submit(each)
@@ -106,7 +109,8 @@ def test_workers_answer_what_single_posts_are_answered(opened, sent, lines, make
     tracker = make("b90").text.replace('"tracker":"', '"tracker":"no-').encode()
     more = [b'{"cut', lines[3], unknown, tracker, b"\n", conflict]
     app.zones.drop(None)
-    before = app.zones.state().misses
+    before, seen = app.zones.state().misses, []
+    app.submissions.observers.append(seen.append)
 
     replay = finished(app, app.replays.start(lines + more, "bulk"))
     again = finished(app, app.replays.start(lines + more, "bulk"))
@@ -126,13 +130,6 @@ def test_workers_answer_what_single_posts_are_answered(opened, sent, lines, make
             app.submissions.submit(submission_from_json(text))
         assert told[number].detail.startswith(str(refusal.value.faults[0]))
     assert "another body" in told[86].detail
-
-
-def test_observers_hear_of_what_workers_computed(opened, lines):
-    app = with_workers(opened(replay_processes=1))
-    seen = []
-    app.submissions.observers.append(seen.append)
-    replay = finished(app, app.replays.start(lines, "bulk"))
     assert sorted(each.batch for each in seen) == sorted(f"b{k}" for k in range(80))
     assert {(each.spacecraft, each.run) for each in seen} == {("XTE", "bulk")}
     assert sum(each.has_attitude for each in seen) == replay.counts.attitudes
@@ -140,6 +137,7 @@ def test_observers_hear_of_what_workers_computed(opened, lines):
         assert sum(each.counts[outcome] for each in seen) == getattr(replay.counts, outcome)
 
 
+@pytest.mark.slow
 def test_workers_that_are_killed_again_and_again_cost_and_double_nothing(opened, make):
     app = with_workers(opened(replay_processes=2), 2)
     killed, wanted, between = [], draws(500, 2000), draws(250, 500)
@@ -273,7 +271,7 @@ def dies_at_start(monkeypatch):
 WATCHED = []
 
 
-@pytest.mark.parametrize("starts", [1, 2])
+@pytest.mark.parametrize("starts", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_process_that_dies_at_its_start_costs_no_chunk(local_workers, dies_at_start, starts):
     workers = local_workers(double, 2)
     WATCHED.append(workers)
@@ -317,6 +315,7 @@ def test_processes_that_are_replaced_on_purpose_are_not_held_against_a_chunk(
     assert future.result(GIVE_UP_S) == []
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_while_it_sends_a_result_costs_no_other_chunk(local_workers):
     workers = local_workers(half_sent, 2)
     futures = {number: workers.submit(number) for number in (1, 13, 2, 3)}
@@ -401,11 +400,8 @@ def test_no_worker_outlives_a_service_that_is_killed(tmp_path, long_replay):
     wait_until(lambda: not served.left(), why="a worker is left behind")
 
 
-@pytest.mark.parametrize(
-    "stop",
-    [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM],
-    ids=lambda each: each.name,
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM], ids=lambda each: each.name)
 def test_whoever_stops_the_whole_group_stops_it_in_order(tmp_path, long_replay, stop):
     """As Ctrl-C does, and systemd."""
     served = Served(tmp_path, long_replay)

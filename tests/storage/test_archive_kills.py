@@ -48,6 +48,7 @@ def stored(app, table, *columns):
         return set(map(tuple, connection.execute(select(*(table.c[name] for name in columns)))))
 
 
+@pytest.mark.slow
 @pytest.mark.torture
 def test_every_batch_is_there_once_after_every_kill(opened, database, tmp_path, rng, figures):
     place = tmp_path / "archive"

@@ -4,6 +4,7 @@ import json
 import signal
 
 import httpx
+import pytest
 
 from service.app.factory import open_app
 from service.missions.mission import SHIPPED_FOLDER, load_missions
@@ -31,6 +32,7 @@ def unnamed(answer):
     return told | {"tracking": told["tracking"] | {"prediction": named}}
 
 
+@pytest.mark.slow
 def test_killed_and_started_again_it_gives_the_same_record(database, flown, tmp_path, monkeypatch):
     folder = tmp_path / "missions"
     folder.mkdir()

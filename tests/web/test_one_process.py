@@ -55,6 +55,7 @@ def _children(process):
     return [int(pid) for task in tasks for pid in task.read_text().split()]
 
 
+@pytest.mark.slow
 def test_while_it_compiles_posts_are_told_to_come_again_and_told_to_stop_it_stops(
     compiling, tmp_path, sky, missions
 ):
@@ -69,6 +70,7 @@ def test_while_it_compiles_posts_are_told_to_come_again_and_told_to_stop_it_stop
     assert "Traceback" not in (tmp_path / "log").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are listed in /proc")
 def test_killed_while_it_compiles_it_leaves_no_process(compiling):
     process, _ = compiling

@@ -63,9 +63,8 @@ def test_every_name_of_this_machine_counts_as_this_machine(host):
     assert is_loopback(host)
 
 
-@pytest.mark.parametrize(
-    "stop", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("stop", [signal.SIGTERM, signal.SIGINT])
 def test_told_to_stop_it_ends_in_order_and_keeps_what_it_took(process, database, batch, stop):
     address, running = process()
     answer = httpx.post(f"{address}/api/v1/batches", json=batch, timeout=60)
@@ -77,6 +76,7 @@ def test_told_to_stop_it_ends_in_order_and_keeps_what_it_took(process, database,
     assert record["answer"] == answer.json()
 
 
+@pytest.mark.slow
 def test_killed_it_keeps_what_it_acknowledged(process, database, batch):
     address, running = process()
     answer = httpx.post(f"{address}/api/v1/batches", json=batch, timeout=60)
