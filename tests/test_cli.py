@@ -12,6 +12,7 @@ import subprocess
 import sys
 from contextlib import closing
 
+import httpx
 import pytest
 import yaml
 
@@ -23,7 +24,7 @@ from service.simulate.files import read_objects
 from service.times import parse_utc
 from tests.sky.test_sky2000 import SIRIUS, written
 from tests.waiting import wait_until
-from tests.web.serving import served
+from tests.web.serving import free_port, served
 
 COMMANDS = [
     "serve",
@@ -363,13 +364,19 @@ def test_results_are_never_written_over_what_is_replayed(acquire, tmp_path):
     assert path.read_bytes() == before
 
 
-def test_the_server_serves_takes_a_replay_and_stops_when_told(acquire, tmp_path):
-    """The real process: `serve`, then `replay` to it, then SIGTERM."""
+def test_the_server_serves_takes_a_replay_and_stops_when_told(acquire, tmp_path, monkeypatch):
+    """The real process: `serve`, probes at a port of their own, `replay` to it, then SIGTERM."""
     path = telemetry(acquire, tmp_path / "night.ndjson", "SOHO", 4)
+    probes = free_port()
+    monkeypatch.setenv("ACQUIRE_PROBE_PORT", str(probes))
     with served(f"sqlite:///{tmp_path / 'acquire.db'}") as (server, url):
         code, out, err = acquire("replay", path, "--url", url)
         assert code == 0, err
         assert "new               4" in out
+        for path in ("/livez", "/readyz", "/metrics"):
+            assert httpx.get(f"http://127.0.0.1:{probes}{path}").status_code == 200
+        for path in ("/", "/api/v1/about"):
+            assert httpx.get(f"http://127.0.0.1:{probes}{path}").status_code == 404
         server.send_signal(signal.SIGTERM)
         assert server.wait(60) in (0, -signal.SIGTERM)
 
@@ -547,6 +554,7 @@ def test_no_command_that_reads_makes_tables_in_another_file(acquire, tmp_path, c
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
+@pytest.mark.slow
 def test_what_writes_keeps_off_a_file_that_a_service_is_at_work_on(acquire, tmp_path):
     """Killed, the service leaves nothing behind that stands in the way."""
     telemetry(acquire, tmp_path / "pass.ndjson", "XTE", 4, "--nominal")

@@ -10,9 +10,8 @@ import pytest
 from service.app.factory import open_app
 from service.web.app import create_app
 from service.web.connection_limits import Admission
-from tests.fresh_databases import sqlite_at
 from tests.waiting import wait_until
-from tests.web.serving import Server, in_process_settings, served
+from tests.web.serving import Server, free_port, in_process_settings
 
 GET = b"GET /livez HTTP/1.1\r\nHost: localhost\r\n\r\n"
 EVENTS = b"GET /api/v1/events HTTP/1.1\r\nHost: localhost\r\n\r\n"
@@ -192,26 +191,6 @@ def test_networks_of_trusted_proxies_have_no_share():
         kept = [Kept() for _ in range(5)]
         assert all(admission.admit(each, proxy) for each in kept)
         assert not any(each.closed for each in kept)
-
-
-def free_port():
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        return free.getsockname()[1]
-
-
-def test_a_port_of_its_own_answers_probes_alone(tmp_path, monkeypatch):
-    port = free_port()
-    monkeypatch.setenv("ACQUIRE_PROBE_PORT", str(port))
-    with served(sqlite_at(tmp_path / "acquire.db")) as (_, url):
-        for path, status in (
-            ("/livez", 200),
-            ("/readyz", 200),
-            ("/metrics", 200),
-            ("/", 404),
-            ("/api/v1/about", 404),
-        ):
-            assert httpx.get(f"http://127.0.0.1:{port}{path}").status_code == status
-        assert httpx.get(f"{url}/api/v1/about").status_code == 200
 
 
 def test_a_probe_port_that_is_taken_is_named(acquire, monkeypatch, tmp_path):
