@@ -21,7 +21,11 @@ from service.missions.mission import load_missions
 
 
 @pytest.mark.parametrize(
-    "benchmark", [aberration, consistency, covariance, tracker_calibration, tracker_sigmas]
+    "benchmark",
+    [
+        *(aberration, tracker_calibration, tracker_sigmas),
+        *(pytest.param(each, marks=pytest.mark.slow) for each in (consistency, covariance)),
+    ],
 )
 def test_a_benchmark_s_small_sample_is_within_its_bounds(benchmark, seed):
     report = benchmark.run(quick=True, seed=seed)

@@ -411,6 +411,7 @@ def test_a_parameter_that_must_be_given_is_no_addition():
 # ---- the inputs ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_same_seed_draws_the_same_inputs_and_every_name_once(tmp_path):
     write_twin(tmp_path)
     one, again = (phases_of(60, 3, tmp_path) for _ in range(2))

@@ -6,7 +6,7 @@ import tracemalloc
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.errors import BadBatch, BadFile
@@ -15,6 +15,7 @@ from service.observations.readers.csv_rows import write_batches_csv
 from service.observations.readers.lines import MAX_LINE_BYTES, Line
 from service.observations.readers.telemetry import read_lines
 from service.observations.schema import BatchIn, submission_from_json
+from tests.scale import draws
 
 HEADER = "spacecraft,batch,time,q1,q2,q3,qc,tracker,x,y,z,magnitude"
 
@@ -305,6 +306,7 @@ bodies = st.fixed_dictionaries(
 )
 
 
+@settings(max_examples=draws(30, 100))
 @given(st.lists(bodies, min_size=1, max_size=4, unique_by=lambda body: body["batch"]))
 def test_rows_and_json_of_one_batch_are_one_submission(some: list[dict[str, object]]) -> None:
     """Written as CSV and read back, a batch has the text and the fingerprint that it had."""

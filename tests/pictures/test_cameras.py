@@ -21,6 +21,7 @@ from service.missions.mission import parse_mission, read_mission
 from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion
 from tests.pictures.drawn import draw_picture, jpeg_of
+from tests.scale import draws
 
 FOLDER = Path(__file__).parent
 LENS = Lens(1024, 768, 3889.03, 0.02, 0.01, -0.015)
@@ -168,7 +169,7 @@ def test_claimed_sigmas_of_a_calibration_hold(blind):
     """Stars alone, without pixels: places with noise of a tenth of a pixel."""
     sky, solver = blind
     rng, pulls = np.random.default_rng(5), []
-    for _ in range(12):
+    for _ in range(draws(6, 12)):
         lens = Lens(1024, 768, rng.uniform(2000.0, 4000.0), *rng.normal(0.0, 0.01, 3))
         results = []
         for _ in range(4):
@@ -185,7 +186,7 @@ def test_claimed_sigmas_of_a_calibration_hold(blind):
 
 def test_a_calibration_without_an_attitude_is_refused(tmp_path, capsys, rng):
     picture = tmp_path / "noise.jpg"
-    picture.write_bytes(_file(rng.normal(50, 3, (300, 400))).getvalue())
+    picture.write_bytes(_file(rng.normal(50, 3, (100, 150))).getvalue())
     assert main(["camera", "calibrate", str(picture), "-o", str(tmp_path / "a.toml")]) == 2
     assert "nothing to calibrate with" in capsys.readouterr().err
 

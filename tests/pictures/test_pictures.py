@@ -57,6 +57,7 @@ def test_a_real_picture_told_nothing_or_its_field_within_a_tenth(blind, truth, g
         assert any("residuals are radial" in each for each in result.remarks)
 
 
+@pytest.mark.slow
 def test_drawn_pictures_of_random_lenses_are_right_or_have_no_answer(blind, rng):
     sky, solver = blind
     right, squares = 0, []

@@ -23,6 +23,7 @@ from service.simulate.telemetry import draw_pass
 from service.sky.ephemeris import apparent, observer_velocity, sun_direction
 from service.times import parse_utc, shifted
 from service.vectors import ARCSEC_PER_RADIAN, angle_between_deg, matrix_from_quaternion, unit
+from tests.scale import draws
 
 SERIOUS = Troubles(Trouble(0.2), Trouble(0.2, 2), Trouble(0.2, 0.5), Trouble(0.2, 12.0))
 ALL = ("XTE", "SWAS", "SOHO")
@@ -147,7 +148,7 @@ def test_batches_follow_each_other_by_the_cadence(missions, sky):
 @pytest.mark.parametrize("aberration", ["to_correct", "applied_upstream", "ignore"])
 def test_stars_miss_their_place_by_the_trackers_noise_alone(missions, sky, name, aberration, seed):
     """Aberration, turning and the stars' own times are all in the measured directions."""
-    passes = drawn(missions, sky, name, seed, 150, aberration={aberration: 1.0})
+    passes = drawn(missions, sky, name, seed, draws(60, 150), aberration={aberration: 1.0})
     quiet = [one for one in passes if one.truth["stretch"] != "position_error"]
     misses = np.concatenate([misses_arcsec(one, missions, sky) for one in quiet])
     sigma = missions[name].trackers[0].sigma_arcsec

@@ -108,6 +108,7 @@ def test_a_line_says_when_how_grave_which_request_who_and_of_what_run(service, b
     assert 201 not in posts, "a line for each recorded batch would take time from all"
 
 
+@pytest.mark.slow
 def test_text_is_a_line_each_and_cannot_be_forged(service, batch):
     made = service()
     with made.running() as client:
@@ -126,6 +127,7 @@ def test_text_is_a_line_each_and_cannot_be_forged(service, batch):
     assert "caller=local" in shown[1]
 
 
+@pytest.mark.slow
 def test_at_debug_every_request_has_a_line(service, batch):
     made = service(log_level="debug")
     with made.running() as client:
@@ -150,6 +152,7 @@ def test_an_error_that_is_repeated_is_written_once_and_counted(service):
     assert {each["repeated"] for each in told if "repeated" in each} == {29}
 
 
+@pytest.mark.slow
 def test_an_error_line_names_the_request_that_failed(service, batch):
     made = service(log_format="json")
     with made.running() as client:

@@ -19,6 +19,7 @@ from service.storage.projections import projector
 from service.web.app import create_app
 from service.web.warm_request import warm_request
 from tests.fresh_databases import sqlite_at
+from tests.scale import draws
 from tests.waiting import wait_until
 from tests.web.serving import Server, in_process_settings
 
@@ -206,13 +207,14 @@ def opened_and_closed(database, serves):
 
 def test_closed_services_leave_no_memory_and_no_thread(tmp_path, resident_mb):
     """A service that is ready keeps its objects from the garbage collector, until it is closed."""
-    databases = (sqlite_at(tmp_path / f"{number}.db") for number in range(21))
+    services = draws(10, 20)
+    databases = (sqlite_at(tmp_path / f"{number}.db") for number in range(1 + services))
     # The first one fills caches that the process keeps.
     references = [opened_and_closed(next(databases), serves=True)]
     gc.collect()
     before_mb, threads = resident_mb(), set(threading.enumerate())
     references += [opened_and_closed(each, n % 10 == 0) for n, each in enumerate(databases)]
     gc.collect()
-    assert [each() for pair in references for each in pair] == [None] * 42
+    assert [each() for pair in references for each in pair] == [None] * 2 * (1 + services)
     assert set(threading.enumerate()) <= threads
     assert resident_mb() - before_mb < 40

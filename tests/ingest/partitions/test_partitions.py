@@ -99,7 +99,8 @@ def test_trends_pages_and_lists_of_the_run_are_those_of_a_recorded_one(archived,
     assert (answer.run, answer.id, answer.timings_us.zone) == ("again", first.id, 0)
 
 
-def test_bytes_follow_from_the_input_alone(archived, place):
+@pytest.mark.parametrize("processes", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_bytes_follow_from_the_input_alone(archived, place, processes):
     again(archived, place)
     made = files_of(place, "again")
     for file in made:
@@ -108,7 +109,7 @@ def test_bytes_follow_from_the_input_alone(archived, place):
         kept = [part for part in manifest.parts if part.run != "again"]
         folder.write_manifest(place, folder.Manifest(**(asdict(manifest) | {"parts": kept})))
     archived.store.writer.change(forget("again")).result()
-    again(archived, place, processes=2)
+    again(archived, place, processes=processes)
     assert files_of(place, "again") == made
     assert_whole(archived, place)
 

@@ -257,6 +257,7 @@ def test_at_psi_100_a_cap_of_120_deg_gives_what_geometry_off_gives(sky, rng):
     assert right[2] < 0.1 * total
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_counts_however_the_work_is_shared(seed):
     runs = [run_named("2", "psi100"), run_named("4", "sm1.0")]
     alone, shared = (run_experiments(runs, 600, [seed], processes=n) for n in (1, 2))

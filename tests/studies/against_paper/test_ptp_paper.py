@@ -127,6 +127,7 @@ class TestRivals:
 
 
 class TestComparison:
+    @pytest.mark.slow
     def test_scenes_do_not_depend_on_how_the_work_is_shared_out(self):
         case = Case("figure-12", ("PTP",), 1.0)
         one, two = (compare([case], 51, 5, processes)[0].rows for processes in (1, 2))
@@ -197,6 +198,7 @@ class TestCommand:
         ]
         assert all(f"| {row['index']:,} " in out.getvalue() for row in written)
 
+    @pytest.mark.slow
     def test_the_page_shows_everything_with_its_claims_and_pictures(self, tmp_path):
         page = tmp_path / "ptp.md"
         run_ptp("ptp", 3, 2, None, 1, tmp_path / "plots", page, out=io.StringIO())
