@@ -170,6 +170,7 @@ def test_each_signal_stops_it(tmp_path, told, ignored):
     assert_served_and_stopped(demonstration_of(tmp_path, told, ignored, "--batches", 3))
 
 
+@pytest.mark.slow
 def test_a_second_time_nothing_is_new_and_the_figures_are_the_same_as_json_too(first, demo):
     code, printed, complaints = demo(first.folder, "--batches", BATCHES, "--json")
     assert code == 0, complaints

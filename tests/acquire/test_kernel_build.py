@@ -136,7 +136,7 @@ def _fail(missions, share, zones_built):
     raise SystemExit(1)
 
 
-@pytest.mark.parametrize("end", ["go-on", "fail"])
+@pytest.mark.parametrize("end", ["go-on", pytest.param("fail", marks=pytest.mark.slow)])
 def test_zones_are_open_while_the_rest_is_compiled(nothing_compiled, monkeypatch, tmp_path, end):
     monkeypatch.setattr(kernel_build, "_compile", _wait_between)
     build, told = KernelBuild(), []

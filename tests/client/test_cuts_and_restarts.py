@@ -76,6 +76,7 @@ class Follower:
         assert not self._thread.is_alive()
 
 
+@pytest.mark.slow
 @pytest.mark.torture
 def test_a_stream_that_is_cut_and_a_service_that_is_killed_lose_and_double_nothing(
     database, example, rng, figures

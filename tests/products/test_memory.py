@@ -31,7 +31,13 @@ def peak_bytes(name, count):
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("name", list(attitude_formats()))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] if name in ("acm", "aem-xml", "csv") else [])
+        for name in attitude_formats()
+    ],
+)
 def test_memory_does_not_grow_with_the_attitudes(name):
     peak_bytes(name, 1)
     size, peak = peak_bytes(name, 30)
