@@ -73,6 +73,7 @@ def request_of(body, key):
     return (head + body).encode()
 
 
+@pytest.mark.slow
 @pytest.mark.torture
 def test_the_same_key_fifty_times_at_once_is_one_record_and_one_answer(
     database, sky, missions, seed, figures

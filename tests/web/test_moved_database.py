@@ -13,7 +13,7 @@ from service.app.factory import open_app
 from service.storage.sql.tables import batches
 from service.storage.upkeep.verify import verify
 from tests.storage import samples
-from tests.web.serving import in_process_settings, served, serving_in_process
+from tests.web.serving import in_process_settings, serving_in_process
 from tests.web.test_hanging_database import ready_again
 
 PARTS = ("", "-wal", "-shm")
@@ -68,7 +68,8 @@ def test_moved_away_nothing_is_acknowledged_and_moved_back_all_is_there(
     file, tmp_path, post, parts
 ):
     away = tmp_path / "away"
-    with served(f"sqlite:///{file}") as (_, url):
+    with serving_in_process(f"sqlite:///{file}") as service:
+        url = service.url
         assert post(url, "before").status_code == 201
         moved(file, away, parts)
         for k in range(5):

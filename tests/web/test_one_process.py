@@ -18,7 +18,13 @@ from tests.fresh_databases import sqlite_at
 from tests.storage import samples
 from tests.waiting import wait_until
 from tests.web.load import Load
-from tests.web.serving import Server, in_process_settings, is_ready, served
+from tests.web.serving import (
+    Server,
+    in_process_settings,
+    is_ready,
+    served,
+    serving_in_process,
+)
 from tests.web.test_access import Guarded, shown
 
 JSON = {"Content-Type": "application/json"}
@@ -27,8 +33,9 @@ JSON = {"Content-Type": "application/json"}
 @pytest.fixture(scope="module")
 def service(tmp_path_factory):
     """A service over its own database: its address."""
-    with served(sqlite_at(tmp_path_factory.mktemp("one") / "acquire.db")) as (_, url):
-        yield url
+    database = sqlite_at(tmp_path_factory.mktemp("one") / "acquire.db")
+    with serving_in_process(database) as service:
+        yield service.url
 
 
 @pytest.fixture

@@ -86,7 +86,7 @@ def test_a_thousand_slow_connections_harm_nobody(server, batch, figures):
 
 
 @pytest.mark.torture
-@pytest.mark.parametrize("how", ["declared", "chunked"])
+@pytest.mark.parametrize("how", [pytest.param("declared", marks=pytest.mark.slow), "chunked"])
 def test_bodies_of_300_megabytes_are_refused_without_being_held(server, batch, how, figures):
     process, port, url = server
     names = iter(f"beside-{how}-{number}" for number in range(1_000_000))
