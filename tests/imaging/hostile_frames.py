@@ -3,6 +3,7 @@
 import io
 import struct
 import zlib
+from functools import partial
 
 import numpy as np
 from PIL import Image
@@ -13,15 +14,19 @@ SIDE = 1024
 
 
 def hostile_files(rng):
-    """(name, bytes, word that the refusal must hold)."""
+    """(name, maker of the bytes, word that the refusal must hold)."""
     sky = rng.normal(207.0, 6.0, (SIDE, SIDE)).astype(np.uint16)
     whole = _fits(sky)
-    yield "empty", b"", "empty"
-    yield "text", b"hello, this is no frame", "is not FITS"
-    yield "bigtiff", b"II+\0\x08\0\0\0", "BigTIFF"
-    yield "fits cut off in its header", whole[:2000], "cut off"
-    yield "fits cut off in its data", whole[:100_000], "cut off"
-    yield "fits without end", b"SIMPLE  =                    T".ljust(2880 * 200), "without END"
+    yield "empty", lambda: b"", "empty"
+    yield "text", lambda: b"hello, this is no frame", "is not FITS"
+    yield "bigtiff", lambda: b"II+\0\x08\0\0\0", "BigTIFF"
+    yield "fits cut off in its header", lambda: whole[:2000], "cut off"
+    yield "fits cut off in its data", lambda: whole[:100_000], "cut off"
+    yield (
+        "fits without end",
+        lambda: b"SIMPLE  =                    T".ljust(2880 * 200),
+        "without END",
+    )
     for key, value in (
         ("NAXIS1", 10**13),
         ("NAXIS1", -5),
@@ -33,57 +38,77 @@ def hostile_files(rng):
         ("BZERO", "1E999"),
         ("BSCALE", 0),
     ):
-        yield f"fits {key} {str(value)[:12]}", _fits_with(whole, key, value), key
+        yield f"fits {key} {str(value)[:12]}", partial(_fits_with, whole, key, value), key
     yield (
         "fits of tables alone",
-        _header(NAXIS=0) + _header(XTENSION="'BINTABLE'", NAXIS=0),
+        lambda: _header(NAXIS=0) + _header(XTENSION="'BINTABLE'", NAXIS=0),
         "no image",
     )
-    yield "fits tiles", _header(NAXIS=0, ZIMAGE="T"), "ZNAXIS"
-    yield "one pixel", _fits(sky[:1, :1]), "1 x 1 px"
-    yield "twenty thousand wide", _fits(np.zeros((2, 20_000), np.uint16)), "20000 x 2 px"
-    yield "png bomb", _png(20_000, 20_000, 0), "400000000 pixels"
-    yield "png of more than it says", _png(SIDE, SIDE, 0, bytes(200 << 20)), "no contrast"
-    yield "png text bomb", _png(SIDE, SIDE, 0, chunk=_text_bomb()), "PNG"
-    yield "png profile bomb", _png(SIDE, SIDE, 0, chunk=_profile_bomb()), "PNG"
-    yield "png cut off", _picture(sky, "PNG")[:50_000], "PNG"
-    yield "colour", _picture(np.zeros((SIDE, SIDE, 3), np.uint8), "PNG"), "no contrast"
-    yield "colour tiff", _picture(np.zeros((SIDE, SIDE, 3), np.uint8), "TIFF"), "no contrast"
-    yield "a bit a pixel", _picture(np.zeros((SIDE, SIDE), bool), "PNG"), "a bit a pixel"
+    yield "fits tiles", lambda: _header(NAXIS=0, ZIMAGE="T"), "ZNAXIS"
+    yield "one pixel", lambda: _fits(sky[:1, :1]), "1 x 1 px"
+    yield "twenty thousand wide", lambda: _fits(np.zeros((2, 20_000), np.uint16)), "20000 x 2 px"
+    yield "png bomb", lambda: _png(20_000, 20_000, 0), "400000000 pixels"
+    yield "png of more than it says", lambda: _png(SIDE, SIDE, 0, bytes(200 << 20)), "no contrast"
+    yield "png text bomb", lambda: _png(SIDE, SIDE, 0, chunk=_text_bomb()), "PNG"
+    yield "png profile bomb", lambda: _png(SIDE, SIDE, 0, chunk=_profile_bomb()), "PNG"
+    yield "png cut off", lambda: _picture(sky, "PNG")[:50_000], "PNG"
+    yield "colour", lambda: _picture(np.zeros((SIDE, SIDE, 3), np.uint8), "PNG"), "no contrast"
+    yield (
+        "colour tiff",
+        lambda: _picture(np.zeros((SIDE, SIDE, 3), np.uint8), "TIFF"),
+        "no contrast",
+    )
+    yield "a bit a pixel", lambda: _picture(np.zeros((SIDE, SIDE), bool), "PNG"), "a bit a pixel"
     grey = np.clip(sky, 0, 255).astype(np.uint8)
-    yield "jpeg cut off", _picture(grey, "JPEG")[:20_000], "JPEG"
-    yield "jpeg of no body", b"\xff\xd8\xff\xe0" + bytes(100), "JPEG"
-    yield "jpeg bomb", _jpeg_of_size(_picture(grey, "JPEG"), 60_000), "3600000000 pixels"
-    yield "bmp cut off", _picture(grey, "BMP")[:50_000], "BMP"
+    yield "jpeg cut off", lambda: _picture(grey, "JPEG")[:20_000], "JPEG"
+    yield "jpeg of no body", lambda: b"\xff\xd8\xff\xe0" + bytes(100), "JPEG"
+    yield "jpeg bomb", lambda: _jpeg_of_size(_picture(grey, "JPEG"), 60_000), "3600000000 pixels"
+    yield "bmp cut off", lambda: _picture(grey, "BMP")[:50_000], "BMP"
     bomb = b"BM" + struct.pack("<LLLLllHHL24x", 54, 0, 54, 40, 30_000, 30_000, 1, 24, 1)
-    yield "bmp bomb", bomb, "900000000 pixels"
-    yield "tiff bomb", _tiff_bomb(20_000, 20_000), "20000 x 20000 px"
-    yield "tiff of more than it says", _tiff_bomb(SIDE, SIDE), "no contrast"
-    yield "tiff with great tags", _tiff_tags(200), "TIFF tag"
-    yield "tiff with great tags of fractions", _tiff_tags(200, 5, 8), "TIFF tag"
-    yield "tiff with much exif", _tiff_of_exif(), "EXIF"
-    yield "jpeg with much exif", _jpeg_of_exif(_picture(grey, "JPEG")), "EXIF"
-    yield "png with much exif", _png(SIDE, SIDE, 0, chunk=_chunk(b"eXIf", _exif())), "no contrast"
-    yield "tiff with many tags", _tiff_tags(60_000), "tags"
-    yield "tiff cut off", _picture(sky, "TIFF")[:100_000], "cut off"
-    yield "tiff whose directory is elsewhere", b"II*\0" + struct.pack("<L", 1 << 31), "cut off"
-    yield "npy beyond any memory", _npy((10**9, 10**9), "<f8"), "1000000000 x 1000000000 px"
-    yield "npy of objects", _npy((SIDE, SIDE), "|O"), "numbers"
-    yield "npy of three dimensions", _npy((SIDE, SIDE, 5), "<u2"), "two dimensions"
-    yield "npy with less than it says", _npy((SIDE, SIDE), "<f8"), "cut off"
-    yield "npy with a long header", b"\x93NUMPY\x02\0" + struct.pack("<L", 1 << 30), "header"
-    yield "npy with a header that does not end", _npy_header(b"{'shape': (\n"), "header"
-    yield "npy negative", _npy((-SIDE, -SIDE), "<u2"), "px"
-    yield "all NaN", _array(np.full((SIDE, SIDE), np.nan)), "no number"
-    yield "all infinite", _array(np.full((SIDE, SIDE), np.inf, np.float32)), "no number"
-    yield "all black", _fits(np.zeros((SIDE, SIDE), np.uint16)), "no contrast"
-    yield "8 bit saturated", _picture(np.full((SIDE, SIDE), 255, np.uint8), "PNG"), "no contrast"
+    yield "bmp bomb", lambda: bomb, "900000000 pixels"
+    yield "tiff bomb", lambda: _tiff_bomb(20_000, 20_000), "20000 x 20000 px"
+    yield "tiff of more than it says", lambda: _tiff_bomb(SIDE, SIDE), "no contrast"
+    yield "tiff with great tags", lambda: _tiff_tags(200), "TIFF tag"
+    yield "tiff with great tags of fractions", lambda: _tiff_tags(200, 5, 8), "TIFF tag"
+    yield "tiff with much exif", lambda: _tiff_of_exif(), "EXIF"
+    yield "jpeg with much exif", lambda: _jpeg_of_exif(_picture(grey, "JPEG")), "EXIF"
+    yield (
+        "png with much exif",
+        lambda: _png(SIDE, SIDE, 0, chunk=_chunk(b"eXIf", _exif())),
+        "no contrast",
+    )
+    yield "tiff with many tags", lambda: _tiff_tags(60_000), "tags"
+    yield "tiff cut off", lambda: _picture(sky, "TIFF")[:100_000], "cut off"
+    yield (
+        "tiff whose directory is elsewhere",
+        lambda: b"II*\0" + struct.pack("<L", 1 << 31),
+        "cut off",
+    )
+    yield "npy beyond any memory", lambda: _npy((10**9, 10**9), "<f8"), "1000000000 x 1000000000 px"
+    yield "npy of objects", lambda: _npy((SIDE, SIDE), "|O"), "numbers"
+    yield "npy of three dimensions", lambda: _npy((SIDE, SIDE, 5), "<u2"), "two dimensions"
+    yield "npy with less than it says", lambda: _npy((SIDE, SIDE), "<f8"), "cut off"
+    yield (
+        "npy with a long header",
+        lambda: b"\x93NUMPY\x02\0" + struct.pack("<L", 1 << 30),
+        "header",
+    )
+    yield "npy with a header that does not end", lambda: _npy_header(b"{'shape': (\n"), "header"
+    yield "npy negative", lambda: _npy((-SIDE, -SIDE), "<u2"), "px"
+    yield "all NaN", lambda: _array(np.full((SIDE, SIDE), np.nan)), "no number"
+    yield "all infinite", lambda: _array(np.full((SIDE, SIDE), np.inf, np.float32)), "no number"
+    yield "all black", lambda: _fits(np.zeros((SIDE, SIDE), np.uint16)), "no contrast"
+    yield (
+        "8 bit saturated",
+        lambda: _picture(np.full((SIDE, SIDE), 255, np.uint8), "PNG"),
+        "no contrast",
+    )
     mostly = np.where(rng.random((SIDE, SIDE)) < 0.9, 255, 100).astype(np.uint8)
-    yield "8 bit mostly saturated", _picture(mostly, "PNG"), "saturated"
-    yield "nothing but noise", _array(rng.integers(0, 39_000, (SIDE, SIDE))), ""
+    yield "8 bit mostly saturated", lambda: _picture(mostly, "PNG"), "saturated"
+    yield "nothing but noise", lambda: _array(rng.integers(0, 39_000, (SIDE, SIDE))), ""
     squares = np.indices((SIDE, SIDE)).sum(axis=0) % 2 * 30_000
-    yield "a chess board", _array(squares), ""
-    yield "no star", whole, "no star"
+    yield "a chess board", lambda: _array(squares), ""
+    yield "no star", lambda: whole, "no star"
 
 
 def _fits(counts):
