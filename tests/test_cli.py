@@ -14,7 +14,6 @@ from contextlib import closing
 
 import httpx
 import pytest
-import yaml
 
 from service import __version__
 from service.cli.parser import build_parser
@@ -632,7 +631,7 @@ def test_an_address_of_another_machine_is_named_with_its_remedy(acquire):
 def test_the_description_is_printed_written_and_checked(acquire, tmp_path):
     code, out, _ = acquire("openapi")
     assert code == 0
-    assert yaml.safe_load(out)["openapi"].startswith("3.1")
+    assert out.startswith("openapi: 3.1")
     assert acquire("openapi", "--output", "openapi.yaml")[0] == 0
     assert (tmp_path / "openapi.yaml").read_text() == out
     assert acquire("openapi", "--check")[0] == 0
