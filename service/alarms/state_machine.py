@@ -107,12 +107,19 @@ def observed(
     return changes, actions
 
 
-def acknowledged(alarm: AlarmColumns, who: str, now: str) -> AlarmUpdate:
-    """Acknowledged by `who`; raises `WrongState` if it was already, or is cleared."""
+def acknowledged(
+    alarm: AlarmColumns, who: str, now: str, *, is_retired: bool = False
+) -> AlarmUpdate:
+    """Acknowledged by `who`; raises `WrongState` if it was already, or is cleared.
+
+    The alarm of a retired subject, which gets no value any more, is cleared with it.
+    """
     _require_active(alarm)
-    if alarm["acknowledged_at"] is not None:
+    if alarm["acknowledged_at"] is not None and not is_retired:
         raise WrongState(f"the alarm is already acknowledged by {alarm['acknowledged_by']}")
-    changes = {"acknowledged_at": now, "acknowledged_by": who}
+    changes: Changes = {"acknowledged_at": now, "acknowledged_by": who}
+    if is_retired:
+        changes["current_severity"] = None
     return _cleared({**alarm, **changes}, changes, ["acknowledged"], now)
 
 

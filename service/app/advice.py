@@ -13,7 +13,6 @@ from service.app.advice_record import advice_record
 from service.app.context import Context
 from service.app.submissions import Submissions
 from service.errors import Busy
-from service.missions.mission import mission_named
 from service.observations.schema import TolerancesIn
 from service.storage.grades.period import latest_innovations
 from service.storage.models.advice import Advice
@@ -54,7 +53,7 @@ class AdviceService:
         seconds run out; `step` is called after each, twice a batch.  `tolerances`
         are tried as well.  Raises `Busy` while the service is computing other advice.
         """
-        mission = mission_named(self._context.missions, name)
+        mission = self._context.mission(name)
         own = tolerances.model_dump(exclude_none=True)
         if not self._lock.acquire(blocking=False):
             raise Busy("the service is computing other advice", ADVICE_RETRY_S)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 from service.access.audit import Entry
 from service.alarms import state_machine
+from service.alarms.subjects import limited_trackers
 from service.app.context import ALL_RUNS, Context, known_id
 from service.storage.models.alarms import Alarm, AlarmSpan, AlarmWithActions
 from service.storage.models.base import Page
@@ -57,14 +58,24 @@ class Alarms:
         with self._context.reading() as connection:
             return alarms.read_alarm(connection, known_id(id, "alarm"), utc_now().text)
 
+    def is_retired(self, spacecraft: str, tracker: str | None) -> bool:
+        """Whether no mission file has the spacecraft, or the tracker with limits of its own."""
+        mission = self._context.missions.get(spacecraft)
+        return mission is None or bool(tracker and tracker not in limited_trackers(mission))
+
     def acknowledge(
         self, id: str, who: str, comment: str | None = None, entry: Entry | None = None
     ) -> AlarmWithActions:
-        """Acknowledge an alarm; with the quantity back in limits it is cleared."""
+        """Acknowledge an alarm; with the quantity back in limits, or retired, it is cleared."""
         moment = utc_now().text
         return self._act(
             id,
-            lambda alarm: state_machine.acknowledged(alarm, who, moment),
+            lambda alarm: state_machine.acknowledged(
+                alarm,
+                who,
+                moment,
+                is_retired=self.is_retired(alarm["spacecraft"], alarm["tracker"]),
+            ),
             who,
             comment,
             moment,

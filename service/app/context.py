@@ -1,19 +1,23 @@
 """Shared by the parts of the app: settings, missions, sky and database."""
 
-from collections.abc import Callable
+from collections import ChainMap
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 from sqlalchemy import Connection
 
 from service.access.audit import Entry
+from service.alarms.subjects import limited_trackers
 from service.errors import BadBatch, Fault, NotFound, shown_value
-from service.missions.mission import Mission
+from service.missions.mission import Mission, mission_named
 from service.observations.schema import RunName
 from service.settings import Settings
 from service.sky.model import SkyModel
+from service.storage.queries.histories import Retired
 from service.storage.recording.ids import is_ulid
 from service.storage.sql.database import Store
 
@@ -33,6 +37,20 @@ class Context:
     missions: dict[str, Mission]
     sky: SkyModel
     store: Store
+    retired: Retired = field(default_factory=Retired)
+
+    @cached_property
+    def known(self) -> Mapping[str, Mission]:
+        """The missions of the files, and the last settings of retired spacecraft."""
+        return ChainMap(self.missions, self.retired.missions)
+
+    def mission(self, name: str) -> Mission:
+        """The mission of a spacecraft, a retired one too; raises `NotFound`."""
+        return mission_named(self.known, name)
+
+    def trackers(self, name: str) -> tuple[str, ...]:
+        """The trackers of a spacecraft that have values of their own, then its retired ones."""
+        return (*limited_trackers(self.mission(name)), *self.retired.trackers.get(name, ()))
 
     def reading(self) -> AbstractContextManager[Connection]:
         """A connection that sees one moment of the record and its projections; see `Store`."""

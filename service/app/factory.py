@@ -34,6 +34,7 @@ from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import open_catalog
 from service.sky.model import SkyModel
 from service.storage.projections.projector import Projector
+from service.storage.queries.histories import retired
 from service.storage.queries.replays import mark_interrupted
 from service.storage.recording.results import register
 from service.storage.sql.database import Store
@@ -65,7 +66,7 @@ class App:
         self.frames = Frames(context, self.submissions)
         self.results = Results(context, self.submissions)
         self.spacecraft = Spacecraft(context)
-        self.products = Products(context.missions, context.store)
+        self.products = Products(context.known, context.store)
         self.gyro = Gyro(context)
         self.grades = Grades(context)
         self.live_filter = LiveFilter(context, kernels)
@@ -142,7 +143,9 @@ def open_app(
         serving=serving,
         archive_folder=settings.archive_folder,
     )
-    app = App(Context(settings, missions, sky, store), kernels)
+    with store.reading() as connection:
+        context = Context(settings, missions, sky, store, retired(connection, missions))
+    app = App(context, kernels)
     # A mission that is given takes the place of what was adopted, too.
     leave = mission.name if mission is not None else None
 

@@ -40,14 +40,14 @@ class Limits:
 
     def all(self, name: str, tracker: str | None = None) -> list[Limit]:
         """The limit of every quantity of a spacecraft, or of one of its trackers."""
-        mission = mission_named(self._context.missions, name)
+        mission = self._context.mission(name)
         own = _checked_tracker(mission, tracker)
         with self._context.reading() as connection:
             return limits.list_limits(connection, mission, own)
 
     def get(self, name: str, quantity: QuantityName, tracker: str | None = None) -> LimitHistory:
         """The limit of one quantity, the shipped limit, and the history of changes."""
-        mission = mission_named(self._context.missions, name)
+        mission = self._context.mission(name)
         own = _checked_tracker(mission, tracker, quantity)
         with self._context.reading() as connection:
             return limits.limit_history(connection, mission, quantity, own)
@@ -98,7 +98,7 @@ class Limits:
         Of more than `MOST_PREVIEWED` batches it takes the latest ones.  They are evaluated in the
         order of their time, whenever they came.
         """
-        mission = mission_named(self._context.missions, name)
+        mission = self._context.mission(name)
         own = _checked_tracker(mission, tracker, quantity)
         subject = subject_of(quantity, own)
         with self._context.reading() as connection:

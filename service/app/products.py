@@ -27,6 +27,7 @@ from service.storage.gyro.blocks import BlockFilter
 from service.storage.gyro.samples_table import count_samples, sample_table
 from service.storage.queries.attitude_rows import attitude_pages
 from service.storage.queries.future_dated import LIVE
+from service.storage.queries.histories import retired
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.tables.result_tables import batch_table, star_table
 from service.storage.queries.with_archive.rows import count
@@ -204,6 +205,7 @@ def open_products(settings: Settings) -> Iterator[Products]:
     try:
         with store.reading() as connection:
             missions |= adopted_missions(connection, missions)
+            missions |= retired(connection, missions).missions
         yield Products(missions, store)
     finally:
         store.close()

@@ -6,7 +6,6 @@ from service.app.context import ALL_RUNS, Context, known_id
 from service.app.submissions import Submissions
 from service.errors import NotFound
 from service.ingest.solver_pool import mission_in_input
-from service.missions.mission import mission_named
 from service.observations.schema import OptionsIn
 from service.storage.models.answers import Answer, Neighbours, Result, Summary
 from service.storage.models.base import Page
@@ -47,7 +46,7 @@ class Results:
         A live batch that is dated far in the future counts only where there is no other.
         """
         run = run or LIVE
-        mission_named(self._context.missions, spacecraft)
+        self._context.mission(spacecraft)
         selected = ResultFilter(run, spacecraft)
         with self._context.reading_record() as connection:
             id = results.newest_id(connection, selected, utc_now())
@@ -88,7 +87,7 @@ class Results:
             )
         if spacecraft is not None and not page.items and page.next_cursor is None:
             # A misspelt name must not look like a spacecraft without data.
-            mission_in_input(self._context.missions, spacecraft)
+            mission_in_input(self._context.known, spacecraft)
         return page
 
     def neighbours(self, id: str) -> Neighbours:
@@ -131,7 +130,7 @@ class Results:
 
         See `period.sample.sample_period`, which also bounds what is read.
         """
-        mission_named(self._context.missions, spacecraft)
+        self._context.mission(spacecraft)
         span = BucketFilter(spacecraft, run or LIVE, start, end)
         with self._context.reading_record() as connection:
             sample = sample_period(connection, span)
@@ -141,7 +140,7 @@ class Results:
         """The settings that a what-if of a result changes."""
         with self._context.reading_batch(known_id(id, "batch")) as (connection, _):
             batch, _ = recorded_batch(connection, id)
-        return choices_of(batch, mission_named(self._context.missions, batch.spacecraft))
+        return choices_of(batch, self._context.mission(batch.spacecraft))
 
     def spacecraft_of(self, id: str) -> str | None:
         """The spacecraft that a recorded result belongs to; None where there is no such result."""

@@ -101,7 +101,7 @@ class Runs:
         end: Utc | None = None,
     ) -> tuple[RunComparison, list[RunChange]]:
         """The same of a spacecraft's latest batches of a period alone, and those that differ."""
-        mission_named(self._context.missions, spacecraft)
+        self._context.mission(spacecraft)
         place, archive = ResultFilter(run, spacecraft, start, end), self._context.store.archive
         with self._context.reading() as connection:
             found = compare_runs(connection, archive, place, other, MOST_COMPARED)

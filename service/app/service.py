@@ -137,7 +137,7 @@ class Service:
         are few, several times, because code runs slowly at first.
         """
         with self._context.reading_record() as connection:
-            inputs = latest_inputs(connection)
+            inputs = latest_inputs(connection, self._context.missions)
         for text in inputs:
             try:
                 sent = submission_from_json(text)

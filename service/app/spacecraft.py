@@ -9,7 +9,7 @@ from sqlalchemy import Connection
 from service.alarms.quantities import QuantityName, tracker_names, trend_names
 from service.app.context import Context
 from service.errors import BadBatch, Fault, shown_value
-from service.missions.mission import Mission, mission_named
+from service.missions.mission import Mission
 from service.storage.models.base import Page
 from service.storage.models.fleet import Fleet
 from service.storage.models.overview import Overview
@@ -41,7 +41,7 @@ class Spacecraft:
     ) -> Overview:
         """Every spacecraft in a run at a glance, or some; see `overview.overview`."""
         with self._context.reading() as connection:
-            missions = self._context.missions.values()
+            missions = self._context.known.values()
             return overview.overview(connection, missions, run or LIVE, utc_now(), spacecraft)
 
     def fleet(
@@ -52,22 +52,22 @@ class Spacecraft:
         spacecraft: Collection[str] | None = None,
     ) -> Fleet:
         """Some of the spacecraft in a run, for one page of all of them; see `fleet.fleet`."""
-        missions = [self._context.missions[name] for name in names]
+        missions = [self._context.known[name] for name in names]
         with self._context.reading() as connection:
             return fleet.fleet(connection, missions, run, period, utc_now(), spacecraft)
 
     def states(self, run: str | None = None) -> list[SpacecraftRow]:
-        """Every spacecraft that has a mission file, with its state in a run."""
+        """Every spacecraft, retired ones included, with its state in a run."""
         moment = utc_now()
         with self._context.reading() as connection:
             return [
                 histories.live_state(connection, mission, run or LIVE, moment)
-                for mission in self._context.missions.values()
+                for mission in self._context.known.values()
             ]
 
     def state(self, name: str, run: str | None = None) -> SpacecraftState:
         """One spacecraft's state in a run, its mission's settings and their history."""
-        mission = mission_named(self._context.missions, name)
+        mission = self._context.mission(name)
         with self._context.reading() as connection:
             state = histories.live_state(connection, mission, run or LIVE, utc_now())
             settings = mission.model_dump(mode="json")
@@ -88,7 +88,7 @@ class Spacecraft:
         cursor: str | None = None,
     ) -> Page[AttitudeRow]:
         """The attitudes of current results, oldest batch time first."""
-        mission_named(self._context.missions, name)
+        self._context.mission(name)
         stretch = ResultFilter(run or LIVE, name, start, end)
         with self._context.reading() as connection:
             return histories.list_attitudes(
@@ -108,7 +108,7 @@ class Spacecraft:
 
         Raises `BadInput` for a period with too many of them.
         """
-        mission_named(self._context.missions, name)
+        self._context.mission(name)
         with self._context.reading() as connection:
             found = rollups.rates(
                 connection, name, run=run or LIVE, start=start, end=end, bucket=bucket
@@ -132,9 +132,10 @@ class Spacecraft:
         `minmax` gives buckets with mean, least and greatest, `latest` the newest
         batches one by one; see `trends.history`.  With a tracker they are the tracker's own.
         """
-        mission = mission_named(self._context.missions, name)
+        mission = self._context.mission(name)
         names = _quantities(quantities, tracker)
-        asked = trends.HistoryRequest(names, strategy, size, _split_tracker(mission, tracker))
+        own = self._split_tracker(mission, tracker)
+        asked = trends.HistoryRequest(names, strategy, size, own)
         with self._context.reading() as connection:
             found = trends.history(
                 connection, name, run=run or LIVE, start=start, end=end, request=asked
@@ -152,7 +153,7 @@ class Spacecraft:
         tracker: str | None = None,
     ) -> Iterator[History]:
         """The history of every batch of a period, in pages; see `trends.every_batch`."""
-        mission = mission_named(self._context.missions, name)
+        mission = self._context.mission(name)
         return trends.every_batch(
             self._context.reading,
             name,
@@ -160,7 +161,7 @@ class Spacecraft:
             start=start,
             end=end,
             quantities=_quantities(quantities, tracker),
-            tracker=_split_tracker(mission, tracker),
+            tracker=self._split_tracker(mission, tracker),
         )
 
     def ranking(
@@ -178,13 +179,24 @@ class Spacecraft:
 
         With a tracker they are ranked by its own values.
         """
-        mission = mission_named(self._context.missions, name)
+        mission = self._context.mission(name)
         _quantities((by,), tracker, "by")
         stretch = ResultFilter(run or LIVE, name, start, end)
         with self._context.reading() as connection:
-            own = _split_tracker(mission, tracker)
+            own = self._split_tracker(mission, tracker)
             items = worst_batches(connection, stretch, by, limit, own)
             return Ranking(by=by, items=items, **_named(connection, mission, run or LIVE, tracker))
+
+    def _split_tracker(self, mission: Mission, tracker: str | None) -> str | None:
+        """The tracker whose own values are read; None where the spacecraft's are.
+
+        Those of a single tracker are the spacecraft's.  Raises `BadInput` for one that the
+        mission has not and never had.
+        """
+        if tracker is None or tracker in self._context.trackers(mission.name):
+            return tracker
+        mission.tracker(tracker, "tracker")
+        return None
 
 
 def _quantities(
@@ -198,17 +210,6 @@ def _quantities(
             known = ", ".join(tracker_names())
             raise BadBatch(Fault(field, f"a tracker has {known} only", shown_value(name)))
     return tuple(named) or tracker_names()
-
-
-def _split_tracker(mission: Mission, tracker: str | None) -> str | None:
-    """The tracker whose own values are read; None where the spacecraft's are.
-
-    Those of a single tracker are the spacecraft's.  Raises `BadInput` for one that the
-    mission has not.
-    """
-    if tracker is not None:
-        mission.tracker(tracker, "tracker")
-    return tracker if len(mission.trackers) > 1 else None
 
 
 def _named(

@@ -6,7 +6,7 @@ from service.acquire.prewarm import prewarm_zones
 from service.advice.zone_size import ZoneCost, ZoneSize, zone_cost, zone_size
 from service.app.context import Context
 from service.ingest.solver_pool import mission_in_input
-from service.missions.mission import Mission, mission_named
+from service.missions.mission import Mission
 from service.observations.schema import APrioriIn, prior_of
 from service.sky.cache import CacheEntry, Sized
 from service.sky.catalog.run_catalog import RunCatalog
@@ -55,7 +55,7 @@ class Zones:
         The errors are those of the latest `MOST_ERRORS` batches; a batch without an attitude
         has none.
         """
-        mission = mission_named(self._context.missions, name)
+        mission = self._context.mission(name)
         place = ResultFilter(run or LIVE, name)
         with self._context.reading_record() as connection:
             time = latest_time(connection, place, utc_now())

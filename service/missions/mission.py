@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import (
@@ -234,6 +234,7 @@ class Tracker(Strict):
 class Mission(Strict):
     """All that is fixed for a mission."""
 
+    retired: ClassVar[bool] = False
     name: Name
     description: str = ""
     identifier: Identifier = "verified"
@@ -285,7 +286,6 @@ class Mission(Strict):
         is_band = isinstance(info.data.get("zone"), Band)
         if "pole" not in tests.model_fields_set:
             return tests.model_copy(update={"pole": is_band})
-        # A zone that is itself at fault is not there to be compared with.
         if tests.pole and not is_band and "zone" in info.data:
             raise ValueError("pole: a cap has no pole; false is allowed")
         return tests

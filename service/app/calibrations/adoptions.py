@@ -16,7 +16,7 @@ from service.access.audit import Entry
 from service.app.calibrations.geometry import geometry_digest, with_geometry
 from service.app.context import Context, known_id
 from service.errors import NotFound, WrongState, shown_value
-from service.missions.mission import Mission, mission_named
+from service.missions.mission import Mission, load_missions, mission_named
 from service.storage.calibrations import stored
 from service.storage.calibrations.models import (
     CalibrationAdoption,
@@ -91,13 +91,14 @@ class CalibrationAdoptions:
 
     def in_force(self, spacecraft: str) -> CalibrationInForce:
         """The calibration that new batches use, and every change of it, newest first."""
-        mission = mission_named(self._context.missions, spacecraft)
+        mission = self._context.mission(spacecraft)
         with self._context.reading() as connection:
             history = stored.list_adoptions(connection, spacecraft)
         latest = history[0] if history else None
         overridden = (
             latest is not None
             and latest.trackers is not None
+            and not mission.retired
             and latest.file != geometry_digest(self.file_of(spacecraft))
         )
         return CalibrationInForce(
@@ -144,8 +145,19 @@ class CalibrationAdoptions:
         raise NotFound(f"{spacecraft} has no adoption with the id {shown_value(to)}")
 
     def file_of(self, spacecraft: str) -> Mission:
-        """The settings as the mission file has them, whatever was adopted."""
-        return mission_named(self._files, spacecraft)
+        """The settings as the mission file has them, whatever was adopted; the last without one."""
+        return self._files.get(spacecraft) or self._context.mission(spacecraft)
+
+    def changed_files(self) -> dict[str, str]:
+        """By spacecraft, what the next start would change; raises `BadConfiguration`."""
+        now = load_missions(self._context.settings.missions)
+        found = {}
+        for name, mission in self._files.items():
+            if name not in now:
+                found[name] = "The mission file is gone: the next start retires the spacecraft."
+            elif now[name].digest != mission.digest:
+                found[name] = "The mission file was changed: it takes effect at the next start."
+        return found
 
     def _change(
         self,
@@ -187,7 +199,7 @@ class CalibrationAdoptions:
             return adopted
 
         with self._lock:
-            if self._context.missions[name].digest == mission.digest:
+            if mission_named(self._context.missions, name).digest == mission.digest:
                 raise WrongState("these settings are in force already")
             # Results name the settings by their digest, which is recorded before the first.
             adopted = self._context.change_audited(change, entry)

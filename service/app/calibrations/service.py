@@ -92,7 +92,7 @@ class CalibrationService:
     ) -> Page[CalibrationSummary]:
         """Calibrations, newest first."""
         if spacecraft is not None:
-            mission_named(self._context.missions, spacecraft)
+            self._context.mission(spacecraft)
         with self._context.reading() as connection:
             return stored.list_calibrations(connection, spacecraft, limit, cursor)
 

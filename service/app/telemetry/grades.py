@@ -92,14 +92,14 @@ class Grades:
         cursor: str | None = None,
     ) -> Page[Innovation]:
         """How the measured attitudes of a period met the filter, the earliest first."""
-        mission_named(self._context.missions, name)
+        self._context.mission(name)
         selected = ResultFilter(run or LIVE, name, start, end)
         with self._context.reading() as connection:
             return list_innovations(connection, selected, limit=limit, cursor=cursor)
 
     def of_period(self, name: str, run: str, start: Utc, end: Utc) -> GradesOfPeriod | None:
         """A bounded number of samples and innovations of a period; None where none are recorded."""
-        mission_named(self._context.missions, name)
+        self._context.mission(name)
         with self._context.reading() as connection:
             return grades_of_period(connection, name, run, start, end)
 

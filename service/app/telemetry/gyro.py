@@ -42,7 +42,7 @@ class Gyro:
         cursor: str | None = None,
     ) -> Page[GyroBlockRow]:
         """The blocks of a period without their samples, the earliest first."""
-        mission_named(self._context.missions, name)
+        self._context.mission(name)
         selected = BlockFilter(name, run or LIVE, start, end)
         with self._context.reading() as connection:
             return list_blocks(connection, selected, limit=limit, cursor=cursor)

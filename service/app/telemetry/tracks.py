@@ -7,7 +7,6 @@ import numpy as np
 from service import __version__
 from service.app.context import Context, known_id
 from service.errors import NotFound
-from service.missions.mission import mission_named
 from service.products.tdm import TrackedObject, write_tdm
 from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
@@ -49,7 +48,7 @@ class Tracks:
 
         Raises `BadBatch` where the period has more than `most_batches`, or too many points.
         """
-        mission_named(self._context.missions, name)
+        self._context.mission(name)
         selected = ResultFilter(run or LIVE, name, start, end)
         with self._context.reading() as connection:
             recorded = batches_of_period(connection, selected, most_batches)
@@ -73,7 +72,7 @@ class Tracks:
 
     def tdm(self, found: TrackList) -> Iterator[bytes]:
         """The moving tracks as a CCSDS TDM; raises `NotFound` where there is none."""
-        mission = mission_named(self._context.missions, found.spacecraft)
+        mission = self._context.mission(found.spacecraft)
         moving = [each for each in found.items if each.kind == "moving"]
         if not moving:
             raise NotFound(f"{found.spacecraft}: no moving track, and a TDM cannot be empty")

@@ -71,6 +71,7 @@ class SpacecraftRow(Model, frozen=True, kw_only=True):
 
     name: str
     description: str
+    retired: bool
     state: str
     latest_batch: Summary | None
     attitude: AttitudeRow | None

@@ -36,6 +36,8 @@ class FleetRow:
 
     name: str
     description: str
+    retired: bool
+    """Whether no mission file describes it any more."""
     state: str
     """`good`, `suspect`, `no_attitude` or `no_batches`: that of the latest batch."""
     latest_batch: Summary | None

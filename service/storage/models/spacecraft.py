@@ -53,6 +53,7 @@ class SpacecraftRow(Record, frozen=True, kw_only=True):
     component: ClassVar[str] = "SpacecraftRow"
     name: str
     description: str
+    retired: Annotated[bool, doc("True if no mission file describes it any more.")]
     state: Annotated[
         Literal["good", "suspect", "no_attitude", "no_batches"],
         doc("State of the latest batch."),

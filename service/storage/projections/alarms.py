@@ -5,7 +5,7 @@ both are stored or neither.  The row in `watches` is locked, so that several
 processes evaluate one after the other.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import msgspec
 from msgspec import Struct
@@ -61,10 +61,11 @@ def runs_with_alarms(connection: Connection, names: set[str]) -> set[str]:
     return set(connection.scalars(query)) | (names & {LIVE})
 
 
-def latest_inputs(connection: Connection) -> Sequence[str]:
-    """The latest batch of every live spacecraft, as it was sent."""
+def latest_inputs(connection: Connection, spacecraft: Collection[str]) -> Sequence[str]:
+    """The latest live batch of each of these spacecraft, as it was sent."""
     query = select(batches.c.input).join_from(watches, batches, watches.c.batch_id == batches.c.id)
-    return connection.scalars(query.where(watches.c.run == LIVE)).all()
+    chosen = watches.c.run == LIVE, watches.c.spacecraft.in_(spacecraft)
+    return connection.scalars(query.where(*chosen)).all()
 
 
 class LimitEvaluator:

@@ -97,11 +97,22 @@ def _row(mission: Mission, facts: _Facts | None, now: Utc, active: Sequence[Alar
     alarms = tuple(each for each in active if each.spacecraft == name)
     if facts is None or batch is None:
         return FleetRow(
-            name, mission.description, "no_batches", None, None, (), None, None, None, alarms
+            name,
+            mission.description,
+            mission.retired,
+            "no_batches",
+            None,
+            None,
+            (),
+            None,
+            None,
+            None,
+            alarms,
         )
     return FleetRow(
         name=name,
         description=mission.description,
+        retired=mission.retired,
         state=batch.status or "no_attitude",
         latest_batch=batch,
         last_attitude=facts.attitudes.get(name),

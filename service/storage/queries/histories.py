@@ -1,11 +1,14 @@
 """Histories: attitudes, the state of a spacecraft, its settings, and the runs there are."""
 
 import json
-from collections.abc import Collection
+import logging
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from itertools import groupby
-from typing import Any
+from typing import Any, ClassVar
 
-from sqlalchemy import Connection, Select, func, select
+from pydantic import ValidationError
+from sqlalchemy import Connection, Select, exists, func, select
 
 from service.acquire.measured import METHOD
 from service.missions.mission import Mission
@@ -21,6 +24,24 @@ from service.storage.queries.with_archive.rows import MOST_OPENED, ArchiveUse, p
 from service.storage.sql.rollup_tables import rollups_daily
 from service.storage.sql.tables import batches, mission_uses, missions, results, runs, solutions
 from service.times import DAY_S, Utc, bucket_start
+
+log = logging.getLogger(__name__)
+
+
+class RetiredMission(Mission):
+    """The last recorded settings of a spacecraft that has no mission file any more."""
+
+    retired: ClassVar[bool] = True
+
+
+@dataclass(frozen=True)
+class Retired:
+    """The recorded spacecraft and trackers that no mission file describes any more."""
+
+    missions: dict[str, Mission] = field(default_factory=dict)
+    """The last settings of each spacecraft that has batches."""
+    trackers: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    """By spacecraft, the trackers of its earlier settings that its last ones have not."""
 
 
 def list_attitudes(
@@ -60,6 +81,7 @@ def live_state(connection: Connection, mission: Mission, run: str, now: Utc) -> 
     return SpacecraftRow(
         name=mission.name,
         description=mission.description,
+        retired=mission.retired,
         state="no_batches" if batch is None else batch["status"] or "no_attitude",
         latest_batch=None if batch is None else summary_of(batch),
         attitude=last if is_latest else None,
@@ -90,6 +112,31 @@ def mission_history(connection: Connection, spacecraft: str) -> list[MissionThen
         MissionThen(digest=digest, since=row["since"], settings=json.loads(row["settings"]))
         for digest, (row, *_) in ((digest, list(rows)) for digest, rows in uses)
     ]
+
+
+def retired(connection: Connection, missions_of_files: Mapping[str, Mission]) -> Retired:
+    """The spacecraft with batches that have no mission file, and the trackers of none."""
+    found = Retired()
+    has_batches = exists().where(rollups_daily.c.spacecraft == mission_uses.c.spacecraft)
+    query = (
+        select(mission_uses.c.spacecraft, missions.c.settings)
+        .join(missions, mission_uses.c.digest == missions.c.digest)
+        .where(has_batches)
+        .order_by(mission_uses.c.spacecraft, mission_uses.c.id.desc())
+    )
+    for name, uses in groupby(connection.execute(query), key=lambda row: row.spacecraft):
+        settings = [use.settings for use in uses]
+        mission = missions_of_files.get(name)
+        if mission is None:
+            try:
+                mission = RetiredMission.model_validate_json(settings[0])
+            except ValidationError as error:
+                log.warning("%s: its recorded settings cannot be read: %s", name, error)
+                continue
+            found.missions[name] = mission
+        names = {each["name"] for text in settings for each in json.loads(text)["trackers"]}
+        found.trackers[name] = tuple(sorted(names - {each.name for each in mission.trackers}))
+    return found
 
 
 def list_runs(connection: Connection, spacecraft: Collection[str] | None = None) -> list[Run]:

@@ -148,8 +148,8 @@ class PageContext:
 
     @property
     def spacecraft(self) -> list[str]:
-        """The spacecraft with a mission that the reader may see."""
-        return [name for name in sorted(self.app.missions) if self.caller.may_see(name)]
+        """The spacecraft that the reader may see, retired ones too."""
+        return [name for name in sorted(self.app.context.known) if self.caller.may_see(name)]
 
     @property
     def first_spacecraft(self) -> str:

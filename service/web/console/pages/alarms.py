@@ -9,7 +9,6 @@ from starlette.responses import Response
 
 from service.alarms.causes import CAUSES
 from service.alarms.quantities import trend_names
-from service.alarms.subjects import limited_trackers
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key
 from service.storage.models.alarms import Alarm, AlarmWithActions
@@ -74,6 +73,7 @@ def alarms_page(query: Annotated[AlarmsQuery, InQuery()], context: ContextDep) -
         states=STATES,
         clocks=CLOCKS,
         spacecraft=context.spacecraft,
+        is_retired=context.app.alarms.is_retired,
     )
 
 
@@ -89,12 +89,14 @@ def alarm_page(
     raised = recorded_utc(alarm.raised.time)
     around = {"start": shifted(raised, -BEFORE_S).text, "end": shifted(raised, AFTER_S).text}
     of_tracker = {"tracker": alarm.tracker} if _has_tracker(context, alarm) else {}
+    is_retired = context.app.alarms.is_retired(alarm.spacecraft, alarm.tracker)
     return rendered(
         "alarm.html.jinja",
         context.layout(alarm.run),
         alarm=alarm,
         clock=query.clock,
         clocks=CLOCKS,
+        is_retired=is_retired,
         cause=CAUSES.get(alarm.quantity),
         related=_related(context, alarm),
         trend=_trend(context, alarm),
@@ -105,9 +107,9 @@ def alarm_page(
 
 
 def _has_tracker(context: PageContext, alarm: Alarm) -> bool:
-    """Whether the alarm is about a tracker that the mission still has."""
-    mission = context.app.missions.get(alarm.spacecraft)
-    return mission is not None and alarm.tracker in limited_trackers(mission)
+    """Whether the alarm is about a tracker that has a history of its own."""
+    known = alarm.spacecraft in context.app.context.known
+    return known and alarm.tracker in context.app.context.trackers(alarm.spacecraft)
 
 
 def _end(alarm: Alarm) -> Utc:
@@ -139,7 +141,7 @@ def _related(context: PageContext, alarm: AlarmWithActions) -> list[Alarm]:
 
 def _trend(context: PageContext, alarm: AlarmWithActions) -> AlarmTrend | None:
     """The quantity before and since the raise; None without a history."""
-    if alarm.quantity not in trend_names() or alarm.spacecraft not in context.app.missions:
+    if alarm.quantity not in trend_names() or alarm.spacecraft not in context.app.context.known:
         return None
     if alarm.tracker is not None and not _has_tracker(context, alarm):
         return None

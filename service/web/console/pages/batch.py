@@ -100,7 +100,8 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
         timings_us=structs.asdict(shown.timings_us),
         tracks=_tracks(context, id, answer),
         around=context.app.results.neighbours(id),
-        other_settings=context.app.missions[answer.spacecraft].digest != answer.provenance.mission,
+        other_settings=context.app.context.known[answer.spacecraft].digest
+        != answer.provenance.mission,
     )
 
 

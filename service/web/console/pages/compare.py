@@ -99,7 +99,7 @@ def compare_page(
         )
     run = pair[0] if pair and runs else query.run
     name = query.spacecraft or (pair[2] if pair else context.filled_spacecraft(run))
-    mission = context.app.missions.get(name)
+    mission = context.app.context.known.get(name)
     return rendered(
         "compare.html.jinja",
         context.layout(run),

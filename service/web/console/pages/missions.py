@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from fastapi import Query as InQuery
 from starlette.responses import Response
 
+from service.errors import BadConfiguration
 from service.storage.models.spacecraft import MissionThen
 from service.web.console.options import SYMBOLS
 from service.web.console.page_context import ContextDep, PageQuery
@@ -48,6 +49,10 @@ class SettingsEntry:
 def missions_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
     """Every mission's settings, section by section, with their history."""
     missions = []
+    try:
+        changed, unreadable = context.app.adoptions.changed_files(), None
+    except BadConfiguration as error:
+        changed, unreadable = {}, str(error)
     for name in context.spacecraft:
         state = context.app.spacecraft.state(name)
         settings = state.mission.settings
@@ -55,6 +60,8 @@ def missions_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -
             {
                 "name": name,
                 "description": state.description,
+                "retired": state.retired,
+                "changed": changed.get(name),
                 "digest": state.mission.digest,
                 "sections": list(_sections(settings)),
                 "history": list(reversed(_entries(state.history))),
@@ -64,6 +71,8 @@ def missions_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -
         "missions.html.jinja",
         context.layout(query.run),
         missions=missions,
+        # Its text may name the missions of others.
+        unreadable=unreadable if context.caller.spacecraft is None else None,
         symbols=SYMBOLS,
     )
 

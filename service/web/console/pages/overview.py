@@ -77,8 +77,9 @@ class OverviewLine:
 
     @property
     def is_stale(self) -> bool:
-        """Whether it has fallen behind the run."""
-        return self.item.age_s is not None and self.item.age_s > STALE_AFTER_S
+        """Whether it has fallen behind the run; a retired one sends nothing any more."""
+        item = self.item
+        return not item.retired and item.age_s is not None and item.age_s > STALE_AFTER_S
 
     @property
     def in_trouble(self) -> bool:

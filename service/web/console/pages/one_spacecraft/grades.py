@@ -7,7 +7,6 @@ from fastapi import Path
 from fastapi import Query as InQuery
 from starlette.responses import Response
 
-from service.missions.mission import mission_named
 from service.storage.grades.period import MOST_BLOCKS, GradesOfPeriod
 from service.web.console.charts.grades.grades import grade_charts
 from service.web.console.charts.grades.innovations import innovation_charts
@@ -39,7 +38,7 @@ def grades_page(
     name: Annotated[str, Path()], query: Annotated[SpacecraftQuery, InQuery()], context: ContextDep
 ) -> Response:
     """Filtered and smoothed attitudes of one spacecraft, and what they were made of."""
-    mission = mission_named(context.app.missions, name)
+    mission = context.app.context.mission(name)
     latest = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
     shown = shown_period(context, name, query, latest)
     drawn = None

@@ -36,7 +36,7 @@ def limits_page(
         context.layout(query.run),
         name=name,
         tracker=tracker,
-        trackers=limited_trackers(app.missions[name]),
+        trackers=limited_trackers(app.context.known[name]),
         limits=[app.limits.get(name, each.quantity, tracker) for each in limits],
         severities=SEVERITIES,
         days=PREVIEW_DAYS,

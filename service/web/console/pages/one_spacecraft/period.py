@@ -7,7 +7,6 @@ from fastapi import Path
 from fastapi import Query as InQuery
 from starlette.responses import Response
 
-from service.missions.mission import mission_named
 from service.storage.models.period import TrackerStarsOfPeriod
 from service.web.console.charts.period.all_sky import all_sky_chart
 from service.web.console.charts.period.attitude import attitude_charts
@@ -46,8 +45,9 @@ def period_page(
     name: Annotated[str, Path()], query: Annotated[SpacecraftQuery, InQuery()], context: ContextDep
 ) -> Response:
     """Where each tracker looked, how well its stars fit, and how the spacecraft turned."""
-    mission = mission_named(context.app.missions, name)
-    if query.tracker is not None:
+    mission = context.app.context.mission(name)
+    retired = context.app.context.retired.trackers.get(name, ())
+    if query.tracker is not None and query.tracker not in retired:
         mission.tracker(query.tracker, "tracker")
     latest = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
     shown = shown_period(context, name, query, latest)
@@ -65,7 +65,7 @@ def period_page(
         context.layout(query.run),
         name=name,
         tracker=query.tracker,
-        tracker_names=[each.name for each in mission.trackers],
+        tracker_names=[*(each.name for each in mission.trackers), *retired],
         stretch=shown,
         ranges=list(RANGES_S),
         found=found,

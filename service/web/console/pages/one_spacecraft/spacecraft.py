@@ -163,7 +163,7 @@ def spacecraft_page(
     state = context.app.spacecraft.state(name, query.run)
     latest = context.app.results.page(spacecraft=name, run=query.run, limit=LATEST).items
     stretch = shown_period(context, name, query, latest)
-    trackers = limited_trackers(context.app.missions[name])
+    mission, trackers = context.app.context.known[name], context.app.context.trackers(name)
     ranking = _worst(context, name, query, stretch)
     notes = _annotations(context, name, stretch)
     ranked = [each for each in ranked_names() if not query.tracker or QUANTITIES[each].by_tracker]
@@ -172,6 +172,7 @@ def spacecraft_page(
         context.layout(query.run),
         name=name,
         description=state.description,
+        retired=state.retired,
         latest=latest,
         tracking=state.tracking,
         attitude=_attitude(context, latest),
@@ -185,7 +186,9 @@ def spacecraft_page(
         charts=charts(query.tracker),
         alarms=_alarms(context, name, query, stretch),
         worst=ranking.items,
-        limits=context.app.limits.all(name, query.tracker if trackers else None),
+        limits=context.app.limits.all(
+            name, query.tracker if query.tracker in limited_trackers(mission) else None
+        ),
         formats=table_formats(),
         attitude_formats=attitude_formats(),
         table_kinds=TABLE_KINDS,
