@@ -204,7 +204,7 @@ def parse_utc(text: object, field: str = "time") -> Utc:
     """Read UTC text, calendar or day-of-year.
 
     Raises `BadInput` naming `field` for another form, a day or second that
-    does not exist, and years outside 1972 to 2099.
+    does not exist, and years outside those supported.
     """
     try:
         if not isinstance(text, str):

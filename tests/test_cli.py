@@ -3,6 +3,7 @@
 import csv
 import gzip
 import json
+import os
 import re
 import shlex
 import signal
@@ -672,3 +673,14 @@ def test_a_run_that_was_recorded_wrongly_is_forgotten_once_its_name_is_typed(
     assert [(who.partition(":")[0], *rest) for who, *rest in entries] == [
         ("command", "forget_run", "wrong")
     ] * 2
+
+
+def test_a_locale_that_has_no_sign_for_a_name_hides_no_result(tmp_path):
+    """Here the name of a file; of stars many are Greek."""
+    file = tmp_path / "μ.toml"
+    file.write_text((SHIPPED_FOLDER / "xte.toml").read_text())
+    command = [sys.executable, "-m", "service.cli", "mission", "check", str(tmp_path / "ν.toml")]
+    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
+    found = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert found.returncode == 2
+    assert "\\u03bd.toml: cannot be read: " in found.stderr

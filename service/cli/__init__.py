@@ -7,6 +7,7 @@ loads its own part of the service alone.
 import os
 import sys
 from collections.abc import Sequence
+from io import TextIOWrapper
 
 from service.cli.parser import build_parser
 from service.errors import AcquisitionError, BadInput
@@ -21,6 +22,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0: done; 1: done, with lines or differences that are reported; 2: refused
     for its usage, configuration or input, or no service to talk to.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            # A locale may have no sign for a name of a star, or of a file.
+            stream.reconfigure(errors="backslashreplace")
     parsed = build_parser().parse_args(arguments)
     try:
         code: int = parsed.function(parsed)

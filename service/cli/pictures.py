@@ -38,9 +38,17 @@ def solve_pictures(parsed: Namespace, settings: Settings) -> int:
             print(f"acquire: {file}: {error}", file=sys.stderr)
             continue
         failed += result.attitude is None
-        overlay = _write_overlay(parsed, file, result)
-        told = {"file": str(file), **result_json(result), "overlay": str(overlay)}
+        told = {"file": str(file), **result_json(result), "overlay": None}
+        unwritten = None
+        try:
+            told["overlay"] = str(_write_overlay(parsed, file, result))
+        except OSError as error:
+            unwritten = f"the picture cannot be written: {error.filename}: {error.strerror}"
         print(json.dumps(told) if parsed.json else _summary(file, told))
+        if unwritten is not None:
+            # The attitude is found all the same.
+            failed += 1
+            print(f"acquire: {file}: {unwritten}", file=sys.stderr)
     return 1 if failed else 0
 
 
@@ -182,7 +190,9 @@ def _summary(file: Path, told: dict[str, Any]) -> str:
         ]
         lines.append("  " + ", ".join(names) + (", ..." if len(told["stars"]) > FEW_NAMES else ""))
     lines += [f"  {each}" for each in told["remarks"]]
-    return "\n".join([*lines, f"  picture: {told['overlay']}"])
+    if told["overlay"] is not None:
+        lines.append(f"  picture: {told['overlay']}")
+    return "\n".join(lines)
 
 
 def _matched(told: dict[str, Any]) -> str:

@@ -23,8 +23,10 @@ def allowed_keys(model: type[BaseModel], location: Sequence[str | int]) -> list[
 
 def explained(model: type[BaseModel], error: Mapping[str, Any]) -> str:
     """A fault that pydantic found; for an unknown key the keys that are allowed there."""
+    if error["type"] == "missing":
+        return "is required"
     if error["type"] != "extra_forbidden":
-        return str(error["msg"])
+        return str(error["msg"]).removeprefix("Value error, ")
     allowed = allowed_keys(model, error["loc"][:-1])
     return f"no such key; allowed here: {', '.join(allowed)}"
 

@@ -35,7 +35,7 @@ from service.missions.live_filter import LiveFilterSettings
 from service.missions.packets import Packets
 from service.missions.product_settings import DEFAULT_PRODUCTS, ProductSettings, beside
 from service.missions.scan import Scan
-from service.missions.strict import Strict, is_missing
+from service.missions.strict import Components, Direction, Strict, is_missing
 from service.missions.sun_tracker import SunTracker
 from service.missions.tracking import TrackingSettings
 from service.vectors import Matrix, Vector, read_only, unit
@@ -43,7 +43,6 @@ from service.vectors import Matrix, Vector, read_only, unit
 SHIPPED_FOLDER = Path(__file__).parent
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
-Components = tuple[float, float, float]
 
 
 def _zero_or_wide(step_deg: float) -> float:
@@ -65,7 +64,7 @@ class Cap(Strict):
     """A small circle about the tracker's presumed boresight."""
 
     kind: Literal["cap"]
-    axis_body: Components
+    axis_body: Direction
     """The spacecraft's boresight: the axis that an a priori `boresight` names."""
     radius_deg: float = Field(gt=0, le=180)  # CCAP
     grid_deg: GridStep = 0.0
@@ -76,7 +75,7 @@ class Band(Strict):
     """A band about a small or great circle around the catalog generation vector, its pole."""
 
     kind: Literal["band"]
-    axis_body: Components
+    axis_body: Direction
     """The body axis that lies along the pole: for SOHO the one pointed at the Sun."""
     coelevation_deg: float = Field(gt=0, lt=180)  # COEL
     half_width_deg: float = Field(gt=0, le=90)  # WBAND
@@ -260,8 +259,8 @@ class Mission(Strict):
     @classmethod
     def _names_differ(cls, trackers: tuple[Tracker, ...]) -> tuple[Tracker, ...]:
         names = [tracker.name for tracker in trackers]
-        if len(set(names)) != len(names):
-            raise ValueError(f"two trackers share a name: {', '.join(names)}")
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"each needs a name of its own; several are {', '.join(twice)}")
         return trackers
 
     @field_validator("packets")

@@ -1,9 +1,21 @@
 """The ground rules of every table of a mission file: nothing unknown, no NaN, no infinity."""
 
+import math
 from collections.abc import Mapping
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, ConfigDict
+
+Components = tuple[float, float, float]
+
+
+def _has_direction(vector: Components) -> Components:
+    if math.hypot(*vector) <= 1e-6:
+        raise ValueError("has no direction: give a unit vector")
+    return vector
+
+
+Direction = Annotated[Components, AfterValidator(_has_direction)]
 
 
 class Strict(BaseModel):

@@ -6,10 +6,8 @@ from typing import Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from service.missions.strict import Strict
+from service.missions.strict import Components, Strict
 from service.vectors import Matrix, read_only
-
-Components = tuple[float, float, float]
 
 
 class SunTracker(Strict):

@@ -10,7 +10,7 @@ from service.errors import BadInput
 from service.missions.packets import CdsTime, CucTime, PacketTime
 from service.packets.definition import PacketFault
 from service.packets.values import whole
-from service.times import DAY_S, parse_utc
+from service.times import DAY_S, FIRST_YEAR, LAST_YEAR, parse_utc, recorded_utc
 
 NS = 1_000_000_000
 MS_NS, US_NS = 1_000_000, 1_000
@@ -53,16 +53,18 @@ class _Day:
 def _day(ordinal: int) -> _Day:
     """A day by its ordinal; raises `BadInput` and `ValueError` for one that UTC does not have."""
     text = date.fromordinal(ordinal).isoformat()
-    following = date.fromordinal(ordinal + 1).isoformat()
     start_ns = parse_utc(f"{text}T00:00:00Z").tai_ns
-    return _Day(text, start_ns, parse_utc(f"{following}T00:00:00Z").tai_ns - start_ns)
+    # The day after the last supported one is of no supported year.
+    following = recorded_utc(f"{date.fromordinal(ordinal + 1).isoformat()}T00:00:00Z")
+    return _Day(text, start_ns, following.tai_ns - start_ns)
 
 
 def _checked_day(ordinal: int, parameter: str, value: object) -> _Day:
     try:
         return _day(ordinal)
     except (BadInput, ValueError, OverflowError):
-        raise PacketFault(parameter, "the day is not in 1972 to 2098", value) from None
+        message = f"the day is not in {FIRST_YEAR} to {LAST_YEAR}"
+        raise PacketFault(parameter, message, value) from None
 
 
 def _of_days(time: CdsTime, values: Mapping[str, Any]) -> Moment:

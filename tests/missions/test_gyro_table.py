@@ -61,7 +61,7 @@ def test_axes_that_are_not_at_right_angles_are_solved_for():
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        ("sigma_v_rad_s0_5 = 1e-7", "gyro.sigma_u_rad_s1_5: Field required"),
+        ("sigma_v_rad_s0_5 = 1e-7", "gyro.sigma_u_rad_s1_5: is required"),
         (f'{NOISE}axes = ["X", "Y", "W"]', "gyro.axes"),
         (f'{NOISE}axes = ["X", "Y", "-X"]', "axes: the three must not lie near one plane"),
         (f"{NOISE}axes = [[1, 0, 0], [0, 2, 0], [0, 0, 1]]", "axes: each must be a unit vector"),

@@ -92,7 +92,18 @@ MISTAKES = [
     (XTE.replace("z_axis_body = [1.0", "z_axis_body = [-1.0"), ("trackers.0", "right-handed")),
     (XTE.replace("z_axis_body = [1.0", "z_axis_body = [2.0"), ("trackers.0", "unit vectors")),
     (XTE.replace('name = "STARTRACKER_1"\n', ""), ("trackers.0.name", "required")),
-    (XTE + XTE[XTE.index("[[trackers]]") :], ("trackers", "STARTRACKER_1")),
+    (
+        XTE + XTE[XTE.index("[[trackers]]") :].partition("\n[gyro]")[0],
+        ("trackers: each needs a name of its own; several are STARTRACKER_1",),
+    ),
+    (
+        XTE.replace("axis_body = [1.0, 0.0, 0.0]      #", "#"),
+        ("zone.axis_body: is required",),
+    ),
+    (
+        XTE.replace("axis_body = [1.0, 0.0, 0.0]      #", "axis_body = [0.0, 0.0, 0.0] #"),
+        ("zone.axis_body: has no direction: give a unit vector",),
+    ),
     (
         SOHO.replace("half_width_deg = 2.1", "half_width_deg = 120"),
         ("zone.half_width_deg", "90", "120"),

@@ -9,7 +9,7 @@ from astropy.time import Time
 from service.missions.packets import CdsTime, CucTime
 from service.packets.clock import moment_of
 from service.packets.definition import PacketFault
-from service.times import parse_utc
+from service.times import FIRST_YEAR, LAST_YEAR, parse_utc
 
 CDS = CdsTime(kind="cds", day="D", millisecond="MS", microsecond="US")
 
@@ -38,6 +38,16 @@ def test_days_and_milliseconds_are_utc():
         text = f"{expected.iso[:10]}T{clock}.{ms % 1000:03d}{us:03d}"
         assert found.text.rstrip("Z").ljust(26, "0") == text
         assert found.tai_ns == parse_utc(found.text).tai_ns
+
+
+def test_the_days_of_every_supported_year_are_read():
+    start = date(1958, 1, 1)
+    for day in (date(FIRST_YEAR, 1, 1), date(LAST_YEAR, 12, 31)):
+        found = moment_of(CDS, {"D": (day - start).days, "MS": 86_399_999, "US": 0})
+        assert found.text == f"{day}T23:59:59.999Z"
+    for day in (date(FIRST_YEAR - 1, 12, 31), date(LAST_YEAR + 1, 1, 1)):
+        with pytest.raises(PacketFault, match=f"not in {FIRST_YEAR} to {LAST_YEAR}"):
+            moment_of(CDS, {"D": (day - start).days, "MS": 0, "US": 0})
 
 
 def test_the_milliseconds_of_a_leap_second_are_read():

@@ -193,6 +193,14 @@ def test_the_command_needs_nothing_but_a_picture(tmp_path, capsys, monkeypatch):
         assert overlay.size == (1024, 1024)
 
 
+def test_the_command_prints_its_attitude_where_the_picture_cannot_be_written(tmp_path, capsys):
+    picture, target = FOLDER / "cedarsolve-pleiades.jpg", tmp_path / "missing" / "out.png"
+    assert main(["frame", str(picture), "--fov", "11", "--overlay", str(target)]) == 1
+    told = capsys.readouterr()
+    assert "RA 56.1" in told.out
+    assert f"cannot be written: {target}: No such file" in told.err
+
+
 def test_the_command_says_what_it_found_as_json(tmp_path, capsys):
     picture = FOLDER / "cedarsolve-tree.jpg"
     out = tmp_path / "out.png"

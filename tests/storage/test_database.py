@@ -1,6 +1,9 @@
 """The database: made by migrations, opened with care, refused with a reason."""
 
+import os
 import sqlite3
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -8,6 +11,7 @@ from alembic import command
 from sqlalchemy import create_engine, event, inspect, make_url, select, text
 from sqlalchemy.exc import DBAPIError, OperationalError
 
+from service import __version__
 from service.app.factory import open_app
 from service.errors import BadConfiguration, Busy
 from service.settings import Settings
@@ -17,6 +21,7 @@ from service.storage.sql.database import Store
 from service.storage.sql.engines import database_url, writing_engine
 from service.storage.sql.prepared import execute
 from service.storage.sql.tables import batches
+from service.storage.upkeep.backup import back_up
 
 pytestmark = pytest.mark.both_databases
 
@@ -72,8 +77,60 @@ def test_a_database_of_a_newer_version_is_refused(database):
     with engine.begin() as connection:
         connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
     engine.dispose()
-    with pytest.raises(BadConfiguration, match=r"another version|9999"):
-        Store(database)
+    (by_verify,) = migrations.check(database)
+    for refused in (Store, migrations.upgrade):
+        with pytest.raises(BadConfiguration, match="at 9999, of a newer version") as told:
+            refused(database)
+        # Verifying advises nothing that upgrading would refuse.
+        assert by_verify in str(told.value)
+    assert "upgrade" not in by_verify
+
+
+def test_a_newer_database_names_the_version_that_wrote_it(database, opened, make):
+    app = opened()
+    app.submissions.submit(make("b1"))
+    app.close()
+    engine = create_engine(database_url(database))
+    with engine.begin() as connection:
+        connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
+    engine.dispose()
+    (difference,) = migrations.check(database)
+    assert f"its newest result is of version {__version__}" in difference
+
+
+# Root writes everywhere, but for a process that gave this up.
+AS_OTHERS = (
+    ("setpriv", "--bounding-set=-dac_override", "--inh-caps=-dac_override")
+    if os.geteuid() == 0
+    else ()
+)
+
+
+@pytest.mark.parametrize("database", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("read_only", ["file", "folder"])
+def test_a_read_only_file_is_verified_and_exported(database, opened, make, tmp_path, read_only):
+    app = opened()
+    app.submissions.submit(make("b1"))
+    app.close()
+    source = tmp_path / "kept" / "acquire.db"
+    source.parent.mkdir()
+    back_up(database, source)
+    before = source.read_bytes()
+    os.chmod(source if read_only == "file" else source.parent, 0o555)
+
+    def acquire(*arguments):
+        command = [*AS_OTHERS, sys.executable, "-m", "service.cli", *arguments]
+        command += ["--database", f"sqlite:///{source}"]
+        return subprocess.run(command, capture_output=True, text=True, check=False)
+
+    assert acquire("database", "verify").stdout == "nothing is wrong with 1 batches\n"
+    assert acquire("export", "batches", "--spacecraft", "XTE").stdout.count("\n") == 2
+    refused = acquire("database", "prune", "--before", "2000-001T00:00:00Z")
+    assert refused.returncode == 2
+    assert "read-only here: it can be read" in refused.stderr
+    os.chmod(source.parent, 0o755)
+    assert source.read_bytes() == before
+    assert [each.name for each in source.parent.iterdir()] == ["acquire.db"]
 
 
 def test_a_file_that_is_no_database_is_refused_and_left_alone(tmp_path):

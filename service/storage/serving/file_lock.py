@@ -34,10 +34,15 @@ class FileLock:
     def take(self) -> None:
         """Take the lock, unless it is held; creates a file that is missing.
 
-        Raises `BadConfiguration` that names the process that has it.
+        Raises `BadConfiguration` that names the process that has it, and for a read-only file.
         """
         if self._is_held:
             return
+        if self._file.is_read_only:
+            raise BadConfiguration(
+                f"ACQUIRE_DATABASE: {self._file.path}: the file or its folder is read-only here: "
+                "it can be read, verified and exported, but not written"
+            )
         with self._taking:
             if self._descriptor is None:
                 self._descriptor = self._file.create()

@@ -26,7 +26,7 @@ from service.storage.sql.engines import (
     reading_engine,
     writing_engine,
 )
-from service.storage.sql.migrations import bring_up_to_date, require_up_to_date
+from service.storage.sql.migrations import bring_up_to_date, require_revision, require_up_to_date
 from service.storage.sql.transaction import may_pass
 from service.storage.sql.writer import RETRY_AFTER_S, Writer, remove_probe
 
@@ -136,7 +136,10 @@ class Store(Readers):
             else:
                 if serving:
                     self.require_writing()
-                bring_up_to_date(self._writing, self.file_lock.take)
+                if file is not None and file.is_read_only:
+                    require_revision(database)
+                else:
+                    bring_up_to_date(self._writing, self.file_lock.take)
         except BaseException:
             self._writing.dispose()
             if self.file_lock is not None:

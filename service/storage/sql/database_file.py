@@ -43,6 +43,24 @@ class DatabaseFile:
                 f"ACQUIRE_DATABASE: {self.path}: cannot be opened: {error.strerror}"
             ) from None
 
+    @property
+    def is_read_only(self) -> bool:
+        """Whether this process cannot write to the file, or make SQLite's log beside it."""
+        there = self.path.exists()
+        return there and not (
+            os.access(self.path, os.W_OK) and os.access(self.path.parent, os.W_OK)
+        )
+
+    @property
+    def uri(self) -> str:
+        """How SQLite opens the file, which it never creates.
+
+        One that is read-only and has no log is opened as it is: without a log nobody else has
+        it open, and SQLite need not make one.
+        """
+        is_fixed = self.is_read_only and not Path(self._log_path).exists()
+        return f"{self.path.as_uri()}?{'mode=ro&immutable=1' if is_fixed else 'mode=rw'}"
+
     def remember(self) -> None:
         """Note which file is there, unless that is known."""
         if self.identity is None:

@@ -202,10 +202,10 @@ def _open_as_file(engine: Engine, file: DatabaseFile | None = None, create: bool
     def _connect(_dialect: Any, _record: Any, cargs: Any, cparams: Any) -> Any:
         nonlocal may_create
         place, *others = cargs
+        opened = DatabaseFile(Path(place).absolute())
         if may_create:
-            os.close(DatabaseFile(Path(place).absolute()).create())
-        uri = f"{Path(place).absolute().as_uri()}?mode=rw"
-        connection = sqlite3.connect(uri, *others, **(cparams | {"uri": True}))
+            os.close(opened.create())
+        connection = sqlite3.connect(opened.uri, *others, **(cparams | {"uri": True}))
         may_create = False
         if file is not None:
             file.remember()

@@ -4,15 +4,17 @@ alembic is loaded only where there is something to change or to compare: a
 service that starts would wait for it.
 """
 
+import json
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import URL, Connection, Engine, inspect
 from sqlalchemy.exc import SQLAlchemyError
 
+from service import __version__
 from service.errors import BadConfiguration
 from service.resources import shipped
 from service.storage.serving.file_lock import writing_alone
@@ -86,9 +88,9 @@ def check(database: str) -> list[str]:
     require_there(database)
     url = database_url(database)
     with _disposed(reading_engine(url)) as engine, reported(url), engine.begin() as connection:
-        found = _revision(connection)
-        if found != HEAD:
-            return [_behind(found)]
+        differs = _difference(connection)
+        if differs is not None:
+            return [differs]
         from alembic.autogenerate import compare_metadata
         from alembic.runtime.migration import MigrationContext
 
@@ -130,18 +132,24 @@ def bring_up_to_date(engine: Engine, before: Callable[[], object] = lambda: None
         try:
             command.upgrade(config, "head")
         except CommandError:
+            differs = _difference(connection)
             raise BadConfiguration(
-                f"ACQUIRE_DATABASE: {shown_url(engine.url)}: was written by another version of "
-                "the service"
+                f"ACQUIRE_DATABASE: {shown_url(engine.url)}: {differs}"
             ) from None
 
 
 def require_up_to_date(engine: Engine) -> None:
     """Raise `BadConfiguration` unless the schema is this version's."""
     with reported(engine.url), engine.begin() as connection:
-        found = _revision(connection)
-    if found != HEAD:
-        raise BadConfiguration(f"ACQUIRE_DATABASE: {shown_url(engine.url)}: {_behind(found)}")
+        differs = _difference(connection)
+    if differs is not None:
+        raise BadConfiguration(f"ACQUIRE_DATABASE: {shown_url(engine.url)}: {differs}")
+
+
+def require_revision(database: str) -> None:
+    """`require_up_to_date` of a database that is only read."""
+    with _disposed(reading_engine(database_url(database))) as engine:
+        require_up_to_date(engine)
 
 
 @contextmanager
@@ -178,11 +186,32 @@ def _revision(connection: Connection) -> str | None:
     return next(iter(revisions), None)
 
 
-def _behind(found: str | None) -> str:
+def _difference(connection: Connection) -> str | None:
+    """How the revision of the schema differs from this version's, and what to do; None: not."""
+    found = _revision(connection)
+    if found == HEAD:
+        return None
+    if found is None:
+        return "holds no tables of this service: run `acquire database upgrade` to make them"
+    if found < HEAD:
+        return (
+            f"its schema is at {found}, this version needs {HEAD}: run `acquire database upgrade`"
+        )
     return (
-        f"its schema is at {found or 'nothing'}, this version needs {HEAD}: "
-        "run `acquire database upgrade`"
+        f"its schema is at {found}, of a newer version of the service ({_writer(connection)}); "
+        f"this version, {__version__}, knows those up to {HEAD}: use the newer one"
     )
+
+
+def _writer(connection: Connection) -> str:
+    """The version that wrote the newest answer, as far as another schema lets it be known."""
+    newest = "SELECT answer FROM results ORDER BY id DESC LIMIT 1"
+    with suppress(SQLAlchemyError, ValueError, LookupError, TypeError), connection.begin_nested():
+        version = json.loads(connection.exec_driver_sql(newest).scalar_one())["provenance"][
+            "version"
+        ]
+        return f"its newest result is of version {version}"
+    return "which one, no result tells"
 
 
 def _in_words(difference: Any) -> str:

@@ -15,7 +15,7 @@ from pathlib import Path
 from sqlalchemy import URL
 
 from service.errors import BadConfiguration
-from service.storage.sql.database_file import PRIVATE_FILE
+from service.storage.sql.database_file import PRIVATE_FILE, DatabaseFile
 from service.storage.sql.engines import (
     BUSY_TIMEOUT_MS,
     database_url,
@@ -83,8 +83,7 @@ def _copy_sqlite(source: Path, part: Path, step: Step) -> None:
 
 
 def _opened(source: Path) -> sqlite3.Connection:
-    # Read and write, for its log; but never created.
-    uri = f"{source.absolute().as_uri()}?mode=rw"
+    uri = DatabaseFile(source.absolute()).uri
     connection = sqlite3.connect(uri, isolation_level=None, uri=True)
     connection.execute(f"PRAGMA busy_timeout = {BUSY_TIMEOUT_MS}")
     connection.execute("PRAGMA query_only = ON")

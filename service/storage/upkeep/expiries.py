@@ -10,14 +10,14 @@ from msgspec import Struct
 from sqlalchemy import Connection, select
 
 from service.storage.sql.access_tables import access_tokens
-from service.times import Utc, parse_utc, recorded_utc, shifted, utc_now
+from service.times import LAST_YEAR, Utc, parse_utc, recorded_utc, shifted, utc_now
 
 log = logging.getLogger(__name__)
 
 SOON_DAYS = 30
 """From here on the service warns when it starts; the alert rules begin at the same time."""
 DAY_S = 86_400.0
-_FIRST_YEAR, _LAST_YEAR = 2017, 2099
+_FIRST_YEAR = 2017
 
 
 class TokenTerm(Struct, frozen=True):
@@ -54,10 +54,10 @@ def leap_seconds_end() -> Utc:
     """
     # The ufunc returns its status; the function of the same name prints a warning.
     dubious = 1
-    for year in range(_FIRST_YEAR, _LAST_YEAR):
+    for year in range(_FIRST_YEAR, LAST_YEAR):
         if int(erfa.ufunc.dat(year, 1, 1, 0.0)[1]) == dubious:
             return parse_utc(f"{year}-01-01T00:00:00Z", "year")
-    return parse_utc(f"{_LAST_YEAR}-01-01T00:00:00Z", "year")
+    return parse_utc(f"{LAST_YEAR}-01-01T00:00:00Z", "year")
 
 
 class ExpiryDates:
