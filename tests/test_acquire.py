@@ -23,9 +23,10 @@ from service.sky.catalog.star_catalog import import_csv
 from service.sky.model import SkyModel
 from service.storage.recording.answer import star_rows
 from service.times import parse_utc
-from service.vectors import attitude_error_arcsec, matrix_from_quaternion
+from service.vectors import attitude_error_arcsec, matrix_from_quaternion, to_ra_dec
 from tests.reference import batches
 from tests.reference.compare import Judge, answer_as_json, answered, plain_view
+from tests.reference.plain_starid import PlainCatalog
 
 TIME = "2000-01-01T12:00:00.000Z"
 
@@ -399,7 +400,9 @@ def test_the_true_attitude_is_found_to_a_thousandth_of_an_arcsecond_without_nois
     rng, mission_files, sky
 ):
     judge = Judge(mission_files["XTE"], sky)
-    catalog = judge.catalog(TIME)
+    run = sky.run_catalog(judge.mission, parse_utc(TIME))
+    of_day = to_ra_dec(run.direction_at(parse_utc(TIME)))
+    catalog = PlainCatalog(list(run.star_id), *of_day, run.magnitude_mag)
     for number in range(20):
         truth = batches.quaternion_matrix(batches.random_quaternion(rng))
         # The a priori attitude is two degrees off; the stars are seen as they are.

@@ -222,7 +222,9 @@ class Search:
             in_zones.prior.attitude,
             predicted.covariance_arcsec2,
             self.run_catalog,
-            apparent(self.run_catalog.direction, self.velocity_c, self.batch.time),
+            apparent(
+                self.run_catalog.direction_at(self.batch.time), self.velocity_c, self.batch.time
+            ),
         )
         solved = self._solve(corrected, identifications)
         self.timer.end("identify")
@@ -317,7 +319,7 @@ class Search:
             star,
             tracker_of,
             tuple(each.tracker.name for each in corrected),
-            self.run_catalog.direction,
+            self.run_catalog.direction_at(self.batch.time),
             self.velocity_c,
             self.sun_au,
             self.choices.solver,

@@ -111,7 +111,7 @@ def evidence_of(batch: int, acquisition: Acquisition) -> Evidence:
             acquisition.run_catalog.magnitude_mag[row],
         )
         observed = result.corrected.direction_body[used] @ presumed
-        catalog = acquisition.run_catalog.direction[row]
+        catalog = acquisition.run_catalog.direction_at(acquisition.batch.time)[row]
         polar = [np.full(len(row), np.nan)] * 2
         if isinstance(mission.zone, Band):
             polar = [angle_between_deg(each, result.region.axis) for each in (observed, catalog)]
@@ -198,7 +198,7 @@ def _tracker_attitude(
         np.where(used, result.identification.star, -1),
         None,
         (result.corrected.tracker.name,),
-        acquisition.run_catalog.direction,
+        acquisition.run_catalog.direction_at(acquisition.batch.time),
         aberration_velocity(acquisition.batch),
         sun_distance_au(acquisition.batch.time),
         "quest",

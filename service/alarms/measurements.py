@@ -82,7 +82,7 @@ def _mean_stars(acquisition: "Acquisition") -> list["MeanStars"]:
         acquisition.batch,
         [each.corrected for each in acquisition.trackers],
         [each.identification.star for each in acquisition.trackers],
-        acquisition.run_catalog.direction,
+        acquisition.run_catalog.direction_at(acquisition.batch.time),
     )
 
 

@@ -99,7 +99,7 @@ def _of_tracker(
         directions,
         np.ones(len(star)),
         star,
-        acquisition.run_catalog.direction,
+        acquisition.run_catalog.direction_at(batch.time),
         aberration_velocity(batch),
         sun_distance_au(batch.time),
     )

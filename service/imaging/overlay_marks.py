@@ -73,7 +73,7 @@ def _predicted(
     wanted = set(names)
     rows = {name: row for row, name in enumerate(run_catalog.star_id) if name in wanted}
     row = np.array([-1 if name is None else rows.get(name, -1) for name in names])
-    direction = run_catalog.direction[row]
+    direction = run_catalog.direction_at(batch.time)[row]
     if batch.aberration == "to_correct":
         velocity_c = observer_velocity(batch.time, batch.velocity_km_per_s)
         direction = apparent(direction, velocity_c, batch.time)

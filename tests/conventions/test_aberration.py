@@ -111,7 +111,8 @@ def seen_from_orbit(rng, sky, missions):
         speed_across = np.linalg.norm(np.cross(truth[0], velocity)) / np.linalg.norm(velocity)
         if len(rows) == 6 and speed_across > 0.9:
             break
-    seen = np.array([relativistic(catalog.direction[row], velocity) for row in rows])
+    of_day = catalog.direction_at(EPOCH)
+    seen = np.array([relativistic(of_day[row], velocity) for row in rows])
     body = seen @ truth.T
 
     def attitude(aberration, vectors=body, velocity_km_per_s=velocity_km_per_s):
@@ -137,7 +138,7 @@ def seen_from_orbit(rng, sky, missions):
         assert found.counts["unique"] == 6
         return found
 
-    return truth, velocity, catalog.direction[rows], attitude
+    return truth, velocity, of_day[rows], attitude
 
 
 def off_arcsec(found, truth):

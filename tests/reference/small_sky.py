@@ -29,6 +29,8 @@ def run_catalog(directions, magnitudes):
         dec_deg=dec_deg,
         magnitude_mag=np.array(magnitudes, float)[order],
         catalog_row=order,
+        motion=np.zeros((len(order), 3)),
+        parallax_rad=np.zeros(len(order)),
         star_id=tuple(f"STAR {k}" for k in order),
         rejected=(),
         digest=f"sha256:{hash(np.asarray(directions, float).tobytes())}",

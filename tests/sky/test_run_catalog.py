@@ -2,12 +2,16 @@
 
 import csv
 import dataclasses
+import json
 
+import erfa
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from service.acquire.pipeline import acquire
 from service.missions.mission import RunCatalogSettings
+from service.observations.schema import submission_from_json
 from service.sky.catalog.blending import merged_into
 from service.sky.catalog.run_catalog import (
     build_run_catalog,
@@ -16,7 +20,8 @@ from service.sky.catalog.run_catalog import (
     instrument_magnitude,
 )
 from service.sky.catalog.star_catalog import import_csv, load_embedded
-from service.vectors import angle_between_deg, from_ra_dec, unit
+from service.times import parse_utc, shifted
+from service.vectors import angle_between_deg, from_ra_dec, quaternion_from_matrix, unit
 
 CAP, BAND = 6.5, 8.0
 ZONES = {
@@ -294,3 +299,90 @@ def test_the_digest_tells_run_catalogs_apart(catalog):
     digests = [run_of(catalog, year, limit).digest for year, limit in made]
     assert digests[0] == digests[1]
     assert len(set(digests)) == 3
+
+
+@pytest.mark.parametrize("epochs", [1, pytest.param(12, marks=pytest.mark.slow)])
+def test_directions_are_those_of_the_day_by_erfa(catalog, seed, epochs):
+    rng = np.random.default_rng(seed)
+    settings = RunCatalogSettings(magnitude_limit_mag=BAND, merge_within_arcsec=0.0)
+    for epoch in rng.integers(1985, 2050, epochs).tolist():
+        run = build_run_catalog(catalog, settings, float(epoch))
+        for _ in range(12):
+            time = in_year(rng.uniform(epoch - 0.5, epoch + 0.5))
+            expected = seen_from_earth(catalog, run.catalog_row, time)
+            apart = angle_between_deg(run.direction_at(time), expected) * 3600.0
+            assert apart.max() < 0.02
+
+
+@pytest.mark.parametrize("places", [30, pytest.param(1000, marks=pytest.mark.slow)])
+def test_batches_of_any_day_fit_the_stars_as_erfa_has_them(sky, missions, seed, places):
+    """About the fastest of the bright stars, and anywhere: residuals below 0.02 arcsec."""
+    rng, mission, catalog = np.random.default_rng(seed), missions["XTE"], sky.catalog
+    settings = mission.run_catalog_settings
+    alone = instrument_magnitude(catalog, settings.color_polynomial_mag)
+    light = 10.0 ** (-0.4 * alone) * ~catalog.light_elsewhere
+    leader = merged_into(
+        catalog.direction, alone, catalog.light_elsewhere, settings.merge_within_arcsec
+    )
+    if settings.merge_limit_mag is not None:
+        leader = np.where(alone > settings.merge_limit_mag, np.arange(len(alone)), leader)
+    fast = [catalog.direction[catalog.row_of(f"HIP {hip}")] for hip in (69673, 104214, 71683)]
+    axes = [*fast, *unit(rng.normal(size=(places, 3)))]
+    epochs = np.sort(rng.integers(1985, 2050, len(axes) // 40 + 1))
+    worst, met = 0.0, 0
+    for k, axis in enumerate(axes):
+        # Arcturus and its peers about half a year from the epoch.
+        epoch = int(epochs[k // 40])
+        time = in_year(epoch + (0.49 if k < 3 else rng.uniform(-0.49, 0.49)))
+        run = sky.run_catalog(mission, time)
+        row = np.flatnonzero(run.direction @ axis > np.cos(np.radians(3.5)))[:20]
+        together = np.flatnonzero(np.isin(leader, run.catalog_row[row]))
+        group = {lead: together[leader[together] == lead] for lead in run.catalog_row[row]}
+        there = np.array(
+            [
+                light[of] @ seen_from_earth(catalog, of, time) / light[of].sum()
+                for of in group.values()
+            ]
+        )
+        truth = attitude_along(axis, rng)
+        vectors = unit(there) @ truth.T @ mission.trackers[0].body_from_tracker
+        stars = [
+            {"vector": vector.tolist(), "magnitude": float(magnitude)}
+            for vector, magnitude in zip(vectors, run.magnitude_mag[row], strict=True)
+        ]
+        sent = {
+            "spacecraft": "XTE",
+            "batch": "1",
+            "time": time.text,
+            "a_priori": {"quaternion": quaternion_from_matrix(truth).tolist()},
+            "aberration": "ignore",
+            "observations": [{"tracker": "STARTRACKER_1", "stars": stars}],
+        }
+        found = acquire(submission_from_json(json.dumps(sent)).batch, mission, sky)
+        if found.solution is not None:
+            met += 1
+            worst = max(worst, np.nanmax(found.solution.residual_arcsec))
+            assert met > 3 or worst < 0.02, k
+    assert met > 0.9 * len(axes)
+    assert worst < 0.02
+
+
+def in_year(julian_year):
+    return shifted(parse_utc("2000-01-01T12:00:00Z"), (julian_year - 2000.0) * 365.25 * 86400.0)
+
+
+def seen_from_earth(catalog, rows, time):
+    """Where ERFA has stars at a time, seen from the Earth without aberration."""
+    _, earth, _ = erfa.ufunc.epv00(*time.tt)
+    ra, dec = np.radians([catalog.ra_deg[rows], catalog.dec_deg[rows]])
+    motion = [catalog.pm_ra_mas_per_year[rows], catalog.pm_dec_mas_per_year[rows]]
+    east, north = np.radians(np.array(motion) / 3.6e6)
+    parallax = np.fmax(catalog.parallax_mas[rows], 0.0) / 1000.0
+    years = time.julian_year - 2000.0
+    return erfa.pmpx(ra, dec, east / np.cos(dec), north, parallax, 0.0, years, earth["p"])
+
+
+def attitude_along(axis, rng):
+    """An attitude that has the body's X, XTE's boresight, along an axis, and any roll."""
+    across = unit(np.cross(axis, rng.normal(size=3)))
+    return np.stack([axis, across, np.cross(axis, across)])

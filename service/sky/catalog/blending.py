@@ -44,17 +44,18 @@ def pairs_within(direction: Vector, within_arcsec: float) -> Rows:
 def combined(
     direction: Vector, magnitude: Vector, light_elsewhere: npt.NDArray[np.bool_], leader: Rows
 ) -> tuple[Vector, Vector]:
-    """Directions, not normalised, and magnitudes after merging.
+    """Directions (N, 3), not normalised, and magnitudes after merging.
 
-    A leader has the light of its group and stands in the group's centre of
-    light; every other star is as it was.
+    Further columns of `direction`, such as motions, are combined alike.  A leader has
+    the light of its group and stands in the group's centre of light; every other star
+    is as it was.
     """
     direction, magnitude = direction.copy(), magnitude.copy()
     lost = np.flatnonzero((leader != np.arange(len(leader))) & ~light_elsewhere)
     group, place = np.unique(leader[lost], return_inverse=True)
     light = 10.0 ** (-0.4 * magnitude)
     total = light[group] + np.bincount(place, light[lost], len(group))
-    for axis in range(3):
+    for axis in range(direction.shape[1]):
         moment = np.bincount(place, light[lost] * direction[lost, axis], len(group))
         direction[group, axis] = (light[group] * direction[group, axis] + moment) / total
     magnitude[group] = -2.5 * np.log10(total)

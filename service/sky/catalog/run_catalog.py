@@ -5,32 +5,34 @@ instrument magnitude, merging of what the tracker cannot separate, the
 magnitude limit, and rejection.  Index order, brightest first, is the
 brightness rank that the pair index uses.
 
-Directions are those seen from the solar system's barycentre: a catalog that
-serves a year cannot carry the annual parallax, which is 0.75 arcsec for alpha
-Centauri and below 0.4 arcsec for every other star to V 8.
+The catalog's own directions are those seen from the solar system's barycentre at
+its epoch, and zones are made of them.  `direction_at` gives those seen from the
+Earth on the day of a batch, of which attitudes and residuals are made.
 """
 
 import csv
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
+from erfa import ufunc
 
 from service.csv_cells import neutralised
 from service.missions.mission import RunCatalogSettings
 from service.sky.catalog.blending import Rows, combined, merged_into
-from service.sky.catalog.proper_motion import moved
+from service.sky.catalog.proper_motion import motion_in, moved
 from service.sky.catalog.rejection import rejections
 from service.sky.catalog.star_catalog import Catalog
-from service.vectors import Vector, from_ra_dec, read_only, to_ra_dec
+from service.times import Utc
+from service.vectors import ARCSEC_PER_RADIAN, Vector, from_ra_dec, read_only, to_ra_dec, unit
 
 UNKNOWN_COLOR_BV_MAG = 0.6
 """The B-V of a star whose colour is not known: a Sun-like one, near the catalog's median."""
 
-J2000_YEAR = 2000.0
+J2000_YEAR, J2000_JD, DAYS_PER_YEAR = 2000.0, 2451545.0, 365.25
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,10 @@ class RunCatalog:
     ra_deg: Vector
     dec_deg: Vector
     """ICRS at the epoch.  These numbers are exported, and `direction` is computed from them."""
+    motion: Vector
+    """Of the directions in a Julian year (N, 3), in radians; of merged stars the light's."""
+    parallax_rad: Vector
+    """Zero where it is not known, or was measured below zero."""
     magnitude_mag: Vector
     """Instrument magnitude, of the combined light where stars were merged."""
     catalog_row: Rows
@@ -66,13 +72,32 @@ class RunCatalog:
     @property
     def nbytes(self) -> int:
         """Bytes held, the identifiers estimated."""
-        arrays = (self.ra_deg, self.dec_deg, self.magnitude_mag, self.catalog_row, self.direction)
-        return sum(array.nbytes for array in arrays) + 64 * len(self.star_id)
+        arrays = [self.ra_deg, self.dec_deg, self.magnitude_mag, self.direction, self.motion]
+        floats = sum(array.nbytes for array in (*arrays, self.parallax_rad))
+        return floats + self.catalog_row.nbytes + 64 * len(self.star_id)
 
     @cached_property
     def direction(self) -> Vector:
         """Unit vectors (N, 3) of exactly `ra_deg` and `dec_deg`."""
         return read_only(from_ra_dec(self.ra_deg, self.dec_deg))
+
+    def direction_at(self, time: Utc) -> Vector:
+        """Unit vectors (N, 3) as seen from the Earth on the day of a time, without aberration.
+
+        Proper motion and annual parallax within the day are left out: below 0.02 arcsec for
+        every star.
+        """
+        return _on_day(self, round(time.julian_year * DAYS_PER_YEAR))
+
+
+@lru_cache(maxsize=8)
+def _on_day(run_catalog: RunCatalog, day: int) -> Vector:
+    """The directions of a run catalog on a day, counted from Julian year 0."""
+    year = day / DAYS_PER_YEAR
+    _, of_earth, _ = ufunc.epv00(J2000_JD, DAYS_PER_YEAR * (year - J2000_YEAR))
+    seen = run_catalog.direction + (year - run_catalog.epoch_year) * run_catalog.motion
+    seen -= run_catalog.parallax_rad[:, None] * of_earth["p"]
+    return read_only(unit(seen))
 
 
 def build_run_catalog(
@@ -84,18 +109,17 @@ def build_run_catalog(
     yet no entry: merged into a brighter one, or rejected.
     """
     alone = instrument_magnitude(catalog, settings.color_polynomial_mag)
-    start = moved(
-        catalog.ra_deg,
-        catalog.dec_deg,
-        catalog.pm_ra_mas_per_year,
-        catalog.pm_dec_mas_per_year,
-        epoch_year - J2000_YEAR,
+    known = (
+        *(catalog.ra_deg, catalog.dec_deg),
+        *(catalog.pm_ra_mas_per_year, catalog.pm_dec_mas_per_year),
     )
+    start, motion = moved(*known, epoch_year - J2000_YEAR), motion_in(*known, 1.0)
     leader = merged_into(start, alone, catalog.light_elsewhere, settings.merge_within_arcsec)
     if settings.merge_limit_mag is not None:
         apart = alone > settings.merge_limit_mag
         leader[apart] = np.flatnonzero(apart)
-    direction, magnitude = combined(start, alone, catalog.light_elsewhere, leader)
+    both, magnitude = combined(np.hstack([start, motion]), alone, catalog.light_elsewhere, leader)
+    direction, motion = both[:, :3], both[:, 3:]
     bright = magnitude <= settings.magnitude_limit_mag
     leads = leader == np.arange(len(catalog))
     reasons = {
@@ -119,6 +143,10 @@ def build_run_catalog(
         dec_deg=read_only(dec),
         magnitude_mag=read_only(magnitude[row]),
         catalog_row=read_only(row),
+        motion=read_only(motion[row]),
+        parallax_rad=read_only(
+            np.fmax(catalog.parallax_mas[row], 0.0) / (1000.0 * ARCSEC_PER_RADIAN)
+        ),
         star_id=star_id,
         rejected=tuple(Rejection(catalog.star_id(star), reasons[star]) for star in sorted(reasons)),
         digest=f"sha256:{content.hexdigest()}",

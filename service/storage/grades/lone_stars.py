@@ -125,7 +125,7 @@ def _directions(
         np.concatenate([each.direction_body for each in corrected]),
         np.concatenate([each.sigma_rad for each in corrected]),
         np.array(star, np.int64),
-        run_catalog.direction,
+        run_catalog.direction_at(batch.time),
         aberration_velocity(batch),
         sun_distance_au(batch.time),
     )

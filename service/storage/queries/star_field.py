@@ -93,7 +93,7 @@ def _tracker(
     radius_deg = _radius_deg(tracker, seen, run_catalog.direction[list(named.values())], to_tracker)
     near = _near(run_catalog, region, to_tracker[2], radius_deg)
     shown = np.union1d(near, np.array(list(named.values()), np.int64))
-    natural = run_catalog.direction[shown]
+    natural = run_catalog.direction_at(batch.time)[shown]
     apparent = dict(zip(shown.tolist(), _apparent(natural, batch) @ to_tracker.T, strict=True))
     ra_deg, dec_deg = to_ra_dec(to_tracker[2])
     return TrackerField(

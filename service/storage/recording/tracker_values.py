@@ -62,7 +62,8 @@ def tracker_rows(
     the catalog (n,) of their unique stars, -1 for others and where they are not known.
     """
     catalog_mag = [np.where(rows >= 0, catalog.magnitude_mag[rows], np.nan) for rows in star]
-    means = [] if answer.attitude is None else mean_stars(batch, corrected, star, catalog.direction)
+    directions = catalog.direction_at(batch.time)
+    means = [] if answer.attitude is None else mean_stars(batch, corrected, star, directions)
     alignment = alignment_offsets_arcsec(means) or [None] * len(corrected)
     expected = [_expected_squares(answer, each) for each in corrected]
     scale = _scale(answer, expected)

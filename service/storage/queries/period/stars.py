@@ -167,7 +167,7 @@ def _add(
     residual, expected = np.full((2, len(own), 2), np.nan)
     if answer.attitude is not None:
         to_tracker = turned.T @ matrix_from_quaternion(answer.attitude.quaternion)
-        natural = run_catalog.direction[row]
+        natural = run_catalog.direction_at(batch.time)[row]
         predicted = apparent(natural, aberration_velocity(batch), batch.time) @ to_tracker.T
         covariance = turned.T @ np.array(answer.attitude.covariance_arcsec2) @ turned
         residual, expected = _residuals(direction, predicted, covariance, seen.sigma_arcsec[own])
