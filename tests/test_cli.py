@@ -294,6 +294,9 @@ def test_the_history_of_a_run_is_printed_as_a_table(acquire, tmp_path):
     rows = list(csv.DictReader(out.splitlines()))
     assert (code, len(rows)) == (0, 3)
     assert {"time", "batch", "id", "ambiguous_share"} <= set(rows[0])
+    file = tmp_path / "history.csv"
+    assert acquire("history", "--spacecraft", "XTE", "--run", "r", "--output", file) == (0, "", "")
+    assert file.read_text().splitlines() == out.splitlines()
 
 
 def test_advice_is_printed_in_sentences_or_as_the_api_answers_it(acquire, tmp_path):

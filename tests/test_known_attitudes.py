@@ -119,6 +119,10 @@ def test_a_replay_is_scored_against_its_truth(scored, files):
         code, told = scored(name, "--json", "--plot", files / "errors.svg", "--status", "all")
         assert code == 0
         found[name] = json.loads(told.out)
+    # What `simulate telemetry` wrote is read as it stands.
+    code, told = scored("pass.truth.ndjson", "--json", "--status", "all")
+    assert code == 0
+    assert json.loads(told.out)["axes"]["x"] == pytest.approx(found["truth.aem"]["axes"]["x"])
     assert found["truth.aem"]["attitudes"] == N
     for axis in "xyz":
         for name in ("truth.xml", "truth.zip"):

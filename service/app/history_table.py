@@ -10,12 +10,12 @@ from service.storage.models.trends import History
 from service.times import utc_of_unix
 
 BATCH_COLUMNS = (
-    Column("time", "text", "UTC", description="Time of the batch.", width=30),
+    Column("time", "utc", description="UTC. Time of the batch.", width=30),
     Column("batch", "text", description="Name of the batch.", width=128),
     Column("id", "text", description="Id of the result.", width=26),
 )
 BUCKET_COLUMNS = (
-    Column("start", "text", "UTC", description="Start of the bucket.", width=30),
+    Column("start", "utc", description="UTC. Start of the bucket.", width=30),
     Column("bucket_s", "integer", "s", description="Width of the bucket."),
     Column("batches", "integer", description="Batches in the bucket."),
 )

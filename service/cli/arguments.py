@@ -132,6 +132,13 @@ def add_json(parser: argparse.ArgumentParser, what: str) -> None:
     parser.add_argument("--json", action="store_true", help=f"print {what} as JSON")
 
 
+def add_output(parser: argparse.ArgumentParser) -> None:
+    """Add `--output` of a command that writes one file."""
+    parser.add_argument(
+        "--output", type=Path, metavar="FILE", help="the file to write; default: standard output"
+    )
+
+
 STANDARD_OUTPUT = Path("-")
 
 

@@ -1,10 +1,9 @@
 """The commands that export recorded results as tables."""
 
 from argparse import Namespace
-from pathlib import Path
 from typing import Any
 
-from service.cli.arguments import MISSION, add_command, add_database, add_period
+from service.cli.arguments import MISSION, add_command, add_database, add_output, add_period
 from service.cli.configuration import period_of, settings_of_existing
 from service.cli.output import written_to
 from service.products.formats import table_formats, write_table
@@ -25,9 +24,7 @@ def add_table_export(commands: Any, kind: str, summary: str) -> None:
     parser.add_argument("--spacecraft", required=True, metavar="NAME", help=MISSION)
     add_period(parser, "the run that is read; default live")
     parser.add_argument("--format", choices=tuple(table_formats()), default="csv")
-    parser.add_argument(
-        "--output", type=Path, metavar="FILE", help="the file to write; default: standard output"
-    )
+    add_output(parser)
     parser.set_defaults(kind=kind)
     add_database(parser)
 

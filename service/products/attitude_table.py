@@ -15,7 +15,7 @@ _TO_BODY = f"{_INERTIAL} to {_BODY}"
 _COVARIANCE = ("11", "12", "13", "22", "23", "33")
 
 COLUMNS = (
-    Column("time", "text", "UTC", description="Time of the batch.", width=30),
+    Column("time", "utc", description="UTC. Time of the batch.", width=30),
     Column("tai_ns", "integer", "ns", description="TAI since 2000-01-01T12:00:00 TAI."),
     *(
         Column(

@@ -24,6 +24,8 @@ _J2000_MJD = 51_544
 _FORMATS = {"number": ("D", ">f8"), "integer": ("K", ">i8"), "flag": ("L", "S1")}
 _NAMES = {"time": "UTC"}
 """Names of columns that FITS, which does not tell capitals apart, has another use for."""
+_UNITS = {"ppm": "10**-6"}
+"""Units that FITS does not know by their name."""
 _TIME = Column("TIME", unit="s", description="Terrestrial Time since MJDREFI + MJDREFF.")
 _VALID = Column("VALID", "flag", description="Whether every value of the row is known.")
 
@@ -50,7 +52,7 @@ def write_fits(table: Table) -> Iterator[bytes]:
 
 def _format_of(column: Column) -> tuple[str, str]:
     """The format of a column in FITS, and in numpy."""
-    if column.kind == "text":
+    if column.kind in ("text", "utc"):
         return f"{column.width}A", f"S{column.width}"
     return _FORMATS[column.kind]
 
@@ -65,7 +67,7 @@ def _rows(columns: Sequence[Column], page: Page, dtype: np.dtype[Any]) -> npt.ND
             rows[column.name] = [NULL if value is None else value for value in values]
         elif column.kind == "flag":
             rows[column.name] = [b"T" if value else b"F" for value in values]
-        elif column.kind == "text":
+        elif column.kind in ("text", "utc"):
             rows[column.name] = [_ascii(value) for value in values]
         else:
             rows[column.name] = np.array(values, dtype=np.float64)
@@ -88,7 +90,7 @@ def _headers(table: Table, columns: Sequence[Column], count: int, mjd: int | Non
         fits.Column(
             _NAMES.get(each.name, each.name),
             _format_of(each)[0],
-            unit=each.unit or None,
+            unit=_UNITS.get(each.unit, each.unit) or None,
             null=NULL if each.kind == "integer" else None,
         )
         for each in columns

@@ -1,7 +1,14 @@
-"""Tables as Parquet, with units, frames and descriptions in the metadata of the fields."""
+"""Tables as Parquet, with units, frames and descriptions in the metadata of the fields.
 
-from collections.abc import Iterator
+Beside a time as text stands `timestamp`, the same as a number that programs compute with.  It
+has no leap seconds: of one, and of the second after it, it is the same.
+"""
+
+from collections.abc import Iterator, Sequence
 from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from service.products.tables import Column, Table
 
@@ -14,16 +21,22 @@ def write_parquet(table: Table) -> Iterator[bytes]:
     import pyarrow as pa
     from pyarrow import parquet
 
-    types = {"number": pa.float64(), "integer": pa.int64(), "flag": pa.bool_(), "text": pa.string()}
-    fields = [pa.field(c.name, types[c.kind], metadata=_described(c)) for c in table.columns]
+    text = pa.string()
+    types = {"number": pa.float64(), "integer": pa.int64(), "flag": pa.bool_()}
+    fields = [
+        pa.field(c.name, types.get(c.kind, text), metadata=_described(c)) for c in table.columns
+    ]
+    times = [place for place, c in enumerate(table.columns) if c.kind == "utc"]
+    about = {"description": "The same without leap seconds: POSIX time."}
+    fields += [pa.field("timestamp", pa.timestamp("ns", "UTC"), metadata=about) for _ in times]
     schema = pa.schema(fields, metadata=dict(table.about))
     sink = _Sink()
     # Numbers are seldom the same: dictionaries of them take memory and time, and save nothing.
-    texts = [c.name for c in table.columns if c.kind == "text"]
+    texts = [c.name for c in table.columns if c.kind in ("text", "utc")]
     with parquet.ParquetWriter(sink, schema, use_dictionary=texts or False) as writer:
         group: list[Any] = []
         for page in table.pages:
-            pairs = zip(page, schema, strict=True)
+            pairs = zip([*page, *(_stamps(page[k]) for k in times)], schema, strict=True)
             arrays = [pa.array(values, field.type) for values, field in pairs]
             group.append(pa.record_batch(arrays, schema=schema))
             if sum(map(len, group)) >= ROWS_IN_GROUP:
@@ -32,6 +45,13 @@ def write_parquet(table: Table) -> Iterator[bytes]:
                 yield sink.taken()
         writer.write_table(pa.Table.from_batches(group, schema))
     yield sink.taken()
+
+
+def _stamps(texts: Sequence[str]) -> npt.NDArray[np.datetime64]:
+    """UTC texts as POSIX times; a leap second is the second after it."""
+    shown = np.array([text.rstrip("Z").replace(":60", ":59") for text in texts], "datetime64[ns]")
+    shown[[text[16:19] == ":60" for text in texts]] += np.timedelta64(1, "s")
+    return shown
 
 
 def _described(column: Column) -> dict[str, str]:

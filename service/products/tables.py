@@ -8,7 +8,7 @@ from typing import Any, Literal
 from service.csv_cells import neutralised
 from service.products.number_texts import number_texts
 
-Kind = Literal["number", "integer", "flag", "text"]
+Kind = Literal["number", "integer", "flag", "text", "utc"]
 Page = Sequence[Sequence[Any]]
 """The values of each column, in the order of the columns; None: not known."""
 _NEEDS_QUOTES = re.compile('[",\r\n]')
@@ -19,6 +19,7 @@ class Column:
     """A column: its name, what it holds, its unit, and the frame that its components are in.
 
     `width` is the greatest number of bytes of a text, for formats with fields of fixed width.
+    The kind `utc` is a text, too: only a text can hold a leap second.
     """
 
     name: str

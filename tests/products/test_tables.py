@@ -1,21 +1,28 @@
 """Tables, read by pyarrow, DuckDB, astropy and Python's own reader of CSV."""
 
 import csv
+import dataclasses
 import io
 
 import astropy.io.fits
+import astropy.table
 import astropy.time
 import duckdb
 import numpy as np
+import pandas as pd
 import pyarrow.parquet
 import pytest
 
+from service.alarms.quantities import QUANTITIES
+from service.app import history_table
 from service.errors import NotAvailable
-from service.products.attitude_table import COLUMNS
+from service.products.attitude_table import COLUMNS, ESTIMATED_COLUMNS
 from service.products.fits_file import write_fits
 from service.products.formats import OUTPUT_FORMATS
 from service.products.parquet import write_parquet
 from service.products.tables import Column, Table, write_csv
+from service.storage.gyro import samples_table
+from service.storage.queries.tables import result_tables
 from service.times import parse_utc
 from tests.products.series import GOLDEN, random_quaternions, rows, whole, written
 
@@ -107,6 +114,42 @@ def test_fits_gives_the_same_moments_in_terrestrial_time(tmp_path, pages):
         assert (header["TTYPE8"], header["TUNIT8"]) == ("p11", "arcsec^2")
         names = [each.lower() for each in data.names]
         assert len(set(names)) == len(names)
+
+
+def test_fits_has_units_that_astropy_knows(tmp_path):
+    """Those of every table: a warning is an error here."""
+    quantities = [Column(name, unit=each.unit) for name, each in QUANTITIES.items()]
+    of_tables = [*COLUMNS, *ESTIMATED_COLUMNS, *quantities]
+    for module in (history_table, result_tables, samples_table):
+        for each in vars(module).values():
+            if isinstance(each, tuple) and each and isinstance(each[0], Column):
+                of_tables += each
+    assert {"UTC", "ppm", "rad/s"} & {each.unit for each in of_tables} == {"ppm", "rad/s"}
+    for k, column in enumerate(of_tables):
+        if column.kind in ("text", "utc"):
+            assert not column.unit
+        empty = Table([dataclasses.replace(column, name=f"c{k}")], [])
+        (tmp_path / "t.fits").write_bytes(b"".join(write_fits(empty)))
+        astropy.table.Table.read(tmp_path / "t.fits")
+
+
+def test_parquet_has_times_to_compute_with_beside_those_with_leap_seconds(tmp_path):
+    texts = [
+        *("1996-01-10T12:00:00Z", "2016-12-31T23:59:59.5Z", "2016-12-31T23:59:60.25Z"),
+        *("2017-01-01T00:00:00.250Z", "2017-06-01T00:00:00.123456789Z"),
+    ]
+    file = tmp_path / "t.parquet"
+    file.write_bytes(b"".join(write_parquet(Table([Column("time", "utc")], [[texts]]))))
+    found = pyarrow.parquet.read_table(file)
+    assert found["time"].to_pylist() == texts
+    assert found.schema.field("timestamp").type == pyarrow.timestamp("ns", "UTC")
+    expected = [
+        *("1996-01-10T12:00:00", "2016-12-31T23:59:59.5", "2017-01-01T00:00:00.25"),
+        *("2017-01-01T00:00:00.25", "2017-06-01T00:00:00.123456789"),
+    ]
+    assert found["timestamp"].to_pandas().tolist() == [
+        pd.Timestamp(each, tz="UTC") for each in expected
+    ]
 
 
 def test_values_that_are_not_known_are_nulls_in_each_kind_of_column(tmp_path):

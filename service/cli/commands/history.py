@@ -1,12 +1,15 @@
 """`acquire history`: the quantities of recorded batches as a table."""
 
-import sys
+import json
 from argparse import Namespace
+from collections.abc import Iterator
 from typing import Any
 
-from service.cli.arguments import MISSION, add_command, add_database, add_period
+from service.cli.arguments import MISSION, add_command, add_database, add_output, add_period
 from service.cli.configuration import period_of, settings_of_existing
+from service.cli.output import written_to
 from service.products.formats import table_formats, write_table
+from service.products.tables import Table
 
 
 def add(commands: Any) -> None:
@@ -14,7 +17,7 @@ def add(commands: Any) -> None:
     parser = add_command(
         commands,
         "history",
-        "Print the quantities of every recorded batch of a spacecraft, one row per batch.",
+        "Write the quantities of every recorded batch of a spacecraft, one row per batch.",
         """
         acquire history --spacecraft XTE --format csv
         acquire history --spacecraft XTE --run pass-7 --start 1996-010T00:00:00Z
@@ -25,14 +28,13 @@ def add(commands: Any) -> None:
     add_period(parser, "the run that is read; default live")
     way = parser.add_mutually_exclusive_group()
     way.add_argument("--format", choices=tuple(table_formats()), default="csv", help="default csv")
-    way.add_argument("--json", action="store_true", help="print one JSON object per line")
+    way.add_argument("--json", action="store_true", help="write one JSON object per line")
+    add_output(parser)
     add_database(parser)
 
 
 def run(parsed: Namespace) -> int:
-    """Write the table to the standard output, page by page."""
-    import json
-
+    """Write the table, page by page."""
     from service.app.factory import open_app
     from service.app.history_table import batch_table
 
@@ -41,13 +43,16 @@ def run(parsed: Namespace) -> int:
     try:
         pages = app.spacecraft.every_batch(parsed.spacecraft, run=parsed.run, start=start, end=end)
         table = batch_table(pages)
-        if parsed.json:
-            for page in table.pages:
-                for row in zip(*page, strict=True):
-                    print(json.dumps(dict(zip(table.names, row, strict=True))))
-            return 0
-        for piece in write_table(parsed.format, table):
-            sys.stdout.buffer.write(piece)
+        written_to(
+            parsed.output, _lines(table) if parsed.json else write_table(parsed.format, table)
+        )
     finally:
         app.close()
     return 0
+
+
+def _lines(table: Table) -> Iterator[bytes]:
+    """Every row as a JSON object."""
+    for page in table.pages:
+        for row in zip(*page, strict=True):
+            yield f"{json.dumps(dict(zip(table.names, row, strict=True)))}\n".encode()

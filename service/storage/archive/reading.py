@@ -177,8 +177,8 @@ class Archive:
         if self.folder is None:
             # A client that tries again changes nothing: only a start with the setting does.
             message = (
-                "is archived, and this service knows no folder of an archive: set "
-                "ACQUIRE_ARCHIVE_FOLDER to it and start again"
+                "is archived, and no folder of an archive is set: set ACQUIRE_ARCHIVE_FOLDER to "
+                "the folder that `acquire archive` wrote; a service must be started again with it"
             )
             raise NotAvailable(Fault("batch", message))
         try:

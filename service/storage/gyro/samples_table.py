@@ -18,7 +18,7 @@ BLOCKS = 20
 Reading = Callable[[], AbstractContextManager[Connection]]
 
 COLUMNS = (
-    Column("time", "text", "UTC", description="Time of the sample.", width=30),
+    Column("time", "utc", description="UTC. Time of the sample.", width=30),
     Column("tai_ns", "integer", "ns", description="TAI since 2000-01-01T12:00:00 TAI."),
     Column("block", "text", description="Name of the block.", width=128),
     *(

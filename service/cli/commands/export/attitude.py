@@ -1,7 +1,6 @@
 """`acquire export attitude`: attitudes in the formats of flight dynamics, or as a table."""
 
 from argparse import Namespace
-from pathlib import Path
 from typing import Any
 
 from service.cli.arguments import (
@@ -9,6 +8,7 @@ from service.cli.arguments import (
     add_command,
     add_database,
     add_grade,
+    add_output,
     add_period,
     positive,
 )
@@ -58,9 +58,7 @@ def add(commands: Any) -> None:
         metavar="ID",
         help="NAIF's id of the spacecraft; default: the mission's",
     )
-    parser.add_argument(
-        "--output", type=Path, metavar="FILE", help="the file to write; default: standard output"
-    )
+    add_output(parser)
     add_database(parser)
 
 

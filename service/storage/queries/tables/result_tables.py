@@ -16,7 +16,7 @@ BATCHES, BATCHES_OF_STARS = 5_000, 500
 """Results that are read together."""
 
 _NAMES = (
-    Column("time", "text", "UTC", description="Time of the batch.", width=30),
+    Column("time", "utc", description="UTC. Time of the batch.", width=30),
     Column("tai_ns", "integer", "ns", description="TAI since 2000-01-01T12:00:00 TAI."),
     Column("batch", "text", description="Name of the batch.", width=128),
     Column("id", "text", description="Id of the result.", width=26),
