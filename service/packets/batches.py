@@ -61,6 +61,8 @@ class BatchMaker:
         self._velocity = Held(CARRIED_WITHIN_S)
         self._position = Held(CARRIED_WITHIN_S)
         self._pending: StarBatch | None = None
+        self.without_attitude = 0
+        """Packets whose a priori quaternion was zero or not finite."""
 
     def attitude(self, values: Values) -> PacketAttitude | None:
         """The a priori attitude in a packet; raises `PacketFault`."""
@@ -69,6 +71,7 @@ class BatchMaker:
             return None
         quaternion = quaternion_in(values, names, prior)
         if quaternion is None:
+            self.without_attitude += 1
             return None
         return PacketAttitude(moment_of(prior.time or self._table.time, values), quaternion)
 

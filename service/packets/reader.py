@@ -33,6 +33,8 @@ _OF_SEGMENTS = (
     'packets.sequence_flags = "groups"'
 )
 
+READ_BYTES = 1 << 16
+
 
 class PacketTotals(Struct, kw_only=True):
     """What was in the packets that were read."""
@@ -57,6 +59,12 @@ class PacketTotals(Struct, kw_only=True):
     incomplete: int = 0
     """Segments of packets of which other segments are missing."""
     refused: int = 0
+    unread_bytes: int = 0
+    """From the packets on at which files could not be read any further."""
+    empty_files: int = 0
+    """Files without a packet."""
+    without_attitude: int = 0
+    """Packets whose a priori quaternion was zero or not finite."""
     apids: list[ApidCounts] = []
 
 
@@ -85,6 +93,7 @@ class PacketReader:
         totals.gaps = sum(each.gaps for each in totals.apids)
         totals.missing = sum(each.missing for each in totals.apids)
         totals.backward = sum(each.backward for each in totals.apids)
+        totals.without_attitude = self._maker.without_attitude
         return totals
 
     def lines(self, stream: IO[bytes], name: str) -> Iterator[Line]:
@@ -93,11 +102,18 @@ class PacketReader:
         A line has the number of its packet in the file.  A fault names the file, the packet, its
         first byte and the parameter.  After the end of a file that is damaged nothing follows.
         """
+        before = self._totals.packets
         try:
             for packet in packets_in(stream, self._table.prefix_bytes):
                 yield from self._read(packet, name)
+            if self._totals.packets == before:
+                self._totals.empty_files += 1
+                yield Line(1, None, Fault(name, "is empty: it holds no packet"))
         except EndOfPackets as fault:
             self._totals.refused += 1
+            self._totals.unread_bytes += fault.read
+            while rest := stream.read(READ_BYTES):
+                self._totals.unread_bytes += len(rest)
             yield Line(fault.number, None, _fault_at(fault.number, fault.offset, fault, name))
         yield from self._incomplete(self._segments.end(), name)
         yield from self._lines_of(self._maker.end(), name)

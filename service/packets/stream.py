@@ -63,10 +63,14 @@ class SpacePacket:
 class EndOfPackets(PacketFault):
     """Nothing more of a file can be read; `number` and `offset` are those of the packet."""
 
-    def __init__(self, number: int, offset: int, message: str, value: object = None) -> None:
+    def __init__(
+        self, number: int, offset: int, read: int, message: str, value: object = None
+    ) -> None:
         super().__init__("", message, value)
         self.number = number
         self.offset = offset
+        self.read = read
+        """Bytes that were read from the offset on."""
 
 
 def packets_in(stream: IO[bytes], prefix_bytes: int = 0) -> Iterator[SpacePacket]:
@@ -86,19 +90,19 @@ def packets_in(stream: IO[bytes], prefix_bytes: int = 0) -> Iterator[SpacePacket
         offset += prefix_bytes
         if len(header) < HEADER_BYTES:
             message = f"the file ends after {len(start)} bytes, within the header of a packet"
-            raise EndOfPackets(number, offset, message)
+            raise EndOfPackets(number, offset, len(header), message)
         if marker := SYNC_MARKERS.get(header[:4]) or SYNC_MARKERS.get(header[:2]):
             message = (
                 f"{marker} is where a packet should begin: these are transfer frames; extract the "
                 "space packets first, or set packets.prefix_bytes if each packet has such a prefix"
             )
-            raise EndOfPackets(number, offset, message)
+            raise EndOfPackets(number, offset, len(header), message)
         if header[0] >> 5:
             message = (
                 "the version number of a space packet must be 0; this is no packet, or the "
                 "length of the packet before is wrong"
             )
-            raise EndOfPackets(number, offset, message, header[0] >> 5)
+            raise EndOfPackets(number, offset, len(header), message, header[0] >> 5)
         length = (header[4] << 8 | header[5]) + 1
         data = stream.read(length)
         if len(data) < length:
@@ -106,7 +110,7 @@ def packets_in(stream: IO[bytes], prefix_bytes: int = 0) -> Iterator[SpacePacket
                 f"the file ends after {HEADER_BYTES + len(data)} of the "
                 f"{HEADER_BYTES + length} bytes of the packet"
             )
-            raise EndOfPackets(number, offset, message)
+            raise EndOfPackets(number, offset, len(header + data), message)
         yield SpacePacket(number, offset, header + data)
         offset += HEADER_BYTES + length
 

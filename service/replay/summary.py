@@ -184,11 +184,15 @@ def _packet_rows(packets: dict[str, Any] | None) -> list[tuple[str, str]]:
         "joined": "joined of segments",
         "incomplete": "incomplete segments",
         "refused": "unreadable",
+        "without_attitude": "no a priori",
     }
     rows = [("packets", str(packets["packets"]))]
     rows += [(f"  {name}", str(packets[word])) for word, name in words.items()]
     gaps = f"{packets['gaps']}  ({packets['missing']} packets missing)"
     rows += [("  sequence gaps", gaps), ("  steps backward", str(packets["backward"]))]
+    # Of a damaged file these are the first to be looked at.
+    rows += [("  bytes not read", str(packets["unread_bytes"]))] if packets["unread_bytes"] else []
+    rows += [("  empty files", str(packets["empty_files"]))] if packets["empty_files"] else []
     if packets["gyro_blocks"]:
         blocks = f"{packets['gyro_blocks']}  ({packets['gyro_samples']} samples)"
         rows += [("  gyro blocks", blocks)]

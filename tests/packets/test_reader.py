@@ -2,7 +2,11 @@
 
 import io
 import json
+import math
+import shutil
 import struct
+from itertools import islice
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -300,3 +304,40 @@ def test_a_damaged_file_of_attitudes_is_refused():
         list(reader.attitudes(io.BytesIO(JPSS1_PACKETS.read_bytes()[:100])))
     with pytest.raises(BadFile, match="ADGPSPOSX: begins at byte 23"):
         list(reader.attitudes(io.BytesIO(packet(b"\0" * 20, apid=11)[:4] + b"\0\x13" + b"\0" * 20)))
+
+
+def test_bytes_after_a_wrong_length_an_empty_file_and_an_unknown_attitude_are_counted(batches):
+    whole = packed(batches)
+    size = len(whole) // len(batches)
+    wrong = bytearray(whole)
+    wrong[size + 4 : size + 6] = (size + 100).to_bytes(2, "big")
+    reader = reader_of()
+    found = read(bytes(wrong), reader)
+    assert found[-1].fault is not None
+    totals = reader.totals()
+    # The second packet took a part of the third with it.
+    read_bytes = sum(len(packet.content) for packet in two_packets(bytes(wrong)))
+    assert totals.unread_bytes == len(whole) - read_bytes
+    (empty,) = read(b"", reader)
+    assert "pass.dat: is empty: it holds no packet" in str(empty.fault)
+    assert reader.totals().empty_files == 1
+    for quaternion in ([0.0] * 4, [math.nan, 0.0, 0.0, 1.0]):
+        prior = {"quaternion": quaternion}
+        (line,) = read(packed([batches[0] | {"a_priori": prior}]), reader := reader_of())
+        assert json.loads(line.body)["a_priori"] is None
+        assert reader.totals().without_attitude == 1
+
+
+def two_packets(data):
+    return list(islice(packets_in(io.BytesIO(data)), 2))
+
+
+def test_the_example_of_the_documents_works(acquire, tmp_path, monkeypatch):
+    docs = Path(__file__).parents[2] / "docs"
+    (tmp_path / "missions").mkdir()
+    shutil.copy(docs / "example-packets.toml", tmp_path / "missions")
+    monkeypatch.setenv("ACQUIRE_MISSIONS", str(tmp_path / "missions"))
+    of_packets = ["--packets", docs / "example-packets.dat", "--xtce", docs / "example-packets.xml"]
+    code, out, _ = acquire("replay", *of_packets, "--in-process", "--json")
+    told = json.loads(out)
+    assert (code, told["packets"]["packets"], told["batches"], told["attitudes"]) == (0, 10, 10, 10)

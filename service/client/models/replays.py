@@ -95,6 +95,9 @@ class ReplayPackets(Model, frozen=True):
     apids: Sequence[ApidPackets]
     joined: int = 0
     incomplete: int = 0
+    unread_bytes: int = 0
+    empty_files: int = 0
+    without_attitude: int = 0
 
 
 class Replay(Model, frozen=True):

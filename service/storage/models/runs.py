@@ -113,6 +113,13 @@ class ReplayPackets(Record, frozen=True, kw_only=True):
     incomplete: Annotated[
         Count, doc("Segments of packets of which others are missing; they are refused, too.")
     ] = 0
+    unread_bytes: Annotated[
+        Count, doc("From the packets on at which files could not be read any further.")
+    ] = 0
+    empty_files: Annotated[Count, doc("Files without a packet.")] = 0
+    without_attitude: Annotated[
+        Count, doc("Packets whose a priori quaternion was zero or not finite.")
+    ] = 0
     apids: Annotated[list[ApidPackets], doc("The hundred APIDs with the most packets.")]
 
 
