@@ -1,6 +1,8 @@
 """The documents point to what is there, and are finished."""
 
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -11,10 +13,11 @@ from service import __version__
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted(
     path
-    for pattern in ("*.md", "docs/**/*.md", "catalogs/*.md")
+    for pattern in ("*.md", "docs/**/*.md", "catalogs/*.md", "service/client/*.md")
     for path in ROOT.glob(pattern)
     if ".venv" not in path.parts
 )
+PYTHON = re.compile(r"```python\n(.*?)```", re.DOTALL)
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 
 
@@ -29,6 +32,46 @@ def test_every_link_to_a_file_leads_somewhere(document):
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_no_document_is_left_with_a_gap(document):
     assert "@@" not in document.read_text(encoding="utf-8")
+
+
+PARTS = {
+    "CONTRIBUTING.md": ("op", "sa", "CURRENT"),
+    "calibration.md": ("stars",),
+    "definitive-attitude.md": (
+        *("tai_ns", "rate_rad_s", "measured_ns", "quaternion", "covariance_rad2"),
+        *("next_gyro", "next_attitudes"),
+    ),
+    "webhooks.md": ("body", "headers"),
+}
+"""Documents whose examples are parts of a program, and the names that it would have."""
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        # Those that import the service's core take a checker of types half a minute.
+        pytest.param(path, id=path.name, marks=pytest.mark.slow if of_core else ())
+        for path in DOCUMENTS
+        if (blocks := PYTHON.findall(path.read_text(encoding="utf-8")))
+        for of_core in [any("from service." in each and "client" not in each for each in blocks)]
+    ],
+)
+def test_every_example_passes_a_strict_checker_of_types(document, tmp_path):
+    (tmp_path / "acquire_client").symlink_to(ROOT / "service" / "client")
+    names = "".join(f"{name}: Any\n" for name in PARTS.get(document.name, ()))
+    for k, block in enumerate(PYTHON.findall(document.read_text(encoding="utf-8"))):
+        (tmp_path / f"example_{k}.py").write_text(f"from typing import Any\n{names}{block}")
+    (tmp_path / "mypy.ini").write_text(
+        f"[mypy]\nstrict = true\nmypy_path = {ROOT}:{tmp_path}\nfollow_imports = silent\n"
+    )
+    command = [sys.executable, "-m", "mypy", "--explicit-package-bases"]
+    command += [
+        f"--cache-dir={ROOT / '.mypy_cache' / 'examples'}",
+        f"--config-file={tmp_path / 'mypy.ini'}",
+    ]
+    command += map(str, sorted(tmp_path.glob("example_*.py")))
+    checked = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert checked.returncode == 0, checked.stdout + checked.stderr
 
 
 def test_the_version_is_one():

@@ -1,8 +1,19 @@
 """The base of all models, and what several modules share."""
 
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
 from msgspec import Struct
+
+OutcomeWord = Literal["unique", "ambiguous", "unmatched"]
+StatusWord = Literal["good", "suspect"]
+IdentifierWord = Literal["verified", "starid", "lost_in_space", "ptp"]
+if TYPE_CHECKING:
+    Outcome = OutcomeWord
+    Status = StatusWord
+    Identifier = IdentifierWord
+else:
+    # A later service may know further words: they are read, too.
+    Outcome = Status = Identifier = str
 
 T = TypeVar("T")
 
@@ -11,7 +22,8 @@ class Model(Struct, frozen=True):
     """A part of an answer.
 
     Fields that a later service adds are ignored.  A field with a default may be absent from the
-    answer.  Words such as a status are text: a later service may know further ones.
+    answer.  Words such as a status are text when they are read, since a later service may know
+    further ones; for a type checker they are those of this version.
     """
 
 

@@ -1,11 +1,12 @@
 """The models are those of openapi.yaml: every field, its type, and whether it may be absent."""
 
 import inspect
+from typing import get_args, get_type_hints
 
 import msgspec
 import pytest
 
-from service.client import errors, models
+from service.client import base, errors, models
 from service.client.base import FieldFault, Model
 from tests.web.conformance import reference
 
@@ -39,6 +40,7 @@ NAMES = {
     "Track": "TrackOut",
     "TrackerFit": "TrackerFitOut",
     "TrackerStars": "TrackerOut",
+    "WhatIf": "Answer",
 }
 """The schemas whose names differ from those of the models."""
 MODELS = {
@@ -90,6 +92,24 @@ def test_a_model_has_the_fields_of_its_schema_with_their_types(name):
         # A field that may be absent is None then.
         absent = set() if field in theirs["required"] else {"null"}
         assert here - absent == there - absent, field
+
+
+def test_words_are_those_of_the_schemas():
+    for word, (schema, field) in {
+        base.OutcomeWord: ("StarOut", "outcome"),
+        base.StatusWord: ("AttitudeOut", "status"),
+        base.IdentifierWord: ("Answer", "identifier"),
+    }.items():
+        assert set(get_args(word)) == set(SCHEMAS[schema]["properties"][field]["enum"])
+    # A word of a later service is read all the same.
+    star = {"outcome": "doubtful", "star": None, "votes": 0, "runner_up": 0, "flags": []}
+    star |= {"probability": None, "residual_arcsec": None}
+    assert msgspec.convert(star, models.Star).outcome == "doubtful"
+
+
+def test_an_answer_is_a_what_if_that_was_recorded():
+    answer, what_if = (get_type_hints(each) for each in (models.Answer, models.WhatIf))
+    assert answer == what_if | {"id": str}
 
 
 def test_what_a_later_service_adds_is_ignored():

@@ -1,11 +1,12 @@
 """Batches: submit them, read their results, try other options."""
 
 from collections.abc import AsyncIterator, Mapping
-from typing import Any
+from typing import Any, Literal, overload
 
+from ..base import Outcome, Status
 from ..encoding import Batch, Time, path_of
 from ..errors import Problem
-from ..models import Answer, Result, Summary
+from ..models import Answer, Result, Summary, WhatIf
 from ..outcomes import BatchOutcome, RecordedAnswer
 from ..retrying import Repeat
 from .backend import Source, bounded_map
@@ -74,8 +75,8 @@ class AsyncBatches(AsyncConnection):
         run: str = "live",
         start: Time | None = None,
         end: Time | None = None,
-        outcome: str | None = None,
-        status: str | None = None,
+        outcome: Outcome | None = None,
+        status: Status | Literal["no_attitude"] | None = None,
         batch: str | None = None,
     ) -> AsyncItems[Summary]:
         """The current results of recorded batches, newest first by batch time.
@@ -109,7 +110,24 @@ class AsyncBatches(AsyncConnection):
         """
         return await self.get(Result, path_of("spacecraft", spacecraft, "latest"), {"run": run})
 
-    async def what_if(self, id: str, options: Mapping[str, Any], *, record: bool = False) -> Answer:
+    @overload
+    async def what_if(
+        self, id: str, options: Mapping[str, Any], *, record: Literal[True]
+    ) -> Answer: ...
+
+    @overload
+    async def what_if(
+        self, id: str, options: Mapping[str, Any], *, record: Literal[False] = False
+    ) -> WhatIf: ...
+
+    @overload
+    async def what_if(
+        self, id: str, options: Mapping[str, Any], *, record: bool
+    ) -> Answer | WhatIf: ...
+
+    async def what_if(
+        self, id: str, options: Mapping[str, Any], *, record: bool = False
+    ) -> Answer | WhatIf:
         """Process a recorded batch again with other options; `record` keeps the result beside it.
 
         >>> latest = await client.latest("XTE")
@@ -118,8 +136,10 @@ class AsyncBatches(AsyncConnection):
         (1, None)
         """
         body = {"options": dict(options), "record": record}
-        repeat = Repeat.IF_REFUSED if record else Repeat.ALWAYS
-        return await self.post(Answer, path_of("batches", id, "what-if"), body, repeat)
+        path = path_of("batches", id, "what-if")
+        if record:
+            return await self.post(Answer, path, body)
+        return await self.post(WhatIf, path, body, Repeat.ALWAYS)
 
     async def adopt(self, id: str, options: Mapping[str, Any]) -> Answer:
         """Process a recorded batch again, and let the result stand for the batch.

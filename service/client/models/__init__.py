@@ -19,6 +19,7 @@ from .answers import (
     Timings,
     TrackerFit,
     TrackerStars,
+    WhatIf,
 )
 from .calibrations import (
     Calibration,
@@ -131,4 +132,5 @@ __all__ = [
     "TrackerFit",
     "TrackerGeometry",
     "TrackerStars",
+    "WhatIf",
 ]

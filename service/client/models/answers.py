@@ -7,7 +7,7 @@ are UTC in calendar form, as text: they may be in a leap second and have nanosec
 from collections.abc import Sequence
 from typing import Any
 
-from ..base import Model
+from ..base import Identifier, Model, Outcome, Status
 
 
 class StarRef(Model, frozen=True):
@@ -24,7 +24,7 @@ class Star(Model, frozen=True, kw_only=True):
     the zone; None where the identifier gives none.
     """
 
-    outcome: str
+    outcome: Outcome
     star: StarRef | None
     votes: int
     runner_up: int
@@ -97,7 +97,7 @@ class Attitude(Model, frozen=True):
     predicted_rms_arcsec: float | None
     taste: float | None
     degrees_of_freedom: int
-    status: str
+    status: Status
     triad: Sequence[float] | None
     quest: Sequence[float] | None
     triad_quest_angle_arcsec: float | None
@@ -195,19 +195,17 @@ class Tracking(Model, frozen=True, kw_only=True):
     reason: str | None
 
 
-class Answer(Model, frozen=True, kw_only=True):
-    """The answer to a batch.  Without an attitude, `reason` says why there is none.
+class AnswerFields(Model, frozen=True, kw_only=True):
+    """What every answer has.  Without an attitude, `reason` says why there is none.
 
-    `id` is None for a what-if that was not recorded; `parent` is the result that a what-if
-    started from.
+    `parent` is the result that a what-if started from.
     """
 
-    id: str | None
     spacecraft: str
     batch: str
     run: str
     time: str
-    identifier: str
+    identifier: Identifier
     path: str
     observations: Sequence[TrackerStars]
     counts: StarCounts
@@ -220,6 +218,18 @@ class Answer(Model, frozen=True, kw_only=True):
     recorded: bool = True
     frame: FrameSummary | None = None
     tracking: Tracking | None = None
+
+
+class Answer(AnswerFields, frozen=True, kw_only=True):
+    """The answer to a batch that was recorded."""
+
+    id: str
+
+
+class WhatIf(AnswerFields, frozen=True, kw_only=True):
+    """The answer to a what-if; `id` is None where it was not recorded."""
+
+    id: str | None
 
 
 class Summary(Model, frozen=True, kw_only=True):
@@ -236,10 +246,10 @@ class Summary(Model, frozen=True, kw_only=True):
     time: str
     received: str
     created: str
-    identifier: str
+    identifier: Identifier
     options: dict[str, Any]
     counts: StarCounts
-    status: str | None
+    status: Status | None
     reason: str | None
     measures: dict[str, float | None]
     parent: str | None

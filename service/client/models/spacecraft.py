@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from ..base import Model
+from ..base import Model, Status
 from ..tables import pandas_of, table_of_history
 from .answers import Summary
 
@@ -25,7 +25,7 @@ class AttitudeRow(Model, frozen=True):
     predicted_rms_arcsec: float | None
     taste: float | None
     method: str
-    status: str
+    status: Status
 
 
 class LiveAttitude(Model, frozen=True, kw_only=True):
