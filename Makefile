@@ -34,6 +34,8 @@ PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 UV = $(BIN)/uv pip install --quiet --python $(BIN)/python
 COMPILE = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header
 
+IMAGE_EXTRAS = postgresql spice tle packets tables dask plots images raw
+
 RUNTIME = $(VENV)/.installed-runtime
 DEV = $(VENV)/.installed-dev
 
@@ -158,6 +160,8 @@ openapi: $(DEV)
 # The second lock is bound to the first, so that one .venv serves both.
 lock: $(DEV)
 	@$(COMPILE) --upgrade --group build --extra postgresql --output-file requirements.lock pyproject.toml
+	@$(COMPILE) --group build $(addprefix --extra ,$(IMAGE_EXTRAS)) --constraint requirements.lock \
+		--output-file docker/requirements.lock pyproject.toml
 	@$(COMPILE) --upgrade --group dev --extra postgresql --constraint requirements.lock \
 		--output-file requirements-dev.lock pyproject.toml
 

@@ -1,9 +1,12 @@
 """The image and its composition, read: what they hold and what they say."""
 
+import json
 import os
 import re
+import socket
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -54,3 +57,50 @@ def test_the_image_is_built_with_its_kernels_for_the_processor_that_it_runs_on()
 def test_the_composition_says_how_access_is_controlled(named):
     assert "no access control" not in COMPOSE
     assert named in COMPOSE
+
+
+def test_the_image_has_the_packages_of_every_extra_that_the_service_asks_for():
+    """Its user can install none: what a message would name is there."""
+    root = DOCKER.parent
+    lock = set(
+        re.findall(r"^([\w.-]+)==", (DOCKER / "requirements.lock").read_text(), re.MULTILINE)
+    )
+    extras = tomllib.loads((root / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    asked = set()
+    for path in (root / "service").rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        asked |= set(re.findall(r"require_extra\(\s*\"(\w+)\"|extra=\"(\w+)\"", text))
+    names = {name for pair in asked for name in pair if name} | {"postgresql"}
+    assert names >= {"tables", "packets", "tle"}
+    for name in names & extras.keys():
+        wanted = {re.match(r"[\w.-]+", each)[0].lower() for each in extras[name]}
+        assert wanted <= lock, name
+    copied = re.search(r"ARG LOCK=(\S+)", DOCKERFILE)[1]
+    assert f"!{copied}" in (DOCKER / "Dockerfile.dockerignore").read_text().splitlines()
+
+
+@pytest.mark.parametrize("host", [None, "", "127.0.0.1", "0.0.0.0", "::", "::1"])
+def test_the_health_check_asks_where_the_service_listens(host):
+    written = re.search(r"HEALTHCHECK [^[]*(\[.*?\])\nENTRYPOINT", DOCKERFILE, re.DOTALL)[1]
+    program, *arguments = json.loads(written.replace("\\\n", ""))
+    assert program == "python"
+    family = socket.AF_INET6 if host and ":" in host else socket.AF_INET
+    with socket.create_server(
+        ("::1" if family == socket.AF_INET6 else "127.0.0.1", 0), family=family
+    ) as listening:
+        environment = os.environ | {"ACQUIRE_PORT": str(listening.getsockname()[1])}
+        environment |= {} if host is None else {"ACQUIRE_HOST": host}
+        asking = subprocess.Popen([sys.executable, *arguments], env=environment)
+        connection, _ = listening.accept()
+        with connection:
+            assert connection.recv(1000).startswith(b"GET /readyz ")
+            connection.sendall(b"HTTP/1.0 200 OK\r\n\r\n")
+        assert asking.wait(20) == 0
+
+
+def test_no_password_is_a_part_of_a_url():
+    for file in DOCKER.glob("*.yaml"):
+        for line in file.read_text().splitlines():
+            assert not ("://" in line and "PASSWORD" in line), line

@@ -1,10 +1,12 @@
 """The database: made by migrations, opened with care, refused with a reason."""
 
 import os
+import re
 import sqlite3
 import subprocess
 import sys
 from pathlib import Path
+from urllib.parse import quote
 
 import pytest
 from alembic import command
@@ -131,6 +133,22 @@ def test_a_read_only_file_is_verified_and_exported(database, opened, make, tmp_p
     os.chmod(source.parent, 0o755)
     assert source.read_bytes() == before
     assert [each.name for each in source.parent.iterdir()] == ["acquire.db"]
+
+
+@pytest.mark.parametrize(
+    "password",
+    ["hunter@2-secret", "@secret@", "sec/ret@word", "sec?ret", "sec:ret@", "s%zzecret", "se#cret"],
+)
+def test_no_message_holds_a_part_of_a_password(password, caplog):
+    """Written into the URL as it is, whatever its signs; encoded it is accepted."""
+    for tried in (password, quote(password, safe="")):
+        url = f"postgresql://acquire:{tried}@127.0.0.1:1/acquire?connect_timeout=1"
+        with pytest.raises(BadConfiguration) as told:
+            Store(url)
+        told = f"{told.value} {caplog.text}"
+        for part in re.findall(r"[a-z0-9]{3,}", password):
+            assert part not in told.replace("password", "")
+    assert database_url(url).password == password
 
 
 def test_a_file_that_is_no_database_is_refused_and_left_alone(tmp_path):

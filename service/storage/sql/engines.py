@@ -87,6 +87,12 @@ def database_url(text: str) -> URL:
         raise BadConfiguration(
             "ACQUIRE_DATABASE: must be sqlite:///FILE or postgresql://USER@HOST:PORT/DATABASE"
         ) from None
+    if url.password is not None and "@" in f"{url.host}{url.database}":
+        # A part of the password stands where host and database should.
+        raise BadConfiguration(
+            "ACQUIRE_DATABASE: more than one @: in a password write it as %40 (and % as %25), or "
+            "leave the password out and set PGPASSWORD"
+        )
     if driver == "sqlite" and url.database in (None, "", ":memory:"):
         raise BadConfiguration("ACQUIRE_DATABASE: SQLite needs a file, as in sqlite:///acquire.db")
     return url.set(drivername=driver)
