@@ -26,6 +26,7 @@ from service.missions.mission import load_missions
 from service.replay.items import items_of
 from service.replay.over_http import replay_over_http
 from service.replay.summary import ReplaySummary
+from service.resources import shipped
 from service.settings import PREFIX, Settings
 from service.simulate.files import read_objects, truth_path, write_pass
 from service.simulate.gyro import GyroWanted, with_gyro
@@ -193,7 +194,9 @@ def _where_next(
         "acquire frame PICTURE",
         "any picture of the sky, from any camera: its attitude, its lens, the names of its stars",
     )
-    yield "docs/quickstart.md", "a walk: post a batch, read the attitude, try other tolerances"
+    # A wheel has no documents.
+    if shipped("docs", "quickstart.md").is_file():
+        yield "docs/quickstart.md", "a walk: post a batch, read the attitude, try other tolerances"
     if not once:
         yield serve, "serve these records again, without the demonstration"
 

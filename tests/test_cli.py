@@ -187,8 +187,8 @@ def test_the_version_is_the_packages(acquire):
         ("openapi --check none.yaml", "none.yaml: No such file or directory"),
         ("serve --host http://here", "must be an address or a name"),
         ("serve --port 70000", "must be from 0 to 65535"),
-        ("serve --port 0 --database no://where", "ACQUIRE_DATABASE: "),
-        ("database check --database sqlite:///no/such/folder.db", "ACQUIRE_DATABASE: "),
+        ("serve --port 0 --database no://where", "--database: "),
+        ("database check --database sqlite:///no/such/folder.db", "--database: "),
         ("demo --seed -1 --once", "seed: must not be negative (got -1)"),
         ("demo --port 0 --once", "--port: must be a port that can be named"),
     ],
@@ -534,7 +534,7 @@ def test_old_batches_are_archived_verified_and_restored(acquire, tmp_path):
 def test_no_command_that_reads_makes_a_database(acquire, tmp_path, command):
     code, out, err = acquire(*command.split(), "--database", "sqlite:///no.db")
     assert (code, out) == (2, "")
-    assert "ACQUIRE_DATABASE: no.db: there is no such file" in err
+    assert "--database: no.db: there is no such file" in err
     assert list(tmp_path.iterdir()) == []
 
 

@@ -199,13 +199,19 @@ def test_all_missions_fly_on_the_day_that_the_console_shows_first(first):
     assert times[0][0][:10] == times[0][-1][:10]
 
 
-def test_when_nothing_serves_any_more_the_way_to_the_records_comes_before_their_address():
+def test_when_nothing_serves_any_more_the_way_to_the_records_comes_before_their_address(
+    tmp_path, monkeypatch
+):
     told = dict(demonstration._where_next("http://h:1", "demo-1", Path("f"), Settings(), True))
     places = [place.strip() for place in told]
     serve, page = (f"acquire serve --database {Settings().database}", "http://h:1/?run=demo-1")
     assert places.index(serve) < places.index(page)
     assert not [each for each in places if each.startswith("curl")]
     assert "docs/quickstart.md" in places
+    # A wheel has no documents.
+    monkeypatch.setattr(demonstration, "shipped", lambda *parts: tmp_path.joinpath(*parts))
+    told = dict(demonstration._where_next("http://h:1", "demo-1", Path("f"), Settings(), True))
+    assert not [place for place in told if place.startswith("docs/")]
 
 
 @pytest.mark.slow

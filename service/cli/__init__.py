@@ -35,7 +35,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for fault in error.faults:
             _complain(str(fault))
     except AcquisitionError as error:
-        _complain(str(error))
+        text = str(error)
+        if getattr(parsed, "database", None) is not None:
+            # It stands in the place of the setting.
+            text = text.replace("ACQUIRE_DATABASE", "--database")
+        _complain(text)
     except KeyboardInterrupt:
         _complain("interrupted")
         return INTERRUPTED

@@ -1,5 +1,6 @@
 """The database: made by migrations, opened with care, refused with a reason."""
 
+import logging
 import os
 import re
 import sqlite3
@@ -28,12 +29,17 @@ from service.storage.upkeep.backup import back_up
 pytestmark = pytest.mark.both_databases
 
 
-def test_the_migrations_make_what_the_tables_say(empty_database):
+def test_the_migrations_make_what_the_tables_say(empty_database, caplog):
     if empty_database.startswith("sqlite"):
         Path(make_url(empty_database).database).touch()
     assert "acquire database upgrade" in migrations.check(empty_database)[0]
-    migrations.upgrade(empty_database)
+    with caplog.at_level(logging.INFO, "service.storage.sql.migrations"):
+        migrations.upgrade(empty_database)
+        migrations.upgrade(empty_database)
     assert migrations.check(empty_database) == []
+    # What was done to a database stands in the log, once.
+    (line,) = caplog.messages
+    assert line.endswith(f"made with the schema {migrations.HEAD}")
 
 
 def test_a_fresh_database_is_checked_without_leaving_one_behind(tmp_path, monkeypatch):
@@ -109,8 +115,7 @@ AS_OTHERS = (
 
 
 @pytest.mark.parametrize("database", ["sqlite"], indirect=True)
-@pytest.mark.parametrize("read_only", ["file", "folder"])
-def test_a_read_only_file_is_verified_and_exported(database, opened, make, tmp_path, read_only):
+def test_a_read_only_file_is_verified_and_exported(database, opened, make, tmp_path):
     app = opened()
     app.submissions.submit(make("b1"))
     app.close()
@@ -118,7 +123,8 @@ def test_a_read_only_file_is_verified_and_exported(database, opened, make, tmp_p
     source.parent.mkdir()
     back_up(database, source)
     before = source.read_bytes()
-    os.chmod(source if read_only == "file" else source.parent, 0o555)
+    os.chmod(source, 0o444)
+    os.chmod(source.parent, 0o555)
 
     def acquire(*arguments):
         command = [*AS_OTHERS, sys.executable, "-m", "service.cli", *arguments]

@@ -5,6 +5,7 @@ service that starts would wait for it.
 """
 
 import json
+import logging
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -29,6 +30,8 @@ from service.storage.sql.engines import (
 
 if TYPE_CHECKING:
     from alembic.config import Config
+
+log = logging.getLogger(__name__)
 
 HEAD = "0017"
 """The latest revision of `migrations/`."""
@@ -121,7 +124,8 @@ def check_fresh() -> list[str]:
 def bring_up_to_date(engine: Engine, before: Callable[[], object] = lambda: None) -> None:
     """Run the migrations that are missing, in one transaction; `before` is called first of all."""
     with reported(engine.url), engine.begin() as connection:
-        if _revision(connection) == HEAD:
+        found = _revision(connection)
+        if found == HEAD:
             return
         before()
         from alembic import command
@@ -131,6 +135,8 @@ def bring_up_to_date(engine: Engine, before: Callable[[], object] = lambda: None
         config.attributes["connection"] = connection
         try:
             command.upgrade(config, "head")
+            what = "made with" if found is None else f"brought from {found} to"
+            log.info("%s: %s the schema %s", shown_url(engine.url), what, HEAD)
         except CommandError:
             differs = _difference(connection)
             raise BadConfiguration(
