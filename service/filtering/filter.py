@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from service.errors import BadInput, Fault
 from service.filtering.forward import (
+    AFTER_GAP,
     AGREED,
     IN_A_ROW,
     SINCE_NS,
@@ -223,7 +224,7 @@ def _gates(tail: float) -> tuple[float, float]:
 
 def _track(state: FilterState | None, noise: Noise) -> Track:
     """The state to work on; a copy of what is given."""
-    counts, redundancy, doubt_rad = np.zeros(4, dtype=np.int64), np.zeros(1), np.zeros(1)
+    counts, redundancy, doubt_rad = np.zeros(5, dtype=np.int64), np.zeros(1), np.zeros(1)
     if state is None:
         covariance = np.diag([0.0, 0.0, 0.0, *[noise.first_bias] * 3])
         none, zero = np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
@@ -231,7 +232,7 @@ def _track(state: FilterState | None, noise: Noise) -> Track:
         rest = (status, counts, redundancy, doubt_rad)
         return Track(none, zero, covariance, zero.copy(), none.copy(), *rest)
     counts[IN_A_ROW], counts[AGREED] = state.rejected, state.agreed
-    counts[SINCE_NS] = state.rejected_since_ns
+    counts[SINCE_NS], counts[AFTER_GAP] = state.rejected_since_ns, state.after_gap
     redundancy[0], doubt_rad[0] = state.redundancy, state.doubt_rad
     return Track(
         state.quaternion.copy(),
@@ -262,6 +263,7 @@ def _state(track: Track, tai_ns: int, rate_rad_s: Vector) -> FilterState:
         agreed=counts[AGREED],
         rejected_since_ns=counts[SINCE_NS],
         doubt_rad=float(track.doubt_rad[0]),
+        after_gap=bool(counts[AFTER_GAP]),
     )
 
 
@@ -275,7 +277,7 @@ def _room(n: int, m: int) -> tuple[Epochs, WrittenInnovations]:
         doubt_rad=np.empty(n),
         status=np.empty(n, dtype=np.int64),
         started=np.zeros(n, dtype=np.bool_),
-        updated=np.zeros(n, dtype=np.bool_),
+        updated=np.zeros(n, dtype=np.int64),
         shift=np.zeros((n, 3)),
     )
     written = WrittenInnovations(

@@ -23,8 +23,11 @@ DOUBTFUL, LOST = int(Status.DOUBTFUL), int(Status.LOST)
 UNUSED, ACCEPTED = int(Outcome.UNUSED), int(Outcome.ACCEPTED)
 REJECTED, STARTED = int(Outcome.REJECTED), int(Outcome.STARTED)
 UNDECIDED = int(Outcome.UNDECIDED)
-IN_A_ROW, AGREED, SINCE_NS, HERE = 0, 1, 2, 3
-"""Rows of `Track.counts`; HERE counts those accepted at the present epoch."""
+IN_A_ROW, AGREED, SINCE_NS, HERE, AFTER_GAP = 0, 1, 2, 3, 4
+"""Rows of `Track.counts`; HERE counts those accepted at the present epoch, and AFTER_GAP is 1 from
+a gap of the gyro until the next accepted measurement."""
+UPDATED, UNCHECKED = 1, 2
+"""Values of `Epochs.updated`."""
 PREDICTED = 0.25
 """A measurement of this redundancy number or more was predicted, so that it can be checked."""
 WIDER = 4.0
@@ -34,7 +37,7 @@ WIDER = 4.0
 class Track(NamedTuple):
     """The state while it is worked on: see `FilterState`.
 
-    `status` (1,), `counts` (4,) by the rows above, `redundancy` (1,), `doubt_rad` (1,).
+    `status` (1,), `counts` (5,) by the rows above, `redundancy` (1,), `doubt_rad` (1,).
     """
 
     quaternion: Any
@@ -54,7 +57,8 @@ class Epochs(NamedTuple):
     `quaternion` (n, 4), `bias` (n, 3), `rate` (n, 3) less the bias, `covariance`
     (n, 6, 6), `doubt_rad` (n,), `status` (n,), and `shift` (n, 3), which
     `propagation.predict` was given.  `started` (n,): the state was replaced there;
-    `updated` (n,): it was, or a measurement was accepted.
+    `updated` (n,): UPDATED where it was, or a measurement was accepted, UNCHECKED where that
+    followed a gap of the gyro and has to be confirmed as a start has, 0 elsewhere.
     """
 
     quaternion: Any
@@ -73,12 +77,14 @@ def run_filter(track, timeline, measured, noise, epochs, innovations, work):  # 
     """Filter all epochs of a timeline; `track` is at their end afterwards."""
     for k in range(len(timeline.tai_ns)):
         _propagate(track, k, timeline, noise, epochs.shift[k], work)
-        track.counts[HERE] = 0
+        track.counts[HERE], after_gap = 0, track.counts[AFTER_GAP]
         for m in range(timeline.first[k], timeline.first[k + 1]):
             _measure(track, m, timeline.tai_ns[k], measured, noise, innovations, work)
             if innovations.outcome[m] == STARTED:
                 epochs.started[k] = True
-        epochs.updated[k] = epochs.started[k] or track.counts[HERE] > 0
+        if epochs.started[k] or track.counts[HERE] > 0:
+            is_unchecked = after_gap == 1 and not epochs.started[k] and track.status[0] == STARTING
+            epochs.updated[k] = UNCHECKED if is_unchecked else UPDATED
         _write(track, k, timeline, epochs)
 
 
@@ -94,6 +100,8 @@ def _propagate(track, k, timeline, noise, shift, work):  # type: ignore[no-untyp
     # A step of no length changes nothing, not even the last bit.
     if dt <= 0.0:
         return
+    if timeline.gap_s[k] >= 0.0:
+        track.counts[AFTER_GAP] = 1
     bias_shift(track.anchor, rate, timeline.interval_s[k], noise, shift)
     for i in range(3):
         work.rate[i] = rate[i] - track.bias[i]
@@ -130,7 +138,7 @@ def _measure(track, m, tai_ns, measured, noise, innovations, work):  # type: ign
     confirmed = track.redundancy[0] >= noise.start_redundancy
     gate = noise.gate_3 if size == 3 else noise.gate_2
     redundancy = 0.0
-    if sound and track.redundancy[0] < noise.established:
+    if sound and (track.redundancy[0] < noise.established or counts[AFTER_GAP] == 1):
         redundancy = redundancy_of(r, size, work)
         # An attitude that was hardly predicted checks the first guess of the bias, which may be
         # far off, and not the start.
@@ -138,6 +146,10 @@ def _measure(track, m, tai_ns, measured, noise, innovations, work):  # type: ign
             gate = noise.start_gate_3
     if nis <= gate and (counts[IN_A_ROW] == 0 or _decides(track, measured, m, gate, noise, work)):
         innovations.outcome[m] = ACCEPTED
+        if counts[AFTER_GAP] == 1:
+            # What supported the attitude before the gap supports the share of it that is left.
+            track.redundancy[0] *= redundancy
+            counts[AFTER_GAP] = 0
         if track.redundancy[0] < noise.established:
             track.redundancy[0] += max(redundancy, noise.least_redundancy)
         correct(track.covariance, z, h, size, r, work)
@@ -146,7 +158,7 @@ def _measure(track, m, tai_ns, measured, noise, innovations, work):  # type: ign
     innovations.outcome[m] = REJECTED if nis > gate else UNDECIDED
     again = not confirmed
     if confirmed and counts[HERE] == 0:
-        _contradict(track, tai_ns, nis > gate, angle, z, h, size, work)
+        _contradict(track, m, tai_ns, nis > gate, angle, measured, noise, work)
         again = tai_ns - counts[SINCE_NS] >= noise.reset_after_ns or (
             # A young attitude has no more on its side than those that contradict it.
             track.redundancy[0] < noise.established and counts[IN_A_ROW] > track.redundancy[0]
@@ -160,14 +172,18 @@ def _measure(track, m, tai_ns, measured, noise, innovations, work):  # type: ign
 def _decides(track, measured, m, gate, noise, work):  # type: ignore[no-untyped-def]
     """Whether a measurement that agrees with the state may end a doubt.
 
-    It has to exclude the rival, unless that lies within the state's own covariance by now.
-    `work` has the factor of the innovation's covariance in `small`, and keeps it.
+    It has to exclude the rival.  Of fewer rejected measurements than `confirmations`, it is
+    enough if the rival lies within the state's own covariance by now: more of them are no
+    chance, and a wide covariance holds the true attitude and the wrong one.  `work` has the
+    factor of the innovation's covariance in `small`, and keeps it.
     """
     copy(work.small, work.psi)
     size, _ = innovate(track.rival, measured, m, work.dx, work.psi_square, work.small)
     copy(work.psi, work.small)
     if chi_square(work.dx, size, work) > gate:
         return True
+    if track.counts[IN_A_ROW] >= noise.confirmations:
+        return False
     rotation_between(track.quaternion, track.rival, work.dx)
     if not cholesky(track.covariance, 3, work.psi):
         return False
@@ -181,26 +197,31 @@ def _decides(track, measured, m, gate, noise, work):  # type: ignore[no-untyped-
 
 
 @njit_no_refcount
-def _contradict(track, tai_ns, rejected, angle, z, h, size, work):  # type: ignore[no-untyped-def]
-    """Begin or go on with a doubt; a rejected measurement says what the attitude may be instead.
+def _contradict(track, m, tai_ns, rejected, angle, measured, noise, work):  # type: ignore[no-untyped-def]
+    """Begin or go on with a doubt; rejected measurements say what the attitude may be instead.
 
-    The rival goes on with the gyro as the state does.  A measurement that agrees with
-    both decides nothing.
+    The rival is the mean of the latest of them, and goes on with the gyro as the state does; of
+    a rival that is the last one alone, its own noise would exclude it before long.  A
+    measurement that agrees with both decides nothing.
     """
     counts = track.counts
     if counts[IN_A_ROW] == 0:
         counts[SINCE_NS] = tai_ns
+        for i in range(4):
+            track.rival[i] = track.quaternion[i]
     counts[AGREED] = 0
     track.status[0] = DOUBTFUL
     if not rejected:
         return
     counts[IN_A_ROW] += 1
     track.doubt_rad[0] = max(track.doubt_rad[0], angle)
+    size, _ = innovate(track.rival, measured, m, work.dx, work.partials, work.small)
+    weight = 1.0 / min(float(counts[IN_A_ROW]), noise.established)
     for j in range(3):
         work.theta[j] = 0.0
         for i in range(size):
-            work.theta[j] += h[i, j] * z[i]
-    turn(track.quaternion, work.theta, track.rival)
+            work.theta[j] += weight * work.partials[i, j] * work.dx[i]
+    turn(track.rival, work.theta, track.rival)
 
 
 @njit_no_refcount
@@ -221,7 +242,7 @@ def _start(track, m, measured, noise, bias_is_known):  # type: ignore[no-untyped
                 p[i + 3, j + 3] = 0.0
         if not bias_is_known:
             p[i + 3, i + 3] = WIDER * p[i + 3, i + 3] if is_at_once else noise.first_bias
-    for i in range(4):
+    for i in range(len(track.counts)):
         track.counts[i] = 0
     track.redundancy[0] = track.doubt_rad[0] = 0.0
     track.status[0] = STARTING if noise.start_redundancy > 0.0 else GOOD

@@ -83,14 +83,15 @@ class FilterSettings:
     A measurement is rejected where chi-square passes its innovation with a
     probability below `gate_tail`.  A start is confirmed once the redundancy numbers of the
     measurements accepted since, each of which says how well the filter predicted one, add
-    up to `start_redundancy`: about four measurements where the bias is known, seven where
+    up to `start_redundancy`: about four measurements where the bias is known, six where
     it is not; at a constant rate each counts one.  Until then the gate of attitudes that
     were predicted is `start_gate_tail`, and one that is rejected starts the filter anew.
     `confirmations` accepted measurements in a row end a doubt.  After `reset_after_s` in
     which everything was rejected the filter gives up its own attitude and starts from the
     measurements: the default is longer than the hour for which a tracker may hold on to
     wrong stars.  A young attitude is given up as soon as more reject it in a row than its
-    redundancy.
+    redundancy.  The first measurement accepted after a gap of the gyro multiplies the sum by
+    its own redundancy number.
     An attitude with an axis worse than `lost_rad` is lost: the next one measured replaces it.
     """
 

@@ -88,15 +88,15 @@ class Steps:
     """What the smoother needs of the steps to n epochs: see `propagation.Timeline`.
 
     `started` (n,) says where the state was replaced and `updated` (n,) where it was, or a
-    measurement was accepted; `shift` (n, 3) was added to the variance of the bias before
-    the step.
+    measurement was accepted (see `forward.Epochs`); `shift` (n, 3) was added to the variance of
+    the bias before the step.
     """
 
     step_s: Vector
     measured_rate_rad_s: Vector
     gap_s: Vector
     started: npt.NDArray[np.bool_]
-    updated: npt.NDArray[np.bool_]
+    updated: Integers
     shift: Vector
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from service.compiled.jit import njit_no_refcount
 from service.filtering.filter import noise_of
-from service.filtering.forward import DOUBTFUL, GOOD, LOST, NONE, STARTING
+from service.filtering.forward import DOUBTFUL, GOOD, LOST, NONE, STARTING, UNCHECKED
 from service.filtering.gyro import ConstantRateModel, GyroModel
 from service.filtering.matrices import (
     cholesky,
@@ -162,19 +162,25 @@ def settle(filtered, smoothed):  # type: ignore[no-untyped-def]
     """Take back the doubts that later measurements ended, and confirm starts that they confirmed.
 
     A doubt that lasted to the end of its stretch reaches back to the last accepted measurement.
+    What follows a gap of the gyro confirms no attitude before it; where nothing confirms the
+    measurement that ended a gap, nothing confirms the attitudes back to the one before.
     """
     n = len(filtered.status)
-    lasting, confirmed, doubt_rad = False, False, 0.0
+    lasting, confirmed, unchecked, doubt_rad = False, False, False, 0.0
     for k in range(n - 1, -1, -1):
         status = filtered.status[k]
         if k == n - 1 or filtered.started[k + 1]:
-            lasting, confirmed = filtered.doubt_rad[k] > 0.0, False
+            lasting, confirmed, unchecked = filtered.doubt_rad[k] > 0.0, False, False
+        elif filtered.updated[k + 1] == UNCHECKED:
+            confirmed, unchecked = False, not confirmed
+        if filtered.updated[k]:
+            unchecked = False
         if filtered.doubt_rad[k] > 0.0:
             doubt_rad = filtered.doubt_rad[k]
         elif filtered.updated[k]:
             lasting = False
         smoothed.doubt_rad[k] = doubt_rad if lasting else 0.0
-        if status in (GOOD, DOUBTFUL):
+        if status in (GOOD, DOUBTFUL) and not unchecked:
             confirmed = True
         if status not in (NONE, LOST):
             smoothed.status[k] = DOUBTFUL if lasting else GOOD if confirmed else STARTING

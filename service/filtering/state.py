@@ -46,12 +46,13 @@ class FilterState:
     `bias_rad_s` (3,) that of the gyro, `covariance` (6, 6) of attitude error (rad, about
     the body axes) and bias (rad/s), without what a doubt adds.  `rate_rad_s` (3,) is
     the last measured rate, `anchor_rad_s` (3,) that at its last clear change.  `rival`
-    (4,) is the attitude that the rejected measurements say, where there is a doubt.
+    (4,) is the mean attitude that the rejected measurements say, where there is a doubt.
 
     `redundancy` is how far the measurements since the start support it (see
     `FilterSettings`), up to where more make no difference; `rejected` counts those rejected
     in a row, `agreed` those accepted since then, `rejected_since_ns` and `doubt_rad` say
-    when that began and how far off they were.
+    when that began and how far off they were.  `after_gap` is true from a gap of the gyro until
+    the next accepted measurement.
     """
 
     tai_ns: int
@@ -67,6 +68,7 @@ class FilterState:
     agreed: int = 0
     rejected_since_ns: int = 0
     doubt_rad: float = 0.0
+    after_gap: bool = False
 
     def as_record(self) -> dict[str, Any]:
         """The state as numbers and lists, for JSON, which keeps every bit of them."""
