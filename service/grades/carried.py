@@ -7,7 +7,7 @@ settings, drop the marks after it.
 
 The window does not grow with the day, as that of `day.window_of` does: a look reads at most seven
 hours of attitudes at any time of the day, and the gyro samples of these hours; where batches have
-stopped and the gyro goes on, those of up to 32 hours.
+stopped and the gyro goes on, those of up to 13 hours.
 """
 
 import hashlib
@@ -21,12 +21,12 @@ from service.filtering.gyro import ConstantRateModel
 from service.filtering.result import FilterResult
 from service.filtering.samples import GyroSamples
 from service.filtering.state import FilterState
-from service.grades.day import LOOK_AHEAD_S, WARM_UP_S, GradedSamples, Model, samples_of
+from service.grades.day import WARM_UP_S, GradedSamples, Model, samples_of
 from service.grades.measured import Recorded, attitudes_where, directions_where
 from service.grades.stretches import LONGEST_GAP_S, Stretch, cut
 from service.gyro.block import Nanoseconds
 from service.missions.mission import Mission
-from service.times import DAY_S, HOUR_S, Utc, bucket_start, shifted
+from service.times import HOUR_S, Utc, bucket_start, shifted
 
 MARK_NS = 600 * 10**9
 """A mark ends with the last epoch of each ten minutes of TAI."""
@@ -38,10 +38,10 @@ def live_window(latest: Utc) -> tuple[Utc, Utc]:
     It begins six hours before the UTC hour of the latest batch: late batches and blocks within it
     are filtered in their order, earlier ones change nothing.  It moves on once an hour, because
     a filter that begins at another moment has to filter everything again.  The end leaves room
-    for gyro samples while trackers give no attitude, for as long as those of a day count.
+    for gyro samples while trackers give no attitude: six hours after the hour of the last one.
     """
     hour = bucket_start(latest.bucket(HOUR_S), HOUR_S)
-    return shifted(hour, -WARM_UP_S), shifted(hour, DAY_S + LOOK_AHEAD_S)
+    return shifted(hour, -WARM_UP_S), shifted(hour, HOUR_S + WARM_UP_S)
 
 
 @dataclass(frozen=True, eq=False)
