@@ -150,3 +150,28 @@ def test_an_address_that_does_not_answer_leaves_time_for_the_next(chosen_databas
         for each in waiting:
             each.close()
     assert told["delivered"] is True, told
+
+
+def test_a_late_answer_of_an_earlier_address_disables_nothing(service, receiver, soon):
+    """410 Gone answers an attempt that began before the webhook was given another address."""
+    begun, changed = threading.Event(), threading.Event()
+
+    def answer(handler, request):
+        if request.path == "/old":
+            begun.set()
+            changed.wait(20)
+            handler.say(410)
+        else:
+            handler.say(204)
+
+    receiver.answer = answer
+    new = receiver.url.rsplit("/", 1)[0] + "/new"
+    hook = service.hook(new.replace("/new", "/old"))
+    service.note("once")
+    assert begun.wait(20)
+    assert service.client.put(f"{HERE}/{hook['id']}", json={"name": "test", "url": new}).is_success
+    changed.set()
+    wait_until(lambda: service.read(hook)["waiting"] == 0)
+    shown = service.read(hook)
+    assert (shown["state"], shown["failing_since"], shown["last_fault"]) == ("active", None, None)
+    assert [each.path for each in receiver.requests] == ["/old", "/new"]

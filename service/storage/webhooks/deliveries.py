@@ -173,7 +173,10 @@ def next_of(connection: Connection, queue: Queue, limit: int) -> list[Waiting]:
 
 
 def settle(connection: Connection, attempt: Attempt) -> None:
-    """Delete what was delivered, note what failed, and both at the webhook."""
+    """Delete what was delivered, note what failed, and both at the webhook.
+
+    A failure is not noted where the delivery was queued again, resumed or tried since.
+    """
     of_webhook = _row.webhook_id == attempt.queue.webhook_id
     noted: Row = {"last_attempt": attempt.at, "last_status": attempt.status}
     if attempt.delivered:
@@ -181,8 +184,7 @@ def settle(connection: Connection, attempt: Attempt) -> None:
             delete(webhook_deliveries).where(of_webhook, _row.event_id.in_(attempt.delivered))
         )
         noted |= {"last_delivered": attempt.at, "failing_since": None, "last_fault": None}
-    if attempt.failed is not None:
-        _note_failure(connection, attempt, attempt.failed)
+    if attempt.failed is not None and _note_failure(connection, attempt, attempt.failed):
         noted["last_fault"] = attempt.fault
         noted["failing_since"] = (
             attempt.at if attempt.delivered else func.coalesce(webhooks.c.failing_since, attempt.at)
@@ -196,7 +198,8 @@ def settle(connection: Connection, attempt: Attempt) -> None:
     connection.execute(update(webhooks).where(webhook).values(noted))
 
 
-def _note_failure(connection: Connection, attempt: Attempt, failed: Waiting) -> None:
+def _note_failure(connection: Connection, attempt: Attempt, failed: Waiting) -> bool:
+    """Note a failure; False where the delivery is no longer as it was when it was sent."""
     of_webhook = _row.webhook_id == attempt.queue.webhook_id
     is_dead = attempt.due is None
     values = {
@@ -207,12 +210,13 @@ def _note_failure(connection: Connection, attempt: Attempt, failed: Waiting) -> 
         "dead": is_dead,
         "due": attempt.due or attempt.at,
     }
-    connection.execute(
+    is_same = _row.queued == failed.queued, _row.attempts == failed.attempts, ~_row.dead
+    noted = connection.execute(
         update(webhook_deliveries)
-        .where(of_webhook, _row.event_id == failed.event_id)
+        .where(of_webhook, _row.event_id == failed.event_id, *is_same)
         .values(values)
-    )
-    if is_dead:
+    ).rowcount
+    if noted and is_dead:
         kept = (
             select(_row.event_id)
             .where(of_webhook, _row.dead)
@@ -224,6 +228,7 @@ def _note_failure(connection: Connection, attempt: Attempt, failed: Waiting) -> 
         connection.execute(
             delete(webhook_deliveries).where(of_webhook, _row.dead, _row.event_id <= kept)
         )
+    return bool(noted)
 
 
 def list_deliveries(
