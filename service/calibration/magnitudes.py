@@ -20,7 +20,7 @@ from pydantic import ValidationError
 from service.calibration.observability import NotObservable
 from service.calibration.stars import Indices
 from service.errors import BadInput, Fault
-from service.missions.corrections import Magnitudes
+from service.missions.corrections import AS_MEASURED, Magnitudes
 from service.missions.mission import Tracker
 from service.vectors import Matrix, Vector
 
@@ -113,10 +113,23 @@ def joined(parts: Sequence[MagnitudeStars]) -> MagnitudeStars | None:
 
 
 def calibrate_magnitudes(
-    stars: MagnitudeStars | None, trackers: Sequence[str]
+    stars: MagnitudeStars | None, trackers: Sequence[str], settings: Mapping[str, Magnitudes]
 ) -> tuple[MagnitudeCalibration, ...]:
-    """Every tracker's magnitudes; what its stars do not show is left out and named."""
-    return tuple(_of_tracker(stars, index, name) for index, name in enumerate(trackers))
+    """Every tracker's magnitudes; what its stars do not show is left out and named.
+
+    So is what would change the settings of a tracker, by its name, to ones that no mission file
+    may have.
+    """
+    found = []
+    for index, name in enumerate(trackers):
+        each = _of_tracker(stars, index, name)
+        try:
+            _corrected(settings.get(name, AS_MEASURED), each, 0.0)
+        except BadInput as error:
+            (fault, *_) = error.faults
+            each = _nothing(index, name, dict.fromkeys(UNITS, f"it {fault.message}"))
+        found.append(each)
+    return tuple(found)
 
 
 def calibrated_settings(

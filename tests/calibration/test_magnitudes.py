@@ -12,6 +12,7 @@ from service.calibration.evidence import identified_magnitudes, identified_stars
 from service.calibration.magnitudes import (
     COLOR,
     SCALE,
+    UNITS,
     ZERO,
     MagnitudeStars,
     calibrate_magnitudes,
@@ -61,7 +62,7 @@ def test_values_are_within_three_sigmas_in_97_of_100_and_sigmas_are_right():
     rng = np.random.default_rng(SEED)
     errors = []
     for _ in range(100):
-        _, found = calibrate_magnitudes(drawn(rng), ("A", "B"))
+        _, found = calibrate_magnitudes(drawn(rng), ("A", "B"), {})
         assert found.names == (ZERO, SCALE, COLOR)
         true = np.array([TRUE[name] for name in found.names])
         errors.append((found.value - true) / found.sigma)
@@ -72,14 +73,14 @@ def test_values_are_within_three_sigmas_in_97_of_100_and_sigmas_are_right():
 
 def test_five_percent_wrong_stars_move_values_by_less_than_three_sigmas():
     rng = np.random.default_rng(SEED)
-    _, found = calibrate_magnitudes(drawn(rng, wrong=0.05), ("A", "B"))
+    _, found = calibrate_magnitudes(drawn(rng, wrong=0.05), ("A", "B"), {})
     true = np.array([TRUE[name] for name in found.names])
     assert (np.abs(found.value - true) < 3.0 * found.sigma).all()
     assert found.scatter_mag == pytest.approx(np.hypot(NOISE_MAG, OF_STAR_MAG), rel=0.15)
 
 
 def test_a_tracker_without_error_is_found_to_have_none():
-    found, _ = calibrate_magnitudes(drawn(np.random.default_rng(SEED)), ("A", "B"))
+    found, _ = calibrate_magnitudes(drawn(np.random.default_rng(SEED)), ("A", "B"), {})
     assert (np.abs(found.value) < 4.0 * found.sigma).all()
 
 
@@ -92,7 +93,7 @@ def test_a_tracker_without_error_is_found_to_have_none():
 )
 def test_what_the_stars_do_not_show_is_named_and_left_out(drawing, left_out, reason):
     stars = drawn(np.random.default_rng(SEED), **drawing)
-    _, found = calibrate_magnitudes(stars, ("A", "B"))
+    _, found = calibrate_magnitudes(stars, ("A", "B"), {})
     assert left_out not in found.names
     assert ZERO in found.names
     (missing,) = found.not_observable
@@ -105,7 +106,7 @@ def test_stars_without_a_known_colour_still_give_zero_and_scale():
     stars = drawn(np.random.default_rng(SEED))
     unknown = np.full(len(stars.star), np.nan)
     bare = MagnitudeStars(stars.tracker, stars.star, stars.observed_mag, stars.catalog_mag, unknown)
-    _, found = calibrate_magnitudes(bare, ("A", "B"))
+    _, found = calibrate_magnitudes(bare, ("A", "B"), {})
     assert found.names == (ZERO, SCALE)
     assert [each.name for each in found.not_observable] == [f"B {COLOR}"]
 
@@ -128,7 +129,7 @@ def test_numbers_that_are_no_magnitudes_leave_settings_that_a_mission_file_takes
         *(stars.tracker, stars.star, observed(stars.observed_mag)),
         *(stars.catalog_mag, stars.color_bv_mag),
     )
-    (found, _) = calibrate_magnitudes(sent, ("A", "B"))
+    (found, _) = calibrate_magnitudes(sent, ("A", "B"), {})
     assert not left_out & set(found.names)
     assert (ZERO in found.names) == (ZERO not in left_out)
     reasons = {each.name: each.reason for each in found.not_observable}
@@ -139,6 +140,22 @@ def test_numbers_that_are_no_magnitudes_leave_settings_that_a_mission_file_takes
     assert settings.scale == 1.0
 
 
+def test_a_scale_that_no_mission_file_may_have_refuses_the_magnitudes_of_its_tracker_alone():
+    """Each of two calibrations in a row changes it by a factor of 1.5."""
+    stars = drawn(np.random.default_rng(SEED))
+    shrunk = np.where(stars.tracker == 0, stars.observed_mag / 1.5, stars.observed_mag)
+    sent = MagnitudeStars(
+        *(stars.tracker, stars.star, shrunk, stars.catalog_mag, stars.color_bv_mag)
+    )
+    once, other = calibrate_magnitudes(sent, ("A", "B"), {})
+    assert once.value_of(SCALE) == pytest.approx(1.0 / 1.5 - 1.0, abs=0.01)
+    again, same = calibrate_magnitudes(sent, ("A", "B"), {"A": Magnitudes(scale=1.5)})
+    assert again.names == ()
+    assert {each.name for each in again.not_observable} == {f"A {name}" for name in UNITS}
+    assert all("scale 2.2" in each.reason for each in again.not_observable)
+    assert same.names == other.names == (ZERO, SCALE, COLOR)
+
+
 def test_one_star_that_is_seen_far_more_often_does_not_stand_for_all():
     """Its noise, ten times less than what the catalog has wrong, would leave no other star."""
     rng = np.random.default_rng(SEED)
@@ -147,7 +164,7 @@ def test_one_star_that_is_seen_far_more_often_does_not_stand_for_all():
     of_star = np.concatenate([[0.0], 1.0 + rng.normal(0.0, 0.2, 59)])
     observed = catalog_mag + of_star[star] + rng.normal(0.0, 0.005, len(star))
     stars = MagnitudeStars(np.zeros(len(star), np.int64), star, observed, catalog_mag, color)
-    (found,) = calibrate_magnitudes(stars, ("A",))
+    (found,) = calibrate_magnitudes(stars, ("A",), {})
     assert found.names == ()
     assert len(found.not_observable) == 3
 
@@ -155,7 +172,7 @@ def test_one_star_that_is_seen_far_more_often_does_not_stand_for_all():
 def test_a_tracker_with_few_stars_or_none_gives_nothing():
     few = drawn(np.random.default_rng(SEED), stars=5)
     for stars in (few, None):
-        for each in calibrate_magnitudes(stars, ("A", "B")):
+        for each in calibrate_magnitudes(stars, ("A", "B"), {}):
             assert each.names == ()
             assert len(each.not_observable) == 3
 

@@ -159,9 +159,10 @@ class Estimator:
         found, tried = _calibrated(joined(parts), wanted)
         counts = drawn.total, len(drawn.batches), len(parts), refused
         used = [each.name for each in found.stars.trackers]
-        of_magnitudes = (
-            calibrate_magnitudes(joined_magnitudes(seen), used) if wanted.magnitudes else ()
-        )
+        of_magnitudes: tuple[MagnitudeCalibration, ...] = ()
+        if wanted.magnitudes:
+            settings = {each.name: each.magnitudes for each in mission.trackers}
+            of_magnitudes = calibrate_magnitudes(joined_magnitudes(seen), used, settings)
         ends = drawn.first, drawn.last
         return CalibrationRun(mission, found, tried, *counts, *ends, of_magnitudes)
 
