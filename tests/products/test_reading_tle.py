@@ -235,3 +235,11 @@ def test_a_satellite_number_padded_with_spaces_is_read():
 def test_a_set_without_checksums_is_refused_by_its_length():
     with pytest.raises(BadFile, match="must have 69 characters; it has 68"):
         read([line[:68].replace("  999", " 9990") for line in ISS])
+
+
+def test_the_name_is_the_line_above_the_first_set():
+    """Bulletins of amateurs have lines before it, and end with /EX."""
+    before = ["SB KEPS @ AMSAT $ORB99060.N", "HR AMSAT ORBITAL ELEMENTS", "MOLNIYA 2-14"]
+    found = read([*before, *MOLNIYA, "/EX"])
+    assert found.object_name == "MOLNIYA 2-14"
+    assert len(found.sets) == 1

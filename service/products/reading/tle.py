@@ -112,7 +112,8 @@ def read_tle(name: str, file: IO[bytes], field: str) -> TleEphemeris:
         if first is None and not text.startswith("1 "):
             if text.startswith("2 "):
                 raise source.bad(line, "line 2", "must follow line 1 of its set", text)
-            title = text.removeprefix("0 ").strip()
+            # After the first set it is another set's, or a bulletin's last line.
+            title = title if sets else text.removeprefix("0 ").strip()
             continue
         _check(source, line, text, 1 if first is None else 2)
         if text[2:7] != (number or text[2:7]):
