@@ -161,11 +161,21 @@ class _Expansion:
                 raise XtceFault(each, message, each.get("sizeInBits"))
 
     def _require_clear(self, kind: Any) -> None:
-        """Settle what the package would warn of: spellings, and booleans that are texts."""
+        """Settle what the package would warn of or pass over: spellings, orders, odd booleans."""
         for each in kind.iter(_named("FloatDataEncoding")):
             spelling = each.get("encoding")
             if spelling in _SPELLINGS:
                 each.set("encoding", _SPELLINGS[spelling])
+        for each in kind.iter(_named("ByteOrderList")):
+            # XTCE 1.1 lists the bytes; 1.2 has an attribute for the two orders that are read.
+            order = [_whole(byte, "byteSignificance") for byte in each]
+            if order not in (sorted(order), sorted(order, reverse=True)):
+                raise XtceFault(each, "must ascend or descend", str(order))
+            ends = "least" if order == sorted(order) else "most"
+            each.getparent().set("byteOrder", f"{ends}SignificantByteFirst")
+        for each in kind.iter():
+            if each.get("bitOrder") == "leastSignificantBitFirst":
+                raise XtceFault(each, "bitOrder leastSignificantBitFirst is not supported")
         if self._local(kind) == "BooleanParameterType":
             for word in ("StringDataEncoding", "BinaryDataEncoding"):
                 if kind.find(f".//{_named(word)}") is not None:

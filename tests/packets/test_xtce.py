@@ -69,6 +69,13 @@ def test_every_style_of_namespaces_gives_the_same_parameters(style):
     assert {"ST1_A[0]", "ST1_A[7]", "ST_DAY", "PKT_APID"} <= found
 
 
+def in_attitude(text, name):
+    """The file with one more parameter at the end of the packets of APID 302."""
+    end = text.index(b"</xtce:EntryList>", text.index(b'name="ATTITUDE"'))
+    entry = f'<xtce:ParameterRefEntry parameterRef="{name}"/>'.encode()
+    return text[:end] + entry + text[end:]
+
+
 def test_the_members_of_an_array_of_aggregates_are_read_in_order():
     types = (
         '<xtce:AggregateParameterType name="STAR_T"><xtce:MemberList>'
@@ -80,10 +87,7 @@ def test_the_members_of_an_array_of_aggregates_are_read_in_order():
         "</xtce:EndingIndex></xtce:Dimension></xtce:DimensionList></xtce:ArrayParameterType>"
     )
     text = xtce(types=types, parameters='<xtce:Parameter name="S" parameterTypeRef="STARS_T"/>')
-    at = text.index(b'name="ATTITUDE"')
-    end = text.index(b"</xtce:EntryList>", at)
-    text = text[:end] + b'<xtce:ParameterRefEntry parameterRef="S"/>' + text[end:]
-    definition = PacketDefinition(text, "test.xml", "CCSDSPacket")
+    definition = PacketDefinition(in_attitude(text, "S"), "test.xml", "CCSDSPacket")
     data = bytes(8) + struct.pack(">8d", 0, 0, 0, 1, 1.5, 2.5, 3.5, 4.5)
     values = definition.read(packet(data, apid=302))
     names = ("S[0].H", "S[0].V", "S[1].H", "S[1].V")
@@ -104,6 +108,18 @@ INTEGER = (
     '<xtce:IntegerParameterType name="I_T"><xtce:IntegerDataEncoding sizeInBits="{}"/>'
     "</xtce:IntegerParameterType>"
 )
+
+
+def ordered(encoding, significances):
+    """A type of 64 bits with a list of its bytes, as XTCE 1.1 has it."""
+    listed = "".join(f'<xtce:Byte byteSignificance="{each}"/>' for each in significances)
+    kind = encoding.replace("DataEncoding", "ParameterType")
+    return (
+        f'<xtce:{kind} name="O_T" sizeInBits="64"><xtce:{encoding} sizeInBits="64">'
+        f"<xtce:ByteOrderList>{listed}</xtce:ByteOrderList></xtce:{encoding}></xtce:{kind}>"
+    )
+
+
 UNSUPPORTED = [
     (xtce(entries='<xtce:FixedValueEntry binaryValue="00" sizeInBits="8"/>'), "FixedValueEntry"),
     (xtce(entries=entry("<xtce:RepeatEntry/>")), "RepeatEntry"),
@@ -126,6 +142,8 @@ UNSUPPORTED = [
     (xtce(types=POLYNOMIAL.format("00000000000000000000099999999")), "12 digits"),
     (xtce(types=INTEGER.format(10_000_000)), "sizeInBits"),
     (xtce(types=INTEGER.format(0)), "sizeInBits"),
+    (xtce(types=INTEGER.format('16" bitOrder="leastSignificantBitFirst')), "bitOrder"),
+    (xtce(types=ordered("IntegerDataEncoding", [1, 0, 2])), "ascend or descend"),
     (xtce(entries='<xtce:ContainerRefEntry containerRef="STARS"/>'), "refers to itself"),
     (xtce(entries='<xtce:ContainerRefEntry containerRef="NONE"/>'), "NONE"),
     (xtce()[:-60], "is not XML"),
@@ -134,6 +152,21 @@ UNSUPPORTED = [
     (b"<html/>", "SpaceSystem"),
     (b'<SpaceSystem xmlns="http://www.w3.org/1999/xhtml"/>', "namespace"),
 ]
+
+
+@pytest.mark.parametrize("order", "<>")
+def test_a_list_of_bytes_gives_the_order_of_a_parameter(order):
+    significances = range(8) if order == "<" else range(7, -1, -1)
+    text = in_attitude(
+        xtce(
+            types=ordered("FloatDataEncoding", significances),
+            parameters='<xtce:Parameter name="O" parameterTypeRef="O_T"/>',
+        ),
+        "O",
+    )
+    data = bytes(8) + struct.pack(">4d", 0, 0, 0, 1) + struct.pack(order + "d", 1.5)
+    definition = PacketDefinition(text, "test.xml", "CCSDSPacket")
+    assert definition.read(packet(data, apid=302))["O"] == 1.5
 
 
 @pytest.mark.parametrize(("text", "why"), UNSUPPORTED)
