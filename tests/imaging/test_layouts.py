@@ -149,6 +149,9 @@ def test_where_white_is_zero_the_counts_are_turned_over(rng, kind):
         (lambda v: with_tag(tiff(v), 277, 7), "not named as colours"),
         (lambda v: with_tag(tiff(v), 256, COLUMNS - 1), "another size"),
         (lambda v: with_tag(tiff(v), 278, 3), "number of strips"),
+        # Its pixels would be out of place, and an attitude from them wrong.
+        (lambda v: with_tag(tiff(v), 273, 16), "over its tags"),
+        (lambda v: with_first_strip_moved(tiff(v, rowsperstrip=7), 2), "over each other"),
     ],
 )
 def test_what_is_not_read_of_a_tiff_is_refused_by_its_name(rng, make, word):
@@ -165,6 +168,17 @@ def with_tag(data, tag, value):
     for entry in range(at + 2, at + 2 + 12 * count, 12):
         if struct.unpack_from("<H", data, entry)[0] == tag:
             struct.pack_into("<HLL", data, entry + 2, 4, 1, value)
+    return bytes(data)
+
+
+def with_first_strip_moved(data, by):
+    """A little-endian TIFF of several strips whose first one is said to begin elsewhere."""
+    with tifffile.TiffFile(io.BytesIO(data)) as opened:
+        offsets = opened.pages[0].tags["StripOffsets"]
+        place, first = offsets.valueoffset, offsets.value[0]
+    form = "<H" if offsets.dtype == tifffile.DATATYPE.SHORT else "<L"
+    data = bytearray(data)
+    struct.pack_into(form, data, place, first + by)
     return bytes(data)
 
 

@@ -204,6 +204,7 @@ def _segments(page: Any, file: IO[bytes], packed: Any) -> Iterator[tuple[int, by
     if not len(offsets) == len(sizes) == planes * down * across:
         message = "has another number of strips or tiles than its size needs"
         raise bad_frame(message, f"{len(offsets)} where {planes * down * across} are needed")
+    _require_apart(page)
     end = file.seek(0, os.SEEK_END)
     for index, (at, size) in enumerate(zip(offsets, sizes, strict=True)):
         high = tall if tiled else min(tall, rows - index % down * tall)
@@ -216,6 +217,32 @@ def _segments(page: Any, file: IO[bytes], packed: Any) -> Iterator[tuple[int, by
         file.seek(at)
         data = file.read(size)
         yield index, data[:wanted] if packed is None else _unpacked(data, packed, wide * item, high)
+
+
+def _require_apart(page: Any) -> None:
+    """Raise `BadFile` where a strip or tile lies over another one, a tag's value or the directory.
+
+    Its pixels would be out of their places, and an attitude from them wrong.
+    """
+    form = page.parent.tiff
+    directory_bytes = form.tagnosize + len(page.tags) * form.tagsize + form.offsetsize
+    spans = {(page.offset, page.offset + directory_bytes, False)}
+    spans |= {
+        (tag.valueoffset, tag.valueoffset + tag.valuebytecount, False)
+        for tag in page.tags
+        if tag.valuebytecount > form.offsetsize
+    }
+    # Blank tiles may share their bytes.
+    pairs = zip(page.dataoffsets, page.databytecounts, strict=True)
+    spans |= {(at, at + size, True) for at, size in pairs}
+    tags_end = data_end = 0
+    for at, end, is_data in sorted(spans):
+        if at < data_end or (is_data and at < tags_end):
+            raise bad_frame("has strips or tiles that lie over each other or over its tags")
+        if is_data:
+            data_end = max(data_end, end)
+        else:
+            tags_end = max(tags_end, end)
 
 
 def _unpacked(data: bytes, compression: int, row_bytes: int, rows: int) -> bytes:
