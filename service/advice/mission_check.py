@@ -9,9 +9,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
-from service.advice.zone_census import Spread, ZoneCensus, share_below, spread_of, stars_in_view
+from service.advice.zone_census import (
+    Extremes,
+    Spread,
+    ZoneCensus,
+    share_below,
+    star_counts,
+    star_spread,
+)
 from service.missions.mission import Band, Mission, Tracker
 from service.missions.scan import Raster, Sweep
 from service.sky.catalog.run_catalog import RunCatalog
@@ -58,8 +63,10 @@ def tracker_views(mission: Mission, run_catalog: RunCatalog) -> list[TrackerView
     """The view of each tracker."""
     found = []
     for tracker in mission.trackers:
-        counts = stars_in_view(run_catalog, tracker.field_of_view_radius_deg)
-        found.append(TrackerView(tracker.name, spread_of(counts), share_below(counts, FEW_STARS)))
+        view = run_catalog.direction, 0.0, tracker.field_of_view_radius_deg
+        counts = star_counts(*view)
+        stars = star_spread(Extremes(*view), counts)
+        found.append(TrackerView(tracker.name, stars, share_below(counts, FEW_STARS)))
     return found
 
 
@@ -256,6 +263,7 @@ def _stars(
                 "in a usual field; fewer are enough, and faster",
             )
     for each in zones:
-        if int(np.max(each.pairs)) > MANY_PAIRS:
-            text = f"a {each.of} holds up to {int(np.max(each.pairs)):,} pairs: slow and large"
+        most = each.spread["pairs"].most
+        if most > MANY_PAIRS:
+            text = f"a {each.of} holds up to {most:,} pairs: slow and large"
             yield Finding("unusual", "zone", text)

@@ -5,14 +5,20 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from service.missions.mission import Band, Mission
 from service.sky.catalog.run_catalog import RunCatalog
-from service.vectors import Vector, from_ra_dec
+from service.vectors import Vector, from_ra_dec, to_ra_dec, unit
 
 ROWS, COLUMNS = 18, 72
 """The grid of axes: every 10 deg of declination, every 5 deg of right ascension."""
+
+FIRST_STEP_DEG, LAST_STEP_DEG = 2.5, 0.02
+STAR_STARTS, PAIR_STARTS = 16, 8
+"""From how many axes of the grid the extremes of stars and of pairs are sought."""
+AXES_AT_ONCE = 72
 
 
 @dataclass(frozen=True)
@@ -30,6 +36,7 @@ class ZoneCensus:
 
     `stars` and `pairs` (ROWS, COLUMNS) are NCAP and NTOT; declination falls along the
     rows, right ascension grows along the columns.  `of` says which shape that is.
+    `spread` is that of both over the whole sky, and `richest` the axis with the most pairs.
     """
 
     of: str
@@ -37,17 +44,87 @@ class ZoneCensus:
     most_deg: float
     stars: Vector
     pairs: Vector
-
-    @property
-    def spread(self) -> dict[str, Spread]:
-        """The spread of stars and of pairs."""
-        return {"stars": spread_of(self.stars), "pairs": spread_of(self.pairs)}
+    spread: dict[str, Spread]
+    richest: Vector
 
     def richest_deg(self) -> tuple[float, float]:
         """Right ascension and declination of the axis with the most pairs."""
-        row, column = np.unravel_index(int(np.argmax(self.pairs)), self.pairs.shape)
-        ra_deg, dec_deg = axes_deg()
-        return float(ra_deg[column]), float(dec_deg[row])
+        ra_deg, dec_deg = to_ra_dec(self.richest)
+        return float(ra_deg), float(dec_deg)
+
+
+class Extremes:
+    """The fewest and the most stars or pairs of a zone whose axis may lie anywhere.
+
+    They are sought from the poorest and the richest axes of the grid: of 24 axes about each, to
+    half the distance between rows at first, the best is taken, and the steps are halved where
+    none is better.  Counts jump from one axis to the next, so an extreme is not proven; no random
+    axis of 100,000 exceeds one.
+    """
+
+    def __init__(
+        self, direction: Vector, least_deg: float, most_deg: float, limit_deg: float = 0.0
+    ) -> None:
+        self._direction = direction
+        self._bounds_deg = least_deg, most_deg
+        self._limit_deg = limit_deg
+
+    def stars(self, counts: Vector, most: bool) -> tuple[int, Vector]:
+        """The extreme of NCAP and its axis; `counts` (ROWS, COLUMNS) are those of the grid."""
+        return self._best(counts, STAR_STARTS, most, pairs=False)
+
+    def pairs(self, counts: Vector, most: bool) -> tuple[int, Vector]:
+        """The extreme of NTOT and its axis; `counts` need only be roughly those of the grid."""
+        return self._best(counts, PAIR_STARTS, most, pairs=True)
+
+    def _best(self, counts: Vector, starts: int, most: bool, pairs: bool) -> tuple[int, Vector]:
+        sign = 1 if most else -1
+        order = np.argsort(-sign * counts.ravel(), kind="stable")[:starts]
+        found = [self._climb(axis, sign, pairs) for axis in axes_of_sky()[order]]
+        return max(found, key=lambda each: sign * each[0])
+
+    def _climb(self, axis: Vector, sign: int, pairs: bool) -> tuple[int, Vector]:
+        step_deg, count = FIRST_STEP_DEG, 0
+        while step_deg >= LAST_STEP_DEG:
+            axes = np.vstack([axis, _axes_about(axis, step_deg)])
+            counts = self._counts(axes, step_deg, pairs)
+            best = int(np.argmax(sign * counts))
+            count, axis = int(counts[best]), axes[best]
+            if best == 0:
+                step_deg /= 2.0
+        return count, axis
+
+    def _counts(self, axes: Vector, step_deg: float, pairs: bool) -> Vector:
+        """The stars or pairs of zones about axes no farther than a step from the first."""
+        least_deg, most_deg = self._bounds_deg
+        wide = _inside(self._direction @ axes[0], least_deg - step_deg, most_deg + step_deg)
+        near = self._direction[wide]
+        inside = _inside(axes @ near.T, least_deg, most_deg)
+        if not pairs:
+            return np.asarray(inside.sum(axis=1))
+        if len(near) == 0:
+            return np.zeros(len(axes), dtype=int)
+        tree: Any = cKDTree(near)
+        first, second = tree.query_pairs(_chord(self._limit_deg), output_type="ndarray").T.copy()
+        return np.array([np.count_nonzero(row[first] & row[second]) for row in inside])
+
+
+def _axes_about(axis: Vector, step_deg: float) -> Vector:
+    """Unit vectors (24, 3) about an axis, at a step and at half of it by turns."""
+    first = unit(np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))]))
+    second = np.cross(axis, first)
+    turn = np.arange(24)[:, None] * math.pi / 12.0
+    angle = math.radians(step_deg) * np.where(np.arange(24) % 2, 1.0, 0.5)[:, None]
+    return np.asarray(
+        np.cos(angle) * axis + np.sin(angle) * (np.cos(turn) * first + np.sin(turn) * second)
+    )
+
+
+def _inside(cosine: Vector, least_deg: float, most_deg: float) -> npt.NDArray[np.bool_]:
+    """Which cosines are those of angles between two bounds."""
+    near = math.cos(math.radians(least_deg)) if least_deg > 0.0 else 2.0
+    far = math.cos(math.radians(most_deg)) if most_deg < 180.0 else -2.0
+    return (cosine <= near) & (cosine >= far)
 
 
 def axes_deg() -> tuple[Vector, Vector]:
@@ -71,25 +148,44 @@ def zone_censuses(mission: Mission, run_catalog: RunCatalog) -> list[ZoneCensus]
                 min(180.0, middle_deg + zone.half_width_deg),
             )
     limit_deg = mission.tolerances.pair_separation_max_deg
-    return [
-        ZoneCensus(of, *bounds, *_counts(run_catalog.direction, *bounds, limit_deg))
-        for of, bounds in shapes.items()
+    return [_census(of, run_catalog.direction, *bounds, limit_deg) for of, bounds in shapes.items()]
+
+
+def _census(
+    of: str, direction: Vector, least_deg: float, most_deg: float, limit_deg: float
+) -> ZoneCensus:
+    stars, pairs = _counts(direction, least_deg, most_deg, limit_deg)
+    sky = Extremes(direction, least_deg, most_deg, limit_deg)
+    most_pairs, richest = sky.pairs(pairs, most=True)
+    spread = {
+        "stars": star_spread(sky, stars),
+        "pairs": Spread(sky.pairs(pairs, most=False)[0], median_of(pairs), most_pairs),
+    }
+    return ZoneCensus(of, least_deg, most_deg, stars, pairs, spread, richest)
+
+
+def star_spread(sky: Extremes, counts: Vector) -> Spread:
+    """The spread of the stars of zones, or of fields of view, by their counts over the grid."""
+    least, _ = sky.stars(counts, most=False)
+    most, _ = sky.stars(counts, most=True)
+    return Spread(least, median_of(counts), most)
+
+
+def star_counts(direction: Vector, least_deg: float, most_deg: float) -> Vector:
+    """The stars (ROWS, COLUMNS) between two angles from each axis of the grid."""
+    axes = axes_of_sky()
+    counts = [
+        _inside(axes[first : first + AXES_AT_ONCE] @ direction.T, least_deg, most_deg).sum(axis=1)
+        for first in range(0, len(axes), AXES_AT_ONCE)
     ]
-
-
-def stars_in_view(run_catalog: RunCatalog, radius_deg: float) -> Vector:
-    """How many stars (ROWS, COLUMNS) of a run catalog a field of view shows."""
-    tree: Any = cKDTree(run_catalog.direction)
-    counts = tree.query_ball_point(axes_of_sky(), _chord(radius_deg), return_length=True)
-    return np.asarray(counts).reshape(ROWS, COLUMNS)
+    return np.concatenate(counts).reshape(ROWS, COLUMNS)
 
 
 def zone_counts(
     direction: Vector, axis: Vector, least_deg: float, most_deg: float, limit_deg: float
 ) -> tuple[int, int]:
     """Stars between two angles from an axis, and their pairs not farther apart than a limit."""
-    angle_deg = np.degrees(2.0 * np.arcsin(np.linalg.norm(direction - axis, axis=1).clip(0, 2) / 2))
-    inside = direction[(least_deg <= angle_deg) & (angle_deg <= most_deg)]
+    inside = direction[_inside(direction @ axis, least_deg, most_deg)]
     if len(inside) == 0:
         return 0, 0
     tree: Any = cKDTree(inside)
@@ -103,12 +199,11 @@ def share_below(counts: Vector, least: int) -> float:
     return float(_weights()[counts.ravel() < least].sum())
 
 
-def spread_of(counts: Vector) -> Spread:
-    """The spread of counts over the grid."""
+def median_of(counts: Vector) -> int:
+    """The median over the sky of counts over the grid."""
     flat = counts.ravel()
     order = np.argsort(flat)
-    middle = int(np.searchsorted(np.cumsum(_weights()[order]), 0.5))
-    return Spread(int(flat.min()), int(flat[order][middle]), int(flat.max()))
+    return int(flat[order][np.searchsorted(np.cumsum(_weights()[order]), 0.5)])
 
 
 def _counts(

@@ -14,15 +14,22 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from service.advice.zone_census import COLUMNS, ROWS, Spread, axes_deg, axes_of_sky, spread_of
-from service.advice.zone_census import zone_counts as counted
+from service.advice.zone_census import (
+    COLUMNS,
+    ROWS,
+    Extremes,
+    Spread,
+    axes_of_sky,
+    median_of,
+    star_spread,
+)
 from service.advice.zone_size import geometric_k_g
 from service.missions.mission import Band, Mission
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.geometry.pairs import PAIRS_PER_BIN
 from service.sky.geometry.star_buckets import BUCKETS_PER_STAR
 from service.sky.geometry.star_voxels import REACH_RAD
-from service.vectors import Vector
+from service.vectors import Vector, to_ra_dec
 
 RINGS = 4
 """Of equal area, about a star."""
@@ -64,9 +71,10 @@ class Shape:
 class ZoneEstimate:
     """Zones of one shape over the sky: `pairs` (NTOT) are predicted, `stars` (NCAP) counted.
 
-    `richest_deg` is the axis (right ascension, declination) of the zone with the most pairs,
-    `k_g` its share of pairs, and `pairs_counted` what a zone built there would hold.
-    `k_g_areas` is equation 2's, `pairs_bound` equation 1 with it and the most stars of the sky.
+    `pairs_counted` is the most pairs that a zone of the sky holds, `richest_deg` its axis (right
+    ascension, declination); `pairs.most` and `k_g`, the share of pairs, are predicted there.
+    `k_g_areas` is equation 2's, `pairs_bound` equation 1 with it and the most stars of the sky:
+    a bound for stars spread evenly, which those of the sky may exceed.
     `most_bytes` is the memory of the largest zone as the service caches it, grown by its grid.
     """
 
@@ -175,31 +183,34 @@ def zone_estimates(
         shape = shape_of(least_deg, most_deg, limit_deg)
         both = np.array([predicted(neighbours, shape, axis) for axis in axes])
         stars, pairs = both[:, 0], both[:, 1]
-        richest = int(np.argmax(pairs))
-        most_stars = int(stars.max())
-        cached = both
-        if grown_by_deg:
-            grown = max(0.0, least_deg - grown_by_deg), min(180.0, most_deg + grown_by_deg)
-            wide = shape_of(*grown, limit_deg)
-            cached = np.array([predicted(neighbours, wide, axis) for axis in axes])
+        grid = stars.reshape(ROWS, COLUMNS), pairs.reshape(ROWS, COLUMNS)
+        sky = Extremes(run_catalog.direction, least_deg, most_deg, limit_deg)
+        star_range = star_spread(sky, grid[0])
+        pairs_counted, richest = sky.pairs(grid[1], most=True)
+        _, poorest = sky.pairs(grid[1], most=False)
+        in_richest, most_pairs = predicted(neighbours, shape, richest)
+        _, least_pairs = predicted(neighbours, shape, poorest)
+        grown = max(0.0, least_deg - grown_by_deg), min(180.0, most_deg + grown_by_deg)
+        cached = Extremes(run_catalog.direction, *grown, limit_deg)
+        most_bytes = zone_bytes(
+            cached.stars(grid[0], most=True)[0], cached.pairs(grid[1], most=True)[0], is_band
+        )
+        ra_deg, dec_deg = to_ra_dec(richest)
         k_g_areas = geometric_k_g(mission, size_deg)
-        row, column = divmod(richest, COLUMNS)
         found.append(
             ZoneEstimate(
                 of=of,
                 size_deg=size_deg,
                 pair_separation_max_deg=limit_deg,
                 magnitude_limit_mag=mission.catalog.magnitude_limit_mag,
-                stars=spread_of(stars.reshape(ROWS, COLUMNS)),
-                pairs=spread_of(np.rint(pairs).reshape(ROWS, COLUMNS)),
-                richest_deg=(float(axes_deg()[0][column]), float(axes_deg()[1][row])),
-                k_g=float(pairs[richest] / max(1.0, _all_pairs(stars[richest]))),
-                pairs_counted=counted(
-                    run_catalog.direction, axes[richest], least_deg, most_deg, limit_deg
-                )[1],
+                stars=star_range,
+                pairs=Spread(round(least_pairs), median_of(np.rint(grid[1])), round(most_pairs)),
+                richest_deg=(float(ra_deg), float(dec_deg)),
+                k_g=float(most_pairs / max(1.0, _all_pairs(in_richest))),
+                pairs_counted=pairs_counted,
                 k_g_areas=k_g_areas,
-                pairs_bound=round(k_g_areas * _all_pairs(most_stars)),
-                most_bytes=max(zone_bytes(int(n), p, is_band) for n, p in cached),
+                pairs_bound=round(k_g_areas * _all_pairs(star_range.most)),
+                most_bytes=most_bytes,
             )
         )
     return found

@@ -2,7 +2,7 @@
 
 A zone must hold the field of view about any attitude that the a priori one may stand for, so
 its radius (of a band: its half width) is that of the field of view and the error together.
-Stars and pairs are counted about the axis of the sky with the most stars.
+The most stars and pairs of such a zone are sought over the whole sky.
 """
 
 import math
@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from service.advice.zone_census import axes_of_sky, zone_counts
+from service.advice.zone_census import Extremes, star_counts
 from service.missions.mission import Band, Mission
 from service.vectors import Vector
 
@@ -27,16 +27,16 @@ RESERVE = 1.2
 """Times the largest usual error that was seen: the next one may be larger."""
 TOO_LARGE = 1.5
 """Times the size with that reserve."""
-AXES_AT_ONCE = 72
 LARGEST_DEG = {"cap": 180.0, "band": 90.0}
 
 
 @dataclass(frozen=True)
 class ZoneCost:
-    """A zone of one size about the richest axis of the sky.
+    """The largest zones of one size that the sky has.
 
-    `stars` is NCAP, `pairs` NTOT as counted; `k_g` is the paper's approximation (equation 2)
-    and `pairs_by_k_g` what it makes of NCAP (equation 1).
+    `stars` is the most NCAP, `pairs` the most NTOT as counted, of a zone about another axis;
+    `k_g` is the paper's approximation (equation 2) and `pairs_by_k_g` what it makes of NCAP
+    (equation 1).
     """
 
     size_deg: float
@@ -123,20 +123,16 @@ def zone_size(mission: Mission, angles_deg: Sequence[float]) -> ZoneSize:
 
 
 def zone_cost(mission: Mission, direction: Vector, size_deg: float) -> ZoneCost:
-    """The stars and pairs of a zone of this size about the axis with the most stars.
+    """The most stars and the most pairs of a zone of this size.
 
     `direction` (n, 3) is the run catalog's.
     """
-    least_deg, most_deg = _bounds_deg(mission, size_deg)
-    nearest, farthest = np.cos(np.radians((least_deg, most_deg)))
-    axes = axes_of_sky()
-    counts = []
-    for first in range(0, len(axes), AXES_AT_ONCE):
-        cosines = direction @ axes[first : first + AXES_AT_ONCE].T
-        counts += ((cosines <= nearest) & (cosines >= farthest)).sum(axis=0).tolist()
-    limit_deg = mission.tolerances.pair_separation_max_deg
-    axis = axes[int(np.argmax(counts))]
-    stars, pairs = zone_counts(direction, axis, least_deg, most_deg, limit_deg)
+    bounds_deg = _bounds_deg(mission, size_deg)
+    counts = star_counts(direction, *bounds_deg)
+    sky = Extremes(direction, *bounds_deg, mission.tolerances.pair_separation_max_deg)
+    stars, _ = sky.stars(counts, most=True)
+    # Where stars are dense pairs are many: the grid's pairs need not be counted for the starts.
+    pairs, _ = sky.pairs(counts, most=True)
     return ZoneCost(size_deg, stars, pairs, geometric_k_g(mission, size_deg))
 
 

@@ -65,7 +65,7 @@ class Zones:
         return size, [self._cost(mission, run_catalog, each) for each in size.sizes_deg]
 
     def _cost(self, mission: Mission, run_catalog: RunCatalog, size_deg: float) -> ZoneCost:
-        """The cost of a zone of this size; counting the whole sky takes up to a second."""
+        """The cost of a zone of this size; searching the whole sky takes up to seconds."""
         key = mission.digest, run_catalog.digest, size_deg
         if key not in self._costs:
             if len(self._costs) >= MOST_COSTS:

@@ -14,8 +14,9 @@ if TYPE_CHECKING:
 
 NOTES = """\
 NCAP is counted, NTOT predicted: NTOT = k_g (NCAP^2 - NCAP) / 2 with the k_g of the place and
-the shape of the zone. The table also has NTOT as counted for the richest zone, and the bound of
-Fink & Shoup (1994): k_g of the areas (equation 2) in equation 1, with the most stars of the sky.
+the shape of the zone. "counted" is the most NTOT that a zone anywhere in the sky holds. The bound
+is that of Fink & Shoup (1994): k_g of the areas (equation 2) in equation 1, with the most stars of
+any zone. It is a bound for stars spread evenly; the text names the zones that exceed it.
 Memory is that of the largest zone as the service caches it, grown by the zone's grid."""
 
 
@@ -140,11 +141,14 @@ def _text(mission: "Mission", epoch_year: float, found: "list[ZoneEstimate]") ->
         markdown(header, rows),
     ]
     richest = dict.fromkeys(
-        f"{each.of} about RA {each.richest_deg[0]:g}, Dec {each.richest_deg[1]:g} deg"
+        f"{each.of} about RA {each.richest_deg[0]:.2f}, Dec {each.richest_deg[1]:+.2f} deg"
         for each in found
     )
     lines += ["counted: NTOT of the richest zone: " + "; ".join(richest)]
-    if any(each.pairs.most > MAX_PAIRS for each in found):
+    exceeding = dict.fromkeys(each.of for each in found if each.pairs_counted > each.pairs_bound)
+    if exceeding:
+        lines.append(f"counted exceeds the bound: {'; '.join(exceeding)}")
+    if any(each.pairs_counted > MAX_PAIRS for each in found):
         lines.append(f"A zone of more than {MAX_PAIRS:,} pairs is refused.")
     return "\n".join(lines)
 

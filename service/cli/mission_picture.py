@@ -34,7 +34,7 @@ def picture(report: "MissionReport") -> str:
 
 def _panel(report: "MissionReport", zone: ZoneCensus) -> list[str]:
     ra_deg, dec_deg = axes_deg()
-    least, most = int(zone.pairs.min()), int(zone.pairs.max())
+    least, most = zone.spread["pairs"].least, zone.spread["pairs"].most
     half_ra, half_dec = 180.0 / len(ra_deg), 90.0 / len(dec_deg)
     parts = [f'<text x="12" y="22">{report.mission.name}: pairs in a {zone.of} by its axis</text>']
     for row, dec in enumerate(dec_deg):

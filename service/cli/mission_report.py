@@ -134,7 +134,7 @@ def _row(title: str, of: Any) -> str:
 def _map(zone: ZoneCensus) -> list[str]:
     """Pairs by the direction of the zone's axis, a character each."""
     _, dec_deg = axes_deg()
-    most = max(1, int(zone.pairs.max()))
+    most = max(1, zone.spread["pairs"].most)
     shade = np.minimum(zone.pairs * len(SHADES) // most, len(SHADES) - 1).astype(int)
     lines = [f"pairs in a {zone.of}, by the direction of its axis; '@' is {most:,}"]
     # East is to the left, as on the sky.

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from service.advice.zone_census import zone_censuses
+from service.advice.zone_census import zone_censuses, zone_counts
 from service.advice.zone_estimate import (
     neighbours_of,
     predicted,
@@ -87,13 +87,60 @@ def test_the_worst_of_the_sky_is_that_of_the_census(sky, missions):
     (found,) = zone_estimates(mission, run_catalog, neighbours)
     (census,) = zone_censuses(mission, run_catalog)
     assert found.stars == census.spread["stars"]
-    assert found.pairs.most == pytest.approx(census.pairs.max(), rel=0.05)
-    assert found.pairs_counted == pytest.approx(census.pairs.max(), rel=0.05)
+    assert found.pairs.most == pytest.approx(found.pairs_counted, rel=0.05)
+    assert found.pairs_counted == pytest.approx(census.spread["pairs"].most, rel=0.005)
+    assert found.richest_deg == pytest.approx(census.richest_deg(), abs=1.0)
     assert found.pairs.median == pytest.approx(census.spread["pairs"].median, rel=0.02)
     assert found.k_g_areas == pytest.approx(0.4224, abs=5e-5)
     # Equation 1 with it.
     most = found.stars.most
     assert found.pairs_bound == round(found.k_g_areas * most * (most - 1) / 2)
+
+
+@pytest.mark.slow
+@pytest.mark.torture
+@pytest.mark.parametrize(
+    ("name", "cap_deg"), [("XTE", None), ("SWAS", None), ("SOHO", None), ("XTE", 6.0)]
+)
+def test_no_random_axis_has_a_poorer_or_richer_zone_than_the_extremes(
+    sky, missions, rng, name, cap_deg, figures
+):
+    """100,000 axes at full size; the pairs are counted of the 300 with the most stars."""
+    mission = missions[name]
+    if cap_deg:
+        zone = mission.zone.model_copy(update={"radius_deg": cap_deg})
+        mission = mission.model_copy(update={"zone": zone})
+    run_catalog = sky.run_catalog(mission, TIME)
+    limit_deg = mission.tolerances.pair_separation_max_deg
+    direction, near = run_catalog.direction, neighbours_of(run_catalog.direction, limit_deg)
+    (found,) = zone_estimates(mission, run_catalog, near)
+    region = region_of(mission, np.array([0.0, 0.0, 1.0]))
+    farthest, nearest = np.cos(np.radians((region.most_deg, region.least_deg)))
+    axes = rng.normal(size=(size(100_000, 1_000), 3))
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    stars = np.concatenate(
+        [
+            ((part >= farthest) & (part <= nearest)).sum(axis=1)
+            for part in (axes[k : k + 100] @ direction.T for k in range(0, len(axes), 100))
+        ]
+    )
+    densest = axes[np.argsort(stars)[-size(300, 30) :]]
+    bounds = region.least_deg, region.most_deg, limit_deg
+    pairs = max(zone_counts(direction, axis, *bounds)[1] for axis in densest)
+    figures(
+        stars=f"{stars.min()} to {stars.max()} in {found.stars.least} to {found.stars.most}",
+        pairs=f"{pairs} in {found.pairs_counted}, bound {found.pairs_bound}",
+    )
+    assert found.stars.least <= stars.min()
+    assert stars.max() <= found.stars.most
+    assert pairs <= found.pairs_counted <= found.pairs_bound
+
+
+@pytest.mark.slow
+def test_the_command_says_where_the_sky_exceeds_the_bound(acquire):
+    code, out, _ = acquire("mission", "estimate", "XTE", "--size", "10.66", "15", "--epoch", "2000")
+    assert code == 0
+    assert "counted exceeds the bound: cap of 15 deg\n" in out + "\n"
 
 
 def test_the_command_estimates_each_size_and_limit(acquire, tmp_path):

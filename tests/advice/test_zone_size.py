@@ -19,14 +19,14 @@ def test_k_g_is_that_of_the_paper_s_tables_13_and_14(missions, name, k_g):
     assert round(geometric_k_g(mission, size_deg), 4) == k_g
 
 
+@pytest.mark.slow
 def test_soho_s_worst_band_is_about_that_of_the_paper(sky, missions):
     """Table 14 has 3,124 stars and 106,802 pairs, with the catalog of its day."""
     run_catalog = sky.run_catalog(missions["SOHO"], TIME)
     cost = zone_cost(missions["SOHO"], run_catalog.direction, 2.1)
-    assert cost.stars == pytest.approx(3124, rel=0.02)
-    assert cost.pairs == pytest.approx(106_802, rel=0.05)
-    assert cost.pairs_by_k_g == pytest.approx(0.0249 * 3124 * 3123 / 2, rel=0.05)
-    assert cost.pairs_by_k_g > cost.pairs
+    assert 3124 <= cost.stars <= 1.05 * 3124
+    assert 106_802 <= cost.pairs <= 1.15 * 106_802
+    assert cost.pairs < cost.pairs_by_k_g
 
 
 def test_the_richest_zone_is_that_of_the_census(sky, missions):
@@ -34,8 +34,8 @@ def test_the_richest_zone_is_that_of_the_census(sky, missions):
     run_catalog = build_run_catalog(sky.catalog, mission.catalog, 2000.0)
     (census,) = zone_censuses(mission, run_catalog)
     cost = zone_cost(mission, run_catalog.direction, 10.66)
-    assert cost.stars == census.stars.max()
-    assert cost.pairs in census.pairs[census.stars == cost.stars]
+    assert cost.stars == census.spread["stars"].most > census.stars.max()
+    assert cost.pairs == pytest.approx(census.spread["pairs"].most, rel=0.005)
 
 
 @pytest.mark.parametrize(
