@@ -1,8 +1,11 @@
 """The settings of one batch: its own options, and its mission's for the others."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from msgspec import Struct
 
+from service.errors import BadBatch, Fault
 from service.missions.mission import (
     TESTS_OF_ROLL,
     Band,
@@ -12,9 +15,11 @@ from service.missions.mission import (
     SolverName,
     Tests,
     Tolerances,
+    idle_reason,
     rules_of,
 )
 from service.observations.batch import BoresightPrior, ObservationBatch, PredictedPrior
+from service.observations.schema import OptionsIn
 from service.sky.ephemeris import observer_velocity
 from service.vectors import Vector
 
@@ -76,6 +81,42 @@ def _rules(batch: ObservationBatch, mission: Mission) -> Rules:
         mission.tolerances.model_copy(update=tolerances),
         mission.tests.model_copy(update=tests),
     )
+
+
+def idle_options(batch: ObservationBatch, mission: Mission) -> dict[str, str]:
+    """The tests and tolerances that a batch's options name in vain, each with the reason."""
+    options = batch.options
+    if not (options.tests or options.tolerances):
+        return {}
+    choices = choices_of(batch, mission)
+    named = (("tests", options.tests or {}), ("tolerances", options.tolerances or {}))
+    reasons = {
+        f"{table}.{name}": idle_reason(name, choices.identifier, choices.tests, mission.zone)
+        for table, settings in named
+        for name in settings
+    }
+    return {name: reason for name, reason in reasons.items() if reason is not None}
+
+
+def refuse_idle_options(
+    options: OptionsIn, batches: Sequence[ObservationBatch], mission: Mission, field: str
+) -> None:
+    """Raise `BadBatch` for tests and tolerances that change nothing for any of some batches.
+
+    The batches have the options already; `field` is where those were given.
+    """
+    named = options.model_dump(include={"tests", "tolerances"}, exclude_none=True)
+    asked = [f"{table}.{name}" for table, settings in named.items() for name in settings]
+    if not (asked and batches):
+        return
+    idle = [idle_options(batch, mission) for batch in batches]
+    faults = [
+        Fault(f"{field}.{name}", f"{idle[0][name]} and would change nothing")
+        for name in asked
+        if all(name in each for each in idle)
+    ]
+    if faults:
+        raise BadBatch(faults)
 
 
 def impossible_tests(batch: ObservationBatch, mission: Mission) -> tuple[str, ...]:

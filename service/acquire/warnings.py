@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from service.acquire.choices import impossible_tests
+from service.acquire.choices import idle_options, impossible_tests
 from service.acquire.result import RivalAttitude, TrackerResult
 from service.attitude.solution import AttitudeSolution
 from service.attitude.solve import taste_bound
@@ -33,13 +33,18 @@ FLIP_DEG = 5.0
 
 def warnings_of_batch(batch: ObservationBatch, mission: Mission) -> list[str]:
     """Warnings about the batch itself, whatever was found."""
-    warnings = []
-    if batch.options.tests:
-        warnings += [
-            f"test_off: {name} was asked for and cannot be made of this a priori knowledge"
-            for name in impossible_tests(batch, mission)
-            if batch.options.tests.get(name)
-        ]
+    off = [
+        name for name in impossible_tests(batch, mission) if (batch.options.tests or {}).get(name)
+    ]
+    warnings = [
+        f"test_off: {name} was asked for and cannot be made of this a priori knowledge"
+        for name in off
+    ]
+    warnings += [
+        f"option_idle: {name} {reason}"
+        for name, reason in idle_options(batch, mission).items()
+        if name.removeprefix("tests.") not in off
+    ]
     if batch.aberration == "to_correct" and batch.velocity_km_per_s is None:
         warnings.append(
             "velocity_of_earth_alone: no velocity_km_per_s was given; "

@@ -79,10 +79,14 @@ def advise(
     mission: Mission,
     batches: Sequence[ObservationBatch],
     run: RunAgain,
+    run_freely: RunAgain,
     own: Mapping[str, float] | None = None,
     pace: WorkLimit | None = None,
 ) -> Findings:
-    """The advice that batches of a mission give; `run` acquires one batch.
+    """The advice that batches of a mission give; `run` acquires one batch within its zones.
+
+    `run_freely` also searches the whole sky, as the service does: a batch whose attitude lies
+    outside its zones fits there by chance alone, and as well in a mirror.
 
     Batches should come in random order: when time runs out, the rest are
     left out.  `own` are additional tolerances to try.
@@ -103,7 +107,9 @@ def advise(
             sure = tuple(each.identification for each in acquisition.trackers)
             sample.cases.append((batch, sure, trial_counts(acquisition, sure)))
             sample.with_rival += acquisition.rival is not None
-            sample.mirrored += any(each.mirrored for each in sure)
+            if any(each.mirrored for each in sure):
+                freely = run_freely(verified.of(batch)).trackers
+                sample.mirrored += any(each.identification.mirrored for each in freely)
         pace.step()
     evidence = merged(parts)
     tolerances = tuple(tolerance_findings(mission, evidence))

@@ -21,7 +21,7 @@ _APRIORI = ("cross_product_deg", "pole_difference_deg", "pole_angle_deg")
 class FileChange:
     """A line for the mission file: its table, of a tracker where `tracker` names one, and why."""
 
-    table: Literal["tolerances", "catalog", "trackers", "gyro"]
+    table: Literal["zone", "tolerances", "catalog", "trackers", "gyro"]
     tracker: str | None
     line: str
 
@@ -70,6 +70,11 @@ def tolerance_statement(finding: ToleranceFinding, advice: Findings) -> Statemen
     start = f"{finding.symbol} ({name})"
     if finding.verdict == "not_used":
         return Statement("keep", f"{start}: its test is off, so it has no effect.")
+    if not advice.uses_voting:
+        text = f"{start} is not used by the identifier {advice.mission.identifier}: no effect."
+        if finding.recommended is not None:
+            text += f" By votes it should be {finding.recommended:g}."
+        return Statement("keep", text)
     if finding.verdict == "no_verdict" or finding.needed is None or finding.beyond is None:
         return Statement(
             "wait",
@@ -102,24 +107,16 @@ def tolerance_statement(finding: ToleranceFinding, advice: Findings) -> Statemen
                 text + " The noise changed meanwhile: correct that first, then ask again for a "
                 "period in which it is constant.",
             )
-        return _change_statement("widen", text, finding, advice)
+        return _change_statement("widen", text, finding)
     text = f"{start} is wide: {kept} {needed}, and {now} is far more than that. {effect}"
     if not _gains(present, with_it):
         return Statement("keep", text + " A smaller value gains nothing certain: keep it.")
     if name in _APRIORI:
         text += " That holds while the a priori attitude stays as good as in this sample."
-    return _change_statement("tighten", text, finding, advice)
+    return _change_statement("tighten", text, finding)
 
 
-def _change_statement(
-    action: Action, text: str, finding: ToleranceFinding, advice: Findings
-) -> Statement:
-    if not advice.uses_voting:
-        return Statement(
-            "keep",
-            f"{text} {advice.mission.name} identifies by {advice.mission.identifier}, which does "
-            f"not use it: keep it. By votes it should be {finding.recommended:g}.",
-        )
+def _change_statement(action: Action, text: str, finding: ToleranceFinding) -> Statement:
     line = f"{finding.tolerance.name} = {finding.recommended:g}"
     change = FileChange("tolerances", None, f"{line:<32} # {finding.symbol}, was {finding.now:g}")
     return Statement(action, text, (change,))

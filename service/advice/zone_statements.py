@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from service.advice.statements import Statement
+from service.advice.statements import FileChange, Statement
 from service.advice.zone_size import LEAST_BATCHES, ZoneCost, ZoneSize
 from service.missions.mission import Band, Mission
 
@@ -43,6 +43,8 @@ def _size_statement(mission: Mission, size: ZoneSize, costs: Sequence[ZoneCost])
             "source, which no zone mends."
         )
     change = f"{size.setting} = {size.covering_deg:g}"
+    line = f"{size.setting.removeprefix('zone.')} = {size.covering_deg:g}"
+    lines = (FileChange("zone", None, f"{line:<32} # {symbol}, was {size.size_deg:g}"),)
     if size.verdict == "fits":
         return Statement("keep", f"{start} fits: {room}, and {seen}.{gross}")
     if size.verdict == "too_small":
@@ -51,11 +53,13 @@ def _size_statement(mission: Mission, size: ZoneSize, costs: Sequence[ZoneCost])
             f"{start} is too small: {room}, and {seen}; in {errors.beyond} of them it was "
             f"more than there is room for. Set {change}, or correct the a priori attitude."
             f"{_cost(size, costs)}{gross}",
+            lines,
         )
     return Statement(
         "tighten",
         f"{start} is larger than needed: {room}, and {seen}. {change} covers that and a fifth "
         f"more.{_cost(size, costs)}{gross}",
+        lines,
     )
 
 
@@ -71,17 +75,21 @@ def _hmax_statement(mission: Mission, size: ZoneSize) -> Statement:
     limit_deg = mission.tolerances.pair_separation_max_deg
     wide_deg = 2.0 * size.field_of_view_deg
     start = "HMAX (pair_separation_max_deg)"
+    line = f"{f'pair_separation_max_deg = {wide_deg:g}':<32} # HMAX, was {limit_deg:g}"
+    lines = (FileChange("tolerances", None, line),)
     if limit_deg > WIDER * wide_deg:
         return Statement(
             "tighten",
             f"{start} is larger than needed: no two stars of a field of view of {wide_deg:g}° are "
             f"{limit_deg:g}° apart. {wide_deg:g} makes the pair index smaller and loses nothing.",
+            lines,
         )
     if limit_deg < NARROWER * wide_deg:
         return Statement(
             "widen",
             f"{start} is small: {limit_deg:g}° leaves out most pairs of a field of view of "
             f"{wide_deg:g}°. {wide_deg:g} uses all of them.",
+            lines,
         )
     return Statement(
         "keep", f"{start} fits: {limit_deg:g}° beside a field of view of {wide_deg:g}°."

@@ -9,10 +9,13 @@ from functools import partial
 from service.advice.advice import WorkLimit, advise
 from service.advice.innovation_statements import innovation_findings
 from service.advice.innovations import innovation_noise
+from service.advice.zone_statements import zone_statements
 from service.app.advice_record import advice_record
 from service.app.context import Context
 from service.app.submissions import Submissions
-from service.errors import Busy
+from service.app.zones import Zones
+from service.errors import BadInput, Busy, Fault
+from service.missions.mission import idle_reason
 from service.observations.schema import TolerancesIn
 from service.storage.grades.period import latest_innovations
 from service.storage.models.advice import Advice
@@ -30,8 +33,9 @@ NO_TOLERANCES = TolerancesIn()
 class AdviceService:
     """Computes advice, for one caller at a time."""
 
-    def __init__(self, context: Context, submissions: Submissions) -> None:
+    def __init__(self, context: Context, submissions: Submissions, zones: Zones) -> None:
         self._context = context
+        self._zones = zones
         self._submissions = submissions
         self._lock = threading.Lock()
 
@@ -55,6 +59,10 @@ class AdviceService:
         """
         mission = self._context.mission(name)
         own = tolerances.model_dump(exclude_none=True)
+        for key in own:
+            reason = idle_reason(key, "starid", mission.tests, mission.zone)
+            if reason is not None:
+                raise BadInput(Fault(f"tolerance {key}", f"{reason} and would change nothing"))
         if not self._lock.acquire(blocking=False):
             raise Busy("the service is computing other advice", ADVICE_RETRY_S)
         try:
@@ -67,8 +75,10 @@ class AdviceService:
             pace = WorkLimit(lambda share: time.monotonic() - began < share * limit_s, step)
             # Without the search of the whole sky, which would hide faults of the settings.
             run_again = partial(self._submissions.ingest.run_again, mission=mission.within_zones)
-            findings = advise(mission, drawn.batches, run_again, own, pace)
+            run_freely = partial(self._submissions.ingest.run_again, mission=mission)
+            findings = advise(mission, drawn.batches, run_again, run_freely, own, pace)
+            zone = zone_statements(mission, *self._zones.advised_size(name, run))
         finally:
             self._lock.release()
         noise = innovation_findings(innovation_noise(met), mission, findings.noise)
-        return advice_record(name, run or LIVE, drawn, findings, noise)
+        return advice_record(name, run or LIVE, drawn, findings, zone, noise)

@@ -29,6 +29,7 @@ from service.storage.models.advice import (
     NoisePeriodAdvice,
     ToleranceAdvice,
     Trial,
+    ZoneAdvice,
 )
 from service.storage.queries.recorded_batch import BatchSample
 
@@ -38,6 +39,7 @@ def advice_record(
     run: str,
     sample: BatchSample,
     findings: Findings,
+    zone: Sequence[Statement],
     innovations: Sequence[InnovationFinding] = (),
 ) -> Advice:
     """The findings with their figures and sentences, the trials, and the lines to change."""
@@ -45,7 +47,10 @@ def advice_record(
     noise = [(each, noise_statement(each)) for each in findings.noise]
     magnitudes = [(each, magnitude_statement(each, findings)) for each in findings.magnitudes]
     alignment = [(each, alignment_statement(each)) for each in findings.alignment]
-    statements = [each for pairs in (tolerances, noise, magnitudes, alignment) for _, each in pairs]
+    statements = [*zone]
+    statements += [
+        each for pairs in (tolerances, noise, magnitudes, alignment) for _, each in pairs
+    ]
     statements += [each.statement for each in innovations]
     return Advice(
         spacecraft=spacecraft,
@@ -62,7 +67,8 @@ def advice_record(
         groups=[
             GroupAdvice(action=each.action, text=each.text) for each in group_statements(findings)
         ],
-        tolerances=[_tolerance(*each) for each in tolerances],
+        zone=[ZoneAdvice(action=each.action, text=each.text) for each in zone],
+        tolerances=[_tolerance(*each, findings.uses_voting) for each in tolerances],
         noise=[_noise(*each) for each in noise],
         magnitudes=[_magnitude(*each) for each in magnitudes],
         alignment=[_alignment(*each) for each in alignment],
@@ -72,14 +78,14 @@ def advice_record(
     )
 
 
-def _tolerance(finding: ToleranceFinding, statement: Statement) -> ToleranceAdvice:
+def _tolerance(finding: ToleranceFinding, statement: Statement, is_used: bool) -> ToleranceAdvice:
     return ToleranceAdvice(
         tolerance=finding.tolerance.name,
         symbol=finding.symbol,
         unit=finding.tolerance.unit,
         now=finding.now,
-        verdict=finding.verdict,
-        confidence=finding.confidence,
+        verdict=finding.verdict if is_used else "not_used",
+        confidence=finding.confidence if is_used else "none",
         differences=finding.differences,
         batches=finding.batches,
         needed=_estimate(finding.needed),
@@ -191,6 +197,8 @@ def _bounded(found: Interval) -> Estimate:
 def no_changes_text(advice: Advice) -> str:
     """The text shown when no line of the mission file should change."""
     findings = (
+        advice.groups,
+        advice.zone,
         advice.tolerances,
         advice.noise,
         advice.magnitudes,

@@ -2,10 +2,11 @@
 
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+from service.acquire.choices import refuse_idle_options
 from service.advice.advice import RunAgain
 from service.app.context import Context
 from service.app.submissions import Submissions
@@ -56,11 +57,12 @@ class Comparisons:
     ) -> Comparison:
         """Run recorded batches again with two sets of options and show where they differ.
 
+        Raises `BadBatch` for a setting that changes nothing for any of them.
         Of a stretch at most `sample` batches, fewer where `limit_s` seconds run
         out.  Settings that the options do not name stay as they were for a batch.  Raises
         `Busy` while the service is computing another comparison.
         """
-        mission_named(self._context.missions, name)
+        mission = mission_named(self._context.missions, name)
         again = self._submissions.ingest.run_again
 
         def pair_of(row: Row) -> Pair:
@@ -71,9 +73,14 @@ class Comparisons:
             options = (batch_with_options(row["input"], row["options"], each) for each in (a, b))
             return Pair(row["id"], *options)
 
+        def check(pairs: Sequence[Pair]) -> None:
+            of_stars = [each for each in pairs if each.a.measurement is None]
+            refuse_idle_options(a, [each.a for each in of_stars], mission, "a")
+            refuse_idle_options(b, [each.b for each in of_stars], mission, "b")
+
         stretch = Stretch(name, run, start, end, sample)
         told = tuple(each.model_dump(mode="json", exclude_none=True) for each in (a, b))
-        return self._compared(stretch, pair_of, (again, again), (told[0], told[1]), limit_s)
+        return self._compared(stretch, pair_of, (again, again), (told[0], told[1]), limit_s, check)
 
     def of_missions(
         self, stretch: Stretch, a: Mission, b: Mission, limit_s: float = math.inf
@@ -95,6 +102,7 @@ class Comparisons:
         sides: tuple[RunAgain, RunAgain],
         options: tuple[Row, Row],
         limit_s: float,
+        check: Callable[[Sequence[Pair]], None] = lambda pairs: None,
     ) -> Comparison:
         if not self._lock.acquire(blocking=False):
             raise Busy("the service is computing another comparison", COMPARE_RETRY_S)
@@ -108,6 +116,7 @@ class Comparisons:
                     stretch.sample,
                 )
             pairs = [pair_of(row) for row in drawn.rows]
+            check(pairs)
             found, cut_short = compare(pairs, sides, limit_s)
         finally:
             self._lock.release()

@@ -1,6 +1,7 @@
 """The cache of zones and run catalogs."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 from service.acquire.prewarm import prewarm_zones
 from service.advice.zone_size import ZoneCost, ZoneSize, zone_cost, zone_size
@@ -49,12 +50,22 @@ class Zones:
             build_us=state.build_us,
         )
 
+    def advised_size(self, name: str, run: str | None) -> tuple[ZoneSize, list[ZoneCost]]:
+        """As `size`, with the costs only where another size is advised."""
+        size, cost_of = self._size(name, run)
+        changes = size.verdict in ("too_small", "larger_than_needed")
+        return size, [cost_of(each) for each in size.sizes_deg] if changes else []
+
     def size(self, name: str, run: str | None = None) -> tuple[ZoneSize, list[ZoneCost]]:
         """Advice on the size of a spacecraft's zone by a run's a priori errors, and the costs.
 
         The errors are those of the latest `MOST_ERRORS` batches; a batch without an attitude
         has none.
         """
+        size, cost_of = self._size(name, run)
+        return size, [cost_of(each) for each in size.sizes_deg]
+
+    def _size(self, name: str, run: str | None) -> tuple[ZoneSize, Callable[[float], ZoneCost]]:
         mission = self._context.mission(name)
         place = ResultFilter(run or LIVE, name)
         with self._context.reading_record() as connection:
@@ -62,7 +73,7 @@ class Zones:
             _, samples = latest_samples(connection, place, "a_priori_angle_deg", MOST_ERRORS)
         run_catalog = self._context.sky.run_catalog(mission, time or utc_now())
         size = zone_size(mission, [angle_deg for _, angle_deg, _ in samples])
-        return size, [self._cost(mission, run_catalog, each) for each in size.sizes_deg]
+        return size, partial(self._cost, mission, run_catalog)
 
     def _cost(self, mission: Mission, run_catalog: RunCatalog, size_deg: float) -> ZoneCost:
         """The cost of a zone of this size; searching the whole sky takes up to seconds."""

@@ -3,7 +3,6 @@
 import textwrap
 from collections.abc import Iterable, Sequence
 
-from service.advice.statements import Statement
 from service.app.advice_record import no_changes_text
 from service.storage.models.advice import (
     Advice,
@@ -14,11 +13,12 @@ from service.storage.models.advice import (
     NoiseAdvice,
     ToleranceAdvice,
     Trial,
+    ZoneAdvice,
 )
 
 Finding = (
-    Statement
-    | GroupAdvice
+    GroupAdvice
+    | ZoneAdvice
     | ToleranceAdvice
     | NoiseAdvice
     | MagnitudeAdvice
@@ -28,12 +28,12 @@ Finding = (
 WIDTH = 96
 
 
-def advice_text(advice: Advice, zone: Sequence[Statement] = ()) -> str:
-    """The advice as lines of text; `zone` are the statements on the zone."""
+def advice_text(advice: Advice) -> str:
+    """The advice as lines of text."""
     lines = [*_heading(advice), ""]
     sections: tuple[tuple[str, Sequence[Finding]], ...] = (
         ("Groups of stars", advice.groups),
-        ("Zone", zone),
+        ("Zone", advice.zone),
         ("Tolerances", advice.tolerances),
         ("Noise", advice.noise),
         ("Magnitudes", advice.magnitudes),

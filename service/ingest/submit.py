@@ -14,6 +14,7 @@ from sqlalchemy import Connection
 from service.access.audit import Entry
 from service.access.tokens import Caller, own_key
 from service.acquire import Acquisition
+from service.acquire.choices import refuse_idle_options
 from service.errors import AcquisitionError, Busy
 from service.ingest.outcomes import (
     Answers,
@@ -26,7 +27,7 @@ from service.ingest.outcomes import (
     outcome_of,
 )
 from service.ingest.queue import Backlog, IngestQueue, PendingBatch
-from service.ingest.solver_pool import WAIT_S, Solver, SolverPool, may_take_long
+from service.ingest.solver_pool import WAIT_S, Solver, SolverPool, may_take_long, mission_in_input
 from service.ingest.tracking import with_prediction
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
@@ -202,6 +203,8 @@ class SubmissionService:
         with self._store.reading_batch(id) as (connection, archived):
             parent = read_parent(connection, id, archived=archived, kept=record or adopt)
         batch = batch_with_options(parent["input"], parent["options"], options)
+        mission = mission_in_input(self.solver.missions, batch.spacecraft)
+        refuse_idle_options(options, [batch], mission, "options")
         acquisition = self.run_again(batch)
         if not (record or adopt):
             answer = answer_of(acquisition, id=None, parent=id, recorded=False)

@@ -31,6 +31,11 @@ class IdentifierEntry:
     """The whole sky is searched where it finds nothing good about the a priori attitude."""
     needs_guide: bool = False
     """It searches the whole sky by itself, with the guide database of triangles."""
+    uses: frozenset[str] | None = None
+    """The tests and tolerances that change what it finds; None: all of them.
+
+    Others may still change the votes that it shows beside its result.
+    """
 
     @cached_property
     def identify(self) -> Callable[[Any], Any]:
@@ -72,6 +77,7 @@ register(
         "a probability for every star, from weighed hypotheses of all of them",
         weighs_hypotheses=True,
         falls_back=True,
+        uses=frozenset({"pair_separation_max_deg"}),
     )
 )
 register(
@@ -80,6 +86,7 @@ register(
         "service.identify.triangles.ptp:identify_ptp",
         "planar triangles in the whole sky; uses neither prior nor magnitudes",
         needs_guide=True,
+        uses=frozenset(),
     )
 )
 register(
@@ -89,5 +96,6 @@ register(
         "as verified, about an attitude that is found in the whole sky",
         weighs_hypotheses=True,
         uses_prior=False,
+        uses=frozenset({"pair_separation_max_deg"}),
     )
 )

@@ -66,7 +66,11 @@ def evidence_from(mission, sky, batches):
 def advice_from(mission, sky, batches, **wanted):
     """The whole advice."""
     return advise(
-        mission, batches, lambda batch: acquire(batch, mission.within_zones, sky), **wanted
+        mission,
+        batches,
+        lambda batch: acquire(batch, mission.within_zones, sky),
+        lambda batch: acquire(batch, mission, sky),
+        **wanted,
     )
 
 

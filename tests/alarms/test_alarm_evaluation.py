@@ -295,7 +295,9 @@ def test_a_batch_dated_far_ahead_is_not_judged(tight, make):
 
 def test_a_what_if_that_is_adopted_raises_nothing(tight, make):
     send(tight, make, ["good"] * 3)
-    options = OptionsIn.model_validate({"tolerances": {"separation_deg": 1e-5}})
+    options = OptionsIn.model_validate(
+        {"identifier": "starid", "tolerances": {"separation_deg": 1e-5}}
+    )
     for each in tight.results.page().items:
         tight.results.what_if(each.id, options, adopt=True)
     assert tight.alarms.page().items == []

@@ -106,7 +106,10 @@ def record(client: httpx.Client, new_token: Callable[[], str]) -> None:
     what_if = f"{API}/batches/{first['id']}/what-if"
     for body in (
         {"options": {"solver": "triad"}, "record": True},
-        {"options": {"tolerances": {"separation_deg": 0.02}}, "adopt": True},
+        {
+            "options": {"identifier": "starid", "tolerances": {"separation_deg": 0.02}},
+            "adopt": True,
+        },
     ):
         client.post(what_if, json=body).raise_for_status()
 

@@ -8,7 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from service.acquire import acquire
 from service.missions.identifiers import IDENTIFIERS, IdentifierEntry, register
+from service.missions.mission import Tolerances, idle_reason
+from service.observations.schema import submission_from_json
+from service.simulate.stretches import Pass
+from service.simulate.telemetry import draw_pass
 
 ROOT = Path(__file__).parents[2]
 
@@ -110,3 +115,66 @@ def test_every_entry_names_a_function_and_says_what_it_is():
 def test_a_second_identifier_of_one_name_is_refused():
     with pytest.raises(ValueError, match="verified"):
         register(IdentifierEntry("verified", print, "another"))
+
+
+TRIED = {
+    "pair_separation_max_deg": (0.5,),
+    "separation_deg": (1e-6,),
+    "magnitude_mag": (1e-3,),
+    "magnitude_order_mag": (0.0, 30.0),
+    "cross_product_deg": (1e-4,),
+    "pole_difference_deg": (1e-5, 30.0),
+    "pole_angle_deg": (1e-5,),
+    "fov_rotation_deg": (1e-4,),
+}
+
+
+def base_of(identifier, setting):
+    """Options under which stars are ambiguous, so that each test of the votes tells some apart."""
+    if IDENTIFIERS[identifier].uses is not None:
+        return {"tests": {}, "tolerances": {}}
+    # The test of the field's rotation hides what that of the cross product refuses.
+    is_on = setting.startswith("fov_rotation")
+    tolerances = {"separation_deg": 0.3} | ({} if is_on else {"cross_product_deg": 30.0})
+    return {"tests": {"fov_rotation": is_on}, "tolerances": tolerances}
+
+
+def settings_of(name, held):
+    """The values of a test or of a tolerance to try instead of the one that holds."""
+    if name in TRIED:
+        return [("tolerances", name, value) for value in TRIED[name]]
+    return [("tests", name, not getattr(held, name))]
+
+
+@pytest.mark.parametrize("spacecraft", ["XTE", "SOHO"])
+@pytest.mark.parametrize("identifier", IDENTIFIERS)
+def test_a_setting_changes_an_answer_or_is_said_to_be_idle(missions, sky, identifier, spacecraft):
+    """Every test and tolerance, under every identifier, in a cap and in a band."""
+    mission = missions[spacecraft]
+    drawn = [each.batch for each in draw_pass(mission, sky, Pass(3, 3, stars=6))]
+
+    def found(base, table=None, name=None, value=None):
+        options = {"identifier": identifier, **{key: {**base[key]} for key in base}}
+        if table is not None:
+            options[table][name] = value
+        for body in drawn:
+            text = json.dumps(body | {"options": options})
+            acquired = acquire(submission_from_json(text).batch, mission, sky)
+            each = acquired.trackers[0].identification
+            # Only of `starid` the votes decide; `verified` shows those of the tests beside.
+            votes = each.votes.tolist() if identifier == "starid" else None
+            seen = each.outcome.tolist(), each.star.tolist(), votes
+            yield seen, str(each.probability.tolist()), acquired.warnings
+
+    for setting in (*type(mission.tests).model_fields, *Tolerances.model_fields):
+        base = base_of(identifier, setting)
+        plain, tests = list(found(base)), mission.tests.model_copy(update=base["tests"])
+        reason = idle_reason(setting, identifier, tests, mission.zone)
+        tried = [list(found(base, *each)) for each in settings_of(setting, tests)]
+        changes = any([x[:2] for x in each] != [x[:2] for x in plain] for each in tried)
+        warnings = [warning for each in tried for *_, told in each for warning in told]
+        idle = [
+            text for text in warnings if f".{setting} is not used" in text or "test_off" in text
+        ]
+        assert changes == (reason is None), setting
+        assert bool(idle) == (reason is not None), setting

@@ -9,6 +9,7 @@ from sqlalchemy import func, select
 
 from service.acquire import acquire
 from service.advice.advice import advise
+from service.advice.zone_statements import zone_statements
 from service.app.advice_record import advice_record
 from service.errors import BadBatch, Busy, NotFound
 from service.observations.schema import OptionsIn, submission_from_json, tolerances_from_text
@@ -92,7 +93,9 @@ def test_a_stretch_bounds_the_sample(app, recorded):
 
 def test_of_a_batch_with_an_adopted_what_if_the_current_options_hold(app, make):
     first = app.submissions.submit(make(run="night"))
-    options = OptionsIn.model_validate({"tolerances": {"separation_deg": 0.01}})
+    options = OptionsIn.model_validate(
+        {"identifier": "starid", "tolerances": {"separation_deg": 0.01}}
+    )
     app.results.what_if(first.id, options, adopt=True)
     (batch,) = drawn_from(app, 10).batches
     assert batch.options.tolerances == {"separation_deg": 0.01}
@@ -112,7 +115,11 @@ def test_the_advice_is_that_of_the_batches_themselves_and_changes_nothing(
     with app.store.reading() as connection:
         sample = sample_batches(connection, Archive(None), ResultFilter("night", "XTE"), 1000)
     plain = advise(
-        mission, batches, lambda b: acquire(b, mission.within_zones, sky), {"separation_deg": 0.01}
+        mission,
+        batches,
+        lambda b: acquire(b, mission.within_zones, sky),
+        lambda b: acquire(b, mission, sky),
+        {"separation_deg": 0.01},
     )
     about = ("spacecraft", "run", "first", "last", "batches_in_range")
     assert [getattr(found, name) for name in about] == [
@@ -122,8 +129,9 @@ def test_the_advice_is_that_of_the_batches_themselves_and_changes_nothing(
         recorded[-1]["time"],
         BATCHES,
     ]
+    zone = zone_statements(mission, *app.zones.size("XTE", "night"))
     # Batches came in another order, which sums of floats may tell in their last digit.
-    expected = to_builtins(advice_record("XTE", "night", sample, plain))
+    expected = to_builtins(advice_record("XTE", "night", sample, plain, zone))
     given = to_builtins(found)
     # Advice on the gyro comes from recorded innovations, and none are recorded here.
     assert [(each["subject"], each["action"]) for each in given["innovations"]] == [

@@ -39,7 +39,7 @@ from tests.storage import twin
 from tests.storage.recount import assert_equal_to_a_recount
 from tests.storage.samples import START
 
-TIGHT = OptionsIn.model_validate({"tolerances": {"separation_deg": 1e-5}})
+TIGHT = OptionsIn.model_validate({"identifier": "starid", "tolerances": {"separation_deg": 1e-5}})
 KINDS = ("good", "suspect", "one_star", "spurious")
 OF_BATCHES = (
     batches,

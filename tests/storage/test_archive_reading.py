@@ -17,7 +17,7 @@ from service.storage.sql.tables import batches, results
 from service.times import shifted
 from tests.storage.samples import START
 
-TIGHT = OptionsIn.model_validate({"tolerances": {"separation_deg": 1e-5}})
+TIGHT = OptionsIn.model_validate({"identifier": "starid", "tolerances": {"separation_deg": 1e-6}})
 VOTES = OptionsIn.model_validate({"identifier": "starid", "tolerances": {"separation_deg": 1e-5}})
 KINDS = ("good", "suspect", "one_star", "spurious", "two_trackers")
 DAY_S = 86_400.0

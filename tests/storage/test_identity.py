@@ -134,7 +134,9 @@ def test_a_key_with_another_body_is_refused_before_anything_else_is_looked_at(ap
 
 def test_a_key_with_the_same_body_gets_the_first_answer_even_after_another_was_adopted(app, make):
     first = app.submissions.submit(make(), "key")
-    wider = OptionsIn.model_validate({"tolerances": {"separation_deg": 0.01}})
+    wider = OptionsIn.model_validate(
+        {"identifier": "starid", "tolerances": {"separation_deg": 0.01}}
+    )
     app.results.what_if(first.id, wider, record=True, adopt=True)
     assert app.submissions.submit(make(), "key").body == first.body
     assert app.submissions.submit(make()).body == first.body

@@ -47,7 +47,9 @@ def rows_of(database, tables):
 def present(opened, make, database):
     """What this version records: batches of every kind, what-ifs, keys; as rows by table."""
     app = opened()
-    tight = OptionsIn.model_validate({"tolerances": {"separation_deg": 1e-5}})
+    tight = OptionsIn.model_validate(
+        {"identifier": "starid", "tolerances": {"separation_deg": 1e-5}}
+    )
     for k, kind in enumerate(KINDS):
         id = app.submissions.submit(make(f"b{k}", kind=kind, after_s=k * 5_000.0), f"key-{k}").id
         app.results.what_if(id, tight, adopt=k % 2 == 0, record=True)

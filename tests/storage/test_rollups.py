@@ -14,7 +14,7 @@ from tests.storage.samples import KINDS
 pytestmark = pytest.mark.both_databases
 
 TIGHT = OptionsIn.model_validate({"identifier": "starid", "tolerances": {"separation_deg": 1e-5}})
-WIDE = OptionsIn.model_validate({"tolerances": {"separation_deg": 0.05}})
+WIDE = OptionsIn.model_validate({"identifier": "starid", "tolerances": {"separation_deg": 0.05}})
 
 BATCH = st.fixed_dictionaries(
     {

@@ -51,7 +51,7 @@ from service.times import shifted
 from tests.scale import draws
 from tests.storage.samples import START
 
-TIGHT = OptionsIn.model_validate({"tolerances": {"separation_deg": 1e-5}})
+TIGHT = OptionsIn.model_validate({"identifier": "starid", "tolerances": {"separation_deg": 1e-5}})
 KINDS = ("good", "suspect", "one_star", "spurious")
 
 

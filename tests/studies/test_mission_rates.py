@@ -22,7 +22,7 @@ BASELINE = ("phi_deg=0.0111111", "theta_deg=0.0111111")
 def plan_of(mission, *sweeps, seed=1, identifier="starid", zones=4, **given):
     settings = settings_of(one_tracker(mission, None), [Sweep.parsed(text) for text in sweeps])
     place = {"direction_deg": None, "within_deg": 180.0, "views": 10, "most_stars": 5} | given
-    return Plan(tuple(settings), identifier, zones=zones, seed=seed, **place)
+    return Plan(tuple(settings), identifier, {}, zones=zones, seed=seed, **place)
 
 
 class TestRates:

@@ -78,7 +78,7 @@ def walk(client: httpx.Client, app: App) -> Json:
     take("submit_frame", _send(client, "XTE", frame, file), "no_camera")
 
     here = f"{API}/batches/{first['id']}"
-    asked = {"options": {"tolerances": {"separation_deg": 0.02}}}
+    asked = {"options": {"identifier": "starid", "tolerances": {"separation_deg": 0.02}}}
     take("what_if", client.post(f"{here}/what-if", json=asked), "not_recorded", asked)
     asked = {"options": {"solver": "triad"}, "adopt": True}
     take("what_if", client.post(f"{here}/what-if", json=asked), "adopted", asked)
@@ -98,7 +98,7 @@ def walk(client: httpx.Client, app: App) -> Json:
     asked = {
         "spacecraft": "XTE",
         "sample": 5,
-        "b": {"tolerances": {"separation_deg": 1e-5}},
+        "b": {"identifier": "starid", "tolerances": {"separation_deg": 1e-5}},
     }
     take("compare", client.post(f"{API}/compare", json=asked), "tighter", asked)
     _alarm(client, take)

@@ -7,7 +7,7 @@ import httpx
 import pytest
 
 URL = "/api/v1/batches"
-OTHER = {"options": {"tolerances": {"separation_deg": 0.02}}}
+OTHER = {"options": {"identifier": "starid", "tolerances": {"separation_deg": 0.02}}}
 
 
 def what_if(client, id, **asked):

@@ -12,7 +12,7 @@ from service.cli.arguments import (
     count,
     print_json,
 )
-from service.cli.configuration import period_of, settings_of, settings_of_existing
+from service.cli.configuration import period_of, settings_of_existing
 
 
 def add(commands: Any) -> None:
@@ -58,15 +58,12 @@ def run(parsed: Namespace) -> int:
     import msgspec
     from tqdm import tqdm
 
-    from service.advice.zone_statements import zone_statements
     from service.app.factory import open_app
     from service.cli.advice_text import advice_text
-    from service.missions.mission import load_missions, mission_named
     from service.observations.schema import tolerances_from_text
 
     start, end = period_of(parsed)
     tolerances = tolerances_from_text(parsed.tolerance, "--try")
-    mission = mission_named(load_missions(settings_of(parsed).missions), parsed.spacecraft)
     app = open_app(settings_of_existing(parsed), reads_only=True)
     try:
         with tqdm(
@@ -81,11 +78,10 @@ def run(parsed: Namespace) -> int:
                 tolerances=tolerances,
                 step=bar.update,
             )
-        zone = zone_statements(mission, *app.zones.size(parsed.spacecraft, parsed.run))
     finally:
         app.close()
     if parsed.json:
         print_json(msgspec.to_builtins(advice))
     else:
-        print(advice_text(advice, zone))
+        print(advice_text(advice))
     return 0

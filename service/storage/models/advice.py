@@ -42,7 +42,9 @@ class ToleranceAdvice(Record, frozen=True, kw_only=True):
     share_beyond: Annotated[
         Estimate | None, doc("Share of the true pairs or stars that the present value rejects.")
     ]
-    recommended: float | None
+    recommended: Annotated[
+        float | None, doc("For votes; `not_used` says where the identifier is another.")
+    ]
     action: Action
     text: Text
 
@@ -51,6 +53,14 @@ class GroupAdvice(Record, frozen=True, kw_only=True):
     """Findings that no setting can correct: two groups of stars, mirrored axes."""
 
     component: ClassVar[str] = "GroupAdvice"
+    action: Action
+    text: Text
+
+
+class ZoneAdvice(Record, frozen=True, kw_only=True):
+    """A finding on the size of the zone, or on the largest separation of its pairs."""
+
+    component: ClassVar[str] = "ZoneAdvice"
     action: Action
     text: Text
 
@@ -166,7 +176,7 @@ class Change(Record, frozen=True, kw_only=True):
     """A line for the mission's file."""
 
     component: ClassVar[str] = "Change"
-    table: Literal["tolerances", "catalog", "trackers", "gyro"]
+    table: Literal["zone", "tolerances", "catalog", "trackers", "gyro"]
     tracker: str | None
     line: str
 
@@ -193,6 +203,7 @@ class Advice(Record, frozen=True, kw_only=True):
             "mirrored batches."
         ),
     ]
+    zone: Annotated[list[ZoneAdvice], doc("By the a priori errors of the run's latest batches.")]
     tolerances: list[ToleranceAdvice]
     noise: list[NoiseAdvice]
     magnitudes: list[MagnitudeAdvice]

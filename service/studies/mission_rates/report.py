@@ -30,30 +30,35 @@ def report_text(plan: Plan, rates: Sequence[Rates], at_most_ambiguous: float | N
 
 
 def heading(plan: Plan) -> list[str]:
-    """What was simulated: two lines."""
+    """What was simulated, in lines."""
     first = plan.settings[0]
     mission, errors = first.mission, first.errors
     where = "the whole sky"
     if plan.direction_deg is not None:
         ra_deg, dec_deg = plan.direction_deg
         where = f"{plan.within_deg:g} deg about RA {ra_deg:g}, Dec {dec_deg:g} deg"
-    told = {
-        "phi, theta, psi": f"{errors.phi_deg:g}, {errors.theta_deg:g}, {errors.psi_deg:g} deg",
-        "off axis": f"to {errors.off_axis_deg:g} deg",
-        "position": (
-            f"{errors.position_error_arcsec:.4g} arcsec per axis "
+    said = {
+        "phi_deg": f"phi {errors.phi_deg:g} deg",
+        "theta_deg": f"theta {errors.theta_deg:g} deg",
+        "psi_deg": f"psi {errors.psi_deg:g} deg",
+        "off_axis_deg": f"off axis to {errors.off_axis_deg:g} deg",
+        "position_error_arcsec": (
+            f"position {errors.position_error_arcsec:.4g} arcsec per axis "
             f"(SIGOBS {sigobs_arcsec(errors):.4g})"
         ),
-        "magnitude": f"{errors.magnitude_error_mag:g} mag",
+        "magnitude_error_mag": f"magnitude {errors.magnitude_error_mag:g} mag",
     }
-    return [
+    unswept = [text for name, text in said.items() if name not in first.values]
+    switched = [f"{name} {'on' if is_on else 'off'}" for name, is_on in plan.tests.items()]
+    lines = [
         (
             f"{mission.name}, {mission.trackers[0].name}, by {plan.identifier}: {plan.zones} zones "
             f"of {where}, {plan.views} views each, at most {plan.most_stars} stars a view, "
             f"seed {plan.seed}"
         ),
-        "Errors where not swept: " + "; ".join(f"{key} {value}" for key, value in told.items()),
+        "Errors that are not swept: " + ("; ".join(unswept) or "none"),
     ]
+    return [*lines, "Tests: " + ", ".join(switched)] if switched else lines
 
 
 def _table(rates: Sequence[Rates]) -> str:
@@ -102,12 +107,14 @@ def report_json(
     plan: Plan, rates: Sequence[Rates], at_most_ambiguous: float | None
 ) -> dict[str, Any]:
     """The report as plain values; rates are shares from 0 to 1 with 95 % intervals."""
-    mission = plan.settings[0].mission
+    first = plan.settings[0]
+    mission = first.mission
     met = None if at_most_ambiguous is None else meeting(rates, at_most_ambiguous)
     return {
         "mission": mission.name,
         "tracker": mission.trackers[0].name,
         "identifier": plan.identifier,
+        "tests": first.mission.tests.model_dump(),
         "direction_deg": plan.direction_deg,
         "within_deg": plan.within_deg,
         "zones": plan.zones,

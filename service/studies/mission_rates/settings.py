@@ -13,15 +13,13 @@ import numpy as np
 from pydantic import ValidationError
 
 from service.errors import BadInput, Fault, shown_value
-from service.missions.mission import Band, Mission, Tolerances
+from service.missions.mission import Band, Mission, Tolerances, idle_reason
 
 MOST_SETTINGS = 400
 MOST_DIGITS = 12
 """Of a value in a range: .3 + 3 * .2 is to be 0.9."""
 BOUND_SIGMAS = 6.0
 """The bound of magnitude errors: RCMAG of the paper's Table 1 is six times its SIGMAG."""
-USED_BY_ALL = ("pair_separation_max_deg",)
-"""Tolerances that every identifier of a zone uses; the others are those of the votes."""
 
 
 @dataclass(frozen=True)
@@ -214,13 +212,20 @@ def _with(mission: Mission, values: Mapping[str, float]) -> Mission:
     return mission.model_copy(update={"zone": zone, "tolerances": tolerances})
 
 
-def only_of_votes(sweeps: Sequence[Sweep]) -> list[str]:
-    """The swept tolerances that only identification by votes uses."""
-    return [
-        sweep.name
-        for sweep in sweeps
-        if sweep.name in Tolerances.model_fields and sweep.name not in USED_BY_ALL
-    ]
+def options_of_settings(sweeps: Sequence[Sweep], tests: Mapping[str, bool]) -> dict[str, str]:
+    """The tests and tolerances that are asked for, each with the option that does so."""
+    switches = {True: "--with", False: "--without"}
+    options = {name: switches[is_on] for name, is_on in tests.items()}
+    swept = [each.name for each in sweeps if each.name in Tolerances.model_fields]
+    return options | dict.fromkeys(swept, "--sweep")
+
+
+def refuse_idle(options: Mapping[str, str], mission: Mission, identifier: str) -> None:
+    """Raise `BadInput` naming an option whose test or tolerance changes nothing."""
+    for name, option in options.items():
+        reason = idle_reason(name, identifier, mission.tests, mission.zone)
+        if reason is not None:
+            raise BadInput(Fault(f"{option} {name}", f"{reason} and would change nothing"))
 
 
 def sigobs_arcsec(errors: Errors) -> float:

@@ -8,7 +8,7 @@ zone's number alone, not on how the work is shared out.
 import math
 import multiprocessing
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -47,12 +47,13 @@ OUTCOMES = {
 class Plan:
     """What is simulated: zones about axes drawn over the sky, or within an angle of a direction.
 
-    `within_deg` is RCCAT.  Each zone has `views` fields of view with at most `most_stars`
-    observed stars each.  All settings are of one tracker.
+    `within_deg` is RCCAT; `tests` are those switched on or off.  Each zone has `views` fields
+    of view with at most `most_stars` observed stars each.  All settings are of one tracker.
     """
 
     settings: tuple[Setting, ...]
     identifier: Identifier
+    tests: Mapping[str, bool]
     direction_deg: tuple[float, float] | None
     within_deg: float
     zones: int

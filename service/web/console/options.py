@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from service.acquire.choices import Choices
 from service.errors import BadBatch, Fault, shown_value
 from service.missions.identifiers import IDENTIFIERS
-from service.missions.mission import Mission, SolverName, Tests, Tolerances
+from service.missions.mission import Mission, SolverName, Tests, Tolerances, idle_reason
 from service.observations.schema import OptionsIn
 
 SYMBOLS: Mapping[str, str] = {
@@ -42,6 +42,8 @@ class FormField:
     before: Any
     choices: tuple[str, ...] = ()
     group: str = ""
+    idle: str | None = None
+    """Why it changes nothing; None where it may."""
 
     @property
     def changed(self) -> bool:
@@ -129,10 +131,24 @@ def settings_of_mission(mission: Mission) -> dict[str, Any]:
 
 
 def fields_of(
-    asked: Mapping[str, Any], before: Mapping[str, Any] | None, prefix: str = ""
+    asked: Mapping[str, Any],
+    before: Mapping[str, Any] | None,
+    prefix: str = "",
+    mission: Mission | None = None,
 ) -> list[FormField]:
-    """The fields of a form; without settings `before`, they start empty."""
+    """The fields of a form; without settings `before`, they start empty.
+
+    With a mission, those that change nothing under the form's identifier and tests say so.
+    """
     held = before or {}
+    in_force = before or ({} if mission is None else settings_of_mission(mission))
+
+    def idle(leaf: str) -> str | None:
+        if mission is None:
+            return None
+        tests = Tests.model_validate({**in_force["tests"], **asked.get("tests", {})})
+        identifier = asked.get("identifier", in_force["identifier"])
+        return idle_reason(leaf, identifier, tests, mission.zone)
 
     def field(leaf: str, group: str = "", choices: Iterable[str] = ()) -> FormField:
         at = held.get(group, {}) if group else held
@@ -145,7 +161,9 @@ def fields_of(
         value = wanted.get(leaf, was)
         words = label.replace("_", " ")
         symbol = SYMBOLS.get(leaf, "") if group == "tolerances" else ""
-        return FormField(name, words, symbol, unit, value, was, tuple(choices), group or "method")
+        why = idle(leaf) if group else None
+        group = group or "method"
+        return FormField(name, words, symbol, unit, value, was, tuple(choices), group, why)
 
     return [
         field("identifier", choices=tuple(IDENTIFIERS)),

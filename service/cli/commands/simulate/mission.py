@@ -10,6 +10,8 @@ from service.missions.identifiers import IDENTIFIERS
 
 IN_ZONES = [name for name, entry in IDENTIFIERS.items() if entry.searches_zone]
 VOTES = "starid"
+TESTS_USUALLY_ON = ("magnitude", "cross_product", "pole")
+TESTS_USUALLY_OFF = ("fov_rotation", "match_groups")
 DEFAULT_STARS = 10_000
 NOTES = """\
 names of a sweep, with the paper's where it has one:
@@ -69,16 +71,25 @@ def add(group: Any) -> None:
         "--without",
         action="append",
         default=[],
-        choices=("magnitude", "cross_product", "pole"),
+        choices=TESTS_USUALLY_ON,
         metavar="TEST",
-        help="switch a test off: magnitude, cross_product or pole; may be repeated",
+        help=f"switch a test of the votes off: {', '.join(TESTS_USUALLY_ON)}; may be repeated",
+    )
+    parser.add_argument(
+        "--with",
+        dest="with_",
+        action="append",
+        default=[],
+        choices=TESTS_USUALLY_OFF,
+        metavar="TEST",
+        help=f"switch a test of the votes on: {', '.join(TESTS_USUALLY_OFF)}; may be repeated",
     )
     parser.add_argument(
         "--identifier",
         choices=IN_ZONES,
         metavar="NAME",
-        help=f"{', '.join(IN_ZONES)}; default: {VOTES} where a tolerance is swept that only it "
-        "uses, else the mission's",
+        help=f"{', '.join(IN_ZONES)}; default: {VOTES} where a test or a tolerance is asked for "
+        "that only it uses, else the mission's",
     )
     _add_draws(parser)
     _add_outputs(parser)
@@ -158,7 +169,8 @@ def _plan(parsed: Namespace, mission: Any) -> Any:
     from service.studies.mission_rates.settings import (
         Sweep,
         one_tracker,
-        only_of_votes,
+        options_of_settings,
+        refuse_idle,
         settings_of,
     )
     from service.studies.mission_rates.simulation import Plan
@@ -169,19 +181,21 @@ def _plan(parsed: Namespace, mission: Any) -> Any:
         message = "must be from 0 to 180, beside a --direction"
         raise BadInput(Fault("--within", message, shown_value(parsed.within)))
     sweeps = [Sweep.parsed(text) for text in parsed.sweep]
-    of_votes = only_of_votes(sweeps)
+    tests = dict.fromkeys(parsed.without, False) | dict.fromkeys(parsed.with_, True)
+    options = options_of_settings(sweeps, tests)
+    used = IDENTIFIERS[mission.identifier].uses
+    of_votes = used is not None and not options.keys() <= used
     identifier = parsed.identifier or (VOTES if of_votes else mission.identifier)
     if identifier not in IN_ZONES:
         message = f"{mission.name} identifies by {identifier}, which uses no zone; give one of "
         raise BadInput(Fault("--identifier", message + ", ".join(IN_ZONES), identifier))
-    if of_votes and identifier != VOTES:
-        message = f"is not used by {identifier}; give --identifier {VOTES}"
-        raise BadInput(Fault("--sweep", message, of_votes[0]))
-    tests = mission.tests.model_copy(update=dict.fromkeys(parsed.without, False))
-    single = one_tracker(mission.model_copy(update={"tests": tests}), parsed.tracker)
+    switched = {"tests": mission.tests.model_copy(update=tests)}
+    single = one_tracker(mission.model_copy(update=switched), parsed.tracker)
+    refuse_idle(options, single, identifier)
     return Plan(
         settings=tuple(settings_of(single, sweeps)),
         identifier=identifier,
+        tests=tests,
         direction_deg=parsed.direction,
         within_deg=180.0 if parsed.direction is None else (parsed.within or 0.0),
         zones=-(-parsed.stars // (parsed.views * parsed.stars_per_view)),

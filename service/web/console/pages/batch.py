@@ -77,7 +77,8 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
         tried = answer_from_json(context.app.results.what_if(id, options).body)
     shown = tried or answer
     field = context.app.results.star_field(id, tried)
-    fields = fields_of(asked, batch_settings(held))
+    mission = context.app.context.known[answer.spacecraft]
+    fields = fields_of(asked, batch_settings(held), mission=mission)
     layout = context.layout(answer.run)
     return rendered(
         "batch.html.jinja",
@@ -100,8 +101,7 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
         timings_us=structs.asdict(shown.timings_us),
         tracks=_tracks(context, id, answer),
         around=context.app.results.neighbours(id),
-        other_settings=context.app.context.known[answer.spacecraft].digest
-        != answer.provenance.mission,
+        other_settings=mission.digest != answer.provenance.mission,
     )
 
 

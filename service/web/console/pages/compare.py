@@ -110,7 +110,7 @@ def compare_page(
         rates=rates,
         most_compared=MOST_COMPARED,
         spacecraft=context.spacecraft,
-        forms={side: fields_of(asked[side], None, f"{side}.") for side in SIDES},
+        forms={side: fields_of(asked[side], None, f"{side}.", mission) for side in SIDES},
         now={} if mission is None else settings_of_mission(mission),
         result=result,
         sides=SIDES,
