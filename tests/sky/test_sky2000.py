@@ -165,6 +165,16 @@ def test_cut_off_blanks_other_line_ends_and_compression_change_nothing(file, tmp
         assert other.digest == plain.digest
 
 
+def test_a_file_that_was_cut_off_within_a_record_is_refused(file):
+    """Also where the record has its magnitudes: what it lacks is not blank."""
+    path = file(written(**SIRIUS), written(**(SIRIUS | {"ID": 7})))
+    for kept in (300, 521 + 300):
+        cut = path.with_name(f"cut{kept}.dat")
+        cut.write_bytes(path.read_bytes()[:kept])
+        with pytest.raises(BadFile, match="without a line end"):
+            read_sky2000(cut)
+
+
 def test_a_component_whose_light_is_blended_into_another_is_not_counted_twice(file):
     """A and B in one blended magnitude, A's; of two that both show the sum, the first keeps it."""
     pair = {"ID_A": 1, "ID_B": 2}

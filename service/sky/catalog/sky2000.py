@@ -193,6 +193,8 @@ def _line_fault(raw: bytes, text: bytes) -> str | None:
         return f"must not be longer than {RECORD_BYTES} bytes"
     if len(text) < LEAST_BYTES:
         return f"must be {RECORD_BYTES} bytes long, or up to its magnitudes at least {LEAST_BYTES}"
+    if len(text) < RECORD_BYTES and not raw.endswith(b"\n"):
+        return "ends within a record, without a line end: the file was cut off"
     if not text.isascii() or not text.decode("ascii").isprintable():
         return "must hold printable ASCII characters only"
     if not text.startswith(DESIGNATION):
