@@ -206,6 +206,14 @@ def _trackers(mission: Mission) -> Iterator[Finding]:
 def _camera(key: str, tracker: Tracker) -> Iterator[Finding]:
     if tracker.camera is None:
         return
+    if tracker.camera.psf != "gaussian":
+        yield Finding(
+            "unusual",
+            f"{key}.camera.psf",
+            f"{tracker.camera.psf} is an image in light of one colour: without a narrow filter "
+            "stars leave light that it does not explain, and errors of places exceed their sigmas "
+            "by amounts that are not known",
+        )
     corner_deg, told_deg = tracker.camera.corner_radius_deg, tracker.field_of_view_radius_deg
     if not math.isclose(corner_deg, told_deg, rel_tol=CORNER_SHARE):
         yield Finding(
