@@ -687,3 +687,18 @@ def test_a_locale_that_has_no_sign_for_a_name_hides_no_result(tmp_path):
     found = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert found.returncode == 2
     assert "\\u03bd.toml: cannot be read: " in found.stderr
+
+
+def test_the_service_is_looked_for_where_the_settings_have_it_listen(
+    acquire, tmp_path, monkeypatch
+):
+    (tmp_path / "pass.ndjson").write_text("{}\n")
+    monkeypatch.setenv("ACQUIRE_HOST", "127.0.0.2")
+    monkeypatch.setenv("ACQUIRE_PORT", "1")
+    for where, options in (
+        ("http://127.0.0.2:1", ()),
+        ("http://127.0.0.3:1", ("--url", "http://127.0.0.3:1")),
+    ):
+        code, _, err = acquire("replay", "pass.ndjson", "--concurrency", "1", *options)
+        assert code == 2
+        assert where in err

@@ -2,7 +2,7 @@
 
 import logging
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -252,10 +252,10 @@ class Replays:
         require_cancellable(cancelled.state)
         return cancelled
 
-    def all(self) -> list[Replay]:
-        """The latest replays and their progress, newest first."""
+    def all(self, spacecraft: Collection[str] | None = None) -> list[Replay]:
+        """The latest replays, newest first; with `spacecraft`, see `list_replays`."""
         with self._context.reading_record() as connection:
-            return list_replays(connection)
+            return list_replays(connection, spacecraft)
 
     def get(self, id: str) -> Replay:
         """A replay and how far it is, with the lines that were refused."""

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-LOCAL = "http://127.0.0.1:8000"
+SERVICE = "the service; default: ACQUIRE_HOST and ACQUIRE_PORT, else http://127.0.0.1:8000"
 MISSION = "XTE, SWAS, SOHO, or one of your own"
 CAMERA_MISSION = "IMAGER, or one of your own whose tracker has a camera"
 

@@ -24,6 +24,14 @@ def settings_of(parsed: Namespace) -> Settings:
     return dataclasses.replace(Settings.from_environment(), **given)
 
 
+def service_url(parsed: Namespace) -> str:
+    """The address of the service: that of `--url`, else where the settings have it listen."""
+    from service.web.ports import url_of
+
+    settings = settings_of(parsed)
+    return parsed.url or url_of(settings.host, settings.port)
+
+
 def settings_of_existing(parsed: Namespace) -> Settings:
     """`settings_of` a command that reads records; raises `BadConfiguration` without a database.
 

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
+from service.cli.configuration import service_url
 from service.errors import AcquisitionError, Busy, Unauthenticated
 from service.settings import Settings
 
@@ -47,7 +48,7 @@ def frame_submitter(parsed: Namespace, settings: Settings) -> Iterator[FrameSubm
         headers = {} if settings.token is None else {"Authorization": f"Bearer {settings.token}"}
         # The service may listen to this machine alone, where no proxy reaches it.
         with httpx.Client(
-            base_url=parsed.url, timeout=TIMEOUT_S, trust_env=False, headers=headers
+            base_url=service_url(parsed), timeout=TIMEOUT_S, trust_env=False, headers=headers
         ) as client:
             yield _OverHttp(client)
 

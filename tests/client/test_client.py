@@ -471,3 +471,20 @@ def _so_far(client):
         yield event
         if event.data.get("text") == "until here":
             return
+
+
+def test_tokens_are_made_listed_and_revoked(chosen_database):
+    """The first token ends open access."""
+    app = open_app(in_process_settings(chosen_database()))
+    with Server(create_app(app)) as address:
+        tokens_through(address)
+
+
+def tokens_through(address):
+    with Client(address) as open_client:
+        made = open_client.create_token("ops", ["read", "operate"])
+    with Client(address, token=made.token) as client:
+        bound = client.create_token("pipeline", ["submit"], spacecraft=["XTE"], rate_per_s=5.0)
+        assert (bound.spacecraft, bound.state) == (["XTE"], "good")
+        assert client.revoke_token("pipeline").state == "revoked"
+        assert [each.name for each in client.tokens()] == ["ops", "pipeline"]

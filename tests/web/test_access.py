@@ -242,12 +242,20 @@ def test_a_bound_token_submits_reads_and_replays_its_own_spacecraft_alone(guarde
 
 
 def test_whoever_may_start_a_replay_may_follow_it(guarded, anybody, drawn):
-    """With `submit` alone too; the list of all replays is not theirs to read."""
+    """With `submit` alone too; the list of replays needs `read`."""
     submitting = guarded.of_scope["submit"]
     begun = replay_begun(anybody, submitting, drawn("XTE", 2), "run=followed")
     assert ended(anybody, begun, headers=shown(submitting))["counts"]["new"] == 2
     assert anybody.get("/api/v1/replays", headers=shown(submitting)).status_code == 403
-    assert anybody.get("/api/v1/replays", headers=shown(guarded.swas)).status_code == 403
+    # A bound token has those into runs of its spacecraft alone.
+    own = replay_begun(anybody, guarded.swas, drawn("SWAS", 2), "run=swas-alone")
+    ended(anybody, own, headers=shown(guarded.swas))
+    (found,) = (
+        each
+        for each in anybody.get("/api/v1/replays", headers=shown(guarded.swas)).json()["items"]
+        if each["run"] in ("followed", "swas-alone")
+    )
+    assert found["id"] == own.json()["id"]
     operating = shown(guarded.of_scope["operate"])
     refused = anybody.get(begun.headers["Location"], headers=operating)
     assert "needs the scope read or submit" in refused.json()["detail"]

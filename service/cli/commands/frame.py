@@ -9,7 +9,7 @@ from typing import Any
 
 from service.cli.arguments import (
     CAMERA_MISSION,
-    LOCAL,
+    SERVICE,
     add_command,
     add_database,
     degrees,
@@ -76,7 +76,7 @@ def add(commands: Any) -> None:
         "plane of a cube, the number of a TIFF page",
     )
     way = parser.add_mutually_exclusive_group()
-    way.add_argument("--url", default=LOCAL, help=f"the service; default {LOCAL}")
+    way.add_argument("--url", help=SERVICE)
     way.add_argument(
         "--in-process",
         action="store_true",

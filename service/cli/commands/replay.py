@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.cli.arguments import (
-    LOCAL,
+    SERVICE,
     add_command,
     add_database,
     add_json,
@@ -13,7 +13,7 @@ from service.cli.arguments import (
     print_json,
     speed,
 )
-from service.cli.configuration import settings_of
+from service.cli.configuration import service_url, settings_of
 from service.errors import BadFile, BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def add(commands: Any) -> None:
     )
     _add_packets(parser)
     way = parser.add_mutually_exclusive_group()
-    way.add_argument("--url", default=LOCAL, help=f"the service; default {LOCAL}")
+    way.add_argument("--url", help=SERVICE)
     way.add_argument(
         "--in-process",
         action="store_true",
@@ -190,12 +190,12 @@ def run(parsed: Namespace) -> int:
         if parsed.database is not None:
             message = "goes with --in-process; a running service has its own"
             raise BadInput(Fault("--database", message, shown_value(parsed.database)))
-        token = settings_of(parsed).token
+        url, token = service_url(parsed), settings_of(parsed).token
         with ReplaySummary(sized, parsed.results, progress) as summary:
             if not in_bulk:
                 many = parsed.concurrency or DEFAULT_CONCURRENCY
                 replay_over_http(
-                    parsed.url,
+                    url,
                     items,
                     summary.add,
                     pace,
@@ -206,7 +206,7 @@ def run(parsed: Namespace) -> int:
                 )
             else:
                 replay_in_bulk(
-                    parsed.url,
+                    url,
                     files,
                     run,
                     summary.add,

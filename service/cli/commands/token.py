@@ -6,8 +6,8 @@ The commands write into the database; where a service writes to its SQLite file,
 from argparse import ArgumentParser, Namespace
 from typing import Any
 
-from service.cli.arguments import add_command, add_database, add_group, add_json, count
-from service.cli.configuration import settings_of, settings_of_existing
+from service.cli.arguments import SERVICE, add_command, add_database, add_group, add_json, count
+from service.cli.configuration import service_url, settings_of, settings_of_existing
 
 
 def add(commands: Any) -> None:
@@ -86,8 +86,7 @@ def add_service(parser: ArgumentParser) -> None:
     """Declare the database, and the service that may be writing to it."""
     parser.add_argument(
         "--url",
-        help="the service that writes to the SQLite file, which then makes the change; default: "
-        "ACQUIRE_HOST and ACQUIRE_PORT, else http://127.0.0.1:8000",
+        help=f"{SERVICE}.  Where it writes to the SQLite file, it makes the change",
     )
     add_database(parser)
 
@@ -95,12 +94,10 @@ def add_service(parser: ArgumentParser) -> None:
 def create(parsed: Namespace) -> int:
     """Make a token and print it."""
     from service.cli import tokens
-    from service.web.ports import url_of
 
-    settings = settings_of(parsed)
     return tokens.create(
-        settings,
-        parsed.url or url_of(settings.host, settings.port),
+        settings_of(parsed),
+        service_url(parsed),
         parsed.name,
         parsed.scope,
         parsed.spacecraft,
@@ -119,7 +116,5 @@ def show(parsed: Namespace) -> int:
 def revoke(parsed: Namespace) -> int:
     """End a token."""
     from service.cli import tokens
-    from service.web.ports import url_of
 
-    settings = settings_of_existing(parsed)
-    return tokens.revoke(settings, parsed.url or url_of(settings.host, settings.port), parsed.name)
+    return tokens.revoke(settings_of_existing(parsed), service_url(parsed), parsed.name)

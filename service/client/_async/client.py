@@ -1,7 +1,9 @@
 """The client: every part together."""
 
-from ..encoding import path_of
-from ..models import Session
+from collections.abc import Sequence
+
+from ..encoding import decoded, path_of
+from ..models import NewToken, Session, Token, TokenList
 from .alarms import AsyncAlarms
 from .batches import AsyncBatches
 from .calibrations import AsyncCalibrations
@@ -36,6 +38,29 @@ class AsyncClient(
         ['operate', 'read', 'submit']
         """
         return await self.get(Session, path_of("session"))
+
+    async def tokens(self) -> Sequence[Token]:
+        """Every token without its secret, the oldest first."""
+        return (await self.get(TokenList, path_of("tokens"))).items
+
+    async def create_token(
+        self,
+        name: str,
+        scopes: Sequence[str],
+        *,
+        spacecraft: Sequence[str] | None = None,
+        days: int = 365,
+        rate_per_s: float | None = None,
+    ) -> NewToken:
+        """Make a token; its secret is in this answer alone.  The first one ends open access."""
+        asked = {"name": name, "scopes": list(scopes), "days": days, "rate_per_s": rate_per_s}
+        asked["spacecraft"] = None if spacecraft is None else list(spacecraft)
+        return await self.post(NewToken, path_of("tokens"), asked)
+
+    async def revoke_token(self, name: str) -> Token:
+        """End a token at once, with the sessions that were begun with it; raises `NotFound`."""
+        revoked: Token = decoded(await self.request("DELETE", path_of("tokens", name)), Token)
+        return revoked
 
     def events(
         self,

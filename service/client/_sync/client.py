@@ -1,7 +1,9 @@
 """The client: every part together."""
 
-from ..encoding import path_of
-from ..models import Session
+from collections.abc import Sequence
+
+from ..encoding import decoded, path_of
+from ..models import NewToken, Session, Token, TokenList
 from .alarms import Alarms
 from .batches import Batches
 from .calibrations import Calibrations
@@ -34,6 +36,29 @@ class Client(Batches, Spacecraft, Alarms, Replays, Gyro, Calibrations):
         ['operate', 'read', 'submit']
         """
         return self.get(Session, path_of("session"))
+
+    def tokens(self) -> Sequence[Token]:
+        """Every token without its secret, the oldest first."""
+        return (self.get(TokenList, path_of("tokens"))).items
+
+    def create_token(
+        self,
+        name: str,
+        scopes: Sequence[str],
+        *,
+        spacecraft: Sequence[str] | None = None,
+        days: int = 365,
+        rate_per_s: float | None = None,
+    ) -> NewToken:
+        """Make a token; its secret is in this answer alone.  The first one ends open access."""
+        asked = {"name": name, "scopes": list(scopes), "days": days, "rate_per_s": rate_per_s}
+        asked["spacecraft"] = None if spacecraft is None else list(spacecraft)
+        return self.post(NewToken, path_of("tokens"), asked)
+
+    def revoke_token(self, name: str) -> Token:
+        """End a token at once, with the sessions that were begun with it; raises `NotFound`."""
+        revoked: Token = decoded(self.request("DELETE", path_of("tokens", name)), Token)
+        return revoked
 
     def events(
         self,

@@ -41,6 +41,7 @@ from .gyro import GyroBlock, GyroSamples
 from .replays import (
     ApidPackets,
     LineProblem,
+    NewToken,
     RefusedLine,
     Replay,
     ReplayCounts,
@@ -49,6 +50,8 @@ from .replays import (
     Run,
     RunState,
     Session,
+    Token,
+    TokenList,
 )
 from .spacecraft import (
     AttitudeRow,
@@ -100,6 +103,7 @@ __all__ = [
     "LiveAttitude",
     "MissionNow",
     "MissionThen",
+    "NewToken",
     "Provenance",
     "RankedBatch",
     "Ranking",
@@ -126,6 +130,8 @@ __all__ = [
     "StarRef",
     "Summary",
     "Timings",
+    "Token",
+    "TokenList",
     "Track",
     "TrackList",
     "TrackPoint",

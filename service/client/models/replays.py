@@ -120,6 +120,31 @@ class Replay(Model, frozen=True):
     errors: Sequence[RefusedLine]
 
 
+class Token(Model, frozen=True, kw_only=True):
+    """A token without its secret; `state` is good, expired or revoked."""
+
+    name: str
+    scopes: Sequence[str]
+    spacecraft: Sequence[str] | None
+    rate_per_s: float | None
+    created: str
+    expires: str
+    revoked: str | None
+    state: str
+
+
+class NewToken(Token, frozen=True, kw_only=True):
+    """A new token with its secret, which is in this answer alone."""
+
+    token: str
+
+
+class TokenList(Model, frozen=True):
+    """All tokens, the oldest first."""
+
+    items: Sequence[Token]
+
+
 class Session(Model, frozen=True):
     """The caller and its scopes; `spacecraft` is None where the token is bound to none."""
 

@@ -18,6 +18,7 @@ from service.storage.models.runs import (
     ReplayStateName,
 )
 from service.storage.recording import events
+from service.storage.sql.rollup_tables import rollups_daily
 from service.storage.sql.tables import replays
 
 MAX_LISTED = 100
@@ -42,9 +43,17 @@ def read_replay(connection: Connection, id: str) -> Replay:
     return replay
 
 
-def list_replays(connection: Connection) -> list[Replay]:
-    """The latest replays and their progress, newest first."""
+def list_replays(connection: Connection, spacecraft: Collection[str] | None = None) -> list[Replay]:
+    """The latest replays and their progress, newest first.
+
+    With `spacecraft`, those into runs that hold batches of these alone.
+    """
     query = select(replays).order_by(replays.c.id.desc()).limit(MAX_LISTED)
+    if spacecraft is not None:
+        batches = rollups_daily.c
+        own = select(batches.run).where(batches.spacecraft.in_(spacecraft))
+        others = select(batches.run).where(batches.spacecraft.not_in(spacecraft))
+        query = query.where(replays.c.run.in_(own), replays.c.run.not_in(others))
     return [_replay(row) for row in connection.execute(query).mappings()]
 
 

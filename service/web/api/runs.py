@@ -151,9 +151,12 @@ def forget_run(
     dependencies=[NO_QUERY],
     **route_docs({200: ResponseDoc("The latest hundred replays.", ReplayList)}),
 )
-def list_replays(app: AppDep) -> Response:
-    """The latest replays and their progress, newest first."""
-    return json_response(ReplayList(items=app.replays.all()))
+def list_replays(app: AppDep, caller: CallerDep) -> Response:
+    """The latest replays and their progress, newest first.
+
+    A token that is bound to spacecraft sees those into runs with batches of these alone.
+    """
+    return json_response(ReplayList(items=app.replays.all(caller.spacecraft)))
 
 
 @router.post(

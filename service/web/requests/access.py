@@ -98,7 +98,7 @@ POLICIES: dict[str, Policy] = {
     "drop_zones": Policy("operate", "query"),
     "list_runs": Policy("read", "nothing"),
     "start_replay": Policy("submit", "body"),
-    "list_replays": READ,
+    "list_replays": Policy("read", "nothing"),
     # Its id is unguessable: only the client that started it and readers of everything know it.
     "get_replay": Policy("read", "nothing", or_scope="submit"),
     # Of tokens that are bound to spacecraft only the one that started it: see the handler.

@@ -16,7 +16,7 @@ from service.web.requests.access import READ, Policy
 def runs_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
     """Every run, and the replays and reprocessings with their progress.
 
-    A token that is bound to spacecraft sees the runs of these: a replay may be about any.
+    A token that is bound to spacecraft sees the runs of these, and the replays into these runs.
     """
     bound = context.caller.spacecraft is not None
     return rendered(
@@ -24,7 +24,7 @@ def runs_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Re
         context.layout(query.run),
         runs=context.app.runs.all(context.caller.spacecraft),
         reprocessings=[] if bound else context.app.runs.reprocessings(),
-        replays=[] if bound else context.app.replays.all(),
+        replays=context.app.replays.all(context.caller.spacecraft),
         bound=bound,
         now=utc_now(),
     )
