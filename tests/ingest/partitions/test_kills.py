@@ -93,6 +93,7 @@ def wait_for_parts(place, count, process):
     )
 
 
+@pytest.mark.slow
 def test_a_dask_scheduler_whose_workers_come_and_go_makes_the_same_bytes(
     folders, undisturbed, check, tmp_path
 ):
