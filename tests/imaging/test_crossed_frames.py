@@ -8,7 +8,7 @@ from pydantic import ValidationError
 from scipy.ndimage import gaussian_filter
 
 from service.imaging.centroids.centroid import METHODS
-from service.imaging.centroids.sampled_psf import airy_psf, cross_psf, wired_psf
+from service.imaging.centroids.sampled_psf import airy_psf, wired_psf
 from service.imaging.detection.detect import detect
 from service.imaging.detection.measure import measure
 from service.imaging.detection.star_image import psf_of, still_psf
@@ -113,16 +113,6 @@ def test_a_frame_full_of_points_is_bounded_work(crossed, rng):
     assert len(u) > MOST_IMAGES
     assert len(found.images.stars) == MOST_IMAGES
     assert found.count >= MOST_IMAGES
-
-
-def test_wires_along_the_axes_make_the_cross_of_the_report():
-    wires = [(-0.25, 0.1), (0.25, 0.1)]
-    old = cross_psf(1.0, wires, wires, 0.5, 1.0, reach_px=16)
-    places = [(turn, at, width) for turn in (0.0, 90.0) for at, width in wires]
-    new = wired_psf(2.0, places, reach_px=16)
-    grid = np.arange(-12.0, 13.0)
-    expected = old.pixel(grid[None, :], grid[:, None])
-    assert new.pixel(grid[None, :], grid[:, None]) == pytest.approx(expected, abs=1e-9)
 
 
 def test_without_wires_there_is_the_airy_disc():

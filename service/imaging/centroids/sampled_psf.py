@@ -14,8 +14,8 @@ from scipy.special import j1
 
 from service.errors import BadInput, Fault
 from service.imaging.centroids.psf import Array
-from service.imaging.optics.pupil import behind_wires, between_wires, disc
-from service.imaging.optics.spectrum import Spectrum, monochromatic
+from service.imaging.optics.pupil import behind_wires, disc
+from service.imaging.optics.spectrum import monochromatic
 from service.imaging.optics.transfer import image_of
 
 LEAST_SAMPLES_PER_PX = 3
@@ -140,34 +140,6 @@ def airy_psf(
     # The light of the whole plane: the open area, by Parseval.
     total = 4.0 / math.pi * (lambda_over_d_px * samples) ** 2 / ring
     return SampledPsf(image, samples, total, jitter_px)
-
-
-def cross_psf(
-    diameter_m: float,
-    wires_x_m: Sequence[tuple[float, float]],
-    wires_y_m: Sequence[tuple[float, float]],
-    pixel_rad: float,
-    spectrum: Spectrum | float,
-    reach_px: int = 32,
-    jitter_px: float = 0.0,
-    cells_across: int = 512,
-) -> SampledPsf:
-    """The cross of wires before a circular aperture (report, part IV).
-
-    `wires_x_m`: (place along x, diameter) of wires that run along y, and the like for
-    `wires_y_m`; `spectrum` a wavelength in metres, or the light by number of photons.
-    """
-    light = monochromatic(spectrum) if isinstance(spectrum, (int, float)) else spectrum
-    clear = disc(cells_across, diameter_m / cells_across, diameter_m / 2.0)
-    place = clear.places_m
-    open_x = between_wires(place, clear.cell_m, wires_x_m)
-    open_y = between_wires(place, clear.cell_m, wires_y_m)
-    pupil = clear.behind(open_y[:, None] * open_x[None, :])
-    shortest = float(light.wavelength_m.min())
-    samples = max(LEAST_SAMPLES_PER_PX + 1, math.ceil(6.0 * pixel_rad * diameter_m / shortest))
-    image = image_of(pupil, light, pixel_rad / samples, reach_px * samples, photons=True)
-    total = pupil.open_area_m2 / image.step_rad**2
-    return SampledPsf(image.intensity, samples, total, jitter_px)
 
 
 def wired_psf(

@@ -55,15 +55,6 @@ class Spectrum:
             total += power * np.exp(1j * omega * delay)
         return total / (2.0 * math.pi)
 
-    def at_the_image(self, photons: bool = False) -> "Spectrum":
-        """The spectrum that weighs the colours of an image: S / lambda² (see `transfer`).
-
-        A detector that counts photons sees lambda times that.
-        """
-        exponent = 1 if photons else 2
-        scale = (self.mean_wavelength_m / self.wavelength_m) ** exponent
-        return Spectrum(self.omega_rad_per_s, self.power * scale)
-
 
 def monochromatic(wavelength_m: float) -> Spectrum:
     """Light of one colour."""

@@ -43,15 +43,6 @@ class PointImage:
         reach = self.intensity.shape[0] // 2
         return np.arange(-reach, reach + 1) * self.step_rad
 
-    def encircled(self, radius_rad: npt.ArrayLike) -> Array:
-        """The share of the held light within circles about the star."""
-        angle = self.angles_rad
-        distance = np.hypot(angle[None, :], angle[:, None]).ravel()
-        order = np.argsort(distance)
-        summed = np.cumsum(self.intensity.ravel()[order])
-        place = np.searchsorted(distance[order], np.asarray(radius_rad), side="right")
-        return np.asarray(np.concatenate([[0.0], summed])[place] / summed[-1])
-
 
 def image_by_fft(pupil: Pupil, wavelength_m: float) -> PointImage:
     """One colour's image over all directions that the grid of the pupil resolves.
@@ -116,7 +107,7 @@ def image_by_functional(
     """2.23 itself: 2 pi times the sum of phi e_hh(-(u D1 + v D2) / (c f)), at pairs (p, q).
 
     `phi` (odd, odd) at steps of `cell_m`.  Of the plain spectrum this is the report's
-    form; with `Spectrum.at_the_image` it is right in colour, up to a constant.
+    form; with S / lambda² in its place it is right in colour, up to a constant.
     """
     reach = phi.shape[0] // 2
     place = np.arange(-reach, reach + 1) * cell_m

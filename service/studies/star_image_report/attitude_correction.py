@@ -42,7 +42,9 @@ def by_two_scans(a1: float, b1: float, a2: float, b2: float, half_distance: floa
     """
     if half_distance <= 0.0:
         raise BadInput(Fault("half_distance", "must be above zero", str(half_distance)))
-    roll = math.atan((b1 - b2) / (a1 - a2 - 2.0 * half_distance))
+    roll = math.atan2(b2 - b1, 2.0 * half_distance - a1 + a2)
+    if abs(roll) > math.pi / 2.0:
+        roll -= math.copysign(math.pi, roll)
     return Misalignment((a1 + a2) / 2.0, (b1 + b2) / 2.0, roll)
 
 

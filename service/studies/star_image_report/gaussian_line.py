@@ -74,11 +74,6 @@ def null_fill(relative_width: float, report_weight: bool = False) -> float:
     return float(ring / centre)
 
 
-def coherence_length_m(wavelength_m: float, relative_width: float) -> float:
-    """C / sigma: beyond this path difference the colours of the line no longer interfere."""
-    return wavelength_m / (2.0 * math.pi * relative_width)
-
-
 def omega_of(wavelength_m: float) -> float:
     """Angular frequency of a wavelength."""
     return 2.0 * math.pi * LIGHT_SPEED_M_PER_S / wavelength_m

@@ -34,11 +34,6 @@ class Hump:
     R: float = 0.0
     T: float = 0.0
 
-    @property
-    def is_of_fourth_order(self) -> bool:
-        """Whether all five unknowns can be told apart."""
-        return (self.Q, self.R, self.T) != (0.0, 0.0, 0.0)
-
     def intensity(self, u: npt.ArrayLike, v: npt.ArrayLike) -> Array:
         """Phi(u, v)."""
         u, v = np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64)

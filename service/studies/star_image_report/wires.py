@@ -156,15 +156,3 @@ def shares_of_light(
 def order_angle_rad(order: int, wavelength_m: float, mesh: Mesh) -> float:
     """Where the principal maxima of the mesh stand: m lambda / d."""
     return order * wavelength_m / mesh.pitch_m
-
-
-def order_place_m(
-    order: int, wavelength_m: float, mesh: Mesh, focal_length_m: float, sensor_distance_m: float
-) -> float:
-    """The same on the sensor, for a mesh `sensor_distance_m` before it.
-
-    Before the lens that is the focal length; behind it the tails shrink with the
-    distance, and the same light is brighter.
-    """
-    distance = min(sensor_distance_m, focal_length_m)
-    return order_angle_rad(order, wavelength_m, mesh) * distance

@@ -17,7 +17,7 @@ def turned(points, roll, du, dv):
 PAIR = np.array([[-0.05, 0.0], [0.05, 0.0]])
 
 
-@pytest.mark.parametrize("roll", [0.01, 0.2, -0.7])
+@pytest.mark.parametrize("roll", [0.01, 0.2, -0.7, math.pi / 2, -math.pi / 2])
 def test_two_stars_tell_a_roll_and_a_move_exactly(roll):
     seen = turned(PAIR, roll, 0.003, -0.002)
     (a1, b1), (a2, b2) = seen - PAIR

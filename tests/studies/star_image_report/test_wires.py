@@ -11,7 +11,6 @@ from service.studies.star_image_report.wires import (
     first_tail_null_rad,
     mesh_intensity,
     order_angle_rad,
-    order_place_m,
     shares_of_light,
     tail,
 )
@@ -134,10 +133,3 @@ def test_the_null_that_both_share_stays():
     p = np.array([1.5, 2.0]) * LASER_M / THIN_M
     lobe, common = tail(filtered(DIAMETER_M, pair(0.271), []), LASER_M, p, FRINGE_RAD)
     assert common < 0.02 * lobe
-
-
-def test_a_mesh_behind_the_lens_makes_shorter_tails():
-    focal = 0.35
-    before = order_place_m(1, LASER_M, MESH, focal, 2.0)
-    assert before == order_place_m(1, LASER_M, MESH, focal, focal)
-    assert order_place_m(1, LASER_M, MESH, focal, focal / 4) == pytest.approx(before / 4)
