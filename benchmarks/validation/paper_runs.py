@@ -22,6 +22,8 @@ from service.studies.paper_1994.experiments import run_experiments
 from service.studies.paper_1994.plots import draw
 from service.studies.paper_1994.printed import Run, the_paper
 from service.studies.paper_1994.region import differences, is_inside
+from service.studies.paper_1994.report import PAPER_IDENTIFIER
+from service.studies.paper_1994.report import measured as measured_times
 from service.studies.paper_1994.tables import TITLES
 from service.studies.paper_1994.tally import AMBIGUOUS, MISIDENTIFIED, UNMATCHED, Tally
 
@@ -117,12 +119,12 @@ def write(quick: bool, seed: int) -> Written:
     with tempfile.TemporaryDirectory() as folder:
         plots = Path(folder) / "plots"
         draw(votes, plots)
+        times = measured_times(list(TITLES), seeds[0], PAPER_IDENTIFIER)
         pages = {
-            name: document(tallies, of_seeds, plots, Path(folder) / name)
-            for name, tallies, of_seeds in (
-                ("paper.md", votes, seeds),
-                ("paper-verified.md", verified, seeds[:1]),
-            )
+            "paper.md": document(votes, seeds, times, plots, Path(folder) / "paper.md"),
+            "paper-verified.md": document(
+                verified, seeds[:1], (), plots, Path(folder) / "paper-verified.md"
+            ),
         }
         pictures = {path.name: path.read_text("utf-8") for path in sorted(plots.glob("*.svg"))}
     pictures |= pictures_of("paper", lambda folder: _draw(votes, verified, folder))

@@ -14,6 +14,7 @@ from service.studies.ptp_2015.comparison import (
     all_projections,
     compare,
     databases,
+    false_fields,
     stars_in_fields,
 )
 from service.studies.ptp_2015.document import document
@@ -27,7 +28,9 @@ ALL = "ptp"
 """Names every table and figure together."""
 
 CASES: Mapping[str, Sequence[Case]] = {
+    "ptp-1": [],
     "ptp-2": [],
+    "ptp-3": [],
     "figure-6": [],
     "figure-7": [],
     "ptp-5": [Case("ptp-5", SLAVES, 0.0)],
@@ -38,6 +41,7 @@ CASES: Mapping[str, Sequence[Case]] = {
     "figure-13": [
         Case("figure-13", OF_THE_PAPER, 0.0, mag) for mag in (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
     ],
+    "ptp-false": [],
 }
 
 
@@ -98,12 +102,13 @@ def measured(
         {name: [tally for tally in tallies if tally.case.name == name] for name in wanted},
         stars_in_fields(scenes, seed) if "figure-10" in wanted else None,
         databases(list(names)),
+        false_fields(scenes, seed) if "ptp-false" in wanted else (),
         all_projections() if any(name in OF_PROJECTIONS for name in wanted) else None,
     )
 
 
 def rows_of(found: Measurements) -> list[dict[str, Any]]:
-    """One row per condition and algorithm, one of Figure 10, and those of Table 2."""
+    """One row per condition and algorithm, and those of the tables of projections."""
     rows: list[dict[str, Any]] = [
         tally.row() for tallies in found.tallies.values() for tally in tallies
     ]
@@ -118,8 +123,10 @@ def rows_of(found: Measurements) -> list[dict[str, Any]]:
                 "more_than_8": int((found.stars > 8).sum()),
             }
         )
-    if found.projections is not None and "ptp-2" in found.tallies:
-        rows += found.projections.rows()
+    rows += map(dict, found.false_fields)
+    if found.projections is not None:
+        for name in OF_PROJECTIONS:
+            rows += found.projections.rows(name) if name in found.tallies else []
     return rows
 
 

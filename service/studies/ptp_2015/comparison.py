@@ -135,6 +135,38 @@ def _ask(algorithm: Algorithm, scene: Scene) -> tuple[int, ...]:
     )
 
 
+def false_fields(scenes: int, seed: int) -> list[dict[str, str | int]]:
+    """Mirrored skies, and fields of as many random points, that PTP names stars of, at 2 px.
+
+    Counted are fields with three stars or more by sharing stars, and behind the attitude check.
+    """
+    case, rng = Case("ptp-false", ("PTP",), 2.0), np.random.default_rng([seed, 2])
+    half = np.tan(np.radians(5.0))
+    told_rad = case.position_px * case.conditions.camera.pixel_rad
+    counts = {"mirrored sky": np.zeros(2, int), "random points": np.zeros(2, int)}
+    for scene in draw_scenes(_sky(0.0), case.conditions, scenes, seed):
+        points = rng.uniform(-half, half, (len(scene.direction), 2))
+        drawn = np.column_stack([points, np.ones(len(points))])
+        fields = {
+            "mirrored sky": scene.direction * (-1.0, 1.0, 1.0),
+            "random points": drawn / np.linalg.norm(drawn, axis=1)[:, None],
+        }
+        for name, direction in fields.items():
+            sigma_rad = np.full(len(direction), told_rad)
+            row = _ask(_database("PTP"), replace(scene, direction=direction, sigma_rad=sigma_rad))
+            counts[name] += row[1] >= 3, row[3] >= 3
+    return [
+        {
+            "table": "ptp-false",
+            "fields": name,
+            "scenes": scenes,
+            "sharing": int(sharing),
+            "checked": int(checked),
+        }
+        for name, (sharing, checked) in counts.items()
+    ]
+
+
 def databases(names: Sequence[str] = COMPARED) -> list[Database]:
     """Each algorithm's database, built twice: compiling is no part of the second time."""
     made = []

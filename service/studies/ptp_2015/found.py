@@ -21,6 +21,7 @@ class Measurements:
     tallies: Mapping[str, Sequence[Tally]]
     stars: npt.NDArray[np.int64] | None = None
     databases: Sequence[Database] = field(default_factory=tuple)
+    false_fields: Sequence[Mapping[str, str | int]] = ()
     projections: Projections | None = None
     """Of the sky's triangles, for Table 2 and Figures 6 and 7."""
 

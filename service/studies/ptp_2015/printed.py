@@ -53,6 +53,10 @@ class Printed:
     mean_projection: float
     table_1: tuple[tuple[int, float], ...]
     """Index and projection of the nine rows that are printed."""
+    table_1_sides: tuple[tuple[float, ...], ...]
+    """The three sides of each of these rows."""
+    table_3: dict[str, Any]
+    """Four triangles: stars of the field and their SAO numbers; the stars that are identified."""
     table_2: tuple[tuple[int, int], ...]
     """Limit index and k-vector."""
     catalog_stars: int
@@ -73,6 +77,8 @@ def the_ptp_paper() -> Printed:
         axis=tuple(data["table_1"]["axis"]),
         mean_projection=data["table_1"]["mean_projection"],
         table_1=tuple((index, value) for index, value in data["table_1"]["rows"]),
+        table_1_sides=tuple(map(tuple, data["table_1"]["sides"])),
+        table_3=data["table_3"],
         table_2=tuple((index, count) for index, count in data["table_2"]),
         catalog_stars=data["catalog_stars"],
         table_5=tuple(Slaves(**row) for row in data["table_5"]),

@@ -12,6 +12,7 @@ from service.sky.geometry.kvector import KVector, build_kvector
 from service.sky.geometry.triangles import TriangleIndex, build_triangles
 from service.studies.paper_1994.tables import markdown
 from service.studies.ptp_2015.printed import the_ptp_paper
+from service.studies.ptp_2015.rivals.proposed import proposed_by_votes
 from service.vectors import Vector
 
 SHOWN_EVERY = 25
@@ -32,8 +33,16 @@ class Projections:
     once: KVector
     three: KVector
 
-    def rows(self) -> list[dict[str, int | float | str]]:
-        """Table 2 as rows of a file."""
+    def rows(self, name: str) -> list[dict[str, Any]]:
+        """A table or figure as rows of a file."""
+        if name == "ptp-1":
+            return rows_of_table_1()
+        if name == "ptp-3":
+            return rows_of_table_3()
+        if name == "figure-6":
+            return [row_of_figure_6(self)]
+        if name == "figure-7":
+            return rows_of_figure_7(self)
         return [
             {"table": "ptp-2", "index": index, "paper": paper, "ours": ours, "three_slaves": three}
             for index, paper, ours, three in self.table_2()
@@ -59,6 +68,79 @@ def _once(index: TriangleIndex) -> KVector:
     order = np.argsort(index.star[:, 0], kind="stable")
     _, first = np.unique(np.sort(index.star[order], axis=1), axis=0, return_index=True)
     return build_kvector(index.projection.value[np.sort(order[first])])
+
+
+def recovered_axis() -> tuple[Vector, float]:
+    """The axis and the mean projection of Table 1: four unknowns of nine equations."""
+    paper = the_ptp_paper()
+    sides, printed = np.array(paper.table_1_sides), np.array([row[1] for row in paper.table_1])
+    unknowns = np.linalg.lstsq(np.column_stack([sides, -np.ones(len(sides))]), printed)[0]
+    return unknowns[:3], float(unknowns[3])
+
+
+def rows_of_table_1() -> list[dict[str, Any]]:
+    """The printed triangles: sides, the projection that is printed, and by the recovered axis."""
+    axis, mean = recovered_axis()
+    paper = the_ptp_paper()
+    return [
+        {
+            "table": "ptp-1",
+            "index": index,
+            "sides": list(sides),
+            "paper": printed,
+            "ours": float(np.dot(sides, axis) - mean),
+        }
+        for (index, printed), sides in zip(paper.table_1, paper.table_1_sides, strict=True)
+    ]
+
+
+def table_1(found: Projections) -> str:
+    """Table 1: the printed projections, and those that its sides give on the recovered axis."""
+    axis, mean = recovered_axis()
+    lines = [
+        (
+            f"{row['index']:,}",
+            *(f"{side:.5f}" for side in row["sides"]),
+            f"{row['paper']:.5f}",
+            f"{row['ours']:.5f}",
+        )
+        for row in rows_of_table_1()
+    ]
+    text = markdown(("index", "side 1", "side 2", "side 3", "paper: P", "P of the sides"), lines)
+    worst = max(abs(row["ours"] - row["paper"]) for row in rows_of_table_1())
+    shown = ", ".join(f"{part:.5f}" for part in axis)
+    return (
+        f"{text}\n\nThe axis is ({shown}) with |w| = {np.linalg.norm(axis):.6f}, the mean "
+        f"projection {mean:.4f}; no row is farther off than {worst:.6f}."
+    )
+
+
+def rows_of_table_3() -> list[dict[str, Any]]:
+    """The stars of Table 3 with the SAO number that sharing stars validate, None for none."""
+    triangles = the_ptp_paper().table_3["triangles"]
+    sao = sorted({number for each in triangles for number in each["sao"]})
+    image = np.array([each["stars"] for each in triangles], np.int32)
+    star = np.array([[sao.index(n) for n in each["sao"]] for each in triangles], np.int32)
+    count = int(the_ptp_paper().table_3["stars_in_field"]) + 1
+    match = proposed_by_votes(image, star, len(sao), count, shared=True).match.tolist()
+    return [
+        {"table": "ptp-3", "star": k, "sao": sao[match[k]] if match[k] >= 0 else None}
+        for k in range(1, count)
+    ]
+
+
+def table_3(found: Projections) -> str:
+    """Table 3: which stars of the printed triangles sharing stars validate."""
+    printed = the_ptp_paper().table_3["identified"]
+    lines = [
+        (
+            str(row["star"]),
+            "identified" if row["star"] in printed else "",
+            "" if row["sao"] is None else f"SAO {row['sao']}",
+        )
+        for row in rows_of_table_3()
+    ]
+    return markdown(("star of the field", "paper", "ours"), lines)
 
 
 def table_2(found: Projections) -> str:
@@ -97,19 +179,32 @@ def note_on_table_2(found: Projections) -> str:
     )
 
 
-def figure_6(found: Projections) -> str:
-    """Figure 6: how the triangles lie along the axis."""
+def row_of_figure_6(found: Projections) -> dict[str, Any]:
+    """Figure 6 in numbers: how the triangles lie along the axis."""
     value = found.triangles.projection.value
     gap = np.diff(value)
-    within = _within(value, 3.0 * SIGMA_AT_1_PX)
-    shares = ", ".join(f"{100.0 * share:.0f} %" for share in found.triangles.explained)
+    return {
+        "table": "figure-6",
+        "triangles": len(value),
+        "ends": [float(value[0]), float(value[-1])],
+        "explained": [float(share) for share in found.triangles.explained],
+        "gap_median": float(np.median(gap)),
+        "nearer_than_sigma": float(np.mean(gap < SIGMA_AT_1_PX)),
+        "within_3_sigma_median": float(np.median(_within(value, 3.0 * SIGMA_AT_1_PX))),
+    }
+
+
+def figure_6(found: Projections) -> str:
+    """Figure 6: how the triangles lie along the axis."""
+    row = row_of_figure_6(found)
+    shares = ", ".join(f"{100.0 * share:.0f} %" for share in row["explained"])
     rows = (
-        ("triangles", f"{len(value):,}"),
-        ("least and greatest projection", f"{value[0]:.1f}, {value[-1]:.1f}"),
+        ("triangles", f"{row['triangles']:,}"),
+        ("least and greatest projection", f"{row['ends'][0]:.1f}, {row['ends'][1]:.1f}"),
         ("variance along the axis and across it", shares),
-        ("gap between neighbours, median", f"{np.median(gap):.4f}"),
-        ("neighbours nearer than a sigma at 1 px", f"{100.0 * np.mean(gap < SIGMA_AT_1_PX):.2f} %"),
-        ("triangles within 3 sigma at 1 px, median", f"{np.median(within):.0f}"),
+        ("gap between neighbours, median", f"{row['gap_median']:.4f}"),
+        ("neighbours nearer than a sigma at 1 px", f"{100.0 * row['nearer_than_sigma']:.2f} %"),
+        ("triangles within 3 sigma at 1 px, median", f"{row['within_3_sigma_median']:.0f}"),
     )
     text = markdown(("projections on the axis", "ours"), rows)
     return (
@@ -122,11 +217,24 @@ def figure_6(found: Projections) -> str:
 def figure_7(found: Projections) -> str:
     """Figure 7: the index of a triangle by its projection, at the rows that Table 1 prints."""
     rows = [
-        (f"{projection:.5f}", f"{index:,}", *(f"{_index_of(each, projection):,}" for each in both))
-        for both in [(found.triangles.projection, found.once)]
-        for index, projection in the_ptp_paper().table_1
+        (f"{row['projection']:.5f}", *(f"{row[name]:,}" for name in ("paper", "ours", "once")))
+        for row in rows_of_figure_7(found)
     ]
     return markdown(("projection", "paper: index", "ours", "ours, each triangle once"), rows)
+
+
+def rows_of_figure_7(found: Projections) -> list[dict[str, Any]]:
+    """Projection, the printed index, ours, and ours with each triangle once."""
+    return [
+        {
+            "table": "figure-7",
+            "projection": projection,
+            "paper": index,
+            "ours": _index_of(found.triangles.projection, projection),
+            "once": _index_of(found.once, projection),
+        }
+        for index, projection in the_ptp_paper().table_1
+    ]
 
 
 def _index_of(column: KVector, projection: float) -> int:

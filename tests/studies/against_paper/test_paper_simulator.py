@@ -288,8 +288,33 @@ def test_the_command_prints_a_table_and_writes_its_rows(tmp_path, seed):
     assert (tmp_path / "paper-places.svg").stat().st_size > 0
 
 
+@pytest.mark.parametrize("table", [11, 12, 13, 14])
+def test_the_rows_of_times_and_sizes_are_those_of_the_text(table, tmp_path, seed):
+    out, path = io.StringIO(), tmp_path / "rows.json"
+    rows = run_paper(table, seeds=[seed], json_path=path, identifiers=["starid"], out=out)
+    text = out.getvalue()
+    assert json.loads(path.read_text(encoding="utf-8")) == rows
+    assert len(rows) >= 3
+    for row in rows:
+        assert (row["table"], row["case"] in text) == (table, True)
+        if table < 13:
+            assert all(f"{each:.3f}" in text for each in (*row["first_ms"], row["all_ms"]))
+        else:
+            assert f" {row['pairs']} " in text
+            assert f" {row['k_g']:.4f} " in text
+    assert ("The mission allows" in text) == (table < 13)
+
+
 @pytest.mark.parametrize(
-    "asked", [{"table": 1}, {"table": 15}, {"stars": 0}, {"seeds": [-1]}, {"identifiers": ["ptp"]}]
+    "asked",
+    [
+        {"table": 1},
+        {"table": 15},
+        {"stars": 0},
+        {"seeds": [-1]},
+        {"identifiers": ["ptp"]},
+        {"table": 11, "seeds": [1, 2]},
+    ],
 )
 def test_what_the_paper_has_not_is_refused(asked):
     with pytest.raises(BadInput):

@@ -25,7 +25,7 @@ from service.studies.ptp_2015.printed import the_ptp_paper
 from service.studies.ptp_2015.projections import printed_slope
 from service.studies.ptp_2015.rivals.liebe import features
 from service.studies.ptp_2015.rivals.planar_triangle import area_and_moment, area_and_moment_sigma
-from service.studies.ptp_2015.tables import TITLES
+from service.studies.ptp_2015.tables import OF_PROJECTIONS, TITLES
 from service.studies.ptp_2015.tally import COLUMNS, FieldShare, Tally
 from service.vectors import angle_between_deg, unit
 
@@ -197,6 +197,22 @@ class TestCommand:
             (paper, pytest.approx(1.0, abs=0.06)) for _, paper in the_ptp_paper().table_2
         ]
         assert all(f"| {row['index']:,} " in out.getvalue() for row in written)
+
+    @pytest.mark.parametrize("name", [*OF_PROJECTIONS, "ptp-false"])
+    def test_the_rows_are_those_of_the_text(self, name, tmp_path):
+        out, rows = io.StringIO(), tmp_path / "rows.json"
+        run_ptp(name, 5, json_path=rows, out=out)
+        written = json.loads(rows.read_text())
+        assert written
+        for row in written:
+            assert row["table"] == name
+            for value in (each for each in row.values() if isinstance(each, int)):
+                assert f" {value:,} " in out.getvalue() or f" SAO {value} " in out.getvalue()
+
+    def test_what_changes_nothing_is_refused(self, acquire):
+        for option in ("--seed", "--scenes"):
+            code, out, err = acquire("simulate", "paper", "--table", "figure-6", option, "2")
+            assert (code, out, option in err) == (2, "", True)
 
     @pytest.mark.slow
     def test_the_page_shows_everything_with_its_claims_and_pictures(self, tmp_path):

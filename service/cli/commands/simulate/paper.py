@@ -21,7 +21,9 @@ IN_ZONES = [name for name, entry in IDENTIFIERS.items() if entry.searches_zone]
 
 PTP_HELP = """\
 tables by name, each algorithm on the same fields (10 deg square, stars to V 6):
+  ptp-1       projections of the nine printed triangles
   ptp-2       the k-vector of the projections
+  ptp-3       the sharing stars of the four printed triangles
   figure-6    triangles on the projection axis
   figure-7    projection and index of the triangles
   ptp-5       slave stars of the guide database: memory, rate, time
@@ -30,6 +32,7 @@ tables by name, each algorithm on the same fields (10 deg square, stars to V 6):
   figure-11   rate against the stars in the field
   figure-12   rate against the noise of position
   figure-13   rate against the noise of magnitude
+  ptp-false   mirrored skies and random points that PTP accepts
   ptp         all of these
 strict: all stars that the algorithm names are correct, at least three; checked: the
 same after the attitude check of the identifier `ptp`."""
@@ -66,7 +69,7 @@ def add(group: Any) -> None:
         metavar="N",
         help="named tables: fields per condition; default 10000",
     )
-    parser.add_argument("--seed", type=int, nargs="+", default=[1], metavar="S", help="default 1")
+    parser.add_argument("--seed", type=int, nargs="+", metavar="S", help="default 1")
     add_json_file(parser, "the rates, one row per run,")
     parser.add_argument("--plots", type=Path, metavar="FOLDER", help="write the figures")
     parser.add_argument(
@@ -96,13 +99,17 @@ def run(parsed: Namespace) -> int:
                 "--scenes", "goes with a table by name, such as --table ptp-6", str(parsed.scenes)
             )
         )
-    from service.studies.paper_1994.command import DEFAULT_STARS, rows_of, run_paper
+    from service.studies.paper_1994.command import DEFAULT_STARS, run_paper
+    from service.studies.paper_1994.report import PROPORTIONS, TIMES
 
+    if parsed.stars is not None and parsed.table in (*TIMES, *PROPORTIONS):
+        message = f"has no effect on table {parsed.table}, whose zones are as many as the paper's"
+        raise BadInput(Fault("--stars", message, str(parsed.stars)))
     prints_json = parsed.json == STANDARD_OUTPUT
-    tallies = run_paper(
+    rows = run_paper(
         parsed.table,
         parsed.stars or DEFAULT_STARS,
-        parsed.seed,
+        parsed.seed or [1],
         None if prints_json else parsed.json,
         parsed.identifier,
         processes=parsed.processes,
@@ -111,23 +118,30 @@ def run(parsed: Namespace) -> int:
         out=io.StringIO() if prints_json else None,
     )
     if prints_json:
-        print_json(rows_of(tallies))
+        print_json(rows)
     return 0
 
 
 def _run_ptp(parsed: Namespace) -> int:
     from service.studies.ptp_2015.command import DEFAULT_SCENES, rows_of, run_ptp
+    from service.studies.ptp_2015.tables import OF_PROJECTIONS
 
     if parsed.stars is not None:
         message = "goes with a table by number; a named one takes --scenes"
         raise BadInput(Fault("--stars", message, str(parsed.stars)))
-    if len(parsed.seed) > 1:
-        raise BadInput(Fault("--seed", "is one with a table by name", shown_value(parsed.seed)))
+    if parsed.table in OF_PROJECTIONS:
+        message = f"has no effect on {parsed.table}, for which nothing is drawn"
+        for option, value in (("--scenes", parsed.scenes), ("--seed", parsed.seed)):
+            if value is not None:
+                raise BadInput(Fault(option, message, shown_value(value)))
+    seeds = parsed.seed or [1]
+    if len(seeds) > 1:
+        raise BadInput(Fault("--seed", "is one with a table by name", shown_value(seeds)))
     prints_json = parsed.json == STANDARD_OUTPUT
     found = run_ptp(
         parsed.table,
         parsed.scenes or DEFAULT_SCENES,
-        parsed.seed[0],
+        seeds[0],
         None if prints_json else parsed.json,
         parsed.processes,
         parsed.plots,
