@@ -5,8 +5,13 @@ import re
 
 import pytest
 from jsonschema import Draft202012Validator
+from sqlalchemy import select
 
 from service.observations.schema import submission_from_json
+from service.storage.models.base import component_name
+from service.storage.models.events import EVENT_DATA
+from service.storage.recording.events import EVENT_KINDS
+from service.storage.sql.tables import events
 from service.web.app import bare_app
 from service.web.openapi.document import examples
 from service.web.openapi.text import openapi_yaml
@@ -125,6 +130,32 @@ def test_every_example_has_the_shape_it_is_an_example_of(path, method, operation
             for example in content.get("examples", {}).values():
                 if kind.endswith("json"):
                     check.validate(example["value"])
+
+
+def test_the_documents_show_an_event_of_each_kind_as_it_is_described():
+    text = (FILE.parent / "docs" / "api.md").read_text(encoding="utf-8")
+    shown = json.loads(re.search(r"```json\n(\{\"batches\".*?)```", text, re.DOTALL)[1])
+    assert set(shown) == set(EVENT_KINDS) == set(reference()["webhooks"])
+    for kind, data in shown.items():
+        content = reference()["webhooks"][kind]["post"]["requestBody"]["content"]
+        component = content["application/json"]["schema"]["properties"]["data"]["$ref"]
+        validator("components", "schemas", component.rpartition("/")[2]).validate(data)
+
+
+def test_events_as_they_are_recorded_are_as_described(app, client, post, batch):
+    """Those of every kind that the tests before this one gave rise to, too."""
+    post(batch | {"batch": "for-its-event"})
+    client.post("/api/v1/annotations", json={"text": "x", "start": batch["time"], "who": "jb"})
+    client.put(
+        "/api/v1/spacecraft/XTE/limits/silence_s",
+        json={"settings": {"enabled": False}, "who": "jb"},
+    ).raise_for_status()
+    with app.context.reading() as connection:
+        rows = connection.execute(select(events.c.kind, events.c.data)).all()
+    assert {"batches", "annotation", "limit"} <= {row.kind for row in rows}
+    for kind, data in rows:
+        component = component_name(EVENT_DATA[kind])
+        validator("components", "schemas", component).validate(json.loads(data))
 
 
 def test_every_batch_among_the_examples_can_be_sent():

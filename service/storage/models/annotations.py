@@ -29,4 +29,5 @@ class AnnotationPage(Record, frozen=True, kw_only=True):
 class AnnotationChange(Annotation, frozen=True, kw_only=True):
     """The data of an event: an annotation that was written or deleted."""
 
+    component: ClassVar[str] = "AnnotationEvent"
     deleted: bool

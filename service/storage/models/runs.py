@@ -142,6 +142,7 @@ class RefusedLine(Record, frozen=True, kw_only=True):
 class ReplayProgress(Record, frozen=True, kw_only=True):
     """A replay and its progress, without the refused lines: the data of an event."""
 
+    component: ClassVar[str] = "ReplayEvent"
     id: Id
     run: str
     name: str

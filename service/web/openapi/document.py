@@ -15,6 +15,7 @@ from service import __version__
 from service.gyro.schema import GyroBlockIn
 from service.observations.schema import BatchIn
 from service.storage.models.base import Record, component_name, described
+from service.storage.models.events import EVENT_DATA
 from service.web.api.alarms import CommentIn, LimitIn, LimitTrialIn, ShelveIn, StatementIn
 from service.web.api.annotations import AnnotationIn
 from service.web.api.batches import WhatIfIn
@@ -118,12 +119,35 @@ def reference_of(app: FastAPI) -> dict[str, Any]:
         routes=app.routes,
     )
     described["components"] = {"schemas": _schemas(), "securitySchemes": SECURITY}
+    described["webhooks"] = {kind: _webhook(kind, data) for kind, data in EVENT_DATA.items()}
     for address, methods in described["paths"].items():
         for method, operation in methods.items():
             if method == "get" and address.startswith(API):
                 _add_conditional(operation)
             _finish(operation)
     return described
+
+
+def _webhook(kind: str, data: type[Record]) -> dict[str, Any]:
+    """What a webhook sends of an event; the event stream has the same data."""
+    text = {"type": ["string", "null"]}
+    fields = {
+        "type": {"const": kind},
+        "timestamp": {"type": "string", "format": "date-time"},
+        "event": {"type": "integer", "description": "The number of the event in the stream."},
+        "run": text,
+        "spacecraft": text,
+        "data": {"$ref": SCHEMAS + component_name(data)},
+    }
+    schema = {"type": "object", "required": sorted(fields), "properties": fields}
+    return {
+        "post": {
+            "summary": f"An event `{kind}`",
+            "tags": ["events"],
+            "requestBody": {"required": True, "content": {"application/json": {"schema": schema}}},
+            "responses": {"204": {"description": "Any status from 200 to 299: it was received."}},
+        }
+    }
 
 
 REQUESTS: Sequence[type[BaseModel]] = (
