@@ -33,6 +33,7 @@ def files(passing, tmp_path):
     """The telemetry, its truth as AEM in both forms and as C-kernel, and a database."""
     lines, truths = passing
     (tmp_path / "pass.ndjson").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    (tmp_path / "pass.truth.ndjson").write_text("".join(f"{json.dumps(t)}\n" for t in truths))
     page = truth_page(lines, truths)
     for form, name in (("aem", "truth.aem"), ("aem-xml", "truth.xml"), ("ck", "truth.zip")):
         (tmp_path / name).write_bytes(written(form, page))

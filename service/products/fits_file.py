@@ -24,7 +24,7 @@ _J2000_MJD = 51_544
 _FORMATS = {"number": ("D", ">f8"), "integer": ("K", ">i8"), "flag": ("L", "S1")}
 _NAMES = {"time": "UTC"}
 """Names of columns that FITS, which does not tell capitals apart, has another use for."""
-_UNITS = {"ppm": "10**-6"}
+_UNITS = {"ppm": "10**-6", "1": "", "1/h": "h**-1"}
 """Units that FITS does not know by their name."""
 _TIME = Column("TIME", unit="s", description="Terrestrial Time since MJDREFI + MJDREFF.")
 _VALID = Column("VALID", "flag", description="Whether every value of the row is known.")

@@ -260,7 +260,7 @@ def test_the_table_is_the_same_as_parquet(client, night):
     table = parquet.read_table(io.BytesIO(answer.content))
     assert table.num_rows == 240
     rates = [f"rate_{axis}_rad_per_s" for axis in (1, 2, 3)]
-    assert table.column_names == ["time", "tai_ns", "block", *rates]
+    assert table.column_names == ["time", "tai_ns", "block", *rates, "timestamp"]
 
 
 def test_a_table_without_samples_has_the_names_of_its_columns(client, run):

@@ -85,7 +85,7 @@ def test_a_replay_goes_on_after_a_restart_where_it_was(opened, lines):
 
 def test_one_that_waits_can_be_cancelled_and_one_without_its_file_ends(opened, lines):
     app = opened(replay_processes=0)
-    ids = [upload(app, lines[:300]) for _ in range(3)]
+    ids = [upload(app, some) for some in (lines, lines[:300], lines[:300])]
     app.close()
     for place in app.settings.spool_folder.glob(f"{ids[0]}*"):
         place.unlink()
