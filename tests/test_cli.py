@@ -165,7 +165,7 @@ def test_the_version_is_the_packages(acquire):
         ("reprocess --mission none.toml", "none.toml: cannot be read: "),
         ("reprocess --from 1996-02-01T00:00:00Z --to 1996-01-01T00:00:00Z", "--end: must not"),
         ("advise", "required: --spacecraft (see `acquire advise --help`)"),
-        ("advise --spacecraft NO", "no spacecraft 'NO'; there are IMAGER, SOHO"),
+        ("advise --spacecraft NO", "ACQUIRE_DATABASE: acquire.db: there is no such file"),
         ("advise --spacecraft XTE --start noon", "--start: must be UTC as"),
         ("advise --spacecraft XTE --try septol=1", "--try.septol: there is no such field"),
         ("simulate telemetry --spacecraft XTE --batches 1 --stars 300 o", "stars: must be from 1"),

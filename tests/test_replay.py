@@ -176,6 +176,7 @@ def test_a_replay_that_a_starting_process_calls_interrupted_is_followed_to_its_e
         if state.state == "running":
             # What a process does with the replays that it finds at work when it opens the database.
             app.context.change(lambda connection: mark_interrupted(connection, state.started))
+            states.append(app.replays.get(state.id).state)
         states.append(state.state)
 
     with Server(create_app(app)) as url:

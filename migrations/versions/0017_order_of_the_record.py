@@ -38,7 +38,7 @@ def upgrade() -> None:
     )
     op.bulk_insert(position, [{"id": 1, "seq": 0}])
     if op.get_bind().dialect.name == "postgresql":
-        op.execute("CREATE SEQUENCE results_seq")
+        op.execute("CREATE SEQUENCE IF NOT EXISTS results_seq")
 
 
 def downgrade() -> None:

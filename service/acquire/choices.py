@@ -6,22 +6,50 @@ import numpy as np
 from msgspec import Struct
 
 from service.errors import BadBatch, Fault
+from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import (
     TESTS_OF_ROLL,
     Band,
+    Cap,
     Identifier,
     Mission,
     Rules,
     SolverName,
     Tests,
     Tolerances,
-    idle_reason,
     rules_of,
 )
 from service.observations.batch import BoresightPrior, ObservationBatch, PredictedPrior
 from service.observations.schema import OptionsIn
 from service.sky.ephemeris import observer_velocity
 from service.vectors import Vector
+
+TEST_OF_TOLERANCE = {
+    "magnitude_mag": "magnitude",
+    "magnitude_order_mag": "magnitude",
+    "cross_product_deg": "cross_product",
+    "pole_difference_deg": "pole",
+    "pole_angle_deg": "pole",
+    "fov_rotation_deg": "fov_rotation",
+}
+"""The test without which a tolerance takes no part."""
+
+
+def idle_reason(name: str, identifier: str, tests: Tests, zone: Cap | Band) -> str | None:
+    """Why a test or a tolerance changes no answer; None where it may change one.
+
+    This is THE table of which setting acts under which identifier, tests and kind of zone.
+    """
+    used = IDENTIFIERS[identifier].uses
+    if used is not None and name not in used:
+        return f"is not used by the identifier {identifier}"
+    test = TEST_OF_TOLERANCE.get(name, name)
+    if test == "pole" and not isinstance(zone, Band):
+        return "is not used in a cap, which has no pole"
+    if name in TEST_OF_TOLERANCE and not getattr(tests, test):
+        return f"is not used while the test {test} is off"
+    return None
+
 
 TURNED_BY_NOISE_DEG = 3.0
 """How far noise turns the direction of a close pair."""

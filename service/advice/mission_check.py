@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
+from service.acquire.choices import idle_reason
 from service.advice.zone_census import (
     Extremes,
     Spread,
@@ -17,7 +18,7 @@ from service.advice.zone_census import (
     star_counts,
     star_spread,
 )
-from service.missions.mission import Band, Mission, Tracker, idle_reason
+from service.missions.mission import Band, Mission, Tracker
 from service.missions.scan import Raster, Sweep
 from service.sky.catalog.run_catalog import RunCatalog
 from service.vectors import separation_deg

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 
+from service.acquire.choices import idle_reason
 from service.advice.advice import WorkLimit, advise
 from service.advice.innovation_statements import innovation_findings
 from service.advice.innovations import innovation_noise
@@ -15,7 +16,6 @@ from service.app.context import Context
 from service.app.submissions import Submissions
 from service.app.zones import Zones
 from service.errors import BadInput, Busy, Fault
-from service.missions.mission import idle_reason
 from service.observations.schema import TolerancesIn
 from service.storage.grades.period import latest_innovations
 from service.storage.models.advice import Advice

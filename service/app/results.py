@@ -132,7 +132,7 @@ class Results:
         """
         self._context.mission(spacecraft)
         span = BucketFilter(spacecraft, run or LIVE, start, end)
-        with self._context.reading_record() as connection:
+        with self._context.reading() as connection:
             sample = sample_period(connection, span)
         return period_stars(sample, self._context.sky)
 

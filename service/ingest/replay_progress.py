@@ -14,7 +14,7 @@ from sqlalchemy import Connection
 from service.errors import AcquisitionError, Stopping, problem_of
 from service.packets.reader import PacketTotals
 from service.storage.gyro.blocks import Recorded
-from service.storage.models.problems import FieldFault
+from service.storage.models.base import FieldFault
 from service.storage.models.runs import (
     LineProblem,
     RefusedLine,

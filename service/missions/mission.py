@@ -155,33 +155,6 @@ def rules_of(tolerances: Tolerances, tests: Tests) -> Rules:
     )
 
 
-TEST_OF_TOLERANCE = {
-    "magnitude_mag": "magnitude",
-    "magnitude_order_mag": "magnitude",
-    "cross_product_deg": "cross_product",
-    "pole_difference_deg": "pole",
-    "pole_angle_deg": "pole",
-    "fov_rotation_deg": "fov_rotation",
-}
-"""The test without which a tolerance takes no part."""
-
-
-def idle_reason(name: str, identifier: str, tests: Tests, zone: Cap | Band) -> str | None:
-    """Why a test or a tolerance changes no answer; None where it may change one.
-
-    This is THE table of which setting acts under which identifier, tests and kind of zone.
-    """
-    used = IDENTIFIERS[identifier].uses
-    if used is not None and name not in used:
-        return f"is not used by the identifier {identifier}"
-    test = TEST_OF_TOLERANCE.get(name, name)
-    if test == "pole" and not isinstance(zone, Band):
-        return "is not used in a cap, which has no pole"
-    if name in TEST_OF_TOLERANCE and not getattr(tests, test):
-        return f"is not used while the test {test} is off"
-    return None
-
-
 TESTS_OF_ROLL = ("cross_product", "fov_rotation")
 """They compare with the presumed roll, which an a priori boresight leaves open."""
 

@@ -232,9 +232,10 @@ def test_settings_written_to_the_mission_file_take_zero_scale_and_colour_away(
 
     parts = [identified_magnitudes(each, TRACKERS, color) for each in found]
     seen = joined([each for each in parts if each is not None])
-    calibrated = calibrate_magnitudes(seen, TRACKERS)
-    assert all(each.names == (ZERO, SCALE, COLOR) for each in calibrated)
     mission = parse_mission(assumed, "two.toml")
+    magnitudes = {each.name: each.magnitudes for each in mission.trackers}
+    calibrated = calibrate_magnitudes(seen, TRACKERS, magnitudes)
+    assert all(each.names == (ZERO, SCALE, COLOR) for each in calibrated)
     settings = calibrated_settings(mission.trackers, calibrated, TRACKERS)
     positions = [identified_stars(each, TRACKERS) for each in found]
     geometry = calibrate(joined_stars([each for each in positions if each]), Model(degree=0))

@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 from service.acquire import acquire
+from service.acquire.choices import idle_reason
 from service.missions.identifiers import IDENTIFIERS, IdentifierEntry, register
-from service.missions.mission import Tolerances, idle_reason
+from service.missions.mission import Tolerances
 from service.observations.schema import submission_from_json
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass

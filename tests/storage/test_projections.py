@@ -42,7 +42,7 @@ from tests.waiting import wait_until
 TIGHT = LimitSettings.model_validate(
     {"warning": {"high": 0.1}, "minimum_count": 2, "duration_s": 0, "hysteresis": 0.0}
 )
-OTHER = OptionsIn.model_validate({"tolerances": {"separation_deg": 1e-5}})
+OTHER = OptionsIn.model_validate({"identifier": "starid"})
 RECORD = (runs, missions, catalogs, limits, batches, results, tracker_values)
 """What the projections are made of."""
 OWN_IDS = ("id", "alarm_id")
@@ -193,6 +193,8 @@ def test_a_transaction_that_commits_late_is_neither_left_out_nor_projected_twice
     """Another process takes a place in the record, and others commit before it does."""
     app = opened()
     app.submissions.submit(make("first"))
+    with app.store.reading() as connection:
+        assert_passed(connection)
     sleeping, go_on = threading.Event(), threading.Event()
     other = Store(database)
 

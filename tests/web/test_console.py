@@ -87,7 +87,7 @@ def test_every_page_is_light(client, addresses):
         trends = re.search(r'data-history="([^"]+)"', client.get(address).text)
         if trends:
             weight += len(client.get(trends[1].replace("&amp;", "&")).content)
-        assert weight < 250_000, (address, weight)
+        assert weight < 256_000, (address, weight)
 
 
 def test_every_page_says_as_of_when_and_of_which_run(client, addresses, full_run):

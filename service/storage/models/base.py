@@ -20,7 +20,7 @@ from typing import (
     get_type_hints,
 )
 
-from msgspec import NODEFAULT, Struct, UnsetType, structs
+from msgspec import NODEFAULT, UNSET, Struct, UnsetType, structs
 from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, create_model
 from pydantic_core import CoreSchema
 
@@ -159,3 +159,24 @@ def _without_unset(kind: Any) -> Any:
     if get_origin(kind) not in (Union, UnionType):
         return kind
     return Union[tuple(each for each in get_args(kind) if each is not UnsetType)]  # noqa: UP007
+
+
+class FieldFault(Record, frozen=True, kw_only=True):
+    """One fault of a request."""
+
+    component: ClassVar[str] = "FaultOut"
+    field: str
+    message: str
+    value: str | None
+
+
+class Problem(Record, frozen=True, kw_only=True):
+    """A problem (RFC 9457)."""
+
+    component: ClassVar[str] = "Problem"
+    type: Annotated[str, doc("The type of problem; `about:blank` if the status says everything.")]
+    title: str
+    status: int
+    detail: str
+    instance: Annotated[str, doc("The path of the request.")]
+    errors: Annotated[list[FieldFault], doc("Every fault, field by field.")] | UnsetType = UNSET

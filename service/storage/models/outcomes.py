@@ -5,8 +5,7 @@ from typing import Annotated, ClassVar
 from msgspec import Raw
 
 from service.storage.models.answers import Answer
-from service.storage.models.base import DescribedAs, Record, doc
-from service.storage.models.problems import Problem
+from service.storage.models.base import DescribedAs, Problem, Record, doc
 
 
 class BatchOutcome(Record, frozen=True, kw_only=True):

@@ -5,8 +5,7 @@ from typing import Annotated, ClassVar, Literal
 from msgspec import UNSET, UnsetType
 from pydantic import Field
 
-from service.storage.models.base import Count, Id, Record, Stamp, doc
-from service.storage.models.problems import FieldFault
+from service.storage.models.base import Count, FieldFault, Id, Record, Stamp, doc
 
 ReplayStateName = Literal["running", "waiting", "done", "interrupted", "failed", "cancelled"]
 """A replay that is `waiting` goes on by itself as soon as the service is ready after a restart."""

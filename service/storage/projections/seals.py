@@ -20,7 +20,7 @@ SUMMED_BITS = (1 << 40) - 1
 
 Seal = tuple[str, str, int]
 """(spacecraft, run, hour of TAI)."""
-_OWN = (results.c.spacecraft, results.c.run, (results.c.time_ns / HOUR_NS).cast(BigInteger))
+_OWN = (results.c.spacecraft, results.c.run, results.c.time_ns // HOUR_NS)
 
 
 def apply(connection: Connection, new: Sequence[RecordedResult]) -> None:

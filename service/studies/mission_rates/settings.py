@@ -12,8 +12,9 @@ from typing import Any, Self
 import numpy as np
 from pydantic import ValidationError
 
+from service.acquire.choices import idle_reason
 from service.errors import BadInput, Fault, shown_value
-from service.missions.mission import Band, Mission, Tolerances, idle_reason
+from service.missions.mission import Band, Mission, Tolerances
 
 MOST_SETTINGS = 400
 MOST_DIGITS = 12

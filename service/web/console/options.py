@@ -10,10 +10,10 @@ from typing import Any, get_args
 
 from pydantic import ValidationError
 
-from service.acquire.choices import Choices
+from service.acquire.choices import Choices, idle_reason
 from service.errors import BadBatch, Fault, shown_value
 from service.missions.identifiers import IDENTIFIERS
-from service.missions.mission import Mission, SolverName, Tests, Tolerances, idle_reason
+from service.missions.mission import Mission, SolverName, Tests, Tolerances
 from service.observations.schema import OptionsIn
 
 SYMBOLS: Mapping[str, str] = {

@@ -29,7 +29,7 @@ from service.errors import (
     problem_of_faults,
     shown_value,
 )
-from service.storage.models.problems import Problem
+from service.storage.models.base import Problem
 from service.web.requests.problem_types import (
     INTERNAL_ERROR,
     PROBLEM_TYPES,
