@@ -254,7 +254,7 @@ class Replays:
 
     def all(self, spacecraft: Collection[str] | None = None) -> list[Replay]:
         """The latest replays, newest first; with `spacecraft`, see `list_replays`."""
-        with self._context.reading_record() as connection:
+        with self._context.reading() as connection:
             return list_replays(connection, spacecraft)
 
     def get(self, id: str) -> Replay:

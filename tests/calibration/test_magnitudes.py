@@ -247,13 +247,15 @@ def test_settings_written_to_the_mission_file_take_zero_scale_and_colour_away(
         assert each.magnitudes.scale == pytest.approx(true.scale, abs=0.015)
         assert each.magnitudes.color_mag == pytest.approx(true.color_mag, abs=0.05)
 
+    settings_now = {each.name: each.magnitudes for each in written.trackers}
     again = acquired(text, pass_of_true_trackers, sky)
     for off, bv in offsets_of(again, color):
         assert abs(np.mean(off)) < 0.03
         assert abs(np.polyfit(bv, off, 1)[0]) < 0.05
     # What is calibrated once more is what is there.
     parts = [identified_magnitudes(each, TRACKERS, color) for each in again]
-    once_more = calibrate_magnitudes(joined([each for each in parts if each]), TRACKERS)
+    seen = joined([each for each in parts if each])
+    once_more = calibrate_magnitudes(seen, TRACKERS, settings_now)
     twice = calibrated_settings(written.trackers, once_more, TRACKERS)
     for name, each in settings.items():
         assert twice[name].scale == pytest.approx(each.scale, abs=0.01)
