@@ -40,6 +40,7 @@ from service.storage.sql.tables import (
     batches,
     frames,
     idempotency_keys,
+    missions,
     results,
     solutions,
     star_results,
@@ -116,6 +117,12 @@ def test_of_a_sound_database_nothing_is_wrong(filled, database):
         (
             lambda id: update(batches).where(batches.c.id == id).values(input="{"),
             "its input cannot be read",
+        ),
+        (
+            lambda id: update(missions).values(
+                settings=func.replace(missions.c.settings, "1", "2")
+            ),
+            "mission settings sha256:",
         ),
         (lambda id: update(rollups_daily).values(unique=rollups_daily.c.unique + 1), "trends of"),
         (

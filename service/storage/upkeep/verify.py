@@ -4,6 +4,8 @@ Batches are read a few at a time, each time as of one moment, so that it can be
 done while the database is being served.
 """
 
+import hashlib
+import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -26,6 +28,7 @@ from service.storage.sql.migrations import check, reported
 from service.storage.sql.tables import (
     batches,
     frames,
+    missions,
     results,
     solutions,
     star_results,
@@ -63,6 +66,7 @@ def verify(database: str, step: Step = lambda done, total: None) -> list[str]:
             # The content of a damaged file is not evidence of what was written.
             if not found:
                 found += _of_the_batches(engine, step)
+                found += _of_the_missions(engine)
                 found += _of_the_seals(engine)
                 found += _of_the_trends(engine)
                 found += of_the_gyro_blocks(engine)
@@ -270,6 +274,19 @@ def _of_the_trends(engine: Engine) -> Iterator[str]:
             if not is_waiting and not _alike(stored.get(key), counted.get(key)):
                 of = ", ".join([f"trends of {spacecraft}, run {run}", *tracker])
                 yield f"{of}, {bucket} {number}: not those of the results"
+
+
+def _of_the_missions(engine: Engine) -> Iterator[str]:
+    """Settings that do not have the digest which results name; see `Mission.digest`."""
+    with engine.begin() as connection:
+        kept = connection.execute(select(missions.c.digest, missions.c.settings)).all()
+    for digest, settings in kept:
+        try:
+            text = json.dumps(json.loads(settings), sort_keys=True, separators=(",", ":"))
+        except ValueError:
+            text = settings
+        if digest != f"sha256:{hashlib.sha256(text.encode()).hexdigest()}":
+            yield f"mission settings {digest}: they are not what was recorded"
 
 
 def _of_the_seals(engine: Engine) -> Iterator[str]:
