@@ -10,7 +10,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    # What was recorded before is projected already and has no place in the order: zero.
+    # Trends and alarms have all earlier results already; these get no place in the order: zero.
     op.add_column(
         "results", sa.Column("seq", sa.BigInteger(), server_default=sa.text("0"), nullable=False)
     )

@@ -72,7 +72,7 @@ def tracker_views(mission: Mission, run_catalog: RunCatalog) -> list[TrackerView
 
 
 def axis_findings(mission: Mission) -> list[Finding]:
-    """What is unusual about the zone's axis."""
+    """The findings about the zone's axis."""
     length = math.hypot(*mission.zone.axis_body)
     if abs(length - 1.0) > 1e-3:
         text = f"has the length {length:g}; it is used as a direction, so check its components"

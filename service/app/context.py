@@ -71,8 +71,8 @@ class Context:
     def change_audited(self, change: Callable[[Connection], T], entry: Entry | None) -> T:
         """`change` with its entry in the audit list, in one transaction.
 
-        What was recorded before is projected first: somebody acts on alarms as they were shown,
-        and a limit holds from the next batch on.
+        The projector evaluates all earlier batches first: an operator acts on alarms as the page
+        showed them, and a new limit holds from the next batch on.
         """
         self.store.before_reading()
 

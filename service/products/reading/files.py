@@ -40,7 +40,7 @@ def read_attitudes(file: Path, field: str) -> KnownAttitudes:
 
 
 class _Truth(msgspec.Struct):
-    """What is read of a line of simulated truth."""
+    """The fields of a line of simulated truth that are read."""
 
     spacecraft: str
     time: str

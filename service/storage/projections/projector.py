@@ -61,7 +61,7 @@ class _Step:
 
     position: int
     is_all: bool
-    """Nothing was left that could be projected."""
+    """True if the transaction projected every result that it could see."""
     has_time: bool
     """The next one may wait until there is more."""
 
@@ -200,6 +200,7 @@ class Projector:
         try:
             return self._write(self._step)
         except Exception:
+            # One faulty result must not hold up the others: it is looked for one by one.
             if self._most > 1:
                 self._most = 1
                 return _Step(self._position, is_all=False, has_time=False)

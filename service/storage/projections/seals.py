@@ -1,8 +1,8 @@
 """Seals: how many results there are of each hour, and the sum of their digests.
 
 A result that was removed, added or exchanged by anybody but the service does not agree with
-them.  Whoever records or deletes results changes their seals in the same transaction, or the
-projector does it later.
+them.  The projector adds new results.  `prune`, `archive`, `restore` and `forget` change the seals
+in the transaction that deletes or inserts the results.
 """
 
 from collections.abc import Sequence

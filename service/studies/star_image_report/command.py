@@ -49,7 +49,7 @@ a `--seed` of your choice; `--row IM-4` prints one row.
 """
 
 _LEFT_OUT = """\
-## What is left out or different
+## Parts of the report that this project leaves out or does differently
 
 - 1.1, trade of field of view, optics and detection: no study joins them; `acquire simulate
   frames`, `acquire frame` and `acquire simulate mission` give the error of a camera's places and
