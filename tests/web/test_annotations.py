@@ -16,6 +16,13 @@ START, END = "1999-03-01T00:00:00.000Z", "1999-03-01T00:20:00.000Z"
 NOTE = {"spacecraft": "XTE", "start": START, "text": "Wheel 2 unloaded", "who": "J. Operator"}
 
 
+@pytest.fixture(scope="module", autouse=True)
+def none_of_other_files(client):
+    """The server is shared: other files may have written notes there."""
+    for left in client.get(HERE).json()["items"]:
+        client.delete(f"{HERE}/{left['id']}?who=jb").raise_for_status()
+
+
 @pytest.fixture
 def note(client):
     answer = client.post(HERE, json=NOTE)
