@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.acquire import acquire
+from service.acquire import acquire, acquire_at_once
 from service.acquire.choices import choices_of
 from service.acquire.prewarm import prewarm_kernels, prewarm_zones
 from service.attitude.solution import NoAttitude
@@ -18,7 +18,7 @@ from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Mission
 from service.observations.batch import BoresightPrior
 from service.observations.schema import submission_from_json
-from service.sky.cache import LruCache
+from service.sky.cache import LruCache, NotAtHand
 from service.sky.catalog.star_catalog import import_csv
 from service.sky.model import SkyModel
 from service.storage.recording.answer import star_rows
@@ -321,6 +321,37 @@ def test_an_answer_depends_neither_on_the_batches_before_it_nor_on_other_threads
         together = list(pool.map(lambda body: answered(body, judge.mission, shared), bodies * 2))
     assert [without_clock(answer) for answer in together[:4]] == alone
     assert [without_clock(a) for a in together[:24]] == [without_clock(a) for a in together[24:]]
+
+
+@pytest.mark.parametrize("name", ["XTE", "SWAS", "SOHO"])
+def test_what_is_solved_at_once_is_what_takes_its_time_and_nothing_is_built_for_it(
+    name, rng, mission_files, sky
+):
+    judge = Judge(mission_files[name], sky)
+    fresh, had_at_once = SkyModel(sky.catalog, LruCache(64 << 20)), 0
+    kinds = ({}, {"error_deg": 20.0}, {"spurious": 8})
+    drawn = [nominal(rng, judge, k, **kinds[k % 3]) for k in range(24)]
+    options = [{"options": {"identifier": IN_ZONES[k % 2]}} for k in range(24)]
+    sent = [read(body | option) for body, option in zip(drawn, options, strict=True)]
+    for batch in sent:
+        with pytest.raises(NotAtHand):
+            acquire_at_once(batch, judge.mission, fresh)
+    assert fresh.cache.state().entries == ()
+    for number, batch in enumerate(sent):
+        usual = acquire(batch, judge.mission, fresh)
+        entries = fresh.cache.state().misses
+        try:
+            at_once = acquire_at_once(batch, judge.mission, fresh)
+        except NotAtHand:
+            # Its stars are all real, and near the a priori attitude.
+            assert number % 3 > 0
+            continue
+        finally:
+            assert fresh.cache.state().misses == entries
+        had_at_once += 1
+        one, other = (answer_as_json(each, id="1") for each in (usual, at_once))
+        assert without_clock(one) == without_clock(other)
+    assert had_at_once >= 8
 
 
 def test_fifty_first_requests_for_one_zone_build_it_once(mission_files, sky, rng):

@@ -34,12 +34,31 @@ from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
 from service.observations.calibrate import correct
 from service.observations.scans.reduce import reduced
+from service.sky.cache import NotAtHand
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.ephemeris import sun_distance_au
 from service.sky.model import SkyModel
 
+SHORT_WORK = 100_000
+"""The most units of work of what is solved at once: seven milliseconds."""
 
-def acquire(batch: ObservationBatch, mission: Mission, sky: SkyModel) -> Acquisition:
+
+def acquire_at_once(batch: ObservationBatch, mission: Mission, sky: SkyModel) -> Acquisition:
+    """`acquire` for who must not wait; raises `NotAtHand` where it would take long.
+
+    That is so where the whole sky is searched, a zone has to be built, or more work is counted
+    than `SHORT_WORK`.  The answer is the same.
+    """
+    budget = WorkBudget(SHORT_WORK)
+    acquisition = acquire(batch, mission, sky.at_hand(), budget)
+    if budget.was_hit:
+        raise NotAtHand
+    return acquisition
+
+
+def acquire(
+    batch: ObservationBatch, mission: Mission, sky: SkyModel, budget: WorkBudget | None = None
+) -> Acquisition:
     """Identify a batch's stars and solve for the attitude.
 
     Without a priori knowledge, or where it leads to nothing good, the whole sky
@@ -66,7 +85,7 @@ def acquire(batch: ObservationBatch, mission: Mission, sky: SkyModel) -> Acquisi
     run_catalog = sky.run_catalog(mission, batch.time)
     search = Search(
         *(batch, mission, choices, prior, velocity_c, sun_au, run_catalog, sky),
-        *(timer, WorkBudget()),
+        *(timer, budget or WorkBudget()),
     )
     found, rival = find_groups(search, corrected)
     in_zones = found.in_zones

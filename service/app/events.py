@@ -25,16 +25,16 @@ class Events:
 
     def after(self, last: int, limit: int) -> Sequence[Event] | None:
         """The events after a number, oldest first; None where some of them are no longer kept."""
-        with self._context.reading() as connection:
+        with self._context.reading_record() as connection:
             return events.events_after(connection, last, limit)
 
     def listen(self, listener: Callable[[], object]) -> None:
-        """Call a function, from any thread, after each commit."""
-        self._context.store.writer.after_commit.append(listener)
+        """Call a function, from any thread, after each commit that has events."""
+        self._context.store.writer.after_events.append(listener)
 
     def unlisten(self, listener: Callable[[], object]) -> None:
-        """Stop calling a function after each commit."""
-        self._context.store.writer.after_commit.remove(listener)
+        """Stop calling a function after each commit that has events."""
+        self._context.store.writer.after_events.remove(listener)
 
 
 class Audit:

@@ -1,12 +1,11 @@
-"""The queue of submissions: looked up in groups, computed by a pool, recorded by the writer.
+"""The queue of submissions: looked up, solved and recorded in groups by one thread.
 
-    submit ──► inbox ──► ingest thread ──► solver pool ──► writer ──► futures
-                         what is recorded already     one transaction
-                         is answered from the tables  for all that wait
+    submit ──► writer's thread: look up, solve, record in one transaction ──► futures
+                      │ those that take long ──► solver pool ──┘
 
-Each stage takes whatever waits for it, so that look-ups and commits are shared
-under load and nothing waits for a timer.  A batch that takes long delays no other.
-A repeat of a batch that is being computed waits for it and is then looked up.
+The thread takes whatever waits, so that look-ups and commits are shared under load and
+nothing waits for a timer.  A batch that takes long goes to a thread of the pool, and delays
+no other.  A repeat of a batch that is being computed waits for it and is then looked up.
 """
 
 import asyncio
@@ -18,23 +17,19 @@ from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
-from queue import Empty, SimpleQueue
 
 from service.errors import Busy, Stopping
 from service.ingest.solver_pool import WAIT_S, SolverPool, SolverTask
 from service.ingest.turns import Turns
 from service.observations.schema import Submission
+from service.sky.cache import NotAtHand
 from service.storage.recording.identity import Identity, OwnKey
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
-from service.storage.sql.transaction import WriteOutcome, WriteOutcomes
+from service.storage.sql.transaction import QueuedJob, WriteOutcome, WriteOutcomes
 from service.storage.sql.writer import RETRY_AFTER_S, Writer, WriterState
 from service.times import Utc, utc_now
 
 MAX_WAITING = 2_000
-GROUP = 64
-HEARTBEAT_S, STALLED_S = 1.0, 20.0
-"""The longest time between heartbeats of the ingest thread, and the silence that counts as failure;
-one look-up takes at most five seconds."""
 DRAIN_S = 8.0
 """The longest wait for submissions to be answered when the service stops."""
 
@@ -65,6 +60,8 @@ class PendingBatch:
     """The order of those of a sequence that wait together."""
     received: Utc = field(default_factory=utc_now)
     since_s: float = field(default_factory=time.monotonic)
+    unsaved: UnsavedResult | None = None
+    """What was computed."""
 
 
 @dataclass(frozen=True)
@@ -89,15 +86,17 @@ class IngestQueue:
     def __init__(
         self,
         look_up: Callable[[Sequence[PendingBatch]], Found],
-        solve: Callable[[PendingBatch], UnsavedResult],
+        solve: Callable[[PendingBatch, bool], UnsavedResult],
         recorded: Callable[[UnsavedResult, WriteOutcome], object],
         writer: Writer,
         pool: SolverPool,
     ) -> None:
-        """`look_up` answers what is recorded; `recorded` is told of each outcome of a write."""
+        """`look_up` answers what is recorded; `recorded` is told of each outcome of a write.
+
+        `solve` is told, too, whether it may wait; if not it raises `NotAtHand` for what takes long.
+        """
         self._look_up, self._solve, self._told = look_up, solve, recorded
         self._writer, self._pool = writer, pool
-        self._inbox: SimpleQueue[PendingBatch | None] = SimpleQueue()
         self._lock = threading.Lock()
         self._in_flight: dict[Identity, list[PendingBatch]] = {}
         """Those that are being computed or recorded, each with its repeats."""
@@ -107,10 +106,8 @@ class IngestQueue:
         self._closing = False
         self._empty = threading.Event()
         self._empty.set()
-        self._beat_s = time.monotonic()
+        writer.solve_posts = self._begin
         writer.after_commit.append(self._answer_written)
-        self._thread = threading.Thread(target=self._run, name="ingest", daemon=True)
-        self._thread.start()
 
     def put(self, pending: PendingBatch) -> None:
         """Queue a submission; raises `Busy` where too many wait, `Stopping` after `close`."""
@@ -122,7 +119,7 @@ class IngestQueue:
                 raise Busy(message, RETRY_AFTER_S)
             self._unsettled[pending] = None
             self._empty.clear()
-        self._inbox.put(pending)
+        self._queue(pending)
 
     def state(self) -> QueueState:
         """The submissions that wait for their answers."""
@@ -135,86 +132,69 @@ class IngestQueue:
         """Wait until every submission is answered, at most `seconds`."""
         self._empty.wait(seconds)
 
-    def require_alive(self) -> None:
-        """Raise `Stopping` where the ingest thread has ended or does not go on."""
-        if not self._thread.is_alive() or time.monotonic() - self._beat_s > STALLED_S:
-            raise Stopping("submissions are not worked on any more: restart the service")
-
     def close(self) -> None:
-        """Refuse new submissions, answer those that wait, and end the thread."""
+        """Refuse new submissions, and answer those that wait."""
         with self._lock:
             self._closing = True
         self._empty.wait(DRAIN_S)
-        self._inbox.put(None)
-        self._thread.join()
+        with self._lock:
+            left = list(self._unsettled)
+        self._settle([(each, Stopping("the service is stopping")) for each in left])
 
-    # ---- the ingest thread -------------------------------------------------------------------
-
-    def _run(self) -> None:
+    def _queue(self, pending: PendingBatch) -> None:
         try:
-            while (group := self._next_group()) is not None:
-                try:
-                    self._begin(group)
-                except Exception as error:
-                    log.exception("a group of submissions failed")
-                    self._settle([(pending, error) for pending in group])
-        finally:
-            # Empty after an orderly close; otherwise the waiting clients get an error.
-            with self._lock:
-                self._closing = True
-                left = list(self._unsettled)
-            self._settle([(each, Stopping("the service is stopping")) for each in left])
+            self._writer.put(QueuedJob(partial(self._note_written, pending), post=pending))
+        except Busy as error:
+            self._settle([(pending, error)])
 
-    def _next_group(self) -> list[PendingBatch] | None:
-        """The submissions that wait, at least one; None after `close`."""
-        group: list[PendingBatch] = []
-        while not group:
-            self._beat_s = time.monotonic()
-            with suppress(Empty):
-                waiting = self._inbox.get(timeout=HEARTBEAT_S)
-                while waiting is not None and len(group) < GROUP:
-                    group.append(waiting)
-                    waiting = self._inbox.get_nowait()
-                if waiting is None:
-                    return None
-                group.append(waiting)
-        return group
+    # ---- the writer's thread, before a transaction --------------------------------------------
 
-    def _begin(self, group: Sequence[PendingBatch]) -> None:
-        """Answer recorded and expired submissions; start computing the others, each once."""
+    def _begin(self, jobs: Sequence[QueuedJob]) -> list[QueuedJob]:
+        """Answer recorded and expired submissions; compute the others, each once."""
         now_s = time.monotonic()
-        late = [each for each in group if now_s - each.since_s > each.wait_s]
-        group = [each for each in group if now_s - each.since_s <= each.wait_s]
+        late = [job.post for job in jobs if now_s - job.post.since_s > job.post.wait_s]
         for pending in late:
             error = Busy(f"it has waited {pending.wait_s:g} s for its turn", RETRY_AFTER_S)
             self._settle([(pending, error)])
-        if not group:
-            return
+        jobs = [job for job in jobs if job.post not in late]
+        if not jobs:
+            return []
         try:
-            found = self._look_up(group)
+            found = self._look_up([job.post for job in jobs])
         except Exception as error:
-            found = [error] * len(group)
-        self._settle([(p, each) for p, each in zip(group, found, strict=True) if each is not None])
-        for pending, each in zip(group, found, strict=True):
-            if each is None:
-                self._compute(pending)
+            found = [error] * len(jobs)
+        known = [(j.post, each) for j, each in zip(jobs, found, strict=True) if each is not None]
+        self._settle(known)
+        new = [job for job, each in zip(jobs, found, strict=True) if each is None]
+        return [job for job in new if self._is_computed(job)]
 
-    def _compute(self, pending: PendingBatch) -> None:
+    def _is_computed(self, job: QueuedJob) -> bool:
+        """Whether the result is there now; otherwise it comes later, or the batch is answered."""
+        pending: PendingBatch = job.post
         with self._lock:
             repeats = self._in_flight.get(pending.identity)
             if repeats is not None:
                 repeats.append(pending)
-                return
+                return False
             self._in_flight[pending.identity] = []
             sequence = pending.sequence
             if sequence is not None and not self._turns.enter(sequence, pending.time_ns, pending):
-                return
-        error = self._start(pending)
-        if error is not None:
+                return False
+        if pending.is_long or sequence is not None:
+            self._start(pending)
+            return False
+        try:
+            pending.unsaved = self._solve(pending, False)
+        except NotAtHand:
+            self._start(pending)
+        except Exception as error:
             self._finish([(pending, error)])
+        else:
+            job.unsaved_results = [pending.unsaved]
+        return pending.unsaved is not None
 
-    def _start(self, pending: PendingBatch) -> Stopping | None:
-        """Queue a batch for the pool; the error where that takes no more."""
+    def _start(self, pending: PendingBatch) -> None:
+        """Queue a batch for the pool."""
         task = SolverTask(
             partial(self._solve_and_record, pending),
             lambda error: self._finish([(pending, error)]),
@@ -223,25 +203,24 @@ class IngestQueue:
         try:
             self._pool.put(task, pending.turn, is_long=pending.is_long)
         except Stopping as error:
-            return error
-        return None
+            self._finish([(pending, error)])
 
     # ---- a thread of the pool ----------------------------------------------------------------
 
     def _solve_and_record(self, pending: PendingBatch) -> None:
         try:
-            unsaved = self._solve(pending)
-            self._writer.queue([unsaved], partial(self._note_written, pending, unsaved))
+            pending.unsaved = self._solve(pending, True)
+            settle = partial(self._note_written, pending)
+            self._writer.put(QueuedJob(settle, [pending.unsaved]))
         except Exception as error:
             self._finish([(pending, error)])
 
-    # ---- the writer's thread -----------------------------------------------------------------
+    # ---- the writer's thread, after a transaction ---------------------------------------------
 
-    def _note_written(
-        self, pending: PendingBatch, unsaved: UnsavedResult, outcome: WriteOutcomes | Exception
-    ) -> None:
+    def _note_written(self, pending: PendingBatch, outcome: WriteOutcomes | Exception) -> None:
         one = outcome if isinstance(outcome, Exception) else outcome[0]
-        self._told(unsaved, one)
+        if pending.unsaved is not None:
+            self._told(pending.unsaved, one)
         self._written.append((pending, one))
 
     def _answer_written(self) -> None:
@@ -253,20 +232,15 @@ class IngestQueue:
 
     def _finish(self, outcomes: Sequence[tuple[PendingBatch, WriteOutcome]]) -> None:
         """Answer what was computed; its repeats are looked up, for it may have failed."""
-        done = list(outcomes)
-        # The next of a sequence may fail to start: then it is done as well.
-        for pending, _ in done:
-            if pending.sequence is not None:
-                with self._lock:
-                    following = self._turns.leave(pending.sequence)
-                error = None if following is None else self._start(following)
-                if following is not None and error is not None:
-                    done.append((following, error))
         with self._lock:
-            repeats = [each for p, _ in done for each in self._in_flight.pop(p.identity, ())]
+            repeats = [each for p, _ in outcomes for each in self._in_flight.pop(p.identity, ())]
+            ended = [p.sequence for p, _ in outcomes if p.sequence is not None]
+            following = [each for key in ended if (each := self._turns.leave(key)) is not None]
+        self._settle(outcomes)
         for each in repeats:
-            self._inbox.put(each)
-        self._settle(done)
+            self._queue(each)
+        for each in following:
+            self._start(each)
 
     def _settle(self, outcomes: Sequence[tuple[PendingBatch, WriteOutcome]]) -> None:
         by_loop: dict[asyncio.AbstractEventLoop, list[tuple[PendingBatch, WriteOutcome]]] = {}

@@ -9,7 +9,7 @@ from collections.abc import Callable, Hashable, Mapping
 from concurrent.futures import Future
 from typing import NamedTuple, TypeVar
 
-from service.acquire import Acquisition, acquire
+from service.acquire import Acquisition, acquire, acquire_at_once
 from service.errors import (
     AcquisitionError,
     BadBatch,
@@ -48,10 +48,15 @@ class Solver:
         self.sky = sky
         self.ids = Ulids()
 
-    def acquire(self, batch: ObservationBatch, mission: Mission | None = None) -> Acquisition:
-        """The acquisition of a batch, with other settings than its mission's where given."""
+    def acquire(
+        self, batch: ObservationBatch, mission: Mission | None = None, *, may_wait: bool = True
+    ) -> Acquisition:
+        """The acquisition of a batch, with other settings than its mission's where given.
+
+        Where it may not wait it raises `NotAtHand` for what takes long.
+        """
         mission = mission or mission_in_input(self.missions, batch.spacecraft)
-        return acquire(batch, mission, self.sky)
+        return (acquire if may_wait else acquire_at_once)(batch, mission, self.sky)
 
     def asks_for_last(self, batch: ObservationBatch) -> bool:
         """Whether the attitude of a batch is to be predicted from the record first.
@@ -61,11 +66,19 @@ class Solver:
         return asks_for_last(batch, self.missions.get(batch.spacecraft))
 
     def solve(
-        self, submission: Submission, received: Utc | None = None, key: OwnKey | None = None
+        self,
+        submission: Submission,
+        received: Utc | None = None,
+        key: OwnKey | None = None,
+        *,
+        may_wait: bool = True,
     ) -> UnsavedResult:
-        """The result of a submission; raises `BadBatch` for what does not fit its mission."""
+        """The result of a submission; raises `BadBatch` for what does not fit its mission.
+
+        Where it may not wait it raises `NotAtHand`, see `acquire`.
+        """
         received = received or utc_now()
-        acquisition = self.acquire(submission.batch)
+        acquisition = self.acquire(submission.batch, may_wait=may_wait)
         return unsaved_submission(
             submission, acquisition, id=self.ids.new(), received=received, key=key
         )

@@ -304,7 +304,7 @@ class SubmissionService:
 
     def require_alive(self) -> None:
         """Raise `Stopping` where submissions are not worked on any more."""
-        self._queue.require_alive()
+        self._store.writer.require()
 
     def close(self) -> None:
         """Answer what was submitted, and take no more."""
@@ -313,13 +313,13 @@ class SubmissionService:
 
     # ---- steps of the queue ------------------------------------------------------------------
 
-    def _solve(self, pending: PendingBatch) -> UnsavedResult:
+    def _solve(self, pending: PendingBatch, may_wait: bool) -> UnsavedResult:
         submission = pending.make()
         if self.solver.asks_for_last(submission.batch):
             mission = self.solver.missions[submission.batch.spacecraft]
             with self._store.reading_record() as connection:
                 submission = with_prediction(connection, submission, mission)
-        unsaved = self.solver.solve(submission, pending.received, pending.key)
+        unsaved = self.solver.solve(submission, pending.received, pending.key, may_wait=may_wait)
         note_handed_over([unsaved])
         return unsaved
 

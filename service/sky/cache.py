@@ -28,6 +28,10 @@ class Sized(Protocol):
 T = TypeVar("T", bound=Sized)
 
 
+class NotAtHand(Exception):
+    """What is asked for takes long, and the caller must not wait for it."""
+
+
 @dataclass
 class CacheEntry(Generic[T]):
     """One cached thing, and its use so far."""
@@ -68,10 +72,11 @@ class LruCache:
     _evictions: int = 0
     _build_us: int = 0
 
-    def get(self, key: Hashable, build: Callable[[], T]) -> tuple[T, bool]:
+    def get(self, key: Hashable, build: Callable[[], T], wait: bool = True) -> tuple[T, bool]:
         """The thing under `key`, built by `build` where it is missing, and whether it was there.
 
         An error of `build` reaches every waiting caller and leaves nothing behind.
+        Without `wait` what is missing is not built: `NotAtHand` is raised.
         """
         with self._lock:
             entry = self._entries.get(key)
@@ -80,6 +85,8 @@ class LruCache:
                 entry.hits += 1
                 self._hits += 1
                 return entry.thing, True  # type: ignore[return-value]
+            if not wait:
+                raise NotAtHand
             promise = self._building.get(key)
             mine = promise is None
             if promise is None:

@@ -1,11 +1,11 @@
 """The sky of one batch: the run catalog of its epoch, and the zones in it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from service.missions.mission import Mission
-from service.sky.cache import LruCache
+from service.sky.cache import LruCache, NotAtHand
 from service.sky.catalog.run_catalog import RunCatalog, build_run_catalog
 from service.sky.catalog.star_catalog import Catalog
 from service.sky.geometry.triangles import SLAVES
@@ -31,13 +31,21 @@ class SkyModel:
     cache: LruCache
     require_whole_sky: Callable[[], None] = field(default=lambda: None, kw_only=True)
     """Raises `Busy` while the kernels that search the whole sky are compiled."""
+    waits: bool = field(default=True, kw_only=True)
+    """Whether it builds what is missing, or raises `NotAtHand` there."""
+
+    def at_hand(self) -> "SkyModel":
+        """The same sky for who must not wait: what takes long raises `NotAtHand`."""
+        return replace(self, waits=False, require_whole_sky=_not_at_hand)
 
     def run_catalog(self, mission: Mission, time: Utc) -> RunCatalog:
         """The run catalog that serves a mission at a time: that of the nearest epoch."""
         epoch_year = mission.catalog.epoch_of(time.julian_year)
         key = RunCatalogKey(self.catalog.digest, mission.run_catalog_settings.digest, epoch_year)
         run_catalog, _ = self.cache.get(
-            key, lambda: build_run_catalog(self.catalog, mission.run_catalog_settings, epoch_year)
+            key,
+            lambda: build_run_catalog(self.catalog, mission.run_catalog_settings, epoch_year),
+            self.waits,
         )
         return run_catalog
 
@@ -50,7 +58,8 @@ class SkyModel:
         grid_deg: float,
     ) -> tuple[Zone, bool]:
         """The zone that serves a search region, and whether it was cached."""
-        return zone_for(self.cache, mission.name, run_catalog, region, separation_max_deg, grid_deg)
+        asked = (mission.name, run_catalog, region, separation_max_deg, grid_deg)
+        return zone_for(self.cache, *asked, wait=self.waits)
 
     def guide(self, run_catalog: RunCatalog, reach_deg: float) -> Guide:
         """The guide database of PTP for trackers that see so far from their boresight."""
@@ -81,3 +90,7 @@ class SkyModel:
         return self.cache.drop(
             lambda key: isinstance(key, ZoneKey) and mission in (None, key.mission)
         )
+
+
+def _not_at_hand() -> None:
+    raise NotAtHand

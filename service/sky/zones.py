@@ -259,11 +259,14 @@ def zone_for(
     region: SearchRegion,
     separation_max_deg: float,
     grid_deg: float,
+    *,
+    wait: bool = True,
 ) -> tuple[Zone, bool]:
     """The zone that serves a search region, cached or built, and whether it was cached.
 
     With a grid the zone's axis is the nearest grid point and its bounds are
     grown by half the diagonal of a grid cell; grid 0 is the exact zone.
+    Without `wait` it is not built: raises `NotAtHand`.
     """
     x, y, z = region.axis.tolist()
     least_deg, most_deg = region.least_deg, region.most_deg
@@ -290,7 +293,7 @@ def zone_for(
         )
         return build_zone(mission, run_catalog, wide, separation_max_deg, grid_deg)
 
-    return cache.get(key, build)
+    return cache.get(key, build, wait)
 
 
 def snapped(axis: Vector, grid_deg: float) -> Vector:

@@ -23,8 +23,8 @@ TRY_AGAIN_S = 1.0
 async def report_to_supervisor(app: App) -> None:
     """Report ready once the service is, and then that it is alive as often as is asked.
 
-    It runs until it is cancelled.  A loop that stands, or an ingest thread that does not go
-    on, sends nothing more: systemd then restarts the service (`WatchdogSec`).
+    It runs until it is cancelled.  A loop that stands, or a writer's thread that does not
+    go on, sends nothing more: systemd then restarts the service (`WatchdogSec`).
     """
     if "NOTIFY_SOCKET" not in os.environ:
         return

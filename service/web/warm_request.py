@@ -24,7 +24,7 @@ _BODY = json.dumps(_BATCH).encode()
 async def warm_request(app: ASGIApp) -> int:
     """Send the app a batch of an unknown spacecraft; gives the status of the answer.
 
-    It is checked, queued and refused by the ingest thread; where tokens are
+    It is checked, queued and refused by the writer's thread; where tokens are
     required, by the check of access.
     """
     head = (

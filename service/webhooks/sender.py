@@ -107,13 +107,13 @@ class WebhookSender:
         )
         self._thread.start()
         self._started.wait()
-        self._store.writer.after_commit.append(self._poke)
+        self._store.writer.after_events.append(self._poke)
 
     def stop(self) -> None:
         """Wait a little for the attempts under way, and note those that have succeeded."""
         if self._thread is None:
             return
-        self._store.writer.after_commit.remove(self._poke)
+        self._store.writer.after_events.remove(self._poke)
         with suppress(RuntimeError):
             self._loop.call_soon_threadsafe(self._task.cancel)
         self._thread.join()

@@ -248,9 +248,9 @@ def test_a_catalog_that_cannot_be_read_is_a_mistake_in_the_configuration(tmp_pat
 def test_no_moment_of_the_database_is_held_while_many_are_worked_on(app, make):
     held = []
     solver = app.submissions.ingest.solver
-    solver.acquire = lambda *asked, own=solver.acquire: (
+    solver.acquire = lambda *asked, own=solver.acquire, **how: (
         held.append(app.store._readers.pool.checkedout()),
-        own(*asked),
+        own(*asked, **how),
     )[1]
     app.submissions.submit_many([make("b1"), make("b2")])
     assert held == [0, 0]
@@ -292,10 +292,10 @@ def test_a_batch_was_received_before_it_was_worked_on_however_long_that_took(
     acquire = solver.acquire
     begun = []
 
-    def slow(batch, mission=None):
+    def slow(*asked, **how):
         begun.append(utc_now().tai_ns)
         time.sleep(0.02)
-        return acquire(batch, mission)
+        return acquire(*asked, **how)
 
     monkeypatch.setattr(solver, "acquire", slow)
     made = [solver.solve(make("alone"))]

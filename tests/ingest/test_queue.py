@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import sys
 import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -14,6 +15,8 @@ from service.ingest import queue
 from service.ingest import solver_pool as pools
 from service.ingest.solver_pool import SolverPool, SolverTask, TurnQueue, may_take_long
 from service.observations.schema import submission_from_json
+from service.sky.cache import NotAtHand
+from service.storage.sql import writer as writers
 from tests.waiting import wait_until
 
 PATIENCE_S = 20.0
@@ -34,7 +37,15 @@ class Held:
                 assert self.go_on.wait(PATIENCE_S)
             return acquire(batch, mission, sky)
 
+        def at_once(batch, *rest):
+            if batch.batch in names:
+                raise NotAtHand
+            self.computed.append(batch.batch)
+            return acquire_at_once(batch, *rest)
+
+        acquire_at_once = pools.acquire_at_once
         monkeypatch.setattr(pools, "acquire", holding)
+        monkeypatch.setattr(pools, "acquire_at_once", at_once)
 
 
 @pytest.fixture
@@ -54,6 +65,26 @@ def test_a_batch_that_takes_long_delays_no_other(send, make, monkeypatch):
     assert not slow.done()
     held.go_on.set()
     assert not slow.result(PATIENCE_S).replayed
+
+
+def test_what_takes_long_is_told_as_soon_as_it_shows(app, make, monkeypatch):
+    """A zone that has to be built, and an attitude that only the whole sky tells."""
+    app.zones.drop()
+    threads = []
+    acquire = pools.acquire
+    monkeypatch.setattr(
+        pools,
+        "acquire",
+        lambda *asked: (threads.append(threading.current_thread().name), acquire(*asked))[1],
+    )
+    app.submissions.submit(make("builds its zone"))
+    app.submissions.submit(make("has its zone"))
+    assert len(threads) == 1
+    wrong = json.loads(make("wrong").text)
+    wrong["a_priori"] = {"quaternion": [0.0, 0.0, 0.0, 1.0]}
+    app.submissions.submit(submission_from_json(json.dumps(wrong)))
+    assert len(threads) == 2
+    assert all(name.startswith("solver") for name in threads)
 
 
 def test_a_repeat_of_what_is_computed_waits_for_it_and_gets_its_answer(send, make, monkeypatch):
@@ -127,6 +158,7 @@ def test_what_waited_too_long_may_come_again(app, send, make, monkeypatch):
 
 def test_the_answers_of_a_group_reach_an_event_loop_together(app, make):
     sent = [make(f"b{k}") for k in range(8)]
+    app.submissions.submit(make("its zone is at hand then"))
 
     async def post_all():
         loop = asyncio.get_running_loop()
@@ -221,7 +253,8 @@ def test_closing_finishes_what_has_begun_and_refuses_what_has_not():
         pool.call(print, "a", is_long=False)
 
 
-def test_an_ingest_thread_that_ended_or_stalls_is_noticed(app, make, monkeypatch):
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_thread_that_ended_or_stalls_is_noticed(app, make, monkeypatch):
     service = app.submissions.ingest
 
     def is_alive():
@@ -231,8 +264,7 @@ def test_an_ingest_thread_that_ended_or_stalls_is_noticed(app, make, monkeypatch
         return False
 
     assert is_alive()
-    monkeypatch.setattr(queue, "HEARTBEAT_S", 0.05)
-    monkeypatch.setattr(queue, "STALLED_S", 0.5)
+    monkeypatch.setattr(writers, "STALLED_S", 0.1)
     go_on = threading.Event()
     look_up = service._queue._look_up
     monkeypatch.setattr(
@@ -245,8 +277,8 @@ def test_an_ingest_thread_that_ended_or_stalls_is_noticed(app, make, monkeypatch
     go_on.set()
     stalled.exception(PATIENCE_S)
     wait_until(is_alive, why="the thread counts as stalled though it goes on")
-    service._queue._inbox.put(None)
-    service._queue._thread.join(PATIENCE_S)
+    app.store.writer.change(lambda connection: sys.exit())
+    app.store.writer._thread.join(PATIENCE_S)
     with pytest.raises(Stopping, match="restart"):
         service.require_alive()
 

@@ -288,5 +288,5 @@ def test_a_writer_that_ends_leaves_nobody_waiting_and_is_not_ready(app):
         assert isinstance(each.exception(30), Stopping)
     with pytest.raises(Stopping):
         writer.change(new_run("later still"))
-    with pytest.raises(Busy, match="started again"):
+    with pytest.raises(Busy, match="restart the service"):
         app.service.ready()

@@ -3,6 +3,7 @@
 import asyncio
 import gc
 import math
+import sys
 import threading
 import time
 import weakref
@@ -132,12 +133,13 @@ def test_the_warm_up_request_reaches_the_queue_and_is_not_counted(
         app.close()
 
 
-def test_an_ingest_thread_that_has_ended_is_told_by_the_probe_of_life(tmp_path):
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_writer_that_has_ended_is_told_by_the_probe_of_life(tmp_path):
     app = open_app(in_process_settings(sqlite_at(tmp_path / "ended.db")))
     with Server(create_app(app)) as address, httpx.Client(base_url=address) as client:
         assert client.get("/livez").status_code == 200
-        app.submissions.ingest._queue._inbox.put(None)
-        app.submissions.ingest._queue._thread.join(10)
+        app.store.writer.change(lambda connection: sys.exit())
+        app.store.writer._thread.join(10)
         assert client.get("/livez").status_code == 503
 
 

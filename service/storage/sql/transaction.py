@@ -31,7 +31,10 @@ MAX_LOOKS = 5
 
 @dataclass(eq=False)
 class QueuedJob:
-    """Results to record, or another change to make, and the function that takes the outcome."""
+    """Results to record, or another change to make, and the function that takes the outcome.
+
+    The results of a `post` are added when its turn has come, see `Writer.solve_posts`.
+    """
 
     settle: Callable[[Any], object]
     """Called with the `WriteOutcomes`, with what the change returns, or with an error."""
@@ -39,6 +42,7 @@ class QueuedJob:
     change: Callable[[Connection], Any] | None = None
     low_priority: bool = False
     """As a bulk load has: it is written by itself, after what else waits."""
+    post: Any = None
     since_s: float = field(default_factory=time.monotonic)
 
     @property

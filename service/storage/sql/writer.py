@@ -1,9 +1,9 @@
 """The one connection that writes, and the thread behind it.
 
-The thread takes whatever is queued, writes it in one transaction, commits, and only
-then answers: under load many share a commit, and alone nothing waits for others.
-There is no timer.  Chunks of a bulk load are written by themselves, in turn with
-everything else.
+The thread takes whatever is queued, has the posts among it solved, writes all in one
+transaction, commits, and only then answers: under load many share a commit, and alone
+nothing waits for others.  There is no timer.  Chunks of a bulk load are written by
+themselves, in turn with everything else.
 """
 
 import logging
@@ -20,6 +20,7 @@ from sqlalchemy import Connection, Engine, update
 from sqlalchemy.exc import DBAPIError
 
 from service.errors import Busy, Standby, Stopping
+from service.storage.recording import events
 from service.storage.recording.unsaved_result import UnsavedResult
 from service.storage.serving.file_lock import FileLock
 from service.storage.serving.writing_lock import Attempt, WritingLock
@@ -35,7 +36,11 @@ T = TypeVar("T")
 
 MAX_QUEUED = 10_000
 """Results that may wait: a matter of seconds."""
+TOGETHER = 64
+"""The most pieces of work of one transaction."""
 MAX_ATTEMPTS = 5
+STALLED_S = 20.0
+"""Posts that are not solved by then are a failure; a look-up takes at most five seconds."""
 RETRY_AFTER_S = 5
 PROBE_BYTES = 1 << 20
 """What readiness writes after a write that failed: as much as a batch of many stars."""
@@ -90,38 +95,36 @@ class Writer:
         self._changed = threading.Condition()
         self.commits = 0
         """Transactions that were committed, without those of the projector."""
+        self.solve_posts: Callable[[Sequence[QueuedJob]], list[QueuedJob]] = list
+        """Adds the results of posts; gives those that are to be written now.  Settles, or puts
+        again later, the others.  Called by the writer's thread."""
+        self._solving_since_s: float | None = None
         self.after_commit: list[Callable[[], object]] = []
         """Called by the writer's thread, which waits for it, after each transaction."""
+        self.after_events: list[Callable[[], object]] = []
+        """Called after those transactions that recorded events."""
+        self._has_events = False
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
         self._thread.start()
-
-    def queue(
-        self,
-        unsaved_results: Sequence[UnsavedResult],
-        settle: Callable[[WriteOutcomes | Exception], object],
-        low_priority: bool = False,
-    ) -> None:
-        """Queue results for one transaction; raises `Busy` when too much is waiting.
-
-        Those of `low_priority` get a transaction of their own, and what else is queued
-        goes first.  `settle` is called by the writer's thread with one outcome for each, in
-        order: an answer, stored, or the error that kept this result, and no other, from
-        being recorded.  Where the database itself fails it is called with `Busy`.
-        """
-        self._put(QueuedJob(settle, unsaved_results, low_priority=low_priority))
 
     def record(
         self, unsaved_results: Sequence[UnsavedResult], low_priority: bool = False
     ) -> "Future[WriteOutcomes]":
-        """`queue` with a future that gives the outcomes, or raises `Busy`."""
+        """Queue results for one transaction; raises `Busy` when too much is waiting.
+
+        Those of `low_priority` get a transaction of their own, and what else is queued
+        goes first.  The future gives one outcome for each, in order: an answer, stored, or the
+        error that kept this result, and no other, from being recorded.  Where the database
+        itself fails it raises `Busy`.
+        """
         done: Future[WriteOutcomes] = Future()
-        self.queue(unsaved_results, _settling(done), low_priority)
+        self.put(QueuedJob(_settling(done), unsaved_results, low_priority=low_priority))
         return done
 
     def change(self, change: Callable[[Connection], T]) -> "Future[T]":
         """Queue another change, which is kept whole or not at all, and may be made twice over."""
         done: Future[T] = Future()
-        self._put(QueuedJob(_settling(done), change=change))
+        self.put(QueuedJob(_settling(done), change=change))
         return done
 
     def project(self, step: Callable[[Connection], T]) -> "Future[T]":
@@ -130,7 +133,7 @@ class Writer:
         Posts go first, and the queue is never too full for it.
         """
         done: Future[T] = Future()
-        self._put(QueuedJob(_settling(done), change=step, low_priority=True))
+        self.put(QueuedJob(_settling(done), change=step, low_priority=True))
         return done
 
     def take_lock(self) -> Attempt:
@@ -154,9 +157,10 @@ class Writer:
 
     def require(self) -> None:
         """Raise `Stopping` unless what is queued will be written."""
-        with self._changed:
-            if self._closing or not self._thread.is_alive():
-                raise Stopping("nothing is written any more: the service must be started again")
+        since_s = self._solving_since_s
+        is_stalled = since_s is not None and time.monotonic() - since_s > STALLED_S
+        if self._closing or is_stalled or not self._thread.is_alive():
+            raise Stopping("nothing is recorded any more: restart the service")
 
     def note_failure(self, count: int) -> None:
         """Count work that could not be written, or not even be looked up before that."""
@@ -193,14 +197,13 @@ class Writer:
         self._thread.join()
         self._connection.close()
 
-    def _put(self, job: QueuedJob) -> None:
+    def put(self, job: QueuedJob) -> None:
+        """Queue a job, whose `settle` is called by the writer's thread; raises as `record` does."""
         with self._changed:
             if self._closing:
                 raise Stopping("the service is stopping")
-            if self._lock is not None:
-                self._lock.require()
-            if self._file_lock is not None:
-                self._file_lock.take()
+            if job.post is None:
+                self._require_locks()
             # A job that alone is larger than the queue is still taken by an empty one.
             is_full = self._queued and self._queued + job.weight > self._max_queued
             if is_full and not job.is_projection:
@@ -208,6 +211,12 @@ class Writer:
             (self._low_priority if job.low_priority else self._queue).append(job)
             self._queued += job.weight
             self._changed.notify()
+
+    def _require_locks(self) -> None:
+        if self._lock is not None:
+            self._lock.require()
+        if self._file_lock is not None:
+            self._file_lock.take()
 
     # ---- the writer's thread -----------------------------------------------------------------
 
@@ -237,14 +246,13 @@ class Writer:
                 jobs = [self._low_priority.popleft()]
                 self._has_waited = False
             else:
-                jobs = list(self._queue)
-                self._queue.clear()
+                jobs = [self._queue.popleft() for _ in range(min(TOGETHER, len(self._queue)))]
                 self._has_waited = bool(self._low_priority)
             self._queued -= sum(job.weight for job in jobs)
         return jobs
 
     def _settle(self, jobs: Sequence[QueuedJob]) -> None:
-        jobs = self._in_time(jobs)
+        jobs = self._in_time(self._solved(jobs))
         if not jobs:
             return
         try:
@@ -271,6 +279,26 @@ class Writer:
         for job, outcome in zip(jobs, outcomes, strict=True):
             job.settle(outcome)
 
+    def _solved(self, jobs: Sequence[QueuedJob]) -> Sequence[QueuedJob]:
+        """The jobs, with those posts that have results now."""
+        posts = [job for job in jobs if job.post is not None]
+        if not posts:
+            return jobs
+        self._solving_since_s = time.monotonic()
+        try:
+            solved = self.solve_posts(posts)
+            if solved:
+                self._require_locks()
+        except Exception as error:
+            if not isinstance(error, Busy):
+                log.exception("a group of submissions failed")
+            for job in posts:
+                job.settle(error)
+            solved = []
+        finally:
+            self._solving_since_s = None
+        return [job for job in jobs if job.post is None] + solved
+
     def _in_time(self, jobs: Sequence[QueuedJob]) -> Sequence[QueuedJob]:
         """The jobs that have not waited too long; clients of the others are told."""
         if self._wait_s is None:
@@ -290,7 +318,9 @@ class Writer:
         while True:
             try:
                 with self._transaction(jobs) as connection:
-                    return self._transact(connection, jobs, careful=attempt > 1)
+                    outcomes = self._transact(connection, jobs, careful=attempt > 1)
+                    self._has_events = events.noted(connection) > 0
+                return outcomes
             except RolledBack:
                 pass
             except DBAPIError as error:
@@ -321,7 +351,9 @@ class Writer:
             yield connection
 
     def _tell(self) -> None:
-        for told in self.after_commit:
+        listeners = [*self.after_commit, *(self.after_events if self._has_events else ())]
+        self._has_events = False
+        for told in listeners:
             try:
                 told()
             except Exception:
