@@ -18,6 +18,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 
+from sqlalchemy import Connection
+
 from service.errors import Busy, Stopping
 from service.ingest.solver_pool import WAIT_S, SolverPool, SolverTask
 from service.ingest.turns import Turns
@@ -33,7 +35,8 @@ MAX_WAITING = 2_000
 DRAIN_S = 8.0
 """The longest wait for submissions to be answered when the service stops."""
 
-Found = Sequence[Answered | Exception | None]
+Found = Answered | Exception | Callable[[Connection], Answered] | None
+"""What a look-up gives: the answer, the error, a change that gives the answer, or nothing."""
 
 log = logging.getLogger(__name__)
 
@@ -85,7 +88,7 @@ class IngestQueue:
 
     def __init__(
         self,
-        look_up: Callable[[Sequence[PendingBatch]], Found],
+        look_up: Callable[[Sequence[PendingBatch]], Sequence[Found]],
         solve: Callable[[PendingBatch, bool], UnsavedResult],
         recorded: Callable[[UnsavedResult, WriteOutcome], object],
         writer: Writer,
@@ -159,14 +162,20 @@ class IngestQueue:
         jobs = [job for job in jobs if job.post not in late]
         if not jobs:
             return []
+        found: Sequence[Found]
         try:
             found = self._look_up([job.post for job in jobs])
         except Exception as error:
             found = [error] * len(jobs)
-        known = [(j.post, each) for j, each in zip(jobs, found, strict=True) if each is not None]
+        known, to_write = [], []
+        for job, each in zip(jobs, found, strict=True):
+            if isinstance(each, Answered | Exception):
+                known.append((job.post, each))
+            else:
+                job.change = each
+                to_write.append(job)
         self._settle(known)
-        new = [job for job, each in zip(jobs, found, strict=True) if each is None]
-        return [job for job in new if self._is_computed(job)]
+        return [job for job in to_write if job.change is not None or self._is_computed(job)]
 
     def _is_computed(self, job: QueuedJob) -> bool:
         """Whether the result is there now; otherwise it comes later, or the batch is answered."""
@@ -217,8 +226,10 @@ class IngestQueue:
 
     # ---- the writer's thread, after a transaction ---------------------------------------------
 
-    def _note_written(self, pending: PendingBatch, outcome: WriteOutcomes | Exception) -> None:
-        one = outcome if isinstance(outcome, Exception) else outcome[0]
+    def _note_written(
+        self, pending: PendingBatch, outcome: WriteOutcomes | Answered | Exception
+    ) -> None:
+        one = outcome[0] if isinstance(outcome, list) else outcome
         if pending.unsaved is not None:
             self._told(pending.unsaved, one)
         self._written.append((pending, one))

@@ -26,7 +26,7 @@ from service.ingest.outcomes import (
     note_handed_over,
     outcome_of,
 )
-from service.ingest.queue import Backlog, IngestQueue, PendingBatch
+from service.ingest.queue import Backlog, Found, IngestQueue, PendingBatch
 from service.ingest.solver_pool import WAIT_S, Solver, SolverPool, may_take_long, mission_in_input
 from service.ingest.tracking import with_prediction
 from service.missions.mission import Mission
@@ -323,10 +323,11 @@ class SubmissionService:
         note_handed_over([unsaved])
         return unsaved
 
-    def _recorded_before(
-        self, group: Sequence[PendingBatch]
-    ) -> list[Answered | AcquisitionError | None]:
-        """For each: the stored answer, the error where another body has its identity, or None."""
+    def _recorded_before(self, group: Sequence[PendingBatch]) -> list[Found]:
+        """For each: the stored answer, the error where another body has its identity, or None.
+
+        In place of an answer whose key is new: the change that keeps the key, and gives the answer.
+        """
         # Identities before keys, each as of its moment: a batch recorded in between is found by
         # its key, or seems new, and then the transaction finds it.
         with self._noted_failure(len(group)), self._store.lookup() as connection:
@@ -354,7 +355,7 @@ class SubmissionService:
         first: ExistingResult,
         stored: Mapping[str, bytes | AcquisitionError],
         registry: Registry,
-    ) -> Answered | AcquisitionError | None:
+    ) -> Found:
         """The stored answer; a key that came with it belongs to its body from now on."""
         answer = stored.get(first.result_id)
         if answer is None:
@@ -364,14 +365,15 @@ class SubmissionService:
             return answer
         identity, key = pending.identity, pending.key
         # The keys of archived batches are in the archive.
-        if key is not None and key not in registry.keys and not first.archived:
-            try:
-                self._store.writer.change(
-                    lambda connection: remember_key(connection, identity, key, first)
-                ).result()
-            except AcquisitionError as error:
-                return error
-        return Answered(first.result_id, answer, replayed=True)
+        repeated = Answered(first.result_id, answer, replayed=True)
+        if key is None or key in registry.keys or first.archived:
+            return repeated
+
+        def keep_key(connection: Connection) -> Answered:
+            remember_key(connection, identity, key, first)
+            return repeated
+
+        return keep_key
 
     @contextmanager
     def _noted_failure(self, count: int) -> Iterator[None]:

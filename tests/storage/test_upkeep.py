@@ -35,6 +35,7 @@ from service.storage.recording.digests import digest_of
 from service.storage.sql.columns import metadata
 from service.storage.sql.database import Store
 from service.storage.sql.engines import database_url
+from service.storage.sql.packed_text import PackedText
 from service.storage.sql.rollup_tables import rollups_daily, rollups_hourly
 from service.storage.sql.tables import (
     batches,
@@ -75,8 +76,16 @@ def counts(app):
         return {t.name: connection.scalar(select(func.count()).select_from(t)) for t in tables}
 
 
-def change(app, statement):
-    app.store.writer.change(lambda connection: connection.execute(statement)).result()
+def change(app, change):
+    """Make a change, given as a statement or as a function of a connection."""
+    made = change if callable(change) else lambda connection: connection.execute(change)
+    app.store.writer.change(made).result()
+
+
+def replace_in_input(connection, id, old, new):
+    of_batch = batches.c.id == id
+    sent = connection.scalar(select(batches.c.input).where(of_batch))
+    connection.execute(update(batches).where(of_batch).values(input=sent.replace(old, new)))
 
 
 # ---- verify ------------------------------------------------------------------------------------
@@ -107,11 +116,7 @@ def test_of_a_sound_database_nothing_is_wrong(filled, database):
             "0 of its results are current",
         ),
         (
-            lambda id: (
-                update(batches)
-                .where(batches.c.id == id)
-                .values(input=func.replace(batches.c.input, "XTE", "XTF"))
-            ),
+            lambda id: lambda connection: replace_in_input(connection, id, "XTE", "XTF"),
             "its input is not the one that was fingerprinted",
         ),
         (
@@ -145,7 +150,7 @@ def altered(value, kind, rng):
     if isinstance(kind, Double):
         next_one = math.nextafter(value or 0.0, math.inf)
         return 0.5 if value is None else rng.choice([-value or 1.0, next_one])
-    if isinstance(kind, String):
+    if isinstance(kind, String | PackedText):
         text = value or "?"
         place = rng.randrange(len(text))
         return text[:place] + ("~" if text[place] != "~" else "!") + text[place + 1 :]
@@ -222,9 +227,7 @@ def test_a_sound_batch_made_of_a_frame_is_not_called_damaged(app, framed, databa
     [
         (
             lambda id: (
-                update(batches)
-                .where(batches.c.id == id)
-                .values(input=func.replace(batches.c.input, '"magnitude":', '"magnitude":1'))
+                lambda connection: replace_in_input(connection, id, '"magnitude":', '"magnitude":1')
             ),
             "stars of its input are not those of its frame",
         ),

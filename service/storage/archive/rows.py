@@ -25,6 +25,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeEngine
 
+from service.storage.sql.packed_text import PackedText
 from service.storage.sql.statements import insert_all
 from service.storage.sql.tables import (
     batches,
@@ -63,6 +64,7 @@ _TYPES: Sequence[tuple[type[TypeEngine[Any]], pa.DataType]] = (
     (Double, pa.float64()),
     (LargeBinary, pa.binary()),
     (String, pa.string()),
+    (PackedText, pa.string()),
 )
 
 

@@ -14,6 +14,7 @@ from service.storage.queries.pages import PLACE
 from service.storage.recording import events
 from service.storage.recording.unsaved_result import STARS
 from service.storage.sql.columns import Row
+from service.storage.sql.packed_text import unpack
 from service.storage.sql.tables import results
 
 
@@ -39,7 +40,7 @@ def _note_states(
 
     A late batch changes none, and neither does a live one that is dated ahead.
     """
-    states = {each.seq: state_in(each.result["answer"]) for each in new}
+    states = {each.seq: state_in(unpack(each.result["answer"])) for each in new}
     tracked = [each for each in new if states[each.seq] is not None and not each.is_ahead]
     if not tracked:
         return

@@ -10,6 +10,7 @@ from sqlalchemy import Connection, insert
 
 from service.errors import Conflict, KeyReused, shown_value
 from service.observations.batch import ObservationBatch
+from service.storage.sql.packed_text import unpack
 from service.storage.sql.prepared import execute
 from service.storage.sql.tables import idempotency_keys
 
@@ -173,4 +174,4 @@ def key_row(key: OwnKey, taken: ExistingResult) -> dict[str, str]:
 def stored_answers(connection: Connection, ids: Collection[str]) -> dict[str, bytes]:
     """The answers of recorded results, byte for byte as first sent."""
     rows = _rows(connection, _ANSWERS + _AMONG[connection.dialect.name], ids) if ids else ()
-    return {id: answer.encode() for id, answer in rows}
+    return {id: unpack(answer).encode() for id, answer in rows}

@@ -27,6 +27,7 @@ from service.storage.sql.engines import (
     shown_url,
     writing_engine,
 )
+from service.storage.sql.packed_text import unpack
 
 if TYPE_CHECKING:
     from alembic.config import Config
@@ -213,9 +214,8 @@ def _writer(connection: Connection) -> str:
     """The version that wrote the newest answer, as far as another schema lets it be known."""
     newest = "SELECT answer FROM results ORDER BY id DESC LIMIT 1"
     with suppress(SQLAlchemyError, ValueError, LookupError, TypeError), connection.begin_nested():
-        version = json.loads(connection.exec_driver_sql(newest).scalar_one())["provenance"][
-            "version"
-        ]
+        answer = unpack(connection.exec_driver_sql(newest).scalar_one())
+        version = json.loads(answer)["provenance"]["version"]
         return f"its newest result is of version {version}"
     return "which one, no result tells"
 

@@ -22,6 +22,7 @@ from sqlalchemy import (
 from sqlalchemy.exc import DBAPIError
 
 from service.storage.sql.columns import Row
+from service.storage.sql.packed_text import PackedText, pack
 from service.storage.sql.prepared import Prepared
 from service.storage.sql.rollup_tables import COUNTS, MAXIMA, MINIMA, SUMS
 from service.storage.sql.tables import runs
@@ -38,6 +39,7 @@ _COPIED: Sequence[tuple[type[Any], str]] = (
     (Double, "float8"),
     (LargeBinary, "bytea"),
     (String, "text"),
+    (PackedText, "text"),
 )
 
 
@@ -46,7 +48,16 @@ def insert_all(connection: Connection, table: Table, rows: Sequence[Row]) -> Non
     if len(rows) >= COPIED_FROM and connection.dialect.name == "postgresql":
         _copy(connection, table, rows)
         return
+    if connection.dialect.name == "sqlite":
+        for name in _packed(table):
+            rows = [row | {name: pack(row[name])} for row in rows]
     _insert(table).insert(connection, rows)
+
+
+@cache
+def _packed(table: Table) -> Sequence[str]:
+    """The columns whose values SQLite's driver is given packed."""
+    return [column.name for column in table.c if isinstance(column.type, PackedText)]
 
 
 def insert_missing(connection: Connection, table: Table, rows: Sequence[Row]) -> None:

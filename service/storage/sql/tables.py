@@ -51,6 +51,7 @@ from sqlalchemy import (
 from service.alarms.quantities import QUANTITIES, Measured
 from service.storage.sql.alarm_tables import alarm_actions, alarms, watches
 from service.storage.sql.columns import Digest, Id, Moment, Name, RunName, metadata
+from service.storage.sql.packed_text import PackedText
 from service.storage.sql.rollup_tables import (
     rollups_daily,
     rollups_hourly,
@@ -106,7 +107,7 @@ batches = Table(
     Column("time_ns", BigInteger, nullable=False),
     Column("received", Moment, nullable=False),
     Column("fingerprint", String(64), nullable=False),
-    Column("input", Text, nullable=False),
+    Column("input", PackedText, nullable=False),
     UniqueConstraint("spacecraft", "run", "batch"),
 )
 
@@ -152,7 +153,7 @@ results = Table(
     # Null where the quantity is not known.
     *(Column(name, Double) for name in MEASURED),
     # The answer's JSON, byte for byte as it was sent.
-    Column("answer", Text, nullable=False),
+    Column("answer", PackedText, nullable=False),
     # Of all that is kept of the result; null: an earlier version recorded it.
     Column("digest", BigInteger),
 )
