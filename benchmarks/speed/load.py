@@ -52,6 +52,11 @@ def request(path: str, body: bytes, kind: str = "application/json") -> bytes:
     return HEAD.format(path=path, kind=kind, length=len(body)).encode() + body
 
 
+def get(path: str) -> bytes:
+    """A request for a page as it goes over the wire."""
+    return f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode()
+
+
 def drive(
     port: int,
     requests: Iterable[bytes],

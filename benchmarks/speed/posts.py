@@ -12,11 +12,13 @@ at: each post is recorded, new, and its stars are named as the pass drew them.
 
 import itertools
 import json
+import sqlite3
 import tempfile
 import threading
 import time
 import urllib.request
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -25,7 +27,7 @@ from typing import Any
 
 from benchmarks.bounds import Bound, at_least, at_most, equal
 from benchmarks.report import Report
-from benchmarks.speed.load import Driven, drive, request
+from benchmarks.speed.load import Driven, drive, get, request
 from benchmarks.speed.serving import START_S, Served, no_op, service
 from service.app.factory import open_app
 from service.missions.mission import load_missions
@@ -50,7 +52,10 @@ PACED, QUICK_PACED = 1_000, 200
 GAP_S = 0.02
 """Between the posts of a connection, where waits and not rates are measured."""
 CHUNK = 250
-LEAST_OF_NO_OP, LEAST_OF_CEILING, MOST_WAIT, MOST_READY_S = 0.28, 0.5, 3.0, 3.0
+LEAST_OF_NO_OP, LEAST_OF_CEILING, MOST_WAIT, MOST_READY_S = 0.3, 0.5, 3.0, 3.0
+MOST_CPU_US = {8: 1_000.0, 1: 1_400.0}
+"""Of a post, by connections."""
+MOST_OF_LIVEZ, MOST_BYTES = 3.0, 2_500.0
 MOST_READY_MB, MOST_AFTER_MB, MOST_BULK_MB = 700.0, 800.0, 1600.0
 """Of all processes of the service together."""
 MOST_FIRST = 1.5
@@ -135,6 +140,8 @@ def singles(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any]
     ready_s, first, in_a_row, later = (median(each) for each in zip(*starts, strict=True))
     rates: dict[str, list[float]] = {"no-op": [], "any JSON": [], "service": []}
     cpu_us: dict[str, list[float]] = {name: [] for name in rates}
+    of_livez: list[float] = []
+    by_connections_us: dict[int, list[float]] = {each: [] for each in MOST_CPU_US}
     p50_ms: list[float] = []
     right = seen = 0
     with no_op() as bare, service(folder / "single.db") as served:
@@ -157,15 +164,23 @@ def singles(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any]
                     answer = json.loads(driven.last)
                     got, of = pass_.right(int(answer["batch"].rpartition("-")[2]), answer)
                     right, seen = right + got, seen + of
-            row = pass_.bodies(ONE_BY_ONE, f"one-by-one-{round_}")
-            waits = drive(served.port, [request(f"{API}/batches", each) for each in row], 1)
+            for connections, took_us in by_connections_us.items():
+                posted = pass_.bodies(ONE_BY_ONE * connections, f"by-{connections}-{round_}")
+                row = [request(f"{API}/batches", each) for each in posted]
+                cpu = served.cpu_s()
+                waits = drive(served.port, row, connections)
+                took_us.append((served.cpu_s() - cpu) / len(row) * 1e6)
             p50_ms.append(waits.percentile_ms(50))
+            alive = drive(served.port, [get("/livez")] * ONE_BY_ONE, 1)
+            of_livez.append(p50_ms[-1] / alive.percentile_ms(50))
         page = read_json(served, f"{API}/batches?limit=500")["items"]
         for item in page[:100]:
             answer = read_json(served, f"{API}/batches/{item['id']}")["answer"]
             got, of = pass_.right(int(answer["batch"].rpartition("-")[2]), answer)
             right, seen = right + got, seen + of
         after_mb = served.resident_mb()
+    with closing(sqlite3.connect(folder / "single.db")) as database:
+        ((recorded,),) = database.execute("SELECT count(*) FROM batches")
     middle = {name: median(each) for name, each in rates.items()}
     turns = [a / b for a, b in zip(rates["service"], rates["no-op"], strict=True)]
     beside_any = [a / b for a, b in zip(rates["service"], rates["any JSON"], strict=True)]
@@ -185,12 +200,24 @@ def singles(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any]
         "single: cpu of no-op over service": median(cpu_us["no-op"]) / median(cpu_us["service"]),
         "single: cpu of the service, us a post": median(cpu_us["service"]),
         "single: p50 over one connection, ms": median(p50_ms),
+        "single: p50 over one connection, over /livez": median(of_livez),
+        **{
+            f"single: cpu of the service, us a post, connections: {connections}": median(took_us)
+            for connections, took_us in by_connections_us.items()
+        },
+        "single: bytes a batch": (folder / "single.db").stat().st_size / recorded,
         "single: stars named rightly": right / seen,
         "memory: at ready, MB": at_ready_mb,
         f"memory: after {rounds * (count + ONE_BY_ONE) + 400:,} posts, MB": after_mb,
     }
     bounds = [
         at_least("single posts over the no-op", ratio, LEAST_OF_NO_OP),
+        *(
+            at_most(f"cpu of a post, connections: {n}", median(by_connections_us[n]), most, "us")
+            for n, most in MOST_CPU_US.items()
+        ),
+        at_most("p50 over one connection, over /livez", median(of_livez), MOST_OF_LIVEZ),
+        at_most("SQLite", figures["single: bytes a batch"], MOST_BYTES, "bytes a batch"),
         at_most("seconds until ready", ready_s, MOST_READY_S),
         at_most("first request less later ones", (first - later) / in_a_row, MOST_FIRST, "posts"),
         at_least("stars named rightly, share", right / seen, RIGHT),
