@@ -25,9 +25,9 @@ from benchmarks.speed.scale import SPACECRAFT, emptied, filled, time_at
 from benchmarks.speed.stored import milliseconds
 from service.app.factory import open_app
 from service.settings import Settings
-from service.storage.archive.archiving import archive
-from service.storage.sql.database import Store
 from service.storage.sql.migrations import upgrade
+from service.storage.store import Store
+from service.storage.upkeep.archiving import archive
 from service.storage.upkeep.prune import prune
 from service.times import Utc
 

@@ -40,8 +40,8 @@ from service.simulate.telemetry import draw_pass
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
-from service.storage.archive import archiving
 from service.storage.sql.migrations import upgrade
+from service.storage.upkeep import archiving
 from service.times import parse_utc, shifted
 
 BATCHES, QUICK_BATCHES = 40_000, 4_000

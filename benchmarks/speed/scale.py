@@ -43,11 +43,11 @@ from service.simulate.telemetry import draw_pass
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
-from service.storage.archive.archiving import archive
-from service.storage.archive.restoring import PartFilter, restore, verify_archive
-from service.storage.sql.database import Store
 from service.storage.sql.migrations import upgrade
 from service.storage.sql.tables import batches, results
+from service.storage.store import Store
+from service.storage.upkeep.archiving import archive
+from service.storage.upkeep.restoring import PartFilter, restore, verify_archive
 from service.times import Utc, parse_utc
 
 BATCHES, QUICK_BATCHES = 1_000_000, 20_000

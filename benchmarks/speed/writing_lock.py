@@ -19,11 +19,11 @@ from sqlalchemy import Connection, update
 from benchmarks.bounds import at_most
 from benchmarks.report import Report
 from benchmarks.speed.scale import emptied
-from service.storage.serving.writing_lock import WritingLock
+from service.storage.recording.writer import Writer
 from service.storage.sql.engines import TO_COMMIT, database_url, writing_engine
 from service.storage.sql.migrations import upgrade
 from service.storage.sql.tables import event_counter
-from service.storage.sql.writer import Writer
+from service.storage.sql.writing_lock import WritingLock
 
 TRANSACTIONS, WARM_UP = 10_000, 200
 MOST = 1.05

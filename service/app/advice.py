@@ -19,9 +19,9 @@ from service.errors import BadInput, Busy, Fault
 from service.observations.schema import TolerancesIn
 from service.storage.grades.period import latest_innovations
 from service.storage.models.advice import Advice
-from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.recorded_batch import sample_batches
+from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc
 
 ADVICE_SAMPLE = 200

@@ -8,10 +8,10 @@ from service.alarms.subjects import limited_trackers
 from service.app.context import ALL_RUNS, Context, known_id
 from service.storage.models.alarms import Alarm, AlarmSpan, AlarmWithActions
 from service.storage.models.base import Page
+from service.storage.projections.silence import evaluate_by_clock, is_due_by_clock
 from service.storage.queries import alarms
-from service.storage.queries.future_dated import LIVE
 from service.storage.queries.period.alarms import alarm_spans
-from service.storage.recording.silence import evaluate_by_clock, is_due_by_clock
+from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.columns import Row
 from service.times import Utc, shifted, utc_now
 

@@ -15,9 +15,9 @@ from service.ingest.compare_options import ComparedSample, Pair, compare
 from service.missions.mission import Mission, mission_named
 from service.observations.schema import OptionsIn
 from service.storage.models.compare import Comparison
-from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.recorded_batch import batch_with_options, sample_batches
+from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.columns import Row
 from service.times import Utc
 

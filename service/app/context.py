@@ -19,7 +19,7 @@ from service.settings import Settings
 from service.sky.model import SkyModel
 from service.storage.queries.histories import Retired
 from service.storage.recording.ids import is_ulid
-from service.storage.sql.database import Store
+from service.storage.store import Store
 
 ALL_RUNS = "*"
 """Stands for every run, the live one included, where the name of a run is expected."""

@@ -37,7 +37,7 @@ from service.storage.projections.projector import Projector
 from service.storage.queries.histories import retired
 from service.storage.queries.replays import mark_interrupted
 from service.storage.recording.results import register
-from service.storage.sql.database import Store
+from service.storage.store import Store
 from service.storage.upkeep.expiries import ExpiryDates
 from service.storage.upkeep.split_trackers import BackgroundSplit, TrackerSplitter
 from service.times import utc_now

@@ -22,8 +22,8 @@ from service.storage.models.alarms import (
     SeverityName,
 )
 from service.storage.queries import limits
-from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
+from service.storage.recording.unsaved_result import LIVE
 from service.times import DAY_S, shifted, utc_now
 
 PREVIEW_DAYS = 7

@@ -12,7 +12,6 @@ from service.storage.models.base import Page
 from service.storage.models.period import PeriodStars
 from service.storage.models.star_field import StarField
 from service.storage.queries import results
-from service.storage.queries.future_dated import LIVE
 from service.storage.queries.neighbours import here_of, neighbours
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.period.sample import sample_period
@@ -23,7 +22,7 @@ from service.storage.queries.star_field import star_field_of
 from service.storage.queries.time_buckets import BucketFilter
 from service.storage.queries.tracker_comparison import tracker_comparison
 from service.storage.recording.ids import is_ulid
-from service.storage.recording.unsaved_result import Answered
+from service.storage.recording.unsaved_result import LIVE, Answered
 from service.storage.sql.columns import Row
 from service.times import Utc, utc_now
 

@@ -14,16 +14,16 @@ from service.ingest.reprocess import ReprocessPlan, ReprocessProgress, reprocess
 from service.ingest.solver_pool import Solver
 from service.ingest.worker_process import WorkerConfig
 from service.missions.mission import Mission, mission_named
-from service.storage.archive.reprocessing import Reprocessing, reprocessings
 from service.storage.models.compare import RatesOfRuns, RunChange, RunComparison
 from service.storage.models.runs import Forgotten, Run, RunState
 from service.storage.queries import histories, overview
-from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.runs.comparison import changed_batches, compare_runs
 from service.storage.queries.runs.rates import run_rates
 from service.storage.recording.results import set_run_alarms
+from service.storage.recording.unsaved_result import LIVE
 from service.storage.upkeep.forget import ForgetFilter, forget, found
+from service.storage.upkeep.reprocessing import Reprocessing, reprocessings
 from service.times import Utc, utc_now
 
 MOST_COMPARED = 2_000

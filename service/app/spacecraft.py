@@ -23,10 +23,10 @@ from service.storage.models.spacecraft import (
 from service.storage.models.trends import History, Ranking
 from service.storage.projections import rollups
 from service.storage.queries import fleet, histories, overview, trends
-from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.ranking import worst_batches
-from service.storage.queries.tracker_splits import is_waiting
+from service.storage.recording.tracker_splits import is_waiting
+from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, utc_now
 
 

@@ -14,9 +14,9 @@ from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.zones import Zone
 from service.storage.models.answers import ZoneSummary
 from service.storage.models.zones import CachedRunCatalog, CachedZone, ZoneCache
-from service.storage.queries.future_dated import LIVE
 from service.storage.queries.limits import latest_samples, latest_time
 from service.storage.queries.pages import ResultFilter
+from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, utc_now
 
 MOST_ERRORS = 10_000

@@ -56,7 +56,7 @@ def forget(parsed: Namespace) -> int:
     """Show what is removed, ask, and remove it."""
     from tqdm import tqdm
 
-    from service.storage.sql.database import Store
+    from service.storage.store import Store
     from service.storage.upkeep import forget as forgetting
 
     settings = settings_of_existing(parsed)

@@ -29,7 +29,7 @@ from service.observations.schema import Submission, submission_from_json
 from service.storage.gyro.blocks import Recorded
 from service.storage.recording.identity import Registry, look_up
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
-from service.storage.sql.database import Store
+from service.storage.store import Store
 
 PENDING_A_WORKER = 2
 """Chunks a worker that it has, or that wait for it."""

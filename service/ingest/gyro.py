@@ -9,7 +9,7 @@ from service.missions.gyro import largest_rate_deg_per_s
 from service.missions.mission import Mission
 from service.storage.gyro.blocks import Recorded, find_block, record_block, row_of
 from service.storage.recording.ids import Ulids
-from service.storage.sql.database import Store
+from service.storage.store import Store
 from service.times import utc_now
 
 

@@ -9,8 +9,8 @@ from msgspec import Struct
 
 from service.errors import AcquisitionError, BadBatch, Busy, Fault, shown_value
 from service.storage.recording.identity import ExistingResult, Identity, OwnKey, Registry
+from service.storage.recording.transaction import WriteOutcomes
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
-from service.storage.sql.transaction import WriteOutcomes
 
 MAX_KEY_LENGTH = 255
 

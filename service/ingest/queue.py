@@ -26,9 +26,9 @@ from service.ingest.turns import Turns
 from service.observations.schema import Submission
 from service.sky.cache import NotAtHand
 from service.storage.recording.identity import Identity, OwnKey
+from service.storage.recording.transaction import QueuedJob, WriteOutcome, WriteOutcomes
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
-from service.storage.sql.transaction import QueuedJob, WriteOutcome, WriteOutcomes
-from service.storage.sql.writer import RETRY_AFTER_S, Writer, WriterState
+from service.storage.recording.writer import RETRY_AFTER_S, Writer, WriterState
 from service.times import Utc, utc_now
 
 MAX_WAITING = 2_000

@@ -33,7 +33,7 @@ from service.storage.queries.replays import (
 )
 from service.storage.recording import events
 from service.storage.recording.unsaved_result import Answered
-from service.storage.sql.database import Store
+from service.storage.store import Store
 
 MAX_ERRORS_KEPT = 1_000
 MAX_FAULTS_KEPT = 3

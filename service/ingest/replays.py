@@ -18,7 +18,7 @@ from service.observations.readers.lines import Line
 from service.packets.upload import PacketLines
 from service.storage.models.runs import Replay, ReplayStateName
 from service.storage.queries.replays import CANCELLED
-from service.storage.sql.database import Store
+from service.storage.store import Store
 
 BUSY_PAUSE_S = 0.5
 STOP_WITHIN_S = 0.2

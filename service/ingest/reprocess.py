@@ -23,13 +23,12 @@ from service.ingest.tracking import tracked_again
 from service.ingest.worker_process import WorkerConfig
 from service.missions.mission import Mission
 from service.observations.schema import BatchIn, OptionsIn, Submission, submission_from_model
-from service.storage.archive.tables import archived_batches
-from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import PLACE, ResultFilter
-from service.storage.recording.unsaved_result import Answered, UnsavedResult
-from service.storage.sql.database import Store
+from service.storage.recording.unsaved_result import LIVE, Answered, UnsavedResult
+from service.storage.sql.archive_tables import archived_batches
 from service.storage.sql.statements import insert_runs
 from service.storage.sql.tables import batches, results, runs
+from service.storage.store import Store
 from service.times import utc_now
 
 CHUNK = 100

@@ -27,7 +27,7 @@ from service.sky.model import SkyModel
 from service.storage.recording.identity import OwnKey, identity_of
 from service.storage.recording.ids import Ulids
 from service.storage.recording.unsaved_result import UnsavedResult, unsaved_submission
-from service.storage.sql.writer import RETRY_AFTER_S
+from service.storage.recording.writer import RETRY_AFTER_S
 from service.times import Utc, utc_now
 
 WAIT_S = 5.0

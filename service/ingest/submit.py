@@ -47,7 +47,7 @@ from service.storage.recording.identity import (
 )
 from service.storage.recording.results import record
 from service.storage.recording.unsaved_result import Answered, UnsavedResult, unsaved_what_if
-from service.storage.sql.database import Store
+from service.storage.store import Store
 from service.times import utc_now
 
 YIELD_S = 0.002

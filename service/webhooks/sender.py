@@ -24,7 +24,7 @@ from service.errors import Busy, Standby, Stopping
 from service.settings import Network
 from service.storage.recording.events import Event, events_after, first_event, last_event
 from service.storage.recording.ids import unguessable_ulid
-from service.storage.sql.database import Store
+from service.storage.store import Store
 from service.storage.webhooks import deliveries
 from service.storage.webhooks.deliveries import Attempt, Queue, Waiting
 from service.storage.webhooks.registered import Registered, count_webhooks, registered_webhooks

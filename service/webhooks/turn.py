@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import TypeVar
 
-from service.storage.sql.database import Store
+from service.storage.store import Store
 from service.storage.webhooks.sender import hold_sender, read_sender
 
 BEAT_S = 3.0

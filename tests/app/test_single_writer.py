@@ -11,7 +11,7 @@ from service.app.factory import open_app
 from service.app.serving.single_writer import SingleWriter
 from service.observations.schema import submission_from_json
 from service.settings import Settings
-from service.storage.sql.database import Store
+from service.storage.store import Store
 from tests.calibration.wrong_file import true_batches, write_mission_files
 
 pytestmark = pytest.mark.parametrize("database", ["postgresql"], indirect=True)

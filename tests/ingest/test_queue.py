@@ -16,7 +16,7 @@ from service.ingest import solver_pool as pools
 from service.ingest.solver_pool import SolverPool, SolverTask, TurnQueue, may_take_long
 from service.observations.schema import submission_from_json
 from service.sky.cache import NotAtHand
-from service.storage.sql import writer as writers
+from service.storage.recording import writer as writers
 from tests.waiting import wait_until
 
 PATIENCE_S = 20.0

@@ -11,8 +11,8 @@ from msgspec.structs import asdict
 from sqlalchemy import update
 
 from service.errors import BadBatch, Busy, Stopping
+from service.storage.recording.writer import Writer
 from service.storage.sql.tables import replays
-from service.storage.sql.writer import Writer
 from tests.waiting import wait_until
 
 

@@ -12,14 +12,12 @@ from sqlalchemy import func, select, update
 from service.errors import BadConfiguration, Busy, Conflict
 from service.ingest import submit
 from service.observations.schema import OptionsIn
-from service.storage.archive import archiving, folder, rows
+from service.storage.archive import folder, rows
 from service.storage.archive.opened import WHOLE, Opened, columns_of
 from service.storage.archive.reading import Archive
-from service.storage.archive.restoring import PartFilter, restore, verify_archive
-from service.storage.archive.tables import archived_batches
 from service.storage.projections import rollups
+from service.storage.sql.archive_tables import archived_batches
 from service.storage.sql.columns import metadata
-from service.storage.sql.database import Store
 from service.storage.sql.tables import (
     batches,
     frames,
@@ -30,7 +28,10 @@ from service.storage.sql.tables import (
     star_results,
     tracker_values,
 )
+from service.storage.store import Store
+from service.storage.upkeep import archiving
 from service.storage.upkeep.prune import prune
+from service.storage.upkeep.restoring import PartFilter, restore, verify_archive
 from service.storage.upkeep.verify import verify
 from service.times import shifted
 from tests.fresh_databases import sqlite_at

@@ -10,10 +10,11 @@ from pathlib import Path
 import pytest
 from sqlalchemy import select
 
-from service.storage.archive import archiving, folder
-from service.storage.archive.restoring import PartFilter, restore, verify_archive
-from service.storage.archive.tables import archived_batches
+from service.storage.archive import folder
+from service.storage.sql.archive_tables import archived_batches
 from service.storage.sql.tables import batches, results
+from service.storage.upkeep import archiving
+from service.storage.upkeep.restoring import PartFilter, restore, verify_archive
 from service.storage.upkeep.verify import verify
 from service.times import shifted
 from tests.scale import size

@@ -8,12 +8,13 @@ from sqlalchemy import inspect
 
 from service.errors import Busy, WrongState
 from service.observations.schema import OptionsIn
-from service.storage.archive import archiving, folder
-from service.storage.archive.restoring import PartFilter, restore
+from service.storage.archive import folder
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.with_archive import both_runs
 from service.storage.queries.with_archive.rows import count
 from service.storage.sql.tables import batches, results
+from service.storage.upkeep import archiving
+from service.storage.upkeep.restoring import PartFilter, restore
 from service.times import shifted
 from tests.storage.samples import START
 

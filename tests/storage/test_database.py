@@ -20,10 +20,10 @@ from service.errors import BadConfiguration, Busy
 from service.settings import Settings
 from service.storage.sql import migrations
 from service.storage.sql.columns import metadata
-from service.storage.sql.database import Store
 from service.storage.sql.engines import database_url, writing_engine
 from service.storage.sql.prepared import execute
 from service.storage.sql.tables import batches
+from service.storage.store import Store
 from service.storage.upkeep.backup import back_up
 
 pytestmark = pytest.mark.both_databases

@@ -9,16 +9,16 @@ import sys
 import pytest
 
 from service.errors import BadConfiguration
-from service.storage.serving.file_lock import FileLock, is_written
-from service.storage.sql.database import Store
 from service.storage.sql.database_file import DatabaseFile
+from service.storage.sql.file_lock import FileLock, is_written
 from service.storage.sql.migrations import revision_of, upgrade
+from service.storage.store import Store
 from tests.fresh_databases import sqlite_at
 
 HOLDING = """
 import sys
 from pathlib import Path
-from service.storage.serving.file_lock import FileLock
+from service.storage.sql.file_lock import FileLock
 from service.storage.sql.database_file import DatabaseFile
 lock = FileLock(DatabaseFile(Path(sys.argv[1])))
 lock.take()

@@ -4,16 +4,16 @@ import pytest
 from sqlalchemy import func, select
 
 from service.errors import BadConfiguration, NotFound
-from service.storage.archive import archiving
-from service.storage.archive.restoring import verify_archive
-from service.storage.archive.tables import archived_batches, archived_parts
 from service.storage.sql.access_tables import audit
+from service.storage.sql.archive_tables import archived_batches, archived_parts
 from service.storage.sql.columns import metadata
 from service.storage.sql.grade_tables import graded_days
 from service.storage.sql.gyro_tables import gyro_blocks
 from service.storage.sql.rollup_tables import rollups_hourly
 from service.storage.sql.tables import batches, runs
+from service.storage.upkeep import archiving
 from service.storage.upkeep.forget import ForgetFilter, forget, found
+from service.storage.upkeep.restoring import verify_archive
 from service.storage.upkeep.verify import verify
 from service.times import shifted
 from tests.storage.recount import assert_equal_to_a_recount

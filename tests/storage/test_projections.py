@@ -12,13 +12,10 @@ from service.app.factory import open_app
 from service.errors import Busy
 from service.observations.schema import OptionsIn
 from service.settings import Settings
-from service.storage.archive.archiving import archive
-from service.storage.archive.restoring import PartFilter, restore
 from service.storage.projections import projector as projecting
 from service.storage.projections.projector import Projector, rebuild_trends
 from service.storage.recording.results import next_places
 from service.storage.sql.alarm_tables import alarm_actions, alarms, limits, watches
-from service.storage.sql.database import Store
 from service.storage.sql.rollup_tables import rollups_daily, rollups_hourly
 from service.storage.sql.tables import (
     batches,
@@ -30,8 +27,11 @@ from service.storage.sql.tables import (
     runs,
     tracker_values,
 )
+from service.storage.store import Store
+from service.storage.upkeep.archiving import archive
 from service.storage.upkeep.forget import ForgetFilter, forget
 from service.storage.upkeep.prune import prune
+from service.storage.upkeep.restoring import PartFilter, restore
 from service.storage.upkeep.verify import verify
 from service.times import shifted
 from tests.fresh_databases import sqlite_at

@@ -33,7 +33,6 @@ from service.simulate.frames import FrameSettings, draw_frames
 from service.storage.projections import rollups
 from service.storage.recording.digests import digest_of
 from service.storage.sql.columns import metadata
-from service.storage.sql.database import Store
 from service.storage.sql.engines import database_url
 from service.storage.sql.packed_text import PackedText
 from service.storage.sql.rollup_tables import rollups_daily, rollups_hourly
@@ -46,6 +45,7 @@ from service.storage.sql.tables import (
     solutions,
     star_results,
 )
+from service.storage.store import Store
 from service.storage.upkeep.backup import back_up
 from service.storage.upkeep.prune import OF_A_BATCH, OF_A_RESULT, prune
 from service.storage.upkeep.verify import verify

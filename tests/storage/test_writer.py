@@ -8,9 +8,9 @@ from sqlalchemy import Engine, event, func, insert, inspect, select, text
 from sqlalchemy.exc import IntegrityError, OperationalError
 
 from service.errors import Busy, Stopping
-from service.storage.sql.database import Store
+from service.storage.recording.writer import PROBE_TABLE, Writer
 from service.storage.sql.tables import results, runs
-from service.storage.sql.writer import PROBE_TABLE, Writer
+from service.storage.store import Store
 from tests.storage.recount import assert_equal_to_a_recount
 
 pytestmark = pytest.mark.both_databases

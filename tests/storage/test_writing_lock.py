@@ -5,7 +5,7 @@ from contextlib import closing
 import pytest
 
 from service.errors import Busy, Standby
-from service.storage.sql.database import Store
+from service.storage.store import Store
 
 pytestmark = pytest.mark.both_databases
 

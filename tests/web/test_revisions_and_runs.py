@@ -9,7 +9,7 @@ from msgspec import structs
 
 from service.app.factory import open_app
 from service.missions.mission import Mission
-from service.storage.archive.reprocessing import Reprocessing, write_reprocessing
+from service.storage.upkeep.reprocessing import Reprocessing, write_reprocessing
 from service.times import parse_utc, shifted, utc_now
 from service.web.app import create_app
 from tests.web.markup import Markup

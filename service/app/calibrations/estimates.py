@@ -26,9 +26,9 @@ from service.errors import BadInput, Busy, Fault, Stopping, shown_value
 from service.missions.corrections import Magnitudes
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
-from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.recorded_batch import sample_batches
+from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc
 from service.vectors import Matrix
 

@@ -19,8 +19,8 @@ from service.storage.calibrations import stored
 from service.storage.calibrations.models import Calibration, CalibrationSummary
 from service.storage.models.base import Page
 from service.storage.models.compare import Comparison
-from service.storage.queries.future_dated import LIVE
 from service.storage.recording.ids import Ulids
+from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.columns import Row
 from service.times import Utc, utc_now
 

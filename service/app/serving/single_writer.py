@@ -7,7 +7,7 @@ from collections.abc import Callable
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.errors import AcquisitionError, Standby
-from service.storage.sql.database import Store
+from service.storage.store import Store
 
 TRY_EVERY_S = 1.0
 

@@ -17,9 +17,9 @@ from service.storage.grades.inputs import days_with_batches, inputs_digest, reco
 from service.storage.grades.models import GradedDayRow, Innovation
 from service.storage.grades.period import GradesOfPeriod, grades_of_period
 from service.storage.models.base import Page
-from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
 from service.storage.recording.ids import Ulids
+from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, utc_now
 
 

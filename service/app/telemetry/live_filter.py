@@ -15,9 +15,9 @@ from service.grades.day import day_bounds
 from service.missions.mission import mission_named
 from service.storage.grades.inputs import recorded_in
 from service.storage.grades.live import LiveAttitude, live_attitude
-from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter, newest
 from service.storage.recording.events import last_event
+from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.access_tables import audit
 from service.storage.sql.gyro_tables import gyro_blocks
 from service.storage.sql.tables import batches, results

@@ -8,8 +8,8 @@ from service import __version__
 from service.app.context import Context, known_id
 from service.errors import NotFound
 from service.products.tdm import TrackedObject, write_tdm
-from service.storage.queries.future_dated import LIVE
 from service.storage.queries.pages import ResultFilter
+from service.storage.recording.unsaved_result import LIVE
 from service.storage.tracks.models import Track, TrackList, TrackPoint
 from service.storage.tracks.unexplained import (
     RecordedBatches,

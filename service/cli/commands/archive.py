@@ -78,7 +78,7 @@ def archive(parsed: Namespace) -> int:
     from tqdm import tqdm
 
     from service.extras import require_extra
-    from service.storage.sql.database import Store
+    from service.storage.store import Store
     from service.times import parse_utc, utc_now
 
     if parsed.before is None:
@@ -88,8 +88,8 @@ def archive(parsed: Namespace) -> int:
         raise BadInput(Fault("--before", "must not be in the future", before.text))
     folder = _folder(parsed.to, "--to")
     require_extra("tables", "pyarrow", "--to", str(folder))
-    from service.storage.archive import archiving
     from service.storage.projections.projector import projected
+    from service.storage.upkeep import archiving
 
     settings = settings_of_existing(parsed)
     store = Store(settings.database, create=False)
@@ -123,7 +123,7 @@ def verify(parsed: Namespace) -> int:
 
     folder = _folder(parsed.folder, "--archive")
     require_extra("tables", "pyarrow", "--archive", str(folder))
-    from service.storage.archive.restoring import verify_archive
+    from service.storage.upkeep.restoring import verify_archive
 
     needed = {} if parsed.database is None else _parts(parsed)
     seen = 0
@@ -150,11 +150,11 @@ def restore(parsed: Namespace) -> int:
     from tqdm import tqdm
 
     from service.extras import require_extra
-    from service.storage.sql.database import Store
+    from service.storage.store import Store
 
     folder = _folder(parsed.folder, "--archive")
     require_extra("tables", "pyarrow", "--archive", str(folder))
-    from service.storage.archive import restoring
+    from service.storage.upkeep import restoring
 
     start, end = period_of(parsed)
     selected = restoring.PartFilter(parsed.spacecraft, parsed.run, start, end)
@@ -193,7 +193,7 @@ def _folder(given: Path | None, option: str) -> Path:
 def _parts(parsed: Namespace) -> dict[str, str]:
     """The hashes of the parts that the database has batches in, by path."""
     from service.storage.archive.reading import archived_paths
-    from service.storage.sql.database import Readers
+    from service.storage.store import Readers
 
     readers = Readers(settings_of_existing(parsed).database)
     try:

@@ -237,7 +237,7 @@ def rebuild(parsed: Namespace) -> int:
     from tqdm import tqdm
 
     from service.storage.projections.projector import projected, rebuild_trends
-    from service.storage.sql.database import Store
+    from service.storage.store import Store
 
     store = Store(settings_of_existing(parsed).database, create=False)
     try:
@@ -278,7 +278,7 @@ def prune(parsed: Namespace) -> int:
     from tqdm import tqdm
 
     from service.storage.projections.projector import projected
-    from service.storage.sql.database import Store
+    from service.storage.store import Store
     from service.storage.upkeep.prune import Pruned
     from service.storage.upkeep.prune import prune as prune_records
     from service.times import parse_utc

@@ -22,12 +22,12 @@ from service.ingest.reprocess import (
     begin_run,
     require_same_settings,
 )
-from service.storage.archive.archiving import keep_settings
 from service.storage.archive.folder import UNFINISHED, locked
 from service.storage.archive.owner import claim
-from service.storage.archive.reprocessed import merge, name_part, restore_newest, unmerged
-from service.storage.archive.reprocessing import Reprocessing, now_text, write_reprocessing
-from service.storage.sql.database import Store
+from service.storage.store import Store
+from service.storage.upkeep.archiving import keep_settings
+from service.storage.upkeep.reprocessed import merge, name_part, restore_newest, unmerged
+from service.storage.upkeep.reprocessing import Reprocessing, now_text, write_reprocessing
 
 TOLD_EVERY_S = 1.0
 """How often the state is written, and `step` called, while nothing comes."""

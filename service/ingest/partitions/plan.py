@@ -20,9 +20,9 @@ from service.storage.archive.reading import Archive, PlacedPart, parts_between
 from service.storage.queries.pages import PLACE, Place, ResultFilter
 from service.storage.queries.with_archive.rows import bounds_of
 from service.storage.recording.identity import look_up
-from service.storage.sql.database import Store
 from service.storage.sql.rollup_tables import rollups_daily
 from service.storage.sql.tables import batches, results
+from service.storage.store import Store
 from service.times import DAY_S, bucket_start, parse_utc
 
 MOST_BATCHES = 10_000

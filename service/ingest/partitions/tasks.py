@@ -31,12 +31,12 @@ from service.storage.archive.folder import (
     whole_content,
     write_first,
 )
-from service.storage.archive.reprocessed import RunPart, run_part
 from service.storage.archive.rows import CHILDREN, Rows, from_partition, schema_of, to_partition
 from service.storage.recording.ids import derived_ulid
 from service.storage.recording.unsaved_result import UnsavedResult, unsaved_submission
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, results
+from service.storage.upkeep.reprocessed import RunPart, run_part
 from service.times import recorded_utc
 
 COLUMNS = ("id", "batch_id", "batch", "received", "created", "input", "options", "current")

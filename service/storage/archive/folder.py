@@ -28,7 +28,7 @@ from msgspec import Struct
 from pyarrow import parquet
 
 from service.errors import BadConfiguration
-from service.storage.upkeep.backup import sync_folder
+from service.storage.sql.database_file import sync_folder
 
 T = TypeVar("T")
 

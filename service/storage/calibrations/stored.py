@@ -13,8 +13,8 @@ from service.storage.calibrations.models import (
     CalibrationSummary,
     TrackerGeometry,
 )
-from service.storage.calibrations.tables import calibration_adoptions, calibrations
 from service.storage.models.base import Page
+from service.storage.sql.calibration_tables import calibration_adoptions, calibrations
 from service.storage.sql.columns import Row
 
 _GEOMETRIES = msgspec.json.Decoder(list[TrackerGeometry])

@@ -11,8 +11,8 @@ from service.gyro.block import GyroBlock, tai_ns_of, times_of_steps
 from service.gyro.overlap import SAME_TIME_NS, SampleTaken, first_shared_ns
 from service.gyro.packing import pack, unpack
 from service.gyro.schema import MAX_SPAN_S
-from service.storage.gyro.models import GyroBlockRow, GyroSamples
 from service.storage.models.base import Page
+from service.storage.models.gyro import GyroBlockRow, GyroSamples
 from service.storage.recording import events
 from service.storage.sql.columns import Row
 from service.storage.sql.gyro_tables import gyro_blocks

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Annotated, ClassVar
 
 from service.acquire.result import TrackingState
-from service.storage.gyro.models import GyroBlockRow
 from service.storage.models.alarms import Alarm, Limit
 from service.storage.models.annotations import AnnotationChange
 from service.storage.models.answers import StarCounts
@@ -20,6 +19,7 @@ from service.storage.models.base import (
     Status,
     doc,
 )
+from service.storage.models.gyro import GyroBlockRow
 from service.storage.models.runs import ReplayProgress
 
 

@@ -16,11 +16,11 @@ from service.alarms.quantities import SILENCE
 from service.alarms.subjects import Subject, sampler
 from service.alarms.window import BatchRef, Point, Sample, SampleWindow
 from service.missions.mission import Mission
+from service.storage.projections.active_alarms import ActiveAlarms
 from service.storage.projections.recorded import RecordedResult
-from service.storage.queries.future_dated import LIVE
+from service.storage.projections.silence import silence_severity
 from service.storage.queries.limits import limits_of
-from service.storage.recording.active_alarms import ActiveAlarms
-from service.storage.recording.silence import silence_severity
+from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.alarm_tables import watches
 from service.storage.sql.columns import Row
 from service.storage.sql.prepared import prepared

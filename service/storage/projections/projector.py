@@ -22,9 +22,9 @@ from service.errors import BadConfiguration, Busy, Standby
 from service.storage.projections import alarms, rollups, seals, states
 from service.storage.projections.recorded import RecordedResult, recorded_after
 from service.storage.projections.rollups import lock_position
-from service.storage.sql.database import Store
 from service.storage.sql.prepared import execute, prepared
 from service.storage.sql.tables import projector, results
+from service.storage.store import Store
 
 log = logging.getLogger(__name__)
 

@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 from functools import cached_property
 
-import msgspec
 from msgspec import Struct
 from sqlalchemy import Connection, bindparam, literal_column, select
 
-from service.storage.queries.future_dated import AHEAD_NS, LIVE
+from service.storage.recording.unsaved_result import AHEAD_NS, LIVE
 from service.storage.sql.columns import Row
 from service.storage.sql.prepared import prepared
 from service.storage.sql.tables import COUNTED, MEASURED, batches, results, tracker_values
@@ -34,25 +33,6 @@ _TRACKERS = prepared(
     .join_from(tracker_values, results, tracker_values.c.batch_id == results.c.id)
     .where(results.c.seq > bindparam("position"), results.c.seq <= bindparam("last"))
 )
-
-
-class _State(Struct):
-    state: str | None = None
-
-
-class _Tracked(Struct):
-    """As much of an answer as tells the state of tracking."""
-
-    tracking: _State | None = None
-
-
-_TRACKED = msgspec.json.Decoder(_Tracked)
-
-
-def state_in(answer: str | bytes) -> str | None:
-    """The state that an answer tells; None of a batch that did not ask for the last attitude."""
-    tracking = _TRACKED.decode(answer).tracking
-    return None if tracking is None else tracking.state
 
 
 class RecordedResult(Struct, eq=False, dict=True):

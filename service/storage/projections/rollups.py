@@ -13,11 +13,11 @@ from typing import Any, Literal
 from sqlalchemy import ColumnElement, Connection, Select, Table, and_, delete, func, select
 
 from service.errors import BadInput, Fault
-from service.storage.archive.tables import archived_hours
 from service.storage.projections.recorded import RecordedResult
 from service.storage.recording.archived_hours import WHOLE, every_share, shares_of_hour
 from service.storage.recording.result_metrics import merge, rolled_up
 from service.storage.recording.rollup_sql import OF_TRACKERS, SUMMED, SUMMED_OF_TRACKERS
+from service.storage.sql.archive_tables import archived_hours
 from service.storage.sql.columns import Row
 from service.storage.sql.rollup_tables import (
     COUNTS,

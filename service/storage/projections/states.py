@@ -8,11 +8,11 @@ from collections.abc import Sequence
 
 from sqlalchemy import Connection, select
 
-from service.storage.projections.recorded import RecordedResult, state_in
-from service.storage.queries.future_dated import AHEAD_NS, LIVE
+from service.storage.projections.recorded import RecordedResult
 from service.storage.queries.pages import PLACE
 from service.storage.recording import events
-from service.storage.recording.unsaved_result import STARS
+from service.storage.recording.answer import state_in
+from service.storage.recording.unsaved_result import AHEAD_NS, LIVE, STARS
 from service.storage.sql.columns import Row
 from service.storage.sql.packed_text import unpack
 from service.storage.sql.tables import results

@@ -20,11 +20,11 @@ from service.storage.models.fleet import (
 )
 from service.storage.models.overview import WindowCounts
 from service.storage.queries.alarms import active_alarms, summary
-from service.storage.queries.future_dated import AHEAD_NS, LIVE
 from service.storage.queries.pages import PLACE
 from service.storage.queries.results import summary_of, summary_query
 from service.storage.queries.trends import latest_time_of
 from service.storage.recording.rollup_sql import SUMMED
+from service.storage.recording.unsaved_result import AHEAD_NS, LIVE
 from service.storage.sql.rollup_tables import COUNTS, rollups_hourly
 from service.storage.sql.tables import batches, mission_uses, results, solutions, star_results
 from service.times import (

@@ -11,7 +11,6 @@ from service.missions.mission import Mission
 from service.storage.models.alarms import Alarm
 from service.storage.models.overview import Overview, OverviewRow, Sparkline, WindowCounts
 from service.storage.queries.alarms import active_alarms, summary
-from service.storage.queries.future_dated import LIVE
 from service.storage.queries.histories import live_state
 from service.storage.queries.time_buckets import (
     MAX_BATCHES_SUMMED,
@@ -24,6 +23,7 @@ from service.storage.queries.time_buckets import (
     totals,
 )
 from service.storage.queries.trends import latest_time_of
+from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.columns import Row
 from service.storage.sql.rollup_tables import COUNTS, rollups_daily
 from service.storage.sql.tables import runs

@@ -9,8 +9,8 @@ from sqlalchemy import ColumnElement, Connection, RowMapping, Select, tuple_
 
 from service.errors import BadBatch, Fault, shown_value
 from service.storage.models.base import Page
-from service.storage.queries.future_dated import AHEAD_NS, LIVE
 from service.storage.recording.ids import is_ulid
+from service.storage.recording.unsaved_result import AHEAD_NS, LIVE
 from service.storage.sql.tables import results
 from service.times import Utc
 

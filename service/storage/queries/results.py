@@ -10,13 +10,13 @@ from sqlalchemy import ColumnElement, Connection, Select, or_, select
 from service.alarms.quantities import QUANTITIES, value_names
 from service.errors import NotFound, WrongState, shown_value
 from service.storage.archive.reading import Archive, parts_with
-from service.storage.archive.tables import archived_batches, archived_what_ifs
 from service.storage.models.answers import Answer, Result, StarCounts, Summary
 from service.storage.models.base import Page
 from service.storage.models.frames import FrameWithStars
 from service.storage.queries.pages import ResultFilter, newest
 from service.storage.queries.with_archive.rows import MOST_OPENED, ArchiveUse, page_of
 from service.storage.recording.unsaved_result import STARS
+from service.storage.sql.archive_tables import archived_batches, archived_what_ifs
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, frames, missions, results, runs
 from service.times import Utc

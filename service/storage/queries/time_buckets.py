@@ -13,8 +13,8 @@ from typing import Any, Literal
 import numpy as np
 from sqlalchemy import BigInteger, Connection, Select, Table, bindparam, case, func, select
 
-from service.storage.archive.tables import archived_parts
 from service.storage.recording.rollup_sql import OF_TRACKERS, SUMMED, SUMMED_OF_TRACKERS
+from service.storage.sql.archive_tables import archived_parts
 from service.storage.sql.columns import Row
 from service.storage.sql.rollup_tables import (
     COUNTS,

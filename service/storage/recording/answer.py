@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from msgspec import UNSET, UnsetType
+import msgspec
+from msgspec import UNSET, Struct, UnsetType
 
 from service.acquire import Acquisition
 from service.acquire.result import RivalAttitude, TrackerResult
@@ -262,3 +263,22 @@ def _star_id(run_catalog: RunCatalog, row: int) -> str | None:
 
 def _number(value: float) -> float | None:
     return None if math.isnan(value) else value
+
+
+class _State(Struct):
+    state: str | None = None
+
+
+class _Tracked(Struct):
+    """As much of an answer as tells the state of tracking."""
+
+    tracking: _State | None = None
+
+
+_TRACKED = msgspec.json.Decoder(_Tracked)
+
+
+def state_in(answer: str | bytes) -> str | None:
+    """The state that an answer tells; None of a batch that did not ask for the last attitude."""
+    tracking = _TRACKED.decode(answer).tracking
+    return None if tracking is None else tracking.state

@@ -9,9 +9,9 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from sqlalchemy import Connection, delete, insert, select
 
-from service.storage.archive.tables import archived_hours
 from service.storage.recording.result_metrics import merge
 from service.storage.recording.rollup_sql import OF_TRACKERS, SUMMED, SUMMED_OF_TRACKERS
+from service.storage.sql.archive_tables import archived_hours
 from service.storage.sql.columns import Row
 from service.storage.sql.rollup_tables import COUNTS, MAXIMA, MINIMA, SUMS
 from service.storage.sql.tables import results, tracker_values

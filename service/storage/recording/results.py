@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from sqlalchemy import Connection, and_, delete, insert, select, update
 
 from service.errors import AcquisitionError, Busy
-from service.storage.queries.tracker_splits import split_anew
 from service.storage.recording import events
 from service.storage.recording.identity import (
     ExistingResult,
@@ -16,6 +15,7 @@ from service.storage.recording.identity import (
     require_not_archived,
     stored_answers,
 )
+from service.storage.recording.tracker_splits import split_anew
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.sql.access_tables import audit
 from service.storage.sql.columns import Row

@@ -18,7 +18,6 @@ from service.observations.frame_record import FrameRecord
 from service.observations.schema import Submission
 from service.storage.models.answers import Answer
 from service.storage.models.frames import FrameSummary, FrameTimings
-from service.storage.queries.future_dated import AHEAD_NS, LIVE
 from service.storage.recording.answer import answer_of, rows_of_stars
 from service.storage.recording.digests import digest_of
 from service.storage.recording.result_metrics import metrics_of
@@ -26,6 +25,10 @@ from service.storage.recording.tracker_values import values_of_trackers
 from service.storage.sql.columns import Row
 from service.times import Utc
 
+LIVE = "live"
+"""The run of batches that pipelines send."""
+AHEAD_NS = 3600 * 10**9
+"""A live batch dated further in the future than this is never the latest."""
 STARS = ("observed", "unique", "ambiguous", "unmatched")
 """The counts of a result's stars."""
 

@@ -120,3 +120,12 @@ def warn_of_readers(path: Path) -> None:
             private,
             path,
         )
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names of a folder's files outlast a power cut."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

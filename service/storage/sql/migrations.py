@@ -18,7 +18,6 @@ from sqlalchemy.exc import SQLAlchemyError
 from service import __version__
 from service.errors import BadConfiguration
 from service.resources import shipped
-from service.storage.serving.file_lock import writing_alone
 from service.storage.sql.columns import metadata
 from service.storage.sql.engines import (
     database_file,
@@ -27,6 +26,7 @@ from service.storage.sql.engines import (
     shown_url,
     writing_engine,
 )
+from service.storage.sql.file_lock import writing_alone
 from service.storage.sql.packed_text import unpack
 
 if TYPE_CHECKING:
@@ -99,11 +99,11 @@ def check(database: str) -> list[str]:
         from alembic.runtime.migration import MigrationContext
 
         # Every table must be known to the metadata.
-        from service.storage.archive import tables as archive_tables  # noqa: F401
-        from service.storage.calibrations import tables as calibration_tables  # noqa: F401
         from service.storage.sql import (  # noqa: F401
             access_tables,
             alarm_tables,
+            archive_tables,
+            calibration_tables,
             grade_tables,
             gyro_tables,
             tables,

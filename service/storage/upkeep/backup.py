@@ -15,7 +15,7 @@ from pathlib import Path
 from sqlalchemy import URL
 
 from service.errors import BadConfiguration
-from service.storage.sql.database_file import PRIVATE_FILE, DatabaseFile
+from service.storage.sql.database_file import PRIVATE_FILE, DatabaseFile, sync_folder
 from service.storage.sql.engines import (
     BUSY_TIMEOUT_MS,
     database_url,
@@ -149,12 +149,3 @@ def run_client(command: list[str], about: str, secret: Mapping[str, str] | None 
         said = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
         raise BadConfiguration(f"ACQUIRE_DATABASE: {about}: {said}")
     return done.stdout
-
-
-def sync_folder(folder: Path) -> None:
-    """Make the names of a folder's files outlast a power cut."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

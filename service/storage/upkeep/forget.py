@@ -16,20 +16,20 @@ from sqlalchemy import ColumnElement, Connection, Table, delete, exists, func, o
 from sqlalchemy.exc import IntegrityError
 
 from service.errors import BadConfiguration, NotFound, shown_value
-from service.storage.archive.tables import (
+from service.storage.models.runs import Forgotten
+from service.storage.projections import rollups
+from service.storage.recording.archived_hours import forget_share
+from service.storage.recording.unsaved_result import LIVE
+from service.storage.sql.archive_tables import (
     archived_batches,
     archived_hours,
     archived_parts,
     archived_what_ifs,
 )
-from service.storage.models.runs import Forgotten
-from service.storage.projections import rollups
-from service.storage.queries.future_dated import LIVE
-from service.storage.recording.archived_hours import forget_share
-from service.storage.sql.database import Store
 from service.storage.sql.grade_tables import graded_days
 from service.storage.sql.gyro_tables import gyro_blocks
 from service.storage.sql.tables import batches, runs
+from service.storage.store import Store
 from service.storage.upkeep.prune import delete_batches, delete_blocks, delete_days
 from service.times import DAY_S, HOUR_S, recorded_utc
 
@@ -218,7 +218,6 @@ def _forget_archived(store: Store, folder: Path, selected: ForgetFilter) -> int:
     again, from where the selected ones are then deleted; `acquire archive` archives the rest.
     """
     # Archives need pyarrow, which is an extra.
-    from service.storage.archive.archiving import remove_part
     from service.storage.archive.folder import (
         locked,
         manifest_of,
@@ -228,8 +227,9 @@ def _forget_archived(store: Store, folder: Path, selected: ForgetFilter) -> int:
         whole_content,
     )
     from service.storage.archive.owner import claim
-    from service.storage.archive.restoring import put_back
     from service.storage.archive.rows import from_partition
+    from service.storage.upkeep.archiving import remove_part
+    from service.storage.upkeep.restoring import put_back
 
     with locked(folder):
         with store.reading() as connection:

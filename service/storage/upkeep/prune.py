@@ -11,7 +11,6 @@ from functools import partial
 from sqlalchemy import ColumnElement, Connection, delete, func, select
 
 from service.storage.projections import rollups, seals
-from service.storage.sql.database import Store
 from service.storage.sql.grade_tables import graded_blocks, graded_days
 from service.storage.sql.gyro_tables import gyro_blocks
 from service.storage.sql.rollup_tables import rollups_hourly
@@ -24,6 +23,7 @@ from service.storage.sql.tables import (
     star_results,
     tracker_values,
 )
+from service.storage.store import Store
 from service.times import HOUR_S, Utc, bucket_start
 
 OF_A_RESULT = (star_results, solutions, idempotency_keys)

@@ -13,7 +13,7 @@ from pathlib import Path
 from sqlalchemy import URL, inspect
 
 from service.errors import BadConfiguration
-from service.storage.sql.database_file import PRIVATE_FILE
+from service.storage.sql.database_file import PRIVATE_FILE, sync_folder
 from service.storage.sql.engines import database_url, reading_engine, shown_url
 from service.storage.sql.migrations import reported, revision_of
 from service.storage.upkeep.backup import (
@@ -21,7 +21,6 @@ from service.storage.upkeep.backup import (
     Step,
     client_options,
     run_client,
-    sync_folder,
 )
 
 SQLITE, POSTGRESQL = b"SQLite format 3\0", b"PGDMP"

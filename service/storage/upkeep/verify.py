@@ -20,8 +20,8 @@ from service.errors import BadInput
 from service.observations.batch import ObservationBatch
 from service.observations.schema import fingerprint_of, submission_from_json
 from service.storage.projections import rollups, seals
-from service.storage.queries.tracker_splits import is_waiting
 from service.storage.recording.digests import digest_of
+from service.storage.recording.tracker_splits import is_waiting
 from service.storage.sql.columns import Row
 from service.storage.sql.engines import database_url, reading_engine
 from service.storage.sql.migrations import check, reported

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from sqlalchemy import Engine, and_, func, select
 
-from service.storage.archive.tables import archived_batches, archived_parts
+from service.storage.sql.archive_tables import archived_batches, archived_parts
 from service.storage.sql.tables import batches
 
 

@@ -9,7 +9,7 @@ from starlette.responses import Response
 
 from service.errors import BadInput
 from service.gyro.schema import GyroBlockIn
-from service.storage.gyro.models import GyroBlockPage, GyroBlockRow, GyroSamples
+from service.storage.models.gyro import GyroBlockPage, GyroBlockRow, GyroSamples
 from service.web.openapi.route import LINK, LOCATION, REPLAYED, ResponseDoc, route_docs
 from service.web.requests.dependencies import AppDep, MetricsDep, json_response, page_response
 from service.web.requests.headers import NO_KEY_OF_A_BLOCK

@@ -12,7 +12,7 @@ from service.access.tokens import Caller
 from service.app.factory import App
 from service.observations.schema import RunName
 from service.storage.queries.alarms import summary
-from service.storage.queries.future_dated import LIVE
+from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc
 from service.web.console.formatting import present
 from service.web.console.registry import PAGES, ConsolePage, navigation

@@ -30,7 +30,7 @@ from service.ingest.queue import Backlog
 from service.storage.models.alarms import Alarm
 from service.storage.models.zones import ZoneCache
 from service.storage.projections.projector import Lag
-from service.storage.queries.future_dated import LIVE
+from service.storage.recording.unsaved_result import LIVE
 from service.storage.upkeep.expiries import Expiries
 from service.storage.webhooks.models import Webhook
 from service.times import recorded_utc, unix_seconds, utc_now

@@ -5,9 +5,9 @@ import hashlib
 from sqlalchemy import select
 
 from service.storage.archive import folder
-from service.storage.archive.restoring import verify_archive
-from service.storage.archive.tables import archived_batches
+from service.storage.sql.archive_tables import archived_batches
 from service.storage.sql.tables import batches
+from service.storage.upkeep.restoring import verify_archive
 from tests.storage.recount import assert_equal_to_a_recount
 
 START = "1996-01-10T12:00:00.000Z"

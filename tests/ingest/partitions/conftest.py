@@ -11,7 +11,7 @@ from service.observations.schema import submission_from_json
 from service.settings import Settings
 from service.simulate.stretches import Pass, Trouble, Troubles
 from service.simulate.telemetry import draw_pass
-from service.storage.archive import archiving
+from service.storage.upkeep import archiving
 from service.times import parse_utc, shifted
 from tests.fresh_databases import sqlite_at
 from tests.ingest.partitions.checks import BATCHES, CADENCE_S, PART, START

@@ -13,10 +13,11 @@ from service.errors import BadBatch, BadConfiguration, Busy, Conflict
 from service.ingest.partitions import coordinator
 from service.missions.mission import Mission
 from service.observations.schema import submission_from_json
-from service.storage.archive import archiving, folder, reprocessed
+from service.storage.archive import folder
 from service.storage.projections import rollups
 from service.storage.recording.unsaved_result import Answered
 from service.storage.sql.tables import batches
+from service.storage.upkeep import archiving, reprocessed
 from service.storage.upkeep.prune import prune
 from service.storage.upkeep.verify import verify
 from service.times import parse_utc, shifted
@@ -305,7 +306,7 @@ def test_a_damaged_part_ends_it_by_name_and_what_was_done_stays(archived, place)
 def test_an_archive_of_another_database_is_refused(archived, place, tmp_path):
     from service.app.factory import open_app
     from service.settings import Settings
-    from service.storage.archive.restoring import PartFilter, restore
+    from service.storage.upkeep.restoring import PartFilter, restore
 
     other = open_app(Settings(database=f"sqlite:///{tmp_path / 'other.db'}", replay_processes=0))
     try:

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 from sqlalchemy import Connection, Table, select, tuple_
 
 from service.storage.archive.reading import Archive, parts_between, places
-from service.storage.archive.tables import archived_batches
 from service.storage.queries.pages import PLACE, Place, ResultFilter
 from service.storage.queries.with_archive.rows import ArchiveUse, bounds_of, first_rows
+from service.storage.sql.archive_tables import archived_batches
 from service.storage.sql.tables import batches, results
 
 if TYPE_CHECKING:

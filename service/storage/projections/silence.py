@@ -11,10 +11,10 @@ from service.alarms.quantities import SILENCE
 from service.alarms.subjects import Subject
 from service.alarms.window import Point
 from service.missions.mission import Mission
+from service.storage.projections.active_alarms import ActiveAlarms
 from service.storage.queries.alarms import change
-from service.storage.queries.future_dated import LIVE
 from service.storage.queries.limits import limits_of
-from service.storage.recording.active_alarms import ActiveAlarms
+from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.alarm_tables import alarms, watches
 from service.times import Utc, recorded_utc
 

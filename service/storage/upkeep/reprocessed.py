@@ -16,7 +16,6 @@ from sqlalchemy import Connection, func, select
 from sqlalchemy.exc import IntegrityError
 
 from service.errors import BadConfiguration
-from service.storage.archive.archiving import described, hours_of, note_part
 from service.storage.archive.folder import (
     Manifest,
     Part,
@@ -27,9 +26,7 @@ from service.storage.archive.folder import (
     whole_content,
     write_manifest,
 )
-from service.storage.archive.restoring import put_back
 from service.storage.archive.rows import Rows, from_partition
-from service.storage.archive.tables import archived_batches, archived_parts
 from service.storage.projections import alarms, rollups
 from service.storage.projections.recorded import RecordedResult
 from service.storage.recording import events
@@ -37,10 +34,13 @@ from service.storage.recording.archived_hours import WHOLE, insert_share
 from service.storage.recording.identity import look_up
 from service.storage.recording.result_metrics import rolled_up
 from service.storage.recording.unsaved_result import STARS
+from service.storage.sql.archive_tables import archived_batches, archived_parts
 from service.storage.sql.columns import Row
-from service.storage.sql.database import Store
 from service.storage.sql.rollup_tables import rollups_hourly
 from service.storage.sql.tables import batches, runs
+from service.storage.store import Store
+from service.storage.upkeep.archiving import described, hours_of, note_part
+from service.storage.upkeep.restoring import put_back
 from service.times import DAY_S, HOUR_S, bucket_start, parse_utc
 
 IDENTITY = ("id", "spacecraft", "run", "batch", "fingerprint")

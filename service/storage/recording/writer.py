@@ -21,14 +21,19 @@ from sqlalchemy.exc import DBAPIError
 
 from service.errors import Busy, Standby, Stopping
 from service.storage.recording import events
+from service.storage.recording.transaction import (
+    QueuedJob,
+    WriteOutcomes,
+    is_of_the_database,
+    transact,
+)
 from service.storage.recording.unsaved_result import UnsavedResult
-from service.storage.serving.file_lock import FileLock
-from service.storage.serving.writing_lock import Attempt, WritingLock
 from service.storage.sql.connections import PersistentConnection, RolledBack
 from service.storage.sql.database_file import DatabaseFile
 from service.storage.sql.engines import TO_WRITE, patience
+from service.storage.sql.file_lock import FileLock
 from service.storage.sql.tables import WRITTEN_BY_POSTS, event_counter
-from service.storage.sql.transaction import QueuedJob, WriteOutcomes, is_of_the_database, transact
+from service.storage.sql.writing_lock import Attempt, WritingLock
 
 log = logging.getLogger(__name__)
 

@@ -11,8 +11,8 @@ from sqlalchemy.exc import DBAPIError, TimeoutError
 from service import logs
 from service.errors import Busy
 from service.storage.archive.reading import Archive
-from service.storage.serving.file_lock import FileLock
-from service.storage.serving.writing_lock import WritingLock
+from service.storage.recording.transaction import may_pass
+from service.storage.recording.writer import RETRY_AFTER_S, Writer, remove_probe
 from service.storage.sql.connections import PersistentConnection
 from service.storage.sql.database_file import DatabaseFile
 from service.storage.sql.engines import (
@@ -26,9 +26,9 @@ from service.storage.sql.engines import (
     reading_engine,
     writing_engine,
 )
+from service.storage.sql.file_lock import FileLock
 from service.storage.sql.migrations import bring_up_to_date, require_revision, require_up_to_date
-from service.storage.sql.transaction import may_pass
-from service.storage.sql.writer import RETRY_AFTER_S, Writer, remove_probe
+from service.storage.sql.writing_lock import WritingLock
 
 log = logging.getLogger(__name__)
 
