@@ -33,6 +33,7 @@ FITS_WORDS = (
     *(b"BITPIX", b"NAXIS1", b"NAXIS2", b"NAXIS3"),
     *(b"BZERO", b"BSCALE", b"BLANK", b"ROWORDER"),
 )
+END = b"END".ljust(80)
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +92,9 @@ def mutated(data, name, draw):
     elif name == "FITS":
         word = draw.choice(FITS_WORDS)
         at = data.find(word.ljust(8) + b"=")
-        at = data.index(b"END     ".rstrip() + b" " * 77) if at < 0 else at
+        if at < 0:
+            at = data.index(END)
+            data[at + 80 : at + 160] = END
         values = (
             "1",
             "2",
