@@ -53,8 +53,8 @@ INSIDE = (
 )
 SINGLE, QUICK_SINGLE = 0.016, 0.10
 """How far the share of single runs may be off .95: five of the sigmas that exact filters have."""
-OFF, QUICK_OFF = 0.07, 0.3
-"""How far the mean of NEES/6 may be off 1: five of the .014 that exact filters have, 200 runs."""
+OFF, QUICK_OFF = 0.08, 0.3
+"""How far the mean of NEES/6 may be off 1: five of the .016 that exact filters have, 200 runs."""
 CHECKED_S = (600, 3600, HOURS * 3600)
 """Epochs at which the sum over the runs, which are independent, is held against chi-square."""
 SIGMA_V, SIGMA_U = math.sqrt(10.0) * 1e-7, math.sqrt(10.0) * 1e-10
