@@ -109,7 +109,8 @@ def mutated(data, name, draw):
         )
         data[at : at + 80] = f"{word.decode():<8}= {draw.choice(values):>20}".ljust(80).encode()
     else:
-        end = min(len(data), 600) if name == "JPEG" else 33
+        # What follows the header of a scan is the coded picture, whose blocks no header tells.
+        end = data.index(b"\xff\xda") + 10 if name == "JPEG" else 33
         data[draw.randrange(2, end)] = draw.randrange(256)
         data = bytearray(with_right_sums(bytes(data))) if name == "PNG" else data
     return bytes(data)
