@@ -190,27 +190,3 @@ def attitude_error_arcsec(attitude: npt.ArrayLike, truth: npt.ArrayLike) -> Vect
     sine = math.sqrt(float(q[:3] @ q[:3]))
     scale = 2.0 if sine == 0.0 else 2.0 * math.atan2(sine, float(q[3])) / sine
     return np.asarray(q[:3] * scale * ARCSEC_PER_RADIAN)
-
-
-def quaternion_to_scipy(quaternion: npt.ArrayLike) -> Any:
-    """The scipy `Rotation` whose `.apply(body vector)` gives inertial components.
-
-    scipy rotates vectors where the service transforms coordinates: the
-    `Rotation` of A transposed has the service's own components.
-    """
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_quat(np.asarray(quaternion, dtype=np.float64))
-
-
-def quaternion_from_scipy(rotation: Any) -> Vector:
-    """The service's quaternion of a scipy `Rotation` that takes body vectors to inertial."""
-    q = np.asarray(rotation.as_quat(), dtype=np.float64)
-    return -q if q[3] < 0 else q
-
-
-def quaternion_from_spice(spice: npt.ArrayLike) -> Vector:
-    """The service's quaternion of SPICE's `m2q(A)`: scalar first, conjugate; A inertial to body."""
-    s = np.asarray(spice, dtype=np.float64)
-    q = np.array([-s[1], -s[2], -s[3], s[0]])
-    return -q if q[3] < 0 else q

@@ -196,6 +196,10 @@ def test_nothing_is_unusual_in_a_shipped_mission(acquire, name):
             *("imager", ("field_of_view_radius_deg = 7.1", "field_of_view_radius_deg = 5.0")),
             *("unusual", "trackers.0.field_of_view_radius_deg", "the corner of the camera's"),
         ),
+        (
+            *("imager", ("psf_sigma_px = 0.9", 'psf_sigma_px = 0.9\npsf = "airy"')),
+            *("unusual", "trackers.0.camera.psf", "of one colour"),
+        ),
     ],
 )
 def test_a_slip_in_a_mission_file_is_named_by_its_key(

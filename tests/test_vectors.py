@@ -15,9 +15,6 @@ from service.vectors import (
     from_ra_dec,
     matrix_from_quaternion,
     quaternion_from_matrix,
-    quaternion_from_scipy,
-    quaternion_from_spice,
-    quaternion_to_scipy,
     read_only,
     rotate_about,
     separation_deg,
@@ -83,13 +80,6 @@ def test_attitudes_compose_as_their_matrices_do(first, second):
     v1, s1, v2, s2 = first[:3], first[3], second[:3], second[3]
     expected = np.array([*(s2 * v1 + s1 * v2 - np.cross(v2, v1)), s1 * s2 - v1 @ v2])
     assert min(np.abs(composed - expected).max(), np.abs(composed + expected).max()) < 1e-14
-
-
-@given(quaternions)
-def test_the_converters_to_scipy_and_spice_give_back_what_they_took(q):
-    assert quaternion_from_scipy(quaternion_to_scipy(q)) == pytest.approx(upright(q), abs=1e-15)
-    spice = np.array([q[3], -q[0], -q[1], -q[2]])
-    assert quaternion_from_spice(spice) == pytest.approx(upright(q), abs=0)
 
 
 @given(directions, directions, st.sampled_from([0.0, 1e-3, 0.02, 1.0, 3600.0]))

@@ -45,6 +45,13 @@ from service.vectors import (
 GUESS_SHARE = 0.25
 """How far off a focal length or field of view that is told may be."""
 REFINED_POINTS = 200
+MOST_SIGMA_SHARE = 1.0 / 400.0
+"""Of the longer side: an attitude that is less certain is no answer.
+
+Those of nine real pictures are .0005 of the side at most, of drawn ones with seven stars or more
+.001.  Residuals scale the sigmas: where stars lie anywhere within gates of pixels, by chance or
+because the lens's axis was cropped away, they are .004 and more.
+"""
 ENOUGH_FREEDOM = 10
 """Residuals less their parameters from which the sigmas are scaled down as well as up."""
 
@@ -101,6 +108,17 @@ class PictureAttitude:
     def sigma_arcsec(self) -> Vector:
         """One standard deviation (3,) about each axis of the camera."""
         return np.asarray(np.sqrt(np.diag(self.covariance_rad2)) * ARCSEC_PER_RADIAN)
+
+    @property
+    def sigma_share(self) -> float:
+        """The largest sigma as a share of the picture's longer side.
+
+        That about z is taken where it moves the ends of that side.
+        """
+        across, about = self.sigma_arcsec[:2].max(), self.sigma_arcsec[2]
+        side = max(self.lens.width_px, self.lens.height_px)
+        share = max(across * self.lens.focal_px / side, 0.5 * about)
+        return float(share) / ARCSEC_PER_RADIAN
 
     @property
     def boresight_deg(self) -> tuple[float, float]:
@@ -202,6 +220,8 @@ def _solved(
         return PictureResult(frame, points, None, search, ())
     found = solver.refined(search.found, places.first(REFINED_POINTS), focal)
     attitude = _attitude(found, places, points, frame, sky)
+    if attitude.sigma_share > MOST_SIGMA_SHARE:
+        return PictureResult(frame, points, None, search, ())
     remarks = remarks_on(attitude.lens, found, points, guess_px, GUESS_SHARE)
     return PictureResult(frame, points, attitude, search, tuple(remarks))
 

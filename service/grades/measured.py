@@ -1,6 +1,6 @@
 """What was recorded of a window of time, as the filter may use it."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,10 +32,6 @@ class Recorded:
     attitudes: AttitudeMeasurements
     directions: DirectionMeasurements
     unusable: int = 0
-
-    def without_gyro(self) -> "Recorded":
-        """The same without gyro samples."""
-        return replace(self, gyro_ns=self.gyro_ns[:0], rates_rad_s=self.rates_rad_s[:0])
 
 
 def usable_attitudes(

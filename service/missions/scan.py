@@ -54,11 +54,6 @@ class CrossScan(_Detector):
     step_arcsec: float = Field(gt=0, le=3600)
     """From one sample to the next (T of the report)."""
 
-    @property
-    def half_length_deg(self) -> float:
-        """From the middle of a line to its end."""
-        return (self.samples // 2) * self.step_arcsec / 3600.0
-
 
 class Sweep(Strict):
     """A sweep along h and one along v, at a constant rate; a star crosses each wire once.

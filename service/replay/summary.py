@@ -181,8 +181,8 @@ def _packet_rows(packets: dict[str, Any] | None) -> list[tuple[str, str]]:
         "not_asked": "other APIDs",
         "idle": "idle",
         "without_stars": "without stars",
-        "joined": "joined of segments",
-        "incomplete": "incomplete segments",
+        "joined": "joined segments",
+        "incomplete": "lack segments",
         "refused": "unreadable",
         "without_attitude": "no a priori",
     }

@@ -271,7 +271,7 @@ def zone_for(
     x, y, z = region.axis.tolist()
     least_deg, most_deg = region.least_deg, region.most_deg
     if grid_deg > 0.0:
-        x, y, z = _snapped(x, y, z, grid_deg)
+        x, y, z = snapped(x, y, z, grid_deg)
         grown_by_deg = grid_deg / math.sqrt(2.0) + _ROUNDING_DEG
         least_deg = max(0.0, least_deg - grown_by_deg)
         most_deg = min(180.0, most_deg + grown_by_deg)
@@ -296,17 +296,12 @@ def zone_for(
     return cache.get(key, build, wait)
 
 
-def snapped(axis: Vector, grid_deg: float) -> Vector:
+def snapped(x: float, y: float, z: float, grid_deg: float) -> tuple[float, float, float]:
     """The grid point nearest to a direction: rows of declination, each cut into equal steps.
 
     A step along a row is at most `grid_deg` of arc, so that no direction lies
     farther than grid_deg / sqrt(2) from its point.
     """
-    x, y, z = axis.tolist()
-    return np.array(_snapped(x, y, z, grid_deg))
-
-
-def _snapped(x: float, y: float, z: float, grid_deg: float) -> tuple[float, float, float]:
     ra_deg = math.degrees(math.atan2(y, x)) % 360.0
     dec_deg = math.degrees(math.atan2(z, math.hypot(x, y)))
     row_deg = round(dec_deg / grid_deg) * grid_deg

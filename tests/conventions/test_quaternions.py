@@ -10,9 +10,6 @@ from service.vectors import (
     coordinate_rotation,
     matrix_from_quaternion,
     quaternion_from_matrix,
-    quaternion_from_scipy,
-    quaternion_from_spice,
-    quaternion_to_scipy,
 )
 
 C, S = math.cos(math.radians(30.0)), math.sin(math.radians(30.0))
@@ -60,8 +57,6 @@ def test_scipy_s_rotation_of_the_transposed_matrix_has_the_service_s_components(
     # The matrix itself gives the conjugate: the classic trap.
     conjugate = [-q[0], -q[1], -q[2], q[3]]
     assert Rotation.from_matrix(a).as_quat() == pytest.approx(conjugate, abs=1e-15)
-    assert quaternion_to_scipy(q).apply([0.1, 0.2, 0.3]) == pytest.approx(a.T @ [0.1, 0.2, 0.3])
-    assert quaternion_from_scipy(Rotation.from_matrix(a.T)) == pytest.approx(q, abs=1e-15)
 
 
 @pytest.mark.parametrize("axis", ABOUT)
@@ -74,11 +69,9 @@ def test_spice_s_quaternion_is_scalar_first_and_the_conjugate(axis):
     w, v = m2q[0], m2q[1:]
     k = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
     assert np.eye(3) + 2 * w * k + 2 * k @ k == pytest.approx(np.array(a), abs=1e-15)
-    assert quaternion_from_spice(m2q) == pytest.approx(q, abs=1e-15)
+    assert [*-v, w] == pytest.approx(q, abs=1e-15)
 
 
 def test_the_scalar_is_never_negative():
     q = -np.array(ABOUT["z"][0])
     assert quaternion_from_matrix(matrix_from_quaternion(q))[3] > 0
-    assert quaternion_from_scipy(Rotation.from_quat(q))[3] > 0
-    assert quaternion_from_spice([-0.5, 0.5, 0.5, 0.5]).tolist() == [0.5, 0.5, 0.5, 0.5]

@@ -255,19 +255,6 @@ def test_of_two_stars_in_one_place_neither_is_sure(sky, index):
     assert chances.probability[-1] < 0.999
 
 
-def test_near_a_known_attitude_the_same_is_found_without_a_search(sky, solver, seed):
-    for scene in draw_scenes(sky, Conditions(fewest=6), 20, seed):
-        told = (scene.direction, scene.magnitude_mag, scene.sigma_rad)
-        found = solver.solve(*told)
-        near = solver.solve_near(scene.attitude, np.eye(3) * 1e-7, *told)
-        if found.attitude is None:
-            continue
-        assert near.attitude is not None
-        assert is_right(scene, near)
-        far = solver.solve_near(scene.attitude[[1, 2, 0]], np.eye(3) * 1e-7, *told)
-        assert far.attitude is None
-
-
 def test_the_nearest_stars_are_those_of_brute_force(index, rng):
     arrays = index.arrays
     for gate in (1e-4, 2e-3, 2e-2):

@@ -1,17 +1,21 @@
 """The identifier `ptp` in the pipeline: a batch of the paper's camera, the a priori ignored."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from msgspec import structs
 
 from service.acquire import acquire
+from service.imaging.detection.points import find_points
+from service.imaging.frames.files import read_frame
+from service.imaging.frames.frame import FrameLimits
 from service.missions.mission import Mission, parse_mission
 from service.observations.schema import submission_from_json
 from service.simulate.scenes import Conditions, SceneSky, draw_scenes
 from service.sky.whole_sky.guide import GuideKey
-from service.vectors import matrix_from_quaternion, quaternion_from_matrix
+from service.vectors import attitude_error_arcsec, matrix_from_quaternion, quaternion_from_matrix
 
 CAMERA = """
 name = "CAMERA"
@@ -40,6 +44,8 @@ magnitude_sigma_mag = 0.5
 CONDITIONS = Conditions(position_px=1.0, magnitude_sigma_mag=0.0, fewest=7)
 OFF_RIGHT, OFF_TURN = 0.1, 1.0
 """Degrees: what counts as right."""
+PICTURES = Path(__file__).parents[1] / "pictures"
+REAL = json.loads((PICTURES / "truth.json").read_text("utf-8"))["pictures"]
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +76,47 @@ def batch_of(scene, a_priori, **other):
         **other,
     }
     return submission_from_json(json.dumps(body)).batch
+
+
+@pytest.mark.parametrize("real", REAL, ids=[each["file"] for each in REAL])
+def test_a_real_picture_has_its_attitude_or_none(real, mission, sky):
+    """The sixteen brightest points; about a tree most of them are no stars."""
+    with (PICTURES / real["file"]).open("rb") as file:
+        points = find_points(read_frame(file, FrameLimits(10_000_000)).counts)
+    first = np.argsort(-points.flux_counts)[:16]
+    middle = (points.width_px - 1) / 2, (points.height_px - 1) / 2
+    places = np.column_stack([points.u_px, points.v_px])[first] - middle
+    toward = np.column_stack([places / real["focal_length_px"], np.ones(len(first))])
+    body = {
+        "spacecraft": "CAMERA",
+        "batch": "1",
+        "time": "2019-07-29T20:47:26Z",
+        "aberration": "ignore",
+        "a_priori": {"quaternion": [0, 0, 0, 1]},
+        "observations": [
+            {
+                "tracker": "STARTRACKER_1",
+                "stars": [
+                    {"vector": each}
+                    for each in (toward.T / np.linalg.norm(toward, axis=1)).T.tolist()
+                ],
+            }
+        ],
+    }
+    faint = (
+        CAMERA.replace("limit_mag = 6.0", "limit_mag = 7.0")
+        .replace("radius_deg = 5.0", "radius_deg = 7.3")
+        .replace("35.25", "20.0")
+    )
+    camera = parse_mission(faint, "camera.toml")
+    found = acquire(submission_from_json(json.dumps(body)).batch, camera, sky)
+    if "tree" in real["file"]:
+        assert found.solution is None
+        return
+    true = real["rotation_icrs_to_camera"]
+    error = attitude_error_arcsec(matrix_from_quaternion(found.solution.quaternion), true)
+    assert np.abs(error).max() < OFF_RIGHT * 3600
+    assert found.counts["unique"] >= 15
 
 
 def true_prior(scene):

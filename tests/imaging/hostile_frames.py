@@ -20,6 +20,11 @@ def hostile_files(rng):
     yield "empty", lambda: b"", "empty"
     yield "text", lambda: b"hello, this is no frame", "is not FITS"
     yield "bigtiff", lambda: b"II+\0\x08\0\0\0", "BigTIFF"
+    yield "pds3", lambda: b"PDS_VERSION_ID = PDS3\r\nRECORD_TYPE = FIXED_LENGTH\r\n", "a PDS3 file"
+    yield "pds3 behind an SFDU", lambda: b"CCSD3ZF0000100000001NJPL3IF0PDS200000001", "a PDS3 file"
+    yield "pds4", lambda: b'<?xml version="1.0"?><Product_Observational>', "PDS4"
+    yield "xisf", lambda: b"XISF0100" + bytes(100), "XISF"
+    yield "ser", lambda: b"LUCAM-RECORDER" + bytes(178), "SER"
     yield "fits cut off in its header", lambda: whole[:2000], "cut off"
     yield "fits cut off in its data", lambda: whole[:100_000], "cut off"
     yield (

@@ -33,6 +33,7 @@ FITS_WORDS = (
     *(b"BITPIX", b"NAXIS1", b"NAXIS2", b"NAXIS3"),
     *(b"BZERO", b"BSCALE", b"BLANK", b"ROWORDER"),
 )
+END = b"END".ljust(80)
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +92,9 @@ def mutated(data, name, draw):
     elif name == "FITS":
         word = draw.choice(FITS_WORDS)
         at = data.find(word.ljust(8) + b"=")
-        at = data.index(b"END     ".rstrip() + b" " * 77) if at < 0 else at
+        if at < 0:
+            at = data.index(END)
+            data[at + 80 : at + 160] = END
         values = (
             "1",
             "2",
@@ -106,10 +109,24 @@ def mutated(data, name, draw):
         )
         data[at : at + 80] = f"{word.decode():<8}= {draw.choice(values):>20}".ljust(80).encode()
     else:
-        end = min(len(data), 600) if name == "JPEG" else 33
-        data[draw.randrange(2, end)] = draw.randrange(256)
+        places = _header_of_jpeg(data) if name == "JPEG" else range(2, 33)
+        data[draw.choice(places)] = draw.randrange(256)
         data = bytearray(with_right_sums(bytes(data))) if name == "PNG" else data
     return bytes(data)
+
+
+def _header_of_jpeg(data):
+    """The places of a JPEG file's headers, without its tables of codes.
+
+    These belong to the coded picture: one other code moves all that follows by a block of 8
+    pixels.  No layout tells, and no checksum (docs/cameras.md).
+    """
+    places, at = [], 2
+    while data[at + 1] != 0xDA:
+        end = at + 2 + int.from_bytes(data[at + 2 : at + 4])
+        places += range(at, at + 4 if data[at + 1] == 0xC4 else end)
+        at = end
+    return [*places, *range(at, at + 10)]
 
 
 def _number(draw, form):

@@ -223,6 +223,18 @@ def test_every_dialect_is_read_as_the_plain_file(text: str) -> None:
     assert [without_order(body) for body in bodies(read(text))] == IN_ORDER
 
 
+@pytest.mark.parametrize("rows", [ROWS, shuffled(ROWS)], ids=["in order", "apart"])
+@pytest.mark.parametrize("separator", [";", "\t", "|"])
+def test_a_decimal_comma_is_read_in_times_too(rows: list[str], separator: str) -> None:
+    """A spreadsheet of such a language writes 12:00:01,500 beside 0,25, also as ISO 8601 has it."""
+    at = [each.replace(f":{k:02d}Z", f":{k:02d}.500Z") for each in rows for k in [int(each[5])]]
+    text = file_of([each.replace(",", separator).replace(".", ",") for each in at])
+    text = text.replace(HEADER, HEADER.replace(",", separator))
+    found = bodies(read(text))
+    assert found == bodies(read(file_of(at)))
+    assert [body["time"] for body in found] == [f"1996-01-10T12:00:0{k}.500Z" for k in range(4)]
+
+
 @pytest.mark.parametrize(
     "data",
     [

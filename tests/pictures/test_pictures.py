@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from scipy.stats import chi2
 
-from service.acquire.picture import blind_sky, overlay_of, solve_picture
+from service.acquire.picture import MOST_SIGMA_SHARE, blind_sky, overlay_of, solve_picture
 from service.cli import main
 from service.errors import BadFile
 from service.identify.blind.lens import Lens
@@ -53,6 +53,7 @@ def test_a_real_picture_told_nothing_or_its_field_within_a_tenth(blind, truth, g
     square = turn @ np.linalg.solve(result.attitude.covariance_rad2, turn)
     assert square < chi2(3).ppf(0.99)
     assert result.attitude.sigma_arcsec.max() < 200
+    assert result.attitude.sigma_share < MOST_SIGMA_SHARE / 5.0
     if guess is not None:
         assert any("residuals are radial" in each for each in result.remarks)
 
@@ -73,6 +74,18 @@ def test_drawn_pictures_of_random_lenses_are_right_or_have_no_answer(blind, rng)
     assert right >= 0.8 * DRAWN
     # Three degrees of freedom: the median is 2.37; some are drawn with stars that merge.
     assert np.median(squares) < chi2(3).ppf(0.8)
+
+
+def test_an_attitude_of_hundreds_of_arcseconds_is_no_answer(blind):
+    """Stars above a thousand black rows fitted a lens whose axis is in the middle, 2 degrees off.
+
+    They did so to 16 pixels, and the answer claimed 18 arcminutes.
+    """
+    lens = Lens(640, 480, focal_px_of(640, 14.0))
+    rng = np.random.default_rng(5)
+    picture = draw_picture(rng, blind[0], stars=60, quality=None, lens=lens)
+    counts = np.vstack([picture.counts, np.zeros((1024, 640), np.uint8)])
+    assert solve_picture(frame_of(counts), *blind, lens.focal_px).attitude is None
 
 
 @pytest.mark.parametrize("off", [0.99, 0.95, 1.02, 1.1])

@@ -134,8 +134,8 @@ def test_identifiers_are_unique_and_lead_back_to_their_rows(catalog):
         assert catalog.row_of(ids[row]) == row
         assert catalog.star_id(row) == ids[row]
     assert any(star_id.startswith("TYC ") for star_id in ids)
-    sirius = catalog.cross_ids(catalog.row_of("HIP 32349"))
-    assert sirius == {"HIP": "HIP 32349", "HD": "HD 48915", "TYC": "TYC 5949-2777-1"}
+    sirius = catalog.row_of("HIP 32349")
+    assert (catalog.hd[sirius], catalog.tyc[sirius].tolist()) == (48915, [5949, 2777, 1])
     with pytest.raises(NotFound, match="HIP 999999"):
         catalog.row_of("HIP 999999")
 
@@ -265,7 +265,7 @@ def test_a_sites_numbers_come_back_exactly(folder, rows):
             assert catalog.dec_deg[row] == dec
             assert catalog.magnitude_v_mag[row] == magnitude
             assert catalog.pm_ra_mas_per_year[row] == (motion or 0.0)
-            assert catalog.cross_ids(row) == ({"SAO": f"SAO {sao}"} if sao else {})
+            assert catalog.sao[row] == (sao or 0)
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(imported, name), getattr(loaded, name))
 

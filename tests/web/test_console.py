@@ -213,6 +213,23 @@ def test_names_of_clients_are_shown_as_they_are_and_do_nothing(client, post, bat
         assert "{{7*7}}" in text
 
 
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("\u200b\u200b", "‹U+200B›‹U+200B›"),
+        ("b1\u2060", "b1‹U+2060›"),
+        (" ", "‹U+0020›"),
+        ("\u3164", "‹U+3164›"),
+    ],
+)
+def test_a_name_that_nobody_would_see_is_shown_by_its_codes(client, post, batch, run, name, shown):
+    posted = post(batch | {"batch": name, "run": run})
+    assert posted.status_code == 201
+    for address in (f"/batches?run={run}", f"/batches/{posted.json()['id']}"):
+        assert shown in client.get(address).text
+    assert formatting.name("a b") == "a b"
+
+
 # ---- one batch -----------------------------------------------------------------------------------
 
 

@@ -13,7 +13,7 @@ from scipy.stats import norm
 from service.sky.zones import SearchRegion
 from service.storage.models.period import PeriodAttitudes, PeriodStars, TrackerStarsOfPeriod
 from service.times import parse_utc, shifted
-from service.vectors import angle_between_deg, from_ra_dec, quaternion_from_scipy
+from service.vectors import angle_between_deg, from_ra_dec, quaternion_from_matrix
 from service.web.console.charts.period.all_sky import EDGE, HEIGHT, WIDTH, all_sky_chart, hammer
 from service.web.console.charts.period.attitude import attitude_charts
 from service.web.console.charts.period.focal_plane import focal_plane_map
@@ -49,7 +49,7 @@ def attitudes_of(rotations, step_s=10.0, sigma_arcsec=1.0, **other):
         "time_ns": np.array([shifted(START, k * step_s).tai_ns for k in range(count)]),
         "time": tuple(shifted(START, k * step_s).text for k in range(count)),
         "status": ("good",) * count,
-        "quaternion": np.array([quaternion_from_scipy(each) for each in rotations]),
+        "quaternion": np.array([quaternion_from_matrix(each.as_matrix().T) for each in rotations]),
         "covariance_arcsec2": np.tile(np.eye(3) * sigma_arcsec**2, (count, 1, 1)),
         "follows": np.arange(count) > 0,
     }

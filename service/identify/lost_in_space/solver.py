@@ -12,18 +12,15 @@ import numpy as np
 import numpy.typing as npt
 
 from service.attitude.solution import NoAttitude
-from service.compiled.copying import copy_rows
 from service.compiled.jit import njit
 from service.compiled.views import borrowed_view
 from service.identify.lost_in_space import decision, posterior
-from service.identify.lost_in_space.matching import match_at, refine
 from service.identify.lost_in_space.observations import FieldBounds, Points
 from service.identify.lost_in_space.pair_order import magnitude_gate
-from service.identify.lost_in_space.search import MAX_WORK, enter, search
+from service.identify.lost_in_space.search import MAX_WORK, search
 from service.identify.lost_in_space.workspace import (
     USUAL_POINTS,
     Workspace,
-    candidate_in,
     ledger_in,
     order_in,
     points_in,
@@ -160,23 +157,6 @@ class LostInSpace:
         _BLOCKS.append(block)
         return LostInSpaceResult(_REFUSALS[code], *rest)
 
-    def solve_near(
-        self,
-        attitude: Matrix,
-        covariance_rad2: Matrix,
-        direction: Vector,
-        magnitude_mag: Vector,
-        sigma_rad: Vector,
-        velocity_c: Vector = _AT_REST,
-    ) -> LostInSpaceResult:
-        """The same at an attitude that is known to a covariance: no search, the same judgement."""
-        block = np.empty(words_for(len(direction)))
-        code, *rest = _solve_near(
-            *(direction, magnitude_mag, sigma_rad, velocity_c, self.index.store, self._field),
-            *(block, attitude, covariance_rad2),
-        )
-        return LostInSpaceResult(_REFUSALS[code], *rest)
-
     def chances(
         self,
         result: LostInSpaceResult,
@@ -283,35 +263,3 @@ def _searched(n, store, field, max_work, block, matrices, star):  # type: ignore
     if count > 0 and ledger.weight[:count].max() > weight + math.log(posterior.DOUBT):
         code = decision.DOUBTFUL
     return code, log_odds, matched, work + more, bounded
-
-
-@njit(nogil=True)
-def _solve_near(  # type: ignore[no-untyped-def]
-    direction, magnitude, sigma, velocity, store, field, block, attitude, covariance
-):
-    n = len(direction)
-    matrices, star = np.zeros((2, 3, 3)), np.full(n, -1, np.int64)
-    matrices[0], matrices[1] = attitude, covariance
-    _sort_points(direction, magnitude, sigma, velocity, Workspace(block, n))
-    code, log_odds, matched, work, bounded = _weighed(n, store, field, block, matrices, star)
-    return code, matrices, star, log_odds, matched, work, bounded
-
-
-@njit(nogil=True)
-def _weighed(n, store, field, block, matrices, star):  # type: ignore[no-untyped-def]
-    """What the attitude and covariance in `matrices` come to."""
-    index, field = index_in(store), _field_in(field)
-    workspace = Workspace(block, n)
-    candidate, points = candidate_in(workspace), points_in(workspace)
-    candidate.match[:] = -1
-    copy_rows(matrices[0], candidate.t)
-    copy_rows(matrices[1], candidate.covariance)
-    matrices[:] = 0.0
-    gate = magnitude_gate(field.magnitude_sigma)
-    matched, _ = match_at(points, index, gate, candidate)
-    count = 0
-    if matched >= 3:
-        matched, weight = refine(points, index, field, gate, candidate)
-        if matched >= 3 and weight > 0.0:
-            count = enter(candidate, weight, ledger_in(workspace), 0)
-    return _decided(n, count, n, False, workspace, matrices, star)

@@ -19,13 +19,14 @@ from service.imaging.frames.raw import is_raw, read_raw
 Reader = Callable[[IO[bytes], FrameLimits, str], Frame]
 
 FORMATS = "FITS, TIFF, PNG, JPEG, BMP, PGM, a camera's raw file or a numpy array (.npy)"
+_PDS3 = "a PDS3 file; write its image as FITS, TIFF or .npy (with pdr, GDAL or ISIS)"
 OTHERS: Mapping[bytes, str] = {
     b"LUCAM-RECORDER": "a SER video; export one frame of it as FITS or TIFF",
     b"XISF0100": "an XISF file; save it as FITS or TIFF of 16 bits",
-    b"PDS_VERSION_ID": "a PDS3 file; write its image as FITS or TIFF (with pdr, GDAL or ISIS)",
-    b"ODL_VERSION_ID": "a PDS3 file; write its image as FITS or TIFF (with pdr, GDAL or ISIS)",
-    b"CCSD3ZF": "a PDS3 file; write its image as FITS or TIFF (with pdr, GDAL or ISIS)",
-    b"<?xml": "an XML label, as of PDS4; send the image that it describes, as FITS or TIFF",
+    b"PDS_VERSION_ID": _PDS3,
+    b"ODL_VERSION_ID": _PDS3,
+    b"CCSD3ZF": _PDS3,
+    b"<?xml": "an XML label, as of PDS4; write its image as FITS, TIFF or .npy (with pdr)",
 }
 """Formats that are known by their first bytes, and not read."""
 MORE_BYTES, BYTES_PER_PIXEL = 64 << 20, 24

@@ -195,6 +195,8 @@ class CsvTable:
                 cells[name] = cell.replace(",", ".") if self._decimal_comma else cell
             else:
                 cells[name] = original(cell if name in self.kind.verbatim else cell.strip())
+                if name == "time":
+                    cells[name] = _with_point(cells[name])
         return Row(line.number, cells, fault)
 
     def _survey(self) -> int | None:
@@ -260,7 +262,7 @@ class CsvTable:
                 )
                 raise BadFile(Fault(f"line {line.number}", message))
             keys.append(hash(key))
-            times_ns.append(_time_ns(found[time].strip() if time < len(found) else ""))
+            times_ns.append(_time_ns(found[time] if time < len(found) else ""))
             offsets.append(offset)
             numbers.append(line.number)
         order = _order(np.array(keys), np.array(times_ns), self.kind.ordered_by_time)
@@ -281,9 +283,14 @@ def _order(
 def _time_ns(text: str) -> int:
     """The time of a row; 0 for one that cannot be read, which is refused later."""
     try:
-        return parse_utc(text).tai_ns
+        return parse_utc(_with_point(text.strip())).tai_ns
     except BadInput:
         return 0
+
+
+def _with_point(time: str) -> str:
+    """A time whose decimal mark, in ISO 8601 a comma or a point, is a point."""
+    return time.replace(",", ".")
 
 
 def _lower(names: Sequence[str]) -> list[str]:

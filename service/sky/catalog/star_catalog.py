@@ -97,14 +97,6 @@ class Catalog:
             raise NotFound(f"star {star_id!r} is not in catalog {self.name}")
         return row
 
-    def cross_ids(self, row: int) -> dict[str, str]:
-        """The star's identifiers in HIP, TYC, HD and SAO, as far as they are known."""
-        numbers = {"HIP": self.hip[row], "HD": self.hd[row], "SAO": self.sao[row]}
-        known = {name: f"{name} {number}" for name, number in numbers.items() if number}
-        if self.tyc[row].any():
-            known["TYC"] = _tycho_id(self.tyc[row].tolist())
-        return known
-
 
 def _tycho_id(numbers: Sequence[int]) -> str:
     return "TYC {}-{}-{}".format(*numbers)

@@ -50,13 +50,6 @@ def cell_of(x, y, z):  # type: ignore[no-untyped-def]
     return cu * CELLS + cv
 
 
-@njit(nogil=True, inline="always")
-def star_near(bits, level, x, y, z):  # type: ignore[no-untyped-def]
-    """Whether a star may stand near a direction of any length, by one of several bitmaps."""
-    cell = cell_of(x, y, z)
-    return (bits[level, cell >> 3] >> (cell & 7)) & 1 != 0
-
-
 @njit(inline="always")
 def _single_cell(x, y, z):  # type: ignore[no-untyped-def]
     """As `cell_of`, in single precision and with nothing that keeps it from many at a time."""

@@ -25,14 +25,6 @@ class Misalignment:
     dv: float
     roll_rad: float
 
-    def pitch_rad(self, focal_length: float) -> float:
-        """atan(dv / f)."""
-        return math.atan(self.dv / focal_length)
-
-    def yaw_rad(self, focal_length: float) -> float:
-        """atan(du / f)."""
-        return math.atan(self.du / focal_length)
-
 
 def by_two_scans(a1: float, b1: float, a2: float, b2: float, half_distance: float) -> Misalignment:
     """From the displacements of two stars that should stand at (-u0, 0) and (u0, 0) (7.23 to 7.25).
