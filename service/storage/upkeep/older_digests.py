@@ -17,7 +17,7 @@ from service.storage.sql.columns import Row
 from service.storage.sql.database import Store
 from service.storage.sql.tables import batches, frames, results, solutions, star_results
 
-AT_ONCE = 100
+AT_ONCE = 50
 
 
 @dataclass(frozen=True)
