@@ -124,11 +124,12 @@ class Live:
         clock = asyncio.get_running_loop().time
         end_s = clock() + LONGEST_S
         yield f"retry: {RETRY_MS}\n\n".encode()
-        told = last
         if last is None:
             last = await self._read(self._app.events.last)
             # How many events there are of others is no business of a bound token.
             told = await self._read(self._app.events.last, listener.caller.spacecraft)
+        else:
+            told = last
         yield _line(told, "hello", f'{{"last":{told}}}')
         heard_s = clock()
         while not self._stopping and listener.is_admitted and clock() < end_s:
