@@ -477,8 +477,18 @@ def test_records_are_copied_verified_and_pruned(acquire, tmp_path):
     told = "3 batches before 1999-03-01T00:01:30.000Z were deleted\n"
     assert acquire(*before)[:2] == (0, told)
     assert acquire("database", "verify")[:2] == (0, "nothing is wrong with 5 batches\n")
+    with closing(sqlite3.connect(tmp_path / "acquire.db")) as connection:
+        # The dry run left none.
+        (entry,) = connection.execute("SELECT action, body FROM audit").fetchall()
+        assert entry == ("prune", '{"before": "1999-03-01T00:01:30.000Z", "run": null}')
     copy = ("--database", "sqlite:///copy.db")
     assert acquire("database", "verify", *copy)[:2] == (0, "nothing is wrong with 8 batches\n")
+    with closing(sqlite3.connect(tmp_path / "copy.db")) as connection:
+        # As after an upgrade.
+        connection.execute("UPDATE results SET digest = NULL, seq = 0")
+        connection.execute("UPDATE seals SET digests = 0")
+        connection.commit()
+    assert "8 results have no digest yet" in acquire("database", "verify", *copy)[1]
     with closing(sqlite3.connect(tmp_path / "copy.db")) as connection:
         connection.execute("DELETE FROM solutions")
         connection.commit()

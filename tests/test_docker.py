@@ -1,5 +1,6 @@
 """The image and its composition, read: what they hold and what they say."""
 
+import ast
 import json
 import os
 import re
@@ -7,6 +8,7 @@ import socket
 import subprocess
 import sys
 import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -79,6 +81,32 @@ def test_the_image_has_the_packages_of_every_extra_that_the_service_asks_for():
         assert wanted <= lock, name
     copied = re.search(r"ARG LOCK=(\S+)", DOCKERFILE)[1]
     assert f"!{copied}" in (DOCKER / "Dockerfile.dockerignore").read_text().splitlines()
+
+
+def test_whatever_the_service_imports_in_any_function_is_in_the_image():
+    """As its user may run every command of the documents, and can install nothing."""
+    root = DOCKER.parent
+    lock = (DOCKER / "requirements.lock").read_text()
+    locked = set(re.findall(r"^([\w.-]+)==", lock, re.MULTILINE))
+    provided = metadata.packages_distributions()
+    wanted = {}
+    for path in (root / "service").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [node.module] if isinstance(node, ast.ImportFrom) and not node.level else []
+            names += [each.name for each in node.names] if isinstance(node, ast.Import) else []
+            # The client's tables are for programs of its users.
+            for name in names if not path.is_relative_to(root / "service" / "client") else ():
+                wanted.setdefault(name.partition(".")[0], path)
+    # The last is a checkout's own: `catalog build` says so where there is none.
+    own = {"service", *sys.stdlib_module_names, "catalogs"}
+    missing = {
+        name: path
+        for name, path in wanted.items()
+        if name not in own
+        and not locked & {each.lower().replace("_", "-") for each in provided.get(name, [name])}
+    }
+    assert len(wanted.keys() - own) > 20
+    assert missing == {}
 
 
 @pytest.mark.parametrize("host", [None, "", "127.0.0.1", "0.0.0.0", "::", "::1"])

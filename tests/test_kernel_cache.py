@@ -1,7 +1,10 @@
 """Compiled kernels are never older than the source."""
 
 import ast
+import hashlib
 import os
+import pickle
+import random
 import re
 import shutil
 import subprocess
@@ -15,9 +18,13 @@ from numba.core import caching
 import service
 from service.acquire.kernel_build import KernelBuild, mark_built
 from service.compiled.cache import SOURCES
+from service.compiled.checked_file import content_of
 from service.compiled.inner import Kernel
+from tests.scale import size
 
 PACKAGE = Path(service.__file__).parent
+DIGEST_BYTES = 32
+"""Before the content of a file."""
 
 
 def cache_of(package):
@@ -123,6 +130,45 @@ def test_a_damaged_kernel_is_removed_and_compiled_again(cache, caplog, suffix, d
     file.write_bytes(damaged(whole))
     assert KernelBuild().is_needed
     assert not file.exists()
+
+
+def test_whatever_is_damaged_in_a_cache_the_answer_is_right_and_the_cache_heals(
+    cache, seed, figures
+):
+    """Cut, zeroed or flipped anywhere, or written by another version of numba."""
+    rng, (folder, call) = random.Random(seed), cache
+    assert call() == 42
+    whole = {path: path.read_bytes() for path in folder.rglob("*.nb[ci]")}
+    assert len(whole) == 2
+    tries = size(200, 12)
+
+    def other_version(content):
+        version, *rest = pickle.loads(content[DIGEST_BYTES:])
+        content = pickle.dumps((f"{version}.1", *rest))
+        return hashlib.sha256(content).digest() + content
+
+    for number in range(tries):
+        path = rng.choice(sorted(whole))
+        content = bytearray(whole[path])
+        place = rng.randrange(len(content))
+        match number % 4:
+            case 0:
+                del content[place:]
+            case 1:
+                content[place:] = bytes(len(content) - place)
+            case 2:
+                for _ in range(rng.randrange(1, 9)):
+                    content[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
+            case 3:
+                path = next(each for each in whole if each.suffix == ".nbi")
+                content = other_version(whole[path])
+        path.write_bytes(content)
+        assert call() == 42, (path, number)
+        # What was compiled anew is kept: the next process loads it.
+        assert {each: bool(content_of(each)) for each in folder.rglob("*.nb[ci]")} == (
+            dict.fromkeys(whole, True)
+        )
+    figures(damaged=tries)
 
 
 def test_a_cache_that_cannot_be_written_is_an_error_that_names_the_setting(monkeypatch):

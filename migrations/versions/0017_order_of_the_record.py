@@ -8,6 +8,8 @@ down_revision = "0016"
 branch_labels = None
 depends_on = None
 
+WITH_DIGESTS = ("missions", "catalogs", "mission_uses", "tracker_values")
+
 
 def upgrade() -> None:
     # Trends and alarms have all earlier results already; these get no place in the order: zero.
@@ -16,6 +18,17 @@ def upgrade() -> None:
     )
     op.create_index("ix_results_seq", "results", ["seq"])
     op.add_column("results", sa.Column("digest", sa.BigInteger()))
+    # The service gives earlier results theirs, after the upgrade.
+    without = sa.text("digest IS NULL")
+    op.create_index(
+        "ix_results_without_digest",
+        "results",
+        ["id"],
+        sqlite_where=without,
+        postgresql_where=without,
+    )
+    for table in WITH_DIGESTS:
+        op.add_column(table, sa.Column("row_digest", sa.BigInteger()))
     op.create_table(
         "seals",
         sa.Column("spacecraft", sa.String(128), nullable=False),
@@ -46,6 +59,9 @@ def downgrade() -> None:
         op.execute("DROP SEQUENCE results_seq")
     op.drop_table("projector")
     op.drop_table("seals")
+    for table in WITH_DIGESTS:
+        op.drop_column(table, "row_digest")
+    op.drop_index("ix_results_without_digest", "results")
     op.drop_column("results", "digest")
     op.drop_index("ix_results_seq", "results")
     op.drop_column("results", "seq")

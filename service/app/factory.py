@@ -39,7 +39,7 @@ from service.storage.queries.replays import mark_interrupted
 from service.storage.recording.results import register
 from service.storage.store import Store
 from service.storage.upkeep.expiries import ExpiryDates
-from service.storage.upkeep.split_trackers import BackgroundSplit, TrackerSplitter
+from service.storage.upkeep.split_trackers import BackgroundUpgrade, TrackerSplitter
 from service.times import utc_now
 
 
@@ -85,7 +85,7 @@ class App:
         self.audit = Audit(context)
         self.expiries = ExpiryDates(context.reading_record)
         self.webhooks = Webhooks(context, self.access)
-        self.tracker_split = BackgroundSplit(
+        self.upgrade = BackgroundUpgrade(
             TrackerSplitter(context.store, context.sky, context.missions)
         )
         self.service = Service(
@@ -93,7 +93,7 @@ class App:
             self.submissions,
             self.replays,
             kernels,
-            self.tracker_split,
+            self.upgrade,
             self.expiries,
             self.single_writer,
         )
@@ -105,7 +105,7 @@ class App:
         self.replays.stop()
         self.calibrations.close()
         self.live_filter.stop()
-        self.tracker_split.stop()
+        self.upgrade.stop()
         self.submissions.close()
         self.projector.close()
         self.store.close()

@@ -22,7 +22,7 @@ from service.storage.models.overview import About, CatalogAbout, MissionAbout
 from service.storage.projections.alarms import latest_inputs
 from service.storage.recording.ids import Ulids
 from service.storage.upkeep.expiries import ExpiryDates
-from service.storage.upkeep.split_trackers import BackgroundSplit
+from service.storage.upkeep.split_trackers import BackgroundUpgrade
 from service.times import utc_now
 
 log = logging.getLogger(__name__)
@@ -45,7 +45,7 @@ class Service:
         submissions: Submissions,
         replays: Replays,
         kernels: KernelBuild | None,
-        tracker_split: BackgroundSplit,
+        upgrade: BackgroundUpgrade,
         expiries: ExpiryDates,
         single_writer: SingleWriter,
     ) -> None:
@@ -53,7 +53,7 @@ class Service:
         self._submissions = submissions
         self._replays = replays
         self._kernels = kernels
-        self._tracker_split = tracker_split
+        self._upgrade = upgrade
         self._expiries = expiries
         self._single_writer = single_writer
         self._warming = threading.Lock()
@@ -101,7 +101,7 @@ class Service:
 
     def _begin_work(self) -> None:
         self._replays.resume()
-        self._tracker_split.start()
+        self._upgrade.start()
 
     def _begin_with_zones(self) -> None:
         """Load the kernels of batches with a zone, and be ready for these."""

@@ -111,25 +111,26 @@ def _is_confirmed(run: str) -> bool:
 
 def _note(parsed: Namespace) -> Any:
     """What adds the entry of the audit list."""
-    from service.access.audit import add_entry
-    from service.storage.recording.ids import Ulids
-    from service.times import utc_now
-
     asked = {
         "spacecraft": parsed.spacecraft,
         "batches": parsed.batch,
         "gyro_blocks": parsed.gyro_block,
     }
+    return lambda connection, total: note(connection, "forget_run", parsed.run, asked)
 
-    def note(connection: "Connection", total: "Forgotten") -> None:
-        add_entry(
-            connection,
-            id=Ulids().new(),
-            moment=utc_now().text,
-            who=f"command:{getpass.getuser()}"[:80],
-            action="forget_run",
-            about=parsed.run,
-            body=json.dumps(asked),
-        )
 
-    return note
+def note(connection: "Connection", action: str, about: str, asked: dict[str, Any]) -> None:
+    """Add an entry to the audit list: the user of this command did this."""
+    from service.access.audit import add_entry
+    from service.storage.recording.ids import Ulids
+    from service.times import utc_now
+
+    add_entry(
+        connection,
+        id=Ulids().new(),
+        moment=utc_now().text,
+        who=f"command:{getpass.getuser()}"[:80],
+        action=action,
+        about=about,
+        body=json.dumps(asked),
+    )

@@ -32,19 +32,36 @@ from .errors import (
     UnexpectedAnswer,
     WrongState,
 )
-from .event_lines import Event
+from .event_lines import (
+    AdoptedEvent,
+    AlarmEvent,
+    AnnotationEvent,
+    BatchesEvent,
+    CalibrationEvent,
+    Event,
+    GyroEvent,
+    LimitEvent,
+    OtherEvent,
+    ReplayEvent,
+    TrackingEvent,
+)
 from .outcomes import BatchOutcome, RecordedAnswer
 from .retrying import Repeat
 
 __version__ = "0.2.0"
 
 __all__ = [
+    "AdoptedEvent",
+    "AlarmEvent",
+    "AnnotationEvent",
     "AsyncClient",
     "AsyncEvents",
     "AsyncItems",
     "BadInput",
     "BatchOutcome",
+    "BatchesEvent",
     "Busy",
+    "CalibrationEvent",
     "Client",
     "ClientError",
     "Conflict",
@@ -52,19 +69,24 @@ __all__ = [
     "Events",
     "EventsLost",
     "Forbidden",
+    "GyroEvent",
     "InvalidArgument",
     "Items",
     "KeyReused",
+    "LimitEvent",
     "NoAnswer",
     "NotAvailable",
     "NotFound",
+    "OtherEvent",
     "PackageMissing",
     "Problem",
     "RateLimited",
     "RecordedAnswer",
     "Repeat",
     "ReplayEnded",
+    "ReplayEvent",
     "ServiceFailed",
+    "TrackingEvent",
     "Unauthenticated",
     "UnexpectedAnswer",
     "WrongState",

@@ -1,23 +1,117 @@
 """Server-sent events: the blocks of an event stream, and the events in them."""
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Literal, cast, get_args, get_type_hints
 
 import msgspec
 
+from . import models
 from .base import Model
 from .errors import UnexpectedAnswer
 
 
-class Event(Model, frozen=True):
-    """Something that happened, by its number: numbers have no gaps and are in order of commit.
-
-    `kind` is batches, adopted, alarm, limit, annotation, replay, or a word that a later service
-    adds; `data` depends on it.
-    """
+class BatchesEvent(Model, frozen=True):
+    """Batches that were recorded."""
 
     id: int
-    kind: str
+    kind: Literal["batches"]
+    data: models.Recorded
+
+
+class AdoptedEvent(Model, frozen=True):
+    """A what-if that was adopted."""
+
+    id: int
+    kind: Literal["adopted"]
+    data: models.Adopted
+
+
+class AlarmEvent(Model, frozen=True):
+    """An alarm that changed."""
+
+    id: int
+    kind: Literal["alarm"]
+    data: models.Alarm
+
+
+class LimitEvent(Model, frozen=True):
+    """Limits that were set."""
+
+    id: int
+    kind: Literal["limit"]
+    data: models.Limit
+
+
+class AnnotationEvent(Model, frozen=True):
+    """A note that was written or deleted."""
+
+    id: int
+    kind: Literal["annotation"]
+    data: models.AnnotationChange
+
+
+class ReplayEvent(Model, frozen=True):
+    """A replay that went on."""
+
+    id: int
+    kind: Literal["replay"]
+    data: models.ReplayProgress
+
+
+class GyroEvent(Model, frozen=True):
+    """A gyro block that was recorded."""
+
+    id: int
+    kind: Literal["gyro"]
+    data: models.GyroBlock
+
+
+class TrackingEvent(Model, frozen=True):
+    """A tracking state that changed."""
+
+    id: int
+    kind: Literal["tracking"]
+    data: models.TrackingChange
+
+
+class CalibrationEvent(Model, frozen=True):
+    """A calibration that was adopted, or taken back."""
+
+    id: int
+    kind: Literal["calibration"]
+    data: models.CalibrationChange
+
+
+class OtherEvent(Model, frozen=True):
+    """An event of a kind that a later service added: the word is `name`."""
+
+    id: int
+    kind: Literal["other"]
+    name: str
     data: dict[str, Any]
+
+
+Event = (
+    BatchesEvent
+    | AdoptedEvent
+    | AlarmEvent
+    | LimitEvent
+    | AnnotationEvent
+    | ReplayEvent
+    | GyroEvent
+    | TrackingEvent
+    | CalibrationEvent
+    | OtherEvent
+)
+"""Something that happened, by its number: numbers have no gaps and are in order of commit.
+
+`kind` says which it is, and so what `data` is.
+"""
+_BY_KIND: Mapping[str, Any] = {
+    get_args(get_type_hints(each)["kind"])[0]: each
+    for each in get_args(Event)
+    if each is not OtherEvent
+}
 
 
 class Block(Model, frozen=True):
@@ -29,13 +123,18 @@ class Block(Model, frozen=True):
 
     def event(self) -> Event:
         """The block as an event."""
+        fault = UnexpectedAnswer(f"this is no event of the service: {self}")
+        if self.id is None:
+            raise fault
         try:
             data = msgspec.json.decode(self.data or "", type=dict[str, Any])
-        except msgspec.DecodeError:
-            data = None
-        if self.id is None or data is None:
-            raise UnexpectedAnswer(f"this is no event of the service: {self}")
-        return Event(self.id, self.kind, data)
+            kind = _BY_KIND.get(self.kind)
+            if kind is None:
+                return OtherEvent(self.id, "other", self.kind, data)
+            event = {"id": self.id, "kind": self.kind, "data": data}
+            return cast(Event, msgspec.convert(event, type=kind))
+        except (msgspec.DecodeError, msgspec.ValidationError) as error:
+            raise fault from error
 
 
 class BlockReader:

@@ -126,7 +126,11 @@ class Live:
         yield f"retry: {RETRY_MS}\n\n".encode()
         if last is None:
             last = await self._read(self._app.events.last)
-        yield _line(last, "hello", f'{{"last":{last}}}')
+            # How many events there are of others is no business of a bound token.
+            told = await self._read(self._app.events.last, listener.caller.spacecraft)
+        else:
+            told = last
+        yield _line(told, "hello", f'{{"last":{told}}}')
         heard_s = clock()
         while not self._stopping and listener.is_admitted and clock() < end_s:
             news = self._news
@@ -218,7 +222,7 @@ class Live:
         self._news.set()
         self._news = asyncio.Event()
 
-    async def _read(self, ask: Callable[..., T], *arguments: int) -> T:
+    async def _read(self, ask: Callable[..., T], *arguments: object) -> T:
         return await run_sync(ask, *arguments, limiter=self._threads)
 
 

@@ -1,34 +1,43 @@
 """The models are those of openapi.yaml: every field, its type, and whether it may be absent."""
 
 import inspect
+import json
+import re
 from typing import get_args, get_type_hints
 
 import msgspec
 import pytest
 
-from service.client import base, errors, models
+from service import client
+from service.client import base, errors, event_lines, models
 from service.client.base import FieldFault, Model
-from tests.web.conformance import reference
+from tests.web.conformance import FILE, reference
 
 SCHEMAS = reference()["components"]["schemas"]
 NAMES = {
     "Acted": "ActedOut",
+    "Adopted": "AdoptedEvent",
     "Alarm": "AlarmOut",
     "AlarmAction": "ActionOut",
     "AlarmRaised": "RaisedOut",
     "AlarmValue": "PointOut",
     "AlarmWithActions": "AlarmRecord",
+    "AnnotationChange": "AnnotationEvent",
     "Attitude": "AttitudeOut",
+    "CalibrationChange": "CalibrationEvent",
     "Detection": "DetectionOut",
     "FieldFault": "FaultOut",
     "FrameSummary": "FrameOut",
     "FrameTimings": "FrameTimingsOut",
     "FrameWithStars": "FrameRecordOut",
+    "Limit": "LimitOut",
     "ProblemDocument": "Problem",
     "Provenance": "ProvenanceOut",
     "RankedBatch": "WorstBatch",
     "Ranking": "WorstList",
+    "Recorded": "BatchesEvent",
     "Replay": "ReplayState",
+    "ReplayProgress": "ReplayEvent",
     "Result": "Record",
     "Rival": "RivalOut",
     "Run": "RunRow",
@@ -40,6 +49,7 @@ NAMES = {
     "Track": "TrackOut",
     "TrackerFit": "TrackerFitOut",
     "TrackerStars": "TrackerOut",
+    "TrackingChange": "TrackingEvent",
     "WhatIf": "Answer",
 }
 """The schemas whose names differ from those of the models."""
@@ -92,6 +102,28 @@ def test_a_model_has_the_fields_of_its_schema_with_their_types(name):
         # A field that may be absent is None then.
         absent = set() if field in theirs["required"] else {"null"}
         assert here - absent == there - absent, field
+
+
+def test_each_kind_of_event_has_the_model_of_its_data():
+    """Those of the webhooks that openapi.yaml describes, and the example of each in api.md."""
+    text = (FILE.parent / "docs" / "api.md").read_text(encoding="utf-8")
+    shown = json.loads(re.search(r"```json\n(\{\"batches\".*?)```", text, re.DOTALL)[1])
+    described = reference()["webhooks"]
+    assert event_lines._BY_KIND.keys() == described.keys()
+    for kind, webhook in described.items():
+        content = webhook["post"]["requestBody"]["content"]["application/json"]["schema"]
+        schema = content["properties"]["data"]["$ref"].rpartition("/")[2]
+        data = get_type_hints(event_lines._BY_KIND[kind])["data"]
+        assert NAMES.get(data.__name__, data.__name__) == schema
+        event = event_lines.Block(7, kind, json.dumps(shown[kind])).event()
+        assert (event.id, event.kind, type(event.data)) == (7, kind, data)
+
+
+def test_an_event_of_a_later_service_is_handed_out_with_its_word():
+    event = event_lines.Block(7, "eclipse", '{"begins": 3}').event()
+    assert event == client.OtherEvent(7, "other", "eclipse", {"begins": 3})
+    with pytest.raises(client.UnexpectedAnswer, match="this is no event of the service"):
+        event_lines.Block(7, "batches", '{"run": 3}').event()
 
 
 def test_words_are_those_of_the_schemas():

@@ -102,14 +102,15 @@ except PackageMissing as error:
     ]
 
 
-def test_the_quick_start_prints_what_is_shown(environment, chosen_database):
-    (lines,), (shown, *_) = (
+def test_the_examples_run_and_the_quick_start_prints_what_is_shown(environment, chosen_database):
+    (lines, *others), (shown, *_) = (
         re.findall(rf"^```{kind}\n(.*?)^```$", DOCUMENT, re.MULTILINE | re.DOTALL)
         for kind in ("python", "text")
     )
     assert len(lines.splitlines()) <= 20
     with Server(create_app(open_app(in_process_settings(chosen_database())))) as url:
-        assert run(environment, lines.replace("http://127.0.0.1:8000", url)) == shown
+        program = "\n".join([lines, *others])
+        assert run(environment, program.replace("http://127.0.0.1:8000", url)) == shown
 
 
 def test_the_document_names_methods_and_errors_that_there_are():

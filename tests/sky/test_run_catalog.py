@@ -336,6 +336,9 @@ def test_batches_of_any_day_fit_the_stars_as_erfa_has_them(sky, missions, seed, 
         time = in_year(epoch + (0.49 if k < 3 else rng.uniform(-0.49, 0.49)))
         run = sky.run_catalog(mission, time)
         row = np.flatnonzero(run.direction @ axis > np.cos(np.radians(3.5)))[:20]
+        if len(row) < 2:
+            # Nothing to find an attitude by; counted as not met.
+            continue
         together = np.flatnonzero(np.isin(leader, run.catalog_row[row]))
         group = {lead: together[leader[together] == lead] for lead in run.catalog_row[row]}
         there = np.array(

@@ -6,7 +6,7 @@ import pytest
 from msgspec import structs
 from sqlalchemy import inspect
 
-from service.errors import Busy, WrongState
+from service.errors import Busy, NotAvailable, WrongState
 from service.observations.schema import OptionsIn
 from service.storage.archive import folder
 from service.storage.queries.pages import ResultFilter
@@ -246,3 +246,11 @@ def test_a_page_of_recorded_batches_needs_no_archive(filled, place):
     ):
         with pytest.raises(Busy, match="ACQUIRE_ARCHIVE_FOLDER"):
             read()
+
+
+def test_without_the_setting_an_archived_batch_is_no_matter_of_trying_again(filled, place, opened):
+    (id,) = [each.id for each in pages_of(filled, 100, batch="b1", spacecraft="XTE")]
+    archiving.archive(filled.store, place, LATER)
+    filled.close()
+    with pytest.raises(NotAvailable, match="set ACQUIRE_ARCHIVE_FOLDER to the folder"):
+        opened(archive_folder=None).results.get(id)

@@ -25,7 +25,7 @@ from service.app.factory import open_app
 from service.settings import Settings
 from service.storage.sql import migrations
 from service.storage.sql.engines import database_url
-from service.storage.upkeep.verify import verify
+from service.storage.upkeep.verify import earlier_results, verify
 from service.web.app import create_app
 from service.web.requests.problem_types import types_with_pages
 from tests.databases.make import FOLDER, restore_postgresql, restore_sqlite
@@ -112,6 +112,8 @@ def earlier(request, new_database):
         opened = open_app(Settings(database=url, replay_processes=0))
         headers = {"Authorization": f"Bearer {_token(opened)}"}
         app = create_app(opened)
+        # As where the service is started by its command.
+        opened.upgrade.start()
         hooks = {"response": [check]}
         with (
             Server(app) as address,
@@ -233,6 +235,15 @@ def test_its_schema_is_that_of_a_new_database(earlier, new_schemas, new_database
 
 def test_verify_finds_nothing_wrong(earlier):
     assert earlier.problems == []
+
+
+def test_its_results_get_digests_that_are_marked_as_made_later(earlier):
+    """Beside the service, which makes them after its start; what changed since then is found."""
+    wait_until(lambda: earlier_results(earlier.url)[0] == 0, why="some have no digest")
+    ids = {row["id"] for row in earlier.before["results"]}
+    made = {row["id"]: row["digest"] for row in rows_of(earlier.url)["results"]}
+    assert all(made[id] < 0 for id in ids)
+    assert verify(earlier.url) == []
 
 
 # ---- reading -------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from service.storage.sql.file_lock import FileLock, is_written
 from service.storage.sql.migrations import revision_of, upgrade
 from service.storage.store import Store
 from tests.fresh_databases import sqlite_at
+from tests.scale import size
 
 HOLDING = """
 import sys
@@ -93,12 +94,12 @@ def test_a_schema_is_not_changed_while_another_process_writes(tmp_path):
         lock.release()
 
 
-def _try(path, ready, begun, results):
-    lock = FileLock(DatabaseFile(path))
+def _try(url, ready, begun, results):
     ready.release()
     begun.wait()
     try:
-        lock.take()
+        # As a service does.
+        Store(url, serving=True)
     except BadConfiguration:
         results.put(False)
     else:
@@ -109,10 +110,10 @@ def _try(path, ready, begun, results):
 
 def test_of_two_that_start_at_the_same_moment_one_is_always_refused(tmp_path):
     fork = multiprocessing.get_context("fork")
-    for each in range(5):
+    for each in range(size(100, 5)):
         ready, begun, results = fork.Semaphore(0), fork.Event(), fork.Queue()
-        path = tmp_path / f"{each}.db"
-        two = [fork.Process(target=_try, args=(path, ready, begun, results)) for _ in range(2)]
+        url = sqlite_at(tmp_path / f"{each}.db")
+        two = [fork.Process(target=_try, args=(url, ready, begun, results)) for _ in range(2)]
         for process in two:
             process.start()
         for _ in two:

@@ -183,7 +183,7 @@ def test_older_batches_are_split_as_if_they_were_recorded_now(
     unsplit(twins)
     assert twins.spacecraft.history("XTE", tracker=SECOND).not_split
     assert_whole(twins)
-    assert twins.tracker_split.splitter.split() == 6
+    assert twins.upgrade.splitter.split() == 6
     assert_alike(rows_of(twins), before)
     assert not twins.spacecraft.history("XTE", tracker=SECOND).not_split
     assert_whole(twins)
@@ -195,7 +195,7 @@ def test_splitting_goes_on_where_it_was_stopped(opened, twins, sky, mission, mon
     ids = fill(twins, sky, mission, 7)
     unsplit(twins)
     steps = iter((False, False, True))
-    assert twins.tracker_split.splitter.split(is_stopped=lambda: next(steps)) == 4
+    assert twins.upgrade.splitter.split(is_stopped=lambda: next(steps)) == 4
     assert_whole(twins)
     twins.submissions.submit(submission(sky, mission, "new", after_s=100.0))
     twins.results.what_if(ids[0], TIGHT, adopt=True)
@@ -203,8 +203,8 @@ def test_splitting_goes_on_where_it_was_stopped(opened, twins, sky, mission, mon
     assert_whole(twins)
     twins.close()
     again = opened(mission)
-    assert again.tracker_split.splitter.split() == 4
-    assert again.tracker_split.splitter.waiting() == []
+    assert again.upgrade.splitter.split() == 4
+    assert again.upgrade.splitter.waiting() == []
     assert {row[1] for row in rows_of(again)[0]} == {FIRST, SECOND}
     assert len(rows_of(again)[0]) == 16
     assert_whole(again)
@@ -216,7 +216,7 @@ def test_two_processes_that_split_do_it_once(twins, opened, sky, mission, monkey
     fill(twins, sky, mission, 5)
     before = rows_of(twins)
     unsplit(twins)
-    one, other = twins.tracker_split.splitter, opened(mission).tracker_split.splitter
+    one, other = twins.upgrade.splitter, opened(mission).upgrade.splitter
     owner = ("XTE", "live")
     while one.waiting():
         one._step(owner)
@@ -233,12 +233,12 @@ def test_a_mission_that_gets_a_second_tracker_is_split_from_its_beginning(
     fill(app, sky, single, 3)
     app.close()
     app = opened(mission)
-    assert app.tracker_split.splitter.waiting() == [("XTE", "live")]
-    assert app.tracker_split.splitter.split() == 3
+    assert app.upgrade.splitter.waiting() == [("XTE", "live")]
+    assert app.upgrade.splitter.split() == 3
     assert {row[1] for row in rows_of(app)[0]} == {FIRST}
     assert_whole(app)
     app.close()
-    assert opened(mission).tracker_split.splitter.waiting() == []
+    assert opened(mission).upgrade.splitter.waiting() == []
 
 
 def test_the_command_splits_what_is_waiting(opened, twins, sky, mission, tmp_path, capsys):

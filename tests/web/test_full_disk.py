@@ -1,6 +1,8 @@
 """While nothing can be written the service says so, and takes it back once it can write again."""
 
+import itertools
 import resource
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -9,7 +11,9 @@ import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from tests.scale import size
 from tests.storage import samples
+from tests.waiting import wait_until
 from tests.web.serving import served
 from tests.web.test_hanging_database import descendants, locked, ready_again
 
@@ -62,6 +66,69 @@ def test_readiness_knows_how_the_last_write_ended(database, sky, missions):
         for k in range(5):
             assert post(f"refused-{k}").status_code == 201
         assert post("first").status_code == 200
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("database", ["sqlite"], indirect=True)
+def test_a_disk_that_fills_and_is_freed_under_load_is_told_by_every_probe(
+    database, sky, missions, figures
+):
+    """From the first post that fails until the disk is freed: no probe says well, none is lost."""
+    wal = Path(database.removeprefix("sqlite:///") + "-wal")
+    answers, probes, full, numbers = [], [], [], itertools.count()
+    ended = threading.Event()
+    with served(database) as (process, url), ThreadPoolExecutor(4) as threads:
+
+        def post():
+            while not ended.is_set():
+                body = samples.batch(sky, missions, f"b{next(numbers)}")
+                headers = {"Content-Type": "application/json"}
+                begun = time.monotonic()
+                answer = httpx.post(
+                    f"{url}/api/v1/batches", content=body, headers=headers, timeout=60
+                )
+                answers.append((begun, time.monotonic(), answer.status_code, body, answer.text))
+
+        def probe():
+            while not ended.wait(1.0):
+                begun = time.monotonic()
+                ready = httpx.get(f"{url}/readyz", timeout=60).status_code
+                well = metric(url, "starid_last_write_succeeded")
+                probes.append((begun, time.monotonic(), ready, well))
+
+        begun = [threads.submit(post) for _ in range(3)] + [threads.submit(probe)]
+        for _ in range(size(20, 2)):
+            wait_until(lambda: wal.exists() and answers and answers[-1][2] == 201)
+            filled = time.monotonic()
+            let_files_grow(process.pid, wal.stat().st_size)
+            time.sleep(4.0)
+            full.append((filled, time.monotonic()))
+            let_files_grow(process.pid, resource.RLIM_INFINITY)
+            ready_again(url)
+            count = len(answers)
+            wait_until(lambda count=count: len(answers) > count + 5)
+        ended.set()
+        for each in begun:
+            each.result()
+        during = 0
+        for filled, freed in full:
+            first = min(e for b, e, status, *_ in answers if filled < b and status == 503)
+            assert first < freed
+            told = [each for each in probes if first < each[0] and each[1] < freed]
+            assert {(ready, well) for _, _, ready, well in told} <= {(503, 0.0)}, told
+            later = {s for b, e, s, *_ in answers if first < b and e < freed}
+            assert later <= {503}
+            during += len(told)
+        assert during >= len(full)
+        assert {status for _, _, status, *_ in answers} == {201, 503}
+        for *_, status, body, text in answers:
+            headers = {"Content-Type": "application/json"}
+            again = httpx.post(f"{url}/api/v1/batches", content=body, headers=headers, timeout=60)
+            if status == 201:
+                assert (again.status_code, again.text) == (200, text)
+            else:
+                assert again.status_code in (200, 201)
+        figures(filled=len(full), posts=len(answers), probes_while_full=during)
 
 
 @pytest.mark.parametrize("database", ["postgresql"], indirect=True)

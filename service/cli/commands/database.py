@@ -3,12 +3,13 @@
 from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from service.cli.arguments import add_command, add_database, add_group, add_json, print_json
 from service.cli.configuration import settings_of, settings_of_existing
-from service.cli.forget import add_forget
+from service.cli.forget import add_forget, note
 
 MAX_PROBLEMS = 100
 
@@ -208,8 +209,10 @@ def verify(parsed: Namespace) -> int:
     """Tell what is wrong with the database."""
     from tqdm import tqdm
 
+    from service.storage.upkeep.verify import earlier_results
     from service.storage.upkeep.verify import verify as verify_records
 
+    database = settings_of(parsed).database
     seen = 0
     with tqdm(total=None, unit=" batches", desc="reading", disable=None, leave=False) as bar:
 
@@ -219,7 +222,7 @@ def verify(parsed: Namespace) -> int:
             bar.update(done - seen)
             seen = done
 
-        problems = verify_records(settings_of(parsed).database, step)
+        problems = verify_records(database, step)
     if parsed.json:
         print_json({"batches": seen, "faults": problems})
         return 1 if problems else 0
@@ -227,9 +230,15 @@ def verify(parsed: Namespace) -> int:
         print(problem)
     if len(problems) > MAX_PROBLEMS:
         print(f"and {len(problems) - MAX_PROBLEMS} more")
-    if not problems:
-        print(f"nothing is wrong with {seen} batches")
-    return 1 if problems else 0
+    if problems:
+        return 1
+    print(f"nothing is wrong with {seen} batches")
+    without, later = earlier_results(database)
+    if later:
+        print(f"{later} results got their digest at an upgrade: changes before it are not found")
+    if without:
+        print(f"{without} results have no digest yet: the service makes them while it runs")
+    return 0
 
 
 def rebuild(parsed: Namespace) -> int:
@@ -266,7 +275,7 @@ def split_trackers(parsed: Namespace) -> int:
     app = open_app(settings_of_existing(parsed))
     try:
         with tqdm(total=None, unit=" batches", desc="splitting", disable=None, leave=False) as bar:
-            done = app.tracker_split.splitter.split(lambda done: bar.update(done - bar.n))
+            done = app.upgrade.splitter.split(lambda done: bar.update(done - bar.n))
     finally:
         app.close()
     print(f"{done} batches were looked at; every batch is split by tracker")
@@ -295,6 +304,9 @@ def prune(parsed: Namespace) -> int:
                 bar.total = pruned.total
                 bar.update(pruned.batches - bar.n)
 
+            if not parsed.dry_run:
+                asked = {"before": before.text, "run": parsed.run}
+                store.writer.change(partial(note, action="prune", about="database", asked=asked))
             pruned = prune_records(store, before, parsed.run, dry_run=parsed.dry_run, step=step)
     finally:
         store.close()

@@ -76,8 +76,9 @@ class AsyncClient(
         does not come back for `give_up_after_s`.
 
         >>> async for event in client.events(after=0):
-        ...     print(event.id, event.kind, event.data["latest"]["batch"])
-        ...     break
-        1 batches 1996-010-0110
+        ...     if event.kind == "batches":
+        ...         print(event.id, event.data.latest.batch)
+        ...         break
+        1 1996-010-0110
         """
         return AsyncEvents(self, {"run": run, "spacecraft": spacecraft}, after)

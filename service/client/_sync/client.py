@@ -74,8 +74,9 @@ class Client(Batches, Spacecraft, Alarms, Replays, Gyro, Calibrations):
         does not come back for `give_up_after_s`.
 
         >>> for event in client.events(after=0):
-        ...     print(event.id, event.kind, event.data["latest"]["batch"])
-        ...     break
-        1 batches 1996-010-0110
+        ...     if event.kind == "batches":
+        ...         print(event.id, event.data.latest.batch)
+        ...         break
+        1 1996-010-0110
         """
         return Events(self, {"run": run, "spacecraft": spacecraft}, after)

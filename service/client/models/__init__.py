@@ -37,6 +37,16 @@ from .calibrations import (
     ResidualMap,
     TrackerGeometry,
 )
+from .events import (
+    Adopted,
+    AnnotationChange,
+    CalibrationChange,
+    LatestBatch,
+    Limit,
+    Recorded,
+    ReplayProgress,
+    TrackingChange,
+)
 from .gyro import GyroBlock, GyroSamples
 from .replays import (
     ApidPackets,
@@ -71,11 +81,13 @@ from .tracks import Track, TrackList, TrackPoint
 
 __all__ = [
     "Acted",
+    "Adopted",
     "Alarm",
     "AlarmAction",
     "AlarmRaised",
     "AlarmValue",
     "AlarmWithActions",
+    "AnnotationChange",
     "Answer",
     "ApidPackets",
     "Attitude",
@@ -83,6 +95,7 @@ __all__ = [
     "Calibration",
     "CalibrationAdoption",
     "CalibrationBatches",
+    "CalibrationChange",
     "CalibrationHeldOut",
     "CalibrationInForce",
     "CalibrationNotObservable",
@@ -99,6 +112,8 @@ __all__ = [
     "GyroSamples",
     "History",
     "Innovation",
+    "LatestBatch",
+    "Limit",
     "LineProblem",
     "LiveAttitude",
     "MissionNow",
@@ -108,11 +123,13 @@ __all__ = [
     "RankedBatch",
     "Ranking",
     "Rates",
+    "Recorded",
     "RefusedLine",
     "Replay",
     "ReplayCounts",
     "ReplayLines",
     "ReplayPackets",
+    "ReplayProgress",
     "ResidualCell",
     "ResidualMap",
     "Result",
@@ -138,5 +155,6 @@ __all__ = [
     "TrackerFit",
     "TrackerGeometry",
     "TrackerStars",
+    "TrackingChange",
     "WhatIf",
 ]

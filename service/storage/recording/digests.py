@@ -1,24 +1,38 @@
-"""Digests of results, over all that the record keeps of each: made when it is written.
+"""Digests of what the record keeps: of each result, and of each row of settings that it names.
 
 `verify` computes them again: a digit that changed later, in an answer, an input, a column or a
-star, does not pass.
+star, does not pass.  What is null is left out, so that a column which a later version adds
+changes no digest that was made before it.
 """
 
 from collections.abc import Callable, Sequence
 from functools import cache
 from hashlib import blake2b
+from operator import itemgetter
 
 import msgspec
 from sqlalchemy import Double, Table
 
 from service.storage.sql.columns import Row
-from service.storage.sql.tables import batches, frames, results, solutions, star_results
+from service.storage.sql.tables import (
+    batches,
+    catalogs,
+    frames,
+    mission_uses,
+    missions,
+    results,
+    solutions,
+    star_results,
+)
 
 BYTES = 8
-_CHANGE_LATER = ("current", "seq", "digest")
-"""Columns of `results` that are no content: what is current, and the place in the record."""
+SETTINGS = (missions, catalogs, mission_uses)
+"""The tables whose rows have a digest each, `row_digest`."""
+_NO_CONTENT = ("results.current", "results.seq", "results.digest", "mission_uses.id")
+"""What is current, places in an order, and digests."""
 
 _encode = msgspec.json.Encoder().encode
+_in_order = itemgetter("tracker", "position")
 
 
 def digest_of(
@@ -32,25 +46,49 @@ def digest_of(
 
     `batch` and `frame` are given for the first result of a batch, and not for a what-if.
     """
-    content = [_values(results)(result), sorted(map(_values(star_results), stars))]
+    content: list[object] = [
+        _content(results)(result),
+        sorted(map(_content(star_results), stars), key=_in_order),
+    ]
     for table, row in ((solutions, solution), (batches, batch), (frames, frame)):
-        content.append([] if row is None else _values(table)(row))
-    digest = blake2b(_encode(content), digest_size=BYTES).digest()
-    return int.from_bytes(digest, "big") >> 1
+        content.append(None if row is None else _content(table)(row))
+    return _digest(content)
+
+
+def digest_of_row(table: Table, row: Row) -> int:
+    """The digest of a row of `SETTINGS` or `tracker_values`."""
+    return _digest(_content(table)(row))
+
+
+def made_later(digest: int) -> int:
+    """The digest as it is kept where it was made after the result: at an upgrade."""
+    return ~digest
+
+
+def agrees(stored: int | None, digest: int) -> bool:
+    """Whether a digest that is kept, if any, is this one, whenever it was made."""
+    return stored in (None, digest, made_later(digest))
+
+
+def _digest(content: object) -> int:
+    return int.from_bytes(blake2b(_encode(content), digest_size=BYTES).digest(), "big") >> 1
 
 
 @cache
-def _values(table: Table) -> Callable[[Row], list[object]]:
-    """A function that gives the values of a row as they come back from any database."""
-    names = [each.name for each in table.columns if each.name not in _CHANGE_LATER]
-    places = [k for k, name in enumerate(names) if isinstance(table.c[name].type, Double)]
+def _content(table: Table) -> Callable[[Row], dict[str, object]]:
+    """A function that gives the content of a row as it comes back from any database."""
+    columns = [
+        (each.name, isinstance(each.type, Double))
+        for each in table.columns
+        if each.name != "row_digest" and f"{table.name}.{each.name}" not in _NO_CONTENT
+    ]
 
-    def values(row: Row) -> list[object]:
-        found = [row[name] for name in names]
-        for k in places:
-            if (value := found[k]) is not None:
-                # SQLite has no minus zero, and a whole number comes back as a float.
-                found[k] = float(value) + 0.0
-        return found
+    def content(row: Row) -> dict[str, object]:
+        # SQLite has no minus zero, and a whole number comes back as a float.
+        return {
+            name: float(value) + 0.0 if is_double else value
+            for name, is_double in columns
+            if (value := row[name]) is not None
+        }
 
-    return values
+    return content

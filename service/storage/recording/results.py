@@ -7,6 +7,7 @@ from sqlalchemy import Connection, and_, delete, insert, select, update
 
 from service.errors import AcquisitionError, Busy
 from service.storage.recording import events
+from service.storage.recording.digests import digest_of_row
 from service.storage.recording.identity import (
     ExistingResult,
     Registry,
@@ -45,8 +46,10 @@ _REMEMBERED = 1_000
 
 def register(connection: Connection, mission_rows: Sequence[Row], catalog_row: Row) -> None:
     """Note the settings and the catalog that results will name, unless they are known already."""
-    insert_missing(connection, missions, mission_rows)
-    insert_missing(connection, catalogs, [catalog_row])
+    for table, rows in ((missions, mission_rows), (catalogs, [catalog_row])):
+        insert_missing(
+            connection, table, [row | {"row_digest": digest_of_row(table, row)} for row in rows]
+        )
     for row in mission_rows:
         latest = (
             select(mission_uses.c.digest)
@@ -60,8 +63,13 @@ def register(connection: Connection, mission_rows: Sequence[Row], catalog_row: R
                 query = select(missions.c.settings).where(missions.c.digest == before)
                 if _trackers(connection.execute(query).scalar_one()) == 1:
                     split_anew(connection, row["spacecraft"])
-            use = {"spacecraft": row["spacecraft"], "digest": row["digest"]}
-            connection.execute(insert(mission_uses), use | {"since": row["first_used"]})
+            use = {
+                "spacecraft": row["spacecraft"],
+                "digest": row["digest"],
+                "since": row["first_used"],
+            }
+            use["row_digest"] = digest_of_row(mission_uses, use)
+            connection.execute(insert(mission_uses), use)
 
 
 def _trackers(settings: str) -> int:

@@ -17,7 +17,8 @@ from service.observations.batch import ObservationBatch
 from service.observations.calibrate import CorrectedObservations
 from service.sky.catalog.run_catalog import RunCatalog
 from service.storage.models.answers import Answer, Star
-from service.storage.sql.tables import MEASURED
+from service.storage.recording.digests import digest_of_row
+from service.storage.sql.tables import MEASURED, tracker_values
 from service.vectors import Vector
 
 Row = dict[str, Any]
@@ -75,23 +76,21 @@ def tracker_rows(
         used = list(_residuals(stars.stars))
         predicted = scale * math.fsum(squares[k] for k, _ in used)
         offsets = (seen.magnitude_mag - magnitudes)[np.isfinite(seen.magnitude_mag - magnitudes)]
-        rows.append(
-            dict.fromkeys(MEASURED)
-            | {
-                "batch_id": batch_id,
-                "tracker": stars.tracker,
-                "observed": len(outcomes),
-                **{name: outcomes.count(name) for name in ("unique", "ambiguous", "unmatched")},
-                "status": _status(answer, stars.tracker),
-                "residual_rms_arcsec": _rms(math.fsum(each**2 for _, each in used), len(used)),
-                "predicted_rms_arcsec": _rms(predicted, len(used)),
-                "magnitude_offset_mag": (
-                    math.fsum(offsets.tolist()) / len(offsets) if len(offsets) else None
-                ),
-                "scale_offset_ppm": scale_offset_ppm(means[k : k + 1]) if means else None,
-                "alignment_offset_arcsec": alignment[k],
-            }
-        )
+        row = dict.fromkeys(MEASURED) | {
+            "batch_id": batch_id,
+            "tracker": stars.tracker,
+            "observed": len(outcomes),
+            **{name: outcomes.count(name) for name in ("unique", "ambiguous", "unmatched")},
+            "status": _status(answer, stars.tracker),
+            "residual_rms_arcsec": _rms(math.fsum(each**2 for _, each in used), len(used)),
+            "predicted_rms_arcsec": _rms(predicted, len(used)),
+            "magnitude_offset_mag": (
+                math.fsum(offsets.tolist()) / len(offsets) if len(offsets) else None
+            ),
+            "scale_offset_ppm": scale_offset_ppm(means[k : k + 1]) if means else None,
+            "alignment_offset_arcsec": alignment[k],
+        }
+        rows.append(row | {"row_digest": digest_of_row(tracker_values, row)})
     return rows
 
 

@@ -164,7 +164,7 @@ def reported(url: URL) -> Iterator[None]:
     """Turn what a database says of itself on opening into a `BadConfiguration`."""
     try:
         yield
-    except SQLAlchemyError as error:
+    except (SQLAlchemyError, UnicodeDecodeError) as error:
         said = str(getattr(error, "orig", None) or error).strip()
         raise BadConfiguration(f"ACQUIRE_DATABASE: {shown_url(url)}: {said}") from error
 

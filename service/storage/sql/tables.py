@@ -77,6 +77,7 @@ missions = Table(
     Column("spacecraft", Name, nullable=False, index=True),
     Column("settings", Text, nullable=False),
     Column("first_used", Moment, nullable=False),
+    Column("row_digest", BigInteger),
 )
 
 mission_uses = Table(
@@ -86,6 +87,7 @@ mission_uses = Table(
     Column("spacecraft", Name, nullable=False, index=True),
     Column("digest", Digest, ForeignKey(missions.c.digest), nullable=False),
     Column("since", Moment, nullable=False),
+    Column("row_digest", BigInteger),
 )
 
 catalogs = Table(
@@ -94,6 +96,7 @@ catalogs = Table(
     Column("digest", Digest, primary_key=True),
     Column("name", Text, nullable=False),
     Column("first_used", Moment, nullable=False),
+    Column("row_digest", BigInteger),
 )
 
 batches = Table(
@@ -154,7 +157,8 @@ results = Table(
     *(Column(name, Double) for name in MEASURED),
     # The answer's JSON, byte for byte as it was sent.
     Column("answer", PackedText, nullable=False),
-    # Of all that is kept of the result; null: an earlier version recorded it.
+    # Of all that is kept of the result.  Null: an earlier version recorded it, and the service has
+    # not come to it yet; negative: then it was made, after the result.
     Column("digest", BigInteger),
 )
 
@@ -204,6 +208,14 @@ Index(
 # The projector takes results in their order.
 Index("ix_results_seq", results.c.seq)
 
+# Empty, or what `upkeep.older_digests` still has to do.
+Index(
+    "ix_results_without_digest",
+    results.c.id,
+    sqlite_where=results.c.digest.is_(None),
+    postgresql_where=results.c.digest.is_(None),
+)
+
 # Deleting a batch checks the foreign key of its results, and finds them.
 Index("ix_results_batch_id", results.c.batch_id)
 
@@ -240,6 +252,8 @@ tracker_values = Table(
     # Of the attitude: good, or suspect if this is the tracker that disagrees; null without.
     Column("status", String(16)),
     *(Column(name, Double) for name in MEASURED),
+    # Null: an earlier version recorded it.
+    Column("row_digest", BigInteger),
     sqlite_with_rowid=False,
 )
 

@@ -115,7 +115,9 @@ def put_back(connection: Connection, folder: Path, part: Part, rows: Rows) -> bo
         select(archived_batches.c.part_id).where(archived_batches.c.id.in_(ids[:1]))
     )
     for digests, table in ((part.missions, missions), (part.catalogs, catalogs)):
-        insert_missing(connection, table, [read_settings(folder, each).row for each in digests])
+        rows_of_settings = [read_settings(folder, each).row for each in digests]
+        # An archive of an earlier version has none.
+        insert_missing(connection, table, [{"row_digest": None} | row for row in rows_of_settings])
     created = pc.min(rows["batches"]["received"]).as_py()
     insert_runs(connection, {part.run: created}, tracked=part.tracked)
     if part_id is not None:

@@ -1,5 +1,7 @@
 """Splits older batches by tracker: what recording does by itself since schema 0008.
 
+Also the thread that does this, and what else an upgrade leaves to be done.
+
 A few batches at a time: they are read and computed beside the writer, and written
 in one short transaction, which also notes how far it came.  Killed, it has split
 whole steps; the next call goes on from there.  A batch that another process split,
@@ -33,6 +35,7 @@ from service.storage.sql.rollup_tables import tracker_splits
 from service.storage.sql.statements import insert_all
 from service.storage.sql.tables import batches, results, tracker_values
 from service.storage.store import Store
+from service.storage.upkeep.older_digests import OlderDigests
 from service.times import HOUR_S, parse_utc
 
 log = logging.getLogger(__name__)
@@ -41,6 +44,7 @@ AT_ONCE = 50
 PAUSE_S = 0.25
 """Between two steps of the service, each of which takes the writer some milliseconds."""
 RETRY_S = 30.0
+LOG_EVERY_S = 60.0
 Owner = tuple[str, str]
 """(spacecraft, run)."""
 Place = tuple[int | None, str | None]
@@ -127,18 +131,21 @@ class TrackerSplitter:
         return self._catalogs[digest]
 
 
-class BackgroundSplit:
-    """Splits what is waiting, in a thread, once."""
+class BackgroundUpgrade:
+    """Brings what earlier versions recorded up to date, in a thread, once.
+
+    Gives results their digests, then splits batches by tracker.
+    """
 
     def __init__(self, splitter: TrackerSplitter) -> None:
-        self.splitter = splitter
+        self.splitter, self.digests = splitter, OlderDigests(splitter.store)
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
         """Begin, if anything is waiting."""
-        if self._thread is None and self.splitter.waiting():
-            self._thread = threading.Thread(target=self._run, name="split-by-tracker")
+        if self._thread is None and (self.digests.waiting() or self.splitter.waiting()):
+            self._thread = threading.Thread(target=self._run, name="upgrade")
             self._thread.start()
 
     def stop(self) -> None:
@@ -148,18 +155,30 @@ class BackgroundSplit:
             self._thread.join()
 
     def _run(self) -> None:
+        self._finish(self.digests.give, "older results were given digests")
+        self._finish(self.splitter.split, "older batches were looked at and split by tracker")
+
+    def _finish(self, work: Callable[..., int], told: str) -> None:
+        logged_s = time.monotonic()
+
+        def log_progress(done: int) -> None:
+            nonlocal logged_s
+            if time.monotonic() - logged_s > LOG_EVERY_S:
+                logged_s = time.monotonic()
+                log.info("%d %s so far", done, told)
+
         while not self._stopping.is_set():
             try:
-                done = self.splitter.split(pause_s=PAUSE_S, is_stopped=self._stopping.is_set)
+                done = work(log_progress, pause_s=PAUSE_S, is_stopped=self._stopping.is_set)
             except Busy:
                 self._stopping.wait(RETRY_S)
                 continue
             except Exception:
-                # Trends of trackers stay incomplete and say so; everything else goes on.
-                log.exception("older batches could not be split by tracker")
+                # What is missing stays so, and is told of; everything else goes on.
+                log.exception("not all %s", told)
                 return
-            if not self._stopping.is_set():
-                log.info("%d older batches were looked at and split by tracker", done)
+            if done and not self._stopping.is_set():
+                log.info("%d %s", done, told)
             return
 
 

@@ -9,20 +9,21 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import product
-from typing import get_args
+from typing import Any, get_args
 
 import msgspec
-from sqlalchemy import ColumnElement, Connection, Engine, Table, func, select
+from sqlalchemy import ColumnElement, Connection, Engine, Table, event, func, select, text
 from sqlalchemy.exc import DatabaseError
 
 from service.errors import BadInput
 from service.observations.batch import ObservationBatch
 from service.observations.schema import fingerprint_of, submission_from_json
 from service.storage.projections import rollups, seals
-from service.storage.recording.digests import digest_of
+from service.storage.recording.digests import SETTINGS, agrees, digest_of, digest_of_row
 from service.storage.recording.tracker_splits import is_waiting
-from service.storage.sql.columns import Row
+from service.storage.sql.columns import Row, metadata
 from service.storage.sql.engines import database_url, reading_engine
 from service.storage.sql.migrations import check, reported
 from service.storage.sql.tables import (
@@ -60,11 +61,14 @@ def verify(database: str, step: Step = lambda done, total: None) -> list[str]:
         return problems
     url = database_url(database)
     engine = reading_engine(url)
+    if engine.dialect.name == "sqlite":
+        event.listen(engine, "connect", _read_any_text)
     try:
         with reported(url):
             found = _of_the_file(engine)
             # The content of a damaged file is not evidence of what was written.
             if not found:
+                found += _of_the_references(engine)
                 found += _of_the_batches(engine, step)
                 found += _of_the_missions(engine)
                 found += _of_the_seals(engine)
@@ -77,6 +81,25 @@ def verify(database: str, step: Step = lambda done, total: None) -> list[str]:
     return found
 
 
+def _read_any_text(connection: Any, _: object) -> None:
+    """Read a changed byte that leaves no UTF-8 as another letter, so that its row is named."""
+    connection.text_factory = partial(str, encoding="utf-8", errors="replace")
+
+
+def earlier_results(database: str) -> tuple[int, int]:
+    """Results of earlier versions: those without a digest, and those that got one at an upgrade."""
+    digest = results.c.digest
+    query = select(func.count().filter(digest.is_(None)), func.count().filter(digest < 0))
+    url = database_url(database)
+    engine = reading_engine(url)
+    try:
+        with reported(url), engine.begin() as connection:
+            without, later = connection.execute(query.select_from(results)).one()
+    finally:
+        engine.dispose()
+    return int(without), int(later)
+
+
 def _of_the_file(engine: Engine) -> list[str]:
     if engine.dialect.name != "sqlite":
         return []
@@ -85,15 +108,22 @@ def _of_the_file(engine: Engine) -> list[str]:
         with engine.begin() as connection:
             said = connection.exec_driver_sql("PRAGMA integrity_check(20)").scalars().all()
             found = [f"the file is damaged: {each}" for each in said if each != "ok"]
-            if not found:
-                found = [
-                    f"{table}: row {row} refers to what is not in {parent}"
-                    for table, row, parent, _ in connection.exec_driver_sql(
-                        "PRAGMA foreign_key_check"
-                    )
-                ]
     except DatabaseError as error:
         found.append(f"the file is damaged: {error.orig}")
+    return found
+
+
+def _of_the_references(engine: Engine) -> list[str]:
+    if engine.dialect.name != "sqlite":
+        return []
+    found = []
+    with engine.begin() as connection:
+        for name, row, parent, _ in connection.exec_driver_sql("PRAGMA foreign_key_check").all():
+            key = "a row"
+            if row is not None:
+                query = select(*metadata.tables[name].primary_key).where(text("rowid = :row"))
+                key = " ".join(map(str, connection.execute(query, {"row": row}).one()))
+            found.append(f"{name}, {key}: it refers to what is not in {parent}")
     return found
 
 
@@ -141,7 +171,9 @@ def _of_a_chunk(connection: Connection, chunk: Mapping[str, Row]) -> Iterator[st
             outcomes = Counter(each["outcome"] for each in of_row)
             yield from _of_a_result(row, batch, outcomes, solution is not None)
             own = (batch, framed.get(id)) if row["id"] == id else ()
-            if row["digest"] not in (None, digest_of(row, of_row, solution, *own)):
+            if row["digest"] is None and row["seq"]:
+                yield f"result {row['id']} of batch {id}: it has no digest"
+            if not agrees(row["digest"], digest_of(row, of_row, solution, *own)):
                 yield f"result {row['id']} of batch {id}: it is not what was recorded"
 
 
@@ -175,6 +207,8 @@ def _of_the_trackers(
     for row in connection.execute(rows).mappings():
         of_batch = stored.setdefault(row["batch_id"], {})
         of_batch[row["tracker"]] = Counter({name: row[name] for name in OUTCOMES})
+        if not agrees(row["row_digest"], digest_of_row(tracker_values, dict(row))):
+            yield f"batch {row['batch_id']}: {row['tracker']}'s values are not what was recorded"
     for id, batch in chunk.items():
         of_stars, of_rows = seen.get(id, {}), stored.get(id, {})
         if of_rows:
@@ -257,35 +291,47 @@ def _of_a_result(row: Row, batch: Row, stars: "Counter[str]", is_solved: bool) -
 
 
 def _of_the_trends(engine: Engine) -> Iterator[str]:
-    for bucket, of_trackers in product(get_args(rollups.Bucket), (False, True)):
-        with engine.begin() as connection:
-            stored, counted = (
-                {key: row for key, row in found.items() if row["batches"]}
-                for found in (
-                    rollups.stored(connection, bucket, of_trackers=of_trackers),
-                    rollups.recount(connection, bucket, of_trackers=of_trackers),
-                )
+    try:
+        for bucket, of_trackers in product(get_args(rollups.Bucket), (False, True)):
+            yield from _of_trends_by(engine, bucket, of_trackers=of_trackers)
+    except BadInput as error:
+        yield f"the trends cannot be counted again: {error}"
+
+
+def _of_trends_by(engine: Engine, bucket: rollups.Bucket, *, of_trackers: bool) -> Iterator[str]:
+    with engine.begin() as connection:
+        stored, counted = (
+            {key: row for key, row in found.items() if row["batches"]}
+            for found in (
+                rollups.stored(connection, bucket, of_trackers=of_trackers),
+                rollups.recount(connection, bucket, of_trackers=of_trackers),
             )
-            # What is not projected yet will be added.
-            waiting = rollups.waiting(connection, bucket)
-        for key in sorted(stored.keys() | counted.keys()):
-            spacecraft, run, *tracker, number = key
-            is_waiting = (spacecraft, run, number) in waiting
-            if not is_waiting and not _alike(stored.get(key), counted.get(key)):
-                of = ", ".join([f"trends of {spacecraft}, run {run}", *tracker])
-                yield f"{of}, {bucket} {number}: not those of the results"
+        )
+        # What is not projected yet will be added.
+        waiting = rollups.waiting(connection, bucket)
+    for key in sorted(stored.keys() | counted.keys()):
+        spacecraft, run, *tracker, number = key
+        is_waiting = (spacecraft, run, number) in waiting
+        if not is_waiting and not _alike(stored.get(key), counted.get(key)):
+            of = ", ".join([f"trends of {spacecraft}, run {run}", *tracker])
+            yield f"{of}, {bucket} {number}: not those of the results"
 
 
 def _of_the_missions(engine: Engine) -> Iterator[str]:
-    """Settings that do not have the digest which results name; see `Mission.digest`."""
+    """Settings and catalogs that are not what was recorded, under the digests that results name."""
     with engine.begin() as connection:
-        kept = connection.execute(select(missions.c.digest, missions.c.settings)).all()
-    for digest, settings in kept:
+        rows = {t: connection.execute(select(t)).mappings().all() for t in SETTINGS}
+    for table, some in rows.items():
+        for row in some:
+            if not agrees(row["row_digest"], digest_of_row(table, dict(row))):
+                yield f"{table.name}, {row['digest']}: the row is not what was recorded"
+    # See `Mission.digest`.
+    for digest, settings in ((row["digest"], row["settings"]) for row in rows[missions]):
         try:
-            text = json.dumps(json.loads(settings), sort_keys=True, separators=(",", ":"))
+            canonical = json.dumps(json.loads(settings), sort_keys=True, separators=(",", ":"))
         except ValueError:
-            text = settings
-        if digest != f"sha256:{hashlib.sha256(text.encode()).hexdigest()}":
+            canonical = settings
+        if digest != f"sha256:{hashlib.sha256(canonical.encode()).hexdigest()}":
             yield f"mission settings {digest}: they are not what was recorded"
 
 
