@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from queue import Empty, SimpleQueue
 
-from service.errors import Busy, Stopping
+from service.errors import BeingBuilt, Busy, Stopping
 from service.ingest.solver_pool import WAIT_S, SolverPool, SolverTask
 from service.ingest.turns import Turns
 from service.observations.schema import Submission
@@ -232,6 +232,8 @@ class IngestQueue:
         try:
             unsaved = self._solve(pending)
             self._writer.queue([unsaved], partial(self._note_written, pending, unsaved))
+        except BeingBuilt:
+            raise  # the pool tries again
         except Exception as error:
             self._finish([(pending, error)])
 

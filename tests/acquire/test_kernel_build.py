@@ -111,7 +111,7 @@ def test_every_kernel_is_compiled_by_one_child(processors):
     named = [name for share in shares for name in (*share.zones, *share.others)]
     assert sorted(named) == sorted(IDENTIFIERS)
     assert all(IDENTIFIERS[name].searches_zone for share in shares for name in share.zones)
-    assert [share.over_batches for share in shares].count(True) == 1
+    assert [share.seldom for share in shares].count(True) == 1
 
 
 def test_what_batches_with_a_zone_need_is_compiled_without_the_whole_sky(
@@ -119,7 +119,7 @@ def test_what_batches_with_a_zone_need_is_compiled_without_the_whole_sky(
 ):
     monkeypatch.setattr(SkyModel, "index", lambda *_: pytest.fail("the whole sky is searched"))
     zones = [name for share in kernel_build._shares(2) for name in share.zones]
-    prewarm_kernels(SkyModel(sky.catalog, LruCache(64 << 20)), missions, zones, False)
+    prewarm_kernels(SkyModel(sky.catalog, LruCache(64 << 20)), missions, zones)
 
 
 def _wait_between(missions, share, zones_built):
