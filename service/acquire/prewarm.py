@@ -1,6 +1,7 @@
 """Preparation: the kernels and the sky before the service is ready, zones on request."""
 
 import json
+import math
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 from service.acquire import acquire
 from service.filtering.compiling import compile_filtering
 from service.identify.prior_attitude import prior_attitude, search_region
-from service.missions.identifiers import IDENTIFIERS, IdentifierEntry
+from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Band, Mission
 from service.observations.batch import APriori, BoresightPrior, SunPointedPrior
 from service.observations.schema import submission_from_json
@@ -18,7 +19,7 @@ from service.sky.model import SkyModel
 from service.sky.zones import Zone
 from service.times import Utc, parse_utc
 from service.tracks.linking import compile_linking
-from service.vectors import quaternion_from_matrix
+from service.vectors import quaternion_from_matrix, rotate_about
 
 ORION = 84.0, -1.0
 """Where there are many bright stars: right ascension and declination, in degrees."""
@@ -67,8 +68,8 @@ def prewarm_kernels(
     """Load the kernels, or compile them, by running a batch of real stars of each kind of zone.
 
     Those of the named identifiers (None: of the missions' own and of the whole sky: to load
-    others takes a batch that needs them some ms), and what is used `seldom`: votes in steps,
-    links of points, filter and smoother.
+    others takes a batch that needs them some ms), and what is used `seldom`: by few batches, or
+    over many, as links of points, filter and smoother.
     The zones that this builds go into a cache of its own, which it drops at the end.
     What builds run catalogs and indexes is compiled only for a sky that opens no files.
     """
@@ -111,18 +112,15 @@ def prewarm_kernels(
                 }
             ],
         }
-        asked: list[tuple[IdentifierEntry, dict[str, Any]]] = [
-            (entry, {}) for entry in IDENTIFIERS.values() if entry.name in identifiers
-        ]
-        if seldom and kind == first:
-            asked.append((IDENTIFIERS["starid"], {"tests": {"match_groups": True}}))
-        for identifier, further in asked:
+        for identifier in IDENTIFIERS.values():
+            if identifier.name not in identifiers:
+                continue
             if not identifier.searches_zone and kind != first:
                 continue  # the same kernels
             # From JSON, as batches are posted: kernels are compiled for that kind of array.
             # One zone on the mission's grid, where more is to be worked out; the others are small.
             exact = {} if identifier.name == "starid" else {"zone_grid_deg": 0.0}
-            options = {"identifier": identifier.name} | exact | further
+            options = {"identifier": identifier.name} | exact
             batch = submission_from_json(json.dumps(body | {"options": options})).batch
             brightest = _of_bright_stars(given, BRIGHTEST_MAG)
             searched = mission if identifier.uses_prior else brightest
@@ -130,9 +128,35 @@ def prewarm_kernels(
                 # So few stars may not be enough, and the whole sky has kernels of its own.
                 searched = searched.model_copy(update={"lost_in_space_fallback": False})
             acquire(batch, searched, apart)
+        if seldom and kind == first:
+            _prewarm_seldom(apart, mission, body)
     if seldom:
         compile_linking()
         compile_filtering()
+
+
+def _prewarm_seldom(sky: SkyModel, mission: Mission, body: dict[str, Any]) -> None:
+    """Compile votes in steps, and what two groups of stars and a misaligned tracker need."""
+    (seen,) = body["observations"]
+    tracker, stars = mission.trackers[0], seen["stars"]
+
+    def turned(angle_deg: float) -> list[dict[str, Any]]:
+        rotation = np.array([math.radians(angle_deg), 0.0, 0.0])
+        return [
+            star | {"vector": rotate_about(rotation, star["vector"]).tolist()} for star in stars
+        ]
+
+    misaligned = tracker.model_copy(update={"name": "misaligned"})
+    searched = mission.model_copy(
+        update={"trackers": (tracker, misaligned), "lost_in_space_fallback": False}
+    )
+    in_steps = {"identifier": "starid", "tests": {"match_groups": True}}
+    for observations, options in (
+        ([seen | {"stars": stars + turned(0.5)}], {"identifier": "verified"}),
+        ([seen, {"tracker": misaligned.name, "stars": turned(0.01)}], in_steps),
+    ):
+        text = json.dumps(body | {"observations": observations, "options": options})
+        acquire(submission_from_json(text).batch, searched, sky)
 
 
 def _of_bright_stars(mission: Mission, to_mag: float) -> Mission:

@@ -14,7 +14,7 @@ from service.app.context import Context
 from service.app.replays import Replays
 from service.app.serving.single_writer import SingleWriter
 from service.app.submissions import Submissions
-from service.errors import Busy
+from service.errors import AcquisitionError, Busy
 from service.ingest.kernel_progress import progress_logged
 from service.ingest.solver_pool import mission_in_input
 from service.missions.identifiers import IDENTIFIERS
@@ -117,7 +117,12 @@ class Service:
     def _prewarm_sky(self, missions: Iterable[Mission], time: Utc) -> None:
         """Open or build what batches need, as far as its kernels are there."""
         is_compiled = self._kernels is None or not self._kernels.is_needed
-        prewarm_sky(self._context.sky, missions, time, whole_sky=is_compiled)
+        for mission in missions:
+            try:
+                prewarm_sky(self._context.sky, [mission], time, whole_sky=is_compiled)
+            except AcquisitionError as error:
+                # It is refused to the batches that need it, and no other mission waits for it.
+                log.warning("the sky of %s cannot be built: %s", mission.name, error)
 
     def _become_warm(self) -> None:
         if not self._is_warm:

@@ -122,6 +122,30 @@ def test_what_batches_with_a_zone_need_is_compiled_without_the_whole_sky(
     prewarm_kernels(SkyModel(sky.catalog, LruCache(64 << 20)), missions, zones)
 
 
+SELDOM = """
+from service.acquire.prewarm import prewarm_kernels
+from service.attitude.kernels import fit_attitude
+from service.identify.attitude_from_matches import matched_vectors
+from service.identify.hypotheses.groups import _log_weight_of
+from service.identify.voting.match_groups import _largest
+from service.identify.voting.pair_tests import cast_votes, count_votes, name_rivals
+from service.missions.mission import load_missions
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.model import SkyModel
+
+prewarm_kernels(SkyModel(load_embedded(), LruCache(64 << 20)), load_missions(), (), seldom=True)
+of_votes = _largest, cast_votes, count_votes, name_rivals
+print(*(len(each.signatures) for each in (fit_attitude, matched_vectors, _log_weight_of, *of_votes)))
+"""
+
+
+def test_what_few_batches_need_is_compiled_before_one_comes():
+    """Two groups of stars, a misaligned tracker, match groups: each is once in its kernel."""
+    done = subprocess.run([sys.executable, "-c", SELDOM], capture_output=True, check=True)
+    assert done.stdout.split() == [b"1"] * 7
+
+
 def _wait_between(missions, share, zones_built):
     """In place of a child's compiling: it ends after its zones, when the folder says how."""
     zones_built.send_bytes(b"zones")
