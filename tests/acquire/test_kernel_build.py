@@ -136,7 +136,8 @@ from service.sky.model import SkyModel
 
 prewarm_kernels(SkyModel(load_embedded(), LruCache(64 << 20)), load_missions(), (), seldom=True)
 of_votes = _largest, cast_votes, count_votes, name_rivals
-print(*(len(each.signatures) for each in (fit_attitude, matched_vectors, _log_weight_of, *of_votes)))
+others = fit_attitude, matched_vectors, _log_weight_of
+print(*(len(each.signatures) for each in (*others, *of_votes)))
 """
 
 
