@@ -82,8 +82,8 @@ full: kernels
 	@$(if $(PYTEST_ARGS),:,$(OVER_POSTGRESQL) --full $(ALL_OVER_POSTGRESQL))
 
 kernels: $(DEV)
-	@echo "== compiling the kernels (minutes after a change of the core, else seconds)"
-	@$(BIN)/python -m service.acquire.prewarm
+	@echo "== kernels and sky (minutes after a change of the core, else seconds)"
+	@$(BIN)/acquire prepare
 
 torture: $(DEV)
 	@echo "== torture: kills, failing disks and odd input at full size; hours"

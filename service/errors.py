@@ -14,6 +14,7 @@
     ├── RateLimited           more requests than the token's rate allows
     ├── BadConfiguration      a mission file, a setting: names file, key and allowed values
     └── Busy                  the queue is full, or the database does not answer
+        ├── BeingBuilt        another thread builds what the work needs
         ├── Standby           another service writes to the database
         └── Stopping          the service is stopping: a later attempt here will fail too
 
@@ -22,6 +23,7 @@ the status codes are given in `service.web.requests.problem_types`.
 """
 
 from collections.abc import Iterable, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any
 
@@ -115,6 +117,14 @@ class Busy(AcquisitionError):
     def __init__(self, message: str, retry_after_s: int = 1) -> None:
         super().__init__(message)
         self.retry_after_s = retry_after_s
+
+
+class BeingBuilt(Busy):
+    """What the work needs is built by another thread; `done` tells when it is there."""
+
+    def __init__(self, done: "Future[Any]") -> None:
+        super().__init__("a part of the sky that this needs is built for the first time", 5)
+        self.done = done
 
 
 class Standby(Busy):

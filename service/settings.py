@@ -34,7 +34,8 @@ class Settings:
     telemetry files whose replays are not over.  `log_format` and `log_level` are
     of `service.logs`.
     `probe_port` is a second port that answers probes alone.  One client address
-    may have `connections_per_address` at a time; addresses and networks in
+    may have `connections_per_address` at a time, and one that asks for nothing is closed
+    after `keep_alive_seconds`; addresses and networks in
     `trusted_proxies` may have more, and the service believes what they say about
     the clients behind them (X-Forwarded-For, X-Forwarded-Proto).  Webhooks reach
     public addresses, and the networks in `webhook_networks`, these by http too.
@@ -57,6 +58,7 @@ class Settings:
     spool: Path | None = None
     probe_port: int | None = None
     connections_per_address: int = 256
+    keep_alive_seconds: int = 75
     trusted_proxies: str = "127.0.0.1,::1"
     webhook_networks: str = ""
     archive_folder: Path | None = None
@@ -86,6 +88,8 @@ class Settings:
             raise _refusal(
                 "connections_per_address", "must be from 1 to 65535", self.connections_per_address
             )
+        if not 1 <= self.keep_alive_seconds <= 3600:
+            raise _refusal("keep_alive_seconds", "must be from 1 to 3600", self.keep_alive_seconds)
         for name in ("trusted_proxies", "webhook_networks"):
             try:
                 networks(getattr(self, name))
@@ -143,6 +147,7 @@ _READERS: dict[str, Callable[[str], Any]] = {
     "port": int,
     "probe_port": int,
     "connections_per_address": int,
+    "keep_alive_seconds": int,
     "replay_processes": int,
     "replay_seconds": int,
 }

@@ -18,7 +18,6 @@ import logging
 import os
 import tomllib
 from contextlib import ExitStack
-from functools import lru_cache
 
 import hypothesis
 import numpy as np
@@ -28,10 +27,8 @@ from _pytest.faulthandler import fault_handler_stderr_fd_key
 from service.cli import main
 from service.missions.mission import SHIPPED_FOLDER, load_missions
 from service.sky.cache import LruCache
-from service.sky.catalog.run_catalog import build_run_catalog
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
-from service.sky.whole_sky.index import build_sky_index
 from service.storage.projections import projector
 from tests import fresh_databases, scale
 from tests.fresh_databases import sqlite_at
@@ -196,21 +193,6 @@ def logging_as_before():
 def projections_waited_for(monkeypatch):
     """Readers wait for the projections as long as it takes, however busy the machine is."""
     monkeypatch.setattr(projector, "WAIT_S", 60.0)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def skies_built_once():
-    """Run catalogs and indexes of the whole sky, locked against writing, last from app to app.
-
-    Each app has a shelf of its own as ever; what it asks for is built for the first of them.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        for place, build in (
-            ("service.sky.model.build_run_catalog", build_run_catalog),
-            ("service.sky.whole_sky.index.build_sky_index", build_sky_index),
-        ):
-            patch.setattr(place, lru_cache(maxsize=32)(build))
-        yield
 
 
 @pytest.fixture

@@ -17,11 +17,13 @@ import httpx
 import pytest
 
 from service import __version__
+from service.acquire import kernel_build
 from service.cli.parser import build_parser
 from service.missions.mission import SHIPPED_FOLDER
 from service.observations.readers.csv_columns import COLUMNS
 from service.simulate.files import read_objects
 from service.times import parse_utc
+from tests.fresh_databases import sqlite_at
 from tests.sky.test_sky2000 import SIRIUS, written
 from tests.waiting import wait_until
 from tests.web.serving import free_port, served
@@ -113,14 +115,85 @@ def test_the_help_of_replay_names_every_column_of_a_csv_file(acquire):
     assert sorted(named) == sorted(COLUMNS)
 
 
-def test_help_loads_nothing_that_takes_time():
-    code = (
-        "import sys; from service.cli.parser import build_parser; build_parser().format_help();"
-        "heavy = {'numpy', 'pydantic', 'fastapi', 'sqlalchemy', 'httpx', 'erfa', 'numba'};"
-        "print(*(heavy & set(sys.modules)))"
+def loaded_by(code, *arguments):
+    """The modules that a process has loaded when it has run some code."""
+    code += "\nimport sys; print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "\n", "")
+    assert (done.returncode, done.stderr) == (0, "")
+    return set(done.stdout.splitlines()[-1].split())
+
+
+def packages(modules):
+    """The packages of modules, without those of Python, and those that hold compiled modules."""
+    found = {each.partition(".")[0] for each in modules} - sys.stdlib_module_names
+    return {each for each in found if not each.startswith("_") and "cython" not in each}
+
+
+def test_help_loads_nothing_that_takes_time():
+    loaded = loaded_by("from service.cli.parser import build_parser; build_parser().format_help()")
+    assert packages(loaded) <= {"service", "msgspec", "typing_extensions"}
+    assert {each for each in loaded if each.startswith("service.") and each.count(".") == 1} == {
+        *("service.cli", "service.compiled", "service.csv_cells", "service.errors"),
+        *("service.extras", "service.logs", "service.missions", "service.products"),
+        "service.settings",
+    }
+
+
+READY = """
+import sys
+from service.app.factory import open_app
+from service.settings import Settings
+from service.web.app import create_app
+import service.cli.commands.serve, service.web.server
+
+app = open_app(Settings(database=sys.argv[1], replay_processes=0), serving=True)
+create_app(app)
+app.service.ready()
+app.close()
+"""
+
+
+def test_a_service_is_ready_without_what_is_used_later(tmp_path):
+    """What is listed here is what each start pays for."""
+    loaded = loaded_by(READY, sqlite_at(tmp_path / "acquire.db"))
+    of_uvicorn = {"click", "dotenv", "h11", "httptools", "watchfiles", "websockets", "yaml"}
+    of_httpx = {"certifi", "httpcore", "idna", "pygments", "rich", "sniffio", "zstandard"}
+    assert packages(loaded) - of_uvicorn - of_httpx <= {
+        *("annotated_doc", "annotated_types", "anyio", "erfa", "fastapi", "greenlet", "httpx"),
+        *("jinja2", "llvmlite", "markupsafe", "msgspec", "numba", "numpy", "opentelemetry"),
+        *("prometheus_client", "pydantic", "pydantic_core", "scipy", "service", "sqlalchemy"),
+        *("starlette", "typing_extensions", "typing_inspection", "uvicorn", "uvloop"),
+    }
+    # numba asks scipy for its version, and nothing else.
+    assert not {each for each in loaded if each.startswith(("scipy.l", "scipy.s", "scipy.o"))}
+    for late in (
+        *("service.demo", "service.replay", "service.simulate", "service.studies"),
+        *("service.identify.blind", "service.identify.triangles", "service.imaging.detection"),
+        *("service.imaging.frames.fits", "service.imaging.sky_overlay", "service.products.spice"),
+        *("service.sky.whole_sky.quads", "service.storage.upkeep.archiving", "service.client"),
+    ):
+        assert late not in loaded
+
+
+@pytest.mark.slow
+def test_the_sky_is_prepared_once_and_one_that_cannot_be_kept_is_said(
+    acquire, monkeypatch, tmp_path
+):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(kernel_build, "_is_complete", lambda: True)
+    code, out, _ = acquire("prepare", "--time", "1999-03-01T00:00:00Z")
+    assert code == 0
+    # The catalog, run catalogs of two limits, and an index for each limit and field of view.
+    assert re.search(r"^kernels: compiled already\nsky: 6 files built in [\d.]+ s\n", out)
+    assert str(tmp_path / "cache") in out
+    code, out, _ = acquire("prepare", "--time", "1999-03-01T00:00:00Z")
+    assert (code, "sky: built already\n" in out) == (0, True)
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file" / "below"))
+    assert acquire("prepare")[0] == 1
+    assert acquire("prepare", "--time", "yesterday")[0] == 2
 
 
 def test_the_version_is_the_packages(acquire):

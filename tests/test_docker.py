@@ -32,7 +32,7 @@ def test_the_image_has_the_program_that_a_backup_of_postgresql_runs():
 
 def test_the_image_is_built_with_its_kernels_for_the_processor_that_it_runs_on():
     last = DOCKERFILE[DOCKERFILE.rindex("\nFROM ") :]
-    compiling = last.index("\nRUN python -m service.acquire.prewarm")
+    compiling = last.index("\nRUN acquire prepare")
     # As the user of the service, whose folder of kernels it is; the settings stay for the run.
     assert last.index("\nUSER acquire") < compiling
     settings = dict(re.findall(r"\b(NUMBA_\w+)=(\S*)", last[:compiling]))

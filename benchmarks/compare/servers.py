@@ -52,9 +52,10 @@ def checked_out(commit: str) -> Path:
 
 def compile_kernels(tree: Path) -> None:
     """Compile what the first requests would wait for: minutes, or seconds when it was done."""
-    here = (tree / "service" / "acquire" / "prewarm.py").exists()
-    module = "service.acquire.prewarm" if here else "service.warm"  # as it was called before
-    subprocess.run([sys.executable, "-m", module], cwd=tree, env=_environment(), check=True)
+    command = ["service.cli", "prepare"]
+    if not (tree / "service" / "sky" / "files.py").exists():
+        command = ["service.acquire.prewarm"]  # as it was called before
+    subprocess.run([sys.executable, "-m", *command], cwd=tree, env=_environment(), check=True)
 
 
 @contextmanager

@@ -23,6 +23,7 @@ from benchmarks.report import Report
 from service.acquire import acquire
 from service.acquire.prewarm import prewarm_kernels
 from service.compiled.jit import njit
+from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import SHIPPED_FOLDER, load_missions
 from service.observations.batch import ObservationBatch
 from service.observations.schema import submission_from_json
@@ -71,7 +72,7 @@ class Place:
 def run(quick: bool, seed: int) -> Report:
     """The benchmark: every place, one after another, on one sky."""
     sky = SkyModel(load_embedded(), LruCache(MEGABYTES_256))
-    prewarm_kernels(sky, load_missions())
+    prewarm_kernels(sky, load_missions(), IDENTIFIERS)
     figures: dict[str, Any] = {}
     bounds: list[Bound] = []
     count = QUICK_BATCHES if quick else BATCHES

@@ -40,7 +40,7 @@ class _Share(NamedTuple):
     zones: list[str]
     """Identifiers that search zones."""
     others: list[str]
-    over_batches: bool
+    seldom: bool
 
 
 class KernelBuild:
@@ -196,7 +196,7 @@ def _compile(
     missions: Mapping[str, Mission], share: _Share, zones_built: connection.Connection
 ) -> None:
     end_with_parent()
-    sky = SkyModel(load_embedded(), LruCache(64 << 20))
-    prewarm_kernels(sky, missions, share.zones, False)
+    sky = SkyModel(load_embedded(), LruCache(64 << 20), opens_files=False)
+    prewarm_kernels(sky, missions, share.zones)
     zones_built.send_bytes(b"zones")
-    prewarm_kernels(sky, missions, share.others, share.over_batches)
+    prewarm_kernels(sky, missions, share.others, share.seldom)

@@ -1,10 +1,9 @@
-"""Preparation: compile the kernels before the service is ready, build zones on request.
-
-python -m service.acquire.prewarm    compiles the kernels, so that nothing waits for it later
-"""
+"""Preparation: the kernels and the sky before the service is ready, zones on request."""
 
 import json
-from collections.abc import Collection, Mapping
+import math
+from collections.abc import Collection, Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from service.sky.model import SkyModel
 from service.sky.zones import Zone
 from service.times import Utc, parse_utc
 from service.tracks.linking import compile_linking
-from service.vectors import quaternion_from_matrix
+from service.vectors import quaternion_from_matrix, rotate_about
 
 ORION = 84.0, -1.0
 """Where there are many bright stars: right ascension and declination, in degrees."""
@@ -28,6 +27,20 @@ BRIGHT_MAG = 4.0
 """So few stars are enough for every kernel, and are soon built from."""
 BRIGHTEST_MAG = 3.0
 """And so few where every pair and every patch of the whole sky is to be indexed."""
+
+
+def prewarm_sky(
+    sky: SkyModel, missions: Iterable[Mission], time: Utc, whole_sky: bool = True
+) -> None:
+    """Open the files that batches of missions and of a time need; those that are missing are built.
+
+    Run catalogs, and indexes of the whole sky unless these are not wanted.
+    """
+    for mission in missions:
+        run_catalog = sky.run_catalog(mission, time)
+        if whole_sky:
+            for radius_deg in {each.field_of_view_radius_deg for each in mission.trackers}:
+                sky.index(mission, run_catalog, radius_deg)
 
 
 def prewarm_zones(sky: SkyModel, mission: Mission, prior: APriori, time: Utc) -> list[Zone]:
@@ -50,19 +63,23 @@ def prewarm_kernels(
     sky: SkyModel,
     missions: Mapping[str, Mission],
     identifiers: Collection[str] | None = None,
-    over_batches: bool = True,
+    seldom: bool = False,
 ) -> None:
-    """Compile the kernels by running a batch of real stars of each kind of zone.
+    """Load the kernels, or compile them, by running a batch of real stars of each kind of zone.
 
-    Those of the named identifiers (None: of all), and of what is computed over many batches:
-    links of points, filter and smoother.
+    Those of the named identifiers (None: of the missions' own and of the whole sky: to load
+    others takes a batch that needs them some ms), and what is used `seldom`: by few batches, or
+    over many, as links of points, filter and smoother.
     The zones that this builds go into a cache of its own, which it drops at the end.
+    What builds run catalogs and indexes is compiled only for a sky that opens no files.
     """
     moment = parse_utc("2000-01-01T12:00:00Z")
     # Large enough that nothing is built twice on the way.
-    apart = SkyModel(sky.catalog, LruCache(max_bytes=256 << 20))
+    apart = SkyModel(sky.catalog, LruCache(max_bytes=256 << 20), opens_files=sky.opens_files)
     kinds = {mission.zone.kind: mission for mission in missions.values()}
     first = next(iter(kinds), None)
+    if identifiers is None:
+        identifiers = {"lost_in_space", *(mission.identifier for mission in missions.values())}
     for kind, given in kinds.items():
         mission = _of_bright_stars(given, BRIGHT_MAG)
         tracker = mission.trackers[0]
@@ -96,7 +113,7 @@ def prewarm_kernels(
             ],
         }
         for identifier in IDENTIFIERS.values():
-            if identifiers is not None and identifier.name not in identifiers:
+            if identifier.name not in identifiers:
                 continue
             if not identifier.searches_zone and kind != first:
                 continue  # the same kernels
@@ -111,19 +128,38 @@ def prewarm_kernels(
                 # So few stars may not be enough, and the whole sky has kernels of its own.
                 searched = searched.model_copy(update={"lost_in_space_fallback": False})
             acquire(batch, searched, apart)
-    if over_batches:
+        if seldom and kind == first:
+            _prewarm_seldom(apart, mission, body)
+    if seldom:
         compile_linking()
         compile_filtering()
+
+
+def _prewarm_seldom(sky: SkyModel, mission: Mission, body: dict[str, Any]) -> None:
+    """Compile votes in steps, and what two groups of stars and a misaligned tracker need."""
+    (seen,) = body["observations"]
+    tracker, stars = mission.trackers[0], seen["stars"]
+
+    def turned(angle_deg: float) -> list[dict[str, Any]]:
+        rotation = np.array([math.radians(angle_deg), 0.0, 0.0])
+        return [
+            star | {"vector": rotate_about(rotation, star["vector"]).tolist()} for star in stars
+        ]
+
+    misaligned = tracker.model_copy(update={"name": "misaligned"})
+    searched = mission.model_copy(
+        update={"trackers": (tracker, misaligned), "lost_in_space_fallback": False}
+    )
+    in_steps = {"identifier": "starid", "tests": {"match_groups": True}}
+    for observations, options in (
+        ([seen | {"stars": stars + turned(0.5)}], {"identifier": "verified"}),
+        ([seen, {"tracker": misaligned.name, "stars": turned(0.01)}], in_steps),
+    ):
+        text = json.dumps(body | {"observations": observations, "options": options})
+        acquire(submission_from_json(text).batch, searched, sky)
 
 
 def _of_bright_stars(mission: Mission, to_mag: float) -> Mission:
     limit_mag = min(to_mag, mission.catalog.magnitude_limit_mag)
     settings = mission.run_catalog_settings.model_copy(update={"magnitude_limit_mag": limit_mag})
     return mission.model_copy(update={"catalog": settings})
-
-
-if __name__ == "__main__":
-    from service.acquire.kernel_build import KernelBuild
-    from service.missions.mission import load_missions
-
-    KernelBuild().run(load_missions())

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from service.missions.mission import Band, Mission
 from service.sky.catalog.run_catalog import RunCatalog
@@ -104,7 +103,7 @@ class Extremes:
             return np.asarray(inside.sum(axis=1))
         if len(near) == 0:
             return np.zeros(len(axes), dtype=int)
-        tree: Any = cKDTree(near)
+        tree = _tree_of(near)
         first, second = tree.query_pairs(_chord(self._limit_deg), output_type="ndarray").T.copy()
         return np.array([np.count_nonzero(row[first] & row[second]) for row in inside])
 
@@ -181,6 +180,13 @@ def star_counts(direction: Vector, least_deg: float, most_deg: float) -> Vector:
     return np.concatenate(counts).reshape(ROWS, COLUMNS)
 
 
+def _tree_of(direction: Vector) -> Any:
+    # Imported here, as everywhere in the service: scipy takes a third of a start.
+    from scipy.spatial import cKDTree
+
+    return cKDTree(direction)
+
+
 def zone_counts(
     direction: Vector, axis: Vector, least_deg: float, most_deg: float, limit_deg: float
 ) -> tuple[int, int]:
@@ -188,7 +194,7 @@ def zone_counts(
     inside = direction[_inside(direction @ axis, least_deg, most_deg)]
     if len(inside) == 0:
         return 0, 0
-    tree: Any = cKDTree(inside)
+    tree = _tree_of(inside)
     # Both orders of a pair are counted, and each star with itself.
     both = int(tree.count_neighbors(tree, _chord(limit_deg)))
     return len(inside), (both - len(inside)) // 2

@@ -3,27 +3,29 @@
 import gc
 import logging
 import threading
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 
 from msgspec import structs
 
 from service import __version__
 from service.acquire.kernel_build import KernelBuild
-from service.acquire.prewarm import prewarm_kernels
+from service.acquire.prewarm import prewarm_kernels, prewarm_sky
 from service.app.context import Context
 from service.app.replays import Replays
 from service.app.serving.single_writer import SingleWriter
 from service.app.submissions import Submissions
-from service.errors import Busy
+from service.errors import AcquisitionError, Busy
 from service.ingest.kernel_progress import progress_logged
+from service.ingest.solver_pool import mission_in_input
 from service.missions.identifiers import IDENTIFIERS
+from service.missions.mission import Mission
 from service.observations.schema import submission_from_json
 from service.storage.models.overview import About, CatalogAbout, MissionAbout
 from service.storage.projections.alarms import latest_inputs
 from service.storage.recording.ids import Ulids
 from service.storage.upkeep.expiries import ExpiryDates
 from service.storage.upkeep.split_trackers import BackgroundUpgrade
-from service.times import utc_now
+from service.times import Utc, utc_now
 
 log = logging.getLogger(__name__)
 
@@ -93,6 +95,7 @@ class Service:
             with progress_logged(log):
                 self._kernels.run(self._context.missions, self._begin_with_zones)
         prewarm_kernels(self._context.sky, self._context.missions)
+        self._prewarm_sky(self._context.missions.values(), utc_now())
         self._become_warm()
         if self._kernels is not None:
             # Only the service does this by itself, not a command beside it.
@@ -106,9 +109,20 @@ class Service:
     def _begin_with_zones(self) -> None:
         """Load the kernels of batches with a zone, and be ready for these."""
         in_zones = [name for name, entry in IDENTIFIERS.items() if entry.searches_zone]
-        prewarm_kernels(self._context.sky, self._context.missions, in_zones, False)
+        prewarm_kernels(self._context.sky, self._context.missions, in_zones)
+        self._prewarm_sky(self._context.missions.values(), utc_now())
         self._become_warm()
         log.info("ready for batches with an a priori attitude; still compiling other kernels")
+
+    def _prewarm_sky(self, missions: Iterable[Mission], time: Utc) -> None:
+        """Open or build what batches need, as far as its kernels are there."""
+        is_compiled = self._kernels is None or not self._kernels.is_needed
+        for mission in missions:
+            try:
+                prewarm_sky(self._context.sky, [mission], time, whole_sky=is_compiled)
+            except AcquisitionError as error:
+                # It is refused to the batches that need it, and no other mission waits for it.
+                log.warning("the sky of %s cannot be built: %s", mission.name, error)
 
     def _become_warm(self) -> None:
         if not self._is_warm:
@@ -141,6 +155,8 @@ class Service:
         for text in inputs:
             try:
                 sent = submission_from_json(text)
+                mission = mission_in_input(self._context.missions, sent.batch.spacecraft)
+                self._prewarm_sky([mission], sent.batch.time)
                 for _ in range(1 + WARM_UP_RUNS // len(inputs)):
                     batch = structs.replace(sent.batch, batch=self._ids.new())
                     self._submissions.ingest.warm_up(

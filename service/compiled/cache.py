@@ -8,6 +8,7 @@ would go on with the old code.
 import hashlib
 import os
 import sys
+from functools import cache
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1]
@@ -46,13 +47,19 @@ def keep_kernels_apart() -> None:
         sys.modules["numba"].config.CACHE_DIR = folder
 
 
-def _folder() -> Path:
+@cache
+def source_digest() -> str:
+    """The digest of `SOURCES`, in hexadecimal digits."""
     state = hashlib.sha256()
     for source in SOURCES:
         place = PACKAGE / source
         for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
             state.update(path.relative_to(PACKAGE).as_posix().encode() + path.read_bytes())
+    return state.hexdigest()
+
+
+def _folder() -> Path:
     pycache = PACKAGE / "__pycache__"
     if not os.access(pycache if pycache.exists() else PACKAGE, os.W_OK):
         pycache = Path.home() / ".cache" / "attitude-acquisition"
-    return pycache / f"kernels-{state.hexdigest()[:16]}"
+    return pycache / f"kernels-{source_digest()[:16]}"

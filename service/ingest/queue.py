@@ -20,7 +20,7 @@ from functools import partial
 
 from sqlalchemy import Connection
 
-from service.errors import Busy, Stopping
+from service.errors import BeingBuilt, Busy, Stopping
 from service.ingest.solver_pool import WAIT_S, SolverPool, SolverTask
 from service.ingest.turns import Turns
 from service.observations.schema import Submission
@@ -221,6 +221,8 @@ class IngestQueue:
             pending.unsaved = self._solve(pending, True)
             settle = partial(self._note_written, pending)
             self._writer.put(QueuedJob(settle, [pending.unsaved]))
+        except BeingBuilt:
+            raise  # the pool tries again
         except Exception as error:
             self._finish([(pending, error)])
 

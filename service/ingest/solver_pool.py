@@ -6,13 +6,15 @@ import threading
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable, Mapping
-from concurrent.futures import Future
-from typing import NamedTuple, TypeVar
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from typing import Any, NamedTuple, TypeVar
 
 from service.acquire import Acquisition, acquire, acquire_at_once
 from service.errors import (
     AcquisitionError,
     BadBatch,
+    BeingBuilt,
     Busy,
     Fault,
     NotFound,
@@ -23,6 +25,7 @@ from service.ingest.tracking import asks_for_last
 from service.missions.mission import Mission, mission_named
 from service.observations.batch import ObservationBatch, TrackerStars
 from service.observations.schema import Submission
+from service.sky.cache import BUILDS_AT_ONCE
 from service.sky.model import SkyModel
 from service.storage.recording.identity import OwnKey, identity_of
 from service.storage.recording.ids import Ulids
@@ -160,7 +163,10 @@ class TurnQueue:
 
 
 class SolverPool:
-    """Threads that compute; long tasks leave one of them to short ones."""
+    """Threads that compute; long tasks leave one of them to short ones.
+
+    A task that raises `BeingBuilt` gives its thread back, and begins anew when that is built.
+    """
 
     def __init__(self, threads: int | None = None) -> None:
         """At least two threads, by default one for each processor."""
@@ -169,6 +175,8 @@ class SolverPool:
         self._long_slots = count - 1
         self._changed = threading.Condition()
         self._closing = False
+        self.builder = ThreadPoolExecutor(BUILDS_AT_ONCE, "sky")
+        """What builds what tasks need while they wait."""
         self._threads = [
             threading.Thread(target=self._run, name=f"solver-{number}", daemon=True)
             for number in range(count)
@@ -193,6 +201,8 @@ class SolverPool:
         def run() -> None:
             try:
                 done.set_result(work())
+            except BeingBuilt:
+                raise
             except BaseException as error:
                 done.set_exception(error)
 
@@ -212,6 +222,7 @@ class SolverPool:
             task.refuse(Stopping("the service is stopping"))
         for thread in self._threads:
             thread.join()
+        self.builder.shutdown(wait=False, cancel_futures=True)
 
     def _run(self) -> None:
         while (taken := self._next()) is not None:
@@ -221,12 +232,26 @@ class SolverPool:
                     task.refuse(Busy("every processor is at work on other batches", RETRY_AFTER_S))
                 else:
                     task.work()
+            except BeingBuilt as waits:
+                waits.done.add_done_callback(partial(self._put_again, task, is_long))
             except Exception:
                 log.exception("a task failed")
             finally:
                 if is_long:
                     with self._changed:
                         self._long_slots += 1
+
+    def _put_again(self, task: SolverTask, is_long: bool, built: "Future[Any]") -> None:
+        """Queue a task again that needed what is built now; where that failed, it fails, too."""
+        error = built.exception()
+        if isinstance(error, Exception):
+            task.refuse(error)
+            return
+        task = task._replace(give_up_s=time.monotonic() + WAIT_S)
+        try:
+            self.put(task, "built", is_long=is_long)
+        except Stopping as stopping:
+            task.refuse(stopping)
 
     def _next(self) -> tuple[SolverTask, bool] | None:
         """The next task and whether it is long; None when there will be none."""

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from typing import TypeVar
 
 import msgspec
@@ -66,8 +67,8 @@ class SubmissionService:
     """Each submission is identified, solved and recorded once, however often it is sent."""
 
     def __init__(self, missions: Mapping[str, Mission], sky: SkyModel, store: Store) -> None:
-        self.solver = Solver(missions, sky)
         self.pool = SolverPool()
+        self.solver = Solver(missions, replace(sky, builder=self.pool.builder))
         self._store = store
         self._queue = IngestQueue(
             self._recorded_before, self._solve, self._tell, store.writer, self.pool

@@ -8,9 +8,11 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from concurrent.futures import Future
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
+
+from service.errors import BeingBuilt
 
 BUILDS_AT_ONCE = 2
 """A build may take many times the memory of its result."""
@@ -72,10 +74,18 @@ class LruCache:
     _evictions: int = 0
     _build_us: int = 0
 
-    def get(self, key: Hashable, build: Callable[[], T], wait: bool = True) -> tuple[T, bool]:
+    def get(
+        self,
+        key: Hashable,
+        build: Callable[[], T],
+        find_builder: Callable[[], Executor | None] = lambda: None,
+        wait: bool = True,
+    ) -> tuple[T, bool]:
         """The thing under `key`, built by `build` where it is missing, and whether it was there.
 
         An error of `build` reaches every waiting caller and leaves nothing behind.
+        Where the thing is missing and `find_builder` gives a builder, the caller neither builds
+        nor waits: that builder builds it, unless this is under way, and `BeingBuilt` is raised.
         Without `wait` what is missing is not built: `NotAtHand` is raised.
         """
         with self._lock:
@@ -94,8 +104,18 @@ class LruCache:
                 self._misses += 1
             else:
                 self._hits += 1
-        if not mine:
-            return promise.result(), True  # type: ignore[return-value]
+        builder = find_builder()
+        if mine and builder is None:
+            self._build(key, build, promise)
+            return promise.result(), False  # type: ignore[return-value]
+        if mine and builder is not None:
+            builder.submit(self._build, key, build, promise)
+        if builder is not None:
+            raise BeingBuilt(promise)
+        return promise.result(), True  # type: ignore[return-value]
+
+    def _build(self, key: Hashable, build: Callable[[], Sized], promise: "Future[Sized]") -> None:
+        """Build a thing and keep the promise of it, which holds the error where there is one."""
         try:
             with self._building_slots:
                 started = time.perf_counter_ns()
@@ -104,13 +124,12 @@ class LruCache:
             with self._lock:
                 del self._building[key]
             promise.set_exception(error)
-            raise
+            return
         build_us = (time.perf_counter_ns() - started) // 1000
         with self._lock:
             del self._building[key]
             self._put(CacheEntry(key, thing, build_us))
         promise.set_result(thing)
-        return thing, False
 
     def _put(self, entry: CacheEntry[Sized]) -> None:
         self._entries[entry.key] = entry

@@ -1,36 +1,57 @@
 """The sky of one batch: the run catalog of its epoch, and the zones in it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from service.missions.mission import Mission
 from service.sky.cache import LruCache, NotAtHand
 from service.sky.catalog.run_catalog import RunCatalog, build_run_catalog
 from service.sky.catalog.star_catalog import Catalog
+from service.sky.files import Content, is_kept, kept
 from service.sky.geometry.triangles import SLAVES
 from service.sky.whole_sky.guide import Guide, GuideKey, build_guide
-from service.sky.whole_sky.index import FURTHER_MAG, SkyIndex, sky_index_for
+from service.sky.whole_sky.index import FURTHER_MAG, SkyIndex, build_sky_index
 from service.sky.zones import SearchRegion, Zone, ZoneKey, zone_for
 from service.times import Utc
 
+Kept = TypeVar("Kept", RunCatalog, SkyIndex)
+
 
 class RunCatalogKey(NamedTuple):
-    """What a run catalog depends on: its key in the cache."""
+    """What a run catalog depends on: its key in the cache and among the files."""
 
     catalog: str
     settings: str
     epoch_year: float
 
 
+class SkyIndexKey(NamedTuple):
+    """What an index of the whole sky depends on: its key in the cache and among the files."""
+
+    run_catalog: RunCatalogKey
+    limit_mag: float
+    radius_deg: float
+
+
 @dataclass(frozen=True)
 class SkyModel:
-    """A star catalog, with the cache of all that is derived from it."""
+    """A star catalog, with the cache of all that is derived from it.
+
+    Run catalogs and indexes of the whole sky are files, too: see `service.sky.files`.
+    """
 
     catalog: Catalog
     cache: LruCache
     require_whole_sky: Callable[[], None] = field(default=lambda: None, kw_only=True)
     """Raises `Busy` while the kernels that search the whole sky are compiled."""
+    builder: Executor | None = field(default=None, kw_only=True)
+    """What builds files that are not there yet: `BeingBuilt` is raised meanwhile.
+
+    None: the caller does."""
+    opens_files: bool = field(default=True, kw_only=True)
+    """False: everything is built anew, as where what builds it is to be compiled."""
     waits: bool = field(default=True, kw_only=True)
     """Whether it builds what is missing, or raises `NotAtHand` there."""
 
@@ -40,14 +61,33 @@ class SkyModel:
 
     def run_catalog(self, mission: Mission, time: Utc) -> RunCatalog:
         """The run catalog that serves a mission at a time: that of the nearest epoch."""
+        settings = mission.run_catalog_settings
         epoch_year = mission.catalog.epoch_of(time.julian_year)
-        key = RunCatalogKey(self.catalog.digest, mission.run_catalog_settings.digest, epoch_year)
-        run_catalog, _ = self.cache.get(
-            key,
-            lambda: build_run_catalog(self.catalog, mission.run_catalog_settings, epoch_year),
-            self.waits,
-        )
-        return run_catalog
+        key = RunCatalogKey(self.catalog.digest, settings.digest, epoch_year)
+
+        def build() -> Content:
+            return build_run_catalog(self.catalog, settings, epoch_year).content
+
+        return self._kept("run-catalog", key, build, RunCatalog.of_content)
+
+    def _kept(
+        self,
+        kind: str,
+        key: Hashable,
+        build: Callable[[], Content],
+        made_of: Callable[[Content], Kept],
+    ) -> Kept:
+        """What is made of a file's content, from the cache."""
+
+        def find_builder() -> Executor | None:
+            # To open a file takes less than to wait for another thread.
+            return None if self.builder is None or is_kept(kind, key) else self.builder
+
+        def make() -> Kept:
+            return made_of(kept(kind, key, build) if self.opens_files else build())
+
+        thing, _ = self.cache.get((kind, key), make, find_builder, self.waits)
+        return thing
 
     def zone(
         self,
@@ -73,17 +113,18 @@ class SkyModel:
         Stars a little beyond the catalog's limit, which noise may show, are known to it.
         """
         limit_mag = mission.catalog.magnitude_limit_mag
-        settings = mission.run_catalog_settings.model_copy(
-            update={"magnitude_limit_mag": limit_mag + FURTHER_MAG}
+        settings = mission.run_catalog_settings
+        epoch_year = run_catalog.epoch_year
+        key = SkyIndexKey(
+            RunCatalogKey(self.catalog.digest, settings.digest, epoch_year), limit_mag, radius_deg
         )
-        index, _ = sky_index_for(
-            self.cache,
-            run_catalog,
-            limit_mag,
-            radius_deg,
-            lambda: build_run_catalog(self.catalog, settings, run_catalog.epoch_year),
-        )
-        return index
+
+        def build() -> Content:
+            further = settings.model_copy(update={"magnitude_limit_mag": limit_mag + FURTHER_MAG})
+            deeper = build_run_catalog(self.catalog, further, epoch_year)
+            return build_sky_index(deeper, limit_mag, radius_deg).content
+
+        return self._kept("whole-sky", key, build, SkyIndex.of_content)
 
     def drop_zones(self, mission: str | None = None) -> int:
         """Drop the zones of a mission, or all, from the cache; how many there were."""

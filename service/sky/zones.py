@@ -293,7 +293,7 @@ def zone_for(
         )
         return build_zone(mission, run_catalog, wide, separation_max_deg, grid_deg)
 
-    return cache.get(key, build, wait)
+    return cache.get(key, build, wait=wait)
 
 
 def snapped(x: float, y: float, z: float, grid_deg: float) -> tuple[float, float, float]:

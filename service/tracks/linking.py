@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import gammaln
 
 from service.errors import BadInput, Fault
 from service.tracks.extending import GATE, MOST_CHANCE, Sightings, count_seeds, extend, try_seeds
@@ -182,5 +181,5 @@ def _log10_expected(
     log = np.sort(np.log(chance))[2:].sum()
     spanned = int(points.batch[own[-1]] - points.batch[own[0]]) + 1
     free, taken = max(spanned - 2, len(own) - 2), len(own) - 2
-    choices = gammaln(free + 1) - gammaln(taken + 1) - gammaln(free - taken + 1)
+    choices = math.lgamma(free + 1) - math.lgamma(taken + 1) - math.lgamma(free - taken + 1)
     return float((log + choices) / math.log(10.0) + math.log10(max(pairs, 1)))

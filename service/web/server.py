@@ -63,29 +63,32 @@ def _opened(settings: Settings) -> tuple[App, socket.socket | None]:
     return app, probes
 
 
-def _run(settings: Settings, web_app: FastAPI, probes: socket.socket | None) -> None:
-    def configured(web_app: ASGIApp) -> uvicorn.Config:
-        return uvicorn.Config(
-            web_app,
-            host=settings.host,
-            port=settings.port,
-            http=cast(type[asyncio.Protocol], Connection),
-            loop="uvloop",
-            ws="none",
-            # As `service.logs` has it; requests are logged where their caller is known.
-            log_config=None,
-            access_log=False,
-            server_header=False,
-            timeout_graceful_shutdown=GRACE_S,
-            forwarded_allow_ips=settings.trusted_proxies,
-        )
+def configuration(settings: Settings, web_app: ASGIApp) -> uvicorn.Config:
+    """How uvicorn serves an app."""
+    return uvicorn.Config(
+        web_app,
+        host=settings.host,
+        port=settings.port,
+        http=cast(type[asyncio.Protocol], Connection),
+        loop="uvloop",
+        ws="none",
+        # As `service.logs` has it; requests are logged where their caller is known.
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        timeout_keep_alive=settings.keep_alive_seconds,
+        timeout_graceful_shutdown=GRACE_S,
+        forwarded_allow_ips=settings.trusted_proxies,
+    )
 
+
+def _run(settings: Settings, web_app: FastAPI, probes: socket.socket | None) -> None:
     admission = Admission(
         _connections(), settings.connections_per_address, networks(settings.trusted_proxies)
     )
-    server = Server(configured(web_app), web_app.state.live.stop, admission)
+    server = Server(configuration(settings, web_app), web_app.state.live.stop, admission)
     if probes is not None:
-        server.add_probes(probes, configured(ProbesOnly(web_app)))
+        server.add_probes(probes, configuration(settings, ProbesOnly(web_app)))
     with suppress(KeyboardInterrupt):
         server.run()
     if not server.started:

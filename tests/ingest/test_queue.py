@@ -10,12 +10,13 @@ from contextlib import suppress
 
 import pytest
 
-from service.errors import Busy, Stopping
+from service.errors import BadInput, BeingBuilt, Busy, Fault, Stopping
 from service.ingest import queue
 from service.ingest import solver_pool as pools
 from service.ingest.solver_pool import SolverPool, SolverTask, TurnQueue, may_take_long
 from service.observations.schema import submission_from_json
 from service.sky.cache import NotAtHand
+from service.sky.whole_sky.index import build_sky_index
 from service.storage.recording import writer as writers
 from tests.waiting import wait_until
 
@@ -251,6 +252,73 @@ def test_closing_finishes_what_has_begun_and_refuses_what_has_not():
         closing.result(PATIENCE_S)
     with pytest.raises(Stopping):
         pool.call(print, "a", is_long=False)
+
+
+def test_a_task_that_waits_for_what_is_built_gives_its_thread_to_others():
+    pool, built, tries = SolverPool(2), Future(), []
+
+    def needs_it():
+        tries.append(1)
+        if not built.done():
+            raise BeingBuilt(built)
+        return "answer"
+
+    with ThreadPoolExecutor(5) as threads:
+        waiting = [
+            threads.submit(pool.call, needs_it, "a", is_long=is_long)
+            for is_long in (False, False, False, True, True)
+        ]
+        wait_until(lambda: len(tries) == 5, why="they were not begun")
+        for is_long in (False, True):
+            assert pool.call(lambda: "at once", "a", is_long=is_long) == "at once"
+        assert not any(each.done() for each in waiting)
+        built.set_result(None)
+        assert [each.result(PATIENCE_S) for each in waiting] == ["answer"] * 5
+    pool.close()
+
+
+def test_what_cannot_be_built_fails_the_tasks_that_wait_for_it():
+    pool, built = SolverPool(2), Future()
+
+    def needs_it():
+        raise BeingBuilt(built)
+
+    with ThreadPoolExecutor(1) as threads:
+        waiting = threads.submit(pool.call, needs_it, "a", is_long=False)
+        built.set_exception(BadInput(Fault("limit", "too deep")))
+        with pytest.raises(BadInput, match="too deep"):
+            waiting.result(PATIENCE_S)
+    pool.close()
+
+
+def test_a_batch_waits_for_the_sky_that_it_needs_and_others_pass(app, make, monkeypatch, tmp_path):
+    """Nothing is built in the way of a post: the whole sky is asked for by the first one alone."""
+    begun, go_on = threading.Event(), threading.Event()
+
+    def build(*arguments):
+        begun.set()
+        assert go_on.wait(PATIENCE_S)
+        return build_sky_index(*arguments)
+
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr("service.sky.model.build_sky_index", build)
+    lost = json.loads(make("lost", stars=8).text) | {"a_priori": None}
+    app.submissions.submit(make("b0"))
+    with ThreadPoolExecutor(3) as threads:
+        waiting = [
+            threads.submit(
+                app.submissions.submit, submission_from_json(json.dumps(lost | {"batch": f"l{k}"}))
+            )
+            for k in range(3)
+        ]
+        assert begun.wait(PATIENCE_S)
+        for k in range(1, 5):
+            app.submissions.submit(make(f"b{k}"))
+        assert not any(each.done() for each in waiting)
+        go_on.set()
+        answers = [json.loads(each.result(PATIENCE_S).body) for each in waiting]
+    assert [each["path"] for each in answers] == ["lost_in_space"] * 3
+    assert all(each["attitude"]["status"] == "good" for each in answers)
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")

@@ -110,9 +110,9 @@ class Tree:
 
     def compile_kernels(self) -> None:
         """Compile them before the tests, which would wait for them; minutes, if they changed."""
-        if (self._folder / "service" / "acquire" / "prewarm.py").exists():
+        if (self._folder / "service" / "sky" / "files.py").exists():
             print("== compiling the kernels of the copy", flush=True)
-            self._python("-m", "service.acquire.prewarm")
+            self._python("-m", "service.cli", "prepare")
 
     def run_suite(self, arguments: Sequence[str]) -> tuple[list[Any], list[dict[str, Any]]]:
         """Run tests with no fault on; pairs of a place and a test that reaches it, and outcomes."""

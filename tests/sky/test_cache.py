@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from service.errors import BeingBuilt
 from service.sky.cache import LruCache
 
 THREADS = 50
@@ -116,6 +117,27 @@ def test_an_error_reaches_every_waiting_caller_and_leaves_nothing_behind():
     assert cache.state().entries == ()
     assert cache.get("zone", lambda: Thing(5)) == (Thing(5), False)
     assert cache.get("zone", fail) == (Thing(5), True)
+
+
+def test_with_a_builder_the_caller_neither_builds_nor_waits():
+    cache, go_on, builders = LruCache(1000), threading.Event(), []
+
+    def build():
+        go_on.wait(10)
+        builders.append(threading.get_ident())
+        return Thing(5)
+
+    with ThreadPoolExecutor(1) as elsewhere:
+        promises = []
+        for _ in range(3):
+            with pytest.raises(BeingBuilt) as waits:
+                cache.get("index", build, lambda: elsewhere)
+            promises.append(waits.value.done)
+        go_on.set()
+        assert [each.result(10) for each in promises] == [Thing(5)] * 3
+    assert len(builders) == 1
+    assert builders[0] != threading.get_ident()
+    assert cache.get("index", build, lambda: elsewhere) == (Thing(5), True)
 
 
 def test_dropping_while_something_is_built_harms_neither():

@@ -1,6 +1,5 @@
 """The app behind a real server: in a thread of this process, or as `acquire serve` has it."""
 
-import asyncio
 import socket
 import subprocess
 import sys
@@ -9,14 +8,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from typing import IO, Any, cast
+from typing import IO, Any
 
 import httpx
-import uvicorn
 from fastapi import FastAPI
 
 from service.acquire.prewarm import prewarm_kernels
 from service.app.factory import App, open_app
+from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Mission, load_missions
 from service.settings import Settings
 from service.simulate.stretches import Pass
@@ -27,7 +26,7 @@ from service.sky.model import SkyModel
 from service.web.app import create_app
 from service.web.connection_limits import Admission
 from service.web.server import Server as StreamingServer
-from service.web.slow_clients import Connection
+from service.web.server import configuration
 from tests.waiting import wait_until
 
 
@@ -40,16 +39,23 @@ def _stop_streams_of(app: FastAPI) -> Callable[[], None]:
 @cache
 def compile_kernels() -> None:
     """Compile what a first request would wait for: on a fresh checkout that takes minutes."""
-    prewarm_kernels(SkyModel(load_embedded(), LruCache(64 << 20)), load_missions())
+    sky = SkyModel(load_embedded(), LruCache(64 << 20))
+    prewarm_kernels(sky, load_missions(), IDENTIFIERS, seldom=True)
 
 
 class Server:
     """The app behind uvicorn on a free port, in a thread of this process."""
 
-    def __init__(self, app: FastAPI, port: int = 0, admission: Admission | None = None) -> None:
+    def __init__(
+        self,
+        app: FastAPI,
+        port: int = 0,
+        admission: Admission | None = None,
+        keep_alive_seconds: int = Settings.keep_alive_seconds,
+    ) -> None:
         compile_kernels()
-        protocol = cast(type[asyncio.Protocol], Connection)
-        config = uvicorn.Config(app, port=port, http=protocol, ws="none", log_level="warning")
+        settings = Settings(port=port, keep_alive_seconds=keep_alive_seconds)
+        config = configuration(settings, app)
         self._server = StreamingServer(config, _stop_streams_of(app), admission)
         # Signals belong to the main thread, which is the caller's.
         self._thread = threading.Thread(target=self._server.run, name="server")

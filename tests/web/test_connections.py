@@ -81,6 +81,18 @@ def is_open(connection):
     return False
 
 
+def test_an_idle_connection_is_closed_after_the_time_that_is_set(tmp_path):
+    app = open_app(in_process_settings(f"sqlite:///{tmp_path / 'acquire.db'}"))
+    with Server(create_app(app), keep_alive_seconds=1) as address:
+        url = httpx.URL(address)
+        with socket.create_connection((url.host, url.port), timeout=PATIENCE_S) as connection:
+            connection.sendall(GET)
+            assert answer(connection) == b"HTTP/1.1 200 OK"
+            assert is_open(connection)
+            connection.settimeout(PATIENCE_S)
+            assert connection.recv(1) == b""
+
+
 def test_the_connection_that_was_idle_longest_goes_for_a_new_one(connect):
     idle = [connect(b"G") for _ in range(MOST)]
     assert answer(connect(GET)) == b"HTTP/1.1 200 OK"

@@ -1,4 +1,4 @@
-"""`acquire serve`: serve until told to stop."""
+"""`acquire serve`, which serves until told to stop, and `acquire prepare`, what its start needs."""
 
 import faulthandler
 import gc
@@ -8,9 +8,14 @@ from typing import Any
 from service.cli.arguments import add_command, add_database
 from service.cli.configuration import settings_of
 
+NOTES = """\
+The service does the same when it starts; several processes that need a part build it once. The
+missions and the star catalog are those of ACQUIRE_MISSIONS and ACQUIRE_CATALOG. The exit code is 1
+if the files cannot be written: the service works without them, but each start takes longer."""
+
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the commands."""
     parser = add_command(
         commands,
         "serve",
@@ -28,6 +33,21 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("--port", type=int, help="default: ACQUIRE_PORT, else 8000")
     add_database(parser)
+    parser = add_command(
+        commands,
+        "prepare",
+        "Compile the kernels and build the files of the sky (run catalogs, indexes of the whole "
+        "sky), unless they are there.",
+        """
+        acquire prepare
+        acquire prepare --time 1999-03-01T00:00:00Z
+        """,
+        prepare,
+        NOTES,
+    )
+    parser.add_argument(
+        "--time", metavar="UTC", help="of the batches that the sky is for; default: now"
+    )
 
 
 def run(parsed: Namespace) -> int:
@@ -48,3 +68,43 @@ def run(parsed: Namespace) -> int:
 
     serve_forever(settings)
     return 0
+
+
+def prepare(parsed: Namespace) -> int:
+    """Compile, build, and print what was done."""
+    import logging
+    import time
+
+    from service.acquire.kernel_build import KernelBuild
+    from service.acquire.prewarm import prewarm_sky
+    from service.ingest.kernel_progress import progress_logged
+    from service.missions.mission import load_missions
+    from service.sky.cache import LruCache
+    from service.sky.catalog.star_catalog import open_catalog
+    from service.sky.files import folder, is_kept
+    from service.sky.model import SkyModel
+    from service.times import parse_utc, utc_now
+
+    logging.basicConfig(format="%(message)s", level=logging.INFO)
+    moment = utc_now() if parsed.time is None else parse_utc(parsed.time, "--time")
+    settings = settings_of(parsed)
+    missions = load_missions(settings.missions)
+    build = KernelBuild()
+    if build.is_needed:
+        print("kernels: compiling for a minute or two", flush=True)
+        start = time.monotonic()
+        with progress_logged(logging.getLogger(__name__)):
+            build.run(missions)
+        print(f"kernels: compiled in {time.monotonic() - start:.0f} s")
+    else:
+        print("kernels: compiled already")
+
+    start, before = time.monotonic(), set(folder().glob("*.npy"))
+    sky = SkyModel(open_catalog(settings.catalog), LruCache(settings.shelf_mb << 20))
+    prewarm_sky(sky, missions.values(), moment)
+    built = len(set(folder().glob("*.npy")) - before)
+    keys = [entry.key for entry in sky.cache.state().entries]
+    there = sum(is_kept(*key) for key in keys)  # type: ignore[misc]
+    done = f"{built} files built in {time.monotonic() - start:.1f} s" if built else "built already"
+    print(f"sky: {done}\nfolder: {folder().parent}")
+    return 0 if there == len(keys) else 1

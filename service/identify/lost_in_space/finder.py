@@ -21,7 +21,7 @@ from service.observations.calibrate import CorrectedObservations
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.model import SkyModel
 from service.sky.whole_sky.index import SkyIndex
-from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector
+from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector, read_only
 
 SIGMA_FLOOR_ARCSEC = 1.5
 """No star is taken as better known: a run catalog serves a year, and parallax is left out."""
@@ -184,7 +184,8 @@ def _without_magnitudes(
 ) -> tuple[CorrectedObservations, ...]:
     """Of every tracker: what one of them adds to its magnitudes, others may as well."""
     return tuple(
-        replace(each, magnitude_mag=np.full(len(each.magnitude_mag), math.nan))
+        # Locked, as those of a batch are: for others numba would compile every kernel anew.
+        replace(each, magnitude_mag=read_only(np.full(len(each.magnitude_mag), math.nan)))
         for each in corrected
     )
 

@@ -317,12 +317,6 @@ def tally(sighted, zone, bounds, rules, star_of, tallies):  # type: ignore[no-un
 
 
 @njit(nogil=True)
-def tally_without_gil(sighted, zone, bounds, rules, star_of, tallies):  # type: ignore[no-untyped-def]
-    """`tally` of many stars or pairs, without the interpreter's lock."""
-    return tally(sighted, zone, bounds, rules, star_of, tallies)
-
-
-@njit(nogil=True)
 def polar_angles(zone_polar, stars, bounds, rules):  # type: ignore[no-untyped-def]
     """The zone stars' angles to the axis for `cast_votes`: known ones, or -1; (0,) if not asked."""
     if bounds.all_inside and not rules.switches.pole:

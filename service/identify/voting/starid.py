@@ -19,11 +19,9 @@ from service.identify.voting.pair_tests import (
     Tallies,
     cast_votes,
     count_votes,
-    discard_votes,
     name_rivals,
     polar_angles,
     tally,
-    tally_without_gil,
 )
 from service.sky.zones import ZoneArrays
 from service.vectors import angle_between_deg
@@ -45,12 +43,11 @@ def identify_by_votes(sighting: Sighting) -> Identification:
     if n * (n - 1) // 2 * pairs > MAX_COMPARISONS:
         _refuse_endless(sighting)
     tallies = tallies_for(n)
-    if sighting.rules.tests.match_groups:
-        any_tie, bounded = _tally_groups(sighting, tallies)
+    if sighting.rules.tests.match_groups or n * n * pairs > RELEASE_GIL_ABOVE:
+        any_tie, bounded = _tally_in_steps(sighting, tallies)
     else:
-        count = tally_without_gil if n * n * pairs > RELEASE_GIL_ABOVE else tally
         arrays = voting_arrays(sighting)
-        any_tie, compared = count(*arrays, sighting.zone.star, tallies)
+        any_tie, compared = tally(*arrays, sighting.zone.star, tallies)
         bounded = compared > arrays[-1].max_comparisons
         sighting.budget.spend(compared // COMPARISONS_PER_UNIT)
     return Identification(
@@ -109,23 +106,26 @@ def ballots_for(n: int, stars: int, edges: int = 0) -> Ballots:
     )
 
 
-def _tally_groups(sighting: Sighting, tallies: Tallies) -> tuple[bool, bool]:
-    """`tally` of the votes of the largest match groups alone; whether that search was cut short."""
+def _tally_in_steps(sighting: Sighting, tallies: Tallies) -> tuple[bool, bool]:
+    """Whether any star is ambiguous, and whether the search was cut short.
+
+    As `tally`, but without the interpreter's lock; with match groups, of the votes of the largest
+    ones alone.
+    """
     sighted, zone, bounds, rules = voting_arrays(sighting)
     n, stars = len(sighted.direction), len(zone.direction)
     polar = polar_angles(zone.polar, stars, bounds, rules)
     ballots = ballots_for(n, stars)
-    budget = sighting.budget
+    budget, groups = sighting.budget, sighting.rules.tests.match_groups
     compared = cast_votes(sighted, zone, polar, bounds, rules, ballots)
-    # They are compared again for the edges.
-    budget.spend(2 * compared // COMPARISONS_PER_UNIT)
-    cast = int(ballots.votes.sum()) // 2
+    # For the edges of groups they are compared again.
+    budget.spend((2 if groups else 1) * compared // COMPARISONS_PER_UNIT)
     bounded = compared > rules.max_comparisons
     if bounded:
-        discard_votes(ballots)
-    elif cast > MAX_EDGES:
+        ballots = ballots_for(n, stars)
+    elif groups and (cast := int(ballots.votes.sum()) // 2) > MAX_EDGES:
         bounded = True
-    else:
+    elif groups:
         again = ballots_for(n, stars, cast)
         cast_votes(sighted, zone, polar, bounds, rules, again)
         bounded, nodes = keep_largest_groups(

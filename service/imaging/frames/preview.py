@@ -1,12 +1,15 @@
 """A small picture of a frame for people: its stars, without the noise between them."""
 
 import io
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from service.imaging.detection.detect import Detections
 from service.imaging.frames.frame import CountArray
+
+if TYPE_CHECKING:
+    from service.imaging.detection.detect import Detections
 
 MAX_SIDE_PX = 1024
 BLACK_SIGMAS = 2.0
@@ -15,7 +18,7 @@ GREYS = 48
 """Few greys, and black where there is only noise, make a small file."""
 
 
-def preview_of(found: Detections) -> tuple[bytes, int]:
+def preview_of(found: "Detections") -> tuple[bytes, int]:
     """A PNG of a frame, and how many of its pixels a side make one of the picture's."""
     return preview_png(np.where(found.good, found.light, 0.0), found.noise_counts)
 

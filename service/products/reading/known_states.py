@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import numpy as np
-from scipy.interpolate import KroghInterpolator
 
 from service.errors import BadFile, Fault
 from service.products.attitudes import Integers
@@ -57,6 +56,8 @@ class StateSegment:
         offset_s = (self.time_ns[window] - time_ns) * 1e-9
         # Steps of about 1: powers of seconds would lose digits.
         unit_s = float(np.ptp(offset_s)) / max(self.points - 1, 1)
+        from scipy.interpolate import KroghInterpolator
+
         place, state = offset_s / unit_s, self.state[window]
         if self.method == "LAGRANGE":
             return np.asarray(KroghInterpolator(place, state)(0.0))

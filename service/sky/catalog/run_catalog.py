@@ -26,6 +26,7 @@ from service.sky.catalog.blending import Rows, combined, merged_into
 from service.sky.catalog.proper_motion import motion_in, moved
 from service.sky.catalog.rejection import rejections
 from service.sky.catalog.star_catalog import Catalog
+from service.sky.files import Content
 from service.times import Utc
 from service.vectors import ARCSEC_PER_RADIAN, Vector, from_ra_dec, read_only, to_ra_dec, unit
 
@@ -33,6 +34,9 @@ UNKNOWN_COLOR_BV_MAG = 0.6
 """The B-V of a star whose colour is not known: a Sun-like one, near the catalog's median."""
 
 J2000_YEAR, J2000_JD, DAYS_PER_YEAR = 2000.0, 2451545.0, 365.25
+
+
+_ARRAYS = ("ra_deg", "dec_deg", "motion", "parallax_rad", "magnitude_mag", "catalog_row")
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,29 @@ class RunCatalog:
         arrays = [self.ra_deg, self.dec_deg, self.magnitude_mag, self.direction, self.motion]
         floats = sum(array.nbytes for array in (*arrays, self.parallax_rad))
         return floats + self.catalog_row.nbytes + 64 * len(self.star_id)
+
+    @property
+    def content(self) -> Content:
+        """The content of its file."""
+        facts = {
+            "epoch_year": self.epoch_year,
+            "digest": self.digest,
+            "rejected": [(each.star_id, each.reason) for each in self.rejected],
+        }
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        return Content(facts, arrays | {"star_id": np.array(self.star_id, np.str_)})
+
+    @classmethod
+    def of_content(cls, content: Content) -> "RunCatalog":
+        """The run catalog that a file holds."""
+        facts, arrays = content
+        return cls(
+            epoch_year=facts["epoch_year"],
+            star_id=tuple(arrays["star_id"].tolist()),
+            rejected=tuple(Rejection(*each) for each in facts["rejected"]),
+            digest=facts["digest"],
+            **{name: read_only(arrays[name]) for name in _ARRAYS},
+        )
 
     @cached_property
     def direction(self) -> Vector:

@@ -21,6 +21,7 @@ from service.sky.catalog import csv_file as catalog_csv
 from service.sky.catalog import sky2000
 from service.sky.catalog.coding import COLUMNS, LABEL, file_digest, pack, unpack
 from service.sky.catalog.neighbours import nearest_neighbours
+from service.sky.files import Content, kept
 from service.vectors import Vector, from_ra_dec, read_only
 
 CatalogFormat = Literal["csv", "sky2000"]
@@ -117,7 +118,9 @@ def load(path: Path) -> Catalog:
         data = path.read_bytes()
     except OSError as error:
         raise BadFile(Fault(str(path), f"cannot be read: {error.strerror}")) from error
-    return _catalog(path.stem, file_digest(data), unpack(data, path))
+    digest = file_digest(data)
+    content = kept("catalog", digest, lambda: Content({}, unpack(data, path)))
+    return _catalog(path.stem, digest, content.arrays)
 
 
 @cache

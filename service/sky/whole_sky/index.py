@@ -7,7 +7,6 @@ sky has a list of the stars that a field of view about it may hold.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -16,12 +15,12 @@ import numpy.typing as npt
 
 from service.compiled.jit import njit
 from service.compiled.views import view_into
-from service.sky.cache import LruCache
 from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.files import Content
 from service.sky.geometry.pairs import build_pairs
 from service.sky.geometry.star_grid import build_star_grid
 from service.sky.whole_sky.bitmap import build_sky_bitmap
-from service.sky.whole_sky.store import FIRST, LAST, ROWS, StoreBytes, stored
+from service.sky.whole_sky.store import FIRST, LAST, ROWS, StoreBytes, stored, views_of
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
 BUCKET_RAD = 4.0 / ARCSEC_PER_RADIAN
@@ -104,6 +103,24 @@ class SkyIndex:
         return self.store.nbytes
 
     @property
+    def content(self) -> Content:
+        """The content of its file."""
+        facts = {
+            "run_catalog": self.run_catalog,
+            "limit_mag": self.limit_mag,
+            "radius_deg": self.radius_deg,
+            "forms": [(each.dtype.str, each.shape) for each in self.arrays],
+        }
+        return Content(facts, {"store": self.store})
+
+    @classmethod
+    def of_content(cls, content: Content) -> "SkyIndex":
+        """The index that a file holds."""
+        facts, store = dict(content.facts), content.arrays["store"]
+        arrays = Index(*views_of(store, facts.pop("forms")))
+        return cls(**facts, store=store, arrays=arrays)
+
+    @property
     def stars(self) -> int:
         """The number of stars."""
         return len(self.arrays.stars)
@@ -112,32 +129,6 @@ class SkyIndex:
     def pairs(self) -> int:
         """The number of pairs."""
         return len(self.arrays.pairs)
-
-
-@dataclass(frozen=True)
-class SkyIndexKey:
-    """What an index depends on: its key in the cache."""
-
-    run_catalog: str
-    limit_mag: float
-    radius_deg: float
-
-
-def sky_index_for(
-    cache: LruCache,
-    run_catalog: RunCatalog,
-    limit_mag: float,
-    radius_deg: float,
-    deeper: Callable[[], RunCatalog] | None = None,
-) -> tuple[SkyIndex, bool]:
-    """The index, from the cache or built, and whether it was cached.
-
-    `deeper` makes the same run catalog with the stars beyond its limit.
-    """
-    key = SkyIndexKey(run_catalog.digest, limit_mag, radius_deg)
-    return cache.get(
-        key, lambda: build_sky_index(deeper() if deeper else run_catalog, limit_mag, radius_deg)
-    )
 
 
 def build_sky_index(run_catalog: RunCatalog, limit_mag: float, radius_deg: float) -> SkyIndex:

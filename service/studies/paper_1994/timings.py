@@ -43,7 +43,7 @@ def measure(case: Times, seed: int, identifier: Identifier = "starid") -> list[Z
     world = the_paper().worlds[case.world]
     sky = open_sky()
     mission = paper_mission(world.mission)
-    prewarm_kernels(sky, {mission.name: mission})
+    prewarm_kernels(sky, {mission.name: mission}, [identifier])
     catalog = sky.run_catalog(mission, EPOCH)
     rng = np.random.default_rng([seed, int(case.table)])
     return [

@@ -1,0 +1,189 @@
+"""What is made of a star catalog, kept as files: built once, and mapped by every process.
+
+A file lies beside the compiled kernels, under the digest of all that it depends on.  Its content
+stands behind a digest of its own: a file that was cut or changed is removed and built again.  It is
+written under another name and then renamed, so that a file that can be opened is whole.
+"""
+
+import fcntl
+import hashlib
+import json
+import logging
+import os
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from service.compiled.cache import source_digest
+
+MOST_BYTES = 1 << 30
+"""In the folder: files that were not opened for longest are removed beyond it."""
+LINE = 64
+"""Arrays begin with a line of the processor's caches."""
+_START = 2 * LINE
+"""Where the head begins: before it are the digest of all that follows, and the head's length."""
+_DIGEST = hashlib.sha256
+
+log = logging.getLogger(__name__)
+
+
+class Content(NamedTuple):
+    """The content of a file: what JSON can say of it, and arrays by name."""
+
+    facts: Mapping[str, Any]
+    arrays: Mapping[str, npt.NDArray[Any]]
+
+
+def folder() -> Path:
+    """The folder of the files that this state of the source makes."""
+    return Path(os.environ["NUMBA_CACHE_DIR"]) / f"sky-{source_digest()[:16]}"
+
+
+def is_kept(kind: str, key: Hashable) -> bool:
+    """True if there is a file of a kind and a key."""
+    return _path(kind, key).exists()
+
+
+def kept(kind: str, key: Hashable, build: Callable[[], Content]) -> Content:
+    """The content of the file of a kind and a key, its arrays mapped; built where there is none.
+
+    Of several processes that need it one builds it, and the others wait.  Where no file can be
+    written, the content is what was built: each process has its own.
+    """
+    path = _path(kind, key)
+    content = _opened(path)
+    if content is None:
+        with _alone(path) as is_alone:
+            content = _opened(path)
+            if content is None:
+                content = build()
+                if is_alone and _write(path, content):
+                    content = _opened(path) or content
+    return content
+
+
+def _path(kind: str, key: Hashable) -> Path:
+    return folder() / f"{kind}-{_DIGEST(repr(key).encode()).hexdigest()[:24]}.npy"
+
+
+def _opened(path: Path) -> Content | None:
+    """The content of a file; None where there is none, or a damaged one, which is removed."""
+    try:
+        with path.open("rb") as file:
+            np.lib.format.read_magic(file)
+            np.lib.format.read_array_header_1_0(file)
+            digest = file.read(LINE)[: _DIGEST().digest_size]
+            # Read, not mapped: pages count as a process's own from when it first looks at them.
+            is_whole = hashlib.file_digest(file, _DIGEST).digest() == digest
+        if is_whole:
+            with suppress(OSError):  # of another user, or not to be written
+                os.utime(path)
+            return _content(np.asarray(np.load(path, mmap_mode="r")))
+    except OSError:
+        return None  # not there, or not to be read now
+    except ValueError:
+        pass  # the header is damaged
+    log.warning("%s is damaged: it is removed, and built again", path)
+    with suppress(OSError):
+        path.unlink()
+    return None
+
+
+def _content(block: npt.NDArray[np.uint8]) -> Content:
+    head_bytes = int(block[LINE : LINE + 8].view(np.int64)[0])
+    head = json.loads(block[_START : _START + head_bytes].tobytes())
+    arrays = {}
+    for name, (dtype, shape, first, last) in head["arrays"].items():
+        arrays[name] = block[first:last].view(dtype).reshape(shape)
+    return Content(head["facts"], arrays)
+
+
+def _block(content: Content) -> npt.NDArray[np.uint8]:
+    """The bytes of a file: digest, length of the head, head, and one array after the other."""
+    arrays = {name: np.ascontiguousarray(array) for name, array in content.arrays.items()}
+    # Its length depends on the places of the arrays, which begin behind it: there is room enough.
+    at = _aligned(_START + len(json.dumps(content.facts)) + 200 * (1 + len(arrays)))
+    places = {}
+    for name, array in arrays.items():
+        places[name] = (array.dtype.str, array.shape, at, at + array.nbytes)
+        at = _aligned(at + array.nbytes)
+    block = np.zeros(at, np.uint8)
+    for name, array in arrays.items():
+        _, _, first, last = places[name]
+        block[first:last] = array.reshape(-1).view(np.uint8)
+    head = np.frombuffer(
+        json.dumps({"facts": content.facts, "arrays": places}).encode("ascii"), np.uint8
+    )
+    block[_START : _START + len(head)] = head
+    block[LINE : LINE + 8].view(np.int64)[0] = len(head)
+    digest = np.frombuffer(_DIGEST(block[LINE:].data).digest(), np.uint8)
+    block[: len(digest)] = digest
+    return block
+
+
+def _aligned(at: int) -> int:
+    return -(-at // LINE) * LINE
+
+
+def _write(path: Path, content: Content) -> bool:
+    """Write a file under another name and rename it; False where that cannot be done."""
+    beside = path.with_suffix(".new")
+    try:
+        block = _block(content)
+        _make_room(path.parent, block.nbytes)
+        with beside.open("wb") as file:
+            header = {"descr": block.dtype.str, "fortran_order": False, "shape": block.shape}
+            np.lib.format.write_array_header_1_0(file, header)
+            file.write(block.data)
+        beside.replace(path)
+        return True
+    except OSError as error:
+        with suppress(OSError):
+            beside.unlink()
+        _warn(path.parent, error.strerror or str(error))
+        return False
+
+
+def _make_room(place: Path, nbytes: int) -> None:
+    """Remove the files that were not opened for longest; who has them mapped keeps them."""
+    files = []
+    for path in place.glob("*.npy"):
+        with suppress(FileNotFoundError):  # removed by another process
+            state = path.stat()
+            files.append((state.st_mtime, state.st_size, path))
+    excess = nbytes + sum(size for _, size, _ in files) - MOST_BYTES
+    for _, size, path in sorted(files):
+        if excess <= 0:
+            break
+        path.unlink(missing_ok=True)
+        excess -= size
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[bool]:
+    """While the block runs no other process builds this file; False where that cannot be had."""
+    with ExitStack() as stack:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            lock = stack.enter_context(path.with_suffix(".lock").open("wb"))
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            is_alone = True
+        except OSError as error:
+            _warn(path.parent, error.strerror or str(error))
+            is_alone = False
+        yield is_alone
+
+
+@cache
+def _warn(place: Path, reason: str) -> None:
+    """Say once that files cannot be kept."""
+    log.warning(
+        "the sky cannot be kept in %s (%s): each process builds its own, which takes seconds "
+        "of its start and more memory",
+        *(place, reason),
+    )
