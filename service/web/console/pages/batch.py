@@ -97,12 +97,34 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
         fields=fields,
         options=options.model_dump(exclude_none=True, exclude_unset=True),
         toml=toml_of(fields),
+        adoption=_adoption(answer, shown),
         pointing=_pointing(shown),
         timings_us=structs.asdict(shown.timings_us),
         tracks=_tracks(context, id, answer),
         around=context.app.results.neighbours(id),
         other_settings=mission.digest != answer.provenance.mission,
     )
+
+
+def _adoption(before: Answer, after: Answer) -> list[str]:
+    """What adopting a what-if will change, in sentences."""
+    words = ("unique", "ambiguous", "unmatched")
+    changes = [
+        f"{word} stars {getattr(before.counts, word)} to {getattr(after.counts, word)}"
+        for word in words
+        if getattr(before.counts, word) != getattr(after.counts, word)
+    ]
+    statuses = [each.attitude.status if each.attitude else "none" for each in (before, after)]
+    if statuses[0] != statuses[1]:
+        changes.append(f"attitude {statuses[0]} to {statuses[1]}")
+    return [
+        f"1 batch changes: {', '.join(changes) or 'its counts and its status stay the same'}.",
+        f"Lists, rates and every trend of {after.spacecraft} show the new result at {after.time}.",
+        (
+            "The mission's settings stay: other batches do not change. "
+            "To undo it, adopt the former result, which stays readable."
+        ),
+    ]
 
 
 @console_page("/latest/{name}", "Latest batch", Policy("read", "path"), section="/batches")
