@@ -103,6 +103,7 @@ def create_app(app: App, limits: BodyLimits = DEFAULT_LIMITS) -> FastAPI:
             await web_app.state.live.start()
             app.single_writer.when_writing(app.webhooks.sender.start)
             app.live_filter.start()
+            app.single_writer.when_writing(app.definitive.start_schedule)
             yield
         finally:
             reporting.cancel()

@@ -55,6 +55,7 @@ from .replays import (
 )
 from .spacecraft import (
     AttitudeRow,
+    DefinitiveJob,
     History,
     Innovation,
     LiveAttitude,
@@ -90,6 +91,7 @@ __all__ = [
     "CalibrationResult",
     "CalibrationSummary",
     "CalibrationUnknown",
+    "DefinitiveJob",
     "Detection",
     "FocalPlane",
     "FrameSummary",

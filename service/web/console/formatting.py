@@ -144,6 +144,11 @@ def count(value: int | None) -> str:
     return DASH if value is None else f"{value:,}".replace(",", THIN)
 
 
+def plural(number: int, word: str) -> str:
+    """A count with its word."""
+    return f"{count(number)} {word}{'' if number == 1 else 's'}"
+
+
 def microseconds(value: float | None) -> str:
     """Microseconds, or milliseconds where they become many."""
     if value is None:
@@ -155,7 +160,7 @@ def microseconds(value: float | None) -> str:
 
 def size(value: int) -> str:
     """Bytes in kB and MB."""
-    for least, unit in ((1_000_000, "MB"), (1_000, "kB")):
+    for least, unit in ((1_000_000_000, "GB"), (1_000_000, "MB"), (1_000, "kB")):
         if value >= least:
             return f"{value / least:.1f}{THIN}{unit}"
     return f"{value}{THIN}B"

@@ -16,6 +16,7 @@ from service.storage.models.answers import Answer
 from service.storage.models.answers import Star as FoundStar
 from service.storage.models.star_field import ObservedStarPlace, StarField
 from service.storage.queries.results import answer_from_json
+from service.storage.recording.ids import is_ulid
 from service.storage.tracks.models import TrackList
 from service.vectors import matrix_from_quaternion, to_ra_dec
 from service.web.console.charts.sky_chart import sky_chart
@@ -26,7 +27,7 @@ from service.web.console.options import (
     fields_of,
     toml_of,
 )
-from service.web.console.page_context import ContextDep, PageQuery
+from service.web.console.page_context import LIVE, ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
@@ -61,8 +62,14 @@ class VoteRow:
 
 @console_page("/batches/{id}", "Batch", Policy("read", "result"), section="/batches")
 def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
-    """One result: star field, votes, attitude, provenance; with options in the query, a what-if."""
+    """One result: star field, votes, attitude, provenance; with options in the query, a what-if.
+
+    An id that a sender gave its batch leads to the search for it.
+    """
     query = dict(request.query_params)
+    if not is_ulid(id):
+        asked = {"run": query.get("run", LIVE), "find": id}
+        return RedirectResponse(f"/batches?{urlencode(asked)}", 303)
     view = query.pop("view", "all")
     if view not in VIEWS:
         raise BadBatch(Fault("view", f"must be {' or '.join(VIEWS)}", shown_value(view)))

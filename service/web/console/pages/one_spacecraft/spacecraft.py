@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
-from urllib.parse import quote, urlencode
 
 from fastapi import Path
 from fastapi import Query as InQuery
@@ -13,9 +12,8 @@ from starlette.responses import Response
 
 from service.alarms.quantities import QUANTITIES, RankedName, ranked_names
 from service.alarms.subjects import limited_trackers
-from service.app.products import TABLE_KINDS
 from service.observations.schema import Key
-from service.products.formats import attitude_formats, table_formats
+from service.products.formats import table_formats
 from service.storage.models.annotations import Annotation
 from service.storage.models.answers import Summary
 from service.storage.models.base import Page
@@ -166,11 +164,6 @@ def spacecraft_page(
             name, query.tracker if query.tracker in limited_trackers(mission) else None
         ),
         formats=table_formats(),
-        attitude_formats=attitude_formats(),
-        table_kinds=TABLE_KINDS,
-        file=lambda product, format: (
-            stretch and _file_address(name, query, stretch, product, format)
-        ),
         query=query,
         vertical=VERTICAL,
         others=_others(context, query, stretch),
@@ -317,16 +310,3 @@ def _annotations(context: PageContext, name: str, stretch: ShownPeriod | None) -
     return context.app.annotations.page(
         spacecraft=name, start=stretch.start, end=stretch.end, limit=ANNOTATIONS
     )
-
-
-def _file_address(
-    name: str, query: SpacecraftQuery, stretch: ShownPeriod, product: str, format: str
-) -> str:
-    """The address of a product of the shown period as a file."""
-    asked = {
-        "run": query.run,
-        "start": stretch.start.text,
-        "end": stretch.end.text,
-        "format": format,
-    }
-    return f"/api/v1/spacecraft/{quote(name)}/{product}?{urlencode(asked)}"
