@@ -236,7 +236,7 @@ export class Trend {
     this.annotations = annotations;
     this.bounds = [start, end];
     const { quantities } = this.definition;
-    const known = quantities.filter((each) => history.series[each.name]?.count.some((count) => count > 0));
+    const known = quantities.filter((each) => history.series[each.name]?.mean.some((value) => value !== null));
     this.chart?.destroy();
     this.chart = null;
     this.holder.replaceChildren();
