@@ -509,7 +509,7 @@ def test_a_batch_is_found_by_the_id_of_its_sender_or_by_a_time(client, full_run)
     assert page.text.index(f"/batches/{one['id']}") > 0
     listed = re.findall(r'href="/batches/([0-9A-Z]{26})', page.text)
     assert listed[0] == one["id"]
-    missing = client.get("/batches/no-such-batch", follow_redirects=True)
+    missing = client.get("/batches", params={"find": "no-such-batch"})
     assert "No batch no-such-batch" in text_of(missing)
 
 

@@ -11,7 +11,7 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
 from service.alarms.quantities import QUANTITIES
-from service.errors import BadBatch, Fault, shown_value
+from service.errors import BadBatch, Fault, NotFound, shown_value
 from service.storage.models.answers import Answer
 from service.storage.models.answers import Star as FoundStar
 from service.storage.models.star_field import ObservedStarPlace, StarField
@@ -28,6 +28,7 @@ from service.web.console.options import (
     toml_of,
 )
 from service.web.console.page_context import LIVE, ContextDep, PageQuery
+from service.web.console.pages.batches import BatchesQuery, named
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
@@ -68,6 +69,8 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
     """
     query = dict(request.query_params)
     if not is_ulid(id):
+        if not named(context, BatchesQuery(), id):
+            raise NotFound(f"there is no batch with the id {shown_value(id)}")
         asked = {"run": query.get("run", LIVE), "find": id}
         return RedirectResponse(f"/batches?{urlencode(asked)}", 303)
     view = query.pop("view", "all")

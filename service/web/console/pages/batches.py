@@ -55,7 +55,7 @@ def batches_page(query: Annotated[BatchesQuery, InQuery()], context: ContextDep)
         try:
             return _at(query, parse_utc(text, "find"))
         except BadInput:
-            found = _named(context, query, text)
+            found = named(context, query, text)
         if len(found) == 1:
             address = f"/batches/{found[0].id}?{urlencode({'run': found[0].run})}"
             return RedirectResponse(address, 303)
@@ -92,16 +92,16 @@ def _at(query: BatchesQuery, moment: Utc) -> Response:
     return RedirectResponse(f"/batches?{urlencode(asked)}", 303)
 
 
-def _named(context: PageContext, query: BatchesQuery, text: str) -> list[Summary]:
+def named(context: PageContext, query: BatchesQuery, text: str) -> list[Summary]:
     """The batches with an id, first of the shown run, else of every run."""
     name = context.app.results.spacecraft_of(text)
     if name is not None and context.caller.may_see(name):
         answer = context.app.results.get(text).answer
         return _listed(context, answer.run, answer.spacecraft, answer.batch)
-    # Of one spacecraft and run the database has an index by this id.
+    # The database has an index of these ids for one spacecraft.
     names = [query.spacecraft] if query.spacecraft else context.spacecraft
-    found = [each for name in names for each in _listed(context, query.run, name, text)]
-    return found or _listed(context, ALL_RUNS, query.spacecraft or None, text)
+    found = [each for name in names for each in _listed(context, ALL_RUNS, name, text)]
+    return [each for each in found if each.run == query.run] or found
 
 
 def _listed(context: PageContext, run: str, spacecraft: str | None, text: str) -> list[Summary]:
