@@ -188,7 +188,7 @@ def _where_next(
     stopped = "" if once else "with this server stopped: "
     yield (
         f"acquire smooth XTE --run {run} --database {settings.database}",
-        f"{stopped}filter and smooth XTE with its gyro; its page Attitude over time draws that",
+        f"{stopped}filter and smooth XTE with its gyro; its page Definitive attitude draws it",
     )
     yield (
         "acquire frame PICTURE",

@@ -1,6 +1,6 @@
 """Alarms: lists, one with its history, and what operators do about them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from service.access.audit import Entry
 from service.alarms import state_machine
@@ -10,7 +10,7 @@ from service.storage.models.alarms import Alarm, AlarmSpan, AlarmWithActions
 from service.storage.models.base import Page
 from service.storage.projections.silence import evaluate_by_clock, is_due_by_clock
 from service.storage.queries import alarms
-from service.storage.queries.period.alarms import alarm_spans
+from service.storage.queries.period.alarms import TimeOut, alarm_spans, times_out
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.columns import Row
 from service.times import Utc, shifted, utc_now
@@ -52,6 +52,11 @@ class Alarms:
         """When alarms of a spacecraft were out of their limits; see `alarm_spans`."""
         with self._context.reading() as connection:
             return alarm_spans(connection, run, spacecraft, start, end)
+
+    def times_out(self, found: Sequence[Alarm]) -> list[list[TimeOut]]:
+        """For each alarm, when it was out of its limits; see `period.alarms.times_out`."""
+        with self._context.reading() as connection:
+            return times_out(connection, found)
 
     def get(self, id: str) -> AlarmWithActions:
         """One alarm with its history."""

@@ -25,6 +25,7 @@ from service.app.submissions import Submissions
 from service.app.telemetry.grades import Grades
 from service.app.telemetry.gyro import Gyro
 from service.app.telemetry.live_filter import LiveFilter
+from service.app.telemetry.smoothing import DefinitiveAttitudes
 from service.app.telemetry.tracks import Tracks
 from service.app.zones import Zones
 from service.ingest.spool import Spool
@@ -69,6 +70,7 @@ class App:
         self.products = Products(context.known, context.store)
         self.gyro = Gyro(context)
         self.grades = Grades(context)
+        self.definitive = DefinitiveAttitudes(context, self.grades, kernels)
         self.live_filter = LiveFilter(context, kernels)
         self.tracks = Tracks(context)
         self.limits = Limits(context)
@@ -106,6 +108,7 @@ class App:
         self.calibrations.close()
         self.live_filter.stop()
         self.upgrade.stop()
+        self.definitive.close()
         self.submissions.close()
         self.projector.close()
         self.store.close()

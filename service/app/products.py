@@ -2,14 +2,17 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, Literal, get_args
 
+import numpy as np
 from sqlalchemy import Connection
 
 from service import __version__
 from service.app.calibrations.adoptions import adopted_missions
 from service.errors import BadBatch, Fault
 from service.missions.mission import Mission, load_missions, mission_named
+from service.missions.product_settings import MAX_LARGEST_GAP_S
 from service.products.attitudes import (
     AttitudeRows,
     AttitudeSeries,
@@ -38,6 +41,10 @@ Pages = Iterator[AttitudeRows]
 Order = Literal["oldest", "newest"]
 AROUND = 200
 """Batches on either side of a moment among which its attitude is looked for."""
+CADENCES = 2.5
+"""Usual times between batches that a stretch may be without one."""
+LEAST_OF_CADENCE = 4
+"""Batches from which on a period has a cadence."""
 TableKind = Literal["batches", "stars", "gyro"]
 TABLE_KINDS: tuple[TableKind, ...] = get_args(TableKind)
 _TABLES = {"batches": batch_table, "stars": star_table}
@@ -69,7 +76,9 @@ class Products:
 
         Of the grades `filtered` and `smoothed` they are those of the latest revision of each day.
         They are read as the series is.  The largest gap and the identifiers are the mission's
-        where they are None.  Raises `BadBatch` where a period has more than `most_batches`.
+        where they are None.  A mission that names no gap has one that follows the cadence of the
+        period's batches, so that batches at a steady cadence make one stretch.
+        Raises `BadBatch` where a period has more than `most_batches`.
         """
         mission = mission_named(self._missions, name)
         own = mission.products
@@ -102,8 +111,18 @@ class Products:
             self._require_few(
                 lambda each: count_samples_of(each, selected, grade), most_batches, "samples"
             )
+        if grade == "raw" and largest_gap_s is None and not own.names_gap:
+            about = replace(about, largest_gap_s=self._gap_of_cadence(about, selected))
         pages = self._pages(about, selected, newest_first=about.newest_first)
         return series_of(about, pages)
+
+    def _gap_of_cadence(self, about: SeriesInfo, selected: ResultFilter) -> float:
+        """The largest gap of a period: its first batches tell the usual time between them."""
+        first = next(self._pages(about, selected, page=AROUND), None)
+        if first is None or len(first) < LEAST_OF_CADENCE:
+            return about.largest_gap_s
+        usual_s = float(np.median(np.abs(np.diff(first.time_ns)))) * 1e-9
+        return min(MAX_LARGEST_GAP_S, max(about.largest_gap_s, CADENCES * usual_s))
 
     def _pages(self, about: SeriesInfo, selected: ResultFilter, **wanted: Any) -> Pages:
         """What is recorded of a period in a grade, page by page."""
@@ -123,6 +142,8 @@ class Products:
         largest_gap_s: float | None = None,
     ) -> AttitudeAt:
         """The attitude of a spacecraft at a moment; see `moment.attitude_at`."""
+        if largest_gap_s is None:
+            largest_gap_s = mission_named(self._missions, name).products.largest_gap_s
         about = self.attitudes(
             name, run=run, status=status, grade=grade, largest_gap_s=largest_gap_s
         ).about

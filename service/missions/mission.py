@@ -31,7 +31,7 @@ from service.missions.corrections import AS_MEASURED, Calibration, Magnitudes
 from service.missions.gyro import GyroSettings, MotionSettings
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.keys import dotted_key, explained
-from service.missions.live_filter import LiveFilterSettings
+from service.missions.live_filter import LiveFilterSettings, SmoothingSettings
 from service.missions.packets import Packets
 from service.missions.product_settings import DEFAULT_PRODUCTS, ProductSettings, beside
 from service.missions.scan import Scan
@@ -253,6 +253,7 @@ class Mission(Strict):
     """How the body moves while there is no gyro; missing: as `MotionSettings` has it."""
     tracking: TrackingSettings | None = Field(default=None, exclude_if=is_missing)
     live_filter: LiveFilterSettings | None = Field(default=None, exclude_if=is_missing)
+    smoothing: SmoothingSettings | None = Field(default=None, exclude_if=is_missing)
     sun_tracker: SunTracker | None = Field(default=None, exclude_if=is_missing)
 
     @field_validator("trackers")

@@ -21,13 +21,21 @@ class ProductSettings(Strict):
     """The table `[products]` of a mission file; every key has a default."""
 
     largest_gap_s: float = Field(default=DEFAULT_LARGEST_GAP_S, gt=0, le=MAX_LARGEST_GAP_S)
-    """Attitudes that are farther apart belong to two stretches."""
+    """Attitudes that are farther apart belong to two stretches.
+
+    Without the key, that of raw attitudes follows their cadence: see `app.products`.
+    """
     object_id: str | None = Field(default=None, pattern=f"^{OBJECT_ID}$")
     """OBJECT_ID of CCSDS messages; None: the name of the mission."""
     naif_id: int = Field(default=DEFAULT_NAIF_ID, ge=MIN_NAIF_ID, lt=0)
     """NAIF's id of the spacecraft; the default belongs to no spacecraft."""
     sclk_kernel: Annotated[Path, PlainSerializer(lambda path: path.name)] | None = None
     """The file of the spacecraft's clock (SPICE SCLK), relative to the mission's file."""
+
+    @property
+    def names_gap(self) -> bool:
+        """Whether the mission file has the key `largest_gap_s`."""
+        return "largest_gap_s" in self.model_fields_set
 
     @field_validator("sclk_kernel")
     @classmethod

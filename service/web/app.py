@@ -9,6 +9,7 @@ from contextlib import asynccontextmanager
 import anyio.to_thread
 from fastapi import APIRouter, Depends, FastAPI
 from fastapi.routing import APIRoute
+from starlette.exceptions import HTTPException
 from starlette.middleware.gzip import DEFAULT_EXCLUDED_CONTENT_TYPES, GZipMiddleware
 from starlette.staticfiles import StaticFiles
 
@@ -39,6 +40,7 @@ from service.web.api import (
 from service.web.api import tokens as access
 from service.web.conditional import ConditionalAnswers
 from service.web.console import console_router
+from service.web.console.rendering import page_or_problem
 from service.web.event_stream import Live
 from service.web.middleware import AroundRequests
 from service.web.openapi.document import add_reference
@@ -101,6 +103,7 @@ def create_app(app: App, limits: BodyLimits = DEFAULT_LIMITS) -> FastAPI:
             await web_app.state.live.start()
             app.single_writer.when_writing(app.webhooks.sender.start)
             app.live_filter.start()
+            app.single_writer.when_writing(app.definitive.start_schedule)
             yield
         finally:
             reporting.cancel()
@@ -163,6 +166,7 @@ def bare_app() -> FastAPI:
     web_app.state.routes = [route for router in routers for route in router.routes]
     web_app.mount("/static", StaticFiles(packages=[("service.web.console", "static")]))
     add_error_handlers(web_app)
+    web_app.add_exception_handler(HTTPException, page_or_problem)
     add_reference(web_app)
     return web_app
 

@@ -13,7 +13,7 @@ from service.filtering.samples import (
 from service.grades.day import grade_day
 from service.grades.measured import Recorded
 from service.missions.gyro import GyroSettings, MotionSettings
-from service.missions.live_filter import LiveFilterSettings
+from service.missions.live_filter import LiveFilterSettings, SmoothingSettings
 from service.times import DAY_S, parse_utc
 from tests.filtering.simulated import START_NS
 
@@ -24,8 +24,13 @@ GYRO = {"sigma_v_rad_s0_5": 10**0.5 * 1e-7, "sigma_u_rad_s1_5": 10**0.5 * 1e-10}
 
 
 def mission_with(mission, **tables):
-    """A mission with other tables `gyro`, `motion` or `live_filter`."""
-    kinds = {"gyro": GyroSettings, "motion": MotionSettings, "live_filter": LiveFilterSettings}
+    """A mission with other tables `gyro`, `motion`, `live_filter` or `smoothing`."""
+    kinds = {
+        "gyro": GyroSettings,
+        "motion": MotionSettings,
+        "live_filter": LiveFilterSettings,
+        "smoothing": SmoothingSettings,
+    }
     return mission.model_copy(update={name: kinds[name](**told) for name, told in tables.items()})
 
 

@@ -198,6 +198,16 @@ def test_the_rate_of_batches_counts_the_hours_that_are_shown_of_a_bucket(app):
     assert rate == [pytest.approx(120.0)] * len(rate)
 
 
+def test_the_last_bucket_of_a_few_batches_does_not_double_the_rate(app):
+    start = parse_utc("2015-03-01T20:30:00Z")
+    times = [shifted(start, 600.0 * k) for k in range(37)]
+    put(app, [result_row(app, time) for time in times])
+    end = shifted(times[-1], 0.001)
+    rate = app.spacecraft.history("XTE", start=start, end=end, size=8).series["batches_per_hour"]
+    assert rate.mean[-1] is None
+    assert [each for each in rate.mean if each is not None] == [pytest.approx(6.0)] * 5
+
+
 @pytest.mark.parametrize(
     "text",
     [

@@ -26,7 +26,7 @@ from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
 from service.web.app import create_app
 from tests.fresh_databases import sqlite_at
-from tests.web.serving import Server, compile_kernels, in_process_settings
+from tests.web.serving import Server, compile_kernels, ended, in_process_settings
 
 FILE = Path(__file__).parents[2] / "service" / "web" / "examples.json"
 API = "/api/v1"
@@ -254,7 +254,17 @@ def _gyro(client: httpx.Client, take: Any) -> None:
     take("submit_gyro", client.post(here, json=degrees), "another_unit")
     take("list_gyro", client.get(here), "two_blocks")
     take("list_innovations", client.get(f"{API}/spacecraft/XTE/innovations"), "none_smoothed")
+    _definitive(client, take)
     take("get_gyro", client.get(f"{here}/{first['id']}"), "three_samples")
+
+
+def _definitive(client: httpx.Client, take: Any) -> None:
+    here = f"{API}/spacecraft/XTE/definitive-attitude"
+    asked: Json = {"run": "none", "start": "1999-03-01T00:00:00Z", "who": "J. Operator"}
+    begun = take("make_definitive_attitude", client.post(here, json=asked), "a_day", asked)
+    ended(client, f"{here}/{begun['id']}")
+    take("get_definitive_attitude", client.get(f"{here}/{begun['id']}"), "without_batches")
+    take("list_definitive_attitudes", client.get(here), "one")
 
 
 def _measured(client: httpx.Client, app: App, take: Any) -> None:

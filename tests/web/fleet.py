@@ -4,7 +4,7 @@ The rows are written as the writer would write them, without any star's vector: 
 page of all spacecraft shows does not depend on those.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +14,15 @@ from service.alarms.quantities import QUANTITIES
 from service.app.factory import App
 from service.missions.mission import load_missions
 from service.storage.recording.ids import Ulids
-from service.storage.sql.alarm_tables import alarms
+from service.storage.sql.alarm_tables import alarm_actions, alarms
 from service.storage.sql.statements import insert_all
 from service.storage.sql.tables import solutions, star_results
-from service.times import Utc, parse_utc, shifted
+from service.times import DAY_S, Utc, parse_utc, shifted, utc_now
 from tests.storage.bulk import put, result_row
 
 END = parse_utc("1999-03-02T00:00:00.000Z")
 BATCHES, CADENCE_S = 48, 1800.0
+SILENT_S = 6.5 * 3600.0
 IN_TROUBLE = 6
 QUANTITIES_OUT = ("unmatched_share", "ambiguous_share", "no_attitude_share", "suspect_share")
 SHIPPED = Path(__file__).parents[2] / "service" / "missions" / "xte.toml"
@@ -53,10 +54,22 @@ def write_missions(folder: Path, size: int) -> Path:
     return folder
 
 
-def fill(app: App, size: int, run: str = "live") -> None:
-    """A day of every spacecraft, the last hours of some in trouble, with their alarms."""
+def fill(app: App, size: int, run: str = "live", silent: str | None = None) -> None:
+    """A day of every spacecraft, the last hours of some in trouble, with their alarms.
+
+    The latest batches were received now; those of `silent` end six and a half hours before.
+    """
     in_trouble = troubled(size)
     pairs = [pair for name in names(size) for pair in _batches(app, name, name in in_trouble, run)]
+    present = utc_now()
+    for batch, _ in pairs:
+        behind_s = (END.tai_ns - batch["time_ns"]) * 1e-9
+        batch["received"] = shifted(present, -behind_s).text
+    pairs = [
+        (batch, result)
+        for batch, result in pairs
+        if batch["spacecraft"] != silent or END.tai_ns - batch["time_ns"] >= SILENT_S * 1e9
+    ]
     put(app, pairs)
     latest = [result for _, result in pairs if result["time_ns"] == END.tai_ns]
     raised = [_alarm(name, k, run) for k, name in enumerate(in_trouble)]
@@ -131,6 +144,28 @@ def _alarm(name: str, number: int, run: str) -> dict[str, Any]:
         **_place("worst", END),
         **_place("latest", END),
     }
+
+
+def put_alarm(
+    app: App, name: str, actions: Sequence[tuple[str, float]], in_limits: bool = False
+) -> None:
+    """An alarm of a spacecraft with what its value did, by hours after the day's start."""
+    begin = shifted(END, -DAY_S)
+    alarm = _alarm(name, 0, "live")
+    places = [(action, shifted(begin, 3600.0 * hours)) for action, hours in actions]
+    alarm |= _place("raised", places[0][1]) | _place("latest", places[-1][1])
+    if in_limits:
+        alarm |= {"current_severity": None, "returned_at": utc_now().text}
+    rows = [
+        {"alarm_id": alarm["id"], "at": utc_now().text, "action": action, "time": time.text}
+        for action, time in places
+    ]
+
+    def write(connection: Connection) -> None:
+        connection.execute(insert(alarms), [alarm])
+        connection.execute(insert(alarm_actions), rows)
+
+    app.store.writer.change(write).result()
 
 
 def _place(which: str, time: Utc) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from service.alarms.causes import CAUSES
 from service.alarms.quantities import QUANTITIES, limited_names
 from service.app.factory import open_app
 from service.web.app import create_app
-from service.web.console.charts.alarm_trend import HEIGHT, alarm_trend
+from service.web.console.formatting import with_day_of_year
 from tests.fresh_databases import sqlite_at
 from tests.web import fleet
 from tests.web.serving import Server, in_process_settings
@@ -62,31 +62,61 @@ def test_the_page_of_an_alarm_says_why_and_what_to_do(fleet_client):
 def test_every_page_counts_the_open_alarms_in_header_and_title(fleet_client):
     for page in ("/", "/alarms", "/zones", f"/spacecraft/{fleet.troubled(SIZE)[0]}"):
         answer = fleet_client.get(page)
-        assert f"<title>({fleet.IN_TROUBLE}) " in answer.text, page
+        assert f"<title>◆ ({fleet.IN_TROUBLE}) " in answer.text, page
         assert f"{fleet.IN_TROUBLE} alarms open" in text_of(answer)
-    assert "<title>(" not in fleet_client.get("/", params={"run": "nobody"}).text
+    assert "<title>◆" not in fleet_client.get("/", params={"run": "nobody"}).text
 
 
-def test_times_of_alarms_are_of_one_named_clock(fleet_client):
-    for clock in ("telemetry", "receipt"):
-        text = text_of(fleet_client.get("/alarms", params={"clock": clock}))
-        assert f"raised, {clock} UTC" in text
-        assert f"raised by {clock} time" in text
-    assert fleet_client.get("/alarms", params={"clock": "sundial"}).status_code == 422
+def test_telemetry_time_and_wall_clock_are_named(fleet_client):
+    text = text_of(fleet_client.get("/alarms"))
+    assert "last out of limits, telemetry UTC" in text
+    alarm = alarm_of(fleet_client, "suspect_share")
+    signed = {"who": "J. Operator", "comment": "seen"}
+    address = f"/api/v1/alarms/{alarm['id']}"
+    done = fleet_client.post(f"{address}/acknowledge", json=signed).json()
+    moment = with_day_of_year(done["acknowledged"]["at"])
+    page = text_of(fleet_client.get(f"/alarms/{alarm['id']}"))
+    assert f"{moment} UTC, wall clock: acknowledged by J. Operator: seen" in page
+    listed = text_of(fleet_client.get("/alarms")).replace(" ,", ",")
+    assert f"by J. Operator {moment[:-3]}, wall clock" in listed
 
 
-def test_the_small_trend_joins_what_is_regular_and_leaves_gaps():
-    drawn = alarm_trend(
-        [0.0, 600.0, 1200.0, 6000.0, 6600.0],
-        [0.1, 0.2, 0.3, 0.4, None],
-        start_s=0.0,
-        end_s=7200.0,
-        step_s=60.0,
-        bound=0.25,
-        raised_s=1200.0,
+def test_alarms_are_filtered_sorted_and_grouped(fleet_client):
+    def rows(**asked):
+        page = fleet_client.get("/alarms", params=asked)
+        assert page.status_code == 200, page.text
+        return re.findall(r'data-name="spacecraft"><a href="/spacecraft/([\w-]+)"', page.text)
+
+    assert set(rows()) == set(fleet.troubled(SIZE))
+    assert rows(sort="spacecraft") == sorted(fleet.troubled(SIZE))
+    assert rows(sort="spacecraft", descending="true") == sorted(fleet.troubled(SIZE))[::-1]
+    found = fleet_client.get("/api/v1/alarms").json()["items"]
+    critical = {each["spacecraft"] for each in found if each["severity"] == "critical"}
+    assert set(rows(severity="critical")) == critical
+    assert rows(state="returned") == []
+    one = fleet.troubled(SIZE)[0]
+    assert rows(spacecraft=one) == [one]
+    text = text_of(fleet_client.get("/alarms", params={"group": "quantity"}))
+    assert "unmatched stars: 2 alarms of 2 spacecraft" in text
+    text = text_of(fleet_client.get("/alarms", params={"group": "time"}))
+    assert "Left limits at 1999-03-01 (060) 20:00 UTC: 6 alarms of 6 spacecraft" in text
+
+
+def test_an_alarm_that_went_out_again_shows_the_last_time_and_how_often(tmp_path):
+    app = open_app(in_process_settings(sqlite_at(tmp_path / "acquire.db")))
+    fleet.put_alarm(
+        app,
+        "XTE",
+        [("raised", 0), ("returned", 1), ("left_again", 40), ("returned", 42)],
+        in_limits=True,
     )
-    assert drawn.path.count("M") == 2
-    assert drawn.path.count("L") == 2
-    assert 0 < drawn.bound_y < HEIGHT
-    empty = {"start_s": 0.0, "end_s": 1.0, "step_s": 1.0, "bound": 1.0, "raised_s": 0.0}
-    assert alarm_trend([0.0], [None], **empty) is None
+    with Server(create_app(app)) as address, httpx.Client(base_url=address) as client:
+        text = text_of(client.get("/alarms")).replace("\u202f", " ")
+        assert "1999-03-02 (061) 16:00 to 1999-03-02 (061) 18:00 2 3 h" in text
+        (alarm,) = client.get("/api/v1/alarms").json()["items"]
+        page = text_of(client.get(f"/alarms/{alarm['id']}")).replace("\u202f", " ")
+        assert "Out of limits 2 times, 3 h in all" in page
+        # It waits for an operator, but nothing is out of limits now.
+        overview = client.get("/").text
+        assert "<title>Overview" in overview
+        assert "1 alarms returned" in text_of(client.get("/alarms"))

@@ -41,6 +41,11 @@ def sent(address, batches):
         httpx.post(f"{address}/api/v1/batches", json=each, timeout=60).raise_for_status()
 
 
+SIGN = """(form => { form.elements.who.value = 'J. Operator';
+    form.elements.comment.value = 'after the first pass'; form.querySelector('.main').click(); })(
+    document.querySelector('dialog form'))"""
+
+
 def test_calibrate_try_adopt_and_take_back(browser, folder):
     missions = folder / "assumed"
     app = open_app(in_process_settings(sqlite_at(folder / "acquire.db"), missions=missions))
@@ -55,7 +60,6 @@ def test_calibrate_try_adopt_and_take_back(browser, folder):
         browser.open(page)
         assert "has no calibration yet" in browser.run("found.innerText")
         browser.run("signed.elements.who.value = 'J. Operator'")
-        browser.run("signed.elements.note.value = 'after the first pass'")
         browser.run("document.querySelector('#calibrate button').click()")
         browser.wait(lambda: "version=1" in browser.run("location.search"), 60)
         # The page is shown while the rest of it is still read.
@@ -74,9 +78,12 @@ def test_calibrate_try_adopt_and_take_back(browser, folder):
         in_force = "document.getElementById('in-force').innerText"
         assert "the mission file" in browser.run(in_force)
 
-        browser.run("signed.elements.who.value = 'J. Operator'")
-        browser.run("signed.elements.note.value = 'after the first pass'")
         browser.run("document.querySelector('[data-adopt]').click()")
+        told = browser.run("document.querySelector('dialog').innerText")
+        assert "None of the" in told
+        assert "put the former calibration back" in told
+        assert faults(browser) == []
+        browser.run(SIGN)
         browser.wait(lambda: "version 1" in browser.run(in_force))
         assert "J. Operator" in browser.run(in_force)
         for width, dark in ((1440, False), (400, True)):
@@ -90,8 +97,8 @@ def test_calibrate_try_adopt_and_take_back(browser, folder):
         assert abs(ambiguous - true[1]) <= 2
 
         browser.open(page)
-        browser.run("signed.elements.who.value = 'J. Operator'")
         browser.run("""document.querySelector('[data-revert=""]').click()""")
+        browser.run(SIGN)
         browser.wait(lambda: "the mission file" in browser.run(in_force))
         shown = browser.run("document.getElementById('history').innerText")
         assert "History of calibrations" in shown

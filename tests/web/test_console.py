@@ -13,7 +13,7 @@ import pytest
 from service.app.factory import open_app
 from service.missions.mission import load_missions
 from service.observations.schema import submission_from_json
-from service.simulate.stretches import Pass
+from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
 from service.vectors import angle_between_deg, matrix_from_quaternion
 from service.web.app import create_app
@@ -24,6 +24,8 @@ from service.web.console.charts.sparkline import HEIGHT, PAD, WIDTH, common_top,
 from tests.web.console_pages import console_addresses
 from tests.web.markup import Markup
 from tests.web.serving import Server, in_process_settings
+
+STEADY = Pass(batches=16, seed=3, cadence_s=300.0, troubles=NO_TROUBLES)
 
 HOSTILE = "<script>alert(1)</script>\"'><img src=x onerror=alert(2)>{{7*7}}\u202e"
 
@@ -491,3 +493,54 @@ def test_values_are_written_with_their_units():
     assert formatting.age(None) == "–"
     assert formatting.count(1234567) == f"1{thin}234{thin}567"
     assert formatting.with_day_of_year("1998-12-31T23:59:60.000Z") == "1998-12-31 (365) 23:59:60"
+
+
+# ---- whether the service is well, and files ------------------------------------------------------
+
+
+def test_the_page_of_the_service_tells_whether_it_is_well(client):
+    text = text_of(client.get("/about"))
+    for each in (
+        "ready for batches yes",
+        "batches that wait to be answered 0",
+        "last write succeeded",
+        "trends and alarms 0 results",
+        "memory",
+        "table of leap seconds",
+        "webhooks",
+    ):
+        assert each in text, each
+
+
+def test_a_batch_is_found_by_the_id_of_its_sender_or_by_a_time(client, full_run):
+    asked = {"run": full_run, "spacecraft": "XTE"}
+    sent = client.get("/api/v1/batches", params=asked).json()["items"]
+    one = sent[3]
+    for address in (f"/batches/{one['batch']}", f"/batches?find={one['batch']}"):
+        page = client.get(address, params={"run": full_run}, follow_redirects=True)
+        assert page.status_code == 200
+        # Both spacecraft of the run may have the id: then both are listed.
+        assert one["id"] in str(page.url) or f"/batches/{one['id']}" in page.text
+    shown = {"run": full_run, "spacecraft": "XTE", "find": one["time"]}
+    page = client.get("/batches", params=shown, follow_redirects=True)
+    assert page.text.index(f"/batches/{one['id']}") > 0
+    listed = re.findall(r'href="/batches/([0-9A-Z]{26})', page.text)
+    assert listed[0] == one["id"]
+    missing = client.get("/batches", params={"find": "no-such-batch"})
+    assert "No batch no-such-batch" in text_of(missing)
+
+
+def test_files_of_attitudes_say_what_each_grade_is_and_how_many_stretches(tmp_path):
+    app = open_app(in_process_settings(f"sqlite:///{tmp_path / 'acquire.db'}"))
+    with Server(create_app(app)) as address, httpx.Client(base_url=address, timeout=60) as client:
+        batches = [each.batch for each in draw_pass(app.missions["XTE"], app.sky, STEADY)]
+        for each in batches:
+            client.post("/api/v1/batches", json=each).raise_for_status()
+        text = text_of(client.get("/spacecraft/XTE/files"))
+        assert re.search(r"raw 16 1 12\Dmin\D30\Ds", text), text
+        assert "The definitive attitude" in text
+        # The gap follows the cadence, so that an AEM of a steady cadence is one segment.
+        aem = client.get("/api/v1/spacecraft/XTE/attitude", params={"format": "aem"}).text
+        assert aem.count("META_START") == 1
+        page = client.get("/spacecraft/XTE/files", params={"gap_s": "60"}).text
+        assert "a reader can interpolate hardly anything" in page

@@ -9,8 +9,10 @@ import httpx
 import pytest
 
 from service.app.factory import open_app
+from service.times import parse_utc, shifted
 from service.web.app import create_app
 from tests.fresh_databases import sqlite_at
+from tests.storage.bulk import put, result_row
 from tests.web.browser import CHROMIUM, Browser
 from tests.web.fitting import assert_fits, faults
 from tests.web.serving import Server, in_process_settings
@@ -129,6 +131,92 @@ def test_a_chart_zooms_and_pans_and_the_address_says_where(browser, address, ful
     assert browser.complaints == []
 
 
+SIGN = """(form => { form.elements.who.value = 'J. Operator';
+    form.elements.comment.value = 'it is clear'; form.querySelector('.main').click(); })(
+    document.querySelector('dialog form'))"""
+
+
+def test_a_bad_time_is_told_beside_its_field_and_the_form_is_kept(browser, address, full_run):
+    browser.open(f"{address}/batches?run={full_run}")
+    fill = "document.querySelector('[name={0}]').value = '{1}'"
+    browser.run("document.querySelector('[name=outcome]').value = 'unique'")
+    browser.run(fill.format("start", "yesterday"))
+    browser.run("document.querySelector('main form:not([role])').requestSubmit()")
+    assert "From must be UTC, such as" in text(browser, "main form:not([role])")
+    assert browser.run("document.activeElement.name") == "start"
+    assert faults(browser) == []
+    browser.run(fill.format("start", "1999-03-02 12:00"))
+    browser.run(fill.format("end", "1999-060"))
+    browser.run("document.querySelector('main form:not([role])').requestSubmit()")
+    assert "To must not be before From" in text(browser, "main form:not([role])")
+    assert browser.run("document.querySelector('[name=outcome]').value") == "unique"
+    browser.run(fill.format("start", "1999-02-28"))
+    browser.run(
+        "(picker => { picker.value = '1999-03-04T00:00:00';"
+        "picker.dispatchEvent(new Event('input', {bubbles: true})); })"
+        "(document.querySelectorAll('[data-picks]')[1])"
+    )
+    assert browser.run("document.querySelector('[name=end]').value").startswith("1999-03-04T00:00")
+    browser.run("document.querySelector('main form:not([role])').requestSubmit()")
+    browser.wait(lambda: "outcome=unique" in browser.run("location.search"))
+    assert "start=1999-02-28T00%3A00%3A00Z" in browser.run("location.search")
+    shows(browser, "Newest first")
+    assert browser.complaints == []
+
+
+def test_a_point_of_a_trend_leads_to_its_batches_and_lines_can_be_hidden(
+    browser, address, full_run
+):
+    browser.open(f"{address}/spacecraft/XTE?run={full_run}&beside=SOHO")
+    browser.wait(lambda: browser.run(DRAWN))
+    browser.wait(lambda: "SOHO" in text(browser, "[data-readout=stars] + .chart-keys"))
+    key = "document.querySelector('[data-readout=stars] + .chart-keys button')"
+    browser.run(f"{key}.click()")
+    assert browser.run(f"{key}.ariaPressed") == "false"
+    browser.wait(lambda: browser.run(f"document.activeElement === {key}"))
+    assert faults(browser) == []
+    browser.run("document.querySelector('[data-chart=stars]').focus()")
+    browser.press("Enter")
+    browser.wait(lambda: "Batches from" in text(browser, "#charts-status"))
+    browser.run("document.querySelector('#charts-status a').click()")
+    browser.wait(lambda: browser.run("location.pathname") == "/batches")
+    browser.wait(lambda: browser.run("document.querySelectorAll('#list tbody tr').length") >= 1)
+    assert browser.complaints == []
+
+
+def test_an_outlier_is_marked_at_the_edge_unless_all_values_are_asked_for(browser, tmp_path):
+    app = open_app(in_process_settings(sqlite_at(tmp_path / "acquire.db")))
+    begin = parse_utc("1999-03-01T00:00:00Z")
+    rows = [
+        result_row(
+            app,
+            shifted(begin, 300.0 * k),
+            residual_rms_arcsec=900.0 if k == 100 else 2.0 + k % 3,
+            status=None,
+            reason="no_consistent_attitude",
+        )
+        for k in range(280)
+    ]
+    put(app, rows)
+    readout = "[data-readout=residual]"
+    label = "document.querySelector('[data-chart=residual]').getAttribute('aria-label')"
+    with Server(create_app(app)) as url:
+        browser.open(f"{url}/spacecraft/XTE")
+        browser.wait(lambda: "at the edge: 1 beyond it" in text(browser, readout))
+        assert "greatest 900″" in browser.run(label)
+        for y in ("all", "log"):
+            choose = (
+                "(field => { field.value = 'Y'; field.dispatchEvent(new Event('change',"
+                " {bubbles: true})); })(document.querySelector('select[name=y]'))"
+            )
+            browser.run(choose.replace("Y", y))
+            browser.wait(lambda y=y: f"y={y}" in browser.run("location.search"))
+            browser.wait(lambda: "at the edge" not in text(browser, readout))
+            assert faults(browser) == []
+        browser.call("Page.navigate", url="about:blank")
+    browser.complaints.clear()
+
+
 def test_a_what_if_changes_what_becomes_of_an_ambiguous_star(browser, address, client, drawn):
     """Votes leave it ambiguous, verified identification names it; adopted, that stands."""
     run = f"try-{next(_numbers)}"
@@ -148,11 +236,28 @@ def test_a_what_if_changes_what_becomes_of_an_ambiguous_star(browser, address, c
     assert 'identifier = "verified"' in text(browser, "#toml")
     assert browser.run("document.activeElement.id") == "w-identifier"
     assert "identifier=verified" in browser.run("location.search")
-    browser.run("document.querySelector('[data-adopt]').click()")
+    browser.run("document.querySelector('#outcome [data-adopt]').click()")
+    told = text(browser, "dialog")
+    assert "1 batch changes: unique stars" in told
+    assert "To undo it" in told
+    assert faults(browser) == []
+    # Without a name nothing is sent.
+    browser.run("document.querySelector('dialog .main').click()")
+    assert found in browser.run("location.pathname")
+    browser.run(SIGN)
     browser.wait(lambda: found not in browser.run("location.pathname"))
     shows(browser, "This is an adopted what-if")
     assert "ambiguous" not in text(browser, ".votes")
     assert client.get(f"/api/v1/batches/{found}").json()["current"] is False
+    noted = client.get("/api/v1/annotations", params={"spacecraft": "XTE"}).json()["items"]
+    assert any("adopted (identifier): it is clear" in each["text"] for each in noted)
+    # Undone: the answer of the former is current again.
+    browser.run("document.querySelector('.note [data-adopt]').click()")
+    browser.run(SIGN)
+    browser.wait(lambda: "ambiguous" in text(browser, ".votes"))
+    shows(browser, "This is an adopted what-if")
+    for each in noted[:2]:
+        client.delete(f"/api/v1/annotations/{each['id']}", params={"who": "J. Operator"})
     browser.open(f"{address}/batches/{found}")
     shows(browser, "This batch has another current result")
     assert browser.complaints == []
@@ -436,7 +541,7 @@ def test_a_shift_from_the_overview_to_the_star_and_the_alarm(browser, address, c
     run, replay = watched
     browser.open(f"{address}/?run={run}")
     browser.wait(lambda: client.get(replay).json()["state"] == "done", 60)
-    shows(browser, "critical", "#run-state")
+    shows(browser, "back in limits", "#run-state")
     shows(browser, "1999-060-0160", "#overview")
 
     click(browser, "#overview .spark-link[aria-label='XTE, trend of the last day']")
@@ -454,7 +559,7 @@ def test_a_shift_from_the_overview_to_the_star_and_the_alarm(browser, address, c
     rows = "[...document.querySelectorAll('#alarms tbody tr')].map(row => row.innerText)"
     (raised,) = [each for each in browser.run(rows) if "a priori" in each]
     assert "open" in raised
-    assert "back in limits" in raised
+    assert "out now" not in raised
     browser.run(
         "[...document.querySelectorAll('#alarms tbody tr')]"
         ".find(row => row.innerText.includes('a priori')).querySelector('a').click()"
@@ -468,10 +573,12 @@ def test_a_shift_from_the_overview_to_the_star_and_the_alarm(browser, address, c
         "(document.getElementById('act-form'))"
     )
     click(browser, "[data-act=acknowledge]")
-    shows(browser, "acknowledged by J. Operator", "#alarm")
-    shows(browser, "slew at 00:30, as announced", "#alarm")
+    shows(browser, "acknowledged by J. Operator", "#alarm-history")
+    shows(browser, "slew at 00:30, as announced", "#alarm-history")
     shows(browser, "cleared", "#alarm")
-    places = browser.run("[...document.querySelectorAll('#alarm a')].map(each => each.href)")
+    places = browser.run(
+        "[...document.querySelectorAll('#alarm-history a')].map(each => each.href)"
+    )
     assert {httpx.get(place, timeout=60).status_code for place in places} == {200}
     browser.wait(lambda: browser.run("document.querySelector('[data-act=acknowledge]').disabled"))
     for page in (browser.run("location.pathname"), f"/alarms?run={run}&state=all"):
@@ -495,7 +602,7 @@ def test_acknowledged_but_still_out_of_limits_an_alarm_stays(browser, address, c
     browser.wait(lambda: browser.run(CONNECTED))
     browser.run("document.getElementById('act-form').elements.who.value = 'J. Operator'; 0")
     click(browser, "[data-act=acknowledge]")
-    shows(browser, "acknowledged by J. Operator", "#alarm")
+    shows(browser, "acknowledged by J. Operator", "#alarm-history")
     state = "document.getElementById('alarm').dataset.state"
     browser.wait(lambda: browser.run(state) == "acknowledged")
     assert "back in limits" not in browser.run("document.getElementById('alarm').innerText")
@@ -518,13 +625,13 @@ def test_a_limit_is_changed_on_its_page_and_kept_with_who_and_why(browser, addre
         "form.elements.comment.value = 'crowded field'; })(document.getElementById('signed'))"
     )
     form = "document.querySelector('[data-limit=ambiguous_share]')"
-    browser.run(f"{form}.elements['watch.high'].value = '0.2'")
+    browser.run(f"{form}.elements['watch.high'].value = '20'")
     browser.run(f"{form}.requestSubmit()")
     shows(browser, "by J. Operator", "#ambiguous_share")
     shows(browser, "crowded field", "#ambiguous_share")
     limit = client.get("/api/v1/spacecraft/SWAS/limits/ambiguous_share").json()["limit"]
     assert limit["settings"]["watch"]["high"] == 0.2
-    browser.run(f"{form}.elements['watch.high'].value = '0.9'")
+    browser.run(f"{form}.elements['watch.high'].value = '90'")
     browser.run(f"{form}.requestSubmit()")
     shows(browser, "Not done", "#message")
     click(browser, "#ambiguous_share [data-default]")

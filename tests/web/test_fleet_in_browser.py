@@ -65,6 +65,34 @@ def test_it_fits_wide_and_narrow_light_and_dark_without_any_fault(browser, fille
     assert browser.complaints == []
 
 
+def test_a_silent_spacecraft_is_not_good_and_says_for_how_long(browser, tmp_path):
+    missions = fleet.write_missions(tmp_path / "missions", 8)
+    app = open_app(in_process_settings(sqlite_at(tmp_path / "acquire.db"), missions=missions))
+    fleet.fill(app, 8, silent="SAT-000")
+    row = "document.querySelector('.fleet tbody [href$=\"/SAT-000\"]').closest('tr')"
+    cut = (
+        "[...document.querySelectorAll('.c-latest a, .c-behind')]"
+        ".filter(e => e.offsetParent && e.scrollWidth > e.clientWidth + 1).length"
+    )
+    with Server(create_app(app)) as address:
+        for width in (1440, 400):
+            browser.open(address, width=width, dark=width == 400)
+            browser.wait(lambda: browser.run(DRAWN) == "8")
+            shown = browser.run(f"{row}.innerText").replace("\u202f", " ")
+            assert "6 h 30 min" in shown
+            assert browser.run(cut) == 0
+            assert faults(browser) == []
+        browser.open(address)
+        shown = browser.run(f"{row}.innerText").replace("\u202f", " ")
+        assert "silent 6 h 30 min" in shown
+        assert "1999-03-01 (060) 17:30" in shown
+        assert "good" not in shown
+        browser.open(f"{address}/?show=stale")
+        assert browser.run(NAMES) == ["SAT-000"]
+        browser.call("Page.navigate", url="about:blank")
+    browser.complaints.clear()
+
+
 def test_rows_are_filtered_and_sorted_and_the_address_says_how(browser, filled):
     size, address = filled
     browser.open(address)
@@ -122,7 +150,7 @@ def test_many_alarms_are_acknowledged_at_once_and_the_header_counts_down(browser
     browser.wait(
         lambda: browser.run("document.getElementById('connection').dataset.state") == "live"
     )
-    assert browser.run("document.title").startswith(f"({fleet.IN_TROUBLE}) ")
+    assert browser.run("document.title").startswith(f"◆ ({fleet.IN_TROUBLE}) ")
     selected = "document.getElementById('message').textContent"
     browser.run("document.querySelector('[data-select-all]').click()")
     assert browser.run(selected) == f"{fleet.IN_TROUBLE} selected."
@@ -130,7 +158,7 @@ def test_many_alarms_are_acknowledged_at_once_and_the_header_counts_down(browser
     browser.run("document.querySelector('#bulk input[name=who]').value = 'J. Operator'")
     browser.run("document.querySelector('#bulk [data-act=acknowledge]').click()")
     browser.wait(lambda: browser.run(selected) == f"{fleet.IN_TROUBLE - 1} acknowledged.")
-    browser.wait(lambda: browser.run("document.title").startswith("(1) "))
+    browser.wait(lambda: browser.run("document.title").startswith("◆ (1) "))
     found = httpx.get(f"{address}/api/v1/alarms").json()["items"]
     assert sorted(each["state"] for each in found) == ["acknowledged"] * 5 + ["open"]
     browser.run("document.querySelector('[data-select]').click()")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from service.app.factory import open_app
-from service.times import shifted
+from service.times import parse_utc, shifted
 from service.web.app import create_app
 from service.web.console.charts.grades.grades import grade_charts
 from service.web.console.charts.grades.panels import TimeAxis
@@ -17,10 +17,11 @@ from tests.filtering.simulated import ARCSEC, attitudes_of, gyro_of, slews, trut
 from tests.fresh_databases import sqlite_at
 from tests.grades.passes import GYRO, MODEL, NOON, mission_with, recorded_of
 from tests.grades.records import put_pass
+from tests.waiting import wait_until
 from tests.web.browser import CHROMIUM
 from tests.web.fitting import assert_fits
 from tests.web.markup import Markup
-from tests.web.serving import Server, in_process_settings
+from tests.web.serving import Server, ended, in_process_settings
 
 PAGE = "/spacecraft/XTE/grades"
 ROUTE = "/api/v1/spacecraft/XTE/innovations"
@@ -147,9 +148,9 @@ def test_what_is_drawn_is_bounded_however_long_the_period(address):
     assert 'class="bar-gyro"' in year.text
 
 
-def test_where_nothing_is_smoothed_the_page_names_the_command(address):
+def test_where_nothing_is_smoothed_the_page_says_so(address):
     page = httpx.get(address + PAGE, params={"run": "bare"}).raise_for_status().text
-    assert "acquire smooth XTE --run bare --start" in text_of(page)
+    assert "No definitive attitude in this period" in text_of(page)
     assert "<svg" not in page.partition('id="grades"')[2].partition("</main>")[0]
     none = httpx.get(address + PAGE, params={"run": "nothing"}).raise_for_status()
     assert "No batches of XTE in run nothing" in text_of(none.text)
@@ -199,3 +200,45 @@ def test_it_fits_and_axe_finds_no_fault(address, run, browser):
     assert_fits(browser, f"{address}{PAGE}?run={run}")
     assert browser.complaints == []
     browser.call("Page.navigate", url="about:blank")
+
+
+@in_browser
+def test_the_definitive_attitude_is_made_with_a_button_and_shows_its_progress(browser, address):
+    page = f"{address}{PAGE}?run=bare"
+    browser.open(page)
+    body = "document.querySelector('main').innerText"
+    assert "No definitive attitude in this period" in browser.run(body)
+    browser.run("definitive.elements.who.value = 'J. Operator'")
+    browser.run("document.querySelector('#definitive .main').click()")
+    browser.wait(lambda: "Done: 1 of 1 days" in browser.run("message.innerText"), 120)
+    browser.wait(lambda: "Stretches and status" in browser.run(body))
+    browser.wait(lambda: "by J. Operator: done, 1 of 1 days" in browser.run("jobs.innerText"))
+    assert_fits(browser, page)
+    api = f"{address}/api/v1/spacecraft/XTE"
+    (job,) = httpx.get(f"{api}/definitive-attitude").json()["items"]
+    assert (job["state"], job["done"], job["recorded"]) == ("done", 1, 1)
+    found = httpx.get(f"{api}/attitude", params={"run": "bare", "grade": "smoothed"}).json()
+    assert len(found["items"]) > 1000
+    # What has not changed stays as it is; an unknown spacecraft and an unknown job are told.
+    again = httpx.post(f"{api}/definitive-attitude", json={"run": "bare", "who": "J. Operator"})
+    assert again.status_code == 202
+    with httpx.Client(base_url=address) as client:
+        assert ended(client, again)["recorded"] == 0
+    assert httpx.get(f"{api}/definitive-attitude/nothing").status_code == 404
+
+
+def test_a_mission_that_asks_for_it_gets_the_definitive_attitude_of_each_day(tmp_path, missions):
+    mission = mission_with(missions["XTE"], smoothing={"daily": True})
+    app = open_app(in_process_settings(sqlite_at(tmp_path / "acquire.db")), mission)
+    try:
+        midnight = parse_utc("1999-03-02T00:00:00Z")
+        # The day before is complete two hours and ten minutes after its end.
+        (early,) = app.definitive.begin_due(shifted(midnight, 2 * 3600.0))
+        (job,) = app.definitive.begin_due(shifted(midnight, 2.5 * 3600.0))
+        assert app.definitive.begin_due(shifted(midnight, 12 * 3600.0)) == []
+        assert early.end == "1999-03-01T00:00:00.000Z"
+        assert (job.start, job.end) == ("1999-02-26T00:00:00.000Z", "1999-03-02T00:00:00.000Z")
+        assert (job.who, job.spacecraft) == ("schedule", "XTE")
+        wait_until(lambda: app.definitive.get("XTE", job.id).state == "done")
+    finally:
+        app.close()

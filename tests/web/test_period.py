@@ -111,7 +111,7 @@ def test_alarms_are_bars_below_the_trends_and_lead_to_the_alarm(browser, address
     browser.wait(lambda: browser.run(f"{bars}.length"))
     named = browser.run(f"{bars}.map(each => each.getAttribute('aria-label'))")
     (own,) = [each for each in named if SECOND in each]
-    assert own.startswith(f"warning: {SECOND}: residual over predicted, from 1996-01-10 12:1")
+    assert own.startswith(f"warning: {SECOND}: residual over predicted, from 1996-01-10 (010) 12:1")
     # It recovered: the bar ends before the chart does, and stands below its own area.
     assert "until now" not in own
     place = (

@@ -42,3 +42,14 @@ def test_an_unknown_problem_is_not_found(client):
 def test_the_guide_has_every_type_with_its_status():
     rows = re.findall(r"^\| (\d+) \| `(/problems/[\w-]+)` \|", GUIDE.read_text("utf-8"), re.M)
     assert set(rows) == {(str(kind.status), kind.type) for kind in types_with_pages().values()}
+
+
+def test_an_unknown_address_is_a_page_for_browsers_and_a_problem_for_programs(client):
+    page = client.get("/nope", headers={"Accept": "text/html,*/*"})
+    assert page.status_code == 404
+    assert page.headers["Content-Type"].startswith("text/html")
+    assert "There is no page at /nope." in text_of(page)
+    for path, accept in (("/nope", "*/*"), ("/api/v1/nope", "text/html")):
+        problem = client.get(path, headers={"Accept": accept})
+        assert problem.status_code == 404
+        assert problem.headers["Content-Type"] == "application/problem+json"

@@ -211,7 +211,7 @@ def test_trends_are_tables_with_units(client, full_run, tmp_path):
 
 
 def test_the_console_links_the_attitudes_of_the_range_in_every_format(client, full_run):
-    page = client.get("/spacecraft/XTE", params={"run": full_run}).text
+    page = client.get("/spacecraft/XTE/files", params={"run": full_run}).text
     links = [html.unescape(each) for each in re.findall(r'href="([^"]+/attitude\?[^"]+)"', page)]
     shown = {httpx.URL(each).params["format"]: each for each in links}
     assert list(shown) == list(attitude_formats())
@@ -221,7 +221,7 @@ def test_the_console_links_the_attitudes_of_the_range_in_every_format(client, fu
 
 
 def test_the_console_links_the_tables_of_the_range(client, full_run):
-    page = client.get("/spacecraft/XTE", params={"run": full_run}).text
+    page = client.get("/spacecraft/XTE/files", params={"run": full_run}).text
     for kind in ("batches", "stars"):
         found = re.findall(rf'href="([^"]+/tables/{kind}\?[^"]+)"', page)
         links = {httpx.URL(html.unescape(each)) for each in found}

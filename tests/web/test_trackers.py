@@ -91,7 +91,7 @@ def test_an_alarm_names_its_tracker_and_leads_to_its_trends(client, filled):
     assert {None, FIRST, SECOND} >= set(ratios)
     page = client.get(f"/alarms/{ratios[SECOND]['id']}").raise_for_status().text
     assert f"residual over predicted, {SECOND}</h1>" in page
-    assert "alarm-trend" in page
+    assert 'data-chart="residual-ratio"' in page
     (trends,) = set(re.findall(r'href="(/spacecraft/XTE\?[^"]*tracker=[^"]*)"', page))
     assert client.get(html.unescape(trends)).status_code == 200
     assert f"residual over predicted, {SECOND}" in client.get("/alarms").text

@@ -6,6 +6,7 @@ from ..base import Page
 from ..encoding import Time, path_of
 from ..models import (
     AttitudeRow,
+    DefinitiveJob,
     History,
     Innovation,
     LiveAttitude,
@@ -57,6 +58,25 @@ class Spacecraft(Connection):
     def live_attitude(self, spacecraft: str) -> LiveAttitude:
         """The filtered attitude at the last epoch, of a mission with a live filter."""
         return self.get(LiveAttitude, path_of("spacecraft", spacecraft, "attitude", "latest"))
+
+    def make_definitive_attitude(
+        self,
+        spacecraft: str,
+        *,
+        run: str = "live",
+        start: Time | None = None,
+        end: Time | None = None,
+        who: str | None = None,
+    ) -> DefinitiveJob:
+        """Let the service filter and smooth the days of a period; the job goes on beside it."""
+        asked = {"run": run, "start": start, "end": end, "who": who}
+        path = path_of("spacecraft", spacecraft, "definitive-attitude")
+        return self.post(DefinitiveJob, path, asked)
+
+    def definitive_attitude(self, spacecraft: str, id: str) -> DefinitiveJob:
+        """How far a job is that makes a definitive attitude."""
+        path = path_of("spacecraft", spacecraft, "definitive-attitude", id)
+        return self.get(DefinitiveJob, path)
 
     def innovations(
         self,

@@ -65,6 +65,7 @@ from .replays import (
 )
 from .spacecraft import (
     AttitudeRow,
+    DefinitiveJob,
     History,
     Innovation,
     LiveAttitude,
@@ -103,6 +104,7 @@ __all__ = [
     "CalibrationResult",
     "CalibrationSummary",
     "CalibrationUnknown",
+    "DefinitiveJob",
     "Detection",
     "FocalPlane",
     "FrameSummary",

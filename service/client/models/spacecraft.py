@@ -62,6 +62,28 @@ class Innovation(Model, frozen=True, kw_only=True):
     revision: int
 
 
+class DefinitiveJob(Model, frozen=True, kw_only=True):
+    """The making of a definitive attitude, with the days that are finished.
+
+    `state` is queued, running, done, failed or interrupted; `recorded` counts days with a new
+    revision.
+    """
+
+    id: str
+    spacecraft: str
+    run: str
+    start: str | None
+    end: str | None
+    who: str
+    created: str
+    ended: str | None
+    state: str
+    done: int
+    total: int
+    recorded: int
+    fault: str | None
+
+
 class SpacecraftRow(Model, frozen=True, kw_only=True):
     """The state of a spacecraft in a run.
 

@@ -101,3 +101,31 @@ class InnovationPage(Record, frozen=True, kw_only=True):
     component: ClassVar[str] = "InnovationPage"
     items: list[Innovation]
     next_cursor: str | None
+
+
+class DefinitiveJob(Record, frozen=True, kw_only=True):
+    """The making of a definitive attitude: filtered and smoothed attitudes of recorded days."""
+
+    component: ClassVar[str] = "DefinitiveJob"
+    id: Id
+    spacecraft: str
+    run: str
+    start: Annotated[Moment | None, doc("null: from the first day with batches.")]
+    end: Annotated[Moment | None, doc("null: to the last.")]
+    who: Annotated[str, doc("`schedule`: the mission asks for it each day.")]
+    created: Stamp
+    ended: Stamp | None
+    state: Annotated[
+        str, DescribedAs(Literal["queued", "running", "done", "failed", "interrupted"])
+    ]
+    done: Annotated[int, doc("Days that are finished.")]
+    total: Annotated[int, doc("Days with batches; 0 until they are counted.")]
+    recorded: Annotated[int, doc("Days that got a new revision; the others had not changed.")]
+    fault: str | None
+
+
+class DefinitiveJobList(Record, frozen=True, kw_only=True):
+    """Jobs since the start of the service, the newest first."""
+
+    component: ClassVar[str] = "DefinitiveJobList"
+    items: list[DefinitiveJob]

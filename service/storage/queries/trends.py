@@ -39,6 +39,8 @@ Source = Literal["batch", "hour", "day"]
 MAX_SIZE = 1_500
 PAGE = 1_000
 """Batches that are read together where all of a period are given."""
+LEAST_OF_CUT = 10
+"""Batches of a bucket that the span cuts, from which on it has a rate."""
 MAX_HOURS_READ = 1_500
 """Of one answer; a period with more is drawn from days at the finest."""
 
@@ -151,8 +153,9 @@ def _thinned(
     number = np.floor(cells["unix_s"] / width_s)
     _, first = np.unique(number, return_index=True)
     unix_s = number[first] * width_s
-    reduced = _Reduced(cells, first, _covered_h(unix_s, width_s, span))
-    counts = reduced.sum("batches").astype(int).tolist()
+    number_of = np.add.reduceat(cells["batches"], first) if len(first) else cells["batches"]
+    reduced = _Reduced(cells, first, _covered_h(unix_s, width_s, span, number_of))
+    counts = number_of.astype(int).tolist()
     return History(
         spacecraft=span.spacecraft,
         run=span.run,
@@ -168,10 +171,15 @@ def _thinned(
     )
 
 
-def _covered_h(unix_s: Vector, width_s: int, span: BucketFilter) -> Vector:
-    """The hours of each bucket that lie within the span."""
+def _covered_h(unix_s: Vector, width_s: int, span: BucketFilter, counts: Vector) -> Vector:
+    """The hours of each bucket that lie within the span; NaN of one that has no rate.
+
+    A batch more or less at the cut of a span would double the rate of a few.
+    """
     begin_s, end_s = unix_seconds([span.start.tai_ns, span.end.tai_ns])
-    return np.asarray(np.minimum(unix_s + width_s, end_s) - np.maximum(unix_s, begin_s)) / HOUR_S
+    covered_s = np.minimum(unix_s + width_s, end_s) - np.maximum(unix_s, begin_s)
+    has_no_rate = (covered_s < width_s) & (counts < LEAST_OF_CUT)
+    return np.asarray(np.where(has_no_rate, np.nan, covered_s)) / HOUR_S
 
 
 class _Reduced:

@@ -35,6 +35,7 @@ from service.web.requests.headers import NO_IDEMPOTENCY_KEY, NO_KEY_OF_MANY, ide
 from service.web.requests.problems import problem_within
 from service.web.requests.query_parameters import NO_QUERY, BatchQuery, require_no_query
 from service.web.requests.request_body import BINARY, JsonBody, json_body, read_model, refused
+from service.web.requests.statements import Comment, Who
 
 router = APIRouter(prefix="/api/v1/batches", tags=["batches"])
 
@@ -56,6 +57,8 @@ class WhatIfIn(Wire):
         StrictBool,
         Field(description="Record the result, and make it the current one of its batch."),
     ] = False
+    who: Who = None
+    comment: Comment = None
 
 
 @router.post(

@@ -22,6 +22,8 @@ STATES: Mapping[str, tuple[str, str]] = {
     "suspect": ("▲", "suspect"),
     "no_attitude": ("○", "no attitude"),
     "no_batches": ("–", "no batches"),
+    "silent": ("◌", "silent"),
+    "behind": ("◌", "behind"),
     "unique": ("●", "unique"),
     "ambiguous": ("▲", "ambiguous"),
     "unmatched": ("✕", "unmatched"),
@@ -142,6 +144,11 @@ def count(value: int | None) -> str:
     return DASH if value is None else f"{value:,}".replace(",", THIN)
 
 
+def plural(number: int, word: str) -> str:
+    """A count with its word."""
+    return f"{count(number)} {word}{'' if number == 1 else 's'}"
+
+
 def microseconds(value: float | None) -> str:
     """Microseconds, or milliseconds where they become many."""
     if value is None:
@@ -153,7 +160,7 @@ def microseconds(value: float | None) -> str:
 
 def size(value: int) -> str:
     """Bytes in kB and MB."""
-    for least, unit in ((1_000_000, "MB"), (1_000, "kB")):
+    for least, unit in ((1_000_000_000, "GB"), (1_000_000, "MB"), (1_000, "kB")):
         if value >= least:
             return f"{value / least:.1f}{THIN}{unit}"
     return f"{value}{THIN}B"
@@ -195,6 +202,38 @@ def quantity(value: float | None, name: str) -> str:
     return share(value) if known.is_share else UNITS.get(known.unit, number)(value)
 
 
+def unit_of(name: str) -> str:
+    """The unit in which a quantity is written and entered; shares are percent."""
+    known = quantity_named(name)
+    return "%" if known.is_share else ENTERED_UNITS.get(known.unit, known.unit)
+
+
+def entered(value: float | None, name: str) -> str:
+    """A bound of a quantity in `unit_of` it, as a field of a form has it; empty without one."""
+    if value is None:
+        return ""
+    return f"{100 * value if quantity_named(name).is_share else value:.6g}"
+
+
+def bounds(settings: Mapping[str, Any], name: str) -> str:
+    """The limits of a quantity in words."""
+    if not settings["enabled"]:
+        return "off"
+    parts = [
+        f"{severity} {word} {quantity(settings[severity][bound], name)}"
+        for severity in ("watch", "warning", "critical")
+        for bound, word in (("low", "below"), ("high", "above"))
+        if settings[severity][bound] is not None
+    ]
+    if not parts:
+        return "no bounds, so it raises no alarm"
+    held = f"hysteresis {quantity(settings['hysteresis'], name)}"
+    count = f"over {settings['minimum_count']} batches"
+    return f"{', '.join(parts)}; {held}, {count}, for {age(settings['duration_s'])}"
+
+
+ENTERED_UNITS: Mapping[str, str] = {"1": "", "arcsec": "″", "deg": "°"}
+
 _INVISIBLE = re.compile(
     r"[\x00-\x1f\x7f-\x9f\u00ad\u034f\u061c\u115f\u1160\u17b4\u17b5\u180b-\u180f\u200b-\u200f"
     r"\u2028-\u202e\u2060-\u206f\u2800\u3164\ufe00-\ufe0f\ufeff\uffa0\ufff0-\ufffb"
@@ -232,5 +271,8 @@ FILTERS: Mapping[str, Callable[..., Any]] = {
     "plain": plain,
     "state": state,
     "quantity": quantity,
+    "unit_of": unit_of,
+    "entered": entered,
+    "bounds": bounds,
     "called": lambda name: quantity_named(name).label,
 }

@@ -1,7 +1,8 @@
 """The context of every page: the app and the reader, and the layout around its content."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import Depends
 from pydantic import Field
@@ -9,9 +10,10 @@ from starlette.requests import Request
 
 from service import logs
 from service.access.tokens import Caller
+from service.alarms.limits import Severity
 from service.app.factory import App
 from service.observations.schema import RunName
-from service.storage.queries.alarms import summary
+from service.storage.models.alarms import Alarm
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc
 from service.web.console.formatting import present
@@ -20,7 +22,15 @@ from service.web.requests.access import CallerDep
 from service.web.requests.dependencies import AppDep
 from service.web.requests.query_parameters import Query
 
-__all__ = ["EMPTY_LAYOUT", "LIVE", "ContextDep", "Layout", "PageContext", "PageQuery"]
+__all__ = [
+    "EMPTY_LAYOUT",
+    "LIVE",
+    "ContextDep",
+    "Layout",
+    "PageContext",
+    "PageQuery",
+    "SortedQuery",
+]
 
 
 class PageQuery(Query):
@@ -30,6 +40,22 @@ class PageQuery(Query):
         LIVE
     )
 
+    def address(self, **changed: Any) -> dict[str, Any]:
+        """The parameters of this page with some changed; those at their default are left out."""
+        asked = {name: changed.get(name, value) for name, value in self if name != "run"}
+        fields = type(self).model_fields
+        kept = {name: value for name, value in asked.items() if value != fields[name].default}
+        return {
+            name: str(value).lower() if isinstance(value, bool) else value
+            for name, value in kept.items()
+        }
+
+
+class SortedQuery(PageQuery):
+    """A table that is sorted by one of its columns."""
+
+    descending: bool | None = None
+
 
 @dataclass(frozen=True)
 class RunChoice:
@@ -37,6 +63,36 @@ class RunChoice:
 
     name: str
     batches: int | None
+
+
+@dataclass(frozen=True)
+class AlarmCounts:
+    """How many alarms there are that are not cleared; each is counted once.
+
+    `open` are out of limits now and nobody has acknowledged them; `returned` are back in limits
+    and wait for that.
+    """
+
+    open: int
+    acknowledged: int
+    returned: int
+    shelved: int
+    worst: str | None
+    """The worst present severity of those that are out of limits and not shelved."""
+
+
+def alarm_counts(found: Sequence[Alarm]) -> AlarmCounts:
+    """The counts of alarms that are not cleared."""
+    unshelved = [each for each in found if each.state != "shelved"]
+    out = [each for each in unshelved if not each.in_limits]
+    severities = [each.current_severity for each in out if each.current_severity]
+    return AlarmCounts(
+        open=sum(each.state == "open" for each in out),
+        acknowledged=sum(each.state == "acknowledged" for each in out),
+        returned=len(unshelved) - len(out),
+        shelved=len(found) - len(unshelved),
+        worst=max(severities, key=lambda word: Severity[word.upper()], default=None),
+    )
 
 
 @dataclass(frozen=True)
@@ -60,9 +116,8 @@ class Layout:
     may_operate: bool = False
     address: str = ""
     """Of the service, as the reader's browser has it."""
-    open_alarms: int = 0
-    """Alarms of the run that nobody has acknowledged or shelved; every page counts them."""
-    worst_alarm: str | None = None
+    alarms: "AlarmCounts | None" = None
+    """Alarms of the run, which every page counts; None: of a page that shows no run."""
     stands_by: bool = False
     """Whether another service writes to the database."""
     behind_s: float = 0.0
@@ -121,7 +176,7 @@ class PageContext:
         """The layout of the page that shows a run."""
         batches = {each.run: each.batches for each in self.app.runs.all(self.caller.spacecraft)}
         active = self.app.alarms.active(run)
-        alarms = summary([each for each in active if self.caller.may_see(each.spacecraft)])
+        alarms = alarm_counts([each for each in active if self.caller.may_see(each.spacecraft)])
         names = sorted({LIVE, run, *batches}, key=lambda name: (name != LIVE, name))
         return Layout(
             run=run,
@@ -134,8 +189,7 @@ class PageContext:
             reader=self.caller.name if self.caller.token_id else None,
             may_operate="operate" in self.caller.scopes,
             address=self.address,
-            open_alarms=alarms.open,
-            worst_alarm=alarms.worst,
+            alarms=alarms,
             stands_by=not self.app.single_writer.is_writing,
             behind_s=request.behind_s if (request := logs.request.get()) is not None else 0.0,
         )

@@ -11,6 +11,7 @@ from fastapi.routing import APIRoute
 from jinja2 import Environment, PackageLoader, StrictUndefined, pass_context
 from jinja2.runtime import Context
 from markupsafe import Markup
+from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response
 
@@ -24,7 +25,7 @@ from service.web.requests.problem_types import (
     ProblemType,
     problem_type_of,
 )
-from service.web.requests.problems import faults_in_query
+from service.web.requests.problems import faults_in_query, on_http_error
 
 HEADERS: Mapping[str, str] = {
     "Content-Security-Policy": (
@@ -101,6 +102,18 @@ class PageRoute(APIRoute):
                 return answer
 
         return handler
+
+
+async def page_or_problem(request: Request, error: Exception) -> Response:
+    """What a browser that follows a link to no page gets is a page; all others get a problem."""
+    is_page = not request.url.path.startswith(("/api/", "/static/"))
+    asks_for_page = "text/html" in request.headers.get("accept", "")
+    if not (isinstance(error, HTTPException) and error.status_code == 404):
+        return await on_http_error(request, error)
+    if not (is_page and asks_for_page and request.method in ("GET", "HEAD")):
+        return await on_http_error(request, error)
+    detail = f"There is no page at {request.url.path[:200]}."
+    return _error_page(ProblemType(404, "Not found"), {"detail": detail})
 
 
 def _error_page(kind: ProblemType, problem: Mapping[str, Any]) -> Response:

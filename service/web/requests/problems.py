@@ -113,7 +113,8 @@ async def _on_query_fault(request: Request, error: Exception) -> Response:
     )
 
 
-async def _on_http_error(request: Request, error: Exception) -> Response:
+async def on_http_error(request: Request, error: Exception) -> Response:
+    """The problem of an address or a method that there is not."""
     assert isinstance(error, HTTPException)
     phrase = HTTPStatus(error.status_code).phrase
     headers = dict(error.headers or {})
@@ -154,7 +155,7 @@ async def _on_disconnect(request: Request, error: Exception) -> Response:
 _HANDLERS: Mapping[type[Exception], Callable[[Request, Exception], Awaitable[Response]]] = {
     AcquisitionError: _on_acquisition_error,
     RequestValidationError: _on_query_fault,
-    HTTPException: _on_http_error,
+    HTTPException: on_http_error,
     ClientDisconnect: _on_disconnect,
 }
 

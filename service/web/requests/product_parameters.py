@@ -20,7 +20,8 @@ LargestGap = Annotated[
         le=MAX_LARGEST_GAP_S,
         allow_inf_nan=False,
         description="Attitudes farther apart than this, in seconds, belong to two stretches. "
-        "Default: the mission's.",
+        "Default: the mission's; of raw attitudes of a mission without the key, at least 60 and "
+        "two and a half times the usual time between batches of the period.",
     ),
 ]
 Statuses = Annotated[

@@ -82,7 +82,7 @@ class Query(BaseModel):
         return {name: getattr(self, name) for name in type(self).model_fields}
 
 
-def _require_order(start: Utc | None, end: Utc | None) -> None:
+def require_order(start: Utc | None, end: Utc | None) -> None:
     """Raise `ValueError` for a period that ends before it starts."""
     if start and end and start.tai_ns > end.tai_ns:
         raise ValueError(f"start {start} must not be after end {end}")
@@ -112,7 +112,7 @@ class PeriodQuery(Query):
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
-        _require_order(self.start, self.end)
+        require_order(self.start, self.end)
         return self
 
 
@@ -288,7 +288,7 @@ class AnnotationQuery(Query):
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
-        _require_order(self.start, self.end)
+        require_order(self.start, self.end)
         return self
 
 

@@ -4,14 +4,16 @@ from collections.abc import Sequence
 
 from sqlalchemy import Connection, or_, select
 
-from service.storage.models.alarms import AlarmSpan
+from service.storage.models.alarms import Alarm, AlarmSpan
+from service.storage.queries.alarms import shown_alarm
 from service.storage.sql.alarm_tables import alarm_actions, alarms
-from service.storage.sql.columns import Row
-from service.times import Utc, recorded_utc
+from service.times import Utc, recorded_utc, utc_now
 
 MOST = 200
 """Alarms of a period that are read, the newest: more could not be told apart on a chart."""
 _LEFT, _RETURNED = ("raised", "left_again"), "returned"
+TimeOut = tuple[str, str | None]
+"""From when to when; None: it still is."""
 
 
 def alarm_spans(
@@ -33,8 +35,25 @@ def alarm_spans(
         .order_by(alarms.c.id.desc())
         .limit(MOST)
     )
-    found = [dict(row) for row in connection.execute(chosen).mappings()]
-    actions: dict[str, list[Row]] = {row["id"]: [] for row in found}
+    found = [shown_alarm(row, utc_now().text) for row in connection.execute(chosen).mappings()]
+    spans = [
+        AlarmSpan(
+            id=alarm.id,
+            quantity=alarm.quantity,
+            tracker=alarm.tracker,
+            severity=alarm.severity,
+            start=begin,
+            end=until,
+        )
+        for alarm, times in zip(found, times_out(connection, found), strict=True)
+        for begin, until in times
+    ]
+    return sorted((each for each in spans if _touches(each, start, end)), key=lambda s: s.start)
+
+
+def times_out(connection: Connection, found: Sequence[Alarm]) -> list[list[TimeOut]]:
+    """For each alarm, from when to when it was out of its limits, in telemetry time."""
+    actions: dict[str, list[tuple[str, str | None]]] = {alarm.id: [] for alarm in found}
     noted = (
         select(alarm_actions.c.alarm_id, alarm_actions.c.action, alarm_actions.c.time)
         .where(
@@ -43,34 +62,21 @@ def alarm_spans(
         )
         .order_by(alarm_actions.c.id)
     )
-    for row in connection.execute(noted).mappings():
-        actions[row["alarm_id"]].append(dict(row))
-    spans = [
-        AlarmSpan(
-            id=alarm["id"],
-            quantity=alarm["quantity"],
-            tracker=alarm["tracker"] or None,
-            severity=alarm["severity"],
-            start=begin,
-            end=until,
-        )
-        for alarm in found
-        for begin, until in _out_of_limits(alarm, actions[alarm["id"]])
-    ]
-    return sorted((each for each in spans if _touches(each, start, end)), key=lambda s: s.start)
+    for id, action, time in connection.execute(noted):
+        actions[id].append((action, time))
+    return [_times_out(alarm, actions[alarm.id]) for alarm in found]
 
 
-def _out_of_limits(alarm: Row, actions: Sequence[Row]) -> list[tuple[str, str | None]]:
-    """From when to when it was out of its limits; None: it still is."""
-    spans: list[tuple[str, str | None]] = [(alarm["raised_time"], None)]
-    for each in actions:
+def _times_out(alarm: Alarm, actions: Sequence[tuple[str, str | None]]) -> list[TimeOut]:
+    spans: list[TimeOut] = [(alarm.raised.time, None)]
+    for action, time in actions:
         begin, until = spans[-1]
-        if each["action"] == _RETURNED:
-            spans[-1] = begin, until or each["time"]
-        elif each["action"] == "left_again":
-            spans.append((each["time"], None))
-    if alarm["current_severity"] is None and spans[-1][1] is None:
-        spans[-1] = spans[-1][0], alarm["latest_time"]
+        if action == _RETURNED:
+            spans[-1] = begin, until or time
+        elif action == "left_again" and time is not None:
+            spans.append((time, None))
+    if alarm.in_limits and spans[-1][1] is None:
+        spans[-1] = spans[-1][0], alarm.latest.time
     return spans
 
 

@@ -1,80 +1,212 @@
 """The pages of alarms: the list of a run by state, and one with its cause and its history."""
 
-from typing import Annotated, Literal
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
 
 from fastapi import Path
 from fastapi import Query as InQuery
-from msgspec import UNSET
 from starlette.responses import Response
 
 from service.alarms.causes import CAUSES
-from service.alarms.quantities import trend_names
+from service.alarms.limits import Severity
+from service.alarms.quantities import quantity_named, trend_names
+from service.alarms.subjects import limited_trackers
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key
-from service.storage.models.alarms import Alarm, AlarmWithActions
-from service.times import Utc, recorded_utc, shifted, unix_seconds
-from service.web.console.charts.alarm_trend import AlarmTrend, alarm_trend
-from service.web.console.page_context import ContextDep, PageContext, PageQuery
+from service.storage.models.alarms import Alarm, AlarmWithActions, Limit, SeverityName
+from service.storage.queries.period.alarms import TimeOut
+from service.times import Utc, recorded_utc, shifted
+from service.web.console.formatting import with_day_of_year
+from service.web.console.page_context import ContextDep, PageContext, SortedQuery
+from service.web.console.pages.one_spacecraft.trend_charts import (
+    charts_by_quantity,
+    history_address,
+)
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
 from service.web.requests.query_parameters import Cursor, Query
 
 ROWS = 200
-STATES = ("active", "open", "acknowledged", "shelved", "cleared", "all")
+State = Literal["active", "open", "returned", "acknowledged", "shelved", "cleared", "all"]
+STATES: dict[State, str] = {
+    "active": "not cleared",
+    "open": "open and out of limits",
+    "returned": "back in limits",
+    "acknowledged": "acknowledged",
+    "shelved": "shelved",
+    "cleared": "cleared",
+    "all": "all, with history",
+}
+Order = Literal["last", "severity", "spacecraft", "quantity", "times", "duration", "raised"]
+Grouping = Literal["", "time", "quantity", "spacecraft"]
+NAMES = ("spacecraft", "quantity")
+"""Orders that begin with A; all others begin with the latest or the greatest."""
+GROUPINGS: dict[Grouping, str] = {
+    "": "not grouped",
+    "time": "left limits together",
+    "quantity": "one quantity, one usual cause",
+    "spacecraft": "one spacecraft",
+}
 BEFORE_S, AFTER_S = 1800.0, 1800.0
 """Around the time at which an alarm was raised: what its links and its trend show."""
-TREND_BEFORE_S, TREND_POINTS = 4 * 3600.0, 160
+TREND_BEFORE_S = 4 * 3600.0
 TOGETHER_S = 1800.0
-"""Alarms of one spacecraft that were raised within this time are likely to have one cause."""
-
-Clock = Literal["telemetry", "receipt"]
-CLOCKS: dict[Clock, str] = {
-    "telemetry": "telemetry time, that of the batches",
-    "receipt": "receipt time, by the clock of the service",
-}
+"""Alarms that left their limits within this time are likely to have one cause."""
 
 
-class AlarmsQuery(PageQuery):
-    """Which alarms, by which clock; an empty spacecraft stands for every one."""
+class AlarmsQuery(SortedQuery):
+    """Which alarms, in which order; an empty field of the form stands for any value."""
 
-    state: Literal["active", "open", "acknowledged", "shelved", "cleared", "all"] = "active"
+    state: State = "active"
     spacecraft: Key | Literal[""] = ""
+    severity: SeverityName | Literal[""] = ""
+    sort: Order = "last"
+    group: Grouping = ""
     cursor: Cursor = None
-    clock: Clock = "telemetry"
 
 
-class AlarmQuery(Query):
-    """By which clock the history of an alarm is shown."""
+@dataclass(frozen=True)
+class AlarmLine:
+    """An alarm with the times at which it was out of its limits, in telemetry time."""
 
-    run: str | None = None
-    clock: Clock = "telemetry"
+    alarm: Alarm
+    times: list[TimeOut]
+
+    @property
+    def last(self) -> TimeOut:
+        """The latest of them; without an end, it is out now."""
+        return self.times[-1]
+
+    @property
+    def last_ns(self) -> int:
+        """When the latest of them began, on the clock of TAI."""
+        return recorded_utc(self.last[0]).tai_ns
+
+    @property
+    def duration_s(self) -> float:
+        """How long they last together; the present one lasts until the latest value."""
+        ends = [recorded_utc(end or self.alarm.latest.time).tai_ns for _, end in self.times]
+        starts = [recorded_utc(start).tai_ns for start, _ in self.times]
+        return max(0, sum(ends) - sum(starts)) * 1e-9
+
+
+@dataclass(frozen=True)
+class AlarmGroup:
+    """Alarms with something in common; without a grouping there is one, without a title."""
+
+    title: str
+    lines: list[AlarmLine]
 
 
 @console_page("/alarms", "Alarms", Policy("read", "nothing"), position=20)
 def alarms_page(query: Annotated[AlarmsQuery, InQuery()], context: ContextDep) -> Response:
-    """The alarms of a run, newest first."""
+    """The alarms of a run, those that left their limits last first."""
     if query.spacecraft:
         context.caller.require(query.spacecraft)
     elif context.caller.spacecraft is not None:
         query = query.model_copy(update={"spacecraft": context.first_spacecraft})
-    page = context.app.alarms.page(
-        run=query.run,
-        spacecraft=query.spacecraft or None,
-        state=query.state,
-        limit=ROWS,
-        cursor=query.cursor,
-    )
+    found, next_cursor = _found(context, query)
+    lines = [
+        AlarmLine(alarm, times)
+        for alarm, times in zip(found, context.app.alarms.times_out(found), strict=True)
+    ]
+    lines = _sorted(lines, query)
     return rendered(
         "alarms.html.jinja",
         context.layout(query.run),
         query=query,
-        page=page,
+        groups=_grouped(lines[:ROWS], query.group),
+        left_out=max(0, len(lines) - ROWS),
+        next_cursor=next_cursor,
         states=STATES,
-        clocks=CLOCKS,
+        severities=[each.word for each in Severity],
+        groupings=GROUPINGS,
         spacecraft=context.spacecraft,
         is_retired=context.app.alarms.is_retired,
     )
+
+
+def _found(context: PageContext, query: AlarmsQuery) -> tuple[list[Alarm], str | None]:
+    """The alarms that match: every one that is not cleared, or a page of the history."""
+    next_cursor = None
+    if query.state in ("cleared", "all"):
+        page = context.app.alarms.page(
+            run=query.run,
+            spacecraft=query.spacecraft or None,
+            state=query.state,
+            limit=ROWS,
+            cursor=query.cursor,
+        )
+        found, next_cursor = page.items, page.next_cursor
+    else:
+        found = context.app.alarms.active(query.run)
+    return [each for each in found if _matches(each, query)], next_cursor
+
+
+def _matches(alarm: Alarm, query: AlarmsQuery) -> bool:
+    if query.spacecraft not in ("", alarm.spacecraft):
+        return False
+    if query.severity not in ("", alarm.severity):
+        return False
+    match query.state:
+        case "open":
+            return alarm.state == "open" and not alarm.in_limits
+        case "returned":
+            return alarm.in_limits and alarm.state in ("open", "acknowledged")
+        case "acknowledged" | "shelved":
+            return alarm.state == query.state
+    return True
+
+
+def _sorted(lines: list[AlarmLine], query: AlarmsQuery) -> list[AlarmLine]:
+    """In the asked order; of equals, those that left their limits last come first."""
+    keys: dict[Order, Callable[[AlarmLine], Any]] = {
+        "last": lambda line: (line.last[1] is None, line.last_ns),
+        "severity": lambda line: Severity[line.alarm.severity.upper()],
+        "spacecraft": lambda line: line.alarm.spacecraft,
+        "quantity": lambda line: (line.alarm.quantity, line.alarm.tracker or ""),
+        "times": lambda line: len(line.times),
+        "duration": lambda line: line.duration_s,
+        "raised": lambda line: recorded_utc(line.alarm.raised.time).tai_ns,
+    }
+    ordered = sorted(lines, key=keys["last"], reverse=True)
+    is_down = query.sort not in NAMES if query.descending is None else query.descending
+    return sorted(ordered, key=keys[query.sort], reverse=is_down)
+
+
+def _grouped(lines: list[AlarmLine], grouping: Grouping) -> list[AlarmGroup]:
+    """The groups in the order of their first lines."""
+    groups: dict[Any, list[AlarmLine]] = {}
+    if grouping == "time":
+        # Each group is what left its limits within `TOGETHER_S` after its first.
+        begun_ns: float = -math.inf
+        for line in sorted(lines, key=lambda each: each.last_ns):
+            if line.last_ns - begun_ns > TOGETHER_S * 1e9:
+                begun_ns = line.last_ns
+            groups.setdefault(begun_ns, []).append(line)
+        places = {id(line): k for k, line in enumerate(lines)}
+        for group in groups.values():
+            group.sort(key=lambda line: places[id(line)])
+        return [
+            AlarmGroup(f"Left limits at {with_day_of_year(group[0].last[0], False)} UTC", group)
+            for group in sorted(groups.values(), key=lambda group: places[id(group[0])])
+        ]
+    for line in lines:
+        key = getattr(line.alarm, grouping) if grouping else ""
+        groups.setdefault(key, []).append(line)
+    return [
+        AlarmGroup(quantity_named(key).label if grouping == "quantity" else key, group)
+        for key, group in groups.items()
+    ]
+
+
+class AlarmQuery(Query):
+    """The run in the address of the page is that of the alarm."""
+
+    run: str | None = None
 
 
 @console_page("/alarms/{id}", "Alarm", Policy("read", "nothing"), section="/alarms")
@@ -90,12 +222,12 @@ def alarm_page(
     around = {"start": shifted(raised, -BEFORE_S).text, "end": shifted(raised, AFTER_S).text}
     of_tracker = {"tracker": alarm.tracker} if _has_tracker(context, alarm) else {}
     is_retired = context.app.alarms.is_retired(alarm.spacecraft, alarm.tracker)
+    (times,) = context.app.alarms.times_out([alarm])
     return rendered(
         "alarm.html.jinja",
         context.layout(alarm.run),
         alarm=alarm,
-        clock=query.clock,
-        clocks=CLOCKS,
+        line=AlarmLine(alarm, times),
         is_retired=is_retired,
         cause=CAUSES.get(alarm.quantity),
         related=_related(context, alarm),
@@ -139,33 +271,31 @@ def _related(context: PageContext, alarm: AlarmWithActions) -> list[Alarm]:
     return [other for other in context.app.alarms.active(alarm.run) if is_related(other)]
 
 
+@dataclass(frozen=True)
+class AlarmTrend:
+    """The chart of an alarm's quantity before and since the raise."""
+
+    start: Utc
+    end: Utc
+    history: str
+    chart: dict[str, Any]
+    limits: list[Limit]
+
+
 def _trend(context: PageContext, alarm: AlarmWithActions) -> AlarmTrend | None:
     """The quantity before and since the raise; None without a history."""
     if alarm.quantity not in trend_names() or alarm.spacecraft not in context.app.context.known:
         return None
     if alarm.tracker is not None and not _has_tracker(context, alarm):
         return None
-    raised = recorded_utc(alarm.raised.time)
-    start = shifted(raised, -TREND_BEFORE_S)
-    end = _end(alarm)
-    found = context.app.spacecraft.history(
-        alarm.spacecraft,
-        run=alarm.run,
-        start=start,
-        end=end,
-        size=TREND_POINTS,
-        quantities=[alarm.quantity],
-        tracker=alarm.tracker,
-    )
-    means = found.series[alarm.quantity].mean
-    assert means is not UNSET
-    start_s, end_s, raised_s = unix_seconds([each.tai_ns for each in (start, end, raised)]).tolist()
-    return alarm_trend(
-        found.unix_s,
-        means,
-        start_s=start_s,
-        end_s=end_s,
-        step_s=float(found.bucket_s or 1),
-        bound=alarm.raised.bound,
-        raised_s=raised_s,
+    tracker = alarm.tracker
+    start, end = shifted(recorded_utc(alarm.raised.time), -TREND_BEFORE_S), _end(alarm)
+    limited = limited_trackers(context.app.context.known[alarm.spacecraft])
+    limits = context.app.limits.all(alarm.spacecraft, tracker if tracker in limited else None)
+    return AlarmTrend(
+        start,
+        end,
+        history_address(alarm.spacecraft, alarm.run, tracker, start, end, quantity=alarm.quantity),
+        charts_by_quantity()[alarm.quantity],
+        [each for each in limits if each.quantity == alarm.quantity],
     )

@@ -11,11 +11,12 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
 from service.alarms.quantities import QUANTITIES
-from service.errors import BadBatch, Fault, shown_value
+from service.errors import BadBatch, Fault, NotFound, shown_value
 from service.storage.models.answers import Answer
 from service.storage.models.answers import Star as FoundStar
 from service.storage.models.star_field import ObservedStarPlace, StarField
 from service.storage.queries.results import answer_from_json
+from service.storage.recording.ids import is_ulid
 from service.storage.tracks.models import TrackList
 from service.vectors import matrix_from_quaternion, to_ra_dec
 from service.web.console.charts.sky_chart import sky_chart
@@ -26,7 +27,8 @@ from service.web.console.options import (
     fields_of,
     toml_of,
 )
-from service.web.console.page_context import ContextDep, PageQuery
+from service.web.console.page_context import LIVE, ContextDep, PageQuery
+from service.web.console.pages.batches import BatchesQuery, named
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
@@ -61,8 +63,16 @@ class VoteRow:
 
 @console_page("/batches/{id}", "Batch", Policy("read", "result"), section="/batches")
 def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
-    """One result: star field, votes, attitude, provenance; with options in the query, a what-if."""
+    """One result: star field, votes, attitude, provenance; with options in the query, a what-if.
+
+    An id that a sender gave its batch leads to the search for it.
+    """
     query = dict(request.query_params)
+    if not is_ulid(id):
+        if not named(context, BatchesQuery(), id):
+            raise NotFound(f"there is no batch with the id {shown_value(id)}")
+        asked = {"run": query.get("run", LIVE), "find": id}
+        return RedirectResponse(f"/batches?{urlencode(asked)}", 303)
     view = query.pop("view", "all")
     if view not in VIEWS:
         raise BadBatch(Fault("view", f"must be {' or '.join(VIEWS)}", shown_value(view)))
@@ -97,12 +107,34 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
         fields=fields,
         options=options.model_dump(exclude_none=True, exclude_unset=True),
         toml=toml_of(fields),
+        adoption=_adoption(answer, shown),
         pointing=_pointing(shown),
         timings_us=structs.asdict(shown.timings_us),
         tracks=_tracks(context, id, answer),
         around=context.app.results.neighbours(id),
         other_settings=mission.digest != answer.provenance.mission,
     )
+
+
+def _adoption(before: Answer, after: Answer) -> list[str]:
+    """What adopting a what-if will change, in sentences."""
+    words = ("unique", "ambiguous", "unmatched")
+    changes = [
+        f"{word} stars {getattr(before.counts, word)} to {getattr(after.counts, word)}"
+        for word in words
+        if getattr(before.counts, word) != getattr(after.counts, word)
+    ]
+    statuses = [each.attitude.status if each.attitude else "none" for each in (before, after)]
+    if statuses[0] != statuses[1]:
+        changes.append(f"attitude {statuses[0]} to {statuses[1]}")
+    return [
+        f"1 batch changes: {', '.join(changes) or 'its counts and its status stay the same'}.",
+        f"Lists, rates and every trend of {after.spacecraft} show the new result at {after.time}.",
+        (
+            "The mission's settings stay: other batches do not change. "
+            "To undo it, adopt the former result, which stays readable."
+        ),
+    ]
 
 
 @console_page("/latest/{name}", "Latest batch", Policy("read", "path"), section="/batches")

@@ -2,18 +2,22 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import Query as InQuery
 from starlette.responses import Response
 
 from service.errors import BadConfiguration
+from service.observations.schema import Key
 from service.storage.models.spacecraft import MissionThen
 from service.web.console.options import SYMBOLS
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
+
+MOST_SHOWN = 8
+"""Missions whose settings are shown whole without being asked for."""
 
 
 @dataclass(frozen=True)
@@ -45,15 +49,28 @@ class SettingsEntry:
     is_first: bool
 
 
+class MissionsQuery(PageQuery):
+    """Whose settings are shown whole; an empty field stands for every mission."""
+
+    spacecraft: Key | Literal[""] = ""
+
+
 @console_page("/missions", "Missions", Policy("read", "nothing"), position=70)
-def missions_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
-    """Every mission's settings, section by section, with their history."""
+def missions_page(query: Annotated[MissionsQuery, InQuery()], context: ContextDep) -> Response:
+    """Settings with their history: of a few missions all, of many those of the chosen one."""
+    if query.spacecraft:
+        context.caller.require(query.spacecraft)
+        context.app.context.mission(query.spacecraft)
+    names = context.spacecraft
+    chosen = names if len(names) <= MOST_SHOWN else []
+    if query.spacecraft:
+        chosen = [query.spacecraft]
     missions = []
     try:
         changed, unreadable = context.app.adoptions.changed_files(), None
     except BadConfiguration as error:
         changed, unreadable = {}, str(error)
-    for name in context.spacecraft:
+    for name in chosen:
         state = context.app.spacecraft.state(name)
         settings = state.mission.settings
         missions.append(
@@ -71,6 +88,9 @@ def missions_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -
         "missions.html.jinja",
         context.layout(query.run),
         missions=missions,
+        known=[context.app.context.known[name] for name in names],
+        changed=changed,
+        query=query,
         # Its text may name the missions of others.
         unreadable=unreadable if context.caller.spacecraft is None else None,
         symbols=SYMBOLS,

@@ -1,6 +1,6 @@
 """The first page: the state of every spacecraft, a row each, the worst first."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -16,20 +16,26 @@ from service.times import DAY_S, parse_utc, shifted
 from service.vectors import Matrix
 from service.web.console.charts.heat_map import packed
 from service.web.console.charts.sparkline import SparklineDrawing, common_top, sparkline
-from service.web.console.page_context import ContextDep, PageContext, PageQuery
+from service.web.console.page_context import (
+    LIVE,
+    ContextDep,
+    PageContext,
+    SortedQuery,
+    alarm_counts,
+)
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
 
 STALE_AFTER_S = 3600.0
-"""A spacecraft this far behind the latest batch of its run is marked as stale."""
+"""A spacecraft is silent, or behind the latest batch of its run, from this long on."""
 Order = Literal["worst", "name", "behind", "unique", "ambiguous", "unmatched", "alarms"]
 Shown = Literal["all", "trouble", "alarm", "stale", "good", "suspect", "no_attitude", "no_batches"]
 SHOWN: dict[Shown, str] = {
     "all": "all",
     "trouble": "in trouble",
     "alarm": "with an alarm",
-    "stale": "behind the run",
+    "stale": "silent or behind",
     "good": "good",
     "suspect": "suspect",
     "no_attitude": "no attitude",
@@ -38,6 +44,7 @@ SHOWN: dict[Shown, str] = {
 MARKED_SHARE = 0.15
 """Of ambiguous or unmatched stars in the last hour: as shipped, the bound of `watch`."""
 _STATES = ("good", "suspect", "no_attitude")
+"""From the best to the worst."""
 SPARK_QUANTITIES = ("ambiguous_share", "unmatched_share")
 
 
@@ -46,25 +53,14 @@ def share_names() -> tuple[str, ...]:
     return tuple(name for name, each in QUANTITIES.items() if each.is_share)
 
 
-class OverviewQuery(PageQuery):
+class OverviewQuery(SortedQuery):
     """Which rows, in which order, over which period."""
 
     period: Period = "day"
     sort: Order = "worst"
-    descending: bool | None = None
     q: Annotated[str, Field(max_length=64)] = ""
     show: Shown = "all"
     heat: Annotated[str, OneOf(share_names)] | None = None
-
-    def address(self, **changed: Any) -> dict[str, Any]:
-        """The parameters of this page with some changed; those at their default are left out."""
-        asked = {name: changed.get(name, value) for name, value in self if name != "run"}
-        fields = type(self).model_fields
-        kept = {name: value for name, value in asked.items() if value != fields[name].default}
-        return {
-            name: str(value).lower() if name == "descending" else value
-            for name, value in kept.items()
-        }
 
 
 @dataclass(frozen=True)
@@ -74,12 +70,22 @@ class OverviewLine:
     item: FleetRow
     place: int
     spark: SparklineDrawing | None
+    is_live: bool = True
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether the service has received no live batch of it for long."""
+        return self.is_live and not self.item.retired and _is_long(self.item.received_age_s)
 
     @property
     def is_stale(self) -> bool:
-        """Whether it has fallen behind the run; a retired one sends nothing any more."""
-        item = self.item
-        return not item.retired and item.age_s is not None and item.age_s > STALE_AFTER_S
+        """Whether it is silent or behind the run; a retired one sends nothing any more."""
+        return self.is_silent or (not self.item.retired and _is_long(self.item.age_s))
+
+    @property
+    def state(self) -> str:
+        """The state that the row shows: that of an old batch says nothing of now."""
+        return "silent" if self.is_silent else "behind" if self.is_stale else self.item.state
 
     @property
     def in_trouble(self) -> bool:
@@ -107,6 +113,10 @@ class OverviewLine:
         return outcome != "unique" and self.share(outcome) > MARKED_SHARE
 
 
+def _is_long(seconds: float | None) -> bool:
+    return seconds is not None and seconds > STALE_AFTER_S
+
+
 @console_page("/", "Overview", Policy("read", "nothing"), position=10)
 def overview_page(query: Annotated[OverviewQuery, InQuery()], context: ContextDep) -> Response:
     """State, attitude, shares, alarms and age of every spacecraft in a run."""
@@ -117,7 +127,10 @@ def overview_page(query: Annotated[OverviewQuery, InQuery()], context: ContextDe
     top = common_top(
         max((_greatest(shares[name]) for name in SPARK_QUANTITIES if shares), default=0)
     )
-    every = [_line(fleet, place, shares, top) for place in range(len(fleet.rows))]
+    every = [
+        replace(_line(fleet, place, shares, top), is_live=query.run == LIVE)
+        for place in range(len(fleet.rows))
+    ]
     lines = _sorted([line for line in every if _is_shown(line, query)], query)
     return rendered(
         "overview.html.jinja",
@@ -131,6 +144,7 @@ def overview_page(query: Annotated[OverviewQuery, InQuery()], context: ContextDe
         periods=list(PERIODS_S),
         shown=SHOWN,
         heat=_heat(fleet, lines, shares, query.period),
+        alarms=alarm_counts([each for line in every for each in line.item.alarms]),
         webhooks=_webhooks_in_trouble(context),
     )
 
@@ -192,7 +206,7 @@ def _is_shown(line: OverviewLine, query: OverviewQuery) -> bool:
         case "stale":
             return line.is_stale
         case state:
-            return item.state == state
+            return line.state == state
 
 
 def _sorted(lines: list[OverviewLine], query: OverviewQuery) -> list[OverviewLine]:

@@ -1,4 +1,4 @@
-"""The page of tokens: who may use the service, the form for a new token, and revocation."""
+"""The pages of access: tokens with the form for a new one, and the audit list of changes."""
 
 from typing import Annotated
 
@@ -11,6 +11,22 @@ from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import OPERATE
+from service.web.requests.query_parameters import Cursor
+
+ROWS = 100
+
+
+class AuditPageQuery(PageQuery):
+    """Where the page of the list begins."""
+
+    cursor: Cursor = None
+
+
+@console_page("/audit", "Audit list", OPERATE, section="/about")
+def audit_page(query: Annotated[AuditPageQuery, InQuery()], context: ContextDep) -> Response:
+    """Who changed what and when, the newest first."""
+    page = context.app.audit.page(ROWS, query.cursor)
+    return rendered("audit.html.jinja", context.layout(query.run), page=page)
 
 
 @console_page("/tokens", "Tokens", OPERATE, section="/about")

@@ -1,10 +1,10 @@
 // Bars under a chart of trends: when alarms of its quantities were out of their limits.
 
+import { posix, utc } from "./times.js";
+
 const SHAPES = { watch: "△", warning: "▲", critical: "◆" };
 const MOST_ROWS = 4;
 
-export const posix = (text) => Date.parse(text.replace(":60", ":59").replace(/(\.\d{3})\d*/, "$1")) / 1000;
-const clock = (text) => text.slice(0, 19).replace("T", " ");
 
 export class AlarmBars {
   constructor(holder, quantities) {
@@ -52,7 +52,7 @@ export class AlarmBars {
     bar.style.width = `${100 * (right - left)}%`;
     // A shape for which the bar is too narrow breaks to a line that is not seen.
     bar.textContent = `\u200b${SHAPES[severity]}`;
-    bar.title = `${severity}: ${name}, from ${clock(from)} ${until === null ? "until now" : `to ${clock(until)}`} UTC`;
+    bar.title = `${severity}: ${name}, from ${utc(posix(from))} ${until === null ? "until now" : `to ${utc(posix(until))}`} UTC`;
     bar.setAttribute("aria-label", bar.title);
     return bar;
   }

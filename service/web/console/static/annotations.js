@@ -1,5 +1,5 @@
 // Annotations of the shown period: the marks that charts draw, and the form that writes them.
-import { posix } from "./alarm_bars.js";
+import { posix } from "./times.js";
 import { attempt, rememberWho, send } from "./actions.js";
 import { refreshSoon } from "./live_updates.js";
 
@@ -8,8 +8,8 @@ const message = document.getElementById("annotate-status");
 
 // The annotations of the list, numbered as there.
 export function annotationsShown() {
-  return [...document.querySelectorAll("[data-annotation]")].map(({ dataset: { start, end } }, index) => ({
-    number: index + 1,
+  return [...document.querySelectorAll("[data-annotation]")].map(({ dataset: { start, end, mark } }, index) => ({
+    number: mark ?? index + 1,
     start: posix(start),
     end: end ? posix(end) : null,
   }));
@@ -42,7 +42,7 @@ if (form) {
     });
   });
   // The time of a click on a chart.
-  document.addEventListener("moment", ({ detail: seconds }) => {
+  document.addEventListener("moment", ({ detail: { seconds } }) => {
     start.value = new Date(Math.round(seconds) * 1000).toISOString();
     message.className = "soft";
     message.textContent = "From is the time of the click.";

@@ -1,6 +1,7 @@
 // What-if: every change of a setting redraws the outcome; the address contains the changes.
-import { fetchPage, swapRegions } from "./regions.js";
-import { send } from "./actions.js";
+import { fetchPage } from "./regions.js";
+import { attempt, send } from "./actions.js";
+import { signed } from "./sign.js";
 
 const WAIT_MS = 350;
 const form = () => document.getElementById("try");
@@ -37,19 +38,18 @@ async function draw(where) {
   }
 }
 
+// Adopts a result with a signature, and notes it in the trends, where it can be found again.
 async function adopt(button) {
-  button.disabled = true;
-  const status = document.getElementById("try-status");
-  const options = JSON.parse(button.dataset.adopt);
-  try {
-    const address = `/api/v1/batches/${form().dataset.id}/what-if`;
-    const adopted = await send("POST", address, JSON.stringify({ options, adopt: true }));
+  const { adopt: options, parent, title, changes, note, time, spacecraft } = button.dataset;
+  const sign = await signed(title, changes.split("|"), "Adopt");
+  if (sign === null) return;
+  attempt(button, document.getElementById("try-status"), async () => {
+    const wanted = { options: JSON.parse(options), adopt: true, ...sign, comment: sign.comment || null };
+    const adopted = await send("POST", `/api/v1/batches/${parent}/what-if`, JSON.stringify(wanted));
+    const text = sign.comment ? `${note}: ${sign.comment}` : note;
+    await send("POST", "/api/v1/annotations", JSON.stringify({ text, start: time, spacecraft, who: sign.who }));
     location.href = `/batches/${adopted.id}`;
-  } catch (error) {
-    button.disabled = false;
-    status.className = "problem";
-    status.textContent = `Not adopted: ${error.message}`;
-  }
+  });
 }
 
 // Shows the buttons that need scripts.

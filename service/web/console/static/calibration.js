@@ -1,6 +1,7 @@
 // Calibrates, tries a calibration over recorded batches, adopts it, and takes it back.
 import { attempt, rememberWho, send } from "./actions.js";
 import { refreshSoon } from "./live_updates.js";
+import { signed as signedBy } from "./sign.js";
 
 const POLL_MS = 500;
 const message = document.getElementById("message");
@@ -102,16 +103,19 @@ document.getElementById("try")?.addEventListener("submit", (event) => {
   });
 });
 
-document.addEventListener("click", (event) => {
+document.addEventListener("click", async (event) => {
   const button = event.target.closest("[data-adopt], [data-revert]");
-  if (!button || !signed.reportValidity()) return;
-  const { adopt, revert } = button.dataset;
-  const said = { who: author(), note: signed.elements.note.value.trim() };
+  if (!button) return;
+  const { adopt, revert, title } = button.dataset;
+  const { changes } = document.getElementById("what-changes").dataset;
+  const sign = await signedBy(title, changes.split("|"), adopt === undefined ? "Put back" : "Adopt");
+  if (sign === null) return;
+  const said = { who: sign.who, note: sign.comment };
   attempt(button, message, async () => {
     if (adopt !== undefined) {
       const adopted = await send("POST", `/api/v1/calibrations/${adopt}/adopt`, JSON.stringify(said));
       refreshSoon();
-      return `In force: version ${adopted.version}.`;
+      return `In force: version ${adopted.version}. To undo it, put the former one back in the history below.`;
     }
     const address = `/api/v1/spacecraft/${encodeURIComponent(form.dataset.spacecraft)}/calibration/revert`;
     const back = await send("POST", address, JSON.stringify({ ...said, to: revert || null }));

@@ -1,6 +1,7 @@
 // Parts of every page: the theme, the choice of a run, copying, and the event stream.
 import { keepFresh } from "./live_updates.js";
 import { attempt, send } from "./actions.js";
+import "./time_fields.js";
 
 const theme = document.getElementById("theme");
 const system = matchMedia("(prefers-color-scheme: dark)");

@@ -1,17 +1,20 @@
 // A heat map of spacecraft and time on a canvas, from a byte for each cell: 0 is no batch, 1 the
 // share 0, 255 the share 1.  Pointer or arrow keys read a cell; a click or Enter leads to it.
 
+import { utc } from "./times.js";
+
 const TALLEST_PX = matchMedia("(max-width: 720px)").matches ? 100 : 240;
-const LEAST_ROW_PX = TALLEST_PX < 200 ? 1 : 2;
 const MOST_ROW_PX = 14;
 const NAMES_FROM_PX = 11;
+// More rows than have room for their names are shown if asked for.
+const MOST_NAMED = Math.floor(TALLEST_PX / 12);
 const NAMES_PX = 120;
 const CELLS_AROUND = 3;
 const KEY_SHARES = [0, 0.05, 0.25, 0.5, 1];
 
 const tone = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const channels = (hex) => [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16));
-const utc = (seconds) => new Date(1000 * seconds).toISOString().slice(0, 16).replace("T", " ");
+const moment = (seconds) => utc(seconds, false);
 const percent = (level) => `${((100 * (level - 1)) / 254).toFixed(level > 26 ? 0 : 1)} %`;
 
 // The root of the share: a few percent are told from none.
@@ -46,6 +49,7 @@ export class HeatMap {
     this.readout = section.querySelector("#heat-readout");
     this.at = null;
     this.choice.addEventListener("change", () => this.choose());
+    section.querySelector("#heat-every").addEventListener("change", () => this.draw());
     this.canvas.addEventListener("pointermove", (event) => this.read(this.cellAt(event)));
     this.canvas.addEventListener("pointerleave", () => this.read(null));
     this.canvas.addEventListener("click", (event) => this.open(this.cellAt(event)));
@@ -80,20 +84,24 @@ export class HeatMap {
     const { names, columns, start, width, quantities } = this.shown;
     const quantity = quantities[this.choice.selectedIndex] ?? quantities[0];
     this.cells = bytes(quantity.cells);
-    const row = Math.min(MOST_ROW_PX, Math.max(LEAST_ROW_PX, Math.floor(TALLEST_PX / names.length)));
+    const every = this.section.querySelector("#heat-every");
+    every.hidden = names.length <= MOST_NAMED;
+    every.querySelector("span").textContent = `all ${names.length} rows, without names`;
+    this.rows = every.querySelector("input").checked ? names.length : Math.min(names.length, MOST_NAMED);
+    const row = Math.min(MOST_ROW_PX, Math.max(1, Math.floor(TALLEST_PX / this.rows)));
     const across = this.section.querySelector(".heat-axis").clientWidth;
     this.left = row >= NAMES_FROM_PX ? Math.min(NAMES_PX, across / 4) : 0;
     this.row = row;
     this.column = (across - this.left) / columns;
     const ratio = devicePixelRatio;
     this.canvas.width = across * ratio;
-    this.canvas.height = names.length * row * ratio;
-    this.canvas.style.height = `${names.length * row}px`;
+    this.canvas.height = this.rows * row * ratio;
+    this.canvas.style.height = `${this.rows * row}px`;
     const ink = this.canvas.getContext("2d");
     ink.scale(ratio, ratio);
     const colours = palette();
     const gap = row > 4 ? 1 : 0;
-    for (let k = 0; k < names.length; k++) {
+    for (let k = 0; k < this.rows; k++) {
       for (let j = 0; j < columns; j++) {
         const level = this.cells[k * columns + j];
         if (level === 0) continue;
@@ -106,7 +114,7 @@ export class HeatMap {
     if (this.left) this.name(ink, names);
     this.tell(quantity, colours);
     this.section.querySelectorAll(".heat-axis span").forEach((each, k) => {
-      each.textContent = utc(start + (k / 2) * columns * width);
+      each.textContent = moment(start + (k / 2) * columns * width);
     });
     this.section.querySelector(".heat-axis").style.paddingLeft = `${this.left}px`;
     this.section.dataset.drawn = String(names.length);
@@ -116,7 +124,7 @@ export class HeatMap {
     ink.fillStyle = tone("--soft");
     ink.font = "11px system-ui, sans-serif";
     ink.textBaseline = "middle";
-    names.forEach((each, k) => ink.fillText(each, 0, (k + 0.5) * this.row, this.left - 6));
+    names.slice(0, this.rows).forEach((each, k) => ink.fillText(each, 0, (k + 0.5) * this.row, this.left - 6));
   }
 
   // The key, and in words what the picture shows.
@@ -130,7 +138,7 @@ export class HeatMap {
     }
     const { names, columns, start, width } = this.shown;
     const greatest = this.cells.reduce((best, each, k) => (each > this.cells[best] ? k : best), 0);
-    const where = `${names[Math.floor(greatest / columns)]} at ${utc(start + (greatest % columns) * width)} UTC`;
+    const where = `${names[Math.floor(greatest / columns)]} at ${moment(start + (greatest % columns) * width)} UTC`;
     const most = this.cells[greatest] ? `; greatest ${percent(this.cells[greatest])}, ${where}` : "";
     this.canvas.setAttribute("aria-label", `${quantity.label} of ${names.length} spacecraft${most}`);
     this.label = quantity.label;
@@ -140,7 +148,7 @@ export class HeatMap {
     const box = this.canvas.getBoundingClientRect();
     const j = Math.floor((event.clientX - box.left - this.left) / this.column);
     const k = Math.floor((event.clientY - box.top) / this.row);
-    const inside = j >= 0 && j < this.shown.columns && k >= 0 && k < this.shown.names.length;
+    const inside = j >= 0 && j < this.shown.columns && k >= 0 && k < this.rows;
     return inside ? { k, j } : null;
   }
 
@@ -151,7 +159,7 @@ export class HeatMap {
     const level = this.cells[at.k * columns + at.j];
     const begin = start + at.j * width;
     const value = level ? `${percent(level)} ${this.label}` : "no batch";
-    this.say(`${names[at.k]}, ${utc(begin)} to ${utc(begin + width).slice(11)} UTC: ${value}`);
+    this.say(`${names[at.k]}, ${moment(begin)} to ${moment(begin + width).slice(17)} UTC: ${value}`);
   }
 
   // The spacecraft's trends about a cell.
@@ -172,9 +180,9 @@ export class HeatMap {
     if (event.key === "Enter") this.open(this.at);
     if (!step) return;
     event.preventDefault();
-    const { names, columns } = this.shown;
+    const { columns } = this.shown;
     const from = this.at ?? { k: -step[0], j: columns - 1 - step[1] };
     const bound = (value, count) => Math.min(count - 1, Math.max(0, value));
-    this.read({ k: bound(from.k + step[0], names.length), j: bound(from.j + step[1], columns) });
+    this.read({ k: bound(from.k + step[0], this.rows), j: bound(from.j + step[1], columns) });
   }
 }

@@ -1,7 +1,7 @@
 // The preview of a limit: what it would have done to recorded batches, in words and on the trend.
-import { posix } from "./alarm_bars.js";
+import { posix, utc } from "./times.js";
 import { requestJson } from "./requests.js";
-import { Trend, utc } from "./trend.js";
+import { Trend } from "./trend.js";
 
 const POINTS = 240;
 const MOST_LISTED = 8;

@@ -9,22 +9,26 @@ const signed = document.getElementById("signed");
 rememberWho(signed.elements.who);
 signed.addEventListener("submit", (event) => event.preventDefault());
 
-// An empty field means no bound.
-function numberIn(field) {
+const MAX_DIGITS = 12;
+
+// An empty field means no bound; shares are entered in percent.
+function numberIn(field, scale = 1) {
   const text = field.value.trim();
   if (text === "") return null;
-  const value = Number(text);
+  const value = Number((Number(text) / scale).toPrecision(MAX_DIGITS));
   if (Number.isNaN(value)) throw new Error(`${field.name} must be a number, not ${text}`);
   return value;
 }
 
 function settingsIn(form) {
   const { elements } = form;
+  const scale = form.dataset.percent === undefined ? 1 : 100;
   const settings = { enabled: elements.enabled.checked };
   for (const severity of ["watch", "warning", "critical"]) {
-    settings[severity] = { low: numberIn(elements[`${severity}.low`]), high: numberIn(elements[`${severity}.high`]) };
+    settings[severity] = { low: numberIn(elements[`${severity}.low`], scale), high: numberIn(elements[`${severity}.high`], scale) };
   }
-  for (const name of ["hysteresis", "minimum_count", "duration_s"]) settings[name] = numberIn(elements[name]);
+  settings.hysteresis = numberIn(elements.hysteresis, scale);
+  for (const name of ["minimum_count", "duration_s"]) settings[name] = numberIn(elements[name]);
   return settings;
 }
 

@@ -2,7 +2,8 @@
 import { annotationsShown } from "./annotations.js";
 import { requestJson } from "./requests.js";
 import { fetchLatest, swapRegions } from "./regions.js";
-import { AlarmBars, posix } from "./alarm_bars.js";
+import { AlarmBars } from "./alarm_bars.js";
+import { posix, utc } from "./times.js";
 import { Trend } from "./trend.js";
 
 const stretch = () => document.getElementById("stretch");
@@ -29,14 +30,17 @@ function make() {
 
 async function draw() {
   const mine = ++asked;
-  const { history, start, end, alarms } = stretch().dataset;
+  const { history, start, end, alarms, y, others } = stretch().dataset;
   delete document.getElementById("charts").dataset.drawn;
   try {
-    const found = await requestJson(history);
+    const [found, ...beside] = await Promise.all([history, ...JSON.parse(others ?? "[]")].map((each) => requestJson(each)));
     if (mine !== asked) return;
     shown = found;
     for (const trend of trends) {
-      trend.show(shown, posix(start), posix(end), annotationsShown());
+      // Held is what the chart had when that was chosen, or has at first.
+      if (y === "hold" && trend.vertical !== "hold") trend.hold();
+      trend.vertical = y === "hold" && !trend.held ? "robust" : (y ?? "robust");
+      trend.show(shown, posix(start), posix(end), annotationsShown(), beside);
       trend.definition.bars.show(JSON.parse(alarms), posix(start), posix(end));
     }
     status.textContent = "";
@@ -64,14 +68,27 @@ async function go(address, push = true) {
 
 function zoom(bounds) {
   if (bounds === null) {
-    go(document.querySelector('[data-key="-"]').href);
+    const link = document.querySelector('[data-key="-"]');
+    if (link) go(link.href);
     return;
   }
-  const address = new URL(location.href);
+  const address = new URL(stretch().dataset.trends ?? location.href, location.href);
   address.searchParams.delete("range");
   address.searchParams.set("start", asText(bounds[0]));
   address.searchParams.set("end", asText(bounds[1]));
-  go(address.href);
+  // The chart of an alarm leads to the trends, which have controls.
+  if (stretch().dataset.trends) location.href = address.href;
+  else go(address.href);
+}
+
+// The batches about a point of a chart.
+function linkTo({ start, end }) {
+  const link = document.createElement("a");
+  const query = new URLSearchParams({ run: document.body.dataset.run, spacecraft: document.getElementById("charts").dataset.spacecraft, start: asText(start), end: asText(end) });
+  link.href = `/batches?${query}`;
+  link.textContent = `Batches from ${utc(start)} to ${utc(end)} UTC`;
+  status.className = "";
+  status.replaceChildren(link);
 }
 
 if (stretch()) {
@@ -91,11 +108,17 @@ if (stretch()) {
     go(link.href);
   });
   document.addEventListener("change", (event) => {
-    const form = event.target.closest("[data-worst]");
+    const form = event.target.closest("[data-worst], [data-view]");
     if (!form) return;
     event.target.blur();
     go(`${form.getAttribute("action")}?${new URLSearchParams(new FormData(form))}`);
   });
+  document.addEventListener("submit", (event) => {
+    if (!event.target.matches("[data-view]")) return;
+    event.preventDefault();
+    go(`${event.target.getAttribute("action")}?${new URLSearchParams(new FormData(event.target))}`);
+  });
+  document.addEventListener("moment", ({ detail }) => linkTo(detail));
   addEventListener("popstate", () => go(location.href, false));
   document.addEventListener("drawn", draw);
   document.addEventListener("theme", () => shown && draw());

@@ -1,40 +1,31 @@
 // One chart of trends: a line for each quantity's mean, a band from least to greatest, its limits.
 
+import { DAY_S, dayOfYear, twoDigits, utc } from "./times.js";
+
 const DASHES = { watch: [2, 4], warning: [6, 4], critical: [] };
-const DAY_S = 86400;
+const TONES = ["--other-1", "--other-2", "--other-3", "--other-4"];
 const LABEL_PX = 16;
+// So wide are the axes of neighbouring charts, so that their times stand below each other.
+const LEAST_AXIS_PX = 58;
+// Beyond so many times what nearly all values lie within, a value is marked at the edge.
+const OUTLIER = 3;
+const NEARLY_ALL = 0.98;
 
 // Room for half of a label at the top and at the right end of an axis.
-const PADDING = [12, 32, 0, 0];
+const PADDING = [12, 48, 0, 0];
 const MARK_PX = 16;
 
 function colour(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 }
 
-function twoDigits(value) {
-  return String(value).padStart(2, "0");
-}
-
-// UTC with the day of the year, as everywhere in the console.
-export function utc(seconds, withSeconds = true) {
-  const moment = new Date(seconds * 1000);
-  const text = moment.toISOString();
-  return `${text.slice(0, 10)} (${dayOfYear(moment)}) ${text.slice(11, withSeconds ? 19 : 16)}`;
-}
-
-function dayOfYear(moment) {
-  const first = Date.UTC(moment.getUTCFullYear(), 0, 1);
-  return String(Math.floor((moment.getTime() - first) / (DAY_S * 1000)) + 1).padStart(3, "0");
-}
-
-// Ticks: the time of day within a day, day of the year beyond; the year where it begins.
+// Ticks: the time of day within a day, the date beyond; the day of the year below the date.
 function tickLabels(_, splits, __, ___, step) {
   let before = "";
   return splits.map((seconds) => {
     const moment = new Date(seconds * 1000);
-    const day = `${moment.getUTCFullYear()}-${dayOfYear(moment)}`;
-    if (step >= DAY_S) return day;
+    const day = `${moment.toISOString().slice(0, 10)} (${dayOfYear(moment)})`;
+    if (step >= DAY_S) return day.replace(" ", "\n");
     const clock = `${twoDigits(moment.getUTCHours())}:${twoDigits(moment.getUTCMinutes())}`;
     const label = step < 60 ? `${clock}:${twoDigits(moment.getUTCSeconds())}` : clock;
     const shown = day === before ? label : `${label}\n${day}`;
@@ -63,7 +54,7 @@ function labelWidth(chart, labels, index, cycle) {
   if (cycle > 1) return axis._size;
   chart.ctx.font = axis.font[0];
   const widths = (labels ?? []).map((label) => chart.ctx.measureText(label).width / devicePixelRatio);
-  return Math.ceil(Math.max(40, ...widths) + axis.ticks.size + axis.gap + 4);
+  return Math.ceil(Math.max(LEAST_AXIS_PX - axis.ticks.size - axis.gap - 4, ...widths) + axis.ticks.size + axis.gap + 4);
 }
 
 // Bounds that several quantities share are one line, named after the severity alone.
@@ -106,6 +97,31 @@ function drawLimits(chart, lines) {
   for (const { text, y } of labels) {
     ctx.textBaseline = isHigh(y) ? "top" : "bottom";
     ctx.fillText(text, bbox.left + 4 * devicePixelRatio, y + (isHigh(y) ? 3 : -2) * devicePixelRatio);
+  }
+  ctx.restore();
+}
+
+// A triangle at the edge for every point beyond it.
+function drawBeyond(chart, data, quantities) {
+  const { ctx, bbox } = chart;
+  const { min: least, max: most } = chart.scales.y;
+  const px = devicePixelRatio;
+  ctx.save();
+  ctx.fillStyle = colour("--accent");
+  for (let k = 0; k < quantities; k++) {
+    if (!chart.series[3 * k + 1].show) continue;
+    data[0].forEach((seconds, index) => {
+      const isAbove = data[3 * k + 3][index] > most;
+      const isBelow = data[3 * k + 2][index] !== null && data[3 * k + 2][index] < least;
+      if (!isAbove && !isBelow) return;
+      const x = chart.valToPos(seconds, "x", true);
+      const [y, way] = isAbove ? [bbox.top, 1] : [bbox.top + bbox.height, -1];
+      ctx.beginPath();
+      ctx.moveTo(x, y);
+      ctx.lineTo(x - 4 * px, y + 7 * way * px);
+      ctx.lineTo(x + 4 * px, y + 7 * way * px);
+      ctx.fill();
+    });
   }
   ctx.restore();
 }
@@ -156,15 +172,19 @@ function joined(marks, width) {
   return groups;
 }
 
-// Tells the page the time of a click; the end of a drag is none.
-function reportClicks(chart) {
+// Tells the page the time of a click and the bin there; the end of a drag is none.
+function reportClicks(chart, width) {
   let pressedAt = null;
   chart.over.addEventListener("mousedown", (event) => (pressedAt = event.clientX));
   chart.over.addEventListener("click", (event) => {
     if (pressedAt === null || Math.abs(event.clientX - pressedAt) > 3) return;
     const seconds = chart.posToVal(event.clientX - chart.over.getBoundingClientRect().left, "x");
-    document.dispatchEvent(new CustomEvent("moment", { detail: seconds }));
+    reportMoment(seconds, chart.data[0][chart.cursor.idx] ?? seconds, width);
   });
+}
+
+function reportMoment(seconds, middle, width) {
+  document.dispatchEvent(new CustomEvent("moment", { detail: { seconds, start: middle - width / 2, end: middle + width / 2 } }));
 }
 
 // The usual time from a bucket with batches to the next: batches may come less often than buckets.
@@ -194,6 +214,14 @@ export class Trend {
   constructor(holder, readout, definition, limits, group, onZoom) {
     Object.assign(this, { holder, readout, definition, limits, group, onZoom });
     this.chart = null;
+    this.vertical = "robust";
+    this.hidden = new Set();
+    // Enter on a chart is a click on the point that was read last.
+    holder.addEventListener("keydown", (event) => {
+      if (event.key !== "Enter" || !this.chart) return;
+      const middle = this.data[0][this.chart.cursor.idx ?? this.data[0].length - 1];
+      reportMoment(middle, middle, this.history.bucket_s ?? 1);
+    });
     new ResizeObserver(() => this.chart?.setSize(this.size())).observe(holder);
   }
 
@@ -201,12 +229,14 @@ export class Trend {
     return { width: this.holder.clientWidth, height: this.holder.clientHeight };
   }
 
-  show(history, start, end, annotations = []) {
+  // `others` are histories of further spacecraft, of which the first quantity is drawn.
+  show(history, start, end, annotations = [], others = []) {
     this.history = history;
+    this.others = others;
     this.annotations = annotations;
     this.bounds = [start, end];
     const { quantities } = this.definition;
-    const known = quantities.filter((each) => history.series[each.name]?.count.some((count) => count > 0));
+    const known = quantities.filter((each) => history.series[each.name]?.mean.some((value) => value !== null));
     this.chart?.destroy();
     this.chart = null;
     this.holder.replaceChildren();
@@ -221,15 +251,20 @@ export class Trend {
     const { moments, pick } = withGaps(history);
     const scale = this.definition.percent ? 100 : 1;
     const scaled = (values) => pick(values).map((value) => (value === null || value === undefined ? null : value * scale));
-    const data = [moments];
+    let data = [moments];
     for (const { name } of known) {
       const { mean, min, max } = history.series[name];
       data.push(scaled(mean), scaled(min), scaled(max));
     }
+    const beside = others.map((other) => {
+      const own = withGaps(other);
+      return [own.moments, own.pick(other.series[known[0].name].mean).map((value) => (value === null || value === undefined ? null : value * scale))];
+    });
+    if (beside.length) data = uPlot.join([data, ...beside]);
     this.data = data;
     this.known = known;
+    this.described = false;
     this.chart = new uPlot(this.options(known), data, this.holder);
-    this.describe();
   }
 
   options(known) {
@@ -244,6 +279,10 @@ export class Trend {
       series.push({ stroke, width: 1.6, dash, points }, { stroke: "transparent", points: { show: false } }, { stroke: "transparent", points: { show: false } });
       bands.push({ series: [first + 2, first + 1], fill: `color-mix(in srgb, ${stroke} 20%, transparent)` });
     }
+    known.forEach(({ name }, k) => {
+      for (let part = 1; part <= 3; part++) series[3 * k + part].show = !this.hidden.has(name);
+    });
+    this.others.forEach((_, k) => series.push({ stroke: colour(TONES[k % TONES.length]), width: 1.3, spanGaps: true, points: { show: false } }));
     const scale = this.definition.percent ? 100 : 1;
     const names = known.map(({ name }) => name);
     const lines = merged(limitLines(this.limits, names), names).map((line) => ({ ...line, value: line.value * scale }));
@@ -253,31 +292,61 @@ export class Trend {
       tzDate: (seconds) => uPlot.tzDate(new Date(seconds * 1000), "Etc/UTC"),
       legend: { show: false },
       cursor: { sync: { key: this.group }, drag: { x: true, y: false, setScale: false }, points: { size: 6 }, bind: { dblclick: () => () => this.onZoom(null) } },
-      scales: { x: { time: true, range: () => this.bounds }, y: { range: (_, low, high) => this.range(low, high, lines) } },
+      scales: { x: { time: true, range: () => this.bounds }, y: this.scale(lines) },
       series,
       bands,
       axes: [
-        { ...axis, values: tickLabels, space: 70, size: 40 },
+        { ...axis, values: tickLabels, space: 74, size: 46 },
         { ...axis, size: labelWidth, values: (_, splits) => splits.map((value) => `${+value.toPrecision(6)}${this.definition.unit}`) },
       ],
       hooks: {
-        ready: [reportClicks],
+        ready: [(chart) => reportClicks(chart, this.history.bucket_s ?? 1)],
         drawAxes: [(chart) => drawAnnotations(chart, this.annotations)],
-        draw: [(chart) => drawLimits(chart, lines), ({ bbox }) => this.definition.bars?.align(bbox.left / devicePixelRatio, bbox.width / devicePixelRatio)],
+        draw: [(chart) => drawLimits(chart, lines), (chart) => drawBeyond(chart, this.data, known.length), (chart) => this.describe(chart), ({ bbox }) => this.definition.bars?.align(bbox.left / devicePixelRatio, bbox.width / devicePixelRatio)],
         setSelect: [(chart) => chart.select.width > 4 && this.onZoom([chart.posToVal(chart.select.left, "x"), chart.posToVal(chart.select.left + chart.select.width, "x")])],
         setCursor: [(chart) => this.read(chart.cursor.idx)],
       },
     };
   }
 
+  // The vertical axis: `robust`, `all` values, `log`, or `hold` for the range that it had before.
+  scale(lines) {
+    const positive = this.shownValues().filter((value) => value > 0);
+    if (this.vertical === "log" && positive.length && this.shownValues().every((value) => value >= 0)) {
+      const [low, high] = [positive.reduce((a, b) => Math.min(a, b)), positive.reduce((a, b) => Math.max(a, b))];
+      return { distr: 3, range: () => [10 ** Math.floor(Math.log10(low)), 10 ** Math.ceil(Math.log10(high) + 1e-9)] };
+    }
+    return { range: (_, low, high) => (this.vertical === "hold" && this.held ? this.held : this.range(low, high, lines)) };
+  }
+
+  // Means, least and greatest values of what is not hidden.
+  shownValues() {
+    const columns = this.known.flatMap(({ name }, k) => (this.hidden.has(name) ? [] : [1, 2, 3].map((part) => this.data[3 * k + part])));
+    return [...columns, ...this.data.slice(3 * this.known.length + 1)].flat().filter((value) => value !== null && value !== undefined);
+  }
+
+  // Keeps the present vertical range of the chart, whatever is shown next.
+  hold() {
+    this.held = this.chart ? [this.chart.scales.y.min, this.chart.scales.y.max] : null;
+  }
+
   // Zero belongs to the picture of what cannot be negative; limits near the data are shown too.
+  // A few values far beyond all others do not flatten these: they are marked at the edge.
   range(low, high, lines) {
     if (low === null) return [0, 1];
+    if (this.vertical !== "all") [low, high] = this.withoutOutliers(low, high);
     const near = lines.map(({ value }) => value).filter((value) => Math.abs(value) <= Math.max(Math.abs(high), Math.abs(low)) * 3 || this.definition.percent);
     let [least, most] = [Math.min(low, ...near), Math.max(high, ...near)];
     if (least >= 0) least = 0;
     const room = (most - least || 1) * 0.08;
     return [least < 0 ? least - room : 0, this.definition.percent ? Math.min(100, most + room) : most + room];
+  }
+
+  withoutOutliers(low, high) {
+    const sizes = this.shownValues().map(Math.abs).sort((a, b) => a - b);
+    const usual = sizes[Math.floor(NEARLY_ALL * (sizes.length - 1))] ?? 0;
+    const edge = OUTLIER * usual;
+    return usual > 0 ? [Math.max(low, -edge), Math.min(high, edge)] : [low, high];
   }
 
   text(value) {
@@ -299,15 +368,57 @@ export class Trend {
   }
 
   // The chart in words, for readers who cannot see it; and the key of its lines.
-  describe() {
+  describe(chart) {
+    // The range of a chart is known once it is drawn; later drawings have the same.
+    if (this.described) return;
+    this.described = true;
     const values = this.known.map(({ label }, k) => {
-      const greatest = Math.max(...this.data[3 * k + 3].filter((value) => value !== null));
+      const greatest = this.data[3 * k + 3].reduce((most, value) => Math.max(most, value ?? -Infinity), -Infinity);
       const at = this.data[0][this.data[3 * k + 3].indexOf(greatest)];
       return `${label}: greatest ${this.text(greatest)} at ${utc(at)} UTC`;
     });
-    this.legend = this.known.map(({ label, dash }) => `${dash ? "╌" : "━"} ${label}`).join("   ") + "; shaded: least to greatest";
+    const { min: least, max: most } = chart.scales.y;
+    const beyond = this.data[0].filter((_, index) => this.known.some((__, k) => this.data[3 * k + 3][index] > most || (this.data[3 * k + 2][index] !== null && this.data[3 * k + 2][index] < least))).length;
+    const names = this.known.map(({ label, dash }) => `${dash ? "╌" : "━"} ${label}`);
+    this.legend = [...names, "shaded: least to greatest", ...(beyond ? [`▲ at the edge: ${beyond} beyond it`] : [])].join("; ");
     this.readout.textContent = this.legend;
+    this.drawKeys();
     const marked = this.annotations.length ? `; ${this.definition.marks ?? "annotations"}: ${this.annotations.length}, listed below` : "";
-    this.holder.setAttribute("aria-label", `${this.definition.title}. ${values.join("; ")}${marked}`);
+    this.holder.setAttribute("aria-label", `${this.definition.title}. ${values.join("; ")}${marked}${beyond ? `; ${beyond} beyond the edge` : ""}`);
+  }
+
+  // A button for each line of several, which hides it and shows it; names of other spacecraft.
+  drawKeys() {
+    const keys = this.readout.nextElementSibling?.matches(".chart-keys") ? this.readout.nextElementSibling : document.createElement("p");
+    keys.className = "chart-keys range";
+    const buttons = this.known.length > 1 ? this.known.map(({ name, label }) => this.key(name, label)) : [];
+    const names = this.others.map(({ spacecraft }, k) => {
+      const key = document.createElement("span");
+      const mark = document.createElement("span");
+      mark.textContent = "━ ";
+      mark.className = TONES[k % TONES.length].slice(2);
+      mark.ariaHidden = "true";
+      key.append(mark, spacecraft);
+      return key;
+    });
+    keys.replaceChildren(...buttons, ...names);
+    keys.hidden = !keys.childElementCount;
+    this.readout.after(keys);
+    // The button that was pressed was replaced.
+    keys.children[this.pressed ?? -1]?.focus({ preventScroll: true });
+    this.pressed = null;
+  }
+
+  key(name, label) {
+    const button = document.createElement("button");
+    button.type = "button";
+    button.textContent = label;
+    button.ariaPressed = String(!this.hidden.has(name));
+    button.addEventListener("click", () => {
+      this.hidden.has(name) ? this.hidden.delete(name) : this.hidden.add(name);
+      this.show(this.history, ...this.bounds, this.annotations, this.others);
+      this.pressed = this.known.findIndex((each) => each.name === name);
+    });
+    return button;
   }
 }

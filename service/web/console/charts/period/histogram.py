@@ -6,10 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.storage.models.period import TrackerStarsOfPeriod
+from service.vectors import Vector
 
 WIDTH, HEIGHT = 420.0, 210.0
 FOOT = 24.0
 REACH, STEP = 5.0, 0.5
+
+
+def robust_spread(values: Vector) -> float:
+    """The standard deviation of a normal distribution with the same median absolute deviation."""
+    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 
 @dataclass(frozen=True)
@@ -35,6 +41,9 @@ class Histogram:
     count: int
     below: int
     above: int
+    median: float
+    robust_spread: float
+    """That of a normal distribution with the same median absolute deviation."""
     mean: float
     spread: float
     """The standard deviation; 1 where the sigmas are right."""
@@ -75,6 +84,8 @@ def residual_histogram(tracker: TrackerStarsOfPeriod) -> Histogram | None:
         count=len(values),
         below=int(np.sum(values < -REACH)),
         above=int(np.sum(values > REACH)),
+        median=float(np.median(values)),
+        robust_spread=robust_spread(values),
         mean=float(values.mean()),
         spread=float(values.std()),
         ticks=tuple((x(each), f"{each:+d}".replace("-", "−")) for each in (-4, -2, 2, 4)),

@@ -6,6 +6,7 @@ import numpy as np
 
 from service.storage.models.period import TrackerStarsOfPeriod
 from service.vectors import Vector
+from service.web.console.charts.period.histogram import robust_spread
 
 SIZE = 300.0
 LEFT, FOOT = 28.0, 24.0
@@ -33,6 +34,8 @@ class MagnitudeChart:
     ticks: tuple[tuple[float, float, str], ...]
     rows: tuple[MagnitudeRow, ...]
     stars: int
+    median_mag: float
+    robust_spread_mag: float
     offset_mag: float
     spread_mag: float
     left: float = LEFT
@@ -82,6 +85,8 @@ def magnitude_chart(tracker: TrackerStarsOfPeriod) -> MagnitudeChart | None:
         ),
         rows=tuple(_rows(catalog, offset)),
         stars=len(observed),
+        median_mag=float(np.median(offset)),
+        robust_spread_mag=robust_spread(offset),
         offset_mag=float(offset.mean()),
         spread_mag=float(offset.std()),
     )

@@ -14,7 +14,7 @@ from service.errors import NotFound
 from service.storage.calibrations.models import Calibration, CalibrationSummary
 from service.web.console.charts.calibration_history import parameter_histories
 from service.web.console.charts.residual_maps import residual_pictures
-from service.web.console.page_context import ContextDep, PageQuery
+from service.web.console.page_context import LIVE, ContextDep, PageContext, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
@@ -55,11 +55,21 @@ def calibration_page(
         result=result,
         pictures=[residual_pictures(each) for each in result.maps] if result else [],
         certain=CERTAIN_SIGMAS,
+        corrects=result is not None
+        and any(abs(each.value) > each.sigma for each in result.unknowns),
+        trackers=app.adoptions.file_of(name).trackers,
+        recorded=_recorded(context, name),
         histories=parameter_histories(versions, app.adoptions.file_of(name)),
         largest_degree=LARGEST_DEGREE,
         sample=CALIBRATION_SAMPLE,
         may_write="operate" in context.caller.scopes,
     )
+
+
+def _recorded(context: PageContext, name: str) -> int:
+    """How many live batches of a spacecraft there are."""
+    live = [each for each in context.app.runs.all([name]) if each.run == LIVE]
+    return live[0].batches if live else 0
 
 
 def _shown(

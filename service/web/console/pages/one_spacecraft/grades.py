@@ -22,6 +22,9 @@ from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
 
+JOBS = 8
+"""The latest that the page lists."""
+
 
 @dataclass(frozen=True)
 class Drawn:
@@ -33,7 +36,9 @@ class Drawn:
     strips: list[Strip]
 
 
-@console_page("/spacecraft/{name}/grades", "Grades", Policy("read", "path"), section="/")
+@console_page(
+    "/spacecraft/{name}/grades", "Definitive attitude", Policy("read", "path"), section="/"
+)
 def grades_page(
     name: Annotated[str, Path()], query: Annotated[SpacecraftQuery, InQuery()], context: ContextDep
 ) -> Response:
@@ -62,4 +67,5 @@ def grades_page(
         ranges=list(RANGES_S),
         drawn=drawn,
         most_blocks=MOST_BLOCKS,
+        jobs=context.app.definitive.all(name).items[:JOBS],
     )

@@ -1,6 +1,6 @@
 """The page of a spacecraft's limits: their bounds, their history, and who set them."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import Path
 from fastapi import Query as InQuery
@@ -9,7 +9,7 @@ from starlette.responses import Response
 from service.alarms.subjects import limited_trackers
 from service.observations.schema import Key
 from service.web.console.page_context import ContextDep, PageQuery
-from service.web.console.pages.one_spacecraft.spacecraft import charts
+from service.web.console.pages.one_spacecraft.trend_charts import charts_by_quantity
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
@@ -40,15 +40,6 @@ def limits_page(
         limits=[app.limits.get(name, each.quantity, tracker) for each in limits],
         severities=SEVERITIES,
         days=PREVIEW_DAYS,
-        charts=_charts(),
+        charts=charts_by_quantity(),
         may_write="operate" in context.caller.scopes,
     )
-
-
-def _charts() -> dict[str, Any]:
-    """The chart of each quantity that has a history, by itself."""
-    return {
-        quantity["name"]: chart | {"quantities": [quantity]}
-        for chart in charts()
-        for quantity in chart["quantities"]
-    }

@@ -2,8 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
-from urllib.parse import quote, urlencode
+from typing import Annotated, Any, Literal
 
 from fastapi import Path
 from fastapi import Query as InQuery
@@ -11,17 +10,18 @@ from msgspec import structs
 from pydantic import Field, ValidationInfo, field_validator
 from starlette.responses import Response
 
-from service.alarms.quantities import QUANTITIES, RankedName, ranked_names, trend_names
+from service.alarms.quantities import QUANTITIES, RankedName, ranked_names
 from service.alarms.subjects import limited_trackers
-from service.app.products import TABLE_KINDS
 from service.observations.schema import Key
-from service.products.formats import attitude_formats, table_formats
+from service.products.formats import table_formats
 from service.storage.models.annotations import Annotation
 from service.storage.models.answers import Summary
 from service.storage.models.base import Page
+from service.storage.models.spacecraft import MissionThen
 from service.storage.models.trends import Ranking
-from service.times import DAY_S, HOUR_S, Utc, parse_utc, recorded_utc, shifted
+from service.times import DAY_S, HOUR_S, Utc, parse_utc, recorded_utc, shifted, utc_now
 from service.web.console.page_context import LIVE, ContextDep, PageContext, PageQuery
+from service.web.console.pages.one_spacecraft.trend_charts import charts, history_address
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
@@ -39,69 +39,21 @@ Range = Annotated[
     str, Field(pattern=rf"^({'|'.join(RANGES_S)}|[1-9][0-9]{{0,3}}({'|'.join(UNITS_S)}))$")
 ]
 """The length of a period that ends with the latest batch: by its name, or such as `6h`."""
-POINTS = 240
-"""The most points of a curve: as many as a chart can show."""
 WORST, LATEST = 10, 10
+MOST_BESIDE = 4
+Vertical = Literal["robust", "all", "log", "hold"]
+VERTICAL: dict[Vertical, str] = {
+    "robust": "robust, outliers at the edge",
+    "all": "all values",
+    "log": "logarithmic",
+    "hold": "as it is now",
+}
 ANNOTATIONS = 100
 FIRST_LOOKED_AT: tuple[RankedName, ...] = (
     "ambiguous_share",
     "unmatched_share",
     "a_priori_angle_deg",
 )
-
-
-CHARTS: Sequence[tuple[str, str, tuple[str, ...]]] = (
-    ("stars", "Ambiguous and unmatched stars", ("ambiguous_share", "unmatched_share")),
-    (
-        "batches",
-        "Batches without an attitude, or with a suspect one",
-        ("no_attitude_share", "suspect_share"),
-    ),
-    (
-        "residual",
-        "Residual rms and predicted rms",
-        ("residual_rms_arcsec", "predicted_rms_arcsec"),
-    ),
-    ("magnitude", "Magnitude offset, observed minus catalog", ("magnitude_offset_mag",)),
-    ("scale", "Scale offset, observed over catalog", ("scale_offset_ppm",)),
-    ("alignment", "Angle between trackers, observed minus catalog", ("alignment_offset_arcsec",)),
-    ("a-priori", "Angle from the a priori attitude", ("a_priori_angle_deg",)),
-    ("rate", "Batches per hour", ("batches_per_hour",)),
-)
-"""Id, title and quantities of the charts; every other quantity gets one of its own."""
-UNITS = {"arcsec": "″", "deg": "°", "mag": " mag", "ppm": " ppm"}
-
-
-TRACKER_CHARTS = {"batches": "Batches in which the tracker disagrees with the others"}
-"""Titles that differ for the quantities of one tracker."""
-
-
-def charts(tracker: str | None = None) -> list[dict[str, Any]]:
-    """The charts of every quantity that has a history, or that a tracker has."""
-    shown = {name for _, _, names in CHARTS for name in names}
-    others = [
-        (name.replace("_", "-"), QUANTITIES[name].label.capitalize(), (name,))
-        for name in trend_names()
-        if name not in shown
-    ]
-    if tracker is None:
-        return [_chart(*each) for each in (*CHARTS, *others)]
-    of_tracker = [
-        (id, TRACKER_CHARTS.get(id, title), [name for name in names if QUANTITIES[name].by_tracker])
-        for id, title, names in (*CHARTS, *others)
-    ]
-    return [_chart(*each) for each in of_tracker if each[-1]]
-
-
-def _chart(id: str, title: str, names: Sequence[str]) -> dict[str, Any]:
-    first = QUANTITIES[names[0]]
-    return {
-        "id": id,
-        "title": title,
-        "percent": first.is_share,
-        "unit": " %" if first.is_share else UNITS.get(first.unit, ""),
-        "quantities": [{"name": name, "label": QUANTITIES[name].label} for name in names],
-    }
 
 
 class SpacecraftQuery(PageQuery):
@@ -115,6 +67,28 @@ class SpacecraftQuery(PageQuery):
     end: End = None
     by: RankedName | None = None
     tracker: Key | None = None
+    until: Literal["latest", "now"] = "latest"
+    """Where a range of live batches ends."""
+    y: Vertical = "robust"
+    beside: Annotated[str, Field(max_length=300)] = ""
+    """Other spacecraft in the same charts, with commas between them."""
+
+    @property
+    def others(self) -> list[str]:
+        """The other spacecraft, as many as can be told apart."""
+        names = (name.strip() for name in self.beside.split(","))
+        return list(dict.fromkeys(filter(None, names)))[:MOST_BESIDE]
+
+    @property
+    def kept(self) -> dict[str, str | None]:
+        """What stays in the address while the period changes."""
+        return {
+            "by": self.by,
+            "tracker": self.tracker,
+            "until": self.until if self.until == "now" else None,
+            "y": self.y if self.y != "robust" else None,
+            "beside": self.beside or None,
+        }
 
     @field_validator("start", "end", "range", mode="before")
     @classmethod
@@ -190,16 +164,19 @@ def spacecraft_page(
             name, query.tracker if query.tracker in limited_trackers(mission) else None
         ),
         formats=table_formats(),
-        attitude_formats=attitude_formats(),
-        table_kinds=TABLE_KINDS,
-        file=lambda product, format: (
-            stretch and _file_address(name, query, stretch, product, format)
-        ),
+        query=query,
+        vertical=VERTICAL,
+        others=_others(context, query, stretch),
+        spacecraft=[each for each in context.spacecraft if each != name],
+        changes=_changes(context, name, state.history, query, stretch),
         annotations=sorted(notes.items, key=lambda each: recorded_utc(each.start).tai_ns),
         more_annotations=notes.next_cursor is not None,
         may_write="operate" in context.caller.scopes,
         may_write_of_all=context.caller.spacecraft is None,
-        history=lambda **more: stretch and _history_address(name, query, stretch, more),
+        history=lambda **more: (
+            stretch
+            and history_address(name, query.run, query.tracker, stretch.start, stretch.end, **more)
+        ),
     )
 
 
@@ -211,6 +188,8 @@ def shown_period(
         return None
     # The latest batch belongs to the stretch, whose end does not.
     end = query.end or shifted(parse_utc(latest[0].time), 0.001)
+    if query.until == "now" and query.run == LIVE and not query.end:
+        end = max(end, utc_now(), key=lambda moment: moment.tai_ns)
     if query.start or query.end:
         start = query.start or shifted(end, -range_s(query.range or "day"))
         return ShownPeriod(None, start, end)
@@ -277,6 +256,53 @@ def _attitude(context: PageContext, latest: list[Summary]) -> Any:
     return context.app.results.get(latest[0].id).answer.attitude
 
 
+def _others(context: PageContext, query: SpacecraftQuery, stretch: ShownPeriod | None) -> list[str]:
+    """The addresses of the histories of other spacecraft; raises for one that is not known."""
+    for other in query.others:
+        context.caller.require(other)
+        context.app.context.mission(other)
+    if stretch is None:
+        return []
+    return [
+        history_address(other, query.run, None, stretch.start, stretch.end)
+        for other in query.others
+    ]
+
+
+@dataclass(frozen=True)
+class Change:
+    """Settings that came into force within the shown period."""
+
+    since: str
+    text: str
+
+
+def _changes(
+    context: PageContext,
+    name: str,
+    history: Sequence[MissionThen],
+    query: SpacecraftQuery,
+    stretch: ShownPeriod | None,
+) -> list[Change]:
+    """The changes of settings within a period of live batches, whose times follow the clock."""
+    if stretch is None or query.run != LIVE:
+        return []
+    adopted = {each.adopted[:19]: each for each in context.app.adoptions.in_force(name).history}
+    found = []
+    for each in history[1:]:
+        if not stretch.start.tai_ns <= recorded_utc(each.since).tai_ns < stretch.end.tai_ns:
+            continue
+        adoption = adopted.get(each.since[:19])
+        what = "Settings changed with the mission file"
+        if adoption is not None:
+            version = adoption.version
+            what = "The mission file" if version is None else f"Calibration version {version}"
+            what += f" adopted by {adoption.who}"
+            what += f": {adoption.note}" if adoption.note else ""
+        found.append(Change(each.since, what))
+    return found
+
+
 def _annotations(context: PageContext, name: str, stretch: ShownPeriod | None) -> Page[Annotation]:
     """The annotations that touch the shown period."""
     if stretch is None:
@@ -284,26 +310,3 @@ def _annotations(context: PageContext, name: str, stretch: ShownPeriod | None) -
     return context.app.annotations.page(
         spacecraft=name, start=stretch.start, end=stretch.end, limit=ANNOTATIONS
     )
-
-
-def _history_address(
-    name: str, query: SpacecraftQuery, stretch: ShownPeriod, more: dict[str, Any]
-) -> str:
-    asked: dict[str, object] = {} if query.run == LIVE else {"run": query.run}
-    if query.tracker:
-        asked["tracker"] = query.tracker
-    asked |= {"start": stretch.start.text, "end": stretch.end.text, "size": POINTS} | more
-    return f"/api/v1/spacecraft/{quote(name)}/history?{urlencode(asked)}"
-
-
-def _file_address(
-    name: str, query: SpacecraftQuery, stretch: ShownPeriod, product: str, format: str
-) -> str:
-    """The address of a product of the shown period as a file."""
-    asked = {
-        "run": query.run,
-        "start": stretch.start.text,
-        "end": stretch.end.text,
-        "format": format,
-    }
-    return f"/api/v1/spacecraft/{quote(name)}/{product}?{urlencode(asked)}"
