@@ -9,6 +9,7 @@ no other.  A repeat of a batch that is being computed waits for it and is then l
 """
 
 import asyncio
+import heapq
 import logging
 import threading
 import time
@@ -17,12 +18,13 @@ from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import count
+from typing import Generic, TypeVar
 
 from sqlalchemy import Connection
 
 from service.errors import BeingBuilt, Busy, Stopping
 from service.ingest.solver_pool import WAIT_S, SolverPool, SolverTask
-from service.ingest.turns import Turns
 from service.observations.schema import Submission
 from service.sky.cache import NotAtHand
 from service.storage.recording.identity import Identity, OwnKey
@@ -281,3 +283,32 @@ def _answer(outcomes: Sequence[tuple[PendingBatch, WriteOutcome]]) -> None:
             pending.future.set_exception(outcome)
         else:
             pending.future.set_result(outcome)
+
+
+T = TypeVar("T")
+
+
+class Turns(Generic[T]):
+    """Those of one key that wait while another of it is at work.  The caller holds a lock."""
+
+    def __init__(self) -> None:
+        self._waiting: dict[Hashable, list[tuple[int, int, T]]] = {}
+        """Of each key that has one at work: the time of a batch, a number, the batch."""
+        self._numbers = count()
+
+    def enter(self, key: Hashable, time_ns: int, item: T) -> bool:
+        """Whether it may begin; if not, `leave` gives it when its turn has come."""
+        waiting = self._waiting.get(key)
+        if waiting is None:
+            self._waiting[key] = []
+            return True
+        heapq.heappush(waiting, (time_ns, next(self._numbers), item))
+        return False
+
+    def leave(self, key: Hashable) -> T | None:
+        """The next of a key, whose last one is done; None where none waits."""
+        waiting = self._waiting[key]
+        if waiting:
+            return heapq.heappop(waiting)[2]
+        del self._waiting[key]
+        return None

@@ -8,15 +8,16 @@ import hashlib
 import json
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
 
 import numpy as np
 from pydantic import (
     AfterValidator,
+    BaseModel,
     Field,
     ValidationError,
     ValidationInfo,
@@ -30,14 +31,12 @@ from service.missions.camera_defaults import with_camera_defaults
 from service.missions.corrections import AS_MEASURED, Calibration, Magnitudes
 from service.missions.gyro import GyroSettings, MotionSettings
 from service.missions.identifiers import IDENTIFIERS
-from service.missions.keys import dotted_key, explained
-from service.missions.live_filter import LiveFilterSettings, SmoothingSettings
 from service.missions.packets import Packets
 from service.missions.product_settings import DEFAULT_PRODUCTS, ProductSettings, beside
 from service.missions.scan import Scan
 from service.missions.strict import Components, Direction, Strict, is_missing
 from service.missions.sun_tracker import SunTracker
-from service.missions.tracking import TrackingSettings
+from service.missions.tracking import LiveFilterSettings, SmoothingSettings, TrackingSettings
 from service.vectors import Matrix, Vector, read_only, unit
 
 SHIPPED_FOLDER = Path(__file__).parent
@@ -398,3 +397,59 @@ def mission_named(missions: Mapping[str, Mission], name: str) -> Mission:
     except KeyError:
         known = ", ".join(sorted(missions))
         raise NotFound(f"no spacecraft {shown_value(name)}; there are {known}") from None
+
+
+Models = list[type[BaseModel]]
+
+
+def dotted_key(model: type[BaseModel], location: Sequence[str | int]) -> str:
+    """The key at which pydantic found a fault, without the tags that it puts in between."""
+    return ".".join(str(part) for part in _steps(model, location)) or "the file"
+
+
+def allowed_keys(model: type[BaseModel], location: Sequence[str | int]) -> list[str]:
+    """The keys of the table at a location."""
+    models = [model]
+    for part in location:
+        models = _after(models, part)[1]
+    return list(dict.fromkeys(key for each in models for key in each.model_fields))
+
+
+def explained(model: type[BaseModel], error: Mapping[str, Any]) -> str:
+    """A fault that pydantic found; for an unknown key the keys that are allowed there."""
+    if error["type"] == "missing":
+        return "is required"
+    if error["type"] != "extra_forbidden":
+        return str(error["msg"]).removeprefix("Value error, ")
+    allowed = allowed_keys(model, error["loc"][:-1])
+    return f"no such key; allowed here: {', '.join(allowed)}"
+
+
+def _steps(model: type[BaseModel], location: Sequence[str | int]) -> Iterator[str | int]:
+    models = [model]
+    for part in location:
+        is_key, models = _after(models, part)
+        if is_key:
+            yield part
+
+
+def _after(models: Models, part: str | int) -> tuple[bool, Models]:
+    """Whether a part of a location is a key or an index, and the tables to which it leads."""
+    fields = [each.model_fields[part] for each in models if part in each.model_fields]
+    if fields:
+        return True, [found for field in fields for found in _models_in(field.annotation)]
+    tagged = [each for each in models if part in _tags(each)]
+    # Below a table pydantic also names the members of a union of values.
+    is_key = isinstance(part, int) or bool(models and not tagged)
+    return is_key, tagged or models
+
+
+def _tags(model: type[BaseModel]) -> tuple[Any, ...]:
+    kind = model.model_fields.get("kind")
+    return () if kind is None else get_args(kind.annotation)
+
+
+def _models_in(annotation: Any) -> Models:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [found for part in get_args(annotation) for found in _models_in(part)]

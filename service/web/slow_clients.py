@@ -6,6 +6,7 @@ seconds between two requests.
 """
 
 import asyncio
+import json
 import time
 from http import HTTPStatus
 from typing import Any, cast
@@ -17,7 +18,6 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResp
 from uvicorn.server import ServerState
 
 from service.web.connection_limits import Admission
-from service.web.raw_responses import MAX_FIELDS, MAX_HEAD_BYTES, RAW_RESPONSES
 
 MAX_PIPELINED = 128
 """Requests that wait on one connection until the one before them is answered."""
@@ -386,3 +386,39 @@ class _Http(HttpToolsProtocol):
         if self._unread_timer is not None:
             self._unread_timer.cancel()
             self._unread_timer = None
+
+
+MAX_HEAD_BYTES = 64 << 10
+"""Of a request line with its header fields, and of the trailer fields after a chunked body."""
+MAX_FIELDS = 100
+"""Header fields of a head, or trailer fields."""
+
+
+def _raw_response(status: HTTPStatus, detail: str, *headers: str) -> bytes:
+    problem = {"type": "about:blank", "title": status.phrase, "status": int(status)}
+    body = json.dumps(problem | {"detail": detail}, separators=(",", ":"))
+    lines = (
+        f"HTTP/1.1 {int(status)} {status.phrase}",
+        "content-type: application/problem+json",
+        f"content-length: {len(body)}",
+        "connection: close",
+        *headers,
+    )
+    return ("\r\n".join(lines) + "\r\n\r\n" + body).encode()
+
+
+RAW_RESPONSES = {
+    status: _raw_response(status, detail, *headers)
+    for status, detail, *headers in (
+        (
+            HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE,
+            f"a head, or trailers, may have {MAX_HEAD_BYTES} bytes and {MAX_FIELDS} fields",
+        ),
+        (
+            HTTPStatus.SERVICE_UNAVAILABLE,
+            "all connections that the service or this address may have are in use",
+            "retry-after: 1",
+        ),
+    )
+}
+"""Whole responses by status, as bytes."""

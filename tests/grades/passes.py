@@ -13,7 +13,7 @@ from service.filtering.samples import (
 from service.grades.day import grade_day
 from service.grades.measured import Recorded
 from service.missions.gyro import GyroSettings, MotionSettings
-from service.missions.live_filter import LiveFilterSettings, SmoothingSettings
+from service.missions.tracking import LiveFilterSettings, SmoothingSettings
 from service.times import DAY_S, parse_utc
 from tests.filtering.simulated import START_NS
 

@@ -24,7 +24,7 @@ from service.simulate.scans import readings
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
 from service.sky.ephemeris import sun_direction
-from service.studies.star_image_report.attitude_correction import by_two_scans, sigmas
+from service.studies.star_image_report.scanning import by_two_scans, sigmas
 from service.studies.star_image_report.sun_tracker import SunTracker as Screen
 from service.vectors import matrix_from_quaternion, rotate_about, unit
 from tests.observations.example import BATCH

@@ -15,8 +15,8 @@ from typing import Any
 import httpx
 
 from service.app.factory import App, open_app
-from service.missions.live_filter import LiveFilterSettings
 from service.missions.mission import load_missions
+from service.missions.tracking import LiveFilterSettings
 from service.simulate.frame_files import frame_bytes
 from service.simulate.frames import FrameSettings, draw_frames
 from service.simulate.stretches import NO_TROUBLES, Pass

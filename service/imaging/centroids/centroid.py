@@ -13,14 +13,30 @@ from collections.abc import Sequence
 from typing import Literal
 
 from service.errors import BadInput, Fault
-from service.imaging.centroids.fit_result import record_of
+from service.imaging.centroids.blending import is_blended
 from service.imaging.centroids.moments import by_moments
 from service.imaging.centroids.psf import Psf
-from service.imaging.centroids.record import CentroidRecord
-from service.imaging.centroids.recursive import recursive_fit
-from service.imaging.centroids.region import brightest_pixel
-from service.imaging.centroids.shape_fit import fit
+from service.imaging.centroids.record import (
+    CentroidRecord,
+    Flag,
+    refusal,
+    too_faint,
+)
+from service.imaging.centroids.region import brightest_pixel, square_about
+from service.imaging.centroids.sequential import diffuse
+from service.imaging.centroids.shape_fit import (
+    ENOUGH_SIGMAS,
+    FARTHEST_IN_HALF_WIDTHS,
+    MOVE_BEYOND_PX,
+    Fit,
+    first_flux,
+    fit,
+    linearised,
+    stepped,
+    with_level_error,
+)
 from service.imaging.centroids.window import Window
+from service.observations.scans.profile import BREAKDOWN_RATIO
 
 Method = Literal["window", "scan", "matched", "recursive"]
 METHODS: Sequence[Method] = ("window", "scan", "matched", "recursive")
@@ -68,3 +84,70 @@ def _start(window: Window, start: tuple[float, float] | None) -> tuple[float, fl
     if not all(map(math.isfinite, start)):
         raise BadInput(Fault("start", "must be finite", str(start)))
     return start[0] - window.corner_u_px, start[1] - window.corner_v_px
+
+
+def record_of(
+    method: str, found: Fit | None, psf: Psf, half_width_px: int, window: Window
+) -> CentroidRecord:
+    """The record of a fit, or its refusal in words."""
+    if found is None:
+        return refusal(method, "the shape fits no light of this window", (Flag.OUTSIDE,))
+    flags = found.region.flags(half_width_px)
+    flux, sigma = found.flux_counts, math.sqrt(found.covariance[2, 2])
+    if not found.signal_ratio >= BREAKDOWN_RATIO:
+        return too_faint(method, flux, sigma, flags)
+    if not found.converged:
+        flags = (*flags, Flag.NOT_CONVERGED)
+    if is_blended(found, psf):
+        flags = (*flags, Flag.BLENDED)
+    sigma_u, sigma_v = math.sqrt(found.covariance[0, 0]), math.sqrt(found.covariance[1, 1])
+    return CentroidRecord(
+        method=method,
+        u_px=window.corner_u_px + found.u_px,
+        v_px=window.corner_v_px + found.v_px,
+        sigma_u_px=sigma_u,
+        sigma_v_px=sigma_v,
+        correlation_uv=float(found.covariance[0, 1]) / (sigma_u * sigma_v),
+        flux_counts=flux,
+        sigma_flux_counts=sigma,
+        signal_ratio=found.signal_ratio,
+        iterations=found.steps,
+        flags=flags,
+    )
+
+
+MOST_PASSES = 30
+VAGUE = 100.0
+"""The start is this many times vaguer than a window's width and its light."""
+
+
+def recursive_fit(
+    window: Window, psf: Psf, start: tuple[float, float], half_width_px: int, recentre: bool = True
+) -> Fit | None:
+    """Passes over the pixels, each one point at a time, until the place stays; None without light.
+
+    With `recentre` false there is one pass: the report's own form.
+    """
+    u, v = start
+    region = square_about(window, round(u), round(v), half_width_px)
+    if region is None:
+        return None
+    flux = first_flux(region, psf, u, v)
+    passes, converged = 0, False
+    while not converged and passes < MOST_PASSES:
+        passes += 1
+        seen = linearised(region, psf, u, v, flux)
+        vague = VAGUE * half_width_px
+        start_of_pass = diffuse((vague, vague, VAGUE * flux))
+        estimate = start_of_pass.replayed(seen.rows, seen.left, seen.variance)
+        converged = not recentre or seen.sigmas_of(estimate.state) < ENOUGH_SIGMAS
+        u, v, flux = stepped(u, v, flux, estimate.state)
+        if math.hypot(u - start[0], v - start[1]) > FARTHEST_IN_HALF_WIDTHS * half_width_px:
+            return None
+        if recentre and max(abs(u - region.column), abs(v - region.row)) > MOVE_BEYOND_PX:
+            moved = square_about(window, round(u), round(v), half_width_px)
+            if moved is None:
+                return None
+            region = moved
+    covariance = with_level_error(estimate.covariance, seen, window.background_sigma_counts)
+    return Fit(u, v, flux, covariance, region, passes, converged)

@@ -14,17 +14,23 @@ from itertools import product
 from typing import Any, get_args
 
 import msgspec
-from sqlalchemy import ColumnElement, Connection, Engine, Table, event, func, select, text
+import numpy as np
+from sqlalchemy import ColumnElement, Connection, Engine, Table, and_, event, func, select, text
 from sqlalchemy.exc import DatabaseError
 
 from service.errors import BadInput
+from service.grades.day import GRADES, GradedSamples
+from service.grades.innovations import MeasuredInnovations
+from service.grades.packing import unpacked, unpacked_innovations
 from service.observations.batch import ObservationBatch
 from service.observations.schema import fingerprint_of, submission_from_json
 from service.storage.projections import rollups, seals
 from service.storage.recording.digests import SETTINGS, agrees, digest_of, digest_of_row
 from service.storage.recording.tracker_splits import is_waiting
+from service.storage.sql.archive_tables import archived_batches, archived_parts
 from service.storage.sql.columns import Row, metadata
 from service.storage.sql.engines import database_url, reading_engine
+from service.storage.sql.grade_tables import INNOVATIONS, graded_blocks, graded_days
 from service.storage.sql.migrations import check, reported
 from service.storage.sql.tables import (
     batches,
@@ -35,8 +41,6 @@ from service.storage.sql.tables import (
     star_results,
     tracker_values,
 )
-from service.storage.upkeep.verify_archived import of_the_archived
-from service.storage.upkeep.verify_grades import of_the_grades
 from service.storage.upkeep.verify_gyro import of_the_gyro_blocks
 from service.times import unix_seconds, utc_of_unix
 
@@ -358,3 +362,89 @@ def _same(one: float | None, other: float | None) -> bool:
     if one is None or other is None:
         return one is other
     return math.isclose(one, other, rel_tol=TOLERANCE, abs_tol=TOLERANCE)
+
+
+def of_the_archived(engine: Engine) -> Iterator[str]:
+    """The faults: batches in no part, in fewer than their part has, and recorded ones."""
+    counted = select(archived_batches.c.part_id, func.count()).group_by(archived_batches.c.part_id)
+    both = select(batches.c.id).join(
+        archived_batches,
+        and_(*(archived_batches.c[name] == batches.c[name] for name in _IDENTITY)),
+    )
+    with engine.begin() as connection:
+        found = dict(map(tuple, connection.execute(counted)))
+        parts = connection.execute(select(archived_parts)).mappings().all()
+        recorded = list(connection.scalars(both)) if found else []
+    for part in parts:
+        if found.pop(part["id"], 0) != part["batches"]:
+            yield f"archived part {part['path']}: its batches are not all noted as archived"
+    for part_id in found:
+        yield f"archived batches are noted of a part that is not there: {part_id}"
+    for id in recorded:
+        yield f"batch {id}: it is recorded and archived"
+
+
+_IDENTITY = ("spacecraft", "run", "batch")
+
+
+_UNPACKED: dict[str, Callable[[bytes, int], GradedSamples | MeasuredInnovations]] = {
+    INNOVATIONS: unpacked_innovations
+}
+
+
+def of_the_grades(engine: Engine) -> Iterator[str]:
+    """The faults of the graded days, a sentence each.
+
+    The samples of a current day must be those that were digested, in order of time, within the
+    day and as many as it says; an earlier revision has none.
+    """
+    last = ""
+    while True:
+        query = select(graded_days.c.id).where(graded_days.c.id > last).order_by(graded_days.c.id)
+        with engine.begin() as connection:
+            ids = connection.scalars(query.limit(AT_ONCE)).all()
+        for id in ids:
+            # As of one moment: a new revision takes the samples from the one before.
+            with engine.begin() as connection:
+                yield from _of_a_day(connection, id)
+        if len(ids) < AT_ONCE:
+            return
+        last = ids[-1]
+
+
+def _of_a_day(connection: Connection, id: str) -> Iterator[str]:
+    row = connection.execute(select(graded_days).where(graded_days.c.id == id)).mappings().first()
+    if row is None:
+        return
+    name = f"graded day {id}"
+    c = graded_blocks.c
+    if not row["current"]:
+        if connection.scalar(select(func.count()).where(c.day_id == id)):
+            yield f"{name}: it has samples, though it is not the current revision"
+        return
+    digest, samples = hashlib.sha256(), Counter[str]()
+    for grade in (*GRADES, INNOVATIONS):
+        end_ns = row["start_ns"]
+        chosen = select(graded_blocks).where(c.day_id == row["id"], c.grade == grade)
+        for block in connection.execute(chosen.order_by(c.position)).mappings():
+            where = f"{name}: block {block['position']} of {grade}"
+            try:
+                found = _UNPACKED.get(grade, unpacked)(block["packed"], block["samples"])
+            except ValueError as error:
+                yield f"{where}: its samples cannot be read: {error}"
+                continue
+            digest.update(block["packed"])
+            samples[grade] += block["samples"]
+            times = found.tai_ns
+            bounds = block["start_ns"], block["end_ns"]
+            # Measurements of two trackers may be of the same moment.
+            least = 0 if grade == INNOVATIONS else 1
+            if np.any(np.diff(times) < least) or bounds != (int(times[0]), int(times[-1])):
+                yield f"{where}: its times are not those of its samples"
+            if block["start_ns"] < end_ns or block["end_ns"] >= row["end_ns"]:
+                yield f"{where}: it does not lie within its day, after the block before it"
+            end_ns = block["end_ns"]
+    if any(samples[grade] != row["samples"] for grade in GRADES):
+        yield f"{name}: it has not as many samples as it says"
+    elif f"sha256:{digest.hexdigest()}" != row["digest"]:
+        yield f"{name}: its samples are not those that were digested"

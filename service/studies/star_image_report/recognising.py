@@ -2,22 +2,18 @@
 
 import itertools
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
+from service.errors import BadInput, Fault
 from service.imaging.centroids.psf import GaussianPsf
 from service.imaging.centroids.window import Array
+from service.observations.scans.line_peaks import line_peaks
 from service.sky.catalog.star_catalog import load_embedded
 from service.studies.star_image_report.claims import Claim, Picture, Row, Study
-from service.studies.star_image_report.pattern import (
-    chord_constant,
-    constant_sigma,
-    key_of,
-    pattern_constant,
-    store_of,
-)
-from service.studies.star_image_report.raster import find_by_rasters
 from service.vectors import ARCSEC_PER_RADIAN, unit
 
 SIGMA_ARCSEC = 35.25
@@ -220,3 +216,96 @@ def _draw(figure: Any, told: dict[int, list[tuple[int, float, float]]]) -> None:
     axes[0].set(xlabel="stored fields", ylabel="%", title="alone within 3 sigma")
     axes[1].set(xlabel="stored fields", title="nearest is right")
     axes[0].legend(fontsize=7)
+
+
+def pattern_constant(u: npt.ArrayLike, v: npt.ArrayLike) -> float:
+    """K = (N - 1)(sum u² + sum v²) - sum over i, j of (u_i u_j + v_i v_j) (7.43), unpaired.
+
+    Computed as N sum |r - mean|², which is the same and does not cancel.  (In the
+    report 7.42 reads "a" for its second 2, and 7.46 pairs x with y where both are one.)
+    """
+    x, y = np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64)
+    if x.shape != y.shape or x.ndim != 1:
+        raise BadInput(Fault("v", "must be as many as u", f"{x.shape}, {y.shape}"))
+    spread = float(np.sum((x - x.mean()) ** 2) + np.sum((y - y.mean()) ** 2))
+    return len(x) * spread
+
+
+def chord_constant(vectors: npt.ArrayLike) -> float:
+    """The same of unit vectors (n, 3), by their chords: exact for any pointing in a wide field."""
+    v = np.asarray(vectors, dtype=np.float64)
+    return len(v) * float(np.sum((v - v.mean(axis=0)) ** 2))
+
+
+def constant_sigma(constant: float, stars: int, position_sigma: float) -> float:
+    """sigma_K = 2 sigma sqrt(N K) for errors `position_sigma` per axis."""
+    return 2.0 * position_sigma * math.sqrt(stars * constant)
+
+
+@dataclass(frozen=True)
+class PatternStore:
+    """Known fields by (number of stars, sqrt(K / N)), whose noise is the same for all: sigma.
+
+    One missing or false star makes another pattern of a field; alone this tells apart some
+    thirty fields, and beyond that narrows a search.
+    """
+
+    names: tuple[str, ...]
+    stars: npt.NDArray[np.intp]
+    keys: Array
+
+    def within(
+        self, stars: int, constant: float, position_sigma: float, sigmas: float = 3.0
+    ) -> list[str]:
+        """The stored fields of as many stars within the tolerance, nearest first."""
+        order, distance = self._ranked(stars, constant)
+        return [self.names[i] for i in order if distance[i] <= sigmas * position_sigma]
+
+    def nearest(self, stars: int, constant: float) -> str | None:
+        """The stored field of as many stars that is nearest; None where there is none."""
+        order, _ = self._ranked(stars, constant)
+        return self.names[order[0]] if len(order) else None
+
+    def _ranked(self, stars: int, constant: float) -> tuple[npt.NDArray[np.intp], Array]:
+        distance = np.abs(self.keys - key_of(stars, constant))
+        same = np.flatnonzero(self.stars == stars)
+        return same[np.argsort(distance[same], kind="stable")], distance
+
+
+def key_of(stars: int, constant: float) -> float:
+    """sqrt(K / N)."""
+    return math.sqrt(constant / stars)
+
+
+def store_of(patterns: dict[str, tuple[int, float]]) -> PatternStore:
+    """A store of fields by name: number of stars and K."""
+    counts = np.array([stars for stars, _ in patterns.values()], dtype=np.intp)
+    keys = np.array([key_of(stars, constant) for stars, constant in patterns.values()])
+    return PatternStore(tuple(patterns), counts, keys)
+
+
+@dataclass(frozen=True)
+class RasterStars:
+    """Places of stars along either axis in pixels, rising and unpaired; why not, if refused."""
+
+    u_px: Array
+    v_px: Array
+    refused: str | None = None
+
+
+def find_by_rasters(
+    image: Array, noise_sigma: float, threshold_sigmas: float = 6.0, background: float = 0.0
+) -> RasterStars:
+    """Stars of a field by row and column sums, to about a pixel.
+
+    A line is a star's where its sum is a maximum `threshold_sigmas` above the noise of such
+    a sum.  Two stars in one band of rows or columns look like one: the counts then differ
+    and the field is refused; where that happens to both axes alike it goes unseen.
+    """
+    light = image - background
+    u = line_peaks(light.sum(axis=0), noise_sigma * np.sqrt(image.shape[0]) * threshold_sigmas)
+    v = line_peaks(light.sum(axis=1), noise_sigma * np.sqrt(image.shape[1]) * threshold_sigmas)
+    if len(u) != len(v):
+        why = f"{len(u)} stars by columns, {len(v)} by rows: some stand in one line"
+        return RasterStars(u, v, why)
+    return RasterStars(u, v, None if len(u) else "no line stands out of the noise")

@@ -1,24 +1,19 @@
 """IM-8, IM-9 and IM-10: the cross-scan, two stars, and noise."""
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
+from service.errors import BadInput, Fault
 from service.imaging.centroids.window import Array
 from service.imaging.optics.pupil import disc
 from service.imaging.optics.transfer import image_by_fft
 from service.observations.scans.cross_scan import cross_scan, mean_of_scans
-from service.studies.star_image_report.attitude_correction import by_positions, by_two_scans, sigmas
+from service.observations.scans.profile import ProfileMoment, moment
 from service.studies.star_image_report.claims import Claim, Picture, Row, Study
-from service.studies.star_image_report.cross_scan import (
-    nyquist_spacing,
-    truncated,
-    variance_in_full,
-    variance_of_long_scan,
-    variance_sampled,
-    with_background,
-)
 from service.studies.star_image_report.optics import DIAMETER_M, LASER_M
 
 SIGMA = 0.02
@@ -304,3 +299,112 @@ def _draw_noise(figure: Any, rng: np.random.Generator, trials: int) -> None:
     axes[1].set(xlabel="sum of light over its noise", ylabel="scatter over the law")
     axes[1].set_xticks([3, 5, 10, 20, 40], ["3", "5", "10", "20", "40"], minor=False)
     axes[1].minorticks_off()
+
+
+@dataclass(frozen=True)
+class Misalignment:
+    """How a pattern stands off: displacements in the units of the image plane, roll in radians.
+
+    The image is the nominal one turned by `roll_rad` about the boresight, then moved by
+    (`du`, `dv`).
+    """
+
+    du: float
+    dv: float
+    roll_rad: float
+
+
+def by_two_scans(a1: float, b1: float, a2: float, b2: float, half_distance: float) -> Misalignment:
+    """From the displacements of two stars that should stand at (-u0, 0) and (u0, 0) (7.23 to 7.25).
+
+    Only right for a pair symmetric about the boresight.  Two stars that look alike leave
+    half a turn open: this is the answer within a quarter turn.
+    """
+    if half_distance <= 0.0:
+        raise BadInput(Fault("half_distance", "must be above zero", str(half_distance)))
+    roll = math.atan2(b2 - b1, 2.0 * half_distance - a1 + a2)
+    if abs(roll) > math.pi / 2.0:
+        roll -= math.copysign(math.pi, roll)
+    return Misalignment((a1 + a2) / 2.0, (b1 + b2) / 2.0, roll)
+
+
+def by_positions(nominal: npt.ArrayLike, observed: npt.ArrayLike) -> Misalignment:
+    """From any two or more stars (n, 2), wherever they stand: roll first, then displacement.
+
+    Least squares of a turn and a move, stars told apart, so that any roll is found.
+    Raises `BadInput` for fewer than two stars, or for stars all in one place.
+    """
+    should, are = _pairs(nominal, observed)
+    middle_should, middle_are = should.mean(axis=0), are.mean(axis=0)
+    arms, found = should - middle_should, are - middle_are
+    along = float(np.sum(arms * found))
+    across = float(np.sum(arms[:, 0] * found[:, 1] - arms[:, 1] * found[:, 0]))
+    if math.hypot(along, across) == 0.0:
+        raise BadInput(Fault("nominal", "all stars are in one place: no roll can be told"))
+    roll = math.atan2(across, along)
+    c, s = math.cos(roll), math.sin(roll)
+    moved = middle_are - np.array([[c, -s], [s, c]]) @ middle_should
+    return Misalignment(float(moved[0]), float(moved[1]), roll)
+
+
+def sigmas(position_sigma: float, half_distance: float) -> tuple[float, float]:
+    """Of either displacement, sigma / sqrt 2, and of the roll, sqrt 2 sigma / (2 u0)."""
+    return position_sigma / math.sqrt(2.0), math.sqrt(2.0) * position_sigma / (2.0 * half_distance)
+
+
+def _pairs(nominal: npt.ArrayLike, observed: npt.ArrayLike) -> tuple[Array, Array]:
+    should = np.asarray(nominal, dtype=np.float64)
+    are = np.asarray(observed, dtype=np.float64)
+    if should.shape != are.shape or should.ndim != 2 or should.shape[1] != 2:
+        raise BadInput(
+            Fault("observed", "must be as many (u, v) as nominal", f"{should.shape}, {are.shape}")
+        )
+    if len(should) < 2:
+        raise BadInput(Fault("nominal", "two stars are needed", str(len(should))))
+    return should, are
+
+
+def nyquist_spacing(
+    shortest_wavelength_m: float, focal_length_m: float, diameter_m: float
+) -> float:
+    """T = pi / B = lambda f / (2 D): the widest step at which samples hold all of an image (m)."""
+    return shortest_wavelength_m * focal_length_m / (2.0 * diameter_m)
+
+
+def variance_sampled(spacing: float, noise_sigma: float, reach: int, light_sum: float) -> float:
+    """T² sigma² N (N + 1)(2N + 1) / [3 (sum Phi)²] (7.36; one printing has N² + 1 in it).
+
+    For a star in the middle of the scan and white noise.
+    """
+    n = reach
+    return spacing**2 * noise_sigma**2 * n * (n + 1) * (2 * n + 1) / (3.0 * light_sum**2)
+
+
+def variance_of_long_scan(
+    spacing: float, noise_sigma: float, half_length: float, light_integral: float
+) -> float:
+    """(pi / B) 2 sigma² V³ / [3 (integral of Phi)²] (7.40): 7.36 for N far above 1."""
+    return spacing * 2.0 * noise_sigma**2 * half_length**3 / (3.0 * light_integral**2)
+
+
+def variance_in_full(samples: Array, spacing: float, noise_sigma: float) -> ProfileMoment:
+    """sigma² sum (v - d)² / (sum Phi)²: 7.36 and (2N + 1) d² sigma² / (sum Phi)² for a star off it.
+
+    In steps of the scan; `variance` times spacing² is the law.
+    """
+    return moment(samples, np.full(samples.shape, noise_sigma**2))
+
+
+def truncated(displacement: float, half_length: float, end_light: float, light: float) -> float:
+    """What a scan from -V to V finds: d [1 - 2 V <Phi(V)> / E], with <Phi(V)> the mean of its ends.
+
+    `light` is E, the integral along the line.
+    """
+    return displacement * (1.0 - 2.0 * half_length * end_light / light)
+
+
+def with_background(
+    displacement: float, light_sum: float, samples: int, background: float
+) -> float:
+    """What a scan finds when a level is left in: d E / (E + (2N + 1) b0)."""
+    return displacement * light_sum / (light_sum + samples * background)

@@ -9,14 +9,14 @@ from hypothesis import given
 from hypothesis.extra.numpy import arrays
 
 from service.imaging.centroids.psf import GaussianPsf
-from service.studies.star_image_report.pattern import (
+from service.studies.star_image_report.recognising import (
     chord_constant,
     constant_sigma,
+    find_by_rasters,
     key_of,
     pattern_constant,
     store_of,
 )
-from service.studies.star_image_report.raster import find_by_rasters
 from service.vectors import rotate_about, unit
 
 FIELDS = arrays(np.float64, st.tuples(st.integers(2, 9), st.just(2)), elements=st.floats(-1e3, 1e3))
