@@ -84,7 +84,8 @@ def test_what_takes_long_is_told_as_soon_as_it_shows(app, make, monkeypatch):
     wrong = json.loads(make("wrong").text)
     wrong["a_priori"] = {"quaternion": [0.0, 0.0, 0.0, 1.0]}
     app.submissions.submit(submission_from_json(json.dumps(wrong)))
-    assert len(threads) == 2
+    # Twice more where the sky had to be built first.
+    assert len(threads) >= 2
     assert all(name.startswith("solver") for name in threads)
 
 
