@@ -35,13 +35,19 @@ class ZoneCost:
     """The largest zones of one size that the sky has.
 
     `stars` is the most NCAP, `pairs` the most NTOT as counted, of a zone about another axis;
-    `k_g` is the paper's approximation (equation 2).
+    `k_g` is the paper's approximation (equation 2) and `pairs_by_k_g` what it makes of NCAP
+    (equation 1).
     """
 
     size_deg: float
     stars: int
     pairs: int
     k_g: float
+
+    @property
+    def pairs_by_k_g(self) -> int:
+        """NTOT by equation 1 of Fink & Shoup (1994)."""
+        return round(self.k_g * self.stars * (self.stars - 1) / 2.0)
 
 
 @dataclass(frozen=True)

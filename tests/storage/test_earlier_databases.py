@@ -268,8 +268,9 @@ def names_of(earlier):
         "latest/{name}": spacecraft,
         "runs/{run}": runs,
         "tables/{kind}": ["batches", "stars", "gyro"],
-        # Earlier versions took none.
+        # Of none is anything kept: earlier versions took no gyro, and jobs end with their service.
         "gyro/{id}": [],
+        "definitive-attitude/{id}": [],
         "calibrations/{id}": [
             each["id"] for each in earlier.get(f"{API}/calibrations").json()["items"]
         ],
