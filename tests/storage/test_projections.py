@@ -173,6 +173,7 @@ def test_changes_beside_what_is_not_projected_yet_count_nothing_twice(app, make,
     """What is deleted or replaced first, the projector comes to later, or never."""
     with monkeypatch.context() as patch:
         patch.setattr(projecting, "PROJECTIONS", (held_up,))
+        patch.setattr(projecting, "WAIT_S", 0.1)
         some = [make(f"b{k}", after_s=900.0 * k) for k in range(8)]
         ids = [each.id for each in app.submissions.submit_many(some)]
         app.results.what_if(ids[7], OTHER, adopt=True)
