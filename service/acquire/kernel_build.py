@@ -122,7 +122,8 @@ def _is_complete() -> bool:
     """True if the cache holds every kernel, none of them damaged: a damaged one is removed."""
     marker = _marker()
     try:
-        return count_whole(marker.parent) >= int(marker.read_text(encoding="ascii"))
+        expected = int(marker.read_text(encoding="ascii"))
+        return count_whole(marker.parent) >= expected
     except (OSError, ValueError):
         return False
 
