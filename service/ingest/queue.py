@@ -202,7 +202,8 @@ class IngestQueue:
             self._finish([(pending, error)])
         else:
             job.unsaved_results = [pending.unsaved]
-        return pending.unsaved is not None
+            return True
+        return False
 
     def _start(self, pending: PendingBatch) -> None:
         """Queue a batch for the pool."""

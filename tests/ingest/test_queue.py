@@ -89,6 +89,15 @@ def test_what_takes_long_is_told_as_soon_as_it_shows(app, make, monkeypatch):
     assert all(name.startswith("solver") for name in threads)
 
 
+def test_what_the_pool_computes_before_its_caller_goes_on_is_recorded_once(app, make, monkeypatch):
+    pool = app.submissions.ingest.pool
+    monkeypatch.setattr(pool, "put", lambda task, turn, is_long: task.work())
+    app.zones.drop()
+    answer = app.submissions.submit(make("quick"))
+    assert not answer.replayed
+    assert [each.id for each in app.results.page().items] == [answer.id]
+
+
 def test_a_repeat_of_what_is_computed_waits_for_it_and_gets_its_answer(send, make, monkeypatch):
     held = Held(monkeypatch, "same")
     first = send(make("same"))

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 from sqlalchemy import Connection, Engine, update
 from sqlalchemy.exc import DBAPIError
 
-from service.errors import Busy, Standby, Stopping
+from service.errors import AcquisitionError, Busy, Standby, Stopping
 from service.storage.recording import events
 from service.storage.recording.transaction import (
     QueuedJob,
@@ -292,16 +292,20 @@ class Writer:
         self._solving_since_s = time.monotonic()
         try:
             solved = self.solve_posts(posts)
-            if solved:
-                self._require_locks()
         except Exception as error:
-            if not isinstance(error, Busy):
-                log.exception("a group of submissions failed")
+            log.exception("a group of submissions failed")
             for job in posts:
                 job.settle(error)
             solved = []
         finally:
             self._solving_since_s = None
+        try:
+            if solved:
+                self._require_locks()
+        except AcquisitionError as error:
+            for job in solved:
+                job.settle(error)
+            solved = []
         return [job for job in jobs if job.post is None] + solved
 
     def _in_time(self, jobs: Sequence[QueuedJob]) -> Sequence[QueuedJob]:
