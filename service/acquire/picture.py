@@ -384,7 +384,7 @@ NOTABLE_FOCAL = 0.005
 def remarks_on(
     lens: Lens, found: Verified, points: PointSources, guess_px: float | None, guess_share: float
 ) -> Iterator[str]:
-    """What is worth saying of a picture whose attitude was found."""
+    """Remarks that a user should read about a picture whose attitude was found."""
     fitted_px = lens.focal_px
     if guess_px is not None:
         off = fitted_px / guess_px - 1.0

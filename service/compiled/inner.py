@@ -32,6 +32,7 @@ def _leave_scipy_out() -> None:
     tenth of the start and 40 MB of each process.
     """
     if _SCIPY not in sys.modules:
+        # None makes an import fail, which the types of the standard library do not know.
         sys.modules[_SCIPY] = None  # type: ignore[assignment]
         try:
             importlib.import_module("numba.np.arraymath")

@@ -66,7 +66,7 @@ class PendingBatch:
     received: Utc = field(default_factory=utc_now)
     since_s: float = field(default_factory=time.monotonic)
     unsaved: UnsavedResult | None = None
-    """What was computed."""
+    """The result, once a thread has computed it."""
 
 
 @dataclass(frozen=True)
@@ -168,6 +168,7 @@ class IngestQueue:
         try:
             found = self._look_up([job.post for job in jobs])
         except Exception as error:
+            # Each client gets the error: nothing is decided about its batch.
             found = [error] * len(jobs)
         known, to_write = [], []
         for job, each in zip(jobs, found, strict=True):
@@ -199,6 +200,7 @@ class IngestQueue:
         except NotAtHand:
             self._start(pending)
         except Exception as error:
+            # It concerns this batch alone, and its client gets it.
             self._finish([(pending, error)])
         else:
             job.unsaved_results = [pending.unsaved]

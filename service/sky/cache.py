@@ -31,7 +31,7 @@ T = TypeVar("T", bound=Sized)
 
 
 class NotAtHand(Exception):
-    """What is asked for takes long, and the caller must not wait for it."""
+    """To get the thing would take long, and this caller must not wait."""
 
 
 @dataclass
@@ -94,6 +94,7 @@ class LruCache:
                 self._entries.move_to_end(key)
                 entry.hits += 1
                 self._hits += 1
+                # One cache holds things of several types; a key always names the same type.
                 return entry.thing, True  # type: ignore[return-value]
             if not wait:
                 raise NotAtHand

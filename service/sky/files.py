@@ -1,4 +1,4 @@
-"""What is made of a star catalog, kept as files: built once, and mapped by every process.
+"""Files of run catalogs and whole-sky indexes: one process builds each, every process maps it.
 
 A file lies beside the compiled kernels, under the digest of all that it depends on.  Its content
 stands behind a digest of its own: a file that was cut or changed is removed and built again.  It is

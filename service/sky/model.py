@@ -77,7 +77,7 @@ class SkyModel:
         build: Callable[[], Content],
         made_of: Callable[[Content], Kept],
     ) -> Kept:
-        """What is made of a file's content, from the cache."""
+        """The thing that `made_of` makes of a file's content, from the cache."""
 
         def find_builder() -> Executor | None:
             # To open a file takes less than to wait for another thread.

@@ -185,6 +185,7 @@ class DefinitiveAttitudes:
         except AcquisitionError as error:
             ended = {"state": "failed", "fault": str(error)}
         except Exception:
+            # Whatever fails, the job must end: a client waits for its state.
             log.exception("the definitive attitude of %s failed", wanted.spacecraft)
             ended = {"state": "failed", "fault": "the fault is on the service's side; it is logged"}
         self._change(id, ended=utc_now().text, **ended)

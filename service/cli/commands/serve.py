@@ -104,6 +104,7 @@ def prepare(parsed: Namespace) -> int:
     prewarm_sky(sky, missions.values(), moment)
     built = len(set(folder().glob("*.npy")) - before)
     keys = [entry.key for entry in sky.cache.state().entries]
+    # The cache's keys are of any type; those of this sky are pairs of kind and key.
     there = sum(is_kept(*key) for key in keys)  # type: ignore[misc]
     done = f"{built} files built in {time.monotonic() - start:.1f} s" if built else "built already"
     print(f"sky: {done}\nfolder: {folder().parent}")

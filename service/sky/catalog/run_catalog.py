@@ -225,7 +225,7 @@ def rejections(
 ) -> dict[int, str]:
     """Row and reason of every star of `judged` that is rejected; a merged one by its leader.
 
-    What is not known of a star does not reject it.  Of several reasons the
+    A property that the catalog does not tell rejects no star.  Of several reasons the
     first is given.
     """
     reasons: dict[int, str] = {}

@@ -1,7 +1,7 @@
 """Digests of what the record keeps: of each result, and of each row of settings that it names.
 
 `verify` computes them again: a digit that changed later, in an answer, an input, a column or a
-star, does not pass.  What is null is left out, so that a column which a later version adds
+star, does not pass.  A digest leaves null columns out, so that a column which a later version adds
 changes no digest that was made before it.
 """
 
@@ -29,7 +29,7 @@ BYTES = 8
 SETTINGS = (missions, catalogs, mission_uses)
 """The tables whose rows have a digest each, `row_digest`."""
 _NO_CONTENT = ("results.current", "results.seq", "results.digest", "mission_uses.id")
-"""What is current, places in an order, and digests."""
+"""Columns without content: the mark of the current result, places in an order, digests."""
 
 _encode = msgspec.json.Encoder().encode
 _in_order = itemgetter("tracker", "position")

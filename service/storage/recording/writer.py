@@ -293,6 +293,7 @@ class Writer:
         try:
             solved = self.solve_posts(posts)
         except Exception as error:
+            # The thread goes on for others, and no client waits for ever.
             log.exception("a group of submissions failed")
             for job in posts:
                 job.settle(error)
