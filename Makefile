@@ -147,7 +147,7 @@ pythons: $(DEV)
 dist: $(DEV)
 	@rm -rf dist
 	@UV_PYTHON=$(BIN)/python $(BIN)/uv build --no-build-isolation --quiet --out-dir dist
-	@UV_PYTHON=$(BIN)/python $(BIN)/uv build --no-build-isolation --quiet --wheel --out-dir dist service/client
+	@UV_PYTHON=$(BIN)/python $(BIN)/uv build --no-build-isolation --quiet --wheel --out-dir dist client
 	@$(BIN)/uv tool run --quiet --from cyclonedx-bom==7.5.0 cyclonedx-py requirements \
 		--pyproject pyproject.toml --output-reproducible --output-file dist/bill-of-materials.cdx.json \
 		requirements.lock

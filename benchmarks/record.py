@@ -45,7 +45,7 @@ SIMULATOR = (
 )
 IMAGING = (
     "service/imaging",
-    "service/studies/star_image_report",
+    "studies/star_image_report",
     "service/simulate/drawing.py",
     "service/observations/scans/profile.py",
     "service/observations/scans/cross_scan.py",

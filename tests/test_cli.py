@@ -169,10 +169,10 @@ def test_a_service_is_ready_without_what_is_used_later(tmp_path):
     # numba asks scipy for its version, and nothing else.
     assert not {each for each in loaded if each.startswith(("scipy.l", "scipy.s", "scipy.o"))}
     for late in (
-        *("service.demo", "service.replay", "service.simulate", "service.studies"),
+        *("service.demo", "service.replay", "service.simulate", "studies"),
         *("service.identify.blind", "service.identify.triangles", "service.imaging.detection"),
         *("service.imaging.frames.fits", "service.imaging.sky_overlay", "service.products.spice"),
-        *("service.sky.whole_sky.quads", "service.storage.upkeep.archiving", "service.client"),
+        *("service.sky.whole_sky.quads", "service.storage.upkeep.archiving", "acquire_client"),
     ):
         assert late not in loaded
 

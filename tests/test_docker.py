@@ -71,7 +71,7 @@ def test_the_image_has_the_packages_of_every_extra_that_the_service_asks_for():
         "optional-dependencies"
     ]
     asked = set()
-    for path in (root / "service").rglob("*.py"):
+    for path in [*(root / "service").rglob("*.py"), *(root / "studies").rglob("*.py")]:
         text = path.read_text(encoding="utf-8")
         asked |= set(re.findall(r"require_extra\(\s*\"(\w+)\"|extra=\"(\w+)\"", text))
     names = {name for pair in asked for name in pair if name} | {"postgresql"}
@@ -90,15 +90,15 @@ def test_whatever_the_service_imports_in_any_function_is_in_the_image():
     locked = set(re.findall(r"^([\w.-]+)==", lock, re.MULTILINE))
     provided = metadata.packages_distributions()
     wanted = {}
-    for path in (root / "service").rglob("*.py"):
+    # The client is for programs of its users: its tables need packages that the image has not.
+    for path in [*(root / "service").rglob("*.py"), *(root / "studies").rglob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             names = [node.module] if isinstance(node, ast.ImportFrom) and not node.level else []
             names += [each.name for each in node.names] if isinstance(node, ast.Import) else []
-            # The client's tables are for programs of its users.
-            for name in names if not path.is_relative_to(root / "service" / "client") else ():
+            for name in names:
                 wanted.setdefault(name.partition(".")[0], path)
     # The last is a checkout's own: `catalog build` says so where there is none.
-    own = {"service", *sys.stdlib_module_names, "catalogs"}
+    own = {"service", "studies", "acquire_client", *sys.stdlib_module_names, "catalogs"}
     missing = {
         name: path
         for name, path in wanted.items()

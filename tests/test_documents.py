@@ -13,7 +13,7 @@ from service import __version__
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted(
     path
-    for pattern in ("*.md", "docs/**/*.md", "catalogs/*.md", "service/client/*.md")
+    for pattern in ("*.md", "docs/**/*.md", "catalogs/*.md", "client/*.md")
     for path in ROOT.glob(pattern)
     if ".venv" not in path.parts
 )
@@ -57,7 +57,7 @@ PARTS = {
     ],
 )
 def test_every_example_passes_a_strict_checker_of_types(document, tmp_path):
-    (tmp_path / "acquire_client").symlink_to(ROOT / "service" / "client")
+    (tmp_path / "acquire_client").symlink_to(ROOT / "client" / "acquire_client")
     names = "".join(f"{name}: Any\n" for name in PARTS.get(document.name, ()))
     for k, block in enumerate(PYTHON.findall(document.read_text(encoding="utf-8"))):
         (tmp_path / f"example_{k}.py").write_text(f"from typing import Any\n{names}{block}")

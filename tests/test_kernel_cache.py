@@ -44,8 +44,10 @@ def cache_of(package):
 
 def test_an_edit_of_any_kernel_s_file_starts_a_new_cache(tmp_path):
     """numba alone would go on with what it compiled from the old file."""
+    for name in ("service", "studies"):
+        without = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(PACKAGE.parent / name, tmp_path / name, ignore=without)
     copy = tmp_path / "service"
-    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
     before = cache_of(copy)
     assert cache_of(copy) == before
     edited = copy / "identify" / "hypotheses" / "scene.py"
@@ -70,7 +72,8 @@ def imported_by(path, modules):
 
 def test_all_that_compiled_code_takes_in_is_part_of_the_state_of_the_source():
     """A constant or a function of any module that a kernel's module imports is compiled in."""
-    modules = {module_of(path): path for path in PACKAGE.rglob("*.py")}
+    folders = (PACKAGE, PACKAGE.parent / "studies")
+    modules = {module_of(path): path for each in folders for path in each.rglob("*.py")}
     kernel = re.compile(r"^@(njit|njit_no_refcount|njit_allocating)\b|= intrinsic\(", re.MULTILINE)
     waiting = [name for name, path in modules.items() if kernel.search(path.read_text())]
     assert len(waiting) > 20
@@ -80,7 +83,7 @@ def test_all_that_compiled_code_takes_in_is_part_of_the_state_of_the_source():
         if name not in taken_in:
             taken_in.add(name)
             waiting += imported_by(modules[name], modules)
-    watched = [PACKAGE / source for source in SOURCES]
+    watched = [PACKAGE.parent / source for source in SOURCES]
     outside = {
         name
         for name in taken_in

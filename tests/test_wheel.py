@@ -6,12 +6,13 @@ import sys
 import zipfile
 from pathlib import Path
 
+import acquire_client
 import pytest
 
 import service
-from service import client as acquire_client
 
 CHECKOUT = Path(__file__).parents[1]
+PACKAGED = ["service", "studies", "client/acquire_client", "migrations", "catalogs"]
 UV = Path(sys.executable).parent / "uv"
 
 
@@ -50,7 +51,7 @@ def installed(wheel, tmp_path_factory):
 
 def test_the_wheel_holds_every_file_of_the_package_and_the_shipped_data(wheel):
     listed = subprocess.run(
-        ["git", "ls-files", "service", "migrations", "catalogs"],
+        ["git", "ls-files", *PACKAGED],
         cwd=CHECKOUT,
         capture_output=True,
         text=True,
@@ -58,16 +59,16 @@ def test_the_wheel_holds_every_file_of_the_package_and_the_shipped_data(wheel):
     ).stdout.split()
     shipped = {"catalogs/README.md", "catalogs/stars.npz"}
     wanted = {
-        name if name.startswith("service/") else f"service/_shipped/{name}"
+        name.removeprefix("client/")
+        if name.startswith(("service/", "studies/", "client/"))
+        else f"service/_shipped/{name}"
         for name in listed
-        if not name.startswith("catalogs/") or name in shipped
+        if (CHECKOUT / name).exists() and (not name.startswith("catalogs/") or name in shipped)
     }
     with zipfile.ZipFile(wheel) as archive:
         held = {name for name in archive.namelist() if ".dist-info/" not in name}
-    assert {
-        name for name in wanted if (CHECKOUT / name).exists() or "_shipped" in name
-    } - held == set()
-    assert {name for name in held if not name.startswith("service/")} == set()
+    assert wanted - held == set()
+    assert {name.partition("/")[0] for name in held} == {"service", "studies", "acquire_client"}
     assert {name for name in held if name.endswith((".db", ".nbi", ".nbc", ".pyc"))} == set()
 
 

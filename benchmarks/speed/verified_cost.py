@@ -33,10 +33,10 @@ from service.identify.sighting import SightedArrays, Sighting
 from service.identify.voting.pair_tests import cast_votes, count_votes, polar_angles
 from service.identify.voting.starid import ballots_for, tallies_for, voting_arrays
 from service.sky.model import SkyModel
-from service.studies.paper_1994.experiments import open_sky
-from service.studies.paper_1994.printed import the_paper
-from service.studies.paper_1994.views import EPOCH, batch_of, draw_zone, paper_mission
 from service.vectors import ARCSEC_PER_RADIAN
+from studies.paper_1994.experiments import open_sky
+from studies.paper_1994.printed import the_paper
+from studies.paper_1994.views import EPOCH, batch_of, draw_zone, paper_mission
 
 Rows = npt.NDArray[np.int64]
 
@@ -316,4 +316,4 @@ by votes and with the early stop.
     return Written(text, bounds_of(costs))
 
 
-SECTION = Section("What verifying costs", write, (*CORE, *SIMULATOR, "service/studies/paper_1994"))
+SECTION = Section("What verifying costs", write, (*CORE, *SIMULATOR, "studies/paper_1994"))

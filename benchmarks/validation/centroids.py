@@ -26,7 +26,7 @@ from service.imaging.centroids.centroid import METHODS, centroid
 from service.imaging.centroids.psf import GaussianPsf, Psf
 from service.imaging.centroids.sampled_psf import airy_psf
 from service.imaging.centroids.window import Detector, cutout
-from service.studies.star_image_report.windows import WindowStar, draw_stars, flux_of_peak
+from studies.star_image_report.windows import WindowStar, draw_stars, flux_of_peak
 
 RATIOS = (10.0, 30.0, 100.0, 300.0, 1000.0)
 DETECTOR = Detector(gain_e_per_count=2.0, read_noise_e=10.0, saturation_counts=1e9)

@@ -4,8 +4,8 @@ from benchmarks.bounds import Bound, every
 from benchmarks.record import IMAGING
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
-from service.studies.star_image_report.claims import Row
-from service.studies.star_image_report.command import ROWS, run_imaging
+from studies.star_image_report.claims import Row
+from studies.star_image_report.command import ROWS, run_imaging
 
 _REPORT, _FRAMES = "studies/star_image_report/test_further.py", "imaging/test_crossed_frames.py"
 HELD_AGAINST = (

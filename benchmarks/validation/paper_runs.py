@@ -17,15 +17,15 @@ from benchmarks.record import CORE, SIMULATOR
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, pictures_of, table
 from service.simulate.drawing import Folder
-from service.studies.paper_1994.document import document
-from service.studies.paper_1994.experiments import run_experiments
-from service.studies.paper_1994.plots import draw
-from service.studies.paper_1994.printed import Run, the_paper
-from service.studies.paper_1994.region import differences, is_inside
-from service.studies.paper_1994.report import PAPER_IDENTIFIER
-from service.studies.paper_1994.report import measured as measured_times
-from service.studies.paper_1994.tables import TITLES
-from service.studies.paper_1994.tally import AMBIGUOUS, MISIDENTIFIED, UNMATCHED, Tally
+from studies.paper_1994.document import document
+from studies.paper_1994.experiments import run_experiments
+from studies.paper_1994.plots import draw
+from studies.paper_1994.printed import Run, the_paper
+from studies.paper_1994.region import differences, is_inside
+from studies.paper_1994.report import PAPER_IDENTIFIER
+from studies.paper_1994.report import measured as measured_times
+from studies.paper_1994.tables import TITLES
+from studies.paper_1994.tally import AMBIGUOUS, MISIDENTIFIED, UNMATCHED, Tally
 
 STARS, QUICK_STARS = 20_000, 400
 SEEDS = 3
@@ -262,4 +262,4 @@ def _draw(votes: Sequence[Tally], verified: Sequence[Tally], pictures: Folder) -
     pictures.save(figure, "paper-verified")
 
 
-SECTION = Section("The runs of the paper", write, (*CORE, *SIMULATOR, "service/studies/paper_1994"))
+SECTION = Section("The runs of the paper", write, (*CORE, *SIMULATOR, "studies/paper_1994"))

@@ -19,8 +19,8 @@ from service.sky.catalog.star_catalog import load_embedded
 from service.sky.geometry.kvector import bracket
 from service.sky.geometry.triangles import REACH_DEG, build_triangles, project
 from service.sky.whole_sky.guide import Guide, build_guide
-from service.studies.ptp_2015.printed import the_ptp_paper
 from service.vectors import unit
+from studies.ptp_2015.printed import the_ptp_paper
 
 FIELDS, QUICK_FIELDS = 10_000, 200
 DRAWS = 20_000
@@ -155,5 +155,5 @@ neither may pass. Its tables and its rivals are in [ptp.md](ptp.md).
 
 
 SECTION = Section(
-    "Identification without a prior: PTP", write, (*CORE, *SIMULATOR, "service/studies/ptp_2015")
+    "Identification without a prior: PTP", write, (*CORE, *SIMULATOR, "studies/ptp_2015")
 )

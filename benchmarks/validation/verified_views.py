@@ -21,10 +21,10 @@ from service.sky.cache import LruCache
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
-from service.studies.paper_1994.printed import Run, World, the_paper
-from service.studies.paper_1994.views import EPOCH, View, batch_of, draw_zone, paper_mission
 from service.times import Utc
 from service.vectors import Vector, read_only
+from studies.paper_1994.printed import Run, World, the_paper
+from studies.paper_1994.views import EPOCH, View, batch_of, draw_zone, paper_mission
 
 Rows = npt.NDArray[np.intp]
 

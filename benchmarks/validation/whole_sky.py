@@ -21,8 +21,8 @@ from service.observations.batch import QuaternionPrior
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
-from service.studies.paper_1994.printed import the_paper
-from service.studies.paper_1994.views import EPOCH, batch_of, draw_zone, paper_mission
+from studies.paper_1994.printed import the_paper
+from studies.paper_1994.views import EPOCH, batch_of, draw_zone, paper_mission
 
 VIEWS, QUICK_VIEWS = 10_000, 100
 STARS = 5
@@ -115,6 +115,4 @@ stars, 3 arcsec, 0.1 mag. The heavy-tailed prior has a uniform share, which then
     return Written(text, bounds)
 
 
-SECTION = Section(
-    "Nothing known beforehand", write, (*CORE, *SIMULATOR, "service/studies/paper_1994")
-)
+SECTION = Section("Nothing known beforehand", write, (*CORE, *SIMULATOR, "studies/paper_1994"))

@@ -7,7 +7,7 @@ from benchmarks.sections import Section, Written, table
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
-from service.studies.paper_1994.zone_counts import ZoneQuantity, counts
+from studies.paper_1994.zone_counts import ZoneQuantity, counts
 
 
 def run(quick: bool, seed: int) -> Report:
@@ -46,4 +46,4 @@ July 1995 to January 1996; of these the paper gives the fewest and the most.
     return Written(text, bounds_of(found))
 
 
-SECTION = Section("The sky", write, (*CORE, "service/studies/paper_1994"))
+SECTION = Section("The sky", write, (*CORE, "studies/paper_1994"))

@@ -13,24 +13,24 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1]
 SOURCES = (
-    "attitude",
-    "compiled",
-    "filtering",
-    "identify",
-    "missions",
-    "observations/batch.py",
-    "observations/calibrate.py",
-    "observations/focal_plane.py",
-    "observations/scans",
-    "simulate/scenes.py",
-    "sky",
+    "service/attitude",
+    "service/compiled",
+    "service/filtering",
+    "service/identify",
+    "service/missions",
+    "service/observations/batch.py",
+    "service/observations/calibrate.py",
+    "service/observations/focal_plane.py",
+    "service/observations/scans",
+    "service/simulate/scenes.py",
+    "service/sky",
+    "service/tracks/extending.py",
+    "service/csv_cells.py",
+    "service/errors.py",
+    "service/resources.py",
+    "service/times.py",
+    "service/vectors.py",
     "studies/ptp_2015/rivals",
-    "tracks/extending.py",
-    "csv_cells.py",
-    "errors.py",
-    "resources.py",
-    "times.py",
-    "vectors.py",
 )
 """Where every module with compiled code lies, and all that these import: folders and files."""
 
@@ -52,9 +52,9 @@ def source_digest() -> str:
     """The digest of `SOURCES`, in hexadecimal digits."""
     state = hashlib.sha256()
     for source in SOURCES:
-        place = PACKAGE / source
+        place = PACKAGE.parent / source
         for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
-            state.update(path.relative_to(PACKAGE).as_posix().encode() + path.read_bytes())
+            state.update(path.relative_to(PACKAGE.parent).as_posix().encode() + path.read_bytes())
     return state.hexdigest()
 
 

@@ -11,11 +11,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from acquire_client import Client
+from acquire_client import errors as answers
+from acquire_client.models import Replay
 from msgspec import to_builtins
 
-from service.client import Client
-from service.client import errors as answers
-from service.client.models import Replay
 from service.errors import Busy, problem_of_faults
 from service.observations.readers.telemetry import read_lines
 from service.packets.upload import archive_of

@@ -9,9 +9,10 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
-from service.client import AsyncClient, RecordedAnswer, Repeat
-from service.client import errors as answers
-from service.client.encoding import checked_address, path_of
+from acquire_client import AsyncClient, RecordedAnswer, Repeat
+from acquire_client import errors as answers
+from acquire_client.encoding import checked_address, path_of
+
 from service.errors import (
     BadInput,
     Busy,

@@ -11,9 +11,9 @@ from types import TracebackType
 from typing import IO, Any, Self
 
 import msgspec
+from acquire_client.models import Replay
 from tqdm import tqdm
 
-from service.client.models import Replay
 from service.errors import BadFile, Fault
 from service.observations.readers.telemetry import telemetry_format
 from service.replay.items import LineOutcome

@@ -5,8 +5,8 @@ from itertools import count
 from pathlib import Path
 
 import pytest
+from acquire_client import Client
 
-from service.client import Client
 from service.missions.mission import load_missions
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass

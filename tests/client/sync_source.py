@@ -9,7 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-CLIENT = Path(__file__).parents[2] / "service" / "client"
+CLIENT = Path(__file__).parents[2] / "client" / "acquire_client"
 BY_HAND = ("__init__.py", "backend.py")
 WORDS = [
     (re.compile(pattern), replacement)

@@ -14,11 +14,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import httpx
 import numpy as np
 import pytest
-from sqlalchemy import update
-
-from service.access import tokens
-from service.app.factory import open_app
-from service.client import (
+from acquire_client import (
     AsyncClient,
     BadInput,
     Busy,
@@ -35,10 +31,14 @@ from service.client import (
     UnexpectedAnswer,
     errors,
 )
-from service.client._sync import alarms, batches, gyro, pages, replays, spacecraft
-from service.client._sync import client as whole
-from service.client.encoding import json_of
-from service.client.errors import problem_of
+from acquire_client._sync import alarms, batches, gyro, pages, replays, spacecraft
+from acquire_client._sync import client as whole
+from acquire_client.encoding import json_of
+from acquire_client.errors import problem_of
+from sqlalchemy import update
+
+from service.access import tokens
+from service.app.factory import open_app
 from service.missions.mission import load_missions
 from service.storage.recording import events as records
 from service.storage.recording.ids import Ulids

@@ -9,10 +9,10 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+from acquire_client import Client
 from sqlalchemy import select
 
 from service.app.factory import open_app
-from service.client import Client
 from service.storage.sql.tables import batches
 from service.storage.sql.tables import events as recorded_events
 from tests.client.cutting_proxy import CuttingProxy

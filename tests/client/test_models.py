@@ -5,12 +5,12 @@ import json
 import re
 from typing import get_args, get_type_hints
 
+import acquire_client as client
 import msgspec
 import pytest
+from acquire_client import base, errors, event_lines, models
+from acquire_client.base import FieldFault, Model
 
-from service import client
-from service.client import base, errors, event_lines, models
-from service.client.base import FieldFault, Model
 from tests.web.conformance import FILE, reference
 
 SCHEMAS = reference()["components"]["schemas"]

@@ -10,16 +10,16 @@ from importlib.metadata import distribution
 from pathlib import Path
 
 import pytest
+from acquire_client import __version__
 from packaging.requirements import Requirement
 
 import service
 from service.app.factory import open_app
-from service.client import __version__
 from service.web.app import create_app
 from tests.client.conftest import ROOT
 from tests.web.serving import Server, in_process_settings
 
-CLIENT = ROOT / "service" / "client"
+CLIENT = ROOT / "client"
 DOCUMENT = (ROOT / "docs" / "client.md").read_text(encoding="utf-8")
 
 
@@ -75,7 +75,9 @@ def run(environment, program, cwd=ROOT):
 def test_the_wheel_holds_the_client_alone(environment):
     (metadata,) = environment.glob("acquire_client-*.dist-info/METADATA")
     assert f"Version: {__version__}" in metadata.read_text(encoding="utf-8")
-    files = {str(path.relative_to(CLIENT)) for path in CLIENT.rglob("*.py")} | {"py.typed"}
+    files = {str(path.relative_to(CLIENT / "acquire_client")) for path in CLIENT.rglob("*.py")} | {
+        "py.typed"
+    }
     package = environment / "acquire_client"
     assert {str(p.relative_to(package)) for p in package.rglob("*") if p.is_file()} == files
 
@@ -114,7 +116,7 @@ def test_the_examples_run_and_the_quick_start_prints_what_is_shown(environment, 
 
 
 def test_the_document_names_methods_and_errors_that_there_are():
-    from service import client
+    import acquire_client as client
 
     table = DOCUMENT.partition("## What it does")[2].partition("\n\n- ")[0]
     methods = set(re.findall(r"`([a-z_]+)`", table)) - {"at_once"}

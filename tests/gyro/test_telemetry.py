@@ -4,10 +4,10 @@ import json
 import time
 
 import pytest
+from acquire_client import Client
 
 from service.access.tokens import Caller
 from service.app.factory import open_app
-from service.client import Client
 from service.errors import BadFile
 from service.gyro.schema import block_from_json, block_from_line, is_gyro_line, json_of_block
 from service.observations.readers.telemetry import read_lines

@@ -10,9 +10,9 @@ from service.identify.voting.fov_rotation import rotation_rad
 from service.observations.batch import BoresightPrior
 from service.observations.schema import OptionsIn
 from service.simulate.motion import random_axis, turned_by
-from service.studies.paper_1994.printed import the_paper
-from service.studies.paper_1994.views import EPOCH, batch_of, draw_zone
 from service.vectors import rotate_about, unit
+from studies.paper_1994.printed import the_paper
+from studies.paper_1994.views import EPOCH, batch_of, draw_zone
 
 BORESIGHT, POLE = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
 

@@ -21,9 +21,9 @@ from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import load_missions
 from service.sky.geometry.star_buckets import build_star_buckets, nearest
 from service.sky.geometry.star_voxels import build_star_voxels
-from service.studies.paper_1994.printed import the_paper
-from service.studies.paper_1994.views import EPOCH, batch_of, draw_zone
 from service.vectors import ARCSEC_PER_RADIAN, from_ra_dec, unit
+from studies.paper_1994.printed import the_paper
+from studies.paper_1994.views import EPOCH, batch_of, draw_zone
 from tests.chance import at_least, at_most
 from tests.scale import draws
 

@@ -1,6 +1,6 @@
 """The laboratory of the report: its aperture, laser and 18-mesh screen."""
 
-from service.studies.star_image_report.wires import INCH_M, Mesh
+from studies.star_image_report.wires import INCH_M, Mesh
 
 DIAMETER_M = 0.542 * INCH_M
 LASER_M = 632.8e-9

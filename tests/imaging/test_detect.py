@@ -14,7 +14,7 @@ from service.imaging.detection.measure import measure
 from service.imaging.detection.shapes import is_sharp
 from service.imaging.frames.frame import Frame
 from service.simulate.frames import FrameSettings, draw_frames
-from service.studies.star_image_report.windows import draw_window
+from studies.star_image_report.windows import draw_window
 from tests.chance import assert_chi_square
 
 

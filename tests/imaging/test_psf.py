@@ -8,8 +8,8 @@ from service.imaging.centroids.centroid import centroid
 from service.imaging.centroids.psf import GaussianPsf
 from service.imaging.centroids.sampled_psf import SampledPsf, airy_psf, wired_psf
 from service.imaging.centroids.window import Detector
-from service.studies.star_image_report.optics import airy
-from service.studies.star_image_report.windows import draw_stars
+from studies.star_image_report.optics import airy
+from studies.star_image_report.windows import draw_stars
 from tests.imaging.optics import DIAMETER_M, LASER_M, MESH
 
 WIRES = [

@@ -16,7 +16,7 @@ from service.imaging.optics.transfer import (
     image_by_functional,
     image_of,
 )
-from service.studies.star_image_report.optics import (
+from studies.star_image_report.optics import (
     airy,
     disc_autocorrelation,
     disc_image,

@@ -24,9 +24,9 @@ from service.simulate.scans import readings
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
 from service.sky.ephemeris import sun_direction
-from service.studies.star_image_report.scanning import by_two_scans, sigmas
-from service.studies.star_image_report.sun_tracker import SunTracker as Screen
 from service.vectors import matrix_from_quaternion, rotate_about, unit
+from studies.star_image_report.scanning import by_two_scans, sigmas
+from studies.star_image_report.sun_tracker import SunTracker as Screen
 from tests.observations.example import BATCH
 
 FILE = FilePath(__file__).resolve().parents[2] / "docs" / "scanning-mission.toml"

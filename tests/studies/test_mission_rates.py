@@ -8,11 +8,11 @@ import pytest
 
 from service.errors import BadInput
 from service.missions.mission import SHIPPED_FOLDER, parse_mission
-from service.studies.mission_rates.report import meeting
-from service.studies.mission_rates.settings import Sweep, one_tracker, settings_of, usual_errors
-from service.studies.mission_rates.simulation import Plan, simulate, zone_counts
-from service.studies.paper_1994.printed import the_paper
 from service.vectors import angle_between_deg
+from studies.mission_rates.report import meeting
+from studies.mission_rates.settings import Sweep, one_tracker, settings_of, usual_errors
+from studies.mission_rates.simulation import Plan, simulate, zone_counts
+from studies.paper_1994.printed import the_paper
 from tests.scale import draws
 
 BASELINE = ("phi_deg=0.0111111", "theta_deg=0.0111111")
@@ -87,7 +87,7 @@ class TestRates:
 
     def test_zones_lie_about_the_direction_that_is_asked_for(self, missions, sky, monkeypatch):
         drawn = []
-        module = "service.studies.mission_rates.simulation"
+        module = "studies.mission_rates.simulation"
 
         def kept(world, *_):
             drawn.append(world.axis_deg)

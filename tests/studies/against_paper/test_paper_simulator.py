@@ -12,20 +12,21 @@ from scipy.stats import truncnorm
 
 from service.acquire import acquire
 from service.errors import BadInput
-from service.studies.paper_1994.command import run_paper
-from service.studies.paper_1994.experiments import run_experiments
-from service.studies.paper_1994.printed import PrintedCounts, the_paper
-from service.studies.paper_1994.region import (
+from service.vectors import angle_between_deg, matrix_from_quaternion
+from studies.paper_1994.command import run_paper
+from studies.paper_1994.experiments import run_experiments
+from studies.paper_1994.printed import PrintedCounts, the_paper
+from studies.paper_1994.region import (
     CHI_SQUARE_95,
     Spread,
     distance_squared,
     is_inside,
     spread,
 )
-from service.studies.paper_1994.tally import Tally
-from service.studies.paper_1994.time_tables import geometric_share
-from service.studies.paper_1994.timings import measure, proportion
-from service.studies.paper_1994.views import (
+from studies.paper_1994.tally import Tally
+from studies.paper_1994.time_tables import geometric_share
+from studies.paper_1994.timings import measure, proportion
+from studies.paper_1994.views import (
     EPOCH,
     View,
     batch_of,
@@ -33,7 +34,6 @@ from service.studies.paper_1994.views import (
     paper_mission,
     rotation,
 )
-from service.vectors import angle_between_deg, matrix_from_quaternion
 from tests.chance import at_most
 from tests.scale import draws, is_full
 

@@ -10,24 +10,24 @@ from scipy.stats import binomtest, poisson
 
 from service.errors import BadInput
 from service.simulate.scenes import Conditions, SceneSky, draw_scenes
-from service.studies.ptp_2015 import claims, tables
-from service.studies.ptp_2015.case import Case
-from service.studies.ptp_2015.command import CASES, run_ptp
-from service.studies.ptp_2015.comparison import (
+from service.vectors import angle_between_deg, unit
+from studies.ptp_2015 import claims, tables
+from studies.ptp_2015.case import Case
+from studies.ptp_2015.command import CASES, run_ptp
+from studies.ptp_2015.comparison import (
     ALGORITHMS,
     COMPARED,
     all_projections,
     compare,
     databases,
 )
-from service.studies.ptp_2015.plots import draw
-from service.studies.ptp_2015.printed import the_ptp_paper
-from service.studies.ptp_2015.projections import printed_slope
-from service.studies.ptp_2015.rivals.liebe import features
-from service.studies.ptp_2015.rivals.planar_triangle import area_and_moment, area_and_moment_sigma
-from service.studies.ptp_2015.tables import OF_PROJECTIONS, TITLES
-from service.studies.ptp_2015.tally import COLUMNS, FieldShare, Tally
-from service.vectors import angle_between_deg, unit
+from studies.ptp_2015.plots import draw
+from studies.ptp_2015.printed import the_ptp_paper
+from studies.ptp_2015.projections import printed_slope
+from studies.ptp_2015.rivals.liebe import features
+from studies.ptp_2015.rivals.planar_triangle import area_and_moment, area_and_moment_sigma
+from studies.ptp_2015.tables import OF_PROJECTIONS, TITLES
+from studies.ptp_2015.tally import COLUMNS, FieldShare, Tally
 
 PIXEL_RAD = Conditions().camera.pixel_rad
 SCENES = 60

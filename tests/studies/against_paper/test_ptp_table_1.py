@@ -7,8 +7,8 @@ from service.missions.mission import RunCatalogSettings
 from service.sky.catalog.run_catalog import build_run_catalog
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.geometry.triangles import build_triangles, project
-from service.studies.ptp_2015.printed import the_ptp_paper
-from service.studies.ptp_2015.projections import recovered_axis, rows_of_table_3
+from studies.ptp_2015.printed import the_ptp_paper
+from studies.ptp_2015.projections import recovered_axis, rows_of_table_3
 
 PAPER = the_ptp_paper()
 SIDES = np.array(PAPER.table_1_sides)

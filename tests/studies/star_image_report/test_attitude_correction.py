@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import BadInput
-from service.studies.star_image_report.scanning import by_positions, by_two_scans, sigmas
+from studies.star_image_report.scanning import by_positions, by_two_scans, sigmas
 
 
 def turned(points, roll, du, dv):

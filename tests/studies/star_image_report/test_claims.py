@@ -6,8 +6,8 @@ import json
 import pytest
 
 from service.errors import BadInput
-from service.studies.star_image_report.claims import Claim, Row, Study
-from service.studies.star_image_report.command import ROWS, run_imaging, table
+from studies.star_image_report.claims import Claim, Row, Study
+from studies.star_image_report.command import ROWS, run_imaging, table
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,8 @@ import pytest
 from service.errors import BadInput
 from service.imaging.centroids.psf import GaussianPsf
 from service.imaging.optics.transfer import PointImage, image_by_fft
-from service.studies.star_image_report.correlate import (
+from service.vectors import ARCSEC_PER_RADIAN
+from studies.star_image_report.correlate import (
     displacement_by_derivative,
     displacement_by_peak,
     light_through,
@@ -18,8 +19,7 @@ from service.studies.star_image_report.correlate import (
     overlap,
     search_by_axes,
 )
-from service.studies.star_image_report.wires import INCH_M, filtered
-from service.vectors import ARCSEC_PER_RADIAN
+from studies.star_image_report.wires import INCH_M, filtered
 from tests.imaging.optics import DIAMETER_M, LASER_M
 
 GRID = np.arange(-40.0, 41.0)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from service.imaging.centroids.sequential import diffuse
-from service.studies.star_image_report.correlate import misaligned
-from service.studies.star_image_report.further.measurements import (
+from studies.star_image_report.correlate import misaligned
+from studies.star_image_report.further.measurements import (
     HUMP,
     SIGMA,
     best_order,
@@ -18,15 +18,15 @@ from service.studies.star_image_report.further.measurements import (
     spread_of,
     spreads_along,
 )
-from service.studies.star_image_report.further.rotation import (
+from studies.star_image_report.further.rotation import (
     FIELD,
     SIGMA_PX,
     align,
     correlation_of_field,
     field_image,
 )
-from service.studies.star_image_report.further.sun_acquisition import ThreeDetectors
-from service.studies.star_image_report.further.wires_and_lines import (
+from studies.star_image_report.further.sun_acquisition import ThreeDetectors
+from studies.star_image_report.further.wires_and_lines import (
     THICK_M,
     THIN_M,
     THIRD_M,
@@ -35,7 +35,7 @@ from service.studies.star_image_report.further.wires_and_lines import (
     tail_of_wires,
     wires,
 )
-from service.studies.star_image_report.optics import DIAMETER_M, LASER_M
+from studies.star_image_report.optics import DIAMETER_M, LASER_M
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.2, -2.5])

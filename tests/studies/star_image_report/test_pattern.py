@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis.extra.numpy import arrays
 
 from service.imaging.centroids.psf import GaussianPsf
-from service.studies.star_image_report.recognising import (
+from service.vectors import rotate_about, unit
+from studies.star_image_report.recognising import (
     chord_constant,
     constant_sigma,
     find_by_rasters,
@@ -17,7 +18,6 @@ from service.studies.star_image_report.recognising import (
     pattern_constant,
     store_of,
 )
-from service.vectors import rotate_about, unit
 
 FIELDS = arrays(np.float64, st.tuples(st.integers(2, 9), st.just(2)), elements=st.floats(-1e3, 1e3))
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.observations.scans.cross_scan import cross_scan, mean_of_scans
-from service.studies.star_image_report.scanning import (
+from studies.star_image_report.scanning import (
     nyquist_spacing,
     truncated,
     variance_in_full,

@@ -2,7 +2,7 @@
 
 import pytest
 
-from service.studies.star_image_report.sun_tracker import SunTracker
+from studies.star_image_report.sun_tracker import SunTracker
 
 TRACKER = SunTracker()
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.studies.star_image_report.wires import (
+from studies.star_image_report.wires import (
     INCH_M,
     Mesh,
     along_p,

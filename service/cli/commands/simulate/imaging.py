@@ -41,7 +41,7 @@ def add(group: Any) -> None:
 
 def run(parsed: Namespace) -> int:
     """Hold the star image detection report beside what is measured; 1 where a claim is off."""
-    from service.studies.star_image_report.command import as_json, run_imaging
+    from studies.star_image_report.command import as_json, run_imaging
 
     prints_json = parsed.json == STANDARD_OUTPUT
     rows = run_imaging(

@@ -138,10 +138,10 @@ def run(parsed: Namespace) -> int:
     """Simulate and print the rates."""
     from service.cli.configuration import mission_of_file_or_name
     from service.settings import Settings
-    from service.studies.mission_rates import page
-    from service.studies.mission_rates.plot import checked, draw
-    from service.studies.mission_rates.report import report_json, report_text
-    from service.studies.mission_rates.simulation import simulate
+    from studies.mission_rates import page
+    from studies.mission_rates.plot import checked, draw
+    from studies.mission_rates.report import report_json, report_text
+    from studies.mission_rates.simulation import simulate
 
     plan = _plan(parsed, mission_of_file_or_name(parsed.mission))
     if parsed.plot is not None:
@@ -166,14 +166,14 @@ def run(parsed: Namespace) -> int:
 
 
 def _plan(parsed: Namespace, mission: Any) -> Any:
-    from service.studies.mission_rates.settings import (
+    from studies.mission_rates.settings import (
         Sweep,
         one_tracker,
         options_of_settings,
         refuse_idle,
         settings_of,
     )
-    from service.studies.mission_rates.simulation import Plan
+    from studies.mission_rates.simulation import Plan
 
     if parsed.seed < 0:
         raise BadInput(Fault("--seed", "must not be negative", str(parsed.seed)))

@@ -99,8 +99,8 @@ def run(parsed: Namespace) -> int:
                 "--scenes", "goes with a table by name, such as --table ptp-6", str(parsed.scenes)
             )
         )
-    from service.studies.paper_1994.command import DEFAULT_STARS, run_paper
-    from service.studies.paper_1994.report import PROPORTIONS, TIMES
+    from studies.paper_1994.command import DEFAULT_STARS, run_paper
+    from studies.paper_1994.report import PROPORTIONS, TIMES
 
     if parsed.stars is not None and parsed.table in (*TIMES, *PROPORTIONS):
         message = f"has no effect on table {parsed.table}, whose zones are as many as the paper's"
@@ -123,8 +123,8 @@ def run(parsed: Namespace) -> int:
 
 
 def _run_ptp(parsed: Namespace) -> int:
-    from service.studies.ptp_2015.command import DEFAULT_SCENES, rows_of, run_ptp
-    from service.studies.ptp_2015.tables import OF_PROJECTIONS
+    from studies.ptp_2015.command import DEFAULT_SCENES, rows_of, run_ptp
+    from studies.ptp_2015.tables import OF_PROJECTIONS
 
     if parsed.stars is not None:
         message = "goes with a table by number; a named one takes --scenes"

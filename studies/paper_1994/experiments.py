@@ -1,0 +1,179 @@
+"""Experiments of the paper's size, each view through the pipeline, on all cores.
+
+The zones, views and errors of an experiment depend on the seed, the world and
+the experiment's number alone, not on how the work is shared out.
+"""
+
+import multiprocessing
+import os
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from tqdm import tqdm
+
+from service.acquire import acquire
+from service.acquire.kernel_build import exit_after_parent
+from service.identify.identification import Outcome
+from service.missions.mission import Identifier
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.model import SkyModel
+from studies.paper_1994.printed import Run, World, the_paper
+from studies.paper_1994.tally import Integers, Tally
+from studies.paper_1994.views import EPOCH, batch_of, draw_zone, paper_mission
+
+SHELF_BYTES = 64 << 20
+
+
+@dataclass(frozen=True)
+class Task:
+    """One experiment: which world, which draw of it, and which runs and identifiers see it."""
+
+    world: str
+    seed: int
+    number: int
+    runs: tuple[Run, ...]
+    identifiers: tuple[Identifier, ...]
+
+
+def run_experiments(
+    runs: Sequence[Run],
+    stars: int,
+    seeds: Sequence[int],
+    identifiers: Sequence[Identifier] = ("starid",),
+    processes: int | None = None,
+) -> list[Tally]:
+    """The tallies of every run, per identifier.
+
+    Whole experiments are made until each run has `stars` stars for each seed.
+    `processes` is the number of workers, all cores where it is None; 1 works
+    in this process.
+    """
+    by_world = defaultdict(list)
+    for run in runs:
+        by_world[run.world].append(run)
+    done: dict[tuple[str, int], list[Integers]] = defaultdict(list)
+    paper = the_paper()
+    with _workers(processes) as workers, tqdm(unit="star", unit_scale=True, disable=None) as bar:
+        while True:
+            tasks = [
+                Task(world, seed, number, tuple(its_runs), tuple(identifiers))
+                for world, its_runs in by_world.items()
+                for seed in seeds
+                for number in _missing(done[world, seed], stars, paper.worlds[world])
+            ]
+            if not tasks:
+                break
+            bar.total = bar.n + sum(_stars_expected(task) for task in tasks)
+            # In order, so that a result belongs to its task.
+            for task, counts in zip(tasks, workers.map(tasks), strict=True):
+                done[task.world, task.seed].append(counts)
+                bar.update(int(counts.sum()))
+    tallies = {
+        (run, identifier): np.concatenate(
+            [counts[i, j] for seed in seeds for counts in done[world, seed]]
+        )
+        for world, its_runs in by_world.items()
+        for j, run in enumerate(its_runs)
+        for i, identifier in enumerate(identifiers)
+    }
+    return [Tally(run, each, tallies[run, each]) for each in identifiers for run in runs]
+
+
+def _missing(done: list[Integers], stars: int, world: World) -> range:
+    """The numbers of the experiments that are still to be made."""
+    # Every run of a world sees the same stars: the first tells for all.
+    seen = sum(int(counts[0, 0].sum()) for counts in done)
+    most = world.zones * world.views * 5
+    return range(len(done), len(done) + -(-max(0, stars - seen) // most))
+
+
+def _stars_expected(task: Task) -> int:
+    world = the_paper().worlds[task.world]
+    return world.zones * world.views * 5 * len(task.runs) * len(task.identifiers)
+
+
+def perform(task: Task, sky: SkyModel) -> Integers:
+    """The counts (identifiers, runs, zones, 4) of one experiment."""
+    world = the_paper().worlds[task.world]
+    worlds = list(the_paper().worlds)
+    rng = np.random.default_rng([task.seed, worlds.index(task.world), task.number])
+    mission = paper_mission(world.mission)
+    catalog = sky.run_catalog(mission, EPOCH)
+    counts = np.zeros((len(task.identifiers), len(task.runs), world.zones, 4), np.int64)
+    for zone in range(world.zones):
+        number = task.number * world.zones + zone
+        for view in draw_zone(world, number, mission, catalog, rng):
+            for i, identifier in enumerate(task.identifiers):
+                for j, run in enumerate(task.runs):
+                    if len(view.star):
+                        batch = batch_of(view, run, mission, identifier)
+                        found = acquire(batch, mission, sky).trackers[0].identification
+                        counts[i, j, zone] += _counted(found.outcome, found.star, view.star)
+    return counts
+
+
+def _counted(outcome: Integers, star: Integers, truth: npt.NDArray[np.intp]) -> Integers:
+    unique = outcome == Outcome.UNIQUE
+    correct = int(np.count_nonzero(unique & (star == truth)))
+    return np.array(
+        [
+            np.count_nonzero(outcome == Outcome.AMBIGUOUS),
+            np.count_nonzero(outcome == Outcome.UNMATCHED),
+            correct,
+            np.count_nonzero(unique) - correct,
+        ]
+    )
+
+
+def open_sky() -> SkyModel:
+    """The embedded catalog with a small cache: a zone serves the runs of its views alone."""
+    return SkyModel(load_embedded(), LruCache(SHELF_BYTES))
+
+
+class _Here:
+    """Works in this process."""
+
+    def map(self, tasks: Iterable[Task]) -> Iterator[Integers]:
+        sky = open_sky()
+        return (perform(task, sky) for task in tasks)
+
+    def __enter__(self) -> "_Here":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return None
+
+
+class _Elsewhere(ProcessPoolExecutor):
+    """Works in processes, each with a sky of its own."""
+
+    def __init__(self, processes: int) -> None:
+        super().__init__(
+            processes, mp_context=multiprocessing.get_context("spawn"), initializer=_open
+        )
+
+    def map(self, tasks: Iterable[Task]) -> Iterator[Integers]:  # type: ignore[override]
+        return super().map(_perform_elsewhere, tasks)
+
+
+_sky: SkyModel
+
+
+def _open() -> None:
+    global _sky
+    exit_after_parent()
+    _sky = open_sky()
+
+
+def _perform_elsewhere(task: Task) -> Integers:
+    return perform(task, _sky)
+
+
+def _workers(processes: int | None) -> _Here | _Elsewhere:
+    count = processes or len(os.sched_getaffinity(0))
+    return _Here() if count == 1 else _Elsewhere(count)

@@ -1,0 +1,36 @@
+"""What became of a run's stars, zone by zone."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from service.missions.mission import Identifier
+from studies.paper_1994.printed import Run, World, the_paper
+
+AMBIGUOUS, UNMATCHED, CORRECT, MISIDENTIFIED = range(4)
+
+Integers = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Tally:
+    """What became of a run's stars: counts (zones, 4), zone by zone, over all experiments."""
+
+    run: Run
+    identifier: Identifier
+    counts: Integers
+
+    @property
+    def stars(self) -> int:
+        """The number of stars observed."""
+        return int(self.counts.sum())
+
+    def total(self, outcome: int) -> int:
+        """The number of stars of one outcome."""
+        return int(self.counts[:, outcome].sum())
+
+    @property
+    def world(self) -> World:
+        """The run's world."""
+        return the_paper().worlds[self.run.world]

@@ -1,0 +1,195 @@
+"""The paper's simulator: random zones, fields of view within them, stars, and their errors.
+
+Every run of a world sees the same zones, views, stars and draws, as the paper
+began every run with the same seed; only the sizes of the errors differ.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import ndtr, ndtri
+
+from service.missions.mission import Band, Identifier, Mission, load_missions
+from service.observations.batch import ObservationBatch, Options, QuaternionPrior, TrackerStars
+from service.simulate.motion import pointed, random_axis
+from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.ephemeris import sun_direction
+from service.times import parse_utc
+from service.vectors import (
+    ARCSEC_PER_RADIAN,
+    Matrix,
+    Vector,
+    coordinate_rotation,
+    from_ra_dec,
+    quaternion_from_matrix,
+    unit,
+)
+from studies.paper_1994.printed import Run, World
+
+MOST_STARS = 5
+EPOCH = parse_utc("2000-01-01T12:00:00Z")
+"""Every view uses the run catalogs of 2000, also where the Sun stands as it did in 1995."""
+
+
+@cache
+def paper_mission(name: str) -> Mission:
+    """A shipped mission as the prototype flew it.
+
+    It read "all stars down to" a magnitude from a catalog of stars: one fainter
+    than that was not there, and lifted no brighter one by its light.
+    """
+    settings = load_missions()[name].model_dump()
+    settings["catalog"]["merge_limit_mag"] = settings["catalog"]["magnitude_limit_mag"]
+    return Mission.model_validate(settings)
+
+
+@dataclass(frozen=True)
+class View:
+    """One field of view with its stars, and the draws that their errors are made from.
+
+    `axis` is the zone's; `attitude` the true one, inertial to body; `star` the
+    rows in the run catalog.  `radius` is a normal deviate, `bearing_rad` and
+    `share` are uniform over the circle and over the unit interval.
+    """
+
+    axis: Vector
+    attitude: Matrix
+    star: npt.NDArray[np.intp]
+    direction: Vector
+    magnitude_mag: Vector
+    radius: Vector
+    bearing_rad: Vector
+    share: Vector
+
+    def seen(self, run: Run) -> tuple[Vector, Vector]:
+        """Directions (n, 3), inertial by the erroneous attitude, and magnitudes, with errors."""
+        radius = run.sigma_arcsec / ARCSEC_PER_RADIAN * self.radius[:, None]
+        aside = unit(np.cross(self.direction, _least_axis(self.direction)))
+        above = np.cross(self.direction, aside)
+        bearing = self.bearing_rad[:, None]
+        sideways = np.cos(bearing) * aside + np.sin(bearing) * above
+        moved = np.cos(radius) * self.direction + np.sin(radius) * sideways
+        # v' = A^T R A v
+        return moved @ self.attitude.T @ rotation(run).T @ self.attitude, self._magnitudes(run)
+
+    def _magnitudes(self, run: Run) -> Vector:
+        # A Gaussian error drawn again while it lies beyond the bound is one cut off there.
+        tail = ndtr(-run.bound_mag / run.sigma_mag)
+        error = ndtri(tail + (1.0 - 2.0 * tail) * self.share)
+        return np.asarray(self.magnitude_mag + run.sigma_mag * error)
+
+
+def rotation(run: Run) -> Matrix:
+    """The error of the attitude, R1(psi) R2(theta) R3(phi): phi about Z first, psi about X last."""
+    phi, theta, psi = (arcsec / 3600.0 for arcsec in run.rotation_arcsec)
+    return coordinate_rotation(0, psi) @ coordinate_rotation(1, theta) @ coordinate_rotation(2, phi)
+
+
+def draw_zone(
+    world: World,
+    number: int,
+    mission: Mission,
+    catalog: RunCatalog,
+    rng: np.random.Generator,
+    most_stars: int = MOST_STARS,
+) -> Iterator[View]:
+    """The views of one zone; `number` chooses among the Sun's dates where the world has them."""
+    axis = _axis(world, number, rng)
+    for _ in range(world.views):
+        yield _view(world, axis, mission, catalog, rng, most_stars)
+
+
+def _axis(world: World, number: int, rng: np.random.Generator) -> Vector:
+    if world.axis_deg is not None:
+        return from_ra_dec(*world.axis_deg)
+    if world.sun_dates:
+        date = world.sun_dates[number % len(world.sun_dates)]
+        return sun_direction(parse_utc(f"{date}T00:00:00Z"), None)
+    return random_axis(rng)
+
+
+def _view(
+    world: World,
+    axis: Vector,
+    mission: Mission,
+    catalog: RunCatalog,
+    rng: np.random.Generator,
+    most_stars: int,
+) -> View:
+    tracker = mission.trackers[0]
+    near = _within(axis, math.radians(world.off_axis_deg), rng)
+    # Body X lies near the zone's axis; the rest of the attitude is any.
+    attitude = pointed(mission.axis_body, near, rng.uniform(0.0, math.tau))
+    boresight = attitude.T @ tracker.body_from_tracker[:, 2]
+    edge = math.cos(math.radians(tracker.field_of_view_radius_deg))
+    star = rng.permutation(np.flatnonzero(catalog.direction @ boresight >= edge))[:most_stars]
+    count = len(star)
+    return View(
+        axis=axis,
+        attitude=attitude,
+        star=star,
+        direction=catalog.direction[star],
+        magnitude_mag=catalog.magnitude_mag[star],
+        radius=rng.normal(size=count),
+        bearing_rad=rng.uniform(0.0, math.tau, count),
+        share=rng.uniform(size=count),
+    )
+
+
+def _within(axis: Vector, radius_rad: float, rng: np.random.Generator) -> Vector:
+    """A direction drawn evenly over the cap about an axis."""
+    # 1 - cos, so that small caps lose no digits.
+    height = rng.uniform(0.0, 2.0 * math.sin(radius_rad / 2.0) ** 2)
+    across = math.sqrt(height * (2.0 - height))
+    bearing = rng.uniform(0.0, math.tau)
+    aside = unit(np.cross(axis, _least_axis(axis)))
+    above = np.cross(axis, aside)
+    return unit(
+        (1.0 - height) * axis + across * (math.cos(bearing) * aside + math.sin(bearing) * above)
+    )
+
+
+def _least_axis(direction: Vector) -> Vector:
+    """For each direction the coordinate axis that it leans to least."""
+    return np.asarray(np.eye(3)[np.argmin(np.abs(direction), axis=-1)])
+
+
+def batch_of(view: View, run: Run, mission: Mission, identifier: Identifier) -> ObservationBatch:
+    """The view as the service gets it.
+
+    The a priori attitude has body X on the zone's axis, and the sensor vectors
+    are those that it carries to the paper's inertial ones.
+    """
+    tracker = mission.trackers[0]
+    direction, magnitude = view.seen(run)
+    prior = pointed(mission.axis_body, view.axis, 0.0)
+    count = len(view.star)
+    tests = {} if run.geometry else {"cross_product": False}
+    if not run.geometry and isinstance(mission.zone, Band):
+        tests["pole"] = False
+    none = np.full(count, np.nan)
+    return ObservationBatch(
+        spacecraft=mission.name,
+        batch=f"{run.table} {run.run}",
+        run="paper",
+        time=EPOCH,
+        a_priori=QuaternionPrior(quaternion_from_matrix(prior)),
+        body_rates_deg_per_s=np.zeros(3),
+        velocity_km_per_s=None,
+        aberration="ignore",
+        observations=(
+            TrackerStars(
+                tracker=tracker.name,
+                vector=direction @ prior.T @ tracker.body_from_tracker,
+                angles_deg=np.full((count, 2), np.nan),
+                magnitude_mag=magnitude,
+                time_offset_s=np.zeros(count),
+                sigma_arcsec=none,
+            ),
+        ),
+        options=Options(identifier=identifier, tests=tests, zone_grid_deg=0.0),
+    )

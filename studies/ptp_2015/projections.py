@@ -1,0 +1,277 @@
+"""Table 2 and figures 6 and 7 of the PTP paper: where the projections of all triangles lie."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.geometry.kvector import KVector, build_kvector
+from service.sky.geometry.triangles import TriangleIndex, build_triangles
+from service.vectors import Vector
+from studies.paper_1994.tables import markdown
+from studies.ptp_2015.printed import the_ptp_paper
+from studies.ptp_2015.rivals.proposed import proposed_by_votes
+
+SHOWN_EVERY = 25
+SIGMA_AT_1_PX = 2.87
+"""Of a projection, by the paper's equation 13 at one pixel of 35.25 arcsec."""
+COLORS = ("#0b5394", "#b45309")
+
+
+@dataclass(frozen=True)
+class Projections:
+    """The guide triangles of the sky to V 6, as they are and as the printed tables suggest.
+
+    `once` are the projections of four slaves' triangles, each set of three stars once; `three`
+    those of three slaves.
+    """
+
+    triangles: TriangleIndex
+    once: KVector
+    three: KVector
+
+    def rows(self, name: str) -> list[dict[str, Any]]:
+        """A table or figure as rows of a file."""
+        if name == "ptp-1":
+            return rows_of_table_1()
+        if name == "ptp-3":
+            return rows_of_table_3()
+        if name == "figure-6":
+            return [row_of_figure_6(self)]
+        if name == "figure-7":
+            return rows_of_figure_7(self)
+        return [
+            {"table": "ptp-2", "index": index, "paper": paper, "ours": ours, "three_slaves": three}
+            for index, paper, ours, three in self.table_2()
+        ]
+
+    def table_2(self) -> list[tuple[int, int, int, int]]:
+        """Limit index, the paper's K, ours, and ours of three slaves with each triangle once."""
+        ours = self.triangles.projection.below
+        return [
+            (index, paper, int(ours[index - 1]), int(self.three.below[index - 1]))
+            for index, paper in the_ptp_paper().table_2
+        ]
+
+
+def projections_of(stars: RunCatalog) -> Projections:
+    """Those of a list of stars."""
+    four = build_triangles(stars.direction)
+    return Projections(four, _once(four), _once(build_triangles(stars.direction, slaves=3)))
+
+
+def _once(index: TriangleIndex) -> KVector:
+    """The projections of triangles, each set of three stars once: with its brightest as master."""
+    order = np.argsort(index.star[:, 0], kind="stable")
+    _, first = np.unique(np.sort(index.star[order], axis=1), axis=0, return_index=True)
+    return build_kvector(index.projection.value[np.sort(order[first])])
+
+
+def recovered_axis() -> tuple[Vector, float]:
+    """The axis and the mean projection of Table 1: four unknowns of nine equations."""
+    paper = the_ptp_paper()
+    sides, printed = np.array(paper.table_1_sides), np.array([row[1] for row in paper.table_1])
+    unknowns = np.linalg.lstsq(np.column_stack([sides, -np.ones(len(sides))]), printed)[0]
+    return unknowns[:3], float(unknowns[3])
+
+
+def rows_of_table_1() -> list[dict[str, Any]]:
+    """The printed triangles: sides, the projection that is printed, and by the recovered axis."""
+    axis, mean = recovered_axis()
+    paper = the_ptp_paper()
+    return [
+        {
+            "table": "ptp-1",
+            "index": index,
+            "sides": list(sides),
+            "paper": printed,
+            "ours": float(np.dot(sides, axis) - mean),
+        }
+        for (index, printed), sides in zip(paper.table_1, paper.table_1_sides, strict=True)
+    ]
+
+
+def table_1(found: Projections) -> str:
+    """Table 1: the printed projections, and those that its sides give on the recovered axis."""
+    axis, mean = recovered_axis()
+    lines = [
+        (
+            f"{row['index']:,}",
+            *(f"{side:.5f}" for side in row["sides"]),
+            f"{row['paper']:.5f}",
+            f"{row['ours']:.5f}",
+        )
+        for row in rows_of_table_1()
+    ]
+    text = markdown(("index", "side 1", "side 2", "side 3", "paper: P", "P of the sides"), lines)
+    worst = max(abs(row["ours"] - row["paper"]) for row in rows_of_table_1())
+    shown = ", ".join(f"{part:.5f}" for part in axis)
+    return (
+        f"{text}\n\nThe axis is ({shown}) with |w| = {np.linalg.norm(axis):.6f}, the mean "
+        f"projection {mean:.4f}; no row is farther off than {worst:.6f}."
+    )
+
+
+def rows_of_table_3() -> list[dict[str, Any]]:
+    """The stars of Table 3 with the SAO number that sharing stars validate, None for none."""
+    triangles = the_ptp_paper().table_3["triangles"]
+    sao = sorted({number for each in triangles for number in each["sao"]})
+    image = np.array([each["stars"] for each in triangles], np.int32)
+    star = np.array([[sao.index(n) for n in each["sao"]] for each in triangles], np.int32)
+    count = int(the_ptp_paper().table_3["stars_in_field"]) + 1
+    match = proposed_by_votes(image, star, len(sao), count, shared=True).match.tolist()
+    return [
+        {"table": "ptp-3", "star": k, "sao": sao[match[k]] if match[k] >= 0 else None}
+        for k in range(1, count)
+    ]
+
+
+def table_3(found: Projections) -> str:
+    """Table 3: which stars of the printed triangles sharing stars validate."""
+    printed = the_ptp_paper().table_3["identified"]
+    lines = [
+        (
+            str(row["star"]),
+            "identified" if row["star"] in printed else "",
+            "" if row["sao"] is None else f"SAO {row['sao']}",
+        )
+        for row in rows_of_table_3()
+    ]
+    return markdown(("star of the field", "paper", "ours"), lines)
+
+
+def table_2(found: Projections) -> str:
+    """Table 2: the k-vector at the printed limit indices."""
+    rows = [[f"{cell:,}" for cell in row] for row in found.table_2()]
+    four, three = found.triangles.projection, found.three
+    rows.append(["triangles", "", f"{len(four.value):,}", f"{len(three.value):,}"])
+    rows.append(["one index, in P", "", f"{four.slope:.4f}", f"{three.slope:.4f}"])
+    header = ("limit index", "paper: K", "K, four slaves", "K, three slaves, each once")
+    return markdown(header, rows)
+
+
+def printed_slope(found: Projections) -> float:
+    """What one limit index is worth in P, if Tables 1 and 2 are of one database.
+
+    K of the first row of Table 2 is the row of a triangle whose P follows from the rows of
+    Table 1, 90 rows before, by the density that they show themselves.
+    """
+    index, count = the_ptp_paper().table_2[0]
+    rows = the_ptp_paper().table_1
+    density = (rows[-1][0] - rows[0][0]) / (rows[-1][1] - rows[0][1])
+    there = rows[-1][1] + (count - rows[-1][0]) / density
+    return (there - float(found.triangles.projection.value[0])) / (index - 1)
+
+
+def note_on_table_2(found: Projections) -> str:
+    """What the printed numbers imply of the database that they were made with."""
+    slope = printed_slope(found)
+    value = found.triangles.projection.value
+    implied = (float(value[-1]) - float(value[0])) / slope + 1.0
+    return (
+        "**An illustration.** With the rows of Table 1, which stand just before, Table 2 has one "
+        f"limit index for every {slope:.3f} of P: a database of about {implied:,.0f} triangles, as "
+        f"many as three slaves give with each triangle once ({len(found.three.value):,}), not the "
+        "four slaves that the paper settles on."
+    )
+
+
+def row_of_figure_6(found: Projections) -> dict[str, Any]:
+    """Figure 6 in numbers: how the triangles lie along the axis."""
+    value = found.triangles.projection.value
+    gap = np.diff(value)
+    return {
+        "table": "figure-6",
+        "triangles": len(value),
+        "ends": [float(value[0]), float(value[-1])],
+        "explained": [float(share) for share in found.triangles.explained],
+        "gap_median": float(np.median(gap)),
+        "nearer_than_sigma": float(np.mean(gap < SIGMA_AT_1_PX)),
+        "within_3_sigma_median": float(np.median(_within(value, 3.0 * SIGMA_AT_1_PX))),
+    }
+
+
+def figure_6(found: Projections) -> str:
+    """Figure 6: how the triangles lie along the axis."""
+    row = row_of_figure_6(found)
+    shares = ", ".join(f"{100.0 * share:.0f} %" for share in row["explained"])
+    rows = (
+        ("triangles", f"{row['triangles']:,}"),
+        ("least and greatest projection", f"{row['ends'][0]:.1f}, {row['ends'][1]:.1f}"),
+        ("variance along the axis and across it", shares),
+        ("gap between neighbours, median", f"{row['gap_median']:.4f}"),
+        ("neighbours nearer than a sigma at 1 px", f"{100.0 * row['nearer_than_sigma']:.2f} %"),
+        ("triangles within 3 sigma at 1 px, median", f"{row['within_3_sigma_median']:.0f}"),
+    )
+    text = markdown(("projections on the axis", "ours"), rows)
+    return (
+        f"{text}\n\nThe paper says of its two pictures that the points are too close, and that "
+        "principal components do not separate triangles well. So it is: the sides and the votes "
+        "tell apart what one number cannot."
+    )
+
+
+def figure_7(found: Projections) -> str:
+    """Figure 7: the index of a triangle by its projection, at the rows that Table 1 prints."""
+    rows = [
+        (f"{row['projection']:.5f}", *(f"{row[name]:,}" for name in ("paper", "ours", "once")))
+        for row in rows_of_figure_7(found)
+    ]
+    return markdown(("projection", "paper: index", "ours", "ours, each triangle once"), rows)
+
+
+def rows_of_figure_7(found: Projections) -> list[dict[str, Any]]:
+    """Projection, the printed index, ours, and ours with each triangle once."""
+    return [
+        {
+            "table": "figure-7",
+            "projection": projection,
+            "paper": index,
+            "ours": _index_of(found.triangles.projection, projection),
+            "once": _index_of(found.once, projection),
+        }
+        for index, projection in the_ptp_paper().table_1
+    ]
+
+
+def _index_of(column: KVector, projection: float) -> int:
+    return int(np.searchsorted(column.value, projection)) + 1
+
+
+def _within(value: Vector, reach: float) -> npt.NDArray[np.int64]:
+    low, high = (np.searchsorted(value, value + side * reach) for side in (-1.0, 1.0))
+    return np.asarray(high - low, dtype=np.int64)
+
+
+def draw_figure_6(figure: Any, found: Projections) -> None:
+    """The sides of triangles with the axis of their projections, and how many lie where."""
+    index = found.triangles
+    left = figure.add_subplot(1, 2, 1, projection="3d")
+    some = index.side[::SHOWN_EVERY]
+    left.scatter(*some.T, s=2, color=COLORS[0], alpha=0.4, linewidths=0)
+    ends = np.array([index.projection.value[0], index.projection.value[-1]])
+    line = index.mean + ends[:, None] * index.axis
+    left.plot(*line.T, color=COLORS[1], lw=2)
+    left.set(xlabel="side 1", ylabel="side 2", title="Figure 6: the three sides, the axis")
+    right = figure.add_subplot(1, 2, 2)
+    right.hist(index.projection.value, 80, color=COLORS[0])
+    right.set(xlabel="projection", ylabel="triangles")
+
+
+def draw_figure_7(figure: Any, found: Projections) -> None:
+    """Projections by their index, ours and the nine that the paper prints."""
+    axis = figure.subplots()
+    named: Sequence[tuple[str, KVector, str]] = (
+        ("ours", found.triangles.projection, COLORS[0]),
+        ("ours, each triangle once", found.once, "0.5"),
+    )
+    for label, column, color in named:
+        at = np.arange(0, len(column.value), SHOWN_EVERY)
+        axis.plot(at + 1, column.value[at], color=color, label=label)
+    printed = np.array(the_ptp_paper().table_1)
+    axis.plot(*printed.T, "o", mfc="none", color=COLORS[1], label="paper, Table 1")
+    axis.set(xlabel="index", ylabel="projection", title="Figure 7: projections by their index")
+    axis.legend(fontsize=7)

@@ -1,0 +1,89 @@
+"""The P-vector: one triangle a star, with its two brightest neighbours, found by one number.
+
+Yang Jian, Zhang Guangjun & Jiang Jie, "Fast Star Identification Algorithm Using
+P Vector", Acta Aeronautica et Astronautica Sinica 28(4), 2007, 897-900; as
+Zhou & Ye tell of it.  The projection is that of PTP.  What makes it weak is the
+choice of the triangle: a neighbour lost or added by noise of magnitude makes it
+another, and so does one that lies beyond the edge of the field.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from service.compiled.jit import njit
+from service.identify.triangles.triangle_match import (
+    MAX_MATCHES,
+    ImageTriangles,
+    guide_triangles,
+    match_triangles,
+)
+from service.simulate.scenes import Scene
+from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.geometry.triangles import TriangleIndex, chords, index_triangles, make_triangles
+from studies.ptp_2015.rivals.proposed import Proposed, proposed_by_votes
+
+NEIGHBOURS_WITHIN_DEG = 5.0
+BRIGHTEST = 2
+
+
+@dataclass(frozen=True)
+class PVector:
+    """The triangles of all stars; a triangle that finds one guide triangle alone is believed."""
+
+    triangles: TriangleIndex
+    stars: int
+
+    @property
+    def entries(self) -> int:
+        """One triangle a star, where it has two neighbours."""
+        return self.triangles.count
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of triangles and k-vector."""
+        return self.triangles.nbytes
+
+    def identify(self, scene: Scene) -> Proposed:
+        """Believe what a unique match names; of several names that with the most votes."""
+        n = len(scene.direction)
+        near = np.empty((n, BRIGHTEST), np.int32)
+        # Scenes are in order of measured brightness, as the catalog is of true brightness.
+        brightest_near(scene.direction, *chords(self.triangles.reach_deg), near)
+        image, side = np.empty((n, 3), np.int32), np.empty((n, 3))
+        count = make_triangles(scene.direction, near, image, side)
+        matched, guide = np.empty((2, MAX_MATCHES), np.int32)
+        field = ImageTriangles(scene.direction, scene.sigma_rad, 0.0, image[:count], side[:count])
+        found, _, _ = match_triangles(field, guide_triangles(self.triangles), matched, guide)
+        matched, guide = matched[:found], guide[:found]
+        every = proposed_by_votes(image[matched], self.triangles.star[guide], self.stars, n, False)
+        alone = np.bincount(matched, minlength=n)[matched] == 1
+        believed = proposed_by_votes(
+            image[matched[alone]], self.triangles.star[guide[alone]], self.stars, n, False
+        )
+        return Proposed(believed.match, every.image, every.star)
+
+
+def build_p_vector(stars: RunCatalog, within_deg: float = NEIGHBOURS_WITHIN_DEG) -> PVector:
+    """The P-vector's database of a star list in order of brightness."""
+    near = np.empty((len(stars), BRIGHTEST), np.int32)
+    brightest_near(stars.direction, *chords(within_deg), near)
+    return PVector(index_triangles(stars.direction, near, within_deg), len(stars))
+
+
+@njit(nogil=True)
+def brightest_near(direction, least, most, near):  # type: ignore[no-untyped-def]
+    """Into `near` (n, k) the first rows, -1 for none, whose chord to each star is within bounds."""
+    n, wanted = near.shape
+    near[:] = -1
+    for master in range(n):
+        found = 0
+        for other in range(n):
+            chord2 = 0.0
+            for k in range(3):
+                chord2 += (direction[other, k] - direction[master, k]) ** 2
+            if least * least <= chord2 <= most * most:
+                near[master, found] = other
+                found += 1
+                if found == wanted:
+                    break

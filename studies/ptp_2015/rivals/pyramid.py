@@ -1,0 +1,223 @@
+"""The pyramid: a triangle found by its three separations, confirmed by a fourth star.
+
+D. Mortari, M. A. Samaan, C. Bruccoleri & J. L. Junkins, "The Pyramid Star
+Identification Technique", Navigation 51(3), 2004, 171-183.  Triangles are tried
+in an order that exchanges every star soon, so that a point that is no star
+does not spoil one after another.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from service.compiled.jit import njit
+from service.identify.triangles.triangle_match import SIGMAS
+from service.simulate.scenes import Scene
+from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.geometry.kvector import KVector, build_kvector, rows_within
+from service.sky.geometry.pairs import build_pairs, separation_rad
+from service.vectors import Vector
+from studies.ptp_2015.rivals.proposed import Proposed, Rows
+
+SEPARATION_MAX_DEG = 14.2
+"""The diagonal of the field."""
+MAX_TRIANGLES, MAX_CANDIDATES = 500, 2_000
+
+
+class ObservedField(NamedTuple):
+    """The observed stars (n): unit vectors, and their noise in radians."""
+
+    direction: Any
+    sigma: Any
+
+
+class GuidePairs(NamedTuple):
+    """Catalog stars (m, 3) and their pairs by separation, which a k-vector finds."""
+
+    direction: Any
+    brighter: Any
+    dimmer: Any
+    value: Any
+    below: Any
+    slope: Any
+    intercept: Any
+
+
+class Chains(NamedTuple):
+    """Catalog pairs by either star.
+
+    From `head[a]` on, `link` leads through the pairs with star a, and `end` holds the
+    other star of each.
+    """
+
+    head: Any
+    link: Any
+    end: Any
+
+
+@dataclass(frozen=True)
+class Pyramid:
+    """Pairs of stars by separation in radians."""
+
+    brighter: Rows
+    dimmer: Rows
+    separation: KVector
+    direction: Vector
+
+    @property
+    def entries(self) -> int:
+        """Every pair that fits into the field."""
+        return len(self.brighter)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of pairs and k-vector."""
+        return self.brighter.nbytes + self.dimmer.nbytes + self.separation.nbytes
+
+    def identify(self, scene: Scene) -> Proposed:
+        """The four stars of the first pyramid that fits at one place of the sky alone."""
+        image, star = np.empty((2, 4), np.int32)
+        match = np.full(len(scene.direction), -1, np.int32)
+        index = self.separation
+        pairs = GuidePairs(
+            *(self.direction, self.brighter, self.dimmer),
+            *(index.value, index.below, index.slope, index.intercept),
+        )
+        if not _search(ObservedField(scene.direction, scene.sigma_rad), pairs, image, star):
+            return Proposed(match, image[:0], star[:0])
+        match[image] = star
+        return Proposed(match, image, star)
+
+
+def build_pyramid(stars: RunCatalog, separation_max_deg: float = SEPARATION_MAX_DEG) -> Pyramid:
+    """The pyramid's pairs of a star list."""
+    pairs = build_pairs(stars.direction, separation_max_deg)
+    kvector = build_kvector(pairs.separation_rad)
+    return Pyramid(pairs.brighter, pairs.dimmer, kvector, stars.direction)
+
+
+@njit(nogil=True)
+def _pairs_like(field, i, j, pairs):  # type: ignore[no-untyped-def]
+    """The range of catalog pairs that are as far apart as stars i and j."""
+    apart = separation_rad(field.direction[i], field.direction[j])
+    tolerance = SIGMAS * math.sqrt(field.sigma[i] ** 2 + field.sigma[j] ** 2)
+    return rows_within(
+        *(pairs.value, pairs.below, pairs.slope, pairs.intercept),
+        *(apart - tolerance, apart + tolerance),
+    )
+
+
+@njit(nogil=True)
+def _chain(field, i, j, pairs, chains):  # type: ignore[no-untyped-def]
+    """Chain the catalog pairs that are as far apart as stars i and j, by either star."""
+    head, link, end = chains
+    first, last = _pairs_like(field, i, j, pairs)
+    head[:] = -1
+    for row in range(first, last):
+        at = 2 * (row - first)
+        if at + 1 >= len(link):
+            break
+        a, b = pairs.brighter[row], pairs.dimmer[row]
+        end[at], link[at], head[a] = b, head[a], at
+        end[at + 1], link[at + 1], head[b] = a, head[b], at + 1
+
+
+@njit(nogil=True)
+def _fits(field, i, j, a, b):  # type: ignore[no-untyped-def]
+    """Whether stars a and b are as far apart as observed i and j."""
+    off = separation_rad(field.direction[i], field.direction[j]) - separation_rad(a, b)
+    return abs(off) <= SIGMAS * math.sqrt(field.sigma[i] ** 2 + field.sigma[j] ** 2)
+
+
+@njit(nogil=True)
+def _handed(a, b, c):  # type: ignore[no-untyped-def]
+    """The triple product: its sign tells a triangle from its mirror image."""
+    return (
+        a[0] * (b[1] * c[2] - b[2] * c[1])
+        + a[1] * (b[2] * c[0] - b[0] * c[2])
+        + a[2] * (b[0] * c[1] - b[1] * c[0])
+    )
+
+
+@njit(nogil=True)
+def _search(field, pairs, image, star):  # type: ignore[no-untyped-def]
+    """The first pyramid that fits one place alone into `image` and `star` (4,); whether any."""
+    n = len(field.direction)
+    capacity = 2 * len(pairs.brighter)
+    chains = Chains(
+        np.empty(len(pairs.direction), np.int32),
+        np.empty(capacity, np.int32),
+        np.empty(capacity, np.int32),
+    )
+    candidate = np.empty((MAX_CANDIDATES, 3), np.int32)
+    tried = 0
+    for dj in range(1, n - 1):
+        for dk in range(1, n - dj):
+            for i in range(n - dj - dk):
+                j, k = i + dj, i + dj + dk
+                if tried == MAX_TRIANGLES:
+                    return False
+                tried += 1
+                count = _triangles(field, i, j, k, pairs, chains, candidate)
+                if count == 0:
+                    continue
+                for r in range(n):
+                    if r not in (i, j, k) and _confirmed(
+                        field, (i, j, k, r), pairs, chains, candidate[:count], image, star
+                    ):
+                        return True
+    return False
+
+
+@njit(nogil=True)
+def _confirmed(field, four, pairs, chains, candidate, image, star):  # type: ignore[no-untyped-def]
+    """Whether the fourth star confirms one candidate alone, which goes to `image` and `star`."""
+    i, j, k, r = four
+    direction = pairs.direction
+    _chain(field, i, r, pairs, chains)
+    confirmed = 0
+    for t in range(len(candidate)):
+        a, b, c = candidate[t]
+        at = chains.head[a]
+        while at >= 0:
+            d = chains.end[at]
+            at = chains.link[at]
+            if (
+                d not in (b, c)
+                and _fits(field, j, r, direction[b], direction[d])
+                and _fits(field, k, r, direction[c], direction[d])
+            ):
+                confirmed += 1
+                image[0], image[1], image[2], image[3] = i, j, k, r
+                star[0], star[1], star[2], star[3] = a, b, c, d
+    return confirmed == 1
+
+
+@njit(nogil=True)
+def _triangles(field, i, j, k, pairs, chains, candidate):  # type: ignore[no-untyped-def]
+    """Catalog triangles in the place of stars i, j and k, of the same hand; how many."""
+    direction = pairs.direction
+    first, last = _pairs_like(field, i, j, pairs)
+    _chain(field, i, k, pairs, chains)
+    hand = _handed(field.direction[i], field.direction[j], field.direction[k])
+    count = 0
+    for row in range(first, last):
+        for swap in range(2):
+            a, b = pairs.brighter[row], pairs.dimmer[row]
+            if swap == 1:
+                a, b = b, a
+            at = chains.head[a]
+            while at >= 0:
+                c = chains.end[at]
+                at = chains.link[at]
+                if (
+                    c != b
+                    and _fits(field, j, k, direction[b], direction[c])
+                    and hand * _handed(direction[a], direction[b], direction[c]) > 0.0
+                    and count < len(candidate)
+                ):
+                    candidate[count, 0], candidate[count, 1], candidate[count, 2] = a, b, c
+                    count += 1
+    return count

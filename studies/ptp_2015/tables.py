@@ -1,0 +1,222 @@
+"""The paper's tables and figures as Markdown, its numbers beside ours."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from studies.paper_1994.tables import markdown
+from studies.ptp_2015 import claims, projections
+from studies.ptp_2015.comparison import Database
+from studies.ptp_2015.found import Measurements
+from studies.ptp_2015.printed import Ends, the_ptp_paper
+from studies.ptp_2015.projections import Projections
+from studies.ptp_2015.tally import Tally
+
+TITLES: Mapping[str, str] = {
+    "ptp-1": "Table 1. Projections of nine triangles",
+    "ptp-2": "Table 2. The k-vector",
+    "ptp-3": "Table 3. The sharing stars of four triangles",
+    "figure-6": "Figure 6. Triangles on the projection axis",
+    "figure-7": "Figure 7. Projection and index of the triangles",
+    "ptp-5": "Table 5. The number of slave stars, no noise",
+    "ptp-6": "Table 6. The algorithms compared, 1 px and 0.5 mag of noise",
+    "figure-10": "Figure 10. Stars in the field of view",
+    "figure-11": "Figure 11. Rate against the stars in the field, 0.5 px",
+    "figure-12": "Figure 12. Rate against the noise of position",
+    "figure-13": "Figure 13. Rate against the noise of magnitude, stars lost and added",
+    "ptp-false": "Fields that are none: what sharing stars and the attitude check accept, 2 px",
+}
+
+OF_PROJECTIONS: Mapping[str, Callable[[Projections], str]] = {
+    "ptp-1": projections.table_1,
+    "ptp-2": projections.table_2,
+    "ptp-3": projections.table_3,
+    "figure-6": projections.figure_6,
+    "figure-7": projections.figure_7,
+}
+"""Of all triangles of the sky: no field is drawn for these."""
+
+MB = 1e6
+STARS_IN_FIELD = ((3, 3), (4, 4), (5, 5), (6, 6), (7, 7), (8, 8), (9, 10), (11, 15), (16, 99))
+"""The columns of Figure 11, first to last."""
+
+RATES = (
+    "Shares of fields in percent, in brackets the 95 % interval. *Strict*: the algorithm names "
+    "three stars or more, all rightly; *loose*: two or more, most of them rightly; *checked*: "
+    "three or more behind the attitude check, all rightly; *wrong*: behind the check a star is "
+    "misnamed. The paper does not say when it counts a field as identified. Its times are "
+    "averages; ours are the median and, in brackets, the average of this machine."
+)
+
+
+def section(found: Measurements, name: str) -> str:
+    """A table or figure with its heading, and what the paper claims of it that cannot be."""
+    tallies, paper = found.tallies[name], the_ptp_paper()
+    note = claims.NOT_REPRODUCED.get(name)
+    if name in OF_PROJECTIONS:
+        assert found.projections is not None
+        shown = OF_PROJECTIONS[name](found.projections)
+        note = projections.note_on_table_2(found.projections) if name == "ptp-2" else None
+    elif name == "ptp-5":
+        shown = table_5(tallies, found.databases)
+    elif name == "ptp-6":
+        shown = table_6(tallies, found.databases)
+    elif name == "figure-10":
+        assert found.stars is not None
+        shown = figure_10(found.stars)
+    elif name == "figure-11":
+        shown = figure_11(tallies)
+    elif name == "ptp-false":
+        shown = false_fields(found.false_fields)
+    elif name == "figure-12":
+        shown = line_table(tallies, "position_px", "px", paper.figure_12)
+    else:
+        shown = line_table(tallies, "magnitude_sigma_mag", "mag", paper.figure_13)
+    parts = [f"### {TITLES[name]}", shown, *([note] if note else [])]
+    return "\n\n".join(parts)
+
+
+def table_5(tallies: Sequence[Tally], databases: Sequence[Database]) -> str:
+    """Table 5: how many slaves a master should have."""
+    size = {each.algorithm: each for each in databases}
+    rows = []
+    for printed in the_ptp_paper().table_5:
+        tally = next(t for t in tallies if t.algorithm in _names(printed.slaves))
+        database = size[tally.algorithm]
+        rows.append(
+            (
+                str(printed.slaves),
+                f"{printed.memory_mb:.3f}",
+                f"{database.nbytes / MB:.3f}",
+                f"{database.entries:,}",
+                f"{printed.rate_pct:.2f}",
+                str(tally.strict),
+                str(tally.loose),
+                str(tally.checked),
+                str(tally.wrong),
+                f"{printed.time_ms:.2f}",
+                tally.times,
+            )
+        )
+    header = (
+        *("slaves", "paper: MB", "MB", "triangles", "paper: rate %"),
+        *("strict", "loose", "checked", "wrong", "paper: ms", "ms alone / checked"),
+    )
+    return markdown(header, rows)
+
+
+def _names(slaves: int) -> tuple[str, ...]:
+    return ("PTP",) if slaves == 4 else (f"PTP, {slaves} slaves",)
+
+
+def table_6(tallies: Sequence[Tally], databases: Sequence[Database]) -> str:
+    """Table 6: the algorithms at one pixel and half a magnitude, without and with added stars."""
+    size = {each.algorithm: each for each in databases}
+    printed = {row.algorithm: row for row in the_ptp_paper().table_6}
+    rows = []
+    for tally in tallies:
+        told = printed.get(tally.algorithm)
+        rows.append(
+            (
+                tally.algorithm,
+                "lost and added" if tally.case.adds else "lost alone",
+                f"{told.rate_pct:.2f}" if told else "",
+                str(tally.strict),
+                str(tally.loose),
+                str(tally.checked),
+                str(tally.wrong),
+                f"{told.time_ms:.2f}" if told else "",
+                tally.times,
+                f"{told.memory_mb:g}" if told else "",
+                f"{size[tally.algorithm].nbytes / MB:.2f}",
+            )
+        )
+    header = (
+        *("algorithm", "stars are", "paper: rate %", "strict", "loose", "checked", "wrong"),
+        *("paper: ms", "ms alone / checked", "paper: MB", "MB"),
+    )
+    return markdown(header, rows)
+
+
+def database_table(databases: Iterable[Database]) -> str:
+    """What each algorithm keeps for the sky to V 6, and how long that takes to make."""
+    printed = {row.algorithm: row.memory_mb for row in the_ptp_paper().table_6}
+    rows = (
+        (
+            each.algorithm,
+            f"{each.entries:,}",
+            f"{each.nbytes / MB:.2f}",
+            f"{printed[each.algorithm]:g}" if each.algorithm in printed else "",
+            f"{each.build_s:.3f}",
+        )
+        for each in databases
+    )
+    return markdown(("algorithm", "rows", "MB", "paper: MB", "build s"), rows)
+
+
+def figure_10(stars: npt.NDArray[np.int64]) -> str:
+    """Figure 10: stars in the field of view."""
+    printed = the_ptp_paper().figure_10
+    rows = (
+        ("mean", f"{printed.mean:.2f}", f"{stars.mean():.2f}"),
+        ("least", str(printed.least), str(stars.min())),
+        ("most", str(printed.most), str(stars.max())),
+        (
+            "more than eight, %",
+            f"{printed.more_than_8_pct:.2f}",
+            f"{100.0 * (stars > 8).mean():.2f}",
+        ),
+    )
+    return markdown((f"of {len(stars):,} fields", "paper", "ours"), rows)
+
+
+def figure_11(tallies: Sequence[Tally]) -> str:
+    """Figure 11: the rate against the stars in the field, strict and checked."""
+    rows = []
+    for tally in tallies:
+        parts = [tally.of_fields_with(least, most) for least, most in STARS_IN_FIELD]
+        for word in ("strict", "checked"):
+            rates = [getattr(part, word) for part in parts]
+            rows.append((f"{tally.algorithm}, {word}", *(f"{rate.percent:.1f}" for rate in rates)))
+        if tally is tallies[-1]:
+            rows.append(("fields", *(str(len(part.rows)) for part in parts)))
+    columns = (f"{a}" if a == b else f"{a}+" if b == 99 else f"{a}-{b}" for a, b in STARS_IN_FIELD)
+    return markdown(("stars in the field", *columns), rows)
+
+
+def false_fields(rows: Sequence[Mapping[str, str | int]]) -> str:
+    """Mirrored skies and random points in which three stars or more are named."""
+    header = ("fields", "of", "by sharing stars (section 2.3)", "behind the attitude check")
+    names = ("fields", "scenes", "sharing", "checked")
+    return markdown(header, [tuple(f"{row[name]}" for name in names) for row in rows])
+
+
+def line_table(tallies: Sequence[Tally], axis: str, unit: str, printed: Ends) -> str:
+    """Figures 12 and 13: rates against one kind of noise; `axis` names the case's field."""
+    values = sorted({getattr(tally.case, axis) for tally in tallies})
+    rows = []
+    for tally in sorted(tallies, key=lambda t: getattr(t.case, axis)):
+        value = getattr(tally.case, axis)
+        ends = printed.get(tally.algorithm)
+        told = ""
+        if ends and value in (values[0], values[-1]):
+            told = f"{ends[0] if value == values[0] else ends[1]:.1f}"
+        rows.append(
+            (
+                f"{value:g} {unit}",
+                tally.algorithm,
+                told,
+                str(tally.strict),
+                str(tally.loose),
+                str(tally.checked),
+                str(tally.wrong),
+                tally.times,
+                f"{len(tally.rows):,}",
+            )
+        )
+    header = (
+        *("noise", "algorithm", "paper: rate %", "strict", "loose", "checked", "wrong"),
+        *("ms alone / checked", "fields"),
+    )
+    return markdown(header, rows)
