@@ -76,10 +76,12 @@ test: kernels
 	@$(TEST) $(PYTEST_ARGS)
 	@$(if $(PYTEST_ARGS),:,$(OVER_POSTGRESQL) $(SITTING_OVER_POSTGRESQL))
 
+# Its longest tests take minutes, and more on a busy machine.
+FULL = --full -o faulthandler_timeout=1200
 full: kernels
 	@echo "== all tests"
-	@$(TEST) --full $(PYTEST_ARGS)
-	@$(if $(PYTEST_ARGS),:,$(OVER_POSTGRESQL) --full $(ALL_OVER_POSTGRESQL))
+	@$(TEST) $(FULL) $(PYTEST_ARGS)
+	@$(if $(PYTEST_ARGS),:,$(OVER_POSTGRESQL) $(FULL) $(ALL_OVER_POSTGRESQL))
 
 kernels: $(DEV)
 	@echo "== kernels and sky (minutes after a change of the core, else seconds)"

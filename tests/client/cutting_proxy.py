@@ -25,6 +25,8 @@ class CuttingProxy:
         return self
 
     def __exit__(self, *_):
+        # Only a shutdown wakes the thread that waits for the next connection.
+        _shut(self._listener)
         self._listener.close()
         self.cut()
 
