@@ -185,8 +185,9 @@ def test_the_sky_is_prepared_once_and_one_that_cannot_be_kept_is_said(
     monkeypatch.setattr(kernel_build, "_is_complete", lambda: True)
     code, out, _ = acquire("prepare", "--time", "1999-03-01T00:00:00Z")
     assert code == 0
-    # The catalog, run catalogs of two limits, and an index for each limit and field of view.
-    assert re.search(r"^kernels: compiled already\nsky: 6 files built in [\d.]+ s\n", out)
+    # Run catalogs of two limits, an index for each limit and field of view, and the catalog if
+    # no test before has opened it in this process.
+    assert re.search(r"^kernels: compiled already\nsky: [56] files built in [\d.]+ s\n", out)
     assert str(tmp_path / "cache") in out
     code, out, _ = acquire("prepare", "--time", "1999-03-01T00:00:00Z")
     assert (code, "sky: built already\n" in out) == (0, True)

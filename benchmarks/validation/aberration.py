@@ -39,7 +39,7 @@ def run(quick: bool, seed: int) -> Report:
     boresight = passes.mission.trackers[0].body_from_tracker[:, 2]
     figures: dict[str, Any] = {}
     bounds: list[Bound] = []
-    means: dict[str, float] = {}
+    lengths: dict[str, list[float]] = {}
     for way, (apparent, said, right) in WAYS.items():
         rng = np.random.default_rng(seed)
         priors = batches.prior_attitudes(rng, passes.toml, 20)
@@ -49,8 +49,10 @@ def run(quick: bool, seed: int) -> Report:
             directions = passes.seen if apparent else passes.directions
             truth, found = passes.draw(rng, prior, directions, said)
             error = error_of(truth, found)
+            lengths.setdefault(way, []).append(math.nan)
             if error is not None and found.solution is not None:
                 off.append(float(np.linalg.norm(np.cross(error, boresight))))
+                lengths[way][-1] = off[-1]
                 across = np.cross(truth.T @ boresight, passes.velocity_c)
                 shift.append(float(np.linalg.norm(across)) * ARCSEC_PER_RADIAN)
                 covariance = found.solution.covariance_arcsec2
@@ -58,16 +60,18 @@ def run(quick: bool, seed: int) -> Report:
                 # Rayleigh: the mean length of two Gaussian components alike.
                 noise.append(math.sqrt(float(across_arcsec2) * math.pi) / 2.0)
         expected = float(np.mean(noise if right else shift))
-        means[way] = float(np.mean(off))
-        figures[f"{way}: mean arcsec off"] = f"{means[way]:.2f}"
+        mean = float(np.mean(off))
+        figures[f"{way}: mean arcsec off"] = f"{mean:.2f}"
         figures[f"{way}: predicted from {'the covariance' if right else 'the shift'}"] = (
             f"{expected:.2f}"
         )
         within = NOISE * expected * (5.0 if quick else 1.0) if right else WITHIN_ARCSEC
         bounds.append(
-            between(f"{way}: mean off", means[way], expected - within, expected + within, "arcsec")
+            between(f"{way}: mean off", mean, expected - within, expected + within, "arcsec")
         )
-    apart = abs(means["corrected here"] - means["applied upstream"])
+    # Batch by batch: a star that only one of both ways matched changes a mean of a few batches.
+    here, upstream = (np.array(lengths[way]) for way in ("corrected here", "applied upstream"))
+    apart = float(np.nanmedian(np.abs(here - upstream)))
     bounds.append(
         at_most("corrected here and applied upstream apart", apart, SAME_ARCSEC, "arcsec")
     )

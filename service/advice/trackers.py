@@ -116,14 +116,16 @@ def _noise(tracker: Tracker, index: int, evidence: Evidence) -> NoiseFinding:
         return NoiseFinding(tracker.name, tracker.sigma_arcsec, None, len(fits), "no_verdict")
     fits.sort(key=lambda fit: fit.time.tai_ns)
     squared = _squared_noise(fits)
-    latest = _latest_with_own_noise(squared)
-    now, before = squared[-latest:], squared[:-latest]
     worst = _worst_in_a_row(squared)
-    if worst is not None and len(before) == 0:
-        # The median of both noises would be that of neither.
-        now = np.concatenate([squared[: worst.start], squared[worst.stop :]])
-    elif worst is not None and worst.stop > len(before):
-        worst = None
+    others = np.arange(len(squared))
+    if worst is not None and LEAST_BATCHES <= worst.start:
+        if worst.stop <= len(squared) - LEAST_BATCHES // 2:
+            # It ended.  With it in the median, those before or after it would seem of other noise.
+            others = np.delete(others, worst)
+        else:
+            worst = None
+    latest = _latest_with_own_noise(squared[others])
+    now, before = squared[others[-latest:]], squared[others[:-latest]]
     sigma = _sigma(now, tracker)
     return NoiseFinding(
         tracker.name,
@@ -132,7 +134,7 @@ def _noise(tracker: Tracker, index: int, evidence: Evidence) -> NoiseFinding:
         len(now),
         _size_verdict(tracker.sigma_arcsec, sigma),
         _sigma(before, tracker) if len(before) else None,
-        fits[-latest].time if len(before) else None,
+        fits[others[-latest]].time if len(before) else None,
         None if worst is None else _noise_period(fits[worst], squared[worst], tracker),
     )
 

@@ -137,7 +137,8 @@ def shape_of(least_deg: float, most_deg: float, limit_deg: float) -> Shape:
 def predicted(neighbours: Neighbours, shape: Shape, axis: Vector) -> tuple[int, float]:
     """The stars of a zone about an axis, counted, and its pairs, predicted."""
     direction = neighbours.direction
-    cosine = direction @ axis
+    # Rounded, the axis itself may be outside of its zone.
+    cosine = np.clip(direction @ axis, -1.0, 1.0)
     inside = np.flatnonzero((cosine >= shape.cosine[0]) & (cosine <= shape.cosine[-1]))
     cosine, total = cosine[inside], neighbours.total[inside]
     sine = np.sqrt(np.clip(1.0 - cosine**2, 1e-18, 1.0))
