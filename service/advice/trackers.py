@@ -118,7 +118,7 @@ def _noise(tracker: Tracker, index: int, evidence: Evidence) -> NoiseFinding:
     squared = _squared_noise(fits)
     worst = _worst_in_a_row(squared)
     others = np.arange(len(squared))
-    if worst is not None and LEAST_BATCHES <= worst.start:
+    if worst is not None and worst.start >= LEAST_BATCHES:
         if worst.stop <= len(squared) - LEAST_BATCHES // 2:
             # It ended.  With it in the median, those before or after it would seem of other noise.
             others = np.delete(others, worst)
