@@ -16,6 +16,7 @@ PREFIX = "ACQUIRE_"
 MOST_USEFUL_PROCESSES = 4
 """One process writes: it takes no more than so many can compute."""
 _TOKEN = re.compile(r"[!-~]+")
+_ROOT_PATH = re.compile(r"(/[A-Za-z0-9._~-]+)*", re.ASCII)
 _HOST = re.compile(r"[A-Za-z0-9.:_-]{1,253}", re.ASCII)
 
 
@@ -37,7 +38,8 @@ class Settings:
     may have `connections_per_address` at a time, and one that asks for nothing is closed
     after `keep_alive_seconds`; addresses and networks in
     `trusted_proxies` may have more, and the service believes what they say about
-    the clients behind them (X-Forwarded-For, X-Forwarded-Proto).  Webhooks reach
+    the clients behind them (X-Forwarded-For, X-Forwarded-Proto).  `root_path` is the path
+    below which a proxy serves the service, such as /acquire.  Webhooks reach
     public addresses, and the networks in `webhook_networks`, these by http too.
     `archive_folder` is the folder of `acquire archive`, where archived batches are read.
     """
@@ -60,6 +62,7 @@ class Settings:
     connections_per_address: int = 256
     keep_alive_seconds: int = 75
     trusted_proxies: str = "127.0.0.1,::1"
+    root_path: str = ""
     webhook_networks: str = ""
     archive_folder: Path | None = None
 
@@ -101,6 +104,9 @@ class Settings:
             raise BadConfiguration(
                 f"{PREFIX}TOKEN: must be printable ASCII characters without a space"
             )
+        if not _ROOT_PATH.fullmatch(self.root_path):
+            message = "must be a path without a slash at its end, such as /acquire"
+            raise _refusal("root_path", message, self.root_path)
         if not _HOST.fullmatch(self.host):
             raise _refusal("host", "must be an address or a name, such as 127.0.0.1", self.host)
 

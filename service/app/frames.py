@@ -1,24 +1,33 @@
 """Frames of star trackers: submit one, and the overlay of a recorded one."""
 
+import base64
 import json
+import re
+import threading
 from concurrent.futures import Future
 from typing import IO
+
+from msgspec.structs import replace
 
 from service.access.tokens import Caller, own_key
 from service.app.context import Context, known_id
 from service.app.submissions import Submissions
-from service.imaging.frames.files import frame_digest
+from service.errors import Busy
+from service.imaging.frames.files import frame_digest, read_frame
+from service.imaging.frames.frame import FrameLimits
 from service.imaging.overlay import draw_overlay
 from service.imaging.overlay_marks import marks_of
 from service.imaging.submit import FrameIn
 from service.missions.mission import Mission, mission_named
 from service.observations.schema import FromLastIn, Submission, submission_from_json
+from service.storage.models.pictures import Picture, picture_of
 from service.storage.queries.results import answer_from_json, frame_of_result
 from service.storage.recording.unsaved_result import Answered
 from service.times import utc_now
 
 FRAME_WAIT_S = 30.0
 """The longest time that a frame waits for a thread: other frames may take seconds."""
+_COMMAND_OPTION = re.compile(r" \(--[^)]*\)")
 
 
 def _asks_for_last(known: FrameIn, mission: Mission) -> bool:
@@ -34,6 +43,7 @@ class Frames:
     def __init__(self, context: Context, submissions: Submissions) -> None:
         self._context = context
         self._submissions = submissions
+        self._picture_turn = threading.BoundedSemaphore(1)
 
     def submit(
         self,
@@ -74,6 +84,55 @@ class Frames:
                 wait_s=FRAME_WAIT_S,
                 tracked_ns=utc_now().tai_ns if _asks_for_last(known, mission) else None,
             ).result()
+
+    def picture(
+        self,
+        file: IO[bytes],
+        *,
+        spacecraft: str | None = None,
+        field_of_view_deg: float | None = None,
+        image: str | None = None,
+        draws: bool = False,
+    ) -> Picture:
+        """The attitude and the lens of a picture of any camera; nothing is recorded.
+
+        With a `spacecraft` the picture must have the size of its camera's frames, whose focal
+        length is the first guess.  The file is closed at the end.  One picture is solved at a
+        time.  Raises `Busy` if others take too long, `NotFound` for an unknown spacecraft, and
+        `BadInput` for a file that is no picture.
+        """
+        self._submissions.require_kernels()
+        # Importing this takes a third of the time that the service needs to start.
+        from service.acquire.picture import blind_sky, overlay_of, solve_picture
+        from service.identify.blind.solver import focal_px_of
+
+        with file:
+            shape, guess_px = None, None
+            if spacecraft is not None:
+                mission = mission_named(self._context.missions, spacecraft)
+                _, camera = mission.camera_tracker(None, "spacecraft")
+                shape, guess_px = camera.shape, camera.focal_length_px
+            max_pixels = self._context.settings.frame_megapixels * 1_000_000
+            limits = FrameLimits(max_pixels, shape, spacecraft or "the camera", image)
+            if not self._picture_turn.acquire(timeout=FRAME_WAIT_S):
+                raise Busy("other pictures are being solved", 10)
+            try:
+                frame = read_frame(file, limits)
+                if field_of_view_deg is not None:
+                    side_px = max(frame.width_px, frame.height_px)
+                    guess_px = focal_px_of(side_px, field_of_view_deg)
+                sky, solver = blind_sky(self._context.sky.catalog)
+                result = solve_picture(frame, sky, solver, guess_px)
+                drawn = overlay_of(result, "") if draws else None
+            finally:
+                self._picture_turn.release()
+        found = picture_of(result)
+        return replace(
+            found,
+            # Remarks name options of the command.
+            remarks=[_COMMAND_OPTION.sub("", remark) for remark in found.remarks],
+            overlay_png=base64.b64encode(drawn).decode() if drawn is not None else None,
+        )
 
     def overlay(self, id: str) -> bytes:
         """A PNG of the frame that a result was made of, with its stars, names and residuals."""

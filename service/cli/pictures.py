@@ -1,12 +1,13 @@
 """`acquire frame` without a spacecraft: pictures from any camera, solved in this process."""
 
 import json
-import math
 import sys
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from msgspec import to_builtins
 
 from service.errors import BadInput, Fault, shown_value
 from service.settings import Settings
@@ -24,6 +25,7 @@ def solve_pictures(parsed: Namespace, settings: Settings) -> int:
     """Solve every file and print its result; 1 where one was refused or has no attitude."""
     from service.acquire.picture import blind_sky, solve_picture
     from service.sky.catalog.star_catalog import open_catalog
+    from service.storage.models.pictures import picture_of
 
     sky, solver = blind_sky(open_catalog(settings.catalog))
     read = picture_reader(parsed.dark, settings, parsed.image)
@@ -38,7 +40,8 @@ def solve_pictures(parsed: Namespace, settings: Settings) -> int:
             print(f"acquire: {file}: {error}", file=sys.stderr)
             continue
         failed += result.attitude is None
-        told = {"file": str(file), **result_json(result), "overlay": None}
+        told = {"file": str(file), **to_builtins(picture_of(result)), "overlay": None}
+        told.pop("overlay_png")
         unwritten = None
         try:
             told["overlay"] = str(_write_overlay(parsed, file, result))
@@ -89,66 +92,6 @@ def focal_guess_px(parsed: Namespace, width_px: int, height_px: int) -> float | 
     if parsed.fov is not None:
         return focal_px_of(max(width_px, height_px), parsed.fov)
     return None
-
-
-def result_json(result: "PictureResult") -> dict[str, Any]:
-    """A result ready for JSON; numbers that are not known are null."""
-    points, found = result.points, result.attitude
-    told: dict[str, Any] = {
-        "width_px": points.width_px,
-        "height_px": points.height_px,
-        "candidates": points.count,
-        "psf_sigma_px": round(points.psf_sigma_px, 2),
-        "noise_counts": round(points.noise_counts, 3),
-        "attitude": None,
-        "orientation": result.frame.orientation,
-        "remarks": [*result.remarks, *result.frame.remarks],
-    }
-    if found is None:
-        return told
-    lens, ra_dec = found.lens, found.boresight_deg
-    told["attitude"] = {
-        # The lens was fitted on the picture itself: it is not calibrated.
-        "status": "suspect",
-        "quaternion": [round(each, 9) for each in found.quaternion.tolist()],
-        "sigma_arcsec": [round(each, 2) for each in found.sigma_arcsec.tolist()],
-        "ra_deg": round(ra_dec[0], 5),
-        "dec_deg": round(ra_dec[1], 5),
-        "roll_deg": round(found.roll_deg, 4),
-        "aberration": "corrected" if found.aberration_corrected else "ignored: no time is known",
-        "log_odds": round(found.log_odds, 1),
-    }
-    told["lens"] = {
-        "field_deg": [round(each, 4) for each in found.field_deg],
-        "focal_px": round(lens.focal_px, 2),
-        "focal_sigma_px": _known(found.sigma_of(3) * lens.focal_px, 2),
-        "distortion_corner": round(lens.bend, 6),
-        "distortion_sigma": _known(found.sigma_of(4), 6),
-        "center_px": [round(each, 2) for each in lens.center_px],
-        "center_sigma_px": _known(found.sigma_of(5) * lens.radius_px, 2),
-    }
-    told["residual_rms_px"] = round(found.rms_px, 3)
-    told["sigma_scale"] = round(found.sigma_scale, 3)
-    told["shared_error_px"] = round(found.shared_px, 3)
-    told["zero_point_mag"] = _known(found.zero_point_mag, 2)
-    told["zero_point_sigma_mag"] = _known(found.zero_point_sigma_mag, 2)
-    told["exposure_s"] = result.frame.exposure_s
-    told["stars"] = [
-        {
-            "id": star.id,
-            "name": star.name,
-            "v_mag": round(star.magnitude_v_mag, 2),
-            "u_px": round(star.u_px, 2),
-            "v_px": round(star.v_px, 2),
-            "residual_px": [round(star.residual_u_px, 3), round(star.residual_v_px, 3)],
-        }
-        for star in found.stars
-    ]
-    return told
-
-
-def _known(value: float, digits: int) -> float | None:
-    return round(value, digits) if math.isfinite(value) else None
 
 
 def _summary(file: Path, told: dict[str, Any]) -> str:

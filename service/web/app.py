@@ -45,7 +45,7 @@ from service.web.conditional import ConditionalAnswers
 from service.web.console import console_router
 from service.web.console.rendering import page_or_problem
 from service.web.event_stream import Live
-from service.web.middleware import AroundRequests
+from service.web.middleware import AroundRequests, BelowPath
 from service.web.openapi.document import add_reference
 from service.web.requests.access import authorize
 from service.web.requests.exports import Exports
@@ -146,6 +146,9 @@ def create_app(app: App, limits: BodyLimits = DEFAULT_LIMITS) -> FastAPI:
             for method in route.methods or ()
         },
     )
+    web_app.state.root_path = app.settings.root_path
+    if app.settings.root_path:
+        web_app.add_middleware(BelowPath, root_path=app.settings.root_path)
     return web_app
 
 

@@ -171,6 +171,45 @@ class AroundRequests:
             log.error("%s by %s has no audit entry: %s", action, state["caller"].name, error)
 
 
+class BelowPath:
+    """Serves the app below a path of a proxy, whether the proxy takes that path off or not.
+
+    The app itself does not know the path: it is put before every path in the headers of an
+    answer.  `service.web.console.rendering` does the same for pages.
+    """
+
+    def __init__(self, app: ASGIApp, root_path: str) -> None:
+        self.app = app
+        self.root_path = root_path
+        self._prefix = root_path.encode()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request; pass on other events."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        path: str = scope["path"]
+        if path == self.root_path or path.startswith(f"{self.root_path}/"):
+            scope = {**scope, "path": path.removeprefix(self.root_path) or "/"}
+
+        async def sent(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = [(name, self._rooted(name, value)) for name, value in message["headers"]]
+                message = {**message, "headers": headers}
+            await send(message)
+
+        await self.app(scope, receive, sent)
+
+    def _rooted(self, name: bytes, value: bytes) -> bytes:
+        if name in (b"location", b"content-location") and value.startswith(b"/"):
+            return self._prefix + value
+        if name == b"link":
+            return value.replace(b"</", b"<" + self._prefix + b"/")
+        if name == b"set-cookie":
+            return value.replace(b"Path=/", b"Path=" + self._prefix)
+        return value
+
+
 class ProbesOnly:
     """The app of the probe port: it serves the paths of probes and answers 404 to all others."""
 

@@ -77,6 +77,13 @@ def walk(client: httpx.Client, app: App) -> Json:
     take("submit_frame", _send(client, "IMAGER", cut_off, file[:5760]), "cut_off")
     take("submit_frame", _send(client, "XTE", frame, file), "no_camera")
 
+    octets = {"Content-Type": "application/octet-stream"}
+    solve = f"{API}/pictures?spacecraft=IMAGER"
+    solved = client.post(solve, content=file, headers=octets)
+    del take("solve_picture", solved, "found")["stars"][2:]
+    cut_off = client.post(solve, content=file[:5760], headers=octets)
+    take("solve_picture", cut_off, "cut_off")
+
     here = f"{API}/batches/{first['id']}"
     asked = {"options": {"identifier": "starid", "tolerances": {"separation_deg": 0.02}}}
     take("what_if", client.post(f"{here}/what-if", json=asked), "not_recorded", asked)

@@ -1,7 +1,9 @@
 """A frame in, identification and attitude out: recorded, repeated, frames, refused with words."""
 
+import base64
 import io
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -221,3 +223,61 @@ def test_the_page_of_its_batch_shows_the_frame_with_the_stars(client, recorded):
     assert picture.headers["Content-Type"] == "image/png"
     with Image.open(io.BytesIO(picture.content)) as shown:
         assert min(shown.size) > 700
+
+
+# ---- pictures ------------------------------------------------------------------------------------
+
+PLEIADES = Path(__file__).parents[1] / "pictures" / "cedarsolve-pleiades.jpg"
+OCTETS = {"Content-Type": "application/octet-stream"}
+
+
+def test_a_picture_of_any_camera_is_solved_and_nothing_is_recorded(client):
+    before = client.get("/api/v1/batches?run=*&limit=1").json()
+    asked = {"overlay": "true", "field_of_view_deg": "11"}
+    answer = client.post(
+        "/api/v1/pictures", params=asked, content=PLEIADES.read_bytes(), headers=OCTETS
+    )
+    assert answer.status_code == 200, answer.text
+    found = answer.json()
+    assert abs(found["attitude"]["ra_deg"] - 56.9) < 2.0
+    assert abs(found["attitude"]["dec_deg"] - 24.1) < 2.0
+    assert "Alcyone" in [star["name"] for star in found["stars"]]
+    drawn = Image.open(io.BytesIO(base64.b64decode(found["overlay_png"])))
+    assert drawn.format == "PNG"
+    assert max(drawn.size) >= 800
+    assert client.get("/api/v1/batches?run=*&limit=1").json() == before
+
+
+def test_a_picture_of_a_mission_s_camera_has_the_attitude_of_the_truth(client, frames):
+    address = "/api/v1/pictures?spacecraft=IMAGER"
+    found = client.post(address, content=frame_bytes(frames[1]), headers=OCTETS).json()
+    assert found["time"] == frames[1].known["time"]
+    truth = matrix_from_quaternion(frames[1].truth["quaternion"])
+    tracker = load_missions()["IMAGER"].trackers[0]
+    boresight = tracker.boresight_body @ truth
+    seen = matrix_from_quaternion(found["attitude"]["quaternion"])[2]
+    assert np.degrees(np.arccos(boresight @ seen)) < 0.05
+
+
+def test_a_picture_without_stars_says_what_to_try_and_names_no_option_of_a_command(client):
+    noise = np.random.default_rng(3).normal(40.0, 3.0, (480, 640)).clip(0, 255).astype(np.uint8)
+    file = io.BytesIO()
+    Image.fromarray(noise).save(file, "PNG")
+    found = client.post("/api/v1/pictures", content=file.getvalue(), headers=OCTETS).json()
+    assert found["attitude"] is None
+    assert found["stars"] == []
+    assert found["lens"] is None
+    assert any(each.startswith("try_next: ") for each in found["remarks"])
+    assert not any("--" in each for each in found["remarks"])
+
+
+@pytest.mark.parametrize(
+    ("query", "status"),
+    [("spacecraft=NOPE", 404), ("spacecraft=XTE", 422), ("spacecraft=IMAGER", 422)],
+)
+def test_a_picture_of_a_camera_that_is_not_there_or_of_another_size_is_refused(
+    client, query, status
+):
+    content = PLEIADES.read_bytes()
+    answer = client.post(f"/api/v1/pictures?{query}", content=content, headers=OCTETS)
+    assert answer.status_code == status, answer.text

@@ -3,15 +3,19 @@
 import html
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import httpx
 import numpy as np
 import pytest
 
 from service.app.factory import open_app
+from service.filtering.state import Status
+from service.missions.mission import load_missions
 from service.times import parse_utc, shifted
+from service.vectors import matrix_from_quaternion
 from service.web.app import create_app
-from service.web.console.charts.grades.grades import grade_charts
+from service.web.console.charts.grades.grades import direction_chart, grade_charts
 from service.web.console.charts.grades.panels import TimeAxis
 from tests.filtering.simulated import ARCSEC, attitudes_of, gyro_of, slews, truth_of
 from tests.fresh_databases import sqlite_at
@@ -198,6 +202,69 @@ def test_the_route_names_what_is_wrong(address, asked, status, named):
 @pytest.mark.parametrize("run", ["pass", "bare"])
 def test_it_fits_and_axe_finds_no_fault(address, run, browser):
     assert_fits(browser, f"{address}{PAGE}?run={run}")
+    assert browser.complaints == []
+    browser.call("Page.navigate", url="about:blank")
+
+
+def test_no_line_of_the_boresight_crosses_the_wrap_at_360_degrees():
+    app_axis = TimeAxis(NOON, shifted(NOON, 600.0))
+    angle = np.radians(np.linspace(-20.0, 20.0, 401))
+    # Body x turns about z through RA 0.
+    quaternion = np.zeros((401, 4))
+    quaternion[:, 2], quaternion[:, 3] = np.sin(angle / 2.0), np.cos(angle / 2.0)
+    tracker = load_missions()["XTE"].trackers[0]
+    samples = SimpleNamespace(
+        tai_ns=NOON.tai_ns + np.arange(401, dtype=np.int64) * 1_500_000_000,
+        status=np.full(401, int(Status.GOOD)),
+        quaternion=quaternion,
+    )
+    found = SimpleNamespace(samples={"smoothed": samples}, is_gyro=np.ones(401, dtype=bool))
+    chart = direction_chart(found, app_axis, tracker)
+    ra, dec, roll = chart.panels
+    assert [panel.axis for panel in chart.panels] == ["RA", "Dec", "roll"]
+    (trace,) = ra.traces
+    assert trace.line.count("M") == 2
+    assert all(abs(int(step)) < 100 for step in re.findall(r"l\d+ (-?\d+)", trace.line))
+    assert all(trace.line.count("M") == 1 for trace in (*dec.traces, *roll.traces))
+    assert ra.ticks[-1][1].endswith("°")
+    assert [text for _, text in app_axis.ticks()] == [f"12:0{minute}" for minute in (5,)]
+
+
+@in_browser
+def test_a_chart_is_read_at_a_moment_and_zoomed_by_dragging(browser, address):
+    browser.open(f"{address}{PAGE}?run=pass")
+    plot = "#chart-direction [data-plot]"
+    browser.run(f"document.querySelector('{plot}').focus()")
+    browser.press("ArrowRight")
+    note = "document.querySelector('#chart-direction [data-note]').textContent"
+    moment, _, value = browser.run(note).partition(": ")
+    shown = parse_utc(f"{NOON.text[:11]}{moment}.000Z")
+    found = httpx.get(
+        f"{address}/api/v1/spacecraft/XTE/attitude",
+        params={
+            "run": "pass",
+            "grade": "smoothed",
+            "start": shown.text,
+            "end": shifted(shown, 2.0).text,
+        },
+    ).json()["items"][0]
+    boresight = matrix_from_quaternion(found["quaternion"])[0]
+    ra_deg = np.degrees(np.arctan2(boresight[1], boresight[0])) % 360.0
+    assert float(re.match(r"smoothed ([\d.]+)°$", value)[1]) == pytest.approx(ra_deg, abs=0.3)
+    others = browser.run("[...document.querySelectorAll('[data-note]')].map(e => e.textContent)")
+    assert all(each.startswith(moment) for each in others)
+    # The middle half of half an hour.
+    browser.drag(plot, 0.25, 0.75)
+    browser.wait(lambda: browser.run("location.search").count("start=") == 1)
+    browser.wait(lambda: browser.run("document.readyState") == "complete")
+    start, end = (
+        parse_utc(browser.run(f"document.getElementById('grades').dataset.{name}"))
+        for name in ("start", "end")
+    )
+    assert shifted(start, 900.0).tai_ns == pytest.approx(end.tai_ns, abs=40e9)
+    links = browser.run("[...document.querySelectorAll('#grades a[download]')].map(e => e.href)")
+    smoothed = [each for each in links if "grade=smoothed" in each and "format=csv" in each]
+    assert httpx.get(smoothed[0]).is_success
     assert browser.complaints == []
     browser.call("Page.navigate", url="about:blank")
 

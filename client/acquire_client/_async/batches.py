@@ -4,9 +4,9 @@ from collections.abc import AsyncIterator, Mapping
 from typing import Any, Literal, overload
 
 from ..base import Outcome, Status
-from ..encoding import Batch, Time, path_of
+from ..encoding import Batch, Time, decoded, path_of
 from ..errors import Problem
-from ..models import Answer, Result, Summary, WhatIf
+from ..models import Answer, Picture, Result, Summary, WhatIf
 from ..outcomes import BatchOutcome, RecordedAnswer
 from ..retrying import Repeat
 from .backend import Source, bounded_map
@@ -152,3 +152,25 @@ class AsyncBatches(AsyncConnection):
         """
         body = {"options": dict(options), "adopt": True}
         return await self.post(Answer, path_of("batches", id, "what-if"), body)
+
+    async def solve_picture(
+        self,
+        picture: bytes,
+        *,
+        spacecraft: str | None = None,
+        field_of_view_deg: float | None = None,
+    ) -> Picture:
+        """Find the attitude, the lens and the stars of a picture of any camera; records nothing.
+
+        `picture` is the content of its file; a `spacecraft` is the one whose camera took it.
+        """
+        response = await self.request(
+            "POST",
+            path_of("pictures"),
+            query={"spacecraft": spacecraft, "field_of_view_deg": field_of_view_deg},
+            content=picture,
+            headers={"Content-Type": "application/octet-stream"},
+            repeat=Repeat.ALWAYS,
+        )
+        found: Picture = decoded(response, Picture)
+        return found

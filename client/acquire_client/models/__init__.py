@@ -48,6 +48,7 @@ from .events import (
     TrackingChange,
 )
 from .gyro import GyroBlock, GyroSamples
+from .pictures import Picture, PictureAttitude, PictureLens, PictureStar
 from .replays import (
     ApidPackets,
     LineProblem,
@@ -121,6 +122,10 @@ __all__ = [
     "MissionNow",
     "MissionThen",
     "NewToken",
+    "Picture",
+    "PictureAttitude",
+    "PictureLens",
+    "PictureStar",
     "Provenance",
     "RankedBatch",
     "Ranking",

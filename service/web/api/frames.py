@@ -1,4 +1,4 @@
-"""Frames of star trackers: submit one."""
+"""Frames of star trackers: submit one, or solve a picture of any camera without a record."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,15 +16,21 @@ from service.errors import BadBatch, Fault, shown_value
 from service.imaging.submit import FrameIn, read_known
 from service.missions.mission import mission_named
 from service.storage.models.answers import Answer
+from service.storage.models.pictures import Picture
 from service.web.openapi.route import IDEMPOTENCY_KEY, LOCATION, REPLAYED, ResponseDoc, route_docs
 from service.web.requests.access import CallerDep
-from service.web.requests.dependencies import AppDep, MetricsDep, answer_response
+from service.web.requests.dependencies import (
+    AppDep,
+    MetricsDep,
+    answer_response,
+    json_response,
+)
 from service.web.requests.headers import IdempotencyKey
 from service.web.requests.path_parameters import SpacecraftPath
 from service.web.requests.query_parameters import TIME_SCHEMA, Query
 from service.web.requests.request_body import frame_body
 
-router = APIRouter(prefix="/api/v1/spacecraft", tags=["frames"])
+router = APIRouter(prefix="/api/v1", tags=["frames"])
 
 _A_PRIORI = '{"quaternion": [0.1, 0.2, 0.3, 0.9273618495495703]}'
 
@@ -120,7 +126,7 @@ async def _frame(
 
 
 @router.post(
-    "/{name}/frames",
+    "/spacecraft/{name}/frames",
     **route_docs(
         {
             201: ResponseDoc("The answer, now recorded.", Answer, LOCATION),
@@ -145,3 +151,56 @@ def submit_frame(
     if answered.replayed:
         metrics.count_repeat()
     return answer_response(answered)
+
+
+class PictureQuery(Query):
+    """What is known of a picture's camera."""
+
+    spacecraft: Annotated[
+        str | None,
+        Field(
+            description="Whose camera took it. Default: a camera that the service does not know."
+        ),
+    ] = None
+    field_of_view_deg: Annotated[
+        float | None,
+        Field(gt=0, lt=180, description="Along the longer side; may be wrong by a quarter."),
+    ] = None
+    image: Annotated[str | None, Field(description="As of a frame.", examples=["SCI"])] = None
+    overlay: Annotated[
+        bool, Field(description="Whether the answer holds the picture with the stars.")
+    ] = False
+
+
+async def _picture(
+    request: Request, query: Annotated[PictureQuery, InQuery()], app: AppDep
+) -> IO[bytes]:
+    return await frame_body(request, app.settings.frame_mb << 20)
+
+
+@router.post(
+    "/pictures",
+    **route_docs(
+        {200: ResponseDoc("What was found; nothing is recorded.", Picture)},
+        frame=True,
+        problems=(404, 503),
+    ),
+)
+def solve_picture(
+    query: Annotated[PictureQuery, InQuery()],
+    file: Annotated[IO[bytes], Depends(_picture)],
+    app: AppDep,
+    caller: CallerDep,
+) -> Response:
+    """Find the stars, the attitude and the lens of a picture of any camera, and record nothing."""
+    with file:
+        if query.spacecraft is not None:
+            caller.require(query.spacecraft)
+        found = app.frames.picture(
+            file,
+            spacecraft=query.spacecraft,
+            field_of_view_deg=query.field_of_view_deg,
+            image=query.image,
+            draws=query.overlay,
+        )
+    return json_response(found)

@@ -20,6 +20,7 @@ from service.web.console.formatting import present
 from service.web.console.registry import PAGES, ConsolePage, navigation
 from service.web.requests.access import CallerDep
 from service.web.requests.dependencies import AppDep
+from service.web.requests.problems import root_path
 from service.web.requests.query_parameters import Query
 
 __all__ = [
@@ -226,7 +227,7 @@ class PageContext:
 
 def _page_context(request: Request, app: AppDep, caller: CallerDep) -> PageContext:
     page = PAGES[request.scope["route"].name]
-    address = str(request.base_url).rstrip("/")
+    address = str(request.base_url).rstrip("/") + root_path(request)
     return PageContext(app, caller, page, app.events.last(caller.spacecraft), address)
 
 

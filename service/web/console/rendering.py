@@ -1,6 +1,7 @@
 """Turning a page into HTML: one environment, one set of headers, errors as pages of their own."""
 
 import dataclasses
+import re
 from collections.abc import Callable, Coroutine, Mapping
 from typing import Any
 from urllib.parse import quote, urlencode
@@ -25,7 +26,7 @@ from service.web.requests.problem_types import (
     ProblemType,
     problem_type_of,
 )
-from service.web.requests.problems import faults_in_query, on_http_error
+from service.web.requests.problems import faults_in_query, on_http_error, root_path
 
 HEADERS: Mapping[str, str] = {
     "Content-Security-Policy": (
@@ -79,6 +80,20 @@ def rendered_part(template: str, **values: Any) -> Markup:
     return Markup(_ENVIRONMENT.get_template(template).render(**values))
 
 
+_OWN_ADDRESS = re.compile(rb'\b(href|src|action)="/(?!/)')
+
+
+def below_path(request: Request, page: Response) -> Response:
+    """A page whose addresses begin with the path below which a proxy serves the service."""
+    root = root_path(request).encode()
+    if not root or not isinstance(page, HTMLResponse):
+        return page
+    body = _OWN_ADDRESS.sub(rb'\1="' + root + b"/", bytes(page.body))
+    page.body = body.replace(b"<html ", b'<html data-root="' + root + b'" ', 1)
+    page.headers["Content-Length"] = str(len(page.body))
+    return page
+
+
 class PageRoute(APIRoute):
     """A route whose errors are pages for people."""
 
@@ -88,18 +103,19 @@ class PageRoute(APIRoute):
 
         async def handler(request: Request) -> Response:
             try:
-                return await inner(request)
+                return below_path(request, await inner(request))
             except RequestValidationError as error:
-                return _error_page(
+                page = _error_page(
                     PROBLEM_TYPES[BadInput], problem_of_faults(faults_in_query(error))
                 )
+                return below_path(request, page)
             except AcquisitionError as error:
                 if (kind := problem_type_of(error)) is INTERNAL_ERROR:
                     raise
                 answer = _error_page(kind, problem_of(error))
                 if isinstance(error, Busy):
                     answer.headers["Retry-After"] = str(error.retry_after_s)
-                return answer
+                return below_path(request, answer)
 
         return handler
 
@@ -113,7 +129,8 @@ async def page_or_problem(request: Request, error: Exception) -> Response:
     if not (is_page and asks_for_page and request.method in ("GET", "HEAD")):
         return await on_http_error(request, error)
     detail = f"There is no page at {request.url.path[:200]}."
-    return _error_page(ProblemType(404, "Not found"), {"detail": detail})
+    page = _error_page(ProblemType(404, "Not found"), {"detail": detail})
+    return below_path(request, page)
 
 
 def _error_page(kind: ProblemType, problem: Mapping[str, Any]) -> Response:

@@ -109,13 +109,16 @@ def add_reference(app: FastAPI) -> None:
 
 def reference_of(app: FastAPI) -> dict[str, Any]:
     """The whole description of an app's routes."""
+    root = getattr(app.state, "root_path", "")
     described = get_openapi(
         title="Attitude acquisition",
         version=__version__,
         openapi_version="3.1.0",
         description=DESCRIPTION,
         license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"},
-        servers=[{"url": "/", "description": "The service that returned this description."}],
+        servers=[
+            {"url": root or "/", "description": "The service that returned this description."}
+        ],
         tags=[{"name": name, "description": text} for name, text in TAGS.items()],
         routes=app.routes,
     )

@@ -77,6 +77,8 @@ POLICIES: dict[str, Policy] = {
     "list_spacecraft": Policy("read", "nothing"),
     "get_spacecraft": Policy("read", "path"),
     "submit_frame": Policy("submit", "path"),
+    # It records nothing; the handler asks for access to the spacecraft that is named.
+    "solve_picture": Policy("read", "nothing"),
     "get_overlay": Policy("read", "result"),
     "get_latest": Policy("read", "path"),
     "list_attitudes": Policy("read", "path"),

@@ -58,9 +58,15 @@ def problem_response(
     return Response(body, kind.status, headers, media_type=MEDIA_TYPE)
 
 
+def root_path(request: Request) -> str:
+    """The path below which a proxy serves the service; empty without one."""
+    path: str = getattr(request.app.state, "root_path", "") if "app" in request.scope else ""
+    return path
+
+
 def _content(request: Request, kind: ProblemType, details: Mapping[str, Any]) -> dict[str, Any]:
     return {
-        "type": kind.type,
+        "type": kind.type if kind.slug is None else root_path(request) + kind.type,
         "title": kind.title,
         "status": kind.status,
         "detail": details["detail"],

@@ -1,6 +1,7 @@
 // Bars under a chart of trends: when alarms of its quantities were out of their limits.
 
 import { posix, utc } from "./times.js";
+import { rooted } from "./requests.js";
 
 const SHAPES = { watch: "△", warning: "▲", critical: "◆" };
 const MOST_ROWS = 4;
@@ -45,7 +46,7 @@ export class AlarmBars {
     const left = part(from);
     const right = until === null ? 1 : part(until);
     const run = new URLSearchParams(location.search).get("run");
-    bar.href = `/alarms/${id}${run ? `?run=${encodeURIComponent(run)}` : ""}`;
+    bar.href = rooted(`/alarms/${id}${run ? `?run=${encodeURIComponent(run)}` : ""}`);
     bar.className = severity;
     // A short bar at the end of the chart stays within it.
     bar.style.left = `min(${100 * left}%, 100% - 6px)`;

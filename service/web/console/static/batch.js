@@ -2,6 +2,7 @@
 import { fetchPage } from "./regions.js";
 import { attempt, send } from "./actions.js";
 import { signed } from "./sign.js";
+import { rooted } from "./requests.js";
 
 const WAIT_MS = 350;
 const form = () => document.getElementById("try");
@@ -14,7 +15,7 @@ function address() {
     if (field.name && field.value !== field.dataset.before) query.set(field.name, field.value);
   }
   const text = query.toString();
-  return text ? `${form().getAttribute("action")}?${text}` : form().getAttribute("action");
+  return text ? `${form().action}?${text}` : form().action;
 }
 
 async function draw(where) {
@@ -48,7 +49,7 @@ async function adopt(button) {
     const adopted = await send("POST", `/api/v1/batches/${parent}/what-if`, JSON.stringify(wanted));
     const text = sign.comment ? `${note}: ${sign.comment}` : note;
     await send("POST", "/api/v1/annotations", JSON.stringify({ text, start: time, spacecraft, who: sign.who }));
-    location.href = `/batches/${adopted.id}`;
+    location.href = rooted(`/batches/${adopted.id}`);
   });
 }
 
@@ -85,7 +86,7 @@ document.addEventListener("click", (event) => {
   }
   if (event.target.closest("[data-reset]")) {
     event.preventDefault();
-    draw(form().getAttribute("action"));
+    draw(form().action);
   }
 });
 document.addEventListener("mouseover", (event) => point(event, true));

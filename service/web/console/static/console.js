@@ -2,6 +2,7 @@
 import { keepFresh } from "./live_updates.js";
 import { attempt, send } from "./actions.js";
 import "./time_fields.js";
+import { rooted } from "./requests.js";
 
 const theme = document.getElementById("theme");
 const system = matchMedia("(prefers-color-scheme: dark)");
@@ -51,7 +52,7 @@ document.addEventListener("click", async (event) => {
 document.getElementById("sign-out")?.addEventListener("click", (event) => {
   attempt(event.target, document.getElementById("connection"), async () => {
     await send("DELETE", "/api/v1/session");
-    location.href = "/sign-in";
+    location.href = rooted("/sign-in");
   });
 });
 

@@ -2,6 +2,7 @@
 // share 0, 255 the share 1.  Pointer or arrow keys read a cell; a click or Enter leads to it.
 
 import { utc } from "./times.js";
+import { rooted } from "./requests.js";
 
 const TALLEST_PX = matchMedia("(max-width: 720px)").matches ? 100 : 240;
 const MOST_ROW_PX = 14;
@@ -167,7 +168,7 @@ export class HeatMap {
     if (!at) return;
     const { names, start, width } = this.shown;
     const text = (j) => new Date(1000 * (start + j * width)).toISOString();
-    const address = new URL(`/spacecraft/${encodeURIComponent(names[at.k])}`, location.href);
+    const address = new URL(rooted(`/spacecraft/${encodeURIComponent(names[at.k])}`), location.href);
     const run = new URLSearchParams(location.search).get("run");
     if (run) address.searchParams.set("run", run);
     address.searchParams.set("start", text(at.j - CELLS_AROUND));

@@ -4,6 +4,7 @@
 // the events since then follow.  A hidden page closes its stream, because a browser keeps only six
 // connections to a server, and catches up when it is visible again.
 import { fetchLatest, swapRegions } from "./regions.js";
+import { rooted } from "./requests.js";
 
 const EVENT_KINDS = [
   "batches",
@@ -96,7 +97,7 @@ function streamAddress() {
   const query = new URLSearchParams({ run });
   if (document.body.dataset.stream) query.set("spacecraft", document.body.dataset.stream);
   if (last !== null) query.set("last_event_id", last);
-  return `/api/v1/events?${query}`;
+  return rooted(`/api/v1/events?${query}`);
 }
 
 function connect() {

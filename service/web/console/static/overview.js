@@ -1,6 +1,7 @@
 // The overview: filter and order its rows without loading the page anew, and the heat map.
 import { HeatMap } from "./heat_map.js";
 import { fetchLatest, swapRegions } from "./regions.js";
+import { rooted } from "./requests.js";
 
 const TYPING_MS = 200;
 const heat = new HeatMap(document.getElementById("heat"));
@@ -30,7 +31,7 @@ function asked(form) {
     if (value === "") query.delete(name);
     else query.set(name, value);
   }
-  return query.size ? `/?${query}` : "/";
+  return rooted(query.size ? `/?${query}` : "/");
 }
 
 let typing = null;

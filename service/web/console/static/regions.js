@@ -1,11 +1,11 @@
 // Replaces parts of a page by newer ones; focus, input and selected text stay.
-import { request, unexpected } from "./requests.js";
+import { request, rooted, unexpected } from "./requests.js";
 
 // The present page at an address; throws for an error page.
 export async function fetchPage(address) {
   const { answer, text } = await request(address, { headers: { Accept: "text/html" } });
   // The session has ended: sign in again and return here.
-  if (new URL(answer.url).pathname === "/sign-in") location.href = answer.url;
+  if (new URL(answer.url).pathname === rooted("/sign-in")) location.href = answer.url;
   const fresh = new DOMParser().parseFromString(text, "text/html");
   if (!answer.ok) {
     const problem = fresh.getElementById("problem");

@@ -2,10 +2,18 @@
 
 const NO_ANSWER = "the service does not answer; check that it is running and reachable, then try again";
 
+// The prefix of every address where a proxy serves the service below a path.
+const root = document.documentElement.dataset.root ?? "";
+
+// A path of the service, or a whole address, as the browser must ask for it.
+export function rooted(address) {
+  return address.startsWith("/") ? root + address : address;
+}
+
 // The answer and its text; throws if there is none, or if it is truncated.
 export async function request(address, options) {
   try {
-    const answer = await fetch(address, options);
+    const answer = await fetch(rooted(address), options);
     return { answer, text: await answer.text() };
   } catch {
     throw new Error(NO_ANSWER);
@@ -26,7 +34,8 @@ export function unexpected(answer) {
   return `unexpected answer ${answer.status} of the service; try again in a minute`;
 }
 
-function parsed(text) {
+// The value of JSON, or null for any other text.
+export function parsed(text) {
   try {
     return JSON.parse(text);
   } catch {

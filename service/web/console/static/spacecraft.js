@@ -1,6 +1,6 @@
 // The trends of one spacecraft: charts of the period in the address.
 import { annotationsShown } from "./annotations.js";
-import { requestJson } from "./requests.js";
+import { requestJson, rooted } from "./requests.js";
 import { fetchLatest, swapRegions } from "./regions.js";
 import { AlarmBars } from "./alarm_bars.js";
 import { posix, utc } from "./times.js";
@@ -72,7 +72,7 @@ function zoom(bounds) {
     if (link) go(link.href);
     return;
   }
-  const address = new URL(stretch().dataset.trends ?? location.href, location.href);
+  const address = new URL(rooted(stretch().dataset.trends ?? location.href), location.href);
   address.searchParams.delete("range");
   address.searchParams.set("start", asText(bounds[0]));
   address.searchParams.set("end", asText(bounds[1]));
@@ -85,7 +85,7 @@ function zoom(bounds) {
 function linkTo({ start, end }) {
   const link = document.createElement("a");
   const query = new URLSearchParams({ run: document.body.dataset.run, spacecraft: document.getElementById("charts").dataset.spacecraft, start: asText(start), end: asText(end) });
-  link.href = `/batches?${query}`;
+  link.href = rooted(`/batches?${query}`);
   link.textContent = `Batches from ${utc(start)} to ${utc(end)} UTC`;
   status.className = "";
   status.replaceChildren(link);
@@ -111,12 +111,12 @@ if (stretch()) {
     const form = event.target.closest("[data-worst], [data-view]");
     if (!form) return;
     event.target.blur();
-    go(`${form.getAttribute("action")}?${new URLSearchParams(new FormData(form))}`);
+    go(`${form.action}?${new URLSearchParams(new FormData(form))}`);
   });
   document.addEventListener("submit", (event) => {
     if (!event.target.matches("[data-view]")) return;
     event.preventDefault();
-    go(`${event.target.getAttribute("action")}?${new URLSearchParams(new FormData(event.target))}`);
+    go(`${event.target.action}?${new URLSearchParams(new FormData(event.target))}`);
   });
   document.addEventListener("moment", ({ detail }) => linkTo(detail));
   addEventListener("popstate", () => go(location.href, false));

@@ -1,14 +1,18 @@
 """Attitude, rate, sigma and gyro bias by grade, and differences from the smoothed attitude."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from service.attitude.rotations import rotation_vectors
+from service.attitude.rotations import matrices, rotation_vectors
 from service.filtering.result import Integers
 from service.filtering.state import Status
 from service.grades.innovations import MeasuredInnovations
+from service.missions.mission import Tracker
 from service.storage.grades.period import PARTS, GradesOfPeriod
-from service.vectors import Vector
+from service.vectors import Vector, to_ra_dec
 from service.web.console.charts.grades.panels import (
+    FINE_HEIGHT,
     GradeChart,
     GradePanel,
     Mask,
@@ -29,9 +33,15 @@ WIDEST = 2.0
 """Usual bounds, that a chart of bounds reaches to."""
 
 
-def grade_charts(found: GradesOfPeriod, axis: TimeAxis) -> list[GradeChart]:
-    """The charts of a period, in the order of the page; without those that have no value."""
-    drawn = [_attitude(found, axis), _rate(found, axis), _sigma(found, axis)]
+def grade_charts(
+    found: GradesOfPeriod, axis: TimeAxis, tracker: Tracker | None = None
+) -> list[GradeChart]:
+    """The charts of a period, in the order of the page; without those that have no value.
+
+    With a tracker the first one is where its boresight points.
+    """
+    drawn = [] if tracker is None else [direction_chart(found, axis, tracker)]
+    drawn += [_attitude(found, axis), _rate(found, axis), _sigma(found, axis)]
     if found.innovations is not None and len(found.innovations):
         drawn.append(_differences(found.innovations, axis))
     return [*(each for each in drawn if each), *_bias(found, axis)]
@@ -53,6 +63,44 @@ def _by_grade(found: GradesOfPeriod, name: str) -> dict[str, Vector]:
         grade: np.where(_known(each.status)[:, None], getattr(each, name), np.nan)
         for grade, each in found.samples.items()
     }
+
+
+def direction_chart(found: GradesOfPeriod, axis: TimeAxis, tracker: Tracker) -> GradeChart | None:
+    """Right ascension, declination and roll of a boresight; no line crosses the wrap at 360 deg."""
+    samples = found.samples["smoothed"]
+    known = _known(samples.status)
+    if not known.any():
+        return None
+    # Rows are the tracker's axes in inertial components.
+    axes = tracker.body_from_tracker.T @ matrices(samples.quaternion)
+    ra_deg, dec_deg = to_ra_dec(axes[:, 2])
+    ra, dec = np.radians(ra_deg), np.radians(dec_deg)
+    north = np.column_stack([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
+    east = np.column_stack([-np.sin(ra), np.cos(ra), np.zeros(len(ra))])
+    up = axes[:, 1]
+    roll = np.arctan2(np.sum(up * east, axis=1), np.sum(up * north, axis=1))
+    joins = _joins(found, axis)
+    panels, rows = [], []
+    for name, value in (
+        ("RA", ra_deg),
+        ("Dec", dec_deg),
+        ("roll", np.degrees(roll) % 360.0),
+    ):
+        shown = np.where(known, value, np.nan)
+        wrapped = np.abs(np.diff(shown, prepend=shown[:1])) > 180.0
+        scale = replace(scale_of({"smoothed": shown}) or Scale(0.0, 360.0), height=FINE_HEIGHT)
+        trace = Values(samples.tai_ns, shown, joins & ~wrapped).trace("smoothed", axis, scale)
+        low, high = f"{level(scale.low)}°", f"{level(scale.high)}°"
+        rows.append((name, low, high))
+        panels.append(GradePanel(name, (trace,), "", "", (), f"{low} to {high}", scale, "°"))
+    return GradeChart(
+        "direction",
+        f"Boresight of {tracker.name}; roll: position angle of its +Y, from north through east",
+        tuple(panels),
+        ("angle", "least", "greatest"),
+        tuple(rows),
+        height=FINE_HEIGHT,
+    )
 
 
 def _attitude(found: GradesOfPeriod, axis: TimeAxis) -> GradeChart | None:
@@ -127,7 +175,7 @@ def _sigma(found: GradesOfPeriod, axis: TimeAxis) -> GradeChart | None:
         cells = tuple(medians.get(grade, "–") for grade in ("raw", *found.samples))
         rows.append((name, *cells))
         note = f"{level(scale.low)} to {level(scale.high)}″, logarithmic"
-        panels.append(GradePanel(name, tuple(traces), "", "", (), note))
+        panels.append(GradePanel(name, tuple(traces), "", "", (), note, scale, "″"))
     columns = ("axis", *(f"median of {grade}" for grade in ("raw", *found.samples)))
     return GradeChart(
         "sigma", "One σ of the attitude, by grade", tuple(panels), columns, tuple(rows)
@@ -191,6 +239,8 @@ def bounded_chart(
                 marks_of(met.tai_ns[~used], value[~used], axis, scale),
                 (int(scale.y(np.zeros(1))[0]),),
                 f"to ±{level(largest)}″, 3σ {level(_median(bound))}″",
+                scale,
+                "″",
             )
         )
     columns = ("axis", "mean", "median σ", "rms over σ", "beyond 3σ", "not used")
@@ -215,7 +265,8 @@ def _bias(found: GradesOfPeriod, axis: TimeAxis) -> list[GradeChart]:
         ]
         area = band_of(times, best - width, best + width, joins, axis, inner)
         note = f"{level(float(np.nanmin(best)))} to {level(float(np.nanmax(best)))}°/h"
-        panels.append(GradePanel(name, tuple(traces), area, "", (), f"{note}, σ {level(usual)}°/h"))
+        note += f", σ {level(usual)}°/h"
+        panels.append(GradePanel(name, tuple(traces), area, "", (), note, inner, "°/h"))
         of_filter = _median(sigma["filtered"][:, k])
         cells = f"{level(_median(best))}°/h", f"{level(usual)}°/h", f"{level(of_filter)}°/h"
         rows.append((name, *cells))
@@ -242,7 +293,7 @@ def _lines(
         ]
         low, high = f"{level(scale.low)}{unit}", f"{level(scale.high)}{unit}"
         rows.append((name, low, high))
-        panels.append(GradePanel(name, tuple(traces), "", "", (), f"{low} to {high}"))
+        panels.append(GradePanel(name, tuple(traces), "", "", (), f"{low} to {high}", scale, unit))
     return GradeChart(id, title, tuple(panels), ("axis", "least", "greatest"), tuple(rows))
 
 

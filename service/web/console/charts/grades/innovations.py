@@ -66,6 +66,8 @@ def _chi_square(met: MeasuredInnovations, axis: TimeAxis) -> GradeChart:
         marks_of(met.tai_ns[~used], met.nis[~used], axis, scale),
         tuple(scale.y(np.array([low, high, gate])).tolist()),
         f"lines at {level(low)} and {level(high)} (95 %) and at {level(gate)} (gate); logarithmic",
+        scale,
+        "",
     )
     share = f"{100.0 * inside / count:.1f} %" if count else "–"
     row = ("χ²", level(mean), share, str(int(np.count_nonzero(~used))))

@@ -1,7 +1,9 @@
 """Panels of one axis: traces of several grades, a band, marks, on a linear or logarithmic scale."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from datetime import datetime, timedelta
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +14,15 @@ from service.vectors import Vector
 from service.web.console.charts.period.attitude import HEIGHT, PAD, WIDTH, band_path, line_path
 
 Mask = npt.NDArray[np.bool_]
+FINE_HEIGHT = 10 * HEIGHT
+"""Of panels whose values are read to a thousandth of their range."""
+DAY_S = 86_400
+TIME_STEPS_S = (
+    *(1, 2, 5, 10, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 3 * 3600, 6 * 3600, 12 * 3600),
+    *(days * DAY_S for days in (1, 2, 7, 14, 28, 56, 91, 182)),
+)
+MOST_TICKS = 4
+EDGE_PERCENT = 5.0
 ROOM = 0.04
 """Above the greatest and below the least value, of the height."""
 
@@ -37,6 +48,16 @@ class GradePanel:
     """Heights of horizontal lines."""
     note: str
     """The range of the values, and what else there is to say."""
+    scale: "Scale"
+    unit: str
+
+    @property
+    def ticks(self) -> list[tuple[float, str]]:
+        """Values of the vertical axis: percent from the top, and their text."""
+        values = self.scale.ticks()
+        heights = 100.0 * self.scale.y(np.array(values)) / self.scale.height
+        texts = [f"{value:.6g}".replace("-", "−") + self.unit for value in values]
+        return list(zip(np.round(heights, 1).tolist(), texts, strict=True))
 
 
 @dataclass(frozen=True)
@@ -65,6 +86,22 @@ class TimeAxis:
         along = np.clip((time_ns - self.start.tai_ns) / length, 0.0, 1.0)
         return np.asarray(np.rint(PAD + along * (WIDTH - 2 * PAD)).astype(np.int64))
 
+    def ticks(self) -> list[tuple[float, str]]:
+        """Round times of the period: percent from the left, and their text in UTC."""
+        length_s = (self.end.tai_ns - self.start.tai_ns) * 1e-9
+        step_s = next((step for step in TIME_STEPS_S if length_s <= MOST_TICKS * step), None)
+        if step_s is None or length_s <= 0.0:
+            return []
+        begin = datetime.fromisoformat(self.start.text.replace("Z", "+00:00").replace(":60", ":59"))
+        first_s = math.ceil(begin.timestamp() / step_s) * step_s - begin.timestamp()
+        form = "%H:%M:%S" if step_s < 60 else "%H:%M" if step_s < DAY_S else "%m-%d"
+        found = []
+        for after_s in np.arange(first_s, length_s, step_s).tolist():
+            part = (PAD + after_s / length_s * (WIDTH - 2 * PAD)) / WIDTH
+            moment = begin + timedelta(seconds=after_s)
+            found.append((round(100.0 * part, 1), moment.strftime(form)))
+        return [each for each in found if EDGE_PERCENT < each[0] < 100.0 - EDGE_PERCENT]
+
 
 @dataclass(frozen=True)
 class Scale:
@@ -73,6 +110,20 @@ class Scale:
     low: float
     high: float
     is_log: bool = False
+    height: int = HEIGHT
+
+    def ticks(self) -> list[float]:
+        """Two to five round values of the scale; powers of ten of a logarithmic one."""
+        low, high = self.low, self.high
+        if self.is_log:
+            powers = range(math.ceil(math.log10(low)), math.floor(math.log10(high)) + 1)
+            return [10.0**power for power in powers] or [low, high]
+        if not high > low:
+            return [low]
+        step = 10.0 ** math.floor(math.log10((high - low) / 2.0))
+        step *= max(part for part in (1.0, 2.0, 5.0) if part * step <= (high - low) / 2.0)
+        first = math.ceil(low / step)
+        return [k * step for k in range(first, math.floor(high / step) + 1)]
 
     def y(self, value: Vector) -> Integers:
         """Units from the top (n,); values beyond an edge are at it."""
@@ -81,7 +132,8 @@ class Scale:
             value, low, high = np.log(np.maximum(value, low)), np.log(low), np.log(high)
         room = ROOM * (high - low) or 1.0
         part = (value - low + room) / (high - low + 2.0 * room)
-        return np.asarray(np.rint(HEIGHT * (1.0 - np.clip(part, 0.0, 1.0))).astype(np.int64))
+        units = self.height * (1.0 - np.clip(part, 0.0, 1.0))
+        return np.asarray(np.rint(units).astype(np.int64))
 
 
 @dataclass(frozen=True, eq=False)

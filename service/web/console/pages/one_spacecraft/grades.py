@@ -7,6 +7,7 @@ from fastapi import Path
 from fastapi import Query as InQuery
 from starlette.responses import Response
 
+from service.products.formats import attitude_formats
 from service.storage.grades.period import MOST_BLOCKS, GradesOfPeriod
 from service.web.console.charts.grades.grades import grade_charts
 from service.web.console.charts.grades.innovations import innovation_charts
@@ -34,6 +35,8 @@ class Drawn:
     charts: list[GradeChart]
     innovations: list[GradeChart]
     strips: list[Strip]
+    ticks: list[tuple[float, str]]
+    """Of the time: percent from the left, and their text."""
 
 
 @console_page(
@@ -54,9 +57,10 @@ def grades_page(
             met = found.innovations
             drawn = Drawn(
                 found,
-                grade_charts(found, axis),
+                grade_charts(found, axis, mission.trackers[0]),
                 [] if met is None else innovation_charts(met, axis),
                 strips(found, axis),
+                axis.ticks(),
             )
     return rendered(
         "grades.html.jinja",
@@ -67,5 +71,6 @@ def grades_page(
         ranges=list(RANGES_S),
         drawn=drawn,
         most_blocks=MOST_BLOCKS,
+        attitude_formats=attitude_formats(),
         jobs=context.app.definitive.all(name).items[:JOBS],
     )

@@ -1,0 +1,147 @@
+"""A picture of any camera, solved without a record: its attitude, its lens and its stars."""
+
+import math
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+from service.storage.models.base import Components, Count, Quaternion, Record, doc
+
+if TYPE_CHECKING:
+    from service.acquire.picture import PictureAttitude, PictureResult
+
+
+class PictureAttitudeFound(Record, frozen=True, kw_only=True):
+    """The attitude of a picture as a viewer shows it."""
+
+    component: ClassVar[str] = "PictureAttitude"
+    status: Annotated[str, doc("`suspect`: the lens was fitted on the picture itself.")]
+    quaternion: Annotated[
+        Quaternion,
+        doc("ICRS to camera, scalar last: x right, y down, z to the sky through the middle."),
+    ]
+    sigma_arcsec: Annotated[Components, doc("One standard deviation about x, y and z.")]
+    ra_deg: Annotated[float, doc("Of the middle of the picture.")]
+    dec_deg: Annotated[float, doc("Of the middle of the picture.")]
+    roll_deg: Annotated[
+        float, doc("Position angle of the upper edge, from north through east, 0 to 360.")
+    ]
+    aberration: str
+    log_odds: Annotated[float, doc("Logarithm of the odds against chance.")]
+
+
+class PictureLens(Record, frozen=True, kw_only=True):
+    """The lens that fits a picture; a sigma of a parameter that was not fitted is null."""
+
+    component: ClassVar[str] = "PictureLens"
+    field_deg: Annotated[list[float], doc("Of the width and of the height.")]
+    focal_px: float
+    focal_sigma_px: float | None
+    distortion_corner: Annotated[float, doc("At the corners, as a share of their distance.")]
+    distortion_sigma: float | None
+    center_px: Annotated[list[float], doc("The optical axis, in pixels right and down.")]
+    center_sigma_px: float | None
+
+
+class PictureStarFound(Record, frozen=True, kw_only=True):
+    """A star on a picture; the residual is its place less the expected one."""
+
+    component: ClassVar[str] = "PictureStar"
+    id: str
+    name: str | None
+    v_mag: float
+    u_px: float
+    v_px: float
+    residual_px: list[float]
+
+
+class Picture(Record, frozen=True, kw_only=True):
+    """What was found on a picture; without an attitude, `remarks` say what to try."""
+
+    component: ClassVar[str] = "Picture"
+    width_px: Count
+    height_px: Count
+    candidates: Annotated[Count, doc("Points of light.")]
+    psf_sigma_px: Annotated[float, doc("Width of the images of stars, one sigma.")]
+    noise_counts: float
+    attitude: PictureAttitudeFound | None
+    orientation: Annotated[str, doc("How the pixels of the file were turned.")]
+    remarks: list[str]
+    time: Annotated[str | None, doc("UTC of mid exposure, if the file states it.")]
+    exposure_s: float | None
+    lens: PictureLens | None
+    residual_rms_px: float | None
+    sigma_scale: Annotated[float | None, doc("By which the residuals scaled the sigmas.")]
+    shared_error_px: Annotated[float | None, doc("The error that neighbouring stars share.")]
+    zero_point_mag: Annotated[
+        float | None, doc("Magnitude of one count, per second if `exposure_s` is known.")
+    ]
+    zero_point_sigma_mag: float | None
+    stars: Annotated[list[PictureStarFound], doc("The identified stars, brightest first.")]
+    overlay_png: Annotated[
+        str | None, doc("Base64: the picture with stars, names, a grid and a scale, if asked for.")
+    ] = None
+
+
+def picture_of(result: "PictureResult") -> Picture:
+    """The record of a result; numbers that are not known are null."""
+    points, frame, found = result.points, result.frame, result.attitude
+    return Picture(
+        width_px=points.width_px,
+        height_px=points.height_px,
+        candidates=points.count,
+        psf_sigma_px=round(points.psf_sigma_px, 2),
+        noise_counts=round(points.noise_counts, 3),
+        attitude=_attitude(found) if found else None,
+        orientation=frame.orientation,
+        remarks=[*result.remarks, *frame.remarks],
+        time=frame.time,
+        exposure_s=frame.exposure_s,
+        lens=_lens(found) if found else None,
+        residual_rms_px=round(found.rms_px, 3) if found else None,
+        sigma_scale=round(found.sigma_scale, 3) if found else None,
+        shared_error_px=round(found.shared_px, 3) if found else None,
+        zero_point_mag=_known(found.zero_point_mag, 2) if found else None,
+        zero_point_sigma_mag=_known(found.zero_point_sigma_mag, 2) if found else None,
+        stars=[
+            PictureStarFound(
+                id=star.id,
+                name=star.name,
+                v_mag=round(star.magnitude_v_mag, 2),
+                u_px=round(star.u_px, 2),
+                v_px=round(star.v_px, 2),
+                residual_px=[round(star.residual_u_px, 3), round(star.residual_v_px, 3)],
+            )
+            for star in (found.stars if found else ())
+        ],
+    )
+
+
+def _attitude(found: "PictureAttitude") -> PictureAttitudeFound:
+    ra_deg, dec_deg = found.boresight_deg
+    return PictureAttitudeFound(
+        # The lens was fitted on the picture itself: it is not calibrated.
+        status="suspect",
+        quaternion=[round(part, 9) for part in found.quaternion.tolist()],
+        sigma_arcsec=[round(sigma, 2) for sigma in found.sigma_arcsec.tolist()],
+        ra_deg=round(ra_deg, 5),
+        dec_deg=round(dec_deg, 5),
+        roll_deg=round(found.roll_deg, 4),
+        aberration="corrected" if found.aberration_corrected else "ignored: no time is known",
+        log_odds=round(found.log_odds, 1),
+    )
+
+
+def _lens(found: "PictureAttitude") -> PictureLens:
+    lens = found.lens
+    return PictureLens(
+        field_deg=[round(angle, 4) for angle in found.field_deg],
+        focal_px=round(lens.focal_px, 2),
+        focal_sigma_px=_known(found.sigma_of(3) * lens.focal_px, 2),
+        distortion_corner=round(lens.bend, 6),
+        distortion_sigma=_known(found.sigma_of(4), 6),
+        center_px=[round(place, 2) for place in lens.center_px],
+        center_sigma_px=_known(found.sigma_of(5) * lens.radius_px, 2),
+    )
+
+
+def _known(value: float, digits: int) -> float | None:
+    return round(value, digits) if math.isfinite(value) else None
