@@ -28,10 +28,11 @@ from service.simulate.gyro import GyroWanted, with_gyro
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
 from service.web.app import create_app
-from tests.web.browser import CHROMIUM, Browser
+from tests.web.browser import CHROMIUM, Browser, chromium
 from tests.web.serving import Server
 
 FOLDER = Path(__file__).parents[1] / "docs" / "images"
+PICTURE = Path(__file__).parents[1] / "tests" / "pictures" / "cedarsolve-pleiades.jpg"
 DOCUMENT = FOLDER.parent / "operators.md"
 HEADING = "## All pages: wide and narrow, light and dark"
 RUN = "sample-pass"
@@ -79,7 +80,7 @@ def main() -> int:
             if asked.only:
                 pages = {name: pages[name] for name in asked.only.split(",")}
             asked.folder.mkdir(parents=True, exist_ok=True)
-            with Browser(CHROMIUM) as browser:
+            with chromium(Path(folder) / "profile") as devtools, Browser(devtools) as browser:
                 total = look(browser, address, pages, asked.folder)
     if asked.folder == FOLDER and not asked.only:
         before, _, _ = DOCUMENT.read_text(encoding="utf-8").partition(HEADING)
@@ -128,6 +129,7 @@ def filled(address: str, app: App) -> Mapping[str, str]:
         "batch": f"/batches/{batch}",
         "what-if": f"/batches/{batch}?{tried}",
         "frame": f"/batches/{frame}#frame",
+        "pictures": "/pictures",
         "batches": f"/batches?{run}&outcome=ambiguous",
         "compare": f"/compare?{run}",
         "alarms": f"/alarms?{run}&state=all",
@@ -201,6 +203,8 @@ def look(browser: Browser, address: str, pages: Mapping[str, str], folder: Path)
     for page, size, dark in tqdm(views, desc="pictures", unit="picture"):
         browser.open(address + pages[page], width=SIZES[size], height=900, dark=dark)
         browser.wait(lambda: browser.run(SETTLED))
+        if page == "pictures":
+            solve(browser)
         top = browser.run(TOP)
         height = min(browser.run("document.documentElement.scrollHeight") - top, TALLEST[size])
         picture = browser.picture(SIZES[size], height, top)
@@ -209,6 +213,15 @@ def look(browser: Browser, address: str, pages: Mapping[str, str], folder: Path)
             image.convert("RGB").save(file, "WEBP", quality=QUALITY, method=6)
         total += file.stat().st_size
     return total
+
+
+def solve(browser: Browser) -> None:
+    """Choose a picture on the page of pictures, and wait for its stars."""
+    root = browser.call("DOM.getDocument")["root"]["nodeId"]
+    node = browser.call("DOM.querySelector", nodeId=root, selector="#file")["nodeId"]
+    browser.call("DOM.setFileInputFiles", nodeId=node, files=[str(PICTURE)])
+    browser.run("document.querySelector('#picture button.main').click()")
+    browser.wait(lambda: browser.run("document.getElementById('drawn').naturalWidth"), PATIENCE_S)
 
 
 def gallery(pages: Mapping[str, str]) -> str:

@@ -648,3 +648,72 @@ def click(browser, selector):
         f"(e => e.tagName === 'BUTTON' || e.tagName === 'A' ? e.click() : 0)"
         f"(document.querySelector({json.dumps(selector)}))"
     )
+
+
+def test_a_new_critical_alarm_sounds_once_if_that_is_switched_on(browser, address):
+    browser.open(f"{address}/alarms")
+    rung = "Number(document.getElementById('sound').dataset.rung ?? 0)"
+    alarm = {"id": "a", "run": "live", "state": "open", "current_severity": "critical"}
+
+    def receive(**changed):
+        data = json.dumps(json.dumps(alarm | changed))
+        browser.run(
+            "import('/static/live_updates.js').then(({ received }) => "
+            f"received(new MessageEvent('alarm', {{data: {data}}})))"
+        )
+
+    browser.wait(lambda: browser.run(CONNECTED))
+    receive()
+    assert browser.run(rung) == 0
+    # A browser makes no sound before somebody has clicked.
+    x, y = browser.run("(b => [b.x + 9, b.y + 9])(sound.getBoundingClientRect())")
+    for kind in ("mousePressed", "mouseReleased"):
+        browser.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+    # The click sounds once, so that one knows how.
+    assert browser.run("[localStorage.sound, sound.textContent, sound.ariaPressed]") == [
+        "on",
+        "Sound on",
+        "true",
+    ]
+    assert browser.run(rung) == 1
+    receive(id="b", current_severity="warning")
+    receive(id="b", run="another")
+    assert browser.run(rung) == 1
+    receive(id="b")
+    receive(id="b")
+    assert browser.run(rung) == 2
+    receive(id="b", current_severity=None)
+    receive(id="b")
+    assert browser.run(rung) == 3
+    browser.run("document.getElementById('sound').click()")
+    receive(id="c")
+    assert browser.run(rung) == 3
+    assert browser.complaints == []
+
+
+def test_a_point_of_the_sky_leads_to_its_batch(browser, address, client, full_run):
+    found = client.get("/api/v1/batches", params={"run": full_run, "spacecraft": "XTE"}).json()
+    batches = {each["time"]: each["id"] for each in found["items"]}
+    page = f"{address}/spacecraft/XTE/period?run={full_run}&range=day"
+    browser.open(page)
+    chart = "document.querySelector('.all-sky')"
+    points = "JSON.parse(document.querySelector('#sky-figure [data-json]').content.textContent)"
+    point = (
+        f"(({{x, y}}) => [x, y])(new DOMPoint(...{points}[0].slice(0, 2))"
+        f".matrixTransform({chart}.getScreenCTM()))"
+    )
+    browser.run(f"{chart}.scrollIntoView({{block: 'center'}})")
+    x, y = browser.run(point)
+    for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
+        browser.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+    browser.wait(lambda: browser.run("location.pathname").startswith("/batches/"))
+    assert browser.run("location.pathname.split('/')[2]") in batches.values()
+    browser.open(page)
+    browser.run(f"{chart}.focus()")
+    browser.press("ArrowLeft")
+    assert "Batch at " in text(browser, "#sky-status")
+    browser.press("Enter")
+    browser.wait(lambda: browser.run("location.pathname").startswith("/batches/"))
+    newest = max(batches)
+    assert browser.run("location.pathname.split('/')[2]") == batches[newest]
+    assert browser.complaints == []

@@ -35,6 +35,44 @@ runs.querySelector("button:not([type])").hidden = true;
 // The menu itself is replaced when the list of runs changes.
 runs.addEventListener("change", () => runs.requestSubmit());
 
+// A sound at a new critical alarm, if it is switched on in this browser.
+const sound = document.getElementById("sound");
+let audio = null;
+
+function nameSound() {
+  const isOn = localStorage.getItem("sound") === "on";
+  sound.ariaPressed = String(isOn);
+  sound.textContent = isOn ? "Sound on" : "Sound off";
+}
+
+// Two tones; a browser makes none before the page was clicked or typed into.
+function ring() {
+  if (!navigator.userActivation?.hasBeenActive) {
+    sound.textContent = "▲ Sound: click once to hear it";
+    return;
+  }
+  audio ??= new AudioContext();
+  audio.resume();
+  for (const [number, hertz] of [880, 660].entries()) {
+    const tone = new OscillatorNode(audio, { frequency: hertz });
+    const volume = new GainNode(audio, { gain: 0.2 });
+    tone.connect(volume).connect(audio.destination);
+    tone.start(audio.currentTime + 0.25 * number);
+    tone.stop(audio.currentTime + 0.25 * number + 0.2);
+  }
+  sound.dataset.rung = String(Number(sound.dataset.rung ?? 0) + 1);
+}
+
+sound.hidden = false;
+nameSound();
+sound.addEventListener("click", () => {
+  localStorage.setItem("sound", localStorage.getItem("sound") === "on" ? "off" : "on");
+  nameSound();
+  // Also what tells the reader how it will sound, and lets the browser play it later.
+  if (localStorage.getItem("sound") === "on") ring();
+});
+document.addEventListener("critical", () => localStorage.getItem("sound") === "on" && ring());
+
 document.addEventListener("click", async (event) => {
   const button = event.target.closest("[data-copy]");
   if (!button) return;

@@ -1,7 +1,7 @@
 // The event stream: it reports what was recorded, and the page is then fetched and redrawn.
 //
 // Every event has a number.  After an interruption the request names the last number received, and
-// the events since then follow.  A hidden page closes its stream, because a browser keeps only six
+// the events since then follow.  A hidden page without sound closes its stream, because a browser keeps only six
 // connections to a server, and catches up when it is visible again.
 import { fetchLatest, swapRegions } from "./regions.js";
 import { rooted } from "./requests.js";
@@ -119,10 +119,27 @@ function connected(event) {
   showState("live", "● Connected");
 }
 
-function received(event) {
+export function received(event) {
   last = event.lastEventId || last;
-  if (concernsRun(JSON.parse(event.data))) refreshSoon();
+  const data = JSON.parse(event.data);
+  if (!concernsRun(data)) return;
+  if (event.type === "alarm") noteCritical(data);
+  refreshSoon();
 }
+
+// Alarms that are critical now: each excursion is reported once to whatever sounds.
+const critical = new Set();
+
+function noteCritical({ id, state, current_severity: severity }) {
+  if (severity !== "critical" || state !== "open") critical.delete(id);
+  else if (!critical.has(id)) {
+    critical.add(id);
+    document.dispatchEvent(new CustomEvent("critical"));
+  }
+}
+
+// A hidden page listens only for what sounds.
+const isIdle = () => document.hidden && localStorage.getItem("sound") !== "on";
 
 async function interrupted() {
   // Streams end now and then by design, and the next attempt succeeds: that is not shown.
@@ -165,7 +182,7 @@ function scheduleRetry(waitMs) {
   clearTimeout(retry);
   retry = setTimeout(() => {
     retry = null;
-    if (source === null && !document.hidden) connect();
+    if (source === null && !isIdle()) connect();
   }, waitMs);
   if (lostAt !== null && new Date() - lostAt > SHOW_LOST_AFTER_MS) showLost();
 }
@@ -192,10 +209,10 @@ export function keepFresh() {
     return;
   }
   document.addEventListener("visibilitychange", () => {
-    if (document.hidden) {
+    if (isIdle()) {
       source?.close();
       source = null;
     } else if (source === null && retry === null && !refused) connect();
   });
-  if (!document.hidden) connect();
+  if (!isIdle()) connect();
 }

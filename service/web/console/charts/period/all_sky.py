@@ -6,6 +6,7 @@ inside, and 180 deg is in the middle.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import erfa
@@ -76,6 +77,8 @@ class AllSkyChart:
     sun_path: Path
     zones: tuple[ZoneEdge, ...]
     tracks: tuple[Track, ...]
+    points: tuple[tuple[int, int, str], ...]
+    """Each batch in order of time: its place in pixels, and its time."""
     width: float = WIDTH + 2 * EDGE
     height: float = HEIGHT + 2 * EDGE
 
@@ -113,7 +116,19 @@ def all_sky_chart(period: PeriodStars, shown: list[TrackerStarsOfPeriod]) -> All
             ZoneEdge(each.tracker, _edges(each.region)) for each in shown if each.region is not None
         ),
         tracks=tuple(_track(period, each) for each in shown),
+        points=tuple(_points(period, shown)),
     )
+
+
+def _points(
+    period: PeriodStars, shown: list[TrackerStarsOfPeriod]
+) -> Iterator[tuple[int, int, str]]:
+    """The places of the first tracker that has one in a batch."""
+    for number, time in enumerate(period.attitudes.time):
+        known = [each for each in shown if np.isfinite(each.boresight[number, 0])]
+        if known:
+            x, y = np.round(hammer(known[0].boresight[number])).tolist()
+            yield int(x), int(y), time
 
 
 def _track(period: PeriodStars, tracker: TrackerStarsOfPeriod) -> Track:
