@@ -40,9 +40,7 @@ const sound = document.getElementById("sound");
 let audio = null;
 
 function nameSound() {
-  const isOn = localStorage.getItem("sound") === "on";
-  sound.ariaPressed = String(isOn);
-  sound.textContent = isOn ? "Sound on" : "Sound off";
+  sound.textContent = localStorage.getItem("sound") === "on" ? "Sound on" : "Sound off";
 }
 
 // Two tones; a browser makes none before the page was clicked or typed into.
@@ -63,7 +61,7 @@ function ring() {
   sound.dataset.rung = String(Number(sound.dataset.rung ?? 0) + 1);
 }
 
-sound.hidden = false;
+sound.hidden = document.body.dataset.stream === "off";
 nameSound();
 sound.addEventListener("click", () => {
   localStorage.setItem("sound", localStorage.getItem("sound") === "on" ? "off" : "on");
