@@ -29,8 +29,9 @@ HELD_AGAINST = (
      "test_learned_noise_is_that_of_least_squares"),
     ("crossed apertures as a camera's PSF", "the integral over the chords of the aperture",
      _FRAMES, "test_a_wire_spreads_light_across_itself"),
-    ("stars on frames behind crossed wires", "drawn stars; see [frames](crossed-frames.md)",
-     _FRAMES, "test_places_scatter_as_they_say"),
+    ("stars on frames behind crossed wires",
+     "drawn stars; see [frames](frames.md#frames-behind-crossed-wires)", _FRAMES,
+     "test_places_scatter_as_they_say"),
 )  # fmt: skip
 """What the report only names: the second way to the same number, and the test that takes it."""
 

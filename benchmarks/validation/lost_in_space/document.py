@@ -148,6 +148,7 @@ def document(rows: Sequence[Row], scenes: int, seed: int, turn: int) -> tuple[st
     )
     text = f"""# Lost in space, beside other solvers
 
+For engineers who need an attitude without a prior, or who compare solvers.
 Written by
 `python -m benchmarks.validation.lost_in_space --scenes {scenes} --seed {seed} --write` in an
 environment with the extra `peers`; its figures are not edited by hand. Python
