@@ -89,8 +89,8 @@ def framed(name: str, title: str, written: Written, quick: bool, seed: int, reco
         f"{written.text.strip()}\n\n"
         f"{bounds_table(written.bounds)}\n\n"
         f"{doubt}"
-        f"{record.sentence} Seed {seed}, {size}; again:\n"
-        f"`python -m benchmarks.verification --only {name}`.\n"
+        f"{record.sentence} Seed {seed}, {size}; "
+        f"again: `python -m benchmarks.verification --only {name}`.\n"
         f"<!-- end of {name} -->\n"
     )
 

@@ -171,22 +171,30 @@ def run(quick: bool, seed: int) -> Report:
     return Report("two_groups", figures, bounds_of(rows, others))
 
 
+def _each(rows: list[Row], name: str) -> str:
+    """A value of every mission, in the order of `MISSIONS`."""
+    values = [getattr(row.counted, name) for row in rows]
+    return " / ".join(f"{value:.2f}" if name.endswith("pct") else f"{value:,}" for value in values)
+
+
 def write(quick: bool, seed: int) -> Written:
     """The section of the verification."""
     rows, others = measured(quick, seed)
+    kinds = dict.fromkeys((row.kind, row.stars, row.with_prior) for row in rows)
+    alike = [[r for r in rows if (r.kind, r.stars, r.with_prior) == kind] for kind in kinds]
     groups = table(
         (
-            "mission", "view", "stars", "a priori", "answered", "good", "good and wrong",
+            "view", "stars", "a priori", "answered", "good", "good and wrong",
             "names at .999", "right %", "other good alone", "of these named %",
         ),
         [
             (
-                row.mission, row.kind, row.stars, "yes" if row.with_prior else "none",
-                row.counted.answered, row.counted.good, row.counted.good_and_wrong,
-                row.counted.named, f"{row.counted.named_right_pct:.2f}",
-                row.counted.smaller_good_alone, f"{row.counted.rival_pct:.2f}",
+                of_kind[0].kind, of_kind[0].stars, "yes" if of_kind[0].with_prior else "none",
+                *(_each(of_kind, name) for name in ("answered", "good", "good_and_wrong", "named")),
+                _each(of_kind, "named_right_pct"),
+                _each(of_kind, "smaller_good_alone"), _each(of_kind, "rival_pct"),
             )
-            for row in rows
+            for of_kind in alike
         ],
         numbers=7,
     )  # fmt: skip
@@ -203,8 +211,9 @@ An attitude may be wrong although chance does not explain it: a view may hold a 
 stars that agree with one another. *Ghosts*: every star is doubled by a reflection 0.05 to 1 deg
 away, as bright or up to 3 mag fainter, in half of the batches with magnitudes exchanged; true is
 the attitude of the stars. *Slews*: half of the stars were exposed after an unreported slew of 0.05
-to 5 deg; either attitude is true, if both are named. {rows[0].counted.batches:,} batches a row,
-half of their stars in each group; the a priori attitude is off by up to 3 deg about each axis, the
+to 5 deg; either attitude is true, if both are named. A row has {rows[0].counted.batches:,} batches
+of each of {", ".join(MISSIONS)}, in this order, half of their stars in each group; the a priori
+attitude is off by up to 3 deg about each axis, the
 pole of SOHO by up to 0.1 deg.
 
 *Good and wrong* counts `good` answers that are wrong, and those that do not name the attitude of
