@@ -28,6 +28,8 @@ _KEPT = re.compile(
 )
 _WITHIN, _OUT = "within bounds", "out of bounds"
 BOUNDS_HEAD = ("figure", "measured", "bound", "")
+MOST_ROWS = 12
+"""More bounds are shown by kind."""
 
 
 @dataclass(frozen=True)
@@ -87,21 +89,50 @@ def framed(name: str, title: str, written: Written, quick: bool, seed: int, reco
         f"{written.text.strip()}\n\n"
         f"{bounds_table(written.bounds)}\n\n"
         f"{doubt}"
-        f"{record.sentence} Seed {seed}, {size}; again:\n"
-        f"`python -m benchmarks.verification --only {name}`.\n"
+        f"{record.sentence} Seed {seed}, {size}; "
+        f"again: `python -m benchmarks.verification --only {name}`.\n"
         f"<!-- end of {name} -->\n"
     )
 
 
 def bounds_table(bounds: Iterable[Bound]) -> str:
-    """Every bound in a row; those that do not hold are marked."""
+    """The bounds in rows; those that do not hold are marked.
+
+    Of many bounds, those of one kind that hold make one row: the name behind the last colon
+    says the kind, and the smallest and the largest figure stand for all.
+    """
+    shown_bounds = list(bounds)
+    rows = shown_bounds if len(shown_bounds) <= MOST_ROWS else _by_kind(shown_bounds)
     return table(
         BOUNDS_HEAD,
         [
-            (each.figure, each.measured, each.asked, "holds" if each.holds else "**does not hold**")
-            for each in bounds
+            (row.figure, row.measured, row.asked, "holds" if row.holds else "**does not hold**")
+            for row in rows
         ],
     )
+
+
+def _by_kind(bounds: Iterable[Bound]) -> list[Bound]:
+    kinds: dict[tuple[str, ...], list[Bound]] = {}
+    for bound in bounds:
+        kind = bound.figure.rpartition(": ")[2]
+        key = (kind, bound.asked) if bound.holds else (bound.figure, bound.asked, "broken")
+        kinds.setdefault(key, []).append(bound)
+    rows = []
+    for (kind, asked, *_), alike in kinds.items():
+        if len(alike) == 1:
+            rows.append(alike[0])
+            continue
+        least, most = min(alike, key=_leading), max(alike, key=_leading)
+        ends = dict.fromkeys((least.measured, most.measured))
+        rows.append(Bound(f"{kind} ({len(alike)} cases)", " … ".join(ends), asked, True))
+    return rows
+
+
+def _leading(bound: Bound) -> float:
+    """The number with which a measured figure begins; zero for a figure in words."""
+    found = re.match(r"-?[\d,]*\.?\d+(e[+-]?\d+)?", bound.measured)
+    return float(found[0].replace(",", "")) if found else 0.0
 
 
 def bounds_shown(text: str) -> int:

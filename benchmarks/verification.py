@@ -5,8 +5,7 @@
     python -m benchmarks.verification --only sky,covariance  these anew, the others as they are
     python -m benchmarks.verification --check                measure nothing: which are stale?
 
-A section is a module of `benchmarks.validation` with its `SECTION`, listed in `SECTIONS`; that
-of the cost of verifying is one of `benchmarks.speed`.
+A section is a module of `benchmarks.validation` with its `SECTION`, listed in `SECTIONS`.
 The exit code is 1 where the page has a section out of its bounds.
 
 `--check` names the sections of docs/verification.md and of docs/performance.md
@@ -24,7 +23,7 @@ from pathlib import Path
 
 from benchmarks.record import ROOT, record_of
 from benchmarks.sections import Section, framed, has_record, kept, out_of_bounds, stale
-from benchmarks.speed import performance, verified_cost
+from benchmarks.speed import performance
 from benchmarks.validation import (
     aberration,
     attitude_against_svd,
@@ -52,7 +51,6 @@ SECTIONS: Mapping[str, Section] = {
     "two_groups": two_groups.SECTION,
     "calibration": calibration.SECTION,
     "whole_sky": whole_sky.SECTION,
-    "verified_cost": verified_cost.SECTION,
     "lost_in_space": lost_in_space.SECTION,
     "attitude": attitude_against_svd.SECTION,
     "covariance": covariance.SECTION,
@@ -89,17 +87,16 @@ Measured before records and bounds were kept, and to be made anew: {", ".join(un
     body = "\n".join(sections[name] for name in here)
     return f"""# Verification
 
-Written by `python -m benchmarks.verification`; its figures are not edited by hand.
+Written by `python -m benchmarks.verification`, for engineers who decide how far to trust the
+answers: each method, compared with independent results. Its figures are not edited by hand.
 Version {__version__}. {verdict}
 
-Every section is also a test: `make test` runs the same comparisons on smaller samples, and
-`python -m benchmarks --all` prints them. Each ends with its bounds and with the commit, the library
-versions and the seed that it was measured with; its figures, times included, are those of that
-commit. `python -m benchmarks.verification --check` names the sections whose source files have
-changed since then. It is run before a release, and is no part of `make check`.
-
-Where a figure is a count of random events, its bound is the one that chance alone passes once in
-10,000 times.
+Every section is also a test: `make test` runs the same comparisons on smaller samples. Each ends
+with its bounds, many bounds of one kind in one row from the smallest figure to the largest, and
+with the commit, the library versions and the seed that it was measured with.
+`python -m benchmarks --all` prints every bound by itself, and `make stale` names the sections whose
+source files have changed since their commit. Where a figure is a count of random events, its bound
+is one that chance alone passes once in 10,000 times.
 {older}
 {contents}
 

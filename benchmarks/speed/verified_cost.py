@@ -18,9 +18,7 @@ import numpy.typing as npt
 from tqdm import tqdm
 
 from benchmarks.bounds import Bound, at_least, at_most
-from benchmarks.record import CORE, SIMULATOR
 from benchmarks.report import Report
-from benchmarks.sections import Section, Written, table
 from service.acquire import acquire
 from service.compiled.jit import njit
 from service.identify.budget import MAX_WORK
@@ -279,41 +277,3 @@ def run(quick: bool, seed: int) -> Report:
         for kernel, spent in cost.least_us.items()
     }
     return Report("verified_cost", figures, bounds_of(costs))
-
-
-def write(quick: bool, seed: int) -> Written:
-    """The section of the verification."""
-    costs = everywhere(quick, seed)
-    rows = [
-        (
-            name,
-            PLACES[name].prior_error,
-            f"{cost.least_us[VOTES]:.1f}",
-            *(
-                f"{cost.least_us[kernel]:.1f} ({cost.least_us[kernel] / cost.least_us[VOTES]:.2f})"
-                for kernel in (EXHAUSTIVE, EARLY)
-            ),
-            f"{cost.named[VOTES]:.2%}",
-            f"{cost.named[EARLY]:.2%}",
-            cost.wrong,
-        )
-        for name, cost in costs.items()
-    ]
-    head = (
-        "place", "a priori off by", VOTES, EXHAUSTIVE, EARLY, "votes: named rightly", "verified",
-        "wrong",
-    )  # fmt: skip
-    text = f"""
-Microseconds of five stars in a warm zone, one thread, many views in one compiled loop, and in
-brackets how many times what the votes cost in the same run. *Exhaustive* goes on until nothing that
-was not seen could matter; the *early stop*, which the service uses, ends after the first observed
-pair whose best hypothesis chance does not explain. The bounds in microseconds are for a quiet
-machine; on a slower one the times of the votes count. The stars named rightly of the columns are
-by votes and with the early stop.
-
-{table(head, rows, numbers=6)}
-"""
-    return Written(text, bounds_of(costs))
-
-
-SECTION = Section("What verifying costs", write, (*CORE, *SIMULATOR, "studies/paper_1994"))

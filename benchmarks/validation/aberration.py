@@ -8,7 +8,7 @@ import numpy as np
 from benchmarks.bounds import Bound, at_most, between
 from benchmarks.record import CORE, SIMULATOR
 from benchmarks.report import Report
-from benchmarks.sections import Section, Written, table
+from benchmarks.sections import Section, Written
 from benchmarks.validation.covariance import Passes, error_of
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
@@ -86,8 +86,6 @@ The same batches of an XTE in a low orbit sent four ways, {count_of(quick):,} ea
 directions come from a Lorentz transformation written out in the benchmark. Given is the mean
 pointing error across the boresight. Where aberration is treated rightly, noise alone is left, as
 much as the covariance predicts; where it is not, the shift that it makes at the boresight.
-
-{table(("way: what is shown", "arcsec"), report.figures.items())}
 """
     return Written(text, report.bounds)
 

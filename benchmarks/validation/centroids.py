@@ -251,7 +251,7 @@ def run(quick: bool, seed: int) -> Report:
 def write(quick: bool, seed: int) -> Written:
     """The section of the verification."""
     found, bounds, spent = rows(quick, seed)
-    cut, of_truncation = truncation(quick)
+    _, of_truncation = truncation(quick)
     head = ["image", "peak S/N", "bound (px)", *COLUMNS]
     text = f"""
 Windows with one star anywhere on the middle pixel, photon and read noise, squares of 9 x 9 pixels,
@@ -265,11 +265,9 @@ prediction. photutils and sep saw the same pixels in the same run.
 
 CPU time a star: {", ".join(f"{name} {value:.0f} µs" for name, value in spent.items())}.
 
-What light outside the window takes from a plain moment (pixels, worst of several places, no noise):
-measured without a PSF, and by the report's law from the ends of the window alone. Told the PSF, the
-methods predict it to 0.001 px and take it off.
-
-{table(("image", "method", "half width (px)", "bias", "law"), cut, 3)}
+Without a PSF, a plain moment loses the light outside its window; told the PSF, the methods predict
+that bias to {MOST_TRUNCATION_PX:g} px and take it off. The ends of the window alone predict no more
+than there is (`python -m benchmarks centroids` prints the biases).
 """
     return Written(text, bounds + of_truncation)
 

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from benchmarks.bounds import Bound, at_least, mean_as_expected, share_as_expected
 from benchmarks.report import Report
-from benchmarks.sections import Section, Written, table
+from benchmarks.sections import Section, Written
 from service.acquire import Acquisition, acquire
 from service.missions.mission import SHIPPED_FOLDER, Mission
 from service.observations.schema import submission_from_json
@@ -198,8 +198,6 @@ P the covariance, e^T P^-1 e is chi-square with three degrees of freedom, and TA
 has the mean 2N - 3 and the variance 2 (2N - 3). An attitude is suspect beyond the 99.9 % point of
 TASTE, so one in a thousand is. The a priori attitude is off by up to 3 deg about any axis (XTE,
 SWAS), or by up to 0.1 deg and any angle about the pole (SOHO). {count_of(quick):,} batches each.
-
-{table(("", "figure"), report.figures.items())}
 """
     return Written(text, report.bounds)
 

@@ -1,7 +1,7 @@
 """Frames of a camera behind crossed wires, through the core of the service, held against truth.
 
     python -m benchmarks.validation.crossed_frames --frames 200 --seed 3    a quarter of an hour
-    python -m benchmarks.validation.crossed_frames --write                  docs/crossed-frames.md
+    python -m benchmarks.validation.crossed_frames --write                  into docs/frames.md
 
 The frames are those of `benchmarks.validation.frames`, through two wires each way, and the
 mission's camera says so.  A tenth of them is measured once more by a camera that takes its
@@ -21,10 +21,12 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.bounds import Bound, at_least, at_most, between
-from benchmarks.record import CORE, IMAGING, ROOT, record_of
+from benchmarks.record import CORE, IMAGING, record_of
 from benchmarks.report import Report
 from benchmarks.sections import bounds_table, table
 from benchmarks.validation.frames import (
+    CROSSED,
+    DOCUMENT,
     FOUND_PX,
     PRIORS,
     RIGHT_ARCSEC,
@@ -50,7 +52,6 @@ CHUNK = 2
 COMPARED_EVERY = 10
 FOUND_LEAST = 0.99
 SPREAD = (0.9, 1.1)
-DOCUMENT = ROOT / "docs" / "crossed-frames.md"
 SOURCES = (*CORE, *IMAGING, "service/simulate/frames.py", "benchmarks/validation/frames.py")
 
 Errors = dict[str, list[float]]
@@ -225,11 +226,11 @@ def _naive(found: Sequence[CrossedFrame]) -> dict[str, object]:
 
 
 def document(report: Report, seed: int) -> str:
-    """docs/crossed-frames.md."""
+    """The section of docs/frames.md."""
     verdict = "Everything is within its bounds." if report.passed else "**Out of bounds.**"
     record = record_of(SOURCES)
     frames = report.figures["frames"]
-    return f"""# Frames behind crossed wires
+    return f"""## Frames behind crossed wires
 
 Written by
 `python -m benchmarks.validation.crossed_frames --frames {frames} --seed {seed} --write`;
@@ -238,13 +239,13 @@ its figures are not edited by hand. {verdict}
 {record.sentence} Seed {seed}.
 <!-- {record} -->
 
-The frames are those of [frames.md](frames.md) with one difference: two wires each way, a tenth of
+The frames are those above with one difference: two wires each way, a tenth of
 the aperture wide, stand before the lens, and every star is a cross whose arms reach 90 pixels far.
 The mission's camera has `psf = "cross"` ([missions.md](missions.md#the-image-of-a-star)); its stars
 are taken off the frame one behind the other before the next ones are looked for, and each is placed
 by the shape of the cross, with the arms of all others as its background.
 
-A star counts as found, and an attitude as right, as in frames.md: within {FOUND_PX:g} pixels, and
+A star counts as found, and an attitude as right, as above: within {FOUND_PX:g} pixels, and
 within {RIGHT_ARCSEC[0]:g} arcsec across the boresight and {RIGHT_ARCSEC[2]:g} about it.
 
 {table(("", "figure"), report.figures.items())}
@@ -262,12 +263,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--frames", type=int, default=FRAMES, metavar="N", help="default 200")
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="default 1")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1, metavar="N")
-    parser.add_argument("--write", action="store_true", help="write docs/crossed-frames.md")
+    parser.add_argument("--write", action="store_true", help="write it into docs/frames.md")
     asked = parser.parse_args(arguments)
     report = measured_report(asked.frames, asked.seed, asked.processes)
     print(report.text())
     if asked.write:
-        DOCUMENT.write_text(document(report, asked.seed), encoding="utf-8")
+        above = DOCUMENT.read_text("utf-8").partition(CROSSED)[0]
+        text = f"{above}{CROSSED}\n{document(report, asked.seed)}"
+        DOCUMENT.write_text(text, encoding="utf-8")
     return 0 if report.passed else 1
 
 

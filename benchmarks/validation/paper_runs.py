@@ -3,7 +3,7 @@
     python -m benchmarks paper_runs
 
 A quarter of an hour of one core; it takes the cores that there are.  As a
-section of the verification it makes the pages of the tables beside it.
+section of the verification it makes the page of the tables beside it.
 """
 
 import tempfile
@@ -114,18 +114,13 @@ def run(quick: bool, seed: int) -> Report:
 
 
 def write(quick: bool, seed: int) -> Written:
-    """The section of the verification, and the pages with every run."""
+    """The section of the verification, and the page with every run by votes."""
     votes, verified, seeds = measured(quick, seed)
     with tempfile.TemporaryDirectory() as folder:
         plots = Path(folder) / "plots"
         draw(votes, plots)
         times = measured_times(list(TITLES), seeds[0], PAPER_IDENTIFIER)
-        pages = {
-            "paper.md": document(votes, seeds, times, plots, Path(folder) / "paper.md"),
-            "paper-verified.md": document(
-                verified, seeds[:1], (), plots, Path(folder) / "paper-verified.md"
-            ),
-        }
+        pages = {"paper.md": document(votes, seeds, times, plots, Path(folder) / "paper.md")}
         pictures = {path.name: path.read_text("utf-8") for path in sorted(plots.glob("*.svg"))}
     pictures |= pictures_of("paper", lambda folder: _draw(votes, verified, folder))
     return Written(
@@ -186,7 +181,8 @@ The simulator of Fink & Shoup's paper, made anew, sends its views through the sa
 batch, with the votes as the identifier and with `verified`, the service's default. Every run of
 Tables 2 to 10 has at least {min(t.stars for t in votes):,} stars by votes, seeds
 {", ".join(map(str, seeds))} pooled, and {min(t.stars for t in verified):,} verified, seed
-{seeds[0]}. Every run by itself: [the votes](paper.md), [verified](paper-verified.md).
+{seeds[0]}. [paper.md](paper.md) has every run by votes;
+`acquire simulate paper --identifier verified` prints every run verified.
 
 {table(head, rows, numbers=6)}
 

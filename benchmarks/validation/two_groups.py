@@ -17,7 +17,7 @@ from multiprocessing import get_context
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.bounds import Bound, at_least, at_most
+from benchmarks.bounds import Bound, at_least, at_most, every
 from benchmarks.record import CORE, SIMULATOR
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
@@ -49,18 +49,18 @@ class Row:
     with_prior: bool
     counted: Counted
 
-    def bounds(self) -> list[Bound]:
-        """What is asked of it; one batch is allowed for in small samples."""
+    def bounds(self) -> tuple[Bound, Bound]:
+        """Wrong answers, and rivals not named; one batch is allowed for in small samples."""
         prior = "a priori" if self.with_prior else "no prior"
         name = f"{self.mission}, {self.kind}, {self.stars} stars, {prior}"
         counted = self.counted
         allowed = max(1, math.floor(counted.batches * MOST_WRONG_PCT / 100.0))
         missing = counted.smaller_good_alone - counted.of_these_with_rival
         few = math.ceil(counted.smaller_good_alone * (1.0 - LEAST_RIVAL_PCT / 100.0))
-        return [
+        return (
             at_most(f"{name}: good and wrong", counted.good_and_wrong, allowed),
             at_most(f"{name}: other group good alone, not named", missing, few),
-        ]
+        )
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,10 @@ def measured(quick: bool, seed: int) -> tuple[list[Row], dict[str, Simple]]:
 
 def bounds_of(rows: list[Row], others: dict[str, Simple]) -> list[Bound]:
     """All that is asked."""
-    bounds = [bound for row in rows for bound in row.bounds()]
+    by_row = [row.bounds() for row in rows]
+    bounds = [wrong for wrong, _ in by_row]
+    about = "good attitudes of the other group alone, named as rivals in 99 %"
+    bounds += every(about, [unnamed for _, unnamed in by_row])
     named = sum(row.counted.named for row in rows)
     wrong = sum(row.counted.named_wrong for row in rows)
     right_pct = 100.0 * (1.0 - wrong / max(named, 1))
@@ -168,22 +171,30 @@ def run(quick: bool, seed: int) -> Report:
     return Report("two_groups", figures, bounds_of(rows, others))
 
 
+def _each(rows: list[Row], name: str) -> str:
+    """A value of every mission, in the order of `MISSIONS`."""
+    values = [getattr(row.counted, name) for row in rows]
+    return " / ".join(f"{value:.2f}" if name.endswith("pct") else f"{value:,}" for value in values)
+
+
 def write(quick: bool, seed: int) -> Written:
     """The section of the verification."""
     rows, others = measured(quick, seed)
+    kinds = dict.fromkeys((row.kind, row.stars, row.with_prior) for row in rows)
+    alike = [[r for r in rows if (r.kind, r.stars, r.with_prior) == kind] for kind in kinds]
     groups = table(
         (
-            "mission", "view", "stars", "a priori", "answered", "good", "good and wrong",
+            "view", "stars", "a priori", "answered", "good", "good and wrong",
             "names at .999", "right %", "other good alone", "of these named %",
         ),
         [
             (
-                row.mission, row.kind, row.stars, "yes" if row.with_prior else "none",
-                row.counted.answered, row.counted.good, row.counted.good_and_wrong,
-                row.counted.named, f"{row.counted.named_right_pct:.2f}",
-                row.counted.smaller_good_alone, f"{row.counted.rival_pct:.2f}",
+                of_kind[0].kind, of_kind[0].stars, "yes" if of_kind[0].with_prior else "none",
+                *(_each(of_kind, name) for name in ("answered", "good", "good_and_wrong", "named")),
+                _each(of_kind, "named_right_pct"),
+                _each(of_kind, "smaller_good_alone"), _each(of_kind, "rival_pct"),
             )
-            for row in rows
+            for of_kind in alike
         ],
         numbers=7,
     )  # fmt: skip
@@ -200,8 +211,9 @@ An attitude may be wrong although chance does not explain it: a view may hold a 
 stars that agree with one another. *Ghosts*: every star is doubled by a reflection 0.05 to 1 deg
 away, as bright or up to 3 mag fainter, in half of the batches with magnitudes exchanged; true is
 the attitude of the stars. *Slews*: half of the stars were exposed after an unreported slew of 0.05
-to 5 deg; either attitude is true, if both are named. {rows[0].counted.batches:,} batches a row,
-half of their stars in each group; the a priori attitude is off by up to 3 deg about each axis, the
+to 5 deg; either attitude is true, if both are named. A row has {rows[0].counted.batches:,} batches
+of each of {", ".join(MISSIONS)}, in this order, half of their stars in each group; the a priori
+attitude is off by up to 3 deg about each axis, the
 pole of SOHO by up to 0.1 deg.
 
 *Good and wrong* counts `good` answers that are wrong, and those that do not name the attitude of

@@ -85,6 +85,7 @@ def document(
         if path.exists()
     ]
     written = (
+        "For astronomers who know the paper: its tables beside those that this service gives.\n"
         f"Seeds {', '.join(map(str, seeds))}, {len(mine)} runs, from {_least(mine):,} stars each."
     )
     parts = ["# The tables of Fink & Shoup 1994", written, _INTRODUCTION, *links, tables]

@@ -94,7 +94,10 @@ def document(found: Measurements, plots: Path, file: Path) -> str:
     """
     parts = [
         "# PTP and its rivals: Zhou & Ye 2015",
-        f"Seed {found.seed}, {found.scenes:,} fields a condition.",
+        (
+            "For astronomers who know the paper, or who choose an identifier without a prior.\n"
+            f"Seed {found.seed}, {found.scenes:,} fields a condition."
+        ),
         _INTRODUCTION,
         *_in_short(found),
         "## The axis",

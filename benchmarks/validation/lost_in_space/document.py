@@ -123,17 +123,6 @@ def section_text(rows: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-def ratios(rows: Sequence[Row]) -> list[str]:
-    """Times of the service's own over those of each peer, condition by condition."""
-    return [
-        f"| {row.condition} | {other.solver} | {row.median_ms / other.median_ms:.2f} "
-        f"| {row.p99_ms / other.p99_ms:.2f} |"
-        for row in rows
-        for other in rows
-        if row.solver in OURS and other.condition == row.condition and other is not row
-    ]
-
-
 def document(rows: Sequence[Row], scenes: int, seed: int, turn: int) -> tuple[str, dict[str, str]]:
     """The page and its plots by file name."""
     pictures = {
@@ -148,6 +137,7 @@ def document(rows: Sequence[Row], scenes: int, seed: int, turn: int) -> tuple[st
     )
     text = f"""# Lost in space, beside other solvers
 
+For engineers who need an attitude without a prior, or who compare solvers.
 Written by
 `python -m benchmarks.validation.lost_in_space --scenes {scenes} --seed {seed} --write` in an
 environment with the extra `peers`; its figures are not edited by hand. Python
@@ -188,12 +178,6 @@ the process's own clock around one call from Python.
 ## What came of it
 
 {shown_rows(rows)}
-
-## Times of ours over theirs
-
-| condition | over | median | p99 |
-|---|---|---:|---:|
-{chr(10).join(ratios(rows))}
 
 ![Share of right answers](plots/lost-in-space-rates.svg)
 
