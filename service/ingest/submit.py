@@ -76,6 +76,8 @@ class SubmissionService:
         self._single_s = -float("inf")
         self.observers: list[Observer] = []
         """Called with every batch that is new, after its commit."""
+        self.before_solving: Callable[[Connection], object] = lambda connection: None
+        """Called before each group of submissions is solved, with a connection for look-ups."""
 
     def submit(
         self,
@@ -237,11 +239,11 @@ class SubmissionService:
             is_long=may_take_long(batch),
         )
 
-    def warm_up(self, submission: Submission, write: bool = True) -> None:
+    def warm_up(self, submission: Submission) -> None:
         """Look up, solve and record a batch, and take it back: nothing is kept or told.
 
         Connections are opened and statements prepared that the first batch
-        would wait for.  Without `write` the batch is not even recorded.
+        would wait for.
         """
         pending = PendingBatch(
             identity_of(submission.batch),
@@ -258,8 +260,6 @@ class SubmissionService:
             record(connection, [unsaved])
             raise _WarmedUp
 
-        if not write:
-            return
         with suppress(_WarmedUp):
             self._store.writer.change(record_and_roll_back).result()
 
@@ -337,6 +337,7 @@ class SubmissionService:
                 {each.identity for each in group},
                 {each.key for each in group if each.key is not None},
             )
+            self.before_solving(connection)
         holders = [holder_of(registry, e.identity, e.key, e.fingerprint) for e in group]
         repeats = {each.result_id for each in holders if isinstance(each, ExistingResult)}
         stored: Mapping[str, bytes | AcquisitionError] = {}

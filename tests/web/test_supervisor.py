@@ -7,11 +7,11 @@ from contextlib import suppress
 
 import httpx
 import pytest
+from service.storage.sql.writing_lock import WritingLock
 from sqlalchemy import create_engine
 from sqlalchemy.pool import NullPool
 
 from service.storage.sql.engines import database_url
-from service.storage.sql.writing_lock import WritingLock
 from tests.fresh_databases import sqlite_at
 from tests.waiting import wait_until
 from tests.web.serving import served, serving
