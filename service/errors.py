@@ -15,7 +15,7 @@
     ├── BadConfiguration      a mission file, a setting: names file, key and allowed values
     └── Busy                  the queue is full, or the database does not answer
         ├── BeingBuilt        another thread builds what the work needs
-        ├── NotProjecting     another service does what one of several does alone
+        ├── Standby           another service writes to the database
         └── Stopping          the service is stopping: a later attempt here will fail too
 
 Not finding a star is a result and raises nothing.  Nothing here knows HTTP;
@@ -127,8 +127,19 @@ class BeingBuilt(Busy):
         self.done = done
 
 
-class NotProjecting(Busy):
-    """Another service that shares the database does what one of them does alone."""
+class Standby(Busy):
+    """Another service writes to the database; this one takes over where that ends."""
+
+    def __init__(self, is_known: bool = True) -> None:
+        """`is_known` False: the connection was lost, and no other service may have taken over."""
+        if is_known:
+            super().__init__("another service writes to the database; this one stands by", 2)
+        else:
+            super().__init__(
+                "the connection that writes to the database was lost; this service takes it up "
+                "again, unless another one has",
+                2,
+            )
 
 
 class Stopping(Busy):

@@ -29,7 +29,7 @@ from service.ingest.outcomes import (
 )
 from service.ingest.queue import Backlog, Found, IngestQueue, PendingBatch
 from service.ingest.solver_pool import WAIT_S, Solver, SolverPool, may_take_long, mission_in_input
-from service.ingest.tracking import with_prediction
+from service.ingest.tracking import last_results, with_prediction
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
 from service.observations.schema import OptionsIn, Submission
@@ -316,11 +316,20 @@ class SubmissionService:
 
     def _solve(self, pending: PendingBatch, may_wait: bool) -> UnsavedResult:
         submission = pending.make()
-        if self.solver.asks_for_last(submission.batch):
-            mission = self.solver.missions[submission.batch.spacecraft]
+        is_outdated: Callable[[Connection], bool] | None = None
+        if self.solver.asks_for_last(batch := submission.batch):
+            mission = self.solver.missions[batch.spacecraft]
             with self._store.reading_record() as connection:
                 submission = with_prediction(connection, submission, mission)
+                if self._store.lock is not None:
+                    # Other services record attitudes of this spacecraft, too.
+                    last = last_results(connection, batch, mission)
+
+                    def is_outdated(connection: Connection) -> bool:
+                        return last_results(connection, batch, mission) != last
+
         unsaved = self.solver.solve(submission, pending.received, pending.key, may_wait=may_wait)
+        unsaved.is_outdated = is_outdated
         note_handed_over([unsaved])
         return unsaved
 

@@ -3,9 +3,11 @@
 import json
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
 
 import pytest
+from sqlalchemy import select
 
 from service.access.tokens import Caller
 from service.app.calibrations.estimates import CalibrationRequest
@@ -13,6 +15,7 @@ from service.app.factory import open_app
 from service.observations.schema import submission_from_json
 from service.settings import Settings
 from service.storage.queries.replays import find_replay
+from service.storage.sql.tables import results
 from tests.calibration.wrong_file import true_batches, write_mission_files
 from tests.storage import samples
 from tests.waiting import wait_until
@@ -170,3 +173,55 @@ def test_an_upload_is_followed_and_cancelled_through_the_other_service(services,
     assert first.replays.cancel(id, Caller("all", frozenset(), None, "other")).state == "cancelled"
     wait_until(lambda: not second.replays.at_work, 30.0)
     assert second.replays.get(id).state == "cancelled"
+
+
+def tracked(sky, missions, name, after_s):
+    body = json.loads(samples.batch(sky, missions, name, after_s=after_s))
+    return submission_from_json(json.dumps(body | {"a_priori": {"from": "last"}}))
+
+
+def predicted_from(answered):
+    return json.loads(answered.body)["tracking"]["prediction"]["result"]
+
+
+def test_a_batch_that_asks_for_the_last_attitude_gets_the_one_another_service_recorded_meanwhile(
+    services, sky, missions, monkeypatch
+):
+    first, second = services
+    begin = submitted(first, sky, missions, "begin")
+    solver = second.submissions.ingest.solver
+    solve, solved, go_on = solver.solve, threading.Event(), threading.Event()
+
+    def solve_and_wait(*arguments, **wanted):
+        unsaved = solve(*arguments, **wanted)
+        solved.set()
+        assert go_on.wait(30)
+        return unsaved
+
+    monkeypatch.setattr(solver, "solve", solve_and_wait)
+    with ThreadPoolExecutor(1) as thread:
+        late = thread.submit(second.submissions.submit, tracked(sky, missions, "late", 20.0))
+        assert solved.wait(30)
+        between = first.submissions.submit(tracked(sky, missions, "between", 10.0))
+        go_on.set()
+        assert predicted_from(between) == begin.id
+        assert predicted_from(late.result(30)) == between.id
+
+
+def test_batches_of_a_spacecraft_posted_to_both_services_are_one_sequence(services, sky, missions):
+    submitted(services[0], sky, missions, "begin")
+    posted = [tracked(sky, missions, f"b{k}", 10.0 * k) for k in range(1, 41)]
+    with ThreadPoolExecutor(4) as threads:
+        submit = [app.submissions.submit for app in services]
+        futures = [threads.submit(submit[k % 2], each) for k, each in enumerate(posted)]
+        assert not any(each.result(60).replayed for each in futures)
+    with services[0].context.reading_record() as connection:
+        query = select(results.c.id, results.c.time_ns, results.c.answer).order_by(results.c.seq)
+        recorded = connection.execute(query).all()
+    before = {recorded[0].id: recorded[0].time_ns}
+    for id, time_ns, answer in recorded[1:]:
+        earlier = {each: at for each, at in before.items() if at <= time_ns}
+        last = json.loads(answer)["tracking"]["prediction"]["result"]
+        assert last == max(earlier, key=lambda each: earlier[each])
+        before[id] = time_ns
+    assert len(before) == 41

@@ -4,8 +4,8 @@ from contextlib import closing
 
 import pytest
 
-from service.errors import Busy, NotProjecting
-from service.storage.sql.projector_lock import left_behind
+from service.errors import Busy
+from service.storage.sql.projector_lock import NotProjecting, left_behind
 from service.storage.store import Store
 
 pytestmark = pytest.mark.parametrize("database", ["postgresql"], indirect=True)

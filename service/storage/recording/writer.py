@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 from sqlalchemy import Connection, Engine, update
 from sqlalchemy.exc import DBAPIError
 
-from service.errors import AcquisitionError, Busy, NotProjecting, Stopping
+from service.errors import AcquisitionError, Busy, Stopping
 from service.storage.recording import events
 from service.storage.recording.transaction import (
     QueuedJob,
@@ -32,7 +32,7 @@ from service.storage.sql.connections import PersistentConnection, RolledBack
 from service.storage.sql.database_file import DatabaseFile
 from service.storage.sql.engines import TO_WRITE, patience
 from service.storage.sql.file_lock import FileLock
-from service.storage.sql.projector_lock import Attempt, ProjectorLock
+from service.storage.sql.projector_lock import Attempt, NotProjecting, ProjectorLock
 from service.storage.sql.tables import WRITTEN_BY_POSTS, event_counter
 
 log = logging.getLogger(__name__)

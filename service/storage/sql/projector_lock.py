@@ -16,7 +16,7 @@ from typing import Literal
 
 from sqlalchemy import Connection
 
-from service.errors import NotProjecting
+from service.errors import Busy
 from service.storage.sql.prepared import execute
 
 # Two numbers, the second of which is that of a table: each schema of a database has its own lock.
@@ -28,6 +28,10 @@ _RELEASE = f"SELECT pg_advisory_unlock_shared({_OF_WORK})"
 _IS_FREE = f"SELECT pg_try_advisory_xact_lock({_OF_WORK})"
 
 Attempt = Literal["kept", "taken", "refused"]
+
+
+class NotProjecting(Busy):
+    """Another service that shares the database does what one of them does alone."""
 
 
 class ProjectorLock:
