@@ -146,9 +146,12 @@ def test_a_follower_that_is_stopped_leaves_its_messages_to_another(service, sky,
     async def run():
         async with bus() as made:
             await made.publish(*(samples.batch(sky, missions, f"b{k}") for k in range(20)))
-            async with AsyncClient("http://127.0.0.1:9", give_up_after_s=0.1) as nowhere:
+            async with (
+                AsyncClient("http://127.0.0.1:9", give_up_after_s=0.1) as nowhere,
+                AsyncClient(service.url) as there,
+            ):
                 # A service that answers once, and then does no longer.
-                nowhere.session = AsyncClient(service.url).session
+                nowhere.session = there.session
                 follower = Follower(made.source(), nowhere, Metrics())
                 running = asyncio.create_task(follower.run())
                 while (await made.stream.stream_info(made.name)).state.consumer_count < 1:
