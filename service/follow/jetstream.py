@@ -18,6 +18,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import nats
+from acquire_client import AsyncClient
+from acquire_client import errors as answers
+from acquire_client.encoding import path_of
+from acquire_client.retrying import Repeat
 from nats.aio.client import Client
 from nats.aio.msg import Msg
 from nats.errors import Error as NatsError
@@ -26,10 +30,6 @@ from nats.js.api import AckPolicy, ConsumerConfig
 from nats.js.errors import NoStreamResponseError, NotFoundError
 from prometheus_client import CollectorRegistry, Counter, Gauge
 
-from service.client import AsyncClient
-from service.client import errors as answers
-from service.client.encoding import path_of
-from service.client.retrying import Repeat
 from service.errors import BadConfiguration
 from service.gyro.schema import is_gyro_line
 

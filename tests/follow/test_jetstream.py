@@ -12,10 +12,10 @@ from contextlib import asynccontextmanager
 import nats
 import nats.js.api
 import pytest
+from acquire_client import AsyncClient
 from nats.errors import NoServersError
 from sqlalchemy import func, select
 
-from service.client import AsyncClient
 from service.errors import BadConfiguration
 from service.follow.jetstream import ACK_WAIT_S, DELIVERED, SEQUENCE, Follower, Metrics, Source
 from service.storage.sql.tables import batches

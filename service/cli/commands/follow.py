@@ -75,9 +75,9 @@ def run(parsed: Namespace) -> int:
     from service.extras import require_extra
 
     require_extra("nats", "nats", "SOURCE", parsed.source)
+    from acquire_client import AsyncClient
     from prometheus_client import start_http_server
 
-    from service.client import AsyncClient
     from service.follow.jetstream import Follower, Metrics, Source
     from service.replay.over_http import checked_url, translated
 
